@@ -1,0 +1,3 @@
+"""srf: state-and-rate friction, from a law to its stability boundary."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,49 @@
+"""Errors that a user can act on: what, where, what instead."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class SrfError(Exception):
+    """Misuse that stops a command: `message` says what and where, `hint` what to do instead.
+
+    `exit_code` is 2 for usage, laws and recordings; 1 for I/O.
+    """
+
+    exit_code = 2
+
+    def __init__(self, message: str, hint: str | None = None, *, exit_code: int | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+        if exit_code is not None:
+            self.exit_code = exit_code
+
+
+class ExpressionError(SrfError):
+    """An expression that cannot be a formula; `text` and `column` (0-based) place the caret."""
+
+    def __init__(self, message: str, hint: str | None = None, *, text: str = "", column: int | None = None) -> None:
+        super().__init__(message, hint)
+        self.text = text
+        self.column = column
+
+    def caret(self) -> str | None:
+        """Return the expression with a caret under the offending column, or None when it has no place."""
+        if self.column is None:
+            return None
+        return f"  {self.text}\n  {' ' * self.column}^"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return `Did you mean 'x'? Known: a, b` for a misspelt `name`; the sentence about x only if one is close."""
+    names = sorted(set(known))
+    lowered = {n.lower(): n for n in reversed(names)}
+    close = difflib.get_close_matches(name.lower(), list(lowered), n=1, cutoff=0.5)
+    squeezed = {n.lower().replace("_", "").replace("-", ""): n for n in names}
+    exact = squeezed.get(name.lower().replace("_", "").replace("-", ""))
+    guess = exact or (lowered[close[0]] if close else None)
+    tail = f"Known: {', '.join(names)}" if names else "None are known"
+    return f"Did you mean '{guess}'? {tail}" if guess else tail
