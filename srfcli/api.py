@@ -1,0 +1,206 @@
+"""What the author of a Python plugin imports: decorators that turn a function of symbols into a law value.
+
+    from srfcli.api import Parameter, friction_law, log
+
+    @friction_law(name="my-law", parameters=[Parameter("mu0", 0.33), ...], about="...", cites=["..."])
+    def my_law(v, phi, p):
+        return p.mu0 + p.A * log(v / p.V0) + p.B * log(1 + p.Vsat * phi / p.D0)
+
+The function is called once, with symbols; its arguments are the variables of the law by name, and `p`, the parameters.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import sympy
+from sympy import LambertW as lambertw
+from sympy import asinh, atan, cosh, exp, log, sinh, sqrt, tanh
+
+from srfcli.errors import SrfError, did_you_mean
+from srfcli.expression import FUNCTIONS, expm1, log1p, symbol
+from srfcli.lawfile import (
+    AGEING_SYMBOLS,
+    COMMON,
+    FORMULA,
+    LAW_CLASSES,
+    check_parameters,
+    check_states,
+    check_uses,
+    known_symbols,
+    valid_name,
+)
+from srfcli.laws import AgeingLaw, AgeingModifier, Check, FrictionLaw, Interface, Parameter, State
+
+__all__ = [
+    "AgeingLaw",
+    "AgeingModifier",
+    "Check",
+    "FrictionLaw",
+    "Interface",
+    "Parameter",
+    "State",
+    "ageing_law",
+    "asinh",
+    "atan",
+    "cosh",
+    "exp",
+    "expm1",
+    "friction_law",
+    "interface",
+    "lambertw",
+    "log",
+    "log1p",
+    "modifier",
+    "sinh",
+    "sqrt",
+    "tanh",
+]
+
+Parameters = Iterable[Parameter] | Mapping[str, Parameter]
+
+
+class Symbols:
+    """The parameters of a law as symbols: `p.mu0`, or `p["lambda"]` for a name that is a Python keyword."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._names = tuple(names)
+
+    def __getitem__(self, name: str) -> sympy.Symbol:
+        if name not in self._names:
+            raise SrfError(f"unknown parameter '{name}'", did_you_mean(name, self._names))
+        return symbol(name)
+
+    def __getattr__(self, name: str) -> sympy.Symbol:
+        if name.startswith("__"):  # copy and pickle probe for these
+            raise AttributeError(name)
+        return self[name]
+
+
+def friction_law(
+    *,
+    name: str | None = None,
+    parameters: Parameters = (),
+    about: str = "",
+    cites: Iterable[str] = (),
+    states: Iterable[State] = (State(),),
+    checks: Iterable[Check] = (),
+) -> Callable[[Callable[..., Any]], FrictionLaw]:
+    """Turn a function of v, the states and p into a `FrictionLaw`."""
+    return _decorator("friction", name, parameters, about, cites, checks, states=tuple(states))
+
+
+def ageing_law(
+    *,
+    name: str | None = None,
+    parameters: Parameters = (),
+    about: str = "",
+    cites: Iterable[str] = (),
+    checks: Iterable[Check] = (),
+) -> Callable[[Callable[..., Any]], AgeingLaw]:
+    """Turn a function of v, phi, mu, mu_dot, W, W_dot, F_dot_over_W (those it names) and p into an `AgeingLaw`."""
+    return _decorator("ageing", name, parameters, about, cites, checks)
+
+
+def modifier(
+    *,
+    name: str | None = None,
+    parameters: Parameters = (),
+    about: str = "",
+    cites: Iterable[str] = (),
+    checks: Iterable[Check] = (),
+) -> Callable[[Callable[..., Any]], AgeingModifier]:
+    """Turn a function of the same variables as an ageing law into an `AgeingModifier`."""
+    return _decorator("modifier", name, parameters, about, cites, checks)
+
+
+def interface(
+    *,
+    name: str | None = None,
+    parameters: Parameters = (),
+    about: str = "",
+    cites: Iterable[str] = (),
+    checks: Iterable[Check] = (),
+) -> Callable[[Callable[..., Any]], Interface]:
+    """Turn a function of W and p into an `Interface`."""
+    return _decorator("interface", name, parameters, about, cites, checks)
+
+
+def _decorator(
+    kind: str,
+    name: str | None,
+    parameters: Parameters,
+    about: str,
+    cites: Iterable[str],
+    checks: Iterable[Check],
+    **more: Any,
+) -> Callable[[Callable[..., Any]], Any]:
+    def decorate(function: Callable[..., Any]) -> Any:
+        law_name = name or function.__name__.replace("_", "-")
+        if not valid_name(law_name):
+            raise SrfError(f"law name {law_name!r}: expected small letters, digits and single dashes", "Like my-law.")
+        listed = _parameter_list(parameters)
+        states = more.get("states", ())
+        check_parameters(listed, kind=kind, states=states)
+        check_states(states, listed)
+        known = known_symbols(kind, (p.name for p in listed), states)
+        common: dict[str, Any] = {
+            "name": law_name,
+            "parameters": listed,
+            "about": about or (inspect.getdoc(function) or "").split("\n")[0],
+            "cites": tuple(cites),
+            "checks": tuple(checks),
+            "source": inspect.getsourcefile(function) or "",
+        }
+        law = LAW_CLASSES[kind](**common, **more, **{FORMULA[kind]: _formula(function, kind, listed, known)})
+        check_uses(law)
+        return law
+
+    return decorate
+
+
+def _parameter_list(parameters: Parameters) -> tuple[Parameter, ...]:
+    if not isinstance(parameters, Mapping):
+        return tuple(parameters)
+    for key, value in parameters.items():
+        if key != value.name:
+            raise SrfError(f"parameter '{value.name}' stands under the key '{key}'", "Use one name for both.")
+    return tuple(parameters.values())
+
+
+def _formula(function: Callable[..., Any], kind: str, parameters: tuple[Parameter, ...], known: tuple[str, ...]) -> Any:
+    own = [p.name for p in parameters]
+    names = (*COMMON, *own) if kind in ("ageing", "modifier") else tuple(own)
+    variables = [n for n in known if n not in names] if kind != "ageing" else list(AGEING_SYMBOLS)
+    arguments: dict[str, Any] = {}
+    for argument in inspect.signature(function).parameters:
+        if argument != "p" and argument not in variables:
+            raise SrfError(
+                f"{function.__name__}: unknown argument '{argument}'", did_you_mean(argument, [*variables, "p"])
+            )
+        arguments[argument] = Symbols(names) if argument == "p" else symbol(argument)
+    result = function(**arguments)
+    if result is None and kind == "interface":
+        return None  # rigid
+    return _exact(function.__name__, result, known)
+
+
+def _exact(where: str, result: Any, known: tuple[str, ...]) -> sympy.Expr:
+    """Return a formula with its floats as exact decimals, after the same whitelist as the text form's."""
+    if not isinstance(result, sympy.Expr | int | float):
+        raise SrfError(f"{where}: returned {type(result).__name__}, expected a formula", "Return one expression.")
+    expr = sympy.sympify(result)  # an expression or a number already: no text gets here
+    expr = expr.xreplace({f: sympy.Rational(repr(float(f))) for f in expr.atoms(sympy.Float)})
+    allowed = tuple({f for f in FUNCTIONS.values() if isinstance(f, type)})
+    for node in sympy.preorder_traversal(expr):
+        if node.is_Symbol:
+            if node.name not in known or node != symbol(node.name):
+                raise SrfError(f"{where}: unknown symbol '{node}'", did_you_mean(node.name, known))
+        elif not isinstance(node, (sympy.Add, sympy.Mul, sympy.Pow, sympy.Rational, sympy.NumberSymbol, *allowed)):
+            raise SrfError(
+                f"{where}: '{node.func.__name__}' is not part of a formula",
+                f"Functions: {', '.join(sorted(FUNCTIONS))}.",
+            )
+    return expr

@@ -1,0 +1,1 @@
+"""The `srf` command: one short module per subcommand, light to import."""

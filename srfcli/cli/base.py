@@ -1,0 +1,204 @@
+"""What every `srf` command shares: the run's switches, classes for commands and groups, and how an error is told."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import errno
+import io
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NoReturn, cast
+
+import click
+
+from srfcli.errors import ExpressionError, SrfError, did_you_mean
+
+EXIT_OK, EXIT_UNEXPECTED, EXIT_USAGE, EXIT_PARTIAL, EXIT_CONDITION, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
+
+CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
+
+
+@dataclass
+class Session:
+    """The switches of one run of `srf`; -q, -v and --debug may stand before or after the command's name."""
+
+    arguments: tuple[str, ...] = ()
+    quiet: bool = False
+    verbose: int = 0
+    debug: bool = False
+    notes: list[str] = field(default_factory=list)
+
+    @staticmethod
+    def current() -> Session:
+        """Return the running command's session, or a fresh one outside of any command."""
+        context = click.get_current_context(silent=True)
+        return (context.find_object(Session) if context else None) or Session()
+
+    def say(self, text: str) -> None:
+        """Write one line to stderr, unless -q was given."""
+        if not self.quiet:
+            click.echo(text, err=True)
+
+    def detail(self, text: str) -> None:
+        """Write one line to stderr if -v was given."""
+        if self.verbose and not self.quiet:
+            click.echo(text, err=True)
+
+
+def _switch(context: click.Context, parameter: click.Parameter, value: Any) -> None:
+    session = context.find_object(Session)
+    if value and session is not None:
+        setattr(session, str(parameter.name), value)
+
+
+def switches() -> list[click.Option]:
+    """Return the options -q, -v and --debug; they set the session and are no argument of the command."""
+    common: dict[str, Any] = {"expose_value": False, "callback": _switch, "is_eager": True}
+    return [
+        click.Option(["-q", "--quiet"], is_flag=True, help="No progress and no remarks on stderr.", **common),
+        click.Option(["-v", "--verbose"], count=True, help="Say more on stderr.", **common),
+        click.Option(["--debug"], is_flag=True, help="Show the traceback of an error.", **common),
+    ]
+
+
+class SrfCommand(click.Command):
+    """A command with -q, -v and --debug, whose epilog, the examples, is printed as it is written."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.params.extend(switches())
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog verbatim: a wrapped command line cannot be copied."""
+        write_epilog(self.epilog, formatter)
+
+
+def write_epilog(epilog: str | None, formatter: click.HelpFormatter) -> None:
+    """Write `epilog` as it stands, its common indentation replaced by two spaces."""
+    if epilog:
+        import inspect  # only for help
+
+        formatter.write("\nExamples:\n")
+        for line in inspect.cleandoc(epilog).splitlines():
+            formatter.write(f"  {line}".rstrip() + "\n")
+
+
+class SrfGroup(click.Group):
+    """A group that lists its commands in the order of their registration and tells errors the way `srf` does."""
+
+    command_class = SrfCommand
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{"no_args_is_help": False, **kwargs})
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the commands in reading order rather than the alphabet's."""
+        return list(self.commands)
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Show the help, and succeed, where nothing was asked."""
+        if not args and not self.invoke_without_command:
+            click.echo(ctx.get_help(), color=ctx.color)
+            ctx.exit(EXIT_OK)
+        return super().parse_args(ctx, args)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that `args` begin with; raises SrfError with the nearest names for a misspelt one."""
+        name = args[0]
+        if name in self.commands or name.startswith("-"):
+            return super().resolve_command(ctx, args)
+        raise SrfError(f"no such command {name!r} of {ctx.command_path}", did_you_mean(name, self.commands))
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog verbatim."""
+        write_epilog(self.epilog, formatter)
+
+    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> NoReturn:  # type: ignore[override]
+        """Run the command line and leave with its exit code; every error ends here."""
+        arguments = list(sys.argv[1:] if args is None else args)
+        session = Session(tuple(arguments))
+        extra.pop("standalone_mode", None)
+        sys.exit(_run(self, arguments, session, prog_name=prog_name or "srf", obj=session, **extra))
+
+
+def _run(group: click.Group, arguments: list[str], session: Session, **extra: Any) -> int:
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for a Greek letter, it does not fail
+    try:
+        code = click.Group.main(group, arguments, standalone_mode=False, **extra)
+        sys.stdout.flush()  # here, where a closed pipe can still be caught
+        return code if isinstance(code, int) else EXIT_OK
+    except SystemExit as stop:  # click's own end, on a closed pipe among others
+        return stop.code if isinstance(stop.code, int) else EXIT_UNEXPECTED
+    except (KeyboardInterrupt, click.Abort) as error:
+        return _end("interrupted", None, EXIT_INTERRUPTED, error, session)
+    except BrokenPipeError:
+        _silence_stdout()
+        return EXIT_UNEXPECTED
+    except SrfError as error:
+        caret = error.caret() if isinstance(error, ExpressionError) else None
+        return _end(error.message, error.hint, error.exit_code, error, session, caret=caret)
+    except click.ClickException as error:
+        message, hint = _usage_text(error, group, arguments)
+        return _end(message, hint, error.exit_code, error, session)
+    except OSError as error:
+        if error.errno == errno.EPIPE:
+            _silence_stdout()
+            return EXIT_UNEXPECTED
+        where = f"{error.filename}: " if error.filename else ""
+        return _end(f"{where}{error.strerror or error}", None, EXIT_UNEXPECTED, error, session)
+    except Exception as error:
+        text = f"unexpected {type(error).__name__}: {error}" if str(error) else f"unexpected {type(error).__name__}"
+        return _end(text, "Run with --debug for the traceback.", EXIT_UNEXPECTED, error, session)
+
+
+def _end(
+    message: str, hint: str | None, code: int, error: BaseException, session: Session, *, caret: str | None = None
+) -> int:
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()  # what was found stands before the error
+    if session.debug:
+        traceback.print_exception(error)
+    lines = [f"Error: {' '.join(message.split())}", *([caret] if caret else []), *([f"Try: {hint}"] if hint else [])]
+    with contextlib.suppress(OSError):
+        click.echo("\n".join(lines), err=True)
+    return code
+
+
+def _silence_stdout() -> None:
+    """Point stdout at nothing: the interpreter flushes it once more at exit, and would complain."""
+    with contextlib.suppress(OSError, ValueError):
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, sys.stdout.fileno())
+        os.close(nothing)
+
+
+def _usage_text(error: click.ClickException, group: click.Group, arguments: Sequence[str]) -> tuple[str, str | None]:
+    """Return what click objects to, in a sentence like the others, and where to read on."""
+    path, command = _named_command(group, arguments)
+    if not isinstance(error, click.NoSuchOption):
+        message = error.format_message().strip().rstrip(".")
+        return message[:1].lower() + message[1:], f"{path} --help"
+    name = error.option_name
+    options = [o for p in command.params for o in (*p.opts, *p.secondary_opts) if o.startswith("--")]
+    close = difflib.get_close_matches(name, options, n=1, cutoff=0.65)
+    hints = [f"Did you mean '{close[0]}'?"] if close else []
+    if "--set" in options and name.startswith("--") and name[2:].isidentifier():
+        hints.append(f"A law's parameter is set with --set {name[2:]}=VALUE.")
+    return f"no such option {name} of {path}", " ".join([*hints, f"The options are listed by {path} --help"])
+
+
+def _named_command(group: click.Group, arguments: Sequence[str]) -> tuple[str, click.Command]:
+    """Return the command that `arguments` name, with its full name: an error from click's parser does not say."""
+    path, command = "srf", cast(click.Command, group)
+    for word in arguments:
+        if isinstance(command, click.Group) and word in command.commands:
+            path, command = f"{path} {word}", command.commands[word]
+    return path, command

@@ -1,0 +1,131 @@
+"""The way out of a command: a table to stdout or a file, a figure, their sidecars, progress and the exit code."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from srfcli.cli.base import EXIT_INTERRUPTED, EXIT_OK, EXIT_PARTIAL, Session
+from srfcli.cli.options import OutputOptions
+from srfcli.errors import SrfError
+from srfcli.laws import Law
+from srfcli.output import records, tables
+from srfcli.output.files import is_special, write_atomic
+from srfcli.output.provenance import Provenance, write_sidecar
+from srfcli.output.tables import Table
+from srfcli.status import Status
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def emit(
+    table: Table,
+    options: OutputOptions,
+    *,
+    figure: Figure | Callable[[], Figure] | None = None,
+    laws: Iterable[Law] = (),
+    inputs: Iterable[Path] = (),
+    seed: int | None = None,
+    timings: Mapping[str, float] | None = None,
+) -> None:
+    """Write the table where the options say, then the figure if --plot asks for it, each file with its sidecar.
+
+    `figure` may be a function that draws it, called only for --plot. `laws`, `inputs`, `seed` and `timings` go into
+    the sidecar, as do the table's parameters. A terminal gets a formatted table, a pipe plain text in full precision.
+    """
+    provenance = Provenance(
+        arguments=Session.current().arguments,
+        parameters=table.parameters,
+        laws=tuple(laws),
+        inputs=tuple(inputs),
+        seed=seed,
+        timings=timings or {},
+    )
+    if options.out is None:
+        _to_stdout(table, options.format)
+    else:
+        content = render(table, options.format).encode("utf-8")
+        write_atomic(options.out, content)
+        _wrote(options.out, content, provenance, options)
+    if options.plot is not None:
+        if figure is None:
+            raise SrfError(f"--plot {options.plot}: there is nothing to draw", "Leave --plot out.")
+        from srfcli.output.plots import save_figure
+
+        drawn = figure() if callable(figure) else figure
+        _wrote(options.plot, save_figure(drawn, options.plot), provenance, options)
+
+
+def render(table: Table, format: str) -> str:
+    """Return the table as `format`: text (full precision), json or csv."""
+    return {"text": tables.to_text, "json": records.to_json, "csv": records.to_csv}[format](table)
+
+
+def _to_stdout(table: Table, format: str) -> None:
+    if format == "text" and sys.stdout.isatty():
+        tables.print_terminal(table, sys.stdout)
+    else:
+        click.echo(render(table, format), nl=False)
+
+
+def _wrote(path: Path, content: bytes, provenance: Provenance, options: OutputOptions) -> None:
+    session = Session.current()
+    if options.provenance and not is_special(path):
+        session.detail(f"Wrote {write_sidecar(path, content, provenance)}")
+    session.say(f"Wrote {path}")
+
+
+def finish(status: Status) -> None:
+    """End the command with the exit code of `status`: 0 where its numbers can be used, 130 interrupted, else 3.
+
+    Call it last, after `emit`; the status' advice is printed on stderr.
+    """
+    if status.ok:
+        raise click.exceptions.Exit(EXIT_OK)
+    interrupted = status is Status.INTERRUPTED
+    click.echo(f"{'Interrupted' if interrupted else 'Not finished'}: {status.advice}", err=True)
+    raise click.exceptions.Exit(EXIT_INTERRUPTED if interrupted else EXIT_PARTIAL)
+
+
+class Progress:
+    """One line on stderr that says how far a long loop is; silent where stderr is no terminal, and under -q.
+
+    with Progress("boundary", total=60) as progress:
+        for point in points:
+            progress.advance(note=f"V = {point.V:.3g} um/s")
+    """
+
+    def __init__(self, label: str, total: int | None = None, *, stream: Any = None, quiet: bool | None = None) -> None:
+        self.label, self.total, self.done = label, total, 0
+        self._stream = sys.stderr if stream is None else stream
+        self._active = self._stream.isatty() and not (Session.current().quiet if quiet is None else quiet)
+        self._shown_at = 0.0
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._active and self._shown_at:
+            self._stream.write("\r\x1b[K")  # the line was for waiting; nothing of it stays
+            self._stream.flush()
+
+    def advance(self, steps: int = 1, *, note: str = "") -> None:
+        """Count `steps` more and show it, at most ten times a second."""
+        self.done += steps
+        now = time.monotonic()
+        if not self._active or now - self._shown_at < 0.1:
+            return
+        self._shown_at = now
+        count = f"{self.done}" if self.total is None else f"{self.done}/{self.total}"
+        line = f"{self.label}: {count}  {note}".rstrip()
+        self._stream.write(f"\r\x1b[K{line[:100]}")
+        self._stream.flush()

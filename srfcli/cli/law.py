@@ -1,0 +1,185 @@
+"""`srf law`: show a law, write a new one, check one."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from srfcli.cli.base import EXIT_USAGE, SrfCommand, SrfGroup
+from srfcli.cli.laws import KIND, plugins_option
+from srfcli.errors import ExpressionError, SrfError, did_you_mean
+
+if TYPE_CHECKING:
+    from srfcli.laws import Law
+    from srfcli.registry import Registry
+
+EPILOG = """
+srf law show srf-vsat               formula, parameters, references
+srf law new my-law                  write my-law.toml, ready to be changed
+srf law check my-law.toml           does it stand up?
+srf linear --law my-law --plugins . its critical load
+"""
+NEW_EPILOG = """
+srf law new my-law
+srf law new my-ageing --kind ageing --python
+"""
+CHECK_EPILOG = """
+srf law check my-law.toml
+srf law check dieterich-cutoff
+"""
+
+
+@click.group(cls=SrfGroup, epilog=EPILOG)
+def law() -> None:
+    """Show, write and check laws."""
+
+
+@law.command(cls=SrfCommand)
+@click.argument("name")
+@click.option("--kind", type=KIND, help="Which one, where two kinds of law share a name.")
+@click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
+@plugins_option
+def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
+    """Show formula, parameters and references of a law; NAME may be a file."""
+    from srfcli.registry import load_registry
+
+    found = _find(load_registry(plugins), name, kind)
+    if as_json:
+        documents = [_document(one) for one in found]
+        click.echo(json.dumps({"schema": "srf.law/1", "laws": documents}, indent=2, allow_nan=False))
+    else:
+        click.echo("\n\n".join(_text(one) for one in found))
+
+
+@law.command(cls=SrfCommand, epilog=NEW_EPILOG)
+@click.argument("name")
+@click.option("--kind", type=KIND, default="friction", show_default=True, help="What kind of law.")
+@click.option("--python", is_flag=True, help="Write a Python file in place of TOML.")
+@click.option("--force", is_flag=True, help="Overwrite a file, or take a name that a law already has.")
+def new(name: str, kind: str, python: bool, force: bool) -> None:
+    """Write a commented law into the current folder; it passes `srf law check` as it is."""
+    from srfcli.lawfile import valid_name
+    from srfcli.lawtemplate import template
+    from srfcli.registry import bundled_registry
+
+    if not valid_name(name):
+        raise SrfError(f"{name!r} is not a law name: small letters, digits and single dashes", "srf law new my-law")
+    if not force and any(entry.name == name for entry in bundled_registry().entries(kind)):
+        raise SrfError(
+            f"there is a shipped {kind} law '{name}'; two of one name cannot be used", f"srf law new my-{name}"
+        )
+    path = Path(name + (".py" if python else ".toml"))
+    if path.exists() and not force:
+        raise SrfError(f"{path} exists", "Give --force to overwrite it, or another name.")
+    path.write_text(template(kind, name, python=python), encoding="utf-8")
+    click.echo(str(path))
+    use = {"friction": f"--law {name}", "ageing": f"--ageing {name}", "interface": f"--interface {name}"}
+    option = use.get(kind, f"--ageing dieterich+{name}")
+    click.echo(f"Next: srf law check {path}; srf linear {option} --plugins .", err=True)
+
+
+@law.command(cls=SrfCommand, epilog=CHECK_EPILOG)
+@click.argument("name", metavar="FILE|NAME")
+@click.option("--kind", type=KIND, help="Which one, where two kinds of law share a name.")
+@plugins_option
+@click.pass_context
+def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, ...]) -> None:
+    """Check a law: parses, units, steady state, mu_v > 0, derivatives, worked values. Exit 2 if one fails."""
+    from srfcli.lawcheck import Outcome, check_law
+    from srfcli.registry import load_registry
+
+    registry = load_registry(plugins)
+    try:
+        outcomes = [outcome for one in _find(registry, name, kind) for outcome in check_law(one)]
+    except SrfError as error:
+        if not _is_file(name):
+            raise
+        caret = error.caret() if isinstance(error, ExpressionError) else None
+        text = "\n".join(part for part in (error.message, caret, f"Try: {error.hint}" if error.hint else None) if part)
+        outcomes = [Outcome("parses", "FAIL", text)]
+    for outcome in outcomes:
+        click.echo(f"{outcome.verdict:7}  {outcome.check:13}  {outcome.text}")
+    if any(outcome.verdict == "FAIL" for outcome in outcomes):
+        ctx.exit(EXIT_USAGE)
+
+
+def _is_file(name: str) -> bool:
+    return name.endswith((".toml", ".py")) and Path(name).is_file()
+
+
+def _find(registry: Registry, name: str, kind: str | None) -> list[Law]:
+    """Return the laws in a file, or those of a name in any kind, or in one kind."""
+    from srfcli.lawfile import kind_of
+    from srfcli.registry import read_file
+
+    if name.endswith((".toml", ".py")):
+        found = [one for one in read_file(Path(name)) if kind in (None, kind_of(one))]
+        if not found:
+            raise SrfError(f"{name}: holds no law of kind {kind}")
+        return found
+    kinds = sorted({e.kind for e in registry.entries(kind) if e.name == name})
+    if not kinds:
+        broken = [problem for problem in registry.problems if problem.name == name]
+        if broken:
+            raise SrfError(broken[0].message, broken[0].hint)
+        raise SrfError(f"unknown law '{name}'", did_you_mean(name, {e.name for e in registry.entries(kind)}))
+    return [registry.get(k, name) for k in kinds]
+
+
+def _document(one: Law) -> dict[str, Any]:
+    from srfcli.lawfile import FORMULA, formula_of, kind_of
+
+    formula = formula_of(one)
+    parameters = {
+        p.name: {
+            "default": p.default,
+            "unit": p.unit,
+            "lower": p.lower if math.isfinite(p.lower) else None,
+            "upper": p.upper if math.isfinite(p.upper) else None,
+            "about": p.about,
+        }
+        for p in one.parameters
+    }
+    checks = [{"quantity": c.quantity, "at": dict(c.at), "value": c.value, "rtol": c.rtol} for c in one.checks]
+    states = [{"name": s.name, "length": s.length, "weight": s.weight} for s in getattr(one, "states", ())]
+    return {
+        "name": one.name,
+        "kind": kind_of(one),
+        "about": one.about,
+        FORMULA[kind_of(one)]: None if formula is None else str(formula),
+        "states": states,
+        "parameters": parameters,
+        "cites": list(one.cites),
+        "checks": checks,
+        "source": one.source,
+    }
+
+
+def _text(one: Law) -> str:
+    from srfcli.lawfile import FORMULA, formula_of, kind_of
+
+    kind = kind_of(one)
+    formula = formula_of(one)
+    lines = [f"{one.name}  ({kind})", one.about, "", f"{FORMULA[kind]} = {'rigid' if formula is None else formula}"]
+    for state in getattr(one, "states", ()):
+        lines.append(f"state {state.name}: length {state.length}, weight {state.weight}")
+    if one.parameters:
+        lines += ["", *_parameter_lines(one)]
+    if one.cites:
+        lines += ["", *(f"[{number}] {cite}" for number, cite in enumerate(one.cites, 1))]
+    return "\n".join([*lines, "", f"from {one.source}"])
+
+
+def _parameter_lines(one: Law) -> list[str]:
+    rows = []
+    for p in one.parameters:
+        bounds = "" if math.isinf(p.lower) and math.isinf(p.upper) else f"[{p.lower:g}, {p.upper:g}]"
+        rows.append((p.name, f"{p.default:.15g}", p.unit, bounds, p.about))
+    widths = [max(len(row[i]) for row in rows) for i in range(4)]
+    return [
+        "  ".join([*(cell.ljust(w) for cell, w in zip(row, widths, strict=False)), row[-1]]).rstrip() for row in rows
+    ]

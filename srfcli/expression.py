@@ -1,0 +1,324 @@
+"""Text to sympy through a whitelist of `ast` nodes: nothing that a user writes is ever evaluated as Python."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from collections.abc import Callable, Iterable
+from typing import Any, NoReturn
+
+import sympy
+
+from srfcli.errors import ExpressionError, SrfError, did_you_mean
+
+MAX_CHARS = 2000
+MAX_TOKENS = 500
+MAX_DEPTH = 30
+MAX_DIGITS = 40
+MAX_DECIMAL_EXPONENT = 100
+MAX_POWER = 512
+MAX_BITS = 2048
+MAX_NAME = 32
+
+
+class log1p(sympy.Function):  # small letters: the name is that in generated code
+    """log(1 + x), kept whole so that generated code calls np.log1p."""
+
+    nargs = 1
+
+    @classmethod
+    def eval(cls, arg: sympy.Expr) -> sympy.Expr | None:
+        """Fold the argument 0 and nothing else."""
+        return sympy.S.Zero if arg.is_zero else None
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        """Return the derivative 1/(1 + x)."""
+        return 1 / (1 + self.args[0])
+
+    def _eval_rewrite_as_log(self, arg: sympy.Expr, **_kwargs: Any) -> sympy.Expr:
+        return sympy.log(1 + arg)
+
+    def _eval_evalf(self, prec: int) -> sympy.Expr:
+        return self.rewrite(sympy.log)._eval_evalf(prec)
+
+    def _eval_is_real(self) -> bool | None:
+        return (1 + self.args[0]).is_positive or None
+
+
+class expm1(sympy.Function):
+    """exp(x) - 1, kept whole so that generated code calls np.expm1."""
+
+    nargs = 1
+
+    @classmethod
+    def eval(cls, arg: sympy.Expr) -> sympy.Expr | None:
+        """Fold the argument 0 and nothing else."""
+        return sympy.S.Zero if arg.is_zero else None
+
+    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+        """Return the derivative exp(x)."""
+        return sympy.exp(self.args[0])
+
+    def _eval_rewrite_as_exp(self, arg: sympy.Expr, **_kwargs: Any) -> sympy.Expr:
+        return sympy.exp(arg) - 1
+
+    def _eval_evalf(self, prec: int) -> sympy.Expr:
+        return self.rewrite(sympy.exp)._eval_evalf(prec)
+
+    def _eval_is_real(self) -> bool | None:
+        return self.args[0].is_real
+
+
+# abs, min, max, floor are left out: a law must have derivatives, and complex-step must find them.
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "exp": sympy.exp,
+    "log": sympy.log,
+    "ln": sympy.log,
+    "log1p": log1p,
+    "expm1": expm1,
+    "sqrt": sympy.sqrt,
+    "sinh": sympy.sinh,
+    "cosh": sympy.cosh,
+    "tanh": sympy.tanh,
+    "asinh": sympy.asinh,
+    "atan": sympy.atan,
+    "lambertw": sympy.LambertW,
+    "LambertW": sympy.LambertW,
+}
+# Names that generated modules use themselves; a parameter of that name would shadow them.
+RESERVED = frozenset(
+    {"np", "numpy", "x", "t", "tau", "p", "out", "pi", "sin", "cos", "tan", "arctan", "arcsinh", *FUNCTIONS}
+)
+
+_IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_TOKEN = re.compile(
+    r"(?P<space>\s+)|(?P<name>[A-Za-z_][A-Za-z0-9_]*)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
+    r"|(?P<op>\*\*|[-+*/(),])",
+    re.ASCII,
+)
+_ADVICE = {
+    "^": "Use '**' for powers",
+    "=": "Write the right-hand side only",
+    "//": "Use '/'",
+    "[": "Use round brackets",
+    "{": "Use round brackets",
+    "·": "Use '*'",
+    "×": "Use '*'",
+}
+_LANGUAGE = "A formula has numbers, names, + - * / **, round brackets and the functions " + ", ".join(sorted(FUNCTIONS))
+
+
+def symbol(name: str) -> sympy.Symbol:
+    """Return the symbol of that name with the assumptions all modules share: it is real."""
+    return sympy.Symbol(name, real=True)
+
+
+def check_identifier(name: str, what: str = "name", *, taken: Iterable[str] = ()) -> str:
+    """Return `name` if it can become a name in generated code, else raise `SrfError`; `taken` are names in use."""
+    if not _IDENTIFIER.fullmatch(name):
+        raise SrfError(f"{what} {name!r} is not a name", "Start with a letter; go on with letters, digits, '_'.")
+    if "__" in name or name.endswith("_"):  # generated code writes lambda_ for lambda
+        raise SrfError(f"{what} {name!r} holds a double or final underscore", "Use single underscores inside.")
+    if len(name) > MAX_NAME:
+        raise SrfError(f"{what} {name[:MAX_NAME] + '...'!r} is longer than {MAX_NAME} letters", "Shorten it.")
+    if name in RESERVED:
+        raise SrfError(f"{what} {name!r} is reserved for generated code", f"Reserved: {', '.join(sorted(RESERVED))}.")
+    if name in set(taken):
+        raise SrfError(f"{what} {name!r} already has a meaning here", "Choose another name.")
+    return name
+
+
+def parse_expression(text: str, known: Iterable[str]) -> sympy.Expr:
+    """Return the formula `text` in symbols of the names `known`; decimals become exact rationals.
+
+    Raises `ExpressionError` with the place of the fault for anything that is not such a formula; the size of the text
+    and of every constant is bounded before it is computed. `log(1 + x)` stays as written.
+    """
+    if len(text) > MAX_CHARS:
+        raise ExpressionError(f"the formula has {len(text)} characters, at most {MAX_CHARS} are read", text="")
+    reader = _Reader(text, known)
+    try:
+        result = reader.read()
+    except RecursionError:
+        raise ExpressionError("the formula is nested too deeply", "Split it up.", text=text) from None
+    return result
+
+
+class _Reader:
+    """One formula on its way from text to sympy."""
+
+    def __init__(self, text: str, known: Iterable[str]) -> None:
+        self.text = text
+        self.known = frozenset(known)
+        self.at: dict[int, str] = {}  # column -> name or number as written; Python never sees either
+
+    def fail(self, message: str, column: int | None, hint: str | None = None) -> NoReturn:
+        raise ExpressionError(message, hint, text=re.sub(r"\s", " ", self.text), column=column)
+
+    def read(self) -> sympy.Expr:
+        code = self.tokenise()
+        lead = len(code) - len(code.lstrip())
+        try:
+            tree = ast.parse(code.lstrip(), mode="eval")
+        except (SyntaxError, ValueError, MemoryError) as error:
+            column = min(lead + (getattr(error, "offset", None) or 1) - 1, len(code.rstrip()))
+            self.fail("the formula breaks off or has an operator too many", column)
+        for node in ast.walk(tree.body):
+            if hasattr(node, "col_offset"):
+                node.col_offset += lead
+        result = self.build(tree.body, 0)
+        if result.has(sympy.Abs, sympy.sign, sympy.re, sympy.im, sympy.arg, sympy.I, sympy.nan, sympy.zoo, sympy.oo):
+            self.fail("the formula is not smooth and real: it reduces to " + str(result)[:80], None)
+        return result
+
+    def tokenise(self) -> str:
+        """Return the text with each name and number replaced by one of equal length that Python can read.
+
+        Names become a, aa, aaa..., so that `lambda` and other Python keywords are names like any other; what was
+        written is found again by its column.
+        """
+        code: list[str] = []
+        position, count, before = 0, 0, "op"
+        while position < len(self.text):
+            match = _TOKEN.match(self.text, position)
+            if match is None:
+                self.unreadable(position)
+            kind, word = str(match.lastgroup), match.group()
+            if kind != "space":
+                count += 1
+                opens_value = kind != "op" or (word == "(" and before != "name")
+                if before != "op" and opens_value:
+                    self.fail("an operator is missing here", position, "Write products with '*'.")
+                before = "value" if word == ")" else kind
+            if kind in ("name", "number"):
+                self.at[position] = word
+            code.append({"space": " ", "name": "a", "number": "1", "op": word}[kind])
+            code.append(("a" if kind == "name" else " ") * (len(word) - 1 if kind != "op" else 0))
+            position = match.end()
+        if count > MAX_TOKENS:
+            self.fail(f"the formula has {count} words and signs, at most {MAX_TOKENS} are read", None, "Split it up.")
+        if count == 0:
+            self.fail("the formula is empty", 0)
+        self.balance("".join(code))
+        return "".join(code)
+
+    def balance(self, code: str) -> None:
+        """Refuse brackets that do not match or nest too deeply."""
+        opened: list[int] = []
+        for position, sign in enumerate(code):
+            if sign == "(":
+                opened.append(position)
+                if len(opened) > MAX_DEPTH:
+                    self.fail(f"brackets are nested more than {MAX_DEPTH} deep", position)
+            elif sign == ")":
+                if not opened:
+                    self.fail("this bracket closes nothing", position)
+                opened.pop()
+        if opened:
+            self.fail("this bracket is never closed", opened[-1])
+
+    def unreadable(self, position: int) -> NoReturn:
+        sign = self.text[position]
+        hint = _ADVICE.get(self.text[position : position + 2]) or _ADVICE.get(sign)
+        self.fail(f"{sign!r} is not part of a formula", position, hint + "." if hint else _LANGUAGE + ".")
+
+    def build(self, node: ast.AST, depth: int) -> sympy.Expr:
+        column = getattr(node, "col_offset", None)
+        if depth > MAX_DEPTH:
+            self.fail(f"the formula is nested more than {MAX_DEPTH} deep", column, "Use brackets sparingly or split.")
+        match node:
+            case ast.Constant():
+                return self.number(self.at[node.col_offset], node.col_offset)
+            case ast.Name():
+                return self.name(self.at[node.col_offset], node.col_offset)
+            case ast.UnaryOp(op=ast.USub()):
+                return -self.build(node.operand, depth + 1)
+            case ast.UnaryOp(op=ast.UAdd()):
+                return self.build(node.operand, depth + 1)
+            case ast.BinOp():
+                left, right = self.build(node.left, depth), self.build(node.right, depth + 1)
+                return self.checked(self.binary(node, left, right), node.right.col_offset)
+            case ast.Call(func=ast.Name(), keywords=[]):
+                return self.call(node, depth)
+        self.fail("this is not part of a formula", column, _LANGUAGE + ".")
+
+    def number(self, word: str, column: int) -> sympy.Expr:
+        mantissa, _, exponent = word.lower().partition("e")
+        if sum(c.isdigit() for c in mantissa) > MAX_DIGITS:
+            self.fail(f"the number has more than {MAX_DIGITS} digits", column)
+        if exponent and (len(exponent) > 6 or abs(int(exponent)) > MAX_DECIMAL_EXPONENT):
+            self.fail(f"the exponent of the number is beyond {MAX_DECIMAL_EXPONENT}", column)
+        whole, _, part = mantissa.partition(".")
+        scale = int(exponent or "0") - len(part)
+        digits = sympy.Integer(int((whole + part) or "0"))
+        return digits * sympy.Integer(10) ** scale
+
+    def name(self, word: str, column: int) -> sympy.Expr:
+        if word in self.known:
+            return symbol(word)
+        if word in FUNCTIONS:
+            self.fail(f"the function '{word}' needs an argument in brackets", column, f"Write {word}(...).")
+        self.fail(f"unknown name '{word}'", column, did_you_mean(word, self.known))
+
+    def binary(self, node: ast.BinOp, left: sympy.Expr, right: sympy.Expr) -> sympy.Expr:
+        match node.op:
+            case ast.Add():
+                return left + right
+            case ast.Sub():
+                return left - right
+            case ast.Mult():
+                return left * right
+            case ast.Div():
+                return left / right
+            case ast.Pow():
+                self.bound_power(left, right, node.right.col_offset)
+                return left**right
+        self.fail("this operator is not part of a formula", node.col_offset, _LANGUAGE + ".")
+
+    def bound_power(self, base: sympy.Expr, exponent: sympy.Expr, column: int) -> None:
+        """Refuse a power whose exact constants would outgrow `MAX_BITS`, before it is computed.
+
+        sympy distributes (2 x)**n and joins (x**m)**n, so the constants inside a symbolic base count too.
+        """
+        size = max((abs(n) for n in exponent.atoms(sympy.Rational)), default=sympy.S.One)
+        if exponent.is_Rational and size > MAX_POWER:
+            self.fail(f"the exponent is beyond {MAX_POWER}", column)
+        if _bits(base) * max(size, sympy.S.One) > MAX_BITS or _bits(exponent) > MAX_BITS:
+            self.fail("the constants of this power are too large to compute exactly", column)
+
+    def call(self, node: ast.Call, depth: int) -> sympy.Expr:
+        assert isinstance(node.func, ast.Name)
+        word, column = self.at[node.func.col_offset], node.func.col_offset
+        if word not in FUNCTIONS:
+            if word in self.known:
+                self.fail(f"'{word}' is not a function", column, f"For a product write {word}*(...).")
+            self.fail(f"unknown function '{word}'", column, did_you_mean(word, FUNCTIONS))
+        if len(node.args) != 1 or isinstance(node.args[0], ast.Starred):
+            self.fail(f"'{word}' takes one argument, here are {len(node.args)}", column)
+        argument = self.build(node.args[0], depth + 1)
+        if word == "exp" and argument.has(sympy.log):  # exp(n log 9) is 9**n to sympy
+            self.bound_power(argument, argument, column)
+        if argument.is_number and abs(_value(argument)) > 700:
+            self.fail(f"the constant argument of '{word}' is out of range", column)
+        return self.checked(FUNCTIONS[word](argument), column)
+
+    def checked(self, result: sympy.Expr, column: int) -> sympy.Expr:
+        """Return `result` unless it is a constant that is not a finite real number."""
+        if result in (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo):
+            self.fail("this constant is not a finite number", column)
+        if result.is_number and (not math.isfinite(_value(result)) or result.is_real is False):
+            self.fail("this constant is not a finite real number", column)
+        return result
+
+
+def _bits(expr: sympy.Expr) -> int:
+    return sum(int(n.p).bit_length() + int(n.q).bit_length() - 1 for n in expr.atoms(sympy.Rational) if abs(n) != 1)
+
+
+def _value(expr: sympy.Expr) -> float:
+    """Return a constant as a float, nan where it is not one."""
+    try:
+        return float(expr)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan

@@ -1,0 +1,308 @@
+"""Law files: TOML in the format `srf-law/1` to law values; a breach names file, key, what was found and expected."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from srfcli.dimensions import QUANTITY_UNITS, parse_unit
+from srfcli.errors import ExpressionError, SrfError, did_you_mean
+from srfcli.laws import AgeingLaw, AgeingModifier, Check, FrictionLaw, Interface, Law, Parameter, State
+
+if TYPE_CHECKING:
+    import sympy
+
+FORMAT = "srf-law/1"
+KINDS = ("friction", "ageing", "modifier", "interface")
+FORMULA = {"friction": "mu", "ageing": "rate", "modifier": "term", "interface": "kappa"}  # also the checked quantity
+COMMON = ("mu0", "A", "B", "D0", "V0")  # friction parameters that an ageing law may name
+AGEING_SYMBOLS = ("v", "phi", "mu", "mu_dot", "W", "W_dot", "F_dot_over_W")
+APPARATUS = ("V", "W0", "eps", "f", "K", "M", "angle")  # of the system, which would take a law's parameter for its own
+# names that mean something in every law or system; a parameter cannot take them
+VARIABLES = (*AGEING_SYMBOLS, *APPARATUS, "kappa", "rate", "term", "u", "z")
+LAW_CLASSES: dict[str, type[Law]] = {
+    "friction": FrictionLaw,
+    "ageing": AgeingLaw,
+    "modifier": AgeingModifier,
+    "interface": Interface,
+}
+LAW_NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*", re.ASCII)
+
+_COMMON_KEYS = ("format", "kind", "name", "about", "cites", "parameters", "checks")
+_PARAMETER_KEYS = ("default", "unit", "lower", "upper", "bounds", "about")
+_CHECK_KEYS = ("quantity", "at", "value", "rtol")
+_STATE_KEYS = ("name", "length", "weight")
+
+
+def kind_of(law: Law) -> str:
+    """Return 'friction', 'ageing', 'modifier' or 'interface'."""
+    return next(kind for kind, cls in LAW_CLASSES.items() if isinstance(law, cls))
+
+
+def formula_of(law: Law) -> sympy.Expr | None:
+    """Return the one formula of a law: mu, rate, term or kappa (None for a rigid interface)."""
+    return getattr(law, FORMULA[kind_of(law)])
+
+
+def known_symbols(kind: str, parameters: Iterable[str], states: Iterable[State] = (State(),)) -> tuple[str, ...]:
+    """Return the names that the formula of a law of `kind` may hold."""
+    match kind:
+        case "friction":
+            return ("v", *(state.name for state in states), *parameters)
+        case "interface":
+            return ("W", *parameters)
+    return (*AGEING_SYMBOLS, *COMMON, *parameters)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the table in a TOML file; raises `SrfError` with the place where it is not TOML."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise SrfError(f"{path}: not TOML: {error}", 'Text goes in quotes: mu = "mu0 + A*log(v/V0)".') from None
+    except UnicodeDecodeError:
+        raise SrfError(f"{path}: not UTF-8 text", "Save the file as UTF-8.") from None
+    except OSError as error:
+        raise SrfError(f"{path}: cannot be read: {error.strerror}", "Check path and permissions.") from None
+
+
+def read_header(path: Path) -> tuple[str, str, str]:
+    """Return kind, name and about of a law file without reading its formula."""
+    reader = _Reader(path, read_toml(path))
+    return reader.kind(), reader.name(), reader.text("about")
+
+
+def read_law(path: Path) -> Law:
+    """Return the law in a TOML file."""
+    return _Reader(path, read_toml(path)).law()
+
+
+def valid_name(name: object) -> bool:
+    """True for a kebab-case law name of at most 64 letters."""
+    return isinstance(name, str) and len(name) <= 64 and LAW_NAME.fullmatch(name) is not None
+
+
+def check_parameters(parameters: Iterable[Parameter], *, kind: str, states: Iterable[State] = ()) -> None:
+    """Raise `SrfError` for a name, default, bound or unit that no law may have."""
+    from srfcli.expression import check_identifier
+
+    names: set[str] = set()
+    taken = {*VARIABLES, *(state.name for state in states)}
+    if kind in ("ageing", "modifier"):
+        taken |= set(COMMON)  # they come from the friction law, and one default is enough
+    for p in parameters:
+        check_identifier(p.name, "parameter", taken=taken | names)
+        names.add(p.name)
+        if not math.isfinite(p.default):
+            raise SrfError(f"parameter '{p.name}': the default is {p.default}", "Give a finite number.")
+        if not p.lower <= p.default <= p.upper:
+            raise SrfError(
+                f"parameter '{p.name}': the default {p.default:g} is outside its bounds [{p.lower:g}, {p.upper:g}]",
+                "Change the default or the bounds.",
+            )
+        try:
+            parse_unit(p.unit)
+        except SrfError as error:
+            raise SrfError(f"parameter '{p.name}': {error.message}", error.hint) from None
+
+
+def check_states(states: Iterable[State], parameters: Iterable[Parameter]) -> None:
+    """Raise `SrfError` unless each state has its own name and names parameters for its length and weight."""
+    from srfcli.expression import check_identifier
+
+    names = {p.name for p in parameters}
+    seen: set[str] = set()
+    for state in states:
+        check_identifier(state.name, "state", taken=seen | (set(VARIABLES) - {"phi"}))
+        seen.add(state.name)
+        for role in ("length", "weight"):
+            value = getattr(state, role)
+            if value not in names:
+                raise SrfError(
+                    f"state '{state.name}': {role} '{value}' is not a parameter of this law", did_you_mean(value, names)
+                )
+
+
+def check_uses(law: Law) -> None:
+    """Raise `SrfError` for a friction law without v or without one of its states."""
+    if not isinstance(law, FrictionLaw):
+        return
+    used = {s.name for s in law.mu.free_symbols}
+    for name in ("v", *(state.name for state in law.states)):
+        if name not in used:
+            raise SrfError(f"mu does not depend on '{name}'", "A friction law depends on v and on each of its states.")
+
+
+class _Reader:
+    """One TOML table on its way to a law."""
+
+    def __init__(self, path: Path, table: dict[str, Any]) -> None:
+        self.path, self.table = path, table
+
+    def fail(self, key: str, message: str, hint: str | None = None) -> NoReturn:
+        raise SrfError(f"{self.path}: {key}: {message}", hint)
+
+    def keys(self, where: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
+        for key in table:
+            if key not in tuple(known):
+                at = f"{where}.{key}" if where else key
+                self.fail(at, "unknown key", did_you_mean(key, known))
+
+    def text(self, key: str, default: str = "") -> str:
+        value = self.table.get(key, default)
+        if not isinstance(value, str):
+            self.fail(key, f"found {_shown(value)}, expected text in quotes")
+        return value
+
+    def number(self, where: str, value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self.fail(where, f"found {_shown(value)}, expected a number")
+        return float(value)
+
+    def kind(self) -> str:
+        found = self.table.get("format")
+        if found != FORMAT:
+            said = "nothing" if found is None else _shown(found)
+            self.fail("format", f"found {said}, expected {FORMAT!r}", f'Start the file with format = "{FORMAT}".')
+        kind = self.table.get("kind")
+        if kind not in KINDS:
+            said = "nothing" if kind is None else _shown(kind)
+            self.fail("kind", f"found {said}, expected one of {', '.join(KINDS)}", did_you_mean(str(kind), KINDS))
+        return kind
+
+    def name(self) -> str:
+        name = self.text("name", self.path.stem)
+        if not valid_name(name):
+            self.fail("name", f"found {_shown(name)}, expected small letters, digits and single dashes", "Like my-law.")
+        return name
+
+    def law(self) -> Law:
+        kind, key = self.kind(), FORMULA[self.kind()]
+        self.keys("", self.table, (*_COMMON_KEYS, key, *(("states",) if kind == "friction" else ())))
+        common: dict[str, Any] = {
+            "name": self.name(),
+            "about": self.text("about"),
+            "cites": self.cites(),
+            "parameters": self.parameters(),
+            "source": str(self.path),
+        }
+        if kind == "friction":
+            common["states"] = self.states()
+        states = common.get("states", ())
+        try:
+            check_parameters(common["parameters"], kind=kind, states=states)
+            check_states(states, common["parameters"])
+        except SrfError as error:
+            raise SrfError(f"{self.path}: {error.message}", error.hint) from None
+        names = known_symbols(kind, (p.name for p in common["parameters"]), states)
+        common["checks"] = self.checks(key, names)
+        common[key] = self.formula(key, kind, names)
+        law = LAW_CLASSES[kind](**common)
+        try:
+            check_uses(law)
+        except SrfError as error:
+            raise SrfError(f"{self.path}: {error.message}", error.hint) from None
+        return law
+
+    def formula(self, key: str, kind: str, names: tuple[str, ...]) -> sympy.Expr | None:
+        from srfcli.expression import parse_expression
+
+        if key not in self.table:
+            if kind == "interface":
+                return None  # rigid
+            hint = f'Give the formula as text: {key} = "...".'
+            if key in self.table.get("parameters", {}):
+                hint = "It stands below [parameters]; move it above the first [table]."
+            self.fail(key, "missing", hint)
+        try:
+            return parse_expression(self.text(key), names)
+        except ExpressionError as error:
+            message = f"{self.path}: {key}: {error.message}"
+            raise ExpressionError(message, error.hint, text=error.text, column=error.column) from None
+
+    def cites(self) -> tuple[str, ...]:
+        cites = self.table.get("cites", [])
+        if not isinstance(cites, list) or not all(isinstance(c, str) for c in cites):
+            self.fail("cites", f"found {_shown(cites)}, expected a list of texts")
+        return tuple(cites)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        table = self.table.get("parameters", {})
+        if not isinstance(table, dict):
+            self.fail("parameters", f"found {_shown(table)}, expected a table", "Write [parameters].")
+        return tuple(self.parameter(name, entry) for name, entry in table.items())
+
+    def parameter(self, name: str, entry: object) -> Parameter:
+        where = f"parameters.{name}"
+        if not isinstance(entry, dict):
+            if name in (*_COMMON_KEYS, *FORMULA.values(), "states"):
+                self.fail(where, "this key stands below [parameters]", "Move it above the first [table].")
+            self.fail(
+                where, f"found {_shown(entry)}, expected a table", f'Write {name} = {{ default = 1.0, unit = "1" }}.'
+            )
+        self.keys(where, entry, _PARAMETER_KEYS)
+        if "default" not in entry:
+            self.fail(f"{where}.default", "missing", "Every parameter has a default.")
+        for key in ("unit", "about"):
+            if not isinstance(entry.get(key, ""), str):
+                self.fail(f"{where}.{key}", f"found {_shown(entry[key])}, expected text in quotes")
+        lower, upper = self.bounds(where, entry)
+        default = self.number(f"{where}.default", entry["default"])
+        return Parameter(name, default, entry.get("unit", "1"), lower, upper, entry.get("about", ""))
+
+    def bounds(self, where: str, entry: Mapping[str, Any]) -> tuple[float, float]:
+        if "bounds" not in entry:
+            lower = self.number(f"{where}.lower", entry.get("lower", -math.inf))
+            return lower, self.number(f"{where}.upper", entry.get("upper", math.inf))
+        bounds = entry["bounds"]
+        if "lower" in entry or "upper" in entry:
+            self.fail(f"{where}.bounds", "given together with lower or upper", "Keep one of the two forms.")
+        if not isinstance(bounds, list) or len(bounds) != 2:
+            self.fail(
+                f"{where}.bounds", f"found {_shown(bounds)}, expected [lower, upper]", "inf and -inf are numbers."
+            )
+        return self.number(f"{where}.bounds", bounds[0]), self.number(f"{where}.bounds", bounds[1])
+
+    def states(self) -> tuple[State, ...]:
+        entries = self.table.get("states", [{}])
+        if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+            self.fail("states", f'found {_shown(entries)}, expected [{{ name = "phi", length = "D0", weight = "B" }}]')
+        states = []
+        for number, entry in enumerate(entries):
+            where = f"states[{number}]"
+            self.keys(where, entry, _STATE_KEYS)
+            if not all(isinstance(value, str) for value in entry.values()):
+                self.fail(where, f"found {_shown(entry)}, expected texts for name, length and weight")
+            states.append(State(**entry))
+        return tuple(states)
+
+    def checks(self, quantity: str, names: tuple[str, ...]) -> tuple[Check, ...]:
+        entries = self.table.get("checks", [])
+        if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
+            self.fail("checks", f"found {_shown(entries)}, expected tables", "Write [[checks]] with two brackets.")
+        return tuple(self.check(f"checks[{i}]", entry, quantity, names) for i, entry in enumerate(entries))
+
+    def check(self, where: str, entry: Mapping[str, Any], quantity: str, names: tuple[str, ...]) -> Check:
+        self.keys(where, entry, _CHECK_KEYS)
+        for key in ("at", "value"):
+            if key not in entry:
+                self.fail(f"{where}.{key}", "missing")
+        if entry.get("quantity", quantity) != quantity:
+            found = _shown(entry["quantity"])
+            self.fail(f"{where}.quantity", f"found {found}, expected {quantity!r}", did_you_mean(found, QUANTITY_UNITS))
+        if not isinstance(entry["at"], dict):
+            self.fail(f"{where}.at", f"found {_shown(entry['at'])}, expected {{ v = 1.0, ... }}")
+        self.keys(f"{where}.at", entry["at"], names)
+        at = tuple((name, self.number(f"{where}.at.{name}", value)) for name, value in entry["at"].items())
+        value = self.number(f"{where}.value", entry["value"])
+        rtol = self.number(f"{where}.rtol", entry.get("rtol", Check.rtol))
+        return Check(quantity, at, value, rtol)
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,1 @@
+"""Numerics on generated models: arrays in, arrays out; neither sympy nor click is imported here."""

@@ -1,0 +1,93 @@
+"""Points of a stability boundary: a forced periodic state one of whose multipliers lies on the unit circle.
+
+The unknowns are the state at tau = 0 and the parameters `names`; the test function is g = ln |rho| of one multiplier, so that
+Neimark-Sacker, period-doubling and fold boundaries obey one equation. The gradient of g is exact for the discretised
+problem: with right and left eigenvectors carried along the orbit, d rho = sum w . dJ v over the Gauss points, and the
+generated bilinear forms supply d(w . J v). The bordered system is regular at folds of the curve and of the orbit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from srfcli.model import GeneratedModel
+from srfcli.numerics.collocation import Array, Condensed, Discretisation, condense, expand, gauss, stage_parameters
+from srfcli.numerics.orbit import ordered_eigenvalues, scales, step_limit
+
+Names = tuple[str, ...]
+
+
+@dataclass
+class BoundaryLinear:
+    """Newton's equations of a batch of boundary points in (dx_0, dq): `periodic` (..., n, n+1+k) and `growth` (..., n+1+k).
+
+    Columns: n for dx_0, one for the residual, k for the parameters. `rho` is the multiplier, g = ln |rho| its growth.
+    """
+
+    condensed: Condensed
+    periodic: Array
+    growth: Array
+    rho: Array
+    g: Array
+    multipliers: Array
+
+
+def pick_multiplier(multipliers: Array, target: Array) -> Array:
+    """Return the index (...,) of the multiplier nearest to `target`, of a conjugate pair the one above the real axis."""
+    distance = np.abs(multipliers - target[..., None]) + 1e-9 * (multipliers.imag < 0)
+    return np.argmin(distance, axis=-1)
+
+
+def linearise_boundary(model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array) -> BoundaryLinear:
+    """Return the linearisation of {periodicity, ln |rho| = 0}; rho is the multiplier nearest to `target` (...,)."""
+    n = orbit.x.shape[-1]
+    condensed = condense(model, p, orbit, names)
+    M = condensed.monodromy
+    values, right_vectors = np.linalg.eig(M)
+    values, right_vectors = values.astype(complex), right_vectors.astype(complex)
+    chosen = pick_multiplier(values, target)
+    rho = np.take_along_axis(values, chosen[..., None], -1)[..., 0]
+    r = np.take_along_axis(right_vectors, chosen[..., None, None], -1)[..., 0]
+    left_vectors = np.linalg.inv(right_vectors)  # rows l with l . r = 1
+    l = np.take_along_axis(left_vectors, chosen[..., None, None], -2)[..., 0, :]
+    growth = _growth_row(model, p, orbit, condensed, names, rho, r, l)
+    end = condensed.prefix[..., -1, :n, :].copy()
+    index = np.arange(n)
+    end[..., index, index] -= 1
+    return BoundaryLinear(condensed, end, growth, rho, np.log(np.abs(rho)), values)
+
+
+def _growth_row(
+    model: GeneratedModel, p: Array, orbit: Discretisation, c: Condensed, names: Names, rho: Array, r: Array, l: Array
+) -> Array:
+    """Return the derivative of ln |rho| in (dx_0, residual, dq) as a row (..., n+1+k)."""
+    n, k = orbit.x.shape[-1], len(names)
+    m = orbit.stages.shape[-2]
+    scheme = gauss(m)
+    tau, ps = orbit.phases, stage_parameters(p)
+    v_mesh = (c.prefix[..., :-1, :n, :n] @ r[..., None, :, None])[..., 0]  # (..., N, n)
+    v = (c.local[..., :n] @ v_mesh[..., None, :, None])[..., 0]  # (..., N, m, n)
+    # l carried backwards: l_{i+1} = (l G_{N-1} ... G_{i+1}); G_i is the n x n corner of the interval's map
+    l_mesh = np.empty_like(v_mesh)
+    corner = c.maps[..., :n, :n]
+    row = l
+    for i in range(l_mesh.shape[-2] - 1, -1, -1):
+        l_mesh[..., i, :] = row
+        row = (row[..., None, :] @ corner[..., i, :, :])[..., 0, :]
+    seed = (scheme.step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
+    both = np.stack([seed.real, seed.imag], axis=-1)
+    w = np.linalg.solve(np.swapaxes(c.block, -1, -2), both)
+    w = (w[..., 0] + 1j * w[..., 1]).reshape(v.shape)
+    gradient = model.cycle_bilinear(tau, orbit.stages, ps, w, v)  # (..., N, m, n)
+    scale = 1 / rho
+    weight = (scale[..., None, None, None] * gradient).real
+    local = np.einsum("...ja,...jac->...c", weight, c.local)  # (..., N, n+1+k)
+    row_total = (local[..., None, :n] @ c.prefix[..., :-1, :n, :])[..., 0, :].sum(axis=-2)
+    row_total[..., n:] += local[..., n:].sum(axis=-2)
+    for column, name in enumerate(names):
+        mixed = model.cycle_bilinear_parameter(name)(tau, orbit.stages, ps, w, v)
+        row_total[..., n + 1 + column] += (scale * np.sum(mixed, axis=(-1, -2))).real
+    assert row_total.shape[-1] == n + 1 + k
+    return row_total

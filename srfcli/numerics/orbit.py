@@ -1,0 +1,200 @@
+"""Forced periodic states: Newton's method on the condensed collocation equations, for one parameter point or a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from srfcli.model import GeneratedModel
+from srfcli.numerics.collocation import (
+    STAGES,
+    Array,
+    ComplexArray,
+    Condensed,
+    Discretisation,
+    condense,
+    expand,
+    gauss,
+    join,
+)
+from srfcli.status import Status
+
+CHUNK = 48  # parameter points solved together: their blocks fit the cache
+LOG_STEP = 2.0  # a Newton step changes no velocity or age by more than a factor e^2
+
+
+@dataclass
+class OrbitBatch:
+    """Orbits at the points `p` (n_parameters, ...); `converged` marks those whose last Newton step was below the tolerance."""
+
+    p: Array
+    orbit: Discretisation
+    monodromy: Array
+    converged: Array
+    iterations: int
+
+    @property
+    def multipliers(self) -> ComplexArray:
+        """Return the Floquet multipliers (..., n), largest modulus first; NaN where the orbit did not converge."""
+        return ordered_eigenvalues(self.monodromy, self.converged)
+
+
+def ordered_eigenvalues(matrix: Array, valid: Array) -> ComplexArray:
+    """Return eigenvalues of (..., n, n), largest modulus first, NaN where not `valid`."""
+    n = matrix.shape[-1]
+    usable = valid & np.isfinite(matrix).all(axis=(-1, -2))
+    values = np.linalg.eigvals(np.where(usable[..., None, None], matrix, np.eye(n))).astype(complex)
+    order = np.argsort(-np.abs(values), axis=-1, kind="stable")
+    values = np.take_along_axis(values, order, axis=-1)
+    values[~usable] = np.nan
+    return values
+
+
+def scales(model: GeneratedModel, p: Array) -> Array:
+    """Return the size of each unknown, (..., n): logarithms 1, velocities V, lengths 1 um."""
+    V = p[model.index("V")]
+    columns = [V if name == "z" else np.ones_like(V) for name in model.states]
+    return np.stack(columns, axis=-1)
+
+
+def uniform_mesh(intervals: int) -> Array:
+    """Return the edges of `intervals` equal intervals of one period."""
+    return np.linspace(0.0, 1.0, intervals + 1)
+
+
+def steady_guess(model: GeneratedModel, p: Array, edges: Array, m: int = STAGES) -> Discretisation:
+    """Return steady sliding under the mean load as a first guess of the orbit."""
+    rest = model.steady(p)
+    N, n = len(edges) - 1, rest.shape[-1]
+    x = np.broadcast_to(rest[..., None, :], (*rest.shape[:-1], N, n)).copy()
+    stages = np.broadcast_to(rest[..., None, None, :], (*rest.shape[:-1], N, m, n)).copy()
+    return Discretisation(x, stages, edges)
+
+
+def interpolate(orbit: Discretisation, edges: Array) -> Discretisation:
+    """Return `orbit` evaluated on another mesh by its own collocation polynomials."""
+    m = orbit.stages.shape[-2]
+    nodes = np.concatenate([[0.0], gauss(m).nodes])
+    phases = edges[:-1, None] + np.diff(edges)[:, None] * gauss(m).nodes
+
+    def at(tau: Array) -> Array:
+        cell = np.clip(np.searchsorted(orbit.edges, tau, side="right") - 1, 0, len(orbit.edges) - 2)
+        s = (tau - orbit.edges[cell]) / orbit.steps[cell]
+        basis = _lagrange(nodes, s)  # (..., m+1)
+        values = np.concatenate([orbit.x[..., None, :], orbit.stages], axis=-2)[..., cell, :, :]
+        return np.einsum("...k,...kn->...n", basis, values)
+
+    return Discretisation(at(edges[:-1]), at(phases), edges)
+
+
+def _lagrange(nodes: Array, s: Array) -> Array:
+    """Return the Lagrange polynomials on `nodes` at `s`, with one axis more."""
+    columns = []
+    for i, node in enumerate(nodes):
+        others = np.delete(nodes, i)
+        columns.append(np.prod((s[..., None] - others) / (node - others), axis=-1))
+    return np.stack(columns, axis=-1)
+
+
+def step_limit(model: GeneratedModel, dx: Array, stages: Array) -> Array:
+    """Return the factor (...,) that keeps every logarithm's change within LOG_STEP."""
+    logs = np.array(model.logarithmic)
+    largest = np.maximum(np.abs(dx[..., logs]).max(axis=(-1, -2)), np.abs(stages[..., logs]).max(axis=(-1, -2, -3)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.minimum(1.0, LOG_STEP / largest)
+
+
+def solve_orbits(
+    model: GeneratedModel,
+    p: Array,
+    guess: Discretisation,
+    *,
+    tol: float = 1e-9,
+    max_iterations: int = 40,
+) -> OrbitBatch:
+    """Return the periodic orbits at the parameter points `p` (n_parameters, B) from `guess`; finished ones leave the batch.
+
+    A point that does not converge in `max_iterations` keeps its last iterate and is marked so.
+    """
+    parts = [
+        _solve_chunk(model, p[:, a : a + CHUNK], guess.part(slice(a, a + CHUNK)), tol, max_iterations)
+        for a in range(0, p.shape[1], CHUNK)
+    ]
+    return parts[0] if len(parts) == 1 else join_orbits(parts)
+
+
+def join_orbits(parts: Sequence[OrbitBatch]) -> OrbitBatch:
+    """Return several batches on one mesh as one."""
+    return OrbitBatch(
+        np.concatenate([b.p for b in parts], axis=1),
+        join([b.orbit for b in parts]),
+        np.concatenate([b.monodromy for b in parts]),
+        np.concatenate([b.converged for b in parts]),
+        max(b.iterations for b in parts),
+    )
+
+
+def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: float, max_iterations: int) -> OrbitBatch:
+    B, n = p.shape[1], len(model.states)
+    x, stages = guess.x.copy(), guess.stages.copy()
+    monodromy = np.full((B, n, n), np.nan)
+    converged = np.zeros(B, dtype=bool)
+    size = scales(model, p)
+    active = np.arange(B)
+    iteration = 0
+    while active.size and iteration < max_iterations:
+        iteration += 1
+        part = Discretisation(x[active], stages[active], guess.edges)
+        with np.errstate(all="ignore"):  # a diverging point overflows; it is dropped below
+            linear, dx, dstages, finite = _newton(model, p[:, active], part)
+            limit = step_limit(model, dx, dstages)
+            change = (np.abs(dx) / size[active][:, None, :]).max(axis=(-1, -2))
+        limit = np.where(finite, limit, 0.0)
+        x[active] += np.where(finite[:, None, None], limit[:, None, None] * dx, 0.0)
+        stages[active] += np.where(finite[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
+        monodromy[active] = linear.monodromy
+        done = finite & (change < tol)
+        converged[active[done]] = True
+        active = active[finite & ~done]
+    return OrbitBatch(p, Discretisation(x, stages, guess.edges), monodromy, converged, iteration)
+
+
+def _newton(model: GeneratedModel, p: Array, orbit: Discretisation) -> tuple[Condensed, Array, Array, Array]:
+    """Return the linearisation and the Newton corrections; the last array says which points are finite."""
+    n = orbit.x.shape[-1]
+    try:
+        linear = condense(model, p, orbit)
+    except np.linalg.LinAlgError:  # one singular block spoils the batch: take the points one by one
+        linear = _condense_each(model, p, orbit)
+    matrix = np.eye(n) - linear.monodromy
+    right = linear.prefix[..., -1, :n, n]
+    finite = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
+    matrix = np.where(finite[..., None, None], matrix, np.eye(n))
+    singular = finite & (np.abs(np.linalg.det(matrix)) < 1e-300)
+    matrix[singular] = np.eye(n)
+    start = np.linalg.solve(matrix, np.where(finite[..., None], right, 0.0)[..., None])[..., 0]
+    dx, dstages = expand(linear, start)
+    finite &= ~singular & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
+    return linear, dx, dstages, finite
+
+
+def _condense_each(model: GeneratedModel, p: Array, orbit: Discretisation) -> Condensed:
+    parts = []
+    for b in range(p.shape[1]):
+        one = Discretisation(orbit.x[b : b + 1], orbit.stages[b : b + 1], orbit.edges)
+        try:
+            parts.append(condense(model, p[:, b : b + 1], one))
+        except np.linalg.LinAlgError:
+            n, size = orbit.x.shape[-1], orbit.stages.shape[-2] * orbit.stages.shape[-1]
+            N = orbit.x.shape[-2]
+            nan = np.full((1, N, size // n, n, n + 1), np.nan)
+            parts.append(Condensed(np.full((1, N, size, size), np.nan), nan, np.full((1, N, n + 1, n + 1), np.nan),
+                                   np.full((1, N + 1, n + 1, n + 1), np.nan), np.full(1, np.nan)))
+    return Condensed(*(np.concatenate([getattr(q, k) for q in parts]) for k in ("block", "local", "maps", "prefix", "residual")))
+
+
+def status_of(converged: bool) -> Status:
+    """Return the status of one orbit."""
+    return Status.OK if converged else Status.NO_CONVERGENCE

@@ -1,0 +1,174 @@
+"""The growth rate of a forced periodic state along a line of one parameter, refined where a sign change could hide.
+
+g = ln |leading multiplier| over one forcing period. Between two samples a pair of crossings can hide only where |g| is small
+against the error of interpolating it; there the line is halved, down to a stated resolution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from srfcli.model import GeneratedModel
+from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, join
+from srfcli.numerics.orbit import OrbitBatch, solve_orbits, steady_guess, uniform_mesh
+
+HIDING = 4.0  # halve where |g| is below this many interpolation errors
+
+
+@dataclass
+class LineScan:
+    """Samples along `name` (rising `values`): multipliers (B, n), `g` (B,), the orbits, and the resolution reached."""
+
+    name: str
+    p: Array
+    values: Array
+    multipliers: ComplexArray
+    g: Array
+    orbit: Discretisation
+    resolution: float
+
+    @property
+    def lost(self) -> Array:
+        """Return the values at which no orbit was found."""
+        return self.values[~np.isfinite(self.g)]
+
+    def brackets(self) -> list[int]:
+        """Return the indices i for which g changes sign between values[i] and values[i+1]."""
+        g = self.g
+        return [int(i) for i in np.nonzero(np.isfinite(g[:-1]) & np.isfinite(g[1:]) & (g[:-1] * g[1:] <= 0) & (g[:-1] != 0))[0]]
+
+
+def growth(batch: OrbitBatch) -> tuple[ComplexArray, Array]:
+    """Return the multipliers and ln |leading multiplier| of a batch, NaN where the orbit was not found."""
+    multipliers = batch.multipliers
+    return multipliers, np.log(np.abs(multipliers[:, 0]))
+
+
+def robust_orbits(model: GeneratedModel, p: Array, guess: Discretisation | None, edges: Array, *, tol: float = 1e-7) -> OrbitBatch:
+    """Return orbits at `p`, from `guess`, else from steady sliding, else by raising eps in steps."""
+    rest = steady_guess(model, p, edges)
+    batch = solve_orbits(model, p, guess or rest, tol=tol, max_iterations=14 if guess is not None else 40)
+    if guess is not None and not batch.converged.all():
+        _retry(model, batch, rest, tol)
+    if not batch.converged.all():
+        bad = np.nonzero(~batch.converged)[0]
+        i = model.index("eps")
+        ladder = rest.part(bad)
+        for fraction in (0.25, 0.5, 0.75, 1.0):
+            q = p[:, bad].copy()
+            q[i] *= fraction
+            ladder = solve_orbits(model, q, ladder, tol=tol).orbit
+        _retry(model, batch, _scatter(batch.orbit, ladder, bad), tol)
+    return batch
+
+
+def _scatter(whole: Discretisation, part: Discretisation, index: Array) -> Discretisation:
+    x, stages = whole.x.copy(), whole.stages.copy()
+    x[index], stages[index] = part.x, part.stages
+    return Discretisation(x, stages, whole.edges)
+
+
+def _retry(model: GeneratedModel, batch: OrbitBatch, guess: Discretisation, tol: float) -> None:
+    """Solve again, in place, the members of `batch` that have not converged."""
+    bad = np.nonzero(~batch.converged)[0]
+    again = solve_orbits(model, batch.p[:, bad], guess.part(bad), tol=tol)
+    batch.orbit.x[bad], batch.orbit.stages[bad] = again.orbit.x, again.orbit.stages
+    batch.monodromy[bad], batch.converged[bad] = again.monodromy, again.converged
+
+
+def scan_line(
+    model: GeneratedModel,
+    base: Array,
+    name: str,
+    values: Array,
+    *,
+    intervals: int = 24,
+    guess: Discretisation | None = None,
+    resolution: float = 1e-3,
+    log: bool = True,
+) -> LineScan:
+    """Return the growth rate along parameter `name` through `values` (rising), at the other parameters of `base` (n_parameters,).
+
+    `resolution` is the smallest spacing, in ln(value) where `log`, that halving reaches.
+    """
+    edges = uniform_mesh(intervals)
+    p = np.repeat(base[:, None], len(values), axis=1)
+    p[model.index(name)] = values
+    batch = robust_orbits(model, p, guess, edges)
+    multipliers, g = growth(batch)
+    scan = LineScan(name, p, np.asarray(values, float), multipliers, g, batch.orbit, np.inf)
+    coordinate = np.log if log else np.asarray
+    while True:
+        position = coordinate(scan.values)
+        wanted = np.nonzero(_suspects(position, scan.g, resolution))[0]
+        if not wanted.size:
+            break
+        scan = _halve(model, base, scan, wanted, log)
+    suspects = _suspects(coordinate(scan.values), scan.g, 0.0)
+    gaps = np.diff(coordinate(scan.values))
+    scan.resolution = float(gaps[suspects].max()) if suspects.any() else float(resolution)
+    return scan
+
+
+def _suspects(position: Array, g: Array, resolution: float) -> Array:
+    """Return for each interval whether a pair of crossings could hide in it and it is wider than `resolution`."""
+    usable = np.isfinite(g)
+    error = np.zeros_like(g)
+    for i in range(len(g)):
+        around = [j for j in (i - 2, i - 1, i + 1, i + 2) if 0 <= j < len(g)]
+        if len(around) < 3 or not usable[around].all() or not usable[i]:
+            continue
+        error[i] = abs(g[i] - _polynomial_at(position[around], g[around], position[i]))
+    worst = np.maximum(error[:-1], error[1:])
+    smallest = np.minimum(np.abs(g[:-1]), np.abs(g[1:]))
+    same_side = np.sign(g[:-1]) == np.sign(g[1:])
+    with np.errstate(invalid="ignore"):
+        close = smallest < HIDING * worst
+    return usable[:-1] & usable[1:] & close & (np.diff(position) > 2 * resolution) & (same_side | (worst > 0.1))
+
+
+def _polynomial_at(xs: Array, ys: Array, x: float) -> float:
+    """Return the Lagrange interpolant through (xs, ys) at x."""
+    total = 0.0
+    for i, (xi, yi) in enumerate(zip(xs, ys, strict=True)):
+        others = np.delete(xs, i)
+        total += yi * float(np.prod((x - others) / (xi - others)))
+    return total
+
+
+def _halve(model: GeneratedModel, base: Array, scan: LineScan, wanted: Array, log: bool) -> LineScan:
+    """Return `scan` with the intervals `wanted` halved."""
+    a, b = scan.values[wanted], scan.values[wanted + 1]
+    middle = np.sqrt(a * b) if log else 0.5 * (a + b)
+    left, right = scan.orbit.part(wanted), scan.orbit.part(wanted + 1)
+    guess = Discretisation(0.5 * (left.x + right.x), 0.5 * (left.stages + right.stages), scan.orbit.edges)
+    p = np.repeat(base[:, None], len(middle), axis=1)
+    p[model.index(scan.name)] = middle
+    batch = robust_orbits(model, p, guess, scan.orbit.edges)
+    multipliers, g = growth(batch)
+    values = np.concatenate([scan.values, middle])
+    order = np.argsort(values)
+    return LineScan(
+        scan.name,
+        np.concatenate([scan.p, p], axis=1)[:, order],
+        values[order],
+        np.concatenate([scan.multipliers, multipliers])[order],
+        np.concatenate([scan.g, g])[order],
+        join([scan.orbit, batch.orbit]).part(order),
+        scan.resolution,
+    )
+
+
+def bifurcation_type(rho: complex) -> str:
+    """Return `ns`, `pd` or `fold` for a critical multiplier: off the real axis, at -1, at +1."""
+    if abs(rho.imag) > 1e-7 * abs(rho):
+        return "ns"
+    return "pd" if rho.real < 0 else "fold"
+
+
+def any_lost(scans: Iterable[LineScan]) -> int:
+    """Return how many samples of several scans found no orbit."""
+    return sum(len(s.lost) for s in scans)

@@ -1,0 +1,271 @@
+"""Figures in the house style, from plain arrays; matplotlib is imported on use and never opens a window."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import logging
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from srfcli.errors import SrfError
+from srfcli.output.files import check_target, write_atomic
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SUFFIXES = (".png", ".svg", ".pdf")
+
+# Okabe and Ito's palette without its yellow, dark enough on white; line styles say the same once more for print.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (9, 2)), (0, (3, 1, 1, 1, 1, 1)), (0, (2, 2)))
+DOTTED = (0, (1, 1.2))  # kept for the constant load
+
+STYLE: dict[str, Any] = {
+    "figure.figsize": (6.0, 4.2),
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 200,
+    "font.size": 10.0,
+    "font.family": ["DejaVu Sans"],  # comes with matplotlib: the same bytes on every machine
+    "mathtext.fontset": "dejavusans",
+    "axes.titlesize": 10.5,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.6,
+    "legend.frameon": False,
+    "svg.hashsalt": "srf",
+    "pdf.compression": 6,
+}
+
+# Dates would make two equal figures differ.
+_METADATA: dict[str, dict[str, Any]] = {
+    ".svg": {"Date": None},
+    ".pdf": {"CreationDate": None, "ModDate": None},
+    ".png": {},
+}
+
+
+def check_plot(path: Path, *, force: bool) -> None:
+    """Raise SrfError now if a figure could not be saved at `path` later; matplotlib is looked for but not imported."""
+    if path.suffix.lower() not in SUFFIXES:
+        got = f"ends in {path.suffix!r}" if path.suffix else "has no ending"
+        raise SrfError(f"--plot {path} {got}", f"End it in {', '.join(SUFFIXES)}: --plot {path.with_suffix('.svg')}")
+    check_target(path, force=force, what="--plot")
+    if importlib.util.find_spec("matplotlib") is None:
+        raise _missing()
+
+
+def _missing() -> SrfError:
+    return SrfError("--plot needs matplotlib, which is not installed", 'pip install "srfcli[plot]"')
+
+
+@contextlib.contextmanager
+def house_style() -> Iterator[None]:
+    """Draw and save with the house's settings, whatever the user's matplotlibrc says."""
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise _missing() from error
+    logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # cache chatter is not the user's concern
+    with matplotlib.rc_context():
+        matplotlib.rcParams.update({k: v for k, v in matplotlib.rcParamsDefault.items() if not k.startswith("backend")})
+        matplotlib.rcParams.update(STYLE)
+        yield
+
+
+def new_figure(rows: int = 1, *, size: tuple[float, float] | None = None) -> tuple[Figure, list[Axes]]:
+    """Return a figure of `rows` panels above each other on one x axis; call it, and draw, within `house_style`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)
+    return figure, [row[0] for row in axes]
+
+
+def figure_bytes(figure: Figure, suffix: str) -> bytes:
+    """Return the figure as a .png, .svg or .pdf file's content; equal figures give equal bytes."""
+    buffer = io.BytesIO()
+    with house_style():
+        figure.savefig(buffer, format=suffix.lstrip(".").lower(), metadata=_METADATA[suffix.lower()])
+    return buffer.getvalue()
+
+
+def save_figure(figure: Figure, path: Path) -> bytes:
+    """Write the figure to `path` in the format of its ending, whole or not at all, and return what was written."""
+    content = figure_bytes(figure, path.suffix)
+    write_atomic(path, content)
+    return content
+
+
+def stability_diagram(
+    branches: Sequence[Mapping[str, Any]],
+    *,
+    hopf: Mapping[str, Any] | None = None,
+    title: str = "",
+    xlabel: str = "V  [µm/s]",
+    ylabel: str = "K/W$_0$  [1/µm]",
+) -> Figure:
+    """Return the stability boundaries K/W0 (1/um) against V (um/s, logarithmic); sliding is stable above each of them.
+
+    A branch is {eps, V, K_over_W0, component, label}, of which component and label may be missing; the branches of one
+    eps share colour and line style. `hopf`, {V, K_over_W0}, is the boundary under constant load. A curve that stands
+    alone is shaded on its stable side; a closed one never is.
+    """
+    with house_style():
+        figure, (ax,) = new_figure()
+        ax.set_xscale("log")
+        if hopf is not None:
+            ax.plot(hopf["V"], _gaps(hopf["K_over_W0"]), color="#555555", linestyle=DOTTED, label="ε = 0 (Hopf)")
+        order = list(dict.fromkeys(b["eps"] for b in branches))
+        named: set[str] = set()
+        for branch in branches:
+            index = order.index(branch["eps"])
+            label = branch.get("label") or f"ε = {branch['eps']:g}"
+            ax.plot(
+                branch["V"],
+                _gaps(branch["K_over_W0"]),
+                color=COLOURS[index % len(COLOURS)],
+                linestyle=DASHES[index % len(DASHES)],
+                label=label if label not in named else None,
+            )
+            named.add(label)
+        single = branches[0] if len(branches) == 1 else hopf if not branches else None
+        _finish_axes(ax, xlabel=xlabel, ylabel=ylabel, title=title, legend=len(named) + (hopf is not None) > 1)
+        _frame_curves(ax)
+        if single is not None:
+            _shade_above(ax, single["V"], single["K_over_W0"], COLOURS[0] if branches else "#555555")
+        elif branches:
+            closed = any(_is_closed(b["V"], b["K_over_W0"]) for b in branches)
+            text = "stable above each open curve" if closed else "stable above each curve"
+            ax.annotate(text, (0.99, 0.985), xycoords="axes fraction", ha="right", va="top", color="#555555")
+        _decade_ticks(ax)
+        return figure
+
+
+def _frame_curves(ax: Axes) -> None:
+    """Set the y axis from 0, with room above the curves; the x axis ends where the curves end."""
+    ax.margins(x=0.0)
+    ax.autoscale_view()
+    low, high = ax.get_ylim()
+    ax.set_ylim(min(0.0, low), high + 0.12 * (high - min(0.0, low)))
+
+
+def _gaps(values: Sequence[float | None]) -> list[float]:
+    return [float("nan") if v is None else float(v) for v in values]
+
+
+def _is_closed(x: Sequence[float], y: Sequence[float | None]) -> bool:
+    """Return whether a curve ends where it began, to drawing accuracy."""
+    ends = [(float(x[i]), _gaps(y)[i]) for i in (0, -1)] if len(x) > 2 else []
+    return bool(ends) and all(math.isclose(a, b, rel_tol=1e-6) for a, b in zip(*ends, strict=True))
+
+
+def _shade_above(ax: Axes, x: Sequence[float], y: Sequence[float | None], colour: str) -> None:
+    """Shade between an open curve and the top, which is right through folds too: no curve crosses itself."""
+    points = [(float(a), b) for a, b in zip(x, _gaps(y), strict=True) if b == b]
+    if len(points) < 2 or _is_closed(x, y):
+        return
+    top = ax.get_ylim()[1]
+    ax.fill(
+        *zip(*points, (points[-1][0], top), (points[0][0], top), strict=True), color=colour, alpha=0.10, linewidth=0
+    )
+    ax.annotate("stable", (0.98, 0.97), xycoords="axes fraction", ha="right", va="top", color="#333333")
+    below = (0.02, 0.03)
+    ax.annotate("oscillates", below, xycoords="axes fraction", ha="left", va="bottom", color="#333333")
+
+
+def lines(
+    x: Sequence[float],
+    ys: Sequence[Sequence[float | None]],
+    labels: Sequence[str],
+    xlabel: str,
+    ylabel: str,
+    logx: bool = False,
+    *,
+    logy: bool = False,
+    title: str = "",
+) -> Figure:
+    """Return several curves over one x; labels and units are the caller's; NaN or None leaves a gap."""
+    with house_style():
+        figure, (ax,) = new_figure()
+        for index, (y, label) in enumerate(zip(ys, labels, strict=True)):
+            drawn = _gaps(y)
+            marker = "o" if len(drawn) == 1 else None
+            colour, dash = COLOURS[index % len(COLOURS)], DASHES[index % len(DASHES)]
+            ax.plot(x, drawn, color=colour, linestyle=dash, label=label, marker=marker, markersize=4)
+        if logx:
+            ax.set_xscale("log")
+        if logy:
+            ax.set_yscale("log")
+        ax.margins(x=0.0 if len(x) > 1 else 0.05)
+        _finish_axes(ax, xlabel=xlabel, ylabel=ylabel, title=title, legend=len(labels) > 1)
+        if logx:
+            _decade_ticks(ax)
+        return figure
+
+
+def orbit(
+    tau: Sequence[float],
+    *,
+    u: Sequence[float],
+    v: Sequence[float],
+    states: Mapping[str, Sequence[float]],
+    mu: Sequence[float],
+    W: Sequence[float],
+    title: str = "",
+) -> Figure:
+    """Return one forced period, panels over tau in periods: u (um), v (um/s, logarithmic), ages (s), mu and W (N)."""
+    panels: list[tuple[str, Sequence[float], bool]] = [("u  [µm]", u, False), ("v  [µm/s]", v, True)]
+    panels += [(f"{_greek(name)}  [s]", values, True) for name, values in states.items()]
+    panels += [("µ", mu, False), ("W  [N]", W, False)]
+    with house_style():
+        figure, axes = new_figure(len(panels), size=(6.0, 1.15 * len(panels) + 0.9))
+        for index, (ax, (label, values, log)) in enumerate(zip(axes, panels, strict=True)):
+            ax.plot(tau, values, color=COLOURS[index % len(COLOURS)])
+            if log:
+                ax.set_yscale("log")
+            else:
+                ax.ticklabel_format(axis="y", useOffset=False)
+            ax.set_ylabel(label)
+            ax.margins(x=0.0, y=0.12)
+        axes[0].set_title(title)
+        axes[-1].set_xlabel("time  [periods of the load]")
+        figure.align_ylabels(axes)
+        return figure
+
+
+def _greek(name: str) -> str:
+    return name.replace("phi", "φ").replace("_", " ")
+
+
+def _finish_axes(ax: Axes, *, xlabel: str, ylabel: str, title: str, legend: bool) -> None:
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(ylabel)
+    if title:
+        ax.set_title(title)
+    if legend:
+        ax.legend(loc="best", handlelength=2.8)
+
+
+def _decade_ticks(ax: Axes) -> None:
+    """Write 1, 10, 100 rather than powers of ten, and 2 and 5 between them where the axis spans few decades."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = ax.get_xlim()
+    if low <= 0 or not 1e-4 <= low <= high <= 1e5:
+        return
+    between = (1.0, 2.0, 5.0) if high / low < 2e3 else (1.0,)
+    ax.xaxis.set_major_locator(LogLocator(subs=between))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.xaxis.set_minor_formatter(NullFormatter())

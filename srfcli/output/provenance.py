@@ -1,0 +1,83 @@
+"""A sidecar beside each result: what made it, from what, with which versions."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from srfcli import __version__
+from srfcli.laws import Law
+from srfcli.output.files import write_atomic
+from srfcli.output.tables import plain_value
+
+SCHEMA = "srf.provenance/1"
+_LIBRARIES = ("click", "matplotlib", "numpy", "pint", "scipy", "sympy")
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What made a result. `timings` (seconds by name) is the only part that differs from one run to the next."""
+
+    arguments: tuple[str, ...] = ()
+    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    laws: tuple[Law, ...] = ()
+    inputs: tuple[Path, ...] = ()
+    seed: int | None = None
+    timings: Mapping[str, float] = field(default_factory=dict)
+
+
+def sidecar_path(path: Path) -> Path:
+    """Return the place of the sidecar of the result at `path`."""
+    return path.with_name(f"{path.name}.provenance.json")
+
+
+def write_sidecar(path: Path, content: bytes, provenance: Provenance) -> Path:
+    """Write the sidecar of the result `content` at `path` and return its place; the timings are its last key."""
+    data = {"schema": SCHEMA, "file": path.name, "sha256": hashlib.sha256(content).hexdigest(), **describe(provenance)}
+    data["timings"] = {name: round(seconds, 6) for name, seconds in provenance.timings.items()}
+    place = sidecar_path(path)
+    write_atomic(place, json.dumps(plain_value(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    return place
+
+
+def describe(provenance: Provenance) -> dict[str, Any]:
+    """Return all but the timings as plain data: equal runs give equal data."""
+    return {
+        "arguments": list(provenance.arguments),
+        "versions": versions(),
+        "laws": [describe_law(law) for law in provenance.laws],
+        "parameters": provenance.parameters,
+        "inputs": {str(path): file_hash(path) for path in provenance.inputs},
+        "seed": provenance.seed,
+    }
+
+
+def describe_law(law: Law) -> dict[str, Any]:
+    """Return the law's name, its source and, where that is a file, the hash of the file."""
+    return {"name": law.name, "source": law.source, "sha256": file_hash(Path(law.source)) if law.source else None}
+
+
+def file_hash(path: Path) -> str | None:
+    """Return the SHA-256 of a file's bytes, or None where there is no such file."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except (OSError, ValueError):
+        return None
+
+
+def versions(libraries: Iterable[str] = _LIBRARIES) -> dict[str, str]:
+    """Return the versions of srf, Python and the installed libraries, without importing any."""
+    from importlib import metadata  # costs a sixth of the start, and only sidecars need it
+
+    found = {"srf": __version__, "python": platform.python_version()}
+    for name in libraries:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found

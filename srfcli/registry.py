@@ -1,0 +1,262 @@
+"""Names of laws to files and entry points: a listing imports nothing, a broken plugin stops nobody but its user."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.metadata
+import importlib.util
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from srfcli.errors import SrfError, did_you_mean
+from srfcli.lawfile import KINDS, kind_of, read_header, read_law
+from srfcli.laws import AgeingLaw, AgeingModifier, Law
+from srfcli.pylaw import find_law, laws_in, load_module, scan_python
+
+GROUP = "srf.laws"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A law that can be loaded: what it is called, what it is and where it comes from."""
+
+    name: str
+    kind: str
+    origin: str
+    location: Path
+    about: str = ""
+    module: str | None = field(default=None, repr=False)  # how an entry point imports it
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A source that could not be listed: `name` is what its user would probably ask for."""
+
+    name: str
+    origin: str
+    location: str
+    message: str
+    hint: str | None = None
+
+
+class Registry:
+    """The laws that were found, by kind and name; a law is loaded when it is first asked for, and then kept."""
+
+    def __init__(self, entries: Sequence[Entry], problems: Sequence[Problem] = ()) -> None:
+        self._entries = tuple(sorted(entries, key=lambda e: (KINDS.index(e.kind), e.name, str(e.location))))
+        self.problems = tuple(problems)
+        self._loaded: dict[Entry, Law] = {}
+
+    def entries(self, kind: str | None = None) -> tuple[Entry, ...]:
+        """Return all entries, or those of one kind, sorted by kind and name; clashing ones are all there."""
+        if kind is not None and kind not in KINDS:
+            raise SrfError(f"unknown kind '{kind}'", did_you_mean(kind, KINDS))
+        return tuple(e for e in self._entries if kind in (None, e.kind))
+
+    def clashes(self, entry: Entry) -> tuple[Entry, ...]:
+        """Return the other entries of the same kind and name."""
+        return tuple(e for e in self._entries if e != entry and (e.kind, e.name) == (entry.kind, entry.name))
+
+    def find(self, kind: str, name: str) -> Entry:
+        """Return the one entry of that kind and name; raises `SrfError` where there is none, or more than one."""
+        found = [e for e in self.entries(kind) if e.name == name]
+        if len(found) == 1:
+            return found[0]
+        if found:
+            places = " and ".join(f"{e.location} ({e.origin})" for e in found)
+            raise SrfError(f"two {kind} laws are called '{name}': {places}", "Rename one or take its folder away.")
+        for problem in self.problems:
+            if problem.name == name:
+                raise SrfError(problem.message, problem.hint)
+        raise SrfError(f"unknown {kind} law '{name}'", did_you_mean(name, (e.name for e in self.entries(kind))))
+
+    def get(self, kind: str, name: str) -> Law:
+        """Return the law of that kind and name, or in the file of that name where it ends in .toml or .py."""
+        if name.endswith((".toml", ".py")):
+            return one_law(Path(name), kind)
+        return self.load(self.find(kind, name))
+
+    def load(self, entry: Entry) -> Law:
+        """Return the law of an entry, imported or parsed at the first call."""
+        if entry not in self._loaded:
+            if entry.location.suffix == ".toml":
+                self._loaded[entry] = read_law(entry.location)
+            else:
+                self._loaded[entry] = find_law(entry.location, entry.module, entry.kind, entry.name)
+        return self._loaded[entry]
+
+    def ageing(self, spelling: str) -> tuple[AgeingLaw, tuple[AgeingModifier, ...]]:
+        """Return the ageing law and the modifiers of a spelling such as `dieterich+linker-dieterich`."""
+        first, *rest = (word.strip() for word in spelling.split("+"))
+        if not first or not all(rest):
+            raise SrfError(f"ageing law '{spelling}' has an empty part", "Write dieterich+linker-dieterich.")
+        if len(set(rest)) != len(rest):
+            raise SrfError(
+                f"ageing law '{spelling}' names a modifier twice", "Change the modifier's parameter instead."
+            )
+        law = self.get("ageing", first)
+        modifiers = tuple(self.get("modifier", word) for word in rest)
+        assert isinstance(law, AgeingLaw)
+        own = {p.name for p in law.parameters}
+        for m in modifiers:
+            assert isinstance(m, AgeingModifier)
+            for p in m.parameters:
+                if p.name in own:
+                    raise SrfError(
+                        f"'{spelling}' has two parameters called '{p.name}'", f"Rename the one of '{m.name}'."
+                    )
+                own.add(p.name)
+        return law, modifiers  # type: ignore[return-value]
+
+    def fingerprint(self, entry: Entry) -> str:
+        """Return the sha256 of the file that holds a law."""
+        return hashlib.sha256(entry.location.read_bytes()).hexdigest()
+
+
+def load_registry(plugins: Sequence[Path] = (), *, user: bool = True, entry_points: bool = True) -> Registry:
+    """Return the laws of the bundled folder, entry points, the user's data folder, SRF_PLUGINS and `plugins`.
+
+    A folder in `plugins` or SRF_PLUGINS that does not exist raises `SrfError`; every other fault becomes a `Problem`.
+    """
+    collect = _Collector()
+    collect.folder("bundled", bundled_folder())
+    if entry_points:
+        for point in importlib.metadata.entry_points(group=GROUP):
+            collect.entry_point(point)
+    if user and user_folder().is_dir():
+        collect.folder("user", user_folder())
+    asked = [(p, "--plugins") for p in plugins]
+    asked += [(Path(p), "SRF_PLUGINS") for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
+    for path, origin in asked:
+        path = path.expanduser()
+        if not path.exists():
+            raise SrfError(f"{origin}: no folder {path}", "Give a folder that holds law files.")
+        collect.folder(origin, path)
+    return Registry(collect.entries, collect.problems)
+
+
+@functools.cache
+def bundled_registry() -> Registry:
+    """Return the shipped laws alone."""
+    collect = _Collector()
+    collect.folder("bundled", bundled_folder())
+    return Registry(collect.entries, collect.problems)
+
+
+def bundled_folder() -> Path:
+    """Return the folder of shipped laws: inside the wheel, else beside the package in a checkout."""
+    package = Path(__file__).resolve().parent
+    inside = package / "plugins"
+    return inside if inside.is_dir() else package.parent / "plugins"
+
+
+def user_folder() -> Path:
+    """Return the folder of the user's own laws, which need not exist."""
+    if os.environ.get("SRF_DATA"):
+        return Path(os.environ["SRF_DATA"])
+    base = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+    return Path(base) / "srf" / "plugins"
+
+
+def read_file(path: Path) -> tuple[Law, ...]:
+    """Return the laws in one file, TOML or Python; a Python file is run."""
+    if not path.is_file():
+        raise SrfError(f"no file {path}", "Give the path of a .toml or .py file.")
+    if path.suffix == ".toml":
+        return (read_law(path),)
+    if path.suffix != ".py":
+        raise SrfError(f"{path}: neither .toml nor .py", "Laws are written as TOML or Python.")
+    laws = tuple(laws_in(load_module(path, None)))
+    if not laws:
+        raise SrfError(f"{path}: holds no law", "Decorate a function with @friction_law(...) from srfcli.api.")
+    return laws
+
+
+def one_law(path: Path, kind: str) -> Law:
+    """Return the single law of `kind` in a file."""
+    found = [law for law in read_file(path) if kind_of(law) == kind]
+    if len(found) != 1:
+        raise SrfError(f"{path}: holds {len(found)} laws of kind {kind}, expected one")
+    return found[0]
+
+
+class _Collector:
+    """Entries and problems, gathered source by source; a file that is reached twice counts once."""
+
+    def __init__(self) -> None:
+        self.entries: list[Entry] = []
+        self.problems: list[Problem] = []
+        self.seen: set[Path] = set()
+
+    def folder(self, origin: str, folder: Path) -> None:
+        for path in _law_files(folder):
+            self.file(origin, path)
+
+    def file(self, origin: str, path: Path, module: str | None = None, only: str | None = None) -> None:
+        if path.resolve() in self.seen:
+            return
+        self.seen.add(path.resolve())
+        self.guard(path.stem, origin, path, lambda: self.add(origin, path, module, only))
+
+    def add(self, origin: str, path: Path, module: str | None, only: str | None) -> None:
+        found = [read_header(path)] if path.suffix == ".toml" else scan_python(path)
+        if only is not None:
+            found = [entry for entry in found if entry[1] == only.replace("_", "-")]
+        self.entries += [Entry(name, kind, origin, path, about, module) for kind, name, about in found]
+
+    def entry_point(self, point: importlib.metadata.EntryPoint) -> None:
+        origin = f"entry point {point.name}"
+        self.guard(point.name, origin, point.value, lambda: self.add_point(origin, point))
+
+    def add_point(self, origin: str, point: importlib.metadata.EntryPoint) -> None:
+        place = _without_import(point.module)
+        if place.is_dir() and (not (place / "__init__.py").is_file() or _has_laws(place)):
+            self.folder(origin, place)
+        else:
+            source = place / "__init__.py" if place.is_dir() else place
+            self.file(origin, source, point.module, point.attr or None)
+
+    def guard(self, name: str, origin: str, where: object, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except SrfError as error:
+            self.problems.append(Problem(name, origin, str(where), error.message, error.hint))
+        except Exception as error:  # a foreign source may fail in any way; its user is told, the others go on
+            message = f"{where}: {type(error).__name__}: {error}"
+            self.problems.append(Problem(name, origin, str(where), message))
+
+
+def _law_files(folder: Path) -> Iterator[Path]:
+    """Yield the law files of a folder and of its subfolders friction, ageing, modifier and interface."""
+    if folder.is_file():
+        yield folder
+        return
+    for place in (folder, *(folder / kind for kind in KINDS)):
+        if place.is_dir():
+            yield from sorted(
+                p for p in place.iterdir() if p.suffix in (".toml", ".py") and not p.name.startswith(("_", "."))
+            )
+
+
+def _has_laws(place: Path) -> bool:
+    return place.is_dir() and any(path.suffix == ".toml" for path in _law_files(place))
+
+
+def _without_import(module: str) -> Path:
+    """Return the file or folder of a module; only the finder of its top-level package is asked, nothing is imported."""
+    top, *rest = module.split(".")
+    spec = importlib.util.find_spec(top)
+    if spec is None:
+        raise SrfError(f"entry point names the module {module}, which is not installed")
+    roots = [Path(p) for p in spec.submodule_search_locations or ()]
+    if not rest:
+        return roots[0] if roots else Path(str(spec.origin))
+    for root in roots:
+        place = root.joinpath(*rest)
+        for candidate in (place, place.with_suffix(".py")):
+            if candidate.is_dir() or candidate.is_file():
+                return candidate
+    raise SrfError(f"entry point names {module}, which is not in the package {top}")
