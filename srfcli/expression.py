@@ -94,7 +94,7 @@ RESERVED = frozenset(
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _TOKEN = re.compile(
     r"(?P<space>\s+)|(?P<name>[A-Za-z_][A-Za-z0-9_]*)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
-    r"|(?P<op>\*\*|[-+*/(),])",
+    r"|(?P<op>\*\*|/(?!/)|[-+*(),])",
     re.ASCII,
 )
 _ADVICE = {
@@ -162,7 +162,8 @@ class _Reader:
         try:
             tree = ast.parse(code.lstrip(), mode="eval")
         except (SyntaxError, ValueError, MemoryError) as error:
-            column = min(lead + (getattr(error, "offset", None) or 1) - 1, len(code.rstrip()))
+            end = len(code.rstrip())
+            column = end if code[end - 1] in "+-*/" else min(lead + (getattr(error, "offset", None) or 1) - 1, end)
             self.fail("the formula breaks off or has an operator too many", column)
         for node in ast.walk(tree.body):
             if hasattr(node, "col_offset"):
@@ -219,8 +220,8 @@ class _Reader:
             self.fail("this bracket is never closed", opened[-1])
 
     def unreadable(self, position: int) -> NoReturn:
-        sign = self.text[position]
-        hint = _ADVICE.get(self.text[position : position + 2]) or _ADVICE.get(sign)
+        sign = next((s for s in _ADVICE if self.text.startswith(s, position)), self.text[position])
+        hint = _ADVICE.get(sign)
         self.fail(f"{sign!r} is not part of a formula", position, hint + "." if hint else _LANGUAGE + ".")
 
     def build(self, node: ast.AST, depth: int) -> sympy.Expr:

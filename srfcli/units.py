@@ -87,9 +87,13 @@ def convert(number: float, written: str, unit: str, *, name: str) -> float:
     if source.powers != target.powers:
         expected = "a plain number" if unit == "1" else f"{unit}, or a unit of the same dimension"
         raise SrfError(f"{where}: {written!r} is the wrong unit", f"Write {name} in {expected}.")
-    ratio = source.factor / target.factor
-    tidy = float(f"{ratio:.12g}")  # N/mm -> N/um is 1e-3, not 0.0010000000000000002
-    return number * (tidy if math.isclose(ratio, tidy, rel_tol=1e-14) else ratio)
+    return number * tidy(source.factor / target.factor)  # N/mm -> N/um is 1e-3, not 0.0010000000000000002
+
+
+def tidy(value: float) -> float:
+    """Return the number of twelve digits that `value` misses by rounding alone, else `value` itself."""
+    round_number = float(f"{value:.12g}")
+    return round_number if math.isclose(value, round_number, rel_tol=1e-14) else value
 
 
 def find_unit(text: str, *, where: str = "") -> Unit:

@@ -12,7 +12,7 @@ import click
 from srfcli.errors import SrfError
 from srfcli.laws import Parameter
 from srfcli.settings import check_value, require_parameter
-from srfcli.units import convert, parse_quantity, split_quantity, to_base
+from srfcli.units import convert, parse_quantity, split_quantity, tidy, to_base
 
 DEFAULT_POINTS = 60
 MAX_POINTS = 1_000_000
@@ -41,9 +41,9 @@ class Range:
         steps = self.n - 1
         if self.spacing == "log":
             ratio = math.log(self.hi / self.lo)
-            inner = [self.lo * math.exp(ratio * i / steps) for i in range(1, steps)]
+            inner = [tidy(self.lo * math.exp(ratio * i / steps)) for i in range(1, steps)]
         else:
-            inner = [self.lo + (self.hi - self.lo) * i / steps for i in range(1, steps)]
+            inner = [tidy(self.lo + (self.hi - self.lo) * i / steps) for i in range(1, steps)]
         return [self.lo, *inner, self.hi]
 
     def fitted(self, parameters: Sequence[Parameter], *, where: str = "this system") -> Range:

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import Array, Condensed, Discretisation, condense, expand, gauss, stage_parameters
-from srfcli.numerics.orbit import ordered_eigenvalues, scales, step_limit
+from srfcli.numerics.collocation import Array, ComplexArray, Condensed, Discretisation, condense, gauss, stage_parameters
 
 Names = tuple[str, ...]
 
@@ -29,9 +28,9 @@ class BoundaryLinear:
     condensed: Condensed
     periodic: Array
     growth: Array
-    rho: Array
+    rho: ComplexArray
     g: Array
-    multipliers: Array
+    multipliers: ComplexArray
 
 
 def pick_multiplier(multipliers: Array, target: Array) -> Array:
@@ -40,8 +39,13 @@ def pick_multiplier(multipliers: Array, target: Array) -> Array:
     return np.argmin(distance, axis=-1)
 
 
-def linearise_boundary(model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array) -> BoundaryLinear:
-    """Return the linearisation of {periodicity, ln |rho| = 0}; rho is the multiplier nearest to `target` (...,)."""
+def linearise_boundary(
+    model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array, growth: Array | None = None
+) -> BoundaryLinear:
+    """Return the linearisation of {periodicity, ln |rho| = 0}; rho is the multiplier nearest to `target` (...,).
+
+    A `growth` row from a nearby point, where given, is used in place of a new one: the step is then a chord step.
+    """
     n = orbit.x.shape[-1]
     condensed = condense(model, p, orbit, names)
     M = condensed.monodromy
@@ -49,10 +53,11 @@ def linearise_boundary(model: GeneratedModel, p: Array, orbit: Discretisation, n
     values, right_vectors = values.astype(complex), right_vectors.astype(complex)
     chosen = pick_multiplier(values, target)
     rho = np.take_along_axis(values, chosen[..., None], -1)[..., 0]
-    r = np.take_along_axis(right_vectors, chosen[..., None, None], -1)[..., 0]
-    left_vectors = np.linalg.inv(right_vectors)  # rows l with l . r = 1
-    l = np.take_along_axis(left_vectors, chosen[..., None, None], -2)[..., 0, :]
-    growth = _growth_row(model, p, orbit, condensed, names, rho, r, l)
+    if growth is None:
+        r = np.take_along_axis(right_vectors, chosen[..., None, None], -1)[..., 0]
+        left_vectors = np.linalg.inv(right_vectors)  # rows l with l . r = 1
+        l = np.take_along_axis(left_vectors, chosen[..., None, None], -2)[..., 0, :]
+        growth = _growth_row(model, p, orbit, condensed, names, rho, r, l)
     end = condensed.prefix[..., -1, :n, :].copy()
     index = np.arange(n)
     end[..., index, index] -= 1

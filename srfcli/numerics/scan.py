@@ -6,7 +6,6 @@ against the error of interpolating it; there the line is halved, down to a state
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,7 +105,7 @@ def scan_line(
         wanted = np.nonzero(_suspects(position, scan.g, resolution))[0]
         if not wanted.size:
             break
-        scan = _halve(model, base, scan, wanted, log)
+        scan = halve(model, base, scan, wanted, log=log)
     suspects = _suspects(coordinate(scan.values), scan.g, 0.0)
     gaps = np.diff(coordinate(scan.values))
     scan.resolution = float(gaps[suspects].max()) if suspects.any() else float(resolution)
@@ -139,7 +138,7 @@ def _polynomial_at(xs: Array, ys: Array, x: float) -> float:
     return total
 
 
-def _halve(model: GeneratedModel, base: Array, scan: LineScan, wanted: Array, log: bool) -> LineScan:
+def halve(model: GeneratedModel, base: Array, scan: LineScan, wanted: Array, *, log: bool) -> LineScan:
     """Return `scan` with the intervals `wanted` halved."""
     a, b = scan.values[wanted], scan.values[wanted + 1]
     middle = np.sqrt(a * b) if log else 0.5 * (a + b)
@@ -160,15 +159,3 @@ def _halve(model: GeneratedModel, base: Array, scan: LineScan, wanted: Array, lo
         join([scan.orbit, batch.orbit]).part(order),
         scan.resolution,
     )
-
-
-def bifurcation_type(rho: complex) -> str:
-    """Return `ns`, `pd` or `fold` for a critical multiplier: off the real axis, at -1, at +1."""
-    if abs(rho.imag) > 1e-7 * abs(rho):
-        return "ns"
-    return "pd" if rho.real < 0 else "fold"
-
-
-def any_lost(scans: Iterable[LineScan]) -> int:
-    """Return how many samples of several scans found no orbit."""
-    return sum(len(s.lost) for s in scans)

@@ -7,7 +7,7 @@ import importlib.util
 import io
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,8 @@ from srfcli.output.files import check_target, write_atomic
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+Values = Collection[Any]  # a list or an array of numbers; None or NaN is a gap
 
 SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -161,17 +163,18 @@ def _frame_curves(ax: Axes) -> None:
     ax.set_ylim(min(0.0, low), high + 0.12 * (high - min(0.0, low)))
 
 
-def _gaps(values: Sequence[float | None]) -> list[float]:
+def _gaps(values: Values) -> list[float]:
     return [float("nan") if v is None else float(v) for v in values]
 
 
-def _is_closed(x: Sequence[float], y: Sequence[float | None]) -> bool:
+def _is_closed(x: Values, y: Values) -> bool:
     """Return whether a curve ends where it began, to drawing accuracy."""
-    ends = [(float(x[i]), _gaps(y)[i]) for i in (0, -1)] if len(x) > 2 else []
+    points = list(zip(map(float, x), _gaps(y), strict=True))
+    ends = (points[0], points[-1]) if len(points) > 2 else ()
     return bool(ends) and all(math.isclose(a, b, rel_tol=1e-6) for a, b in zip(*ends, strict=True))
 
 
-def _shade_above(ax: Axes, x: Sequence[float], y: Sequence[float | None], colour: str) -> None:
+def _shade_above(ax: Axes, x: Values, y: Values, colour: str) -> None:
     """Shade between an open curve and the top, which is right through folds too: no curve crosses itself."""
     points = [(float(a), b) for a, b in zip(x, _gaps(y), strict=True) if b == b]
     if len(points) < 2 or _is_closed(x, y):
@@ -186,8 +189,8 @@ def _shade_above(ax: Axes, x: Sequence[float], y: Sequence[float | None], colour
 
 
 def lines(
-    x: Sequence[float],
-    ys: Sequence[Sequence[float | None]],
+    x: Values,
+    ys: Sequence[Values],
     labels: Sequence[str],
     xlabel: str,
     ylabel: str,
@@ -203,7 +206,7 @@ def lines(
             drawn = _gaps(y)
             marker = "o" if len(drawn) == 1 else None
             colour, dash = COLOURS[index % len(COLOURS)], DASHES[index % len(DASHES)]
-            ax.plot(x, drawn, color=colour, linestyle=dash, label=label, marker=marker, markersize=4)
+            ax.plot(_gaps(x), drawn, color=colour, linestyle=dash, label=label, marker=marker, markersize=4)
         if logx:
             ax.set_xscale("log")
         if logy:
@@ -216,23 +219,23 @@ def lines(
 
 
 def orbit(
-    tau: Sequence[float],
+    tau: Values,
     *,
-    u: Sequence[float],
-    v: Sequence[float],
-    states: Mapping[str, Sequence[float]],
-    mu: Sequence[float],
-    W: Sequence[float],
+    u: Values,
+    v: Values,
+    states: Mapping[str, Values],
+    mu: Values,
+    W: Values,
     title: str = "",
 ) -> Figure:
     """Return one forced period, panels over tau in periods: u (um), v (um/s, logarithmic), ages (s), mu and W (N)."""
-    panels: list[tuple[str, Sequence[float], bool]] = [("u  [µm]", u, False), ("v  [µm/s]", v, True)]
+    panels: list[tuple[str, Values, bool]] = [("u  [µm]", u, False), ("v  [µm/s]", v, True)]
     panels += [(f"{_greek(name)}  [s]", values, True) for name, values in states.items()]
     panels += [("µ", mu, False), ("W  [N]", W, False)]
     with house_style():
         figure, axes = new_figure(len(panels), size=(6.0, 1.15 * len(panels) + 0.9))
         for index, (ax, (label, values, log)) in enumerate(zip(axes, panels, strict=True)):
-            ax.plot(tau, values, color=COLOURS[index % len(COLOURS)])
+            ax.plot(_gaps(tau), _gaps(values), color=COLOURS[index % len(COLOURS)])
             if log:
                 ax.set_yscale("log")
             else:

@@ -1,0 +1,212 @@
+"""Tables, records, files, figures and sidecars: full precision, no NaN, whole files, equal bytes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import stat
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from srfcli.errors import SrfError
+from srfcli.laws import Law
+from srfcli.output import plots
+from srfcli.output.files import check_target, write_atomic
+from srfcli.output.provenance import Provenance, describe, sidecar_path, write_sidecar
+from srfcli.output.records import to_csv, to_json
+from srfcli.output.tables import Column, Table, print_terminal, to_text
+from srfcli.status import Status
+
+COLUMNS = (Column("V", "um/s", "driving velocity", ".4g"), Column("W0", "N"), Column("type"), Column("status"))
+ROWS = [
+    (0.1 + 0.2, np.float64(9.123456789012344), "ns", Status.OK),
+    (np.int64(7), float("nan"), None, Status.NO_CONVERGENCE),
+    (1e300, np.inf, "a, [b]", Status.OK),
+]
+TABLE = Table("srf.test/1", COLUMNS, ROWS, title="a title", notes=("one", "two"), parameters={"K": {"value": np.nan}})
+
+
+def test_csv_has_bare_names_and_full_precision() -> None:
+    rows = list(csv.reader(io.StringIO(to_csv(TABLE))))
+    assert rows[0] == ["V", "W0", "type", "status"]
+    assert rows[1] == ["0.30000000000000004", "9.123456789012344", "ns", "ok"]
+    assert rows[2] == ["7", "", "", "no-convergence"]
+    assert rows[3] == ["1e+300", "", "a, [b]", "ok"]
+
+
+def test_json_has_no_nan_and_is_an_envelope() -> None:
+    def refuse(word: str) -> None:
+        raise AssertionError(word)
+
+    data = json.loads(to_json(TABLE), parse_constant=refuse)
+    assert list(data)[:4] == ["schema", "version", "title", "status"]
+    assert data["rows"][0] == {"V": 0.1 + 0.2, "W0": 9.123456789012344, "type": "ns", "status": "ok"}
+    assert data["rows"][1]["W0"] is None and data["rows"][2]["W0"] is None
+    assert data["columns"]["V"] == {"unit": "um/s", "about": "driving velocity"}
+    assert data["parameters"] == {"K": {"value": None}} and data["notes"] == ["one", "two"]
+    assert json.loads(to_json(Table("s", COLUMNS, [])))["rows"] == []
+    assert to_json(TABLE) == to_json(TABLE)
+
+
+def test_json_of_arrays_and_complex_meta() -> None:
+    meta = {"a": np.array([1.0, np.nan]), "b": np.bool_(True), "c": 1 + 2j, "p": Path("x"), "s": {"b", "a"}}
+    data = json.loads(to_json(Table("s", (), [], meta=meta)))
+    assert data["meta"] == {"a": [1.0, None], "b": True, "c": {"re": 1.0, "im": 2.0}, "p": "x", "s": ["a", "b"]}
+
+
+def test_plain_text_is_never_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    wide = Table("s", (Column("x"), Column("long")), [(1 / 3, "w" * 300)])
+    assert "w" * 300 in to_text(wide) and "0.3333333333333333" in to_text(wide)
+    lines = to_text(TABLE).splitlines()
+    assert lines[0] == "a title" and lines[1].split() == ["V", "[um/s]", "W0", "[N]", "type", "status"]
+    assert "inf" in lines[4] and lines[-1] == "Note: two"
+
+
+@pytest.mark.parametrize(("columns", "drawn"), [("120", True), ("20", False)])
+def test_a_terminal_gets_rich_only_where_it_fits(monkeypatch: pytest.MonkeyPatch, columns: str, drawn: bool) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    monkeypatch.setenv("TERM", "xterm")
+    stream = io.StringIO()
+    print_terminal(TABLE, stream)
+    assert ("─" in stream.getvalue()) == drawn
+    assert "a, [b]" in stream.getvalue() and "no-convergence" in stream.getvalue() and "…" not in stream.getvalue()
+
+
+def test_a_row_of_the_wrong_length_is_refused() -> None:
+    with pytest.raises(ValueError, match="a row of 1 cells under 4 columns"):
+        Table("s", COLUMNS, [(1,)])
+
+
+def test_an_atomic_write_leaves_the_old_file_on_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = tmp_path / "x.csv"
+    write_atomic(place, "old")
+    monkeypatch.setattr(os, "fsync", lambda _fd: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        write_atomic(place, "new")
+    assert place.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == ["x.csv"]
+
+
+def test_a_reader_never_sees_half_a_file(tmp_path: Path) -> None:
+    place, seen, done = tmp_path / "x", set(), threading.Event()
+    texts = {letter * 200_000 for letter in "ab"}
+    write_atomic(place, "a" * 200_000)
+
+    def read() -> None:
+        while not done.is_set():
+            seen.add(place.read_text())
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for _ in range(10):
+        for text in texts:
+            write_atomic(place, text)
+    done.set()
+    reader.join()
+    assert seen <= texts
+
+
+def test_modes_links_and_devices(tmp_path: Path) -> None:
+    place, link = tmp_path / "x", tmp_path / "link"
+    mask = os.umask(0o027)
+    try:
+        write_atomic(place, "1")
+    finally:
+        os.umask(mask)
+    assert stat.S_IMODE(place.stat().st_mode) == 0o640
+    link.symlink_to(place)
+    write_atomic(link, "2")
+    assert link.is_symlink() and place.read_text() == "2" and stat.S_IMODE(place.stat().st_mode) == 0o640
+    write_atomic(Path(os.devnull), "3")
+    check_target(Path(os.devnull), force=False)
+    assert stat.S_ISCHR(Path(os.devnull).stat().st_mode)
+
+
+def test_targets_are_refused_with_a_way_out(tmp_path: Path) -> None:
+    (tmp_path / "x").write_text("")
+    for path, said in (
+        (tmp_path / "x", "exists already"),
+        (tmp_path, "is a directory"),
+        (tmp_path / "n" / "x", "mkdir -p"),
+    ):
+        with pytest.raises(SrfError) as caught:
+            check_target(path, force=False)
+        assert said in f"{caught.value.message} {caught.value.hint}"
+    check_target(tmp_path / "x", force=True)
+
+
+def test_a_sidecar_is_stable_but_for_its_timings(tmp_path: Path) -> None:
+    source, place = tmp_path / "law.toml", tmp_path / "x.csv"
+    source.write_text("mu = 'mu0'")
+    kept: dict[str, Any] = {
+        "arguments": ("linear",),
+        "laws": (Law("l", source=str(source)),),
+        "inputs": (source,),
+        "seed": 3,
+    }
+    first, second = (Provenance(**kept, timings={"solve": t}) for t in (0.1, 0.2))
+    assert describe(first) == describe(second)
+    texts = [write_sidecar(place, b"abc", p).read_text() for p in (first, second)]
+    assert texts[0] != texts[1]
+    assert texts[0].split('"timings"')[0] == texts[1].split('"timings"')[0]
+    data = json.loads(sidecar_path(place).read_text())
+    assert list(data)[-1] == "timings" and data["seed"] == 3 and data["arguments"] == ["linear"]
+    assert data["laws"][0]["sha256"] == data["inputs"][str(source)] is not None
+    assert data["sha256"].startswith("ba7816bf") and {"srf", "python", "numpy"} <= set(data["versions"])
+
+
+V = np.geomspace(1, 100, 30)
+HOPF = {"V": V, "K_over_W0": [None, *(0.06 * V[1:] ** -0.25)]}
+BRANCHES = [{"eps": e, "V": V, "K_over_W0": 0.05 * V**-0.25 * (1 - e), "component": 1} for e in (0.09, 0.18)]
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".pdf", ".png"])
+def test_equal_figures_have_equal_bytes(suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("matplotlib")
+    first = plots.save_figure(plots.stability_diagram(BRANCHES, hopf=HOPF, title="t"), tmp_path / f"a{suffix}")
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1000000000")
+    second = plots.figure_bytes(plots.stability_diagram(BRANCHES, hopf=HOPF, title="t"), suffix)
+    assert first == second == (tmp_path / f"a{suffix}").read_bytes()
+
+
+def test_the_users_matplotlibrc_does_not_leak_in_or_out() -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    with matplotlib.rc_context({"lines.linewidth": 9.0}):
+        figure = plots.lines(V, [V], ["v"], "x", "y", True)
+        assert figure.axes[0].lines[0].get_linewidth() == plots.STYLE["lines.linewidth"]
+        assert matplotlib.rcParams["lines.linewidth"] == 9.0
+
+
+def test_only_a_single_open_curve_is_shaded() -> None:
+    pytest.importorskip("matplotlib")
+    angle = np.linspace(0, 2 * np.pi, 50)
+    closed = {"eps": 0.1, "V": 10 * np.exp(0.1 * np.cos(angle)), "K_over_W0": 0.02 + 0.01 * np.sin(angle)}
+    counts = [
+        len(plots.stability_diagram(b, hopf=HOPF).axes[0].patches) for b in ([], BRANCHES[:1], BRANCHES, [closed])
+    ]
+    assert counts == [1, 1, 0, 0]
+    dashes = [line.get_linestyle() for line in plots.stability_diagram(BRANCHES).axes[0].lines]
+    assert len(set(dashes)) == 2  # colour never carries meaning alone
+
+
+def test_an_orbit_has_a_panel_for_each_variable() -> None:
+    pytest.importorskip("matplotlib")
+    t = np.linspace(0, 1, 20)
+    figure = plots.orbit(t, u=t, v=t + 1, states={"phi": t + 1, "phi_2": t + 1}, mu=t, W=t)
+    assert [ax.get_yscale() for ax in figure.axes] == ["linear", "log", "log", "log", "linear", "linear"]
+    assert all("[" in ax.get_ylabel() for ax in figure.axes if ax.get_ylabel() != "µ")
+
+
+def test_a_plot_is_refused_before_anything_is_computed(tmp_path: Path) -> None:
+    for name, said in (("x.jpg", "ends in '.jpg'"), ("x", "has no ending")):
+        with pytest.raises(SrfError, match=said):
+            plots.check_plot(tmp_path / name, force=False)
+    (tmp_path / "x.svg").write_text("")
+    with pytest.raises(SrfError, match="exists already"):
+        plots.check_plot(tmp_path / "x.svg", force=False)
