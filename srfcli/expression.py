@@ -19,6 +19,8 @@ MAX_DIGITS = 40
 MAX_DECIMAL_EXPONENT = 100
 MAX_POWER = 512
 MAX_BITS = 2048
+MAX_ROOT = 1000
+MAX_PLAIN = 100
 MAX_NAME = 32
 
 
@@ -86,6 +88,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "lambertw": sympy.LambertW,
     "LambertW": sympy.LambertW,
 }
+_HYPERBOLIC = frozenset({"sinh", "cosh", "tanh", "asinh", "atan"})
 # Names that generated modules use themselves; a parameter of that name would shadow them.
 RESERVED = frozenset(
     {"np", "numpy", "x", "t", "tau", "p", "out", "pi", "sin", "cos", "tan", "arctan", "arcsinh", *FUNCTIONS}
@@ -139,10 +142,11 @@ def parse_expression(text: str, known: Iterable[str]) -> sympy.Expr:
         raise ExpressionError(f"the formula has {len(text)} characters, at most {MAX_CHARS} are read", text="")
     reader = _Reader(text, known)
     try:
-        result = reader.read()
+        return reader.read()
     except RecursionError:
         raise ExpressionError("the formula is nested too deeply", "Split it up.", text=text) from None
-    return result
+    except (ArithmeticError, TypeError, ValueError, NotImplementedError) as error:  # sympy on constants without sense
+        raise ExpressionError(f"the formula cannot be computed: {error}", text=text) from None
 
 
 class _Reader:
@@ -271,9 +275,13 @@ class _Reader:
             case ast.Mult():
                 return left * right
             case ast.Div():
+                if right.is_zero:
+                    self.fail("this constant is zero", node.right.col_offset)
                 return left / right
             case ast.Pow():
                 self.bound_power(left, right, node.right.col_offset)
+                if left.is_zero and not right.is_positive:
+                    self.fail("this is a power of zero", node.col_offset)
                 return left**right
         self.fail("this operator is not part of a formula", node.col_offset, _LANGUAGE + ".")
 
@@ -283,8 +291,11 @@ class _Reader:
         sympy distributes (2 x)**n and joins (x**m)**n, so the constants inside a symbolic base count too.
         """
         size = max((abs(n) for n in exponent.atoms(sympy.Rational)), default=sympy.S.One)
+        root = max((n.q for n in exponent.atoms(sympy.Rational)), default=1)
         if exponent.is_Rational and size > MAX_POWER:
             self.fail(f"the exponent is beyond {MAX_POWER}", column)
+        if _bits(base) and root > MAX_ROOT:  # 9**(1e-9) is a root of degree 1e9 to sympy
+            self.fail("the exponent of this constant has too many decimals", column, "Make it a parameter.")
         if _bits(base) * max(size, sympy.S.One) > MAX_BITS or _bits(exponent) > MAX_BITS:
             self.fail("the constants of this power are too large to compute exactly", column)
 
@@ -302,6 +313,12 @@ class _Reader:
             self.bound_power(argument, argument, column)
         if argument.is_number and abs(_value(argument)) > 700:
             self.fail(f"the constant argument of '{word}' is out of range", column)
+        if argument.is_number and argument.has(sympy.Function):  # sympy may ponder the sign of log(cosh(9) - ...) for long
+            self.fail(f"'{word}' is taken of a constant that holds a function", column, "Write the number.")
+        # where sympy does not know a power to be real it divides polynomials of the degree of its exponents
+        long = any(abs(n.p) > MAX_PLAIN or n.q > MAX_PLAIN for n in argument.atoms(sympy.Rational))
+        if word in _HYPERBOLIC and argument.is_real is None and long:
+            self.fail(f"the constants in the argument of '{word}' are too long", column, "Make them parameters.")
         return self.checked(FUNCTIONS[word](argument), column)
 
     def checked(self, result: sympy.Expr, column: int) -> sympy.Expr:

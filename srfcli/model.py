@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -39,16 +40,21 @@ class GeneratedModel:
             raise AttributeError(f"generated model has no function '{name}'")
         return function
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Return the parameters' names, in order."""
         return tuple(p.name for p in self.parameters)
 
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
     def index(self, name: str) -> int:
         """Return the place of parameter `name`; SrfError where there is none."""
-        if name not in self.names:
+        place = self._places.get(name)
+        if place is None:
             raise SrfError(f"unknown parameter '{name}' in {self.title}", did_you_mean(name, self.names))
-        return self.names.index(name)
+        return place
 
     def cycle_parameter(self, name: str) -> Function:
         """Return d(cycle)/d(name) as a function of (tau, x, p)."""

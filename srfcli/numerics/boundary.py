@@ -96,3 +96,13 @@ def _growth_row(
         row_total[..., n + 1 + column] += (scale * np.sum(mixed, axis=(-1, -2))).real
     assert row_total.shape[-1] == n + 1 + k
     return row_total
+
+
+def slope_in_last(linear: BoundaryLinear) -> Array:
+    """Return d ln|rho| / d(last parameter) along the branch of orbits, the other parameters fixed, (...,)."""
+    n = linear.periodic.shape[-2]
+    inner = linear.periodic[..., :n]
+    usable = np.isfinite(inner).all(axis=(-1, -2))
+    usable &= np.abs(np.linalg.det(np.where(usable[..., None, None], inner, 0.0))) > 1e-300
+    response = np.linalg.solve(np.where(usable[..., None, None], inner, np.eye(n)), linear.periodic[..., -1:])[..., 0]
+    return linear.growth[..., -1] - np.einsum("...n,...n->...", linear.growth[..., :n], response)

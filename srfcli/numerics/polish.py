@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from srfcli.model import GeneratedModel
-from srfcli.numerics.boundary import BoundaryLinear, linearise_boundary
+from srfcli.numerics.boundary import BoundaryLinear, linearise_boundary, slope_in_last
 from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, expand, join
 from srfcli.numerics.orbit import interpolate, scales, step_limit, uniform_mesh
 from srfcli.status import Status
@@ -111,15 +111,21 @@ def polish(
     *,
     tol: float = 1e-8,
     max_mesh: int = 512,
+    near: bool = False,
 ) -> list[BoundaryPoint]:
     """Return boundary points near `p` (n_parameters, B), moved along `direction`, on meshes doubled until `tol` is met.
 
-    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess. A point that does not converge, or whose
-    estimated error stays above `tol` on `max_mesh` intervals, says so in its status.
+    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess; with `near` they are taken for the solution on
+    their own mesh, and what they lack counts as an error of that mesh. A point that does not converge, or whose estimated
+    error stays above `tol` on `max_mesh` intervals, says so in its status.
     """
     points: list[BoundaryPoint | None] = [None] * p.shape[1]
     index = np.arange(p.shape[1])
-    coarse = _newton(model, p, orbit, target, direction)
+    if near:
+        nothing = np.zeros(p.shape[1])
+        coarse = _Polished(p, orbit, target, nothing, nothing, nothing, nothing, np.ones(p.shape[1], bool))
+    else:
+        coarse = _newton(model, p, orbit, target, direction)
     while index.size:
         N = coarse.orbit.x.shape[-2]
         finer = interpolate(coarse.orbit, uniform_mesh(2 * N))
@@ -203,7 +209,7 @@ def _newton_chunk(
             dx, dstages = expand(linear.condensed, step[:, :n], dq[:, None] * unit)
             limit = step_limit(model, dx, dstages)
             change = np.abs(dx / scales(model, q)[:, None, :]).max(axis=(-1, -2))
-            slope[active] = _slope_in_last(linear, n) * q[rows[-1]]
+            slope[active] = slope_in_last(linear) * q[rows[-1]]
         rho[active] = linear.rho
         others[active] = _largest_other(linear.multipliers, linear.rho)
         usable = finite & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
@@ -230,15 +236,6 @@ def _bordered(linear: BoundaryLinear, unit: Array, n: int) -> tuple[Array, Array
     matrix[:, n, n] = np.einsum("bk,bk->b", linear.growth[..., n + 1 :], unit)
     right = -np.concatenate([linear.periodic[..., n], (linear.g + linear.growth[..., n])[:, None]], axis=-1)
     return matrix, right
-
-
-def _slope_in_last(linear: BoundaryLinear, n: int) -> Array:
-    """Return d ln|rho| / d(last parameter) along the branch of orbits, the other parameters fixed."""
-    inner = linear.periodic[..., :n]
-    usable = np.isfinite(inner).all(axis=(-1, -2))
-    usable &= np.abs(np.linalg.det(np.where(usable[:, None, None], inner, 0.0))) > 1e-300
-    response = np.linalg.solve(np.where(usable[:, None, None], inner, np.eye(n)), linear.periodic[..., -1:])[..., 0]
-    return linear.growth[..., -1] - np.einsum("bn,bn->b", linear.growth[..., :n], response)
 
 
 def _largest_other(multipliers: ComplexArray, rho: ComplexArray) -> Array:
