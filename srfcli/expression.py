@@ -313,7 +313,9 @@ class _Reader:
             self.bound_power(argument, argument, column)
         if argument.is_number and abs(_value(argument)) > 700:
             self.fail(f"the constant argument of '{word}' is out of range", column)
-        if argument.is_number and argument.has(sympy.Function):  # sympy may ponder the sign of log(cosh(9) - ...) for long
+        if argument.is_number and argument.has(
+            sympy.Function
+        ):  # sympy may ponder the sign of log(cosh(9) - ...) for long
             self.fail(f"'{word}' is taken of a constant that holds a function", column, "Write the number.")
         # where sympy does not know a power to be real it divides polynomials of the degree of its exponents
         long = any(abs(n.p) > MAX_PLAIN or n.q > MAX_PLAIN for n in argument.atoms(sympy.Rational))

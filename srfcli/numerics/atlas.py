@@ -166,7 +166,8 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
     p = np.stack([pt.p for pt in pts], axis=1)
     orbit = Discretisation(np.stack([pt.orbit.x for pt in pts]), np.stack([pt.orbit.stages for pt in pts]), pts[0].orbit.edges)
     rho = np.array([pt.rho for pt in pts])
-    polished = polish(model, p, orbit, rho, direction, tol=settings.tol, max_mesh=settings.max_mesh, near=True)
+    growth = np.stack([pt.growth for pt in pts])
+    polished = polish(model, p, orbit, rho, direction, tol=settings.tol, max_mesh=settings.max_mesh, growth=growth)
     branches, part = [], []
     for point in polished:
         if point.others < 1.0:

@@ -50,6 +50,7 @@ class CurvePoint:
     others: float
     tangent_q: Array
     tangent_orbit: Discretisation
+    growth: Array
     slope_y: float = 0.0
     step: float = 0.0
     correction: float = 0.0
@@ -132,7 +133,7 @@ def correct(
             moduli = np.abs(linear.multipliers)
             pair = np.minimum(np.abs(linear.multipliers - rho), np.abs(linear.multipliers - np.conj(rho))) < 1e-9
             others = float(np.where(pair, 0.0, moduli).max())
-            point = CurvePoint(q, plane.point(model, q), orbit, rho, others, tangent_full[n:], tangent_orbit, slope_y, correction=first)
+            point = CurvePoint(q, plane.point(model, q), orbit, rho, others, tangent_full[n:], tangent_orbit, growth, slope_y, correction=first)
             return _normalised(model, point, orientation)
         growth = None if change > STALE * reach or change > 0.05 else growth
     return None

@@ -92,6 +92,7 @@ class _Polished:
     p: Array
     orbit: Discretisation
     rho: ComplexArray
+    growth: Array
     residual: Array
     others: Array
     slope: Array
@@ -99,7 +100,7 @@ class _Polished:
     converged: Array
 
 
-_POINTWISE = ("rho", "residual", "others", "slope", "moved", "converged")
+_POINTWISE = ("rho", "growth", "residual", "others", "slope", "moved", "converged")
 
 
 def polish(
@@ -111,25 +112,25 @@ def polish(
     *,
     tol: float = 1e-8,
     max_mesh: int = 512,
-    near: bool = False,
+    growth: Array | None = None,
 ) -> list[BoundaryPoint]:
     """Return boundary points near `p` (n_parameters, B), moved along `direction`, on meshes doubled until `tol` is met.
 
-    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess; with `near` they are taken for the solution on
-    their own mesh, and what they lack counts as an error of that mesh. A point that does not converge, or whose estimated
-    error stays above `tol` on `max_mesh` intervals, says so in its status.
+    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess. With the gradients `growth` (B, n+1+k) of
+    ln |rho| they are taken for the solution on their own mesh, and what they lack counts as an error of that mesh. A point
+    that does not converge, or whose estimated error stays above `tol` on `max_mesh` intervals, says so in its status.
     """
     points: list[BoundaryPoint | None] = [None] * p.shape[1]
     index = np.arange(p.shape[1])
-    if near:
+    if growth is not None:
         nothing = np.zeros(p.shape[1])
-        coarse = _Polished(p, orbit, target, nothing, nothing, nothing, nothing, np.ones(p.shape[1], bool))
+        coarse = _Polished(p, orbit, target, growth, nothing, nothing, nothing, nothing, np.ones(p.shape[1], bool))
     else:
-        coarse = _newton(model, p, orbit, target, direction)
+        coarse = _newton(model, p, orbit, target, direction, None, tol)
     while index.size:
         N = coarse.orbit.x.shape[-2]
         finer = interpolate(coarse.orbit, uniform_mesh(2 * N))
-        fine = _newton(model, coarse.p, finer, coarse.rho, direction.part(index))
+        fine = _newton(model, coarse.p, finer, coarse.rho, direction.part(index), coarse.growth, tol)
         error = np.abs(fine.moved) / RELIED_ON + 1e-12
         converged = coarse.converged & fine.converged
         done = (converged & (error <= tol)) | ~fine.converged | (4 * N > max_mesh)
@@ -163,11 +164,20 @@ def _select(r: _Polished, keep: Array) -> _Polished:
     return _Polished(r.p[:, keep], r.orbit.part(keep), *fields)
 
 
-def _newton(model: GeneratedModel, p: Array, orbit: Discretisation, target: ComplexArray, direction: Direction) -> _Polished:
+def _newton(
+    model: GeneratedModel,
+    p: Array,
+    orbit: Discretisation,
+    target: ComplexArray,
+    direction: Direction,
+    growth: Array | None,
+    tol: float,
+) -> _Polished:
     parts = []
     for a in range(0, p.shape[1], CHUNK):
         cut = slice(a, a + CHUNK)
-        parts.append(_newton_chunk(model, p[:, cut], orbit.part(cut), target[cut], direction.part(cut)))
+        known = None if growth is None else growth[cut]
+        parts.append(_newton_chunk(model, p[:, cut], orbit.part(cut), target[cut], direction.part(cut), known, tol))
     if len(parts) == 1:
         return parts[0]
     fields = (np.concatenate([getattr(q, k) for q in parts]) for k in _POINTWISE)
@@ -180,28 +190,35 @@ def _newton_chunk(
     orbit: Discretisation,
     target: ComplexArray,
     direction: Direction,
+    growth: Array | None,
+    tol: float,
     *,
-    max_iterations: int = 12,
+    max_iterations: int = 14,
 ) -> _Polished:
-    """Solve {periodicity, ln |rho| = 0} in (orbit, distance along `direction`) for a batch on one mesh."""
-    p, x, stages = p.copy(), orbit.x.copy(), orbit.stages.copy()
-    B, n = p.shape[1], x.shape[-1]
+    """Solve {periodicity, ln |rho| = 0} in (orbit, distance along `direction`) for a batch on one mesh.
+
+    Known gradients `growth` make chord steps, which are kept up while they gain a factor of ten each.
+    """
+    B, n = p.shape[1], orbit.x.shape[-1]
     rows = [model.index(name) for name in direction.names]
-    rho, residual, others, slope = target.astype(complex).copy(), np.full(B, np.inf), np.full(B, np.nan), np.full(B, np.nan)
-    moved, converged, active = np.zeros(B), np.zeros(B, bool), np.arange(B)
+    r = _Polished(
+        p.copy(), Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges), target.astype(complex).copy(),
+        np.full((B, n + 1 + len(rows)), np.nan) if growth is None else growth.copy(),
+        np.full(B, np.inf), np.full(B, np.nan), np.full(B, np.nan), np.zeros(B), np.zeros(B, bool),
+    )
+    active, before, chord = np.arange(B), np.full(B, np.inf), growth is not None
     for _ in range(max_iterations):
         if not active.size:
             break
-        part = Discretisation(x[active], stages[active], orbit.edges)
-        q = p[:, active]
-        line = direction.part(active)
+        part, q, line = r.orbit.part(active), r.p[:, active], direction.part(active)
         unit = line.rates(q[rows])  # dp/d(distance), (B, k)
         with np.errstate(all="ignore"):
             try:
-                linear = linearise_boundary(model, q, part, direction.names, rho[active])
+                known = r.growth[active] if chord else None
+                linear = linearise_boundary(model, q, part, direction.names, r.rho[active], known)
             except np.linalg.LinAlgError:
                 break
-            matrix, right = _bordered(linear, unit, n)
+            matrix, right = _bordered(linear, unit, n, chord)
             finite = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
             matrix[~finite] = np.eye(n + 1)
             step = np.linalg.solve(matrix, np.where(finite[:, None], right, 0.0)[..., None])[..., 0]
@@ -209,24 +226,31 @@ def _newton_chunk(
             dx, dstages = expand(linear.condensed, step[:, :n], dq[:, None] * unit)
             limit = step_limit(model, dx, dstages)
             change = np.abs(dx / scales(model, q)[:, None, :]).max(axis=(-1, -2))
-            slope[active] = slope_in_last(linear) * q[rows[-1]]
-        rho[active] = linear.rho
-        others[active] = _largest_other(linear.multipliers, linear.rho)
+        r.rho[active], r.growth[active] = linear.rho, linear.growth
+        r.others[active] = _largest_other(linear.multipliers, linear.rho)
         usable = finite & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
         limit = np.where(usable, limit, 0.0)
         dq = np.where(usable, limit * dq, 0.0)
-        moved[active] += dq
-        p[np.ix_(rows, active)] = line.moved(q[rows], dq)
-        x[active] += np.where(usable[:, None, None], limit[:, None, None] * dx, 0.0)
-        stages[active] += np.where(usable[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
-        done = usable & (change < 1e-6) & (np.abs(dq) < 1e-7)  # quadratic: the step just made leaves 1e-12 or less
-        residual[active] = np.where(done, np.abs(dq) * np.abs(dq), np.abs(linear.g))
-        converged[active[done]] = True
+        r.moved[active] += dq
+        r.p[np.ix_(rows, active)] = line.moved(q[rows], dq)
+        r.orbit.x[active] += np.where(usable[:, None, None], limit[:, None, None] * dx, 0.0)
+        r.orbit.stages[active] += np.where(usable[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
+        size = np.maximum(0.1 * change, np.abs(dq))
+        gain = np.where(np.isfinite(before[active]), size / before[active], 0.1)
+        left = size * np.clip(gain, size, 1.0) if chord else size * size  # what the step just made leaves behind
+        done = usable & (left < 0.01 * tol) & (size < 1e-3)
+        r.residual[active] = np.where(done, left, np.abs(linear.g))
+        if done.any():
+            r.slope[active] = slope_in_last(linear) * q[rows[-1]]
+        r.converged[active[done]] = True
+        before[active] = size
+        if chord and np.any(usable & ~done & (gain > 0.1)):
+            chord = False
         active = active[usable & ~done]
-    return _Polished(p, Discretisation(x, stages, orbit.edges), rho, residual, others, slope, moved, converged)
+    return r
 
 
-def _bordered(linear: BoundaryLinear, unit: Array, n: int) -> tuple[Array, Array]:
+def _bordered(linear: BoundaryLinear, unit: Array, n: int, chord: bool) -> tuple[Array, Array]:
     """Return Newton's matrix (B, n+1, n+1) and right side for dx_0 and the distance along `unit` (B, k)."""
     B = unit.shape[0]
     matrix = np.empty((B, n + 1, n + 1))
@@ -234,7 +258,7 @@ def _bordered(linear: BoundaryLinear, unit: Array, n: int) -> tuple[Array, Array
     matrix[:, :n, n] = np.einsum("bik,bk->bi", linear.periodic[..., n + 1 :], unit)
     matrix[:, n, :n] = linear.growth[..., :n]
     matrix[:, n, n] = np.einsum("bk,bk->b", linear.growth[..., n + 1 :], unit)
-    right = -np.concatenate([linear.periodic[..., n], (linear.g + linear.growth[..., n])[:, None]], axis=-1)
+    right = -np.concatenate([linear.periodic[..., n], (linear.g + (0 if chord else linear.growth[..., n]))[:, None]], axis=-1)
     return matrix, right
 
 

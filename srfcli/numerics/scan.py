@@ -115,12 +115,7 @@ def scan_line(
 def _suspects(position: Array, g: Array, resolution: float) -> Array:
     """Return for each interval whether a pair of crossings could hide in it and it is wider than `resolution`."""
     usable = np.isfinite(g)
-    error = np.zeros_like(g)
-    for i in range(len(g)):
-        around = [j for j in (i - 2, i - 1, i + 1, i + 2) if 0 <= j < len(g)]
-        if len(around) < 3 or not usable[around].all() or not usable[i]:
-            continue
-        error[i] = abs(g[i] - _polynomial_at(position[around], g[around], position[i]))
+    error = interpolation_error(position, g)
     worst = np.maximum(error[:-1], error[1:])
     smallest = np.minimum(np.abs(g[:-1]), np.abs(g[1:]))
     same_side = np.sign(g[:-1]) == np.sign(g[1:])
@@ -129,13 +124,24 @@ def _suspects(position: Array, g: Array, resolution: float) -> Array:
     return usable[:-1] & usable[1:] & close & (np.diff(position) > 2 * resolution) & (same_side | (worst > 0.1))
 
 
-def _polynomial_at(xs: Array, ys: Array, x: float) -> float:
-    """Return the Lagrange interpolant through (xs, ys) at x."""
-    total = 0.0
-    for i, (xi, yi) in enumerate(zip(xs, ys, strict=True)):
-        others = np.delete(xs, i)
-        total += yi * float(np.prod((x - others) / (xi - others)))
-    return total
+def interpolation_error(position: Array, g: Array) -> Array:
+    """Return for each sample how far it lies from the cubic through its two neighbours on either side, 0 where those lack."""
+    error = np.zeros_like(g)
+    if len(g) < 5:
+        return error
+    middle = position[2:-2]
+    around = [position[:-4], position[1:-3], position[3:-1], position[4:]]
+    values = [g[:-4], g[1:-3], g[3:-1], g[4:]]
+    estimate = np.zeros_like(middle)
+    for i, (xi, gi) in enumerate(zip(around, values, strict=True)):
+        basis = np.ones_like(middle)
+        for j, xj in enumerate(around):
+            if j != i:
+                basis *= (middle - xj) / (xi - xj)
+        estimate += gi * basis
+    error[2:-2] = np.nan_to_num(np.abs(g[2:-2] - estimate))
+    error[:2], error[-2:] = error[2], error[-3]
+    return error
 
 
 def halve(model: GeneratedModel, base: Array, scan: LineScan, wanted: Array, *, log: bool) -> LineScan:
