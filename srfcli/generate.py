@@ -13,7 +13,6 @@ from srfcli.derive import Linearisation, linearise
 from srfcli.expression import symbol
 from srfcli.system import Equations, System, tidy
 
-FORMAT = 3  # raise when the text of the generated module changes
 FUNCTIONS = ("atan", "asinh", "cos", "cosh", "exp", "expm1", "log", "log1p", "pi", "sin", "sinh", "sqrt", "tan", "tanh")
 INVERSE_NAMES = {"atan": "arctan", "asinh": "arcsinh"}
 

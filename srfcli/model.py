@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from srfcli import FORMAT, __version__
+from srfcli.cache import cached_source, content_key
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.laws import Parameter
 from srfcli.units import from_base, to_base
+
+if TYPE_CHECKING:
+    from srfcli.registry import Registry
 
 Function = Callable[..., NDArray[Any]]
 
@@ -79,6 +84,33 @@ class GeneratedModel:
     def declared(self, name: str, value: float) -> float:
         """Return a value in um, s, N in the unit the parameter is declared in."""
         return from_base(value, self.parameters[self.index(name)].unit)
+
+
+def open_model(
+    registry: Registry,
+    *,
+    law: str = "srf-vsat",
+    ageing: str = "dieterich",
+    interface: str = "elastic",
+    loading: str = "vertical",
+    inertia: bool = True,
+) -> GeneratedModel:
+    """Return the model of the system that these names describe, from the cache where it was built before."""
+    base, *modifiers = ageing.split("+")
+    wanted = [("friction", law), ("ageing", base), *(("modifier", m) for m in modifiers), ("interface", interface)]
+    parts = [__version__, str(FORMAT), loading, str(inertia)]
+    for kind, name in wanted:
+        parts += [kind, name, registry.fingerprint(registry.find(kind, name.strip()))]
+    key = content_key(parts)
+
+    def build() -> str:
+        from srfcli.generate import generate
+        from srfcli.system import build_system
+
+        system = build_system(registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia)
+        return generate(system)
+
+    return load_source(cached_source(key, build), key=key)
 
 
 def load_source(source: str, *, key: str = "") -> GeneratedModel:
