@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import sympy as sp
 
 from srfcli.expression import symbol
-from srfcli.system import System, state_rate, steady_states
+from srfcli.system import System, settle, shield, state_rate, steady_states
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ def linearise(system: System) -> Linearisation:
     def at_rest(expression: sp.Expr) -> sp.Expr:
         return expression.subs(steady).subs(v, V)
 
-    mu_v = sp.simplify(at_rest(v * sp.diff(mu, v)))
-    mu_phi = tuple(sp.simplify(at_rest(p * sp.diff(mu, p))) for p in steady)
+    mu_v = settle(at_rest(v * sp.diff(mu, v)))
+    mu_phi = tuple(settle(at_rest(p * sp.diff(mu, p))) for p in steady)
     symbolic = characteristic_polynomial(system)
     m_v, m_phi = slope_symbols(system)
     W, kappa, mu0 = symbol("W"), symbol("kappa"), symbol("mu_ss")
@@ -100,15 +100,15 @@ def characteristic_polynomial(system: System) -> tuple[sp.Expr, ...]:
 
         def slope(name: str, rate: sp.Expr = rate, at: list[tuple[sp.Expr, sp.Expr]] = at) -> sp.Expr:
             d = sp.diff(rate, symbol(name)).subs(still)
-            return sp.simplify(d.subs(at))
+            return settle(d.subs(at))
 
         d_rate = V * slope("v") * d_v + steady[i].subs(v, V) * slope(state.name) * d_phi[i] + slope("mu") * d_mu
         d_rate += slope("W") * d_load + slope("mu_dot") * s * d_mu + slope("W_dot") * s * d_load
         d_rate += slope("F_dot_over_W") * s * (d_mu + mu_ss / W0 * d_load)
         rows.append(s * d_phi[i] - d_rate)
-    determinant = sp.Matrix.vstack(*rows).det(method="berkowitz") / -V
-    coefficients = sp.Poly(sp.expand(determinant), s).all_coeffs()[::-1]
-    return tuple(sp.factor_terms(sp.simplify(c)) for c in coefficients)
+    matrix, back = shield(sp.Matrix.vstack(*rows))
+    coefficients = sp.Poly(sp.expand(matrix.det(method="berkowitz") / -V), s).all_coeffs()[::-1]
+    return tuple(sp.factor_terms(sp.simplify(c)).xreplace(back) for c in coefficients)
 
 
 def paper_coefficients(symbolic: tuple[sp.Expr, ...]) -> tuple[sp.Expr, ...]:
@@ -129,12 +129,12 @@ def hurwitz_determinant(a: tuple[sp.Expr, ...]) -> sp.Expr:
 def _hurwitz_in_load(symbolic: tuple[sp.Expr, ...], meaning: list[tuple[sp.Expr, sp.Expr]]) -> tuple[sp.Expr, ...] | None:
     """Return the coefficients in W0 of the numerator of the Hurwitz determinant, lowest first, or None."""
     W0 = symbol("W0")
-    determinant = hurwitz_determinant(tuple(a.subs(meaning) for a in symbolic))
-    numerator = sp.numer(sp.together(determinant))
+    shielded, back = shield(sp.Matrix([a.subs(meaning) for a in symbolic]))
+    numerator = sp.numer(sp.together(hurwitz_determinant(tuple(shielded))))
     try:
         polynomial = sp.Poly(sp.expand(numerator), W0)
     except sp.PolynomialError:
         return None
     if any(W0 in c.free_symbols for c in polynomial.all_coeffs()):
         return None
-    return tuple(polynomial.all_coeffs()[::-1])
+    return tuple(c.xreplace(back) for c in polynomial.all_coeffs()[::-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -13,8 +14,7 @@ from srfcli.derive import Linearisation, linearise
 from srfcli.expression import symbol
 from srfcli.system import Equations, System, tidy
 
-FUNCTIONS = ("atan", "asinh", "cos", "cosh", "exp", "expm1", "log", "log1p", "pi", "sin", "sinh", "sqrt", "tan", "tanh")
-INVERSE_NAMES = {"atan": "arctan", "asinh": "arcsinh"}
+FUNCTIONS = ("arcsinh", "arctan", "cos", "cosh", "exp", "expm1", "log", "log1p", "pi", "sin", "sinh", "sqrt", "tan", "tanh")
 
 
 class _Printer(NumPyPrinter):
@@ -81,11 +81,11 @@ class _Writer:
         outputs = [(i, e) for i, e in outputs if e != 0 or i in ("", "0")]
         shared, reduced = sp.cse([e for _, e in outputs], symbols=sp.numbered_symbols("_"), order="canonical")
         used = {str(s) for e in [*(e for _, e in shared), *reduced] for s in e.free_symbols}
-        arguments = [*head, *(["x"] if state else []), *tail, "p", *vectors]
+        arguments = [*head, *(["x"] if state else []), *tail, "p", *(f"_{w}" for w in vectors)]  # a law may have a parameter c
         lines = [f"def {name}({', '.join(arguments)}):", f'    """{doc}"""']
         lines += [f"    {line}" for line in self._unpack(used - set(tail), vectors, state)]
         lines += [f"    {s} = {self.text(e)}" for s, e in shared]
-        like = [*head, *(["x[..., 0]"] if state else []), *tail, *(f"{w}[..., 0]" for w in vectors)]
+        like = [*head, *(["x[..., 0]"] if state else []), *tail, *(f"_{w}[..., 0]" for w in vectors)]
         like += [] if state else ["*p"]
         if len(outputs) == 1 and outputs[0][0] == "":
             lines.append(f"    return _empty(({', '.join(like)},), ()) + {self.printer.parenthesize(self._renamed(reduced[0]), 40)}")
@@ -114,7 +114,7 @@ class _Writer:
         for vector in vectors:
             for i in range(len(self.equations.unknowns)):
                 if f"_{vector}{i}" in used:
-                    yield f"_{vector}{i} = {vector}[..., {i}]"
+                    yield f"_{vector}{i} = _{vector}[..., {i}]"
 
 
 def generate(system: System) -> str:
@@ -126,9 +126,7 @@ def generate(system: System) -> str:
     _write_rates(writer, eq)
     _write_cycle(writer, eq)
     body = "\n\n\n".join(writer.parts)
-    names = sorted({INVERSE_NAMES.get(f, f) for f in FUNCTIONS if f"{f}(" in body or f == "pi"})
-    for short, full in INVERSE_NAMES.items():
-        body = body.replace(f"{short}(", f"{full}(") if short in FUNCTIONS and f"{full}(" not in body else body
+    names = [f for f in FUNCTIONS if re.search(rf"\b{f}\b", body)]
     return _HEAD.format(
         title=system.title,
         names=", ".join(names),

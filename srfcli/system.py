@@ -28,6 +28,7 @@ APPARATUS = (
 MASS = Parameter("M", 2.37, "kg", 1e-12, 1e12, "mass of the slider")
 ANGLE = Parameter("angle", 15.0, "deg", -60.0, 60.0, "inclination of the spring: W gains K (u - u_ss) tan(angle)")
 LOADINGS = ("vertical", "inclined")
+MAX_CANCEL = 80  # operations: beyond it a common denominator takes a minute to find and shortens nothing
 
 
 @dataclass(frozen=True)
@@ -279,5 +280,29 @@ def _solve_linear(balance: list[sp.Expr], wanted: list[sp.Symbol], system: Syste
 
 def tidy(expression: sp.Expr) -> sp.Expr:
     """Return the shortest of a few equal forms of `expression`."""
-    forms = (expression, sp.factor_terms(expression), sp.cancel(expression))
+    forms = [expression, sp.factor_terms(expression)]
+    if sp.count_ops(expression) <= MAX_CANCEL:
+        shielded, back = shield(expression)
+        forms.append(sp.cancel(shielded).xreplace(back))
     return min(forms, key=lambda e: (sp.count_ops(e), str(e)))
+
+
+def settle(expression: sp.Expr) -> sp.Expr:
+    """Return `expression` simplified, but for Lambert functions: there sympy trades exp(-v/Vc) for exp(v/Vc), which overflows."""
+    return expression if expression.has(sp.LambertW) else sp.simplify(expression)
+
+
+def shield(expression: sp.Basic) -> tuple[sp.Basic, dict[sp.Symbol, sp.Expr]]:
+    """Return `expression` with its transcendental parts replaced by symbols, and what puts them back.
+
+    Algebra on exp(-V/Vc) otherwise turns it into exp(V/Vc), which overflows.
+    """
+    kinds = (sp.exp, sp.LambertW)
+    atoms = sorted(expression.atoms(*kinds), key=lambda e: (-sp.count_ops(e), str(e)))
+    back: dict[sp.Symbol, sp.Expr] = {}
+    for atom in atoms:  # longest first: an inner one then lives on inside what its outer one puts back
+        name = sp.Symbol(f"shield{len(back)}", positive=True)
+        replaced = expression.xreplace({atom: name})
+        if replaced != expression:
+            back[name], expression = atom, replaced
+    return expression, back

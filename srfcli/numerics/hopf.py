@@ -1,0 +1,185 @@
+"""Linear stability of steady sliding under constant load: critical loads, frequencies, and which way the Hopf bifurcation opens.
+
+All roots in W0 of the Hurwitz determinant are found (as polynomial roots where it is a polynomial in W0, else on a scan), those
+that belong to a pair of imaginary roots are polished on the exact characteristic polynomial, and crossing is checked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from srfcli.model import GeneratedModel
+from srfcli.numerics.collocation import Array
+from srfcli.status import Status
+
+SCAN = np.geomspace(1e-9, 1e9, 1801)  # times K * 1 um: loads at which a non-polynomial determinant is looked at
+
+
+@dataclass(frozen=True)
+class HopfPoint:
+    """A Hopf bifurcation of steady sliding; loads in N, frequencies in rad/s.
+
+    `crossing_rate` is d Re(s)/dW0 at the root: positive where stability is lost as W0 rises. `lyapunov` is the real part of
+    the cubic normal-form coefficient over Omega, for an eigenvector whose ln v component is 1: with z' = s z + c |z|^2 z,
+    delta ln v = 2 Re z, so that a negative one is a direct bifurcation. `leading` says that all other roots are stable.
+    """
+
+    W0: float
+    Omega: float
+    crossing_rate: float
+    lyapunov: float
+    leading: bool
+    residual: float
+
+    @property
+    def direct(self) -> bool:
+        """True where stick-slip grows from zero amplitude."""
+        return self.lyapunov < 0
+
+
+def hopf_points(model: GeneratedModel, p: Array) -> list[HopfPoint]:
+    """Return every Hopf bifurcation in W0 at the parameters `p` (n_parameters,), by rising load; W0 in `p` is not used."""
+    points = []
+    for W0 in _candidates(model, p):
+        point = _polish(model, p, W0)
+        if point is not None and not any(abs(point.W0 / q.W0 - 1) < 1e-9 for q in points):
+            points.append(point)
+    return sorted(points, key=lambda q: q.W0)
+
+
+def critical_point(model: GeneratedModel, p: Array) -> tuple[HopfPoint | None, Status]:
+    """Return the lowest load at which steady sliding loses stability, or None and the status that says why."""
+    for point in hopf_points(model, p):
+        if point.leading and point.crossing_rate > 0:
+            return point, Status.OK
+    return None, Status.NO_HOPF
+
+
+def weakening(model: GeneratedModel, p: Array) -> float:
+    """Return -d mu_ss / d ln V, positive for velocity weakening (states of the same steady age law)."""
+    slopes = model.slopes(p)
+    return float(slopes[..., 1:].sum(axis=-1) - slopes[..., 0])
+
+
+def _with_load(model: GeneratedModel, p: Array, W0: Array | complex | float) -> list[Array | complex | float]:
+    q: list[Array | complex | float] = list(p)
+    q[model.index("W0")] = W0
+    return q
+
+
+def _candidates(model: GeneratedModel, p: Array) -> list[float]:
+    """Return the positive loads at which the last Hurwitz determinant but one vanishes."""
+    if model.namespace["HOPF_DEGREE"] >= 0:
+        coefficients = np.trim_zeros(np.asarray(model.hurwitz_in_load(p))[::-1], "f")
+        if not np.isfinite(coefficients).all() or coefficients.size < 2:
+            return []
+        roots = np.roots(coefficients)
+        real = roots[np.abs(roots.imag) <= 1e-6 * np.abs(roots)].real  # a double root splits by sqrt(rounding)
+        return [float(r) for r in real if r > 0]
+    loads = SCAN * p[model.index("K")]
+    with np.errstate(all="ignore"):
+        values = _hurwitz(model.characteristic(_with_load(model, p, loads)))
+    found = []
+    for i in np.nonzero(np.isfinite(values[:-1]) & np.isfinite(values[1:]) & (values[:-1] * values[1:] <= 0))[0]:
+        a, b = loads[i], loads[i + 1]
+        for _ in range(60):
+            middle = np.sqrt(a * b)
+            value = _hurwitz(model.characteristic(_with_load(model, p, middle)))
+            a, b = (middle, b) if value * values[i] > 0 else (a, middle)
+        found.append(float(np.sqrt(a * b)))
+    return found
+
+
+def _hurwitz(a: Array) -> Array:
+    """Return the Hurwitz determinant of order n-1 of sum a_k s^k for coefficients (..., n+1), scaled to order 1."""
+    n = a.shape[-1] - 1
+    scale = np.abs(a[..., :1] / a[..., -1:]) ** (1.0 / n)  # roots of order one
+    b = a / a[..., -1:] / scale ** np.arange(n, -1, -1)
+    matrix = np.zeros((*a.shape[:-1], n - 1, n - 1))
+    for i in range(n - 1):
+        for j in range(n - 1):
+            k = n - (2 * (j + 1) - (i + 1))
+            if 0 <= k <= n:
+                matrix[..., i, j] = b[..., k]
+    return np.linalg.det(matrix)
+
+
+def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
+    """Return the Hopf point next to the load `W0` by Newton's method on P(i Omega; W0) = 0, or None where the roots are real."""
+    roots = np.roots(np.asarray(model.characteristic(_with_load(model, p, W0)))[::-1])
+    pairs = roots[roots.imag > 1e-9 * np.abs(roots)]
+    if not pairs.size:
+        return None
+    nearest = pairs[np.argmin(np.abs(pairs.real / pairs.imag))]
+    Omega, residual = float(nearest.imag), np.inf
+    if abs(nearest.real) > 1e-2 * Omega:
+        return None
+    for _ in range(30):
+        value, by_s, by_load = _polynomial(model, p, W0, 1j * Omega)
+        matrix = np.array([[(1j * by_s).real, by_load.real], [(1j * by_s).imag, by_load.imag]])
+        if abs(np.linalg.det(matrix)) == 0:
+            return None
+        step = np.linalg.solve(matrix, [-value.real, -value.imag])
+        Omega, W0 = Omega + float(step[0]), W0 + float(step[1])
+        if W0 <= 0 or Omega <= 0:
+            return None
+        moved = max(abs(step[0]) / Omega, abs(step[1]) / W0)
+        stalled = moved >= residual
+        residual = min(residual, moved)
+        if moved < 4e-16 or stalled:  # rounding reached
+            break
+    _, by_s, by_load = _polynomial(model, p, W0, 1j * Omega)
+    roots = np.roots(np.asarray(model.characteristic(_with_load(model, p, W0)))[::-1])
+    others = roots[np.abs(np.abs(roots.imag) - Omega) + np.abs(roots.real) > 1e-5 * Omega]
+    q = p.copy()
+    q[model.index("W0")] = W0
+    return HopfPoint(
+        W0=W0,
+        Omega=Omega,
+        crossing_rate=float(-(by_load / by_s).real),
+        lyapunov=lyapunov_coefficient(model, q, Omega),
+        leading=bool(np.all(others.real < 0)),
+        residual=float(residual),
+    )
+
+
+def _polynomial(model: GeneratedModel, p: Array, W0: float, s: complex) -> tuple[complex, complex, complex]:
+    """Return the characteristic polynomial at s and its derivatives by s and by W0 (complex step)."""
+    h = 1e-30 * W0
+    a = np.asarray(model.characteristic(_with_load(model, p, complex(W0, h))))
+    powers = s ** np.arange(a.shape[-1])
+    k = np.arange(1, a.shape[-1])
+    return complex(a.real @ powers), complex((k * a.real[1:]) @ powers[:-1]), complex((a.imag / h) @ powers)
+
+
+def rest_state(model: GeneratedModel, p: Array) -> tuple[Array, Array]:
+    """Return steady sliding and the Jacobian of the rates there, (n,) and (n, n), under constant load."""
+    x = model.steady(p)
+    V, W0 = p[model.index("V")], p[model.index("W0")]
+    return x, model.rates_jacobian(x, V, W0, 0.0, p)
+
+
+def lyapunov_coefficient(model: GeneratedModel, p: Array, Omega: float) -> float:
+    """Return Re(c)/Omega of the normal form z' = i Omega z + c |z|^2 z at a Hopf point (Kuznetsov, eq. 5.62).
+
+    z is scaled so that the perturbation of ln v is 2 Re z.
+    """
+    x, A = rest_state(model, p)
+    n = x.shape[-1]
+    values, vectors = np.linalg.eig(A)
+    k = int(np.argmin(np.abs(values - 1j * Omega)))
+    q = vectors[:, k] / vectors[model.states.index("ln_v"), k]
+    left = np.linalg.inv(vectors)[k] * vectors[model.states.index("ln_v"), k]  # left . q = 1
+    identity = np.eye(n)
+
+    def B(a: Array, b: Array) -> Array:
+        return model.second(x, p, a, b)
+
+    bar = q.conj()
+    cubic = model.third(x, p, q, q, bar)
+    mean = np.linalg.solve(A.astype(complex), B(q, bar))
+    double = np.linalg.solve(2j * Omega * identity - A, B(q, q))
+    c = 0.5 * left @ (cubic - 2 * B(q, mean) + B(bar, double))
+    return float(c.real / Omega)
