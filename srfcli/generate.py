@@ -214,6 +214,7 @@ def _write_cycle(writer: _Writer, eq: Equations) -> None:
                     [(str(i), e) for i, e in enumerate(field)], head=head, shape=shape)
     writer.function("cycle_jacobian", "d(cycle)/dx.",
                     [(f"{i}, {j}", jacobian[i][j]) for i in n for j in n], head=head, shape=square)
+    writer.function("cycle_friction", "Friction coefficient.", [("", eq.mu.subs(load))], head=head)
     writer.function("cycle_load", "Normal load W.", [("", eq.load.subs(load))], head=head)
     writer.function("cycle_elongation", "Spring elongation u.", [("", eq.spring.subs(load))], head=head)
     w, a = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "wa")

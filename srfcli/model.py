@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from srfcli import FORMAT, __version__
 from srfcli.cache import cached_source, content_key
 from srfcli.errors import SrfError, did_you_mean
-from srfcli.laws import Parameter
+from srfcli.laws import Law, Parameter
 from srfcli.units import from_base, to_base
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ class GeneratedModel:
     parameters: tuple[Parameter, ...] = field(repr=False)
     states: tuple[str, ...]
     logarithmic: tuple[bool, ...]
+    laws: tuple[Law, ...] = field(repr=False, compare=False)
     namespace: Mapping[str, Any] = field(repr=False, compare=False)
 
     def __getattr__(self, name: str) -> Function:
@@ -98,9 +99,11 @@ def open_model(
     """Return the model of the system that these names describe, from the cache where it was built before."""
     base, *modifiers = ageing.split("+")
     wanted = [("friction", law), ("ageing", base), *(("modifier", m) for m in modifiers), ("interface", interface)]
-    parts = [__version__, str(FORMAT), loading, str(inertia)]
+    parts, laws = [__version__, str(FORMAT), loading, str(inertia)], []
     for kind, name in wanted:
-        parts += [kind, name, registry.fingerprint(registry.find(kind, name.strip()))]
+        entry = registry.find(kind, name.strip())
+        parts += [kind, name, registry.fingerprint(entry)]
+        laws.append(Law(entry.name, about=entry.about, source=str(entry.location)))
     key = content_key(parts)
 
     def build() -> str:
@@ -110,10 +113,10 @@ def open_model(
         system = build_system(registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia)
         return generate(system)
 
-    return load_source(cached_source(key, build), key=key)
+    return load_source(cached_source(key, build), key=key, laws=tuple(laws))
 
 
-def load_source(source: str, *, key: str = "") -> GeneratedModel:
+def load_source(source: str, *, key: str = "", laws: tuple[Law, ...] = ()) -> GeneratedModel:
     """Return the model that this generated module text describes."""
     namespace: dict[str, Any] = {"__name__": f"srf_generated_{key[:12]}"}
     exec(compile(source, f"<generated {key[:12]}>", "exec"), namespace)
@@ -125,5 +128,6 @@ def load_source(source: str, *, key: str = "") -> GeneratedModel:
         parameters=tuple(Parameter(*row) for row in namespace["PARAMETERS"]),
         states=namespace["STATES"],
         logarithmic=namespace["LOGARITHMIC"],
+        laws=laws,
         namespace=namespace,
     )

@@ -16,6 +16,7 @@ class Status(Enum):
     LEFT_WINDOW = "left-window"
     CLOSED = "closed"
     NO_HOPF = "no-hopf"
+    INTEGRATION = "integration-stopped"
     INTERRUPTED = "interrupted"
 
     @property
@@ -38,5 +39,6 @@ _ADVICE = {
     Status.LEFT_WINDOW: "The curve left the window that was asked for.",
     Status.CLOSED: "The curve returned to its start.",
     Status.NO_HOPF: "Velocity strengthening: no Hopf bifurcation.",
+    Status.INTEGRATION: "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
     Status.INTERRUPTED: "Interrupted; what was finished is kept.",
 }

@@ -37,6 +37,7 @@ from srfcli.settings import (
 )
 
 if TYPE_CHECKING:
+    from srfcli.model import GeneratedModel
     from srfcli.registry import Registry
     from srfcli.system import System
 
@@ -93,6 +94,19 @@ class SystemOptions:
         from srfcli.system import build_system
 
         return build_system(
+            self.registry(),
+            law=self.law.value,
+            ageing=self.ageing.value,
+            interface=self.interface.value,
+            loading=self.loading.value,
+            inertia=self.inertia.value,
+        )
+
+    def model(self) -> GeneratedModel:
+        """Return the numerical model of that system; sympy runs only where the cache has none."""
+        from srfcli.model import open_model
+
+        return open_model(
             self.registry(),
             law=self.law.value,
             ageing=self.ageing.value,

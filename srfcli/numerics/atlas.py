@@ -59,35 +59,77 @@ class Atlas:
     status: Status = Status.OK
 
 
+FINER_MESHES = 2  # how often a curve is followed again on twice the mesh
 Progress = Callable[[str], None]
 
 
 def find_components(
     model: GeneratedModel, plane: Plane, settings: AtlasSettings | None = None, *, progress: Progress = lambda text: None
 ) -> Iterator[Atlas]:
-    """Yield the atlas as it grows, after each component; the last one yielded is complete and says so in its notes."""
+    """Yield the atlas as it grows, after each component; the last one yielded is complete and says so in its notes.
+
+    A KeyboardInterrupt ends the search: what was followed until then is polished and yielded, with status INTERRUPTED.
+    """
     settings = settings or AtlasSettings()
     atlas = Atlas(plane, [], [], [])
     curves: list[Curve] = []
     missed = 0
-    for scan in _scan_lines(model, plane, settings, progress):
-        atlas.scans.append(scan)
-        for bracket in _unclaimed(model, plane, scan, curves):
-            start = _starting_point(model, plane, scan, bracket, settings)
-            if start is None:
-                missed += 1
-                continue
-            curve = None
-            for curve in trace(model, plane, start, settings.steps):
-                progress(f"component {len(curves) + 1}: {len(curve.points)} points")
-            if curve is not None and len(curve.points) > 1:
-                curves.append(curve)
-                atlas.branches.extend(polish_curve(model, plane, curve, settings))
-                yield atlas
+    try:
+        for scan in _scan_lines(model, plane, settings, progress):
+            atlas.scans.append(scan)
+            for bracket in _unclaimed(model, plane, scan, curves):
+                start = _starting_point(model, plane, scan, bracket, settings)
+                if start is None:
+                    missed += 1
+                    continue
+                for curve, branches in _follow_finely(model, plane, start, settings, lambda n: progress(_said(curves, n))):
+                    curves.append(curve)
+                    atlas.branches.extend(branches)
+                    if curve.end is Status.INTERRUPTED:
+                        raise KeyboardInterrupt
+                    yield atlas
+    except KeyboardInterrupt:
+        atlas.status = Status.INTERRUPTED
     atlas.notes = _notes(atlas, settings, missed)
-    if missed or any(b.start is Status.STEP_TOO_SMALL or b.end is Status.STEP_TOO_SMALL for b in atlas.branches):
-        atlas.status = Status.NO_CONVERGENCE if missed else atlas.status
+    if atlas.status is Status.OK and (missed or not all(pt.status.ok for b in atlas.branches for pt in b.points)):
+        atlas.status = Status.NO_CONVERGENCE
+    ends = {end for b in atlas.branches for end in (b.start, b.end)}
+    if atlas.status is Status.OK:
+        atlas.status = next((e for e in (Status.STEP_TOO_SMALL, Status.MAX_STEPS) if e in ends), Status.OK)
     yield atlas
+
+
+def _said(curves: list[Curve], points: int) -> str:
+    return f"component {len(curves) + 1}: {points} points"
+
+
+def _follow_finely(
+    model: GeneratedModel, plane: Plane, start: CurvePoint, settings: AtlasSettings, count: Callable[[int], None]
+) -> Iterator[tuple[Curve, list[Branch]]]:
+    """Yield the curve through `start` and its polished branches; on a finer mesh where the polish shows the first one to lack."""
+    for attempt in range(FINER_MESHES + 1):
+        curve, interrupted = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED), False
+        try:
+            for curve in trace(model, plane, start, settings.steps):
+                count(len(curve.points))
+        except KeyboardInterrupt:
+            interrupted = True
+            curve.end = Status.INTERRUPTED
+        if len(curve.points) < 2:
+            return
+        branches = polish_curve(model, plane, curve, settings)
+        failed = sum(not pt.status.ok for b in branches for pt in b.points)
+        N = start.orbit.x.shape[-2]
+        if interrupted or not failed or attempt == FINER_MESHES or 4 * N > settings.max_mesh:
+            yield curve, branches
+            return
+        finer = correct(
+            model, plane, start.q, interpolate(start.orbit, uniform_mesh(2 * N)), start.rho, start.tangent_q, np.zeros(start.orbit.x.shape[-1])
+        )
+        if finer is None:
+            yield curve, branches
+            return
+        start = finer
 
 
 def _scan_lines(model: GeneratedModel, plane: Plane, settings: AtlasSettings, progress: Progress) -> Iterator[LineScan]:

@@ -1,0 +1,110 @@
+"""One forced periodic state in full: multipliers with their error, mean friction, harmonics, on a mesh that refines itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from srfcli.model import GeneratedModel
+from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, condense, gauss, stage_parameters
+from srfcli.numerics.orbit import interpolate, solve_orbits, uniform_mesh
+from srfcli.numerics.scan import robust_orbits
+from srfcli.status import Status
+
+FIRST_MESH = 16
+RELIED_ON = 15.0  # as in polish: an interval halved gains 2^8 in theory, 2^4 is relied on
+
+
+@dataclass(frozen=True)
+class FloquetResult:
+    """A forced periodic state. Multipliers (n,) over one forcing period, largest first, with their estimated error.
+
+    `mean_friction` is the mean of mu over the period, `friction_shift` what modulation adds to steady sliding's mu.
+    `u_harmonics`, `mu_harmonics` (H+1,) are complex amplitudes: q = c_0 + sum |c_k| cos(2 pi k tau + arg c_k).
+    `liouville` is |product of the multipliers / exp(integrated trace) - 1|: Liouville's identity, apart from the estimate.
+    """
+
+    p: Array
+    orbit: Discretisation
+    multipliers: ComplexArray
+    error: float
+    liouville: float
+    mean_friction: float
+    friction_shift: float
+    u_harmonics: ComplexArray
+    mu_harmonics: ComplexArray
+    status: Status
+
+    @property
+    def stable(self) -> bool:
+        """True where every multiplier lies inside the unit circle."""
+        return bool(np.all(np.abs(self.multipliers) < 1))
+
+
+@dataclass(frozen=True)
+class Waveforms:
+    """The state over one period: phases tau (T,), unknowns (T, n), and the friction, load and elongation that follow."""
+
+    tau: Array
+    x: Array
+    mu: Array
+    W: Array
+    u: Array
+
+
+def solve_floquet(
+    model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mesh: int = 1024, harmonics: int = 8
+) -> FloquetResult:
+    """Return the forced periodic state at `p` (n_parameters,), its mesh doubled until the multipliers' error is below `tol`."""
+    column = p[:, None]
+    batch = robust_orbits(model, column, None, uniform_mesh(FIRST_MESH), tol=1e-10)
+    error = np.inf
+    while batch.converged[0] and error > tol and 2 * (len(batch.orbit.edges) - 1) <= max_mesh:
+        finer = interpolate(batch.orbit, uniform_mesh(2 * (len(batch.orbit.edges) - 1)))
+        fine = solve_orbits(model, column, finer, tol=1e-10)
+        shift = np.abs(np.sort_complex(fine.multipliers[0]) - np.sort_complex(batch.multipliers[0])).max()
+        error = float(shift) / RELIED_ON + 1e-12
+        batch = fine
+    status = Status.NO_CONVERGENCE if not batch.converged[0] else Status.OK if error <= tol else Status.TOLERANCE
+    orbit = Discretisation(batch.orbit.x[0], batch.orbit.stages[0], batch.orbit.edges)
+    waves = waveforms(model, p, orbit, max(256, 8 * harmonics))
+    rest = float(model.steady_friction(p))
+    u_k, mu_k = harmonic_amplitudes(waves.u, harmonics), harmonic_amplitudes(waves.mu, harmonics)
+    return FloquetResult(
+        p=p,
+        orbit=orbit,
+        multipliers=batch.multipliers[0],
+        error=error,
+        liouville=_liouville(model, p, orbit),
+        mean_friction=float(mu_k[0].real),
+        friction_shift=float(mu_k[0].real) - rest,
+        u_harmonics=u_k,
+        mu_harmonics=mu_k,
+        status=status,
+    )
+
+
+def waveforms(model: GeneratedModel, p: Array, orbit: Discretisation, samples: int) -> Waveforms:
+    """Return the orbit at `samples` equal phases of one period, by its own collocation polynomials."""
+    tau = np.arange(samples) / samples
+    x = interpolate(orbit, np.concatenate([tau, [1.0]])).x
+    return Waveforms(
+        tau, x, model.cycle_friction(tau, x, p.tolist()), model.cycle_load(tau, x, p.tolist()), model.cycle_elongation(tau, x, p.tolist())
+    )
+
+
+def harmonic_amplitudes(values: Array, count: int) -> ComplexArray:
+    """Return c_0..c_count of equally spaced samples: the mean, then amplitudes with their phases at tau = 0."""
+    spectrum = np.fft.rfft(values) / len(values)
+    spectrum[1:] *= 2
+    return spectrum[: count + 1]
+
+
+def _liouville(model: GeneratedModel, p: Array, orbit: Discretisation) -> float:
+    """Return |det M / exp(integrated trace) - 1|, det M as the product over the intervals, which does not underflow."""
+    n = orbit.x.shape[-1]
+    trace = np.trace(model.cycle_jacobian(orbit.phases, orbit.stages, stage_parameters(p)), axis1=-2, axis2=-1)
+    exponent = float((trace @ gauss(orbit.stages.shape[-2]).weights) @ orbit.steps)
+    logarithms = np.linalg.slogdet(condense(model, p, orbit).maps[:, :n, :n])[1]
+    return float(abs(np.expm1(logarithms.sum() - exponent)))
