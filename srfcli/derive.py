@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import sympy as sp
 
 from srfcli.expression import symbol
-from srfcli.system import System, settle, shield, state_rate, steady_states
+from srfcli.system import System, settle, state_rate, steady_states
 
 
 @dataclass(frozen=True)
@@ -44,38 +44,56 @@ def slope_symbols(system: System) -> tuple[sp.Symbol, tuple[sp.Symbol, ...]]:
 
 def linearise(system: System) -> Linearisation:
     """Return the linear stability problem of `system` about steady sliding at V under W0."""
-    v, V = symbol("v"), symbol("V")
+    mu_v, mu_phi, mu_ss = friction_slopes(system)
+    abbreviated, back = _abbreviated_polynomial(system)
+    symbolic = tuple(c.xreplace(back) for c in abbreviated)
+    m_v, m_phi = slope_symbols(system)
+    meaning: list[tuple[sp.Expr, sp.Expr]] = [(m_v, mu_v), *zip(m_phi, mu_phi, strict=True), (symbol("mu_ss"), mu_ss)]
+    stiffness = interface_meaning(system)
+    characteristic = tuple(e.subs([*meaning, *stiffness]) for e in symbolic)
+    hurwitz = _hurwitz_in_load(abbreviated, stiffness)
+    if hurwitz is not None:
+        hurwitz = tuple(e.xreplace(back).subs(meaning) for e in hurwitz)
+    names = {"mu_v": str(mu_v), **{str(s): str(e) for s, e in zip(m_phi, mu_phi, strict=True)}}
+    return Linearisation(symbolic, characteristic, mu_v, mu_phi, hurwitz, names)
+
+
+def friction_slopes(system: System) -> tuple[sp.Expr, tuple[sp.Expr, ...], sp.Expr]:
+    """Return mu_v, mu_phi of each state and mu_ss, in steady sliding at V, in the law's own parameters."""
+    v, V, mu = symbol("v"), symbol("V"), system.friction.mu
     steady = dict(zip([symbol(s.name) for s in system.friction.states], steady_states(system), strict=True))
-    mu = system.friction.mu
 
     def at_rest(expression: sp.Expr) -> sp.Expr:
         return expression.subs(steady).subs(v, V)
 
-    mu_v = settle(at_rest(v * sp.diff(mu, v)))
     mu_phi = tuple(settle(at_rest(p * sp.diff(mu, p))) for p in steady)
-    symbolic = characteristic_polynomial(system)
-    m_v, m_phi = slope_symbols(system)
-    W, kappa, mu0 = symbol("W"), symbol("kappa"), symbol("mu_ss")
-    law = system.interface.kappa
-    meaning: list[tuple[sp.Expr, sp.Expr]] = [(m_v, mu_v), *zip(m_phi, mu_phi, strict=True), (mu0, at_rest(mu))]
-    if law is not None:
-        meaning.append((symbol("kappa_W"), sp.diff(law, W).subs(W, symbol("W0"))))
-        meaning.append((kappa, law.subs(W, symbol("W0"))))
-    characteristic = tuple(e.subs(meaning) for e in symbolic)
-    hurwitz = _hurwitz_in_load(symbolic, meaning[-2:] if law is not None else [])
-    if hurwitz is not None:
-        hurwitz = tuple(e.subs(meaning) for e in hurwitz)
-    names = {"mu_v": str(mu_v), **{str(s): str(e) for s, e in zip(m_phi, mu_phi, strict=True)}}
-    return Linearisation(symbolic, characteristic, mu_v, mu_phi, hurwitz, names)
+    return settle(at_rest(v * sp.diff(mu, v))), mu_phi, at_rest(mu)
+
+
+def interface_meaning(system: System) -> list[tuple[sp.Expr, sp.Expr]]:
+    """Return what kappa_W = d kappa/dW and kappa are at the load W0, in this order; nothing for a rigid interface."""
+    law, at_load = system.interface.kappa, (symbol("W"), symbol("W0"))
+    if law is None:
+        return []
+    return [(symbol("kappa_W"), sp.diff(law, symbol("W")).subs(*at_load)), (symbol("kappa"), law.subs(*at_load))]
 
 
 def characteristic_polynomial(system: System) -> tuple[sp.Expr, ...]:
     """Return a_0..a_n of the characteristic polynomial in s, in mu_v, mu_phi, kappa and the apparatus' symbols.
 
-    Rows: force balance, slip relation, one ageing law a state; columns: position x, ln v, ln phi of each state.
-    Normalised so that a_0 = K V/D0 for the paper's system: the determinant over -V.
+    Normalised so that a_0 = K V/D0 for the paper's system.
     """
-    s, v, V, K, W0 = sp.Symbol("s"), symbol("v"), symbol("V"), symbol("K"), symbol("W0")
+    coefficients, back = _abbreviated_polynomial(system)
+    return tuple(c.xreplace(back) for c in coefficients)
+
+
+def _abbreviated_polynomial(system: System) -> tuple[tuple[sp.Expr, ...], dict[sp.Symbol, sp.Expr]]:
+    """Return a_0..a_n with long slopes of the ageing law as single symbols, and what these stand for.
+
+    Rows: force balance, slip relation, one ageing law a state; columns: position x, ln v, ln phi of each state. The
+    determinant is taken over -V.
+    """
+    s, V, K, W0 = sp.Symbol("s"), symbol("V"), symbol("K"), symbol("W0")
     m_v, m_phi = slope_symbols(system)
     n = len(m_phi)
     mass = symbol("M") if system.inertia else sp.S.Zero
@@ -91,24 +109,43 @@ def characteristic_polynomial(system: System) -> tuple[sp.Expr, ...]:
     if system.elastic:  # d(W mu/kappa)/dt
         slip -= s * (W0 / kappa * d_mu + mu_ss * (1 / kappa - W0 * kappa_W / kappa**2) * d_load)
     rows.append(slip)
+    back: dict[sp.Symbol, sp.Expr] = {}
+    for i, slopes in enumerate(ageing_slopes(system)):
+        g = {name: _abbreviate(e, f"g_{name}{i}", back) for name, e in slopes.items()}
+        d_rate = g["v"] * d_v + g["phi"] * d_phi[i] + g["mu"] * d_mu + g["W"] * d_load
+        d_rate += g["mu_dot"] * s * d_mu + g["W_dot"] * s * d_load
+        d_rate += g["F_dot_over_W"] * s * (d_mu + mu_ss / W0 * d_load)
+        rows.append(s * d_phi[i] - d_rate)
+    determinant = sp.Matrix.vstack(*rows).det(method="berkowitz") / -V
+    coefficients = sp.Poly(sp.expand(determinant), s).all_coeffs()[::-1]
+    return tuple(sp.factor_terms(sp.cancel(c)) for c in coefficients), back
+
+
+def _abbreviate(slope: sp.Expr, name: str, back: dict[sp.Symbol, sp.Expr]) -> sp.Expr:
+    """Return `slope`, or a symbol for it where it is transcendental: algebra would only tear it apart."""
+    if not slope.has(sp.exp, sp.log, sp.LambertW) or slope.has(symbol("W0")):
+        return slope
+    stand_in = sp.Symbol(name, real=True)
+    back[stand_in] = slope
+    return stand_in
+
+
+def ageing_slopes(system: System) -> tuple[dict[str, sp.Expr], ...]:
+    """Return for each state what d(ln phi)/dt changes by with ln v, ln phi, mu, W and the rates, in steady sliding."""
+    v, V = symbol("v"), symbol("V")
     still = {symbol(k): sp.S.Zero for k in ("mu_dot", "W_dot", "F_dot_over_W")}
     steady = steady_states(system)
-    for i, state in enumerate(system.friction.states):
+    found = []
+    for state, age in zip(system.friction.states, steady, strict=True):
         phi = symbol(state.name)
         rate = state_rate(system, state) / phi
-        at = [(phi, steady[i]), (v, V), (symbol("mu"), mu_ss), (symbol("W"), W0)]
-
-        def slope(name: str, rate: sp.Expr = rate, at: list[tuple[sp.Expr, sp.Expr]] = at) -> sp.Expr:
-            d = sp.diff(rate, symbol(name)).subs(still)
-            return settle(d.subs(at))
-
-        d_rate = V * slope("v") * d_v + steady[i].subs(v, V) * slope(state.name) * d_phi[i] + slope("mu") * d_mu
-        d_rate += slope("W") * d_load + slope("mu_dot") * s * d_mu + slope("W_dot") * s * d_load
-        d_rate += slope("F_dot_over_W") * s * (d_mu + mu_ss / W0 * d_load)
-        rows.append(s * d_phi[i] - d_rate)
-    matrix, back = shield(sp.Matrix.vstack(*rows))
-    coefficients = sp.Poly(sp.expand(matrix.det(method="berkowitz") / -V), s).all_coeffs()[::-1]
-    return tuple(sp.factor_terms(sp.simplify(c)).xreplace(back) for c in coefficients)
+        at = [(phi, age), (v, V), (symbol("mu"), symbol("mu_ss")), (symbol("W"), symbol("W0"))]
+        names = {"v": v, "phi": phi, **{k: symbol(k) for k in ("mu", "W", "mu_dot", "W_dot", "F_dot_over_W")}}
+        slopes = {k: settle(sp.diff(rate, x).subs(still).subs(at)) for k, x in names.items()}
+        slopes["v"] = settle(V * slopes["v"])
+        slopes["phi"] = settle(age.subs(v, V) * slopes["phi"])
+        found.append(slopes)
+    return tuple(found)
 
 
 def paper_coefficients(symbolic: tuple[sp.Expr, ...]) -> tuple[sp.Expr, ...]:
@@ -126,15 +163,22 @@ def hurwitz_determinant(a: tuple[sp.Expr, ...]) -> sp.Expr:
     return sp.Matrix(n - 1, n - 1, lambda i, j: coefficient(2 * (j + 1) - (i + 1))).det(method="berkowitz")
 
 
-def _hurwitz_in_load(symbolic: tuple[sp.Expr, ...], meaning: list[tuple[sp.Expr, sp.Expr]]) -> tuple[sp.Expr, ...] | None:
-    """Return the coefficients in W0 of the numerator of the Hurwitz determinant, lowest first, or None."""
+def _hurwitz_in_load(coefficients: tuple[sp.Expr, ...], stiffness: list[tuple[sp.Expr, sp.Expr]]) -> tuple[sp.Expr, ...] | None:
+    """Return the coefficients in W0 of the Hurwitz determinant times a power of W0, lowest first, or None."""
     W0 = symbol("W0")
-    shielded, back = shield(sp.Matrix([a.subs(meaning) for a in symbolic]))
-    numerator = sp.numer(sp.together(hurwitz_determinant(tuple(shielded))))
-    try:
-        polynomial = sp.Poly(sp.expand(numerator), W0)
-    except sp.PolynomialError:
+    fractions = [sp.fraction(sp.cancel(a.subs(stiffness))) for a in coefficients]
+    common = sp.S.One
+    for _, denominator in fractions:
+        common = sp.lcm(common, denominator)
+    whole = tuple(sp.cancel(n * common / d) for n, d in fractions)
+    if not all(a.is_polynomial(W0) for a in whole):
         return None
-    if any(W0 in c.free_symbols for c in polynomial.all_coeffs()):
-        return None
-    return tuple(c.xreplace(back) for c in polynomial.all_coeffs()[::-1])
+    parts: dict[sp.Symbol, sp.Expr] = {}  # each coefficient of a power of W0 as one symbol: its inside plays no role here
+    short = []
+    for k, a in enumerate(whole):
+        terms = sp.Poly(a, W0).all_coeffs()[::-1]
+        names = [sp.Symbol(f"a{k}_{j}") if c != 0 else sp.S.Zero for j, c in enumerate(terms)]
+        parts.update({s: sp.factor_terms(c) for s, c in zip(names, terms, strict=True) if c != 0})
+        short.append(sum((s * W0**j for j, s in enumerate(names)), sp.S.Zero))
+    determinant = sp.Poly(hurwitz_determinant(tuple(short)), W0)
+    return tuple(c.xreplace(parts) for c in determinant.all_coeffs()[::-1])

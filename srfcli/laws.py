@@ -57,7 +57,7 @@ class Law:
 class FrictionLaw(Law):
     """mu(v, phi...): the friction coefficient as a function of slip velocity, state variables and parameters."""
 
-    mu: sympy.Expr = None  # type: ignore[assignment]
+    mu: sympy.Expr = None
     states: tuple[State, ...] = (State(),)
 
 
@@ -68,14 +68,14 @@ class AgeingLaw(Law):
     Symbols: v, phi, mu, mu_dot (dmu/dt), W, W_dot, F_dot_over_W (d(W mu)/dt / W), and the parameters, also the friction law's.
     """
 
-    rate: sympy.Expr = None  # type: ignore[assignment]
+    rate: sympy.Expr = None
 
 
 @dataclass(frozen=True)
 class AgeingModifier(Law):
     """A term that is added to the rate of any ageing law, in the same symbols."""
 
-    term: sympy.Expr = None  # type: ignore[assignment]
+    term: sympy.Expr = None
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ Units are um, s, N; mass is N s^2/um. The spring elongation is u = V t - x, z = 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import sympy as sp
 
@@ -17,6 +17,8 @@ from srfcli.laws import AgeingLaw, AgeingModifier, FrictionLaw, Interface, Law, 
 
 if TYPE_CHECKING:
     from srfcli.registry import Registry
+
+L = TypeVar("L", bound=Law)
 
 APPARATUS = (
     Parameter("V", 10.0, "um/s", 1e-12, 1e9, "driving velocity"),
@@ -38,7 +40,7 @@ class System:
     friction: FrictionLaw
     ageing: AgeingLaw
     modifiers: tuple[AgeingModifier, ...] = ()
-    interface: Interface = Interface("rigid")
+    interface: Interface = field(default_factory=lambda: Interface("rigid"))
     loading: str = "vertical"
     inertia: bool = True
 
@@ -123,15 +125,22 @@ def build_system(
         raise SrfError(f"unknown loading '{loading}'", did_you_mean(loading, LOADINGS))
     ageing_law, modifiers = registry.ageing(ageing)
     system = System(
-        friction=registry.get("friction", law),
+        friction=_of(FrictionLaw, registry.get("friction", law)),
         ageing=ageing_law,
         modifiers=modifiers,
-        interface=registry.get("interface", interface),
+        interface=_of(Interface, registry.get("interface", interface)),
         loading=loading,
         inertia=inertia,
     )
     _check_symbols(system)
     return system
+
+
+def _of(kind: type[L], law: Law) -> L:
+    """Return `law`, which a registry lists under `kind`; anything else in its place is an error of the plugin."""
+    if not isinstance(law, kind):
+        raise SrfError(f"'{law.name}' is not a {kind.__name__}", f"its source, {law.source}, declares another kind")
+    return law
 
 
 def _check_symbols(system: System) -> None:
@@ -215,7 +224,13 @@ def build_equations(system: System) -> Equations:
         mu_dot - m_v * d_ln_v - sum(a * b for a, b in zip(m_phi, d_ln_phi, strict=True)),
         W_rate - W_imposed_dot - tangent * K * u_rate,
     ]
-    stand_ins = {s("mu"): mu, s("mu_dot"): mu_dot, s("W"): load, s("W_dot"): W_rate, s("F_dot_over_W"): mu_dot + mu * W_rate / load}
+    stand_ins = {
+        s("mu"): mu,
+        s("mu_dot"): mu_dot,
+        s("W"): load,
+        s("W_dot"): W_rate,
+        s("F_dot_over_W"): mu_dot + mu * W_rate / load,
+    }
     for state, rate in zip(states, d_ln_phi, strict=True):
         balance.append(s(state.name) * rate - state_rate(system, state).subs(stand_ins, simultaneous=True))
     wanted = [d_ln_v, mu_dot, W_rate, *d_ln_phi]
@@ -232,7 +247,9 @@ def build_equations(system: System) -> Equations:
     W_total = W_imposed
     if system.loading == "inclined":
         shift = tangent * W0 * mu_ss
-        W_total = W_imposed + tangent * K * u - shift if system.inertia else (W_imposed - shift) / (1 - tangent * mu_law)
+        W_total = (
+            W_imposed + tangent * K * u - shift if system.inertia else (W_imposed - shift) / (1 - tangent * mu_law)
+        )
     kappa = system.interface.kappa
     S = sp.simplify(s("W") / kappa) if kappa is not None else sp.S.Zero
     meaning = [
@@ -274,7 +291,9 @@ def _solve_linear(balance: list[sp.Expr], wanted: list[sp.Symbol], system: Syste
         ) from error
     solved = matrix.LUsolve(right) if matrix.shape[0] == matrix.shape[1] else None
     if solved is None:
-        raise SrfError(f"the equations of {system.title} do not determine the motion", "check the laws with `srf law check`")
+        raise SrfError(
+            f"the equations of {system.title} do not determine the motion", "check the laws with `srf law check`"
+        )
     return dict(zip(wanted, [tidy(e) for e in solved], strict=True))
 
 

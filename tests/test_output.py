@@ -183,23 +183,38 @@ def test_the_users_matplotlibrc_does_not_leak_in_or_out() -> None:
         assert matplotlib.rcParams["lines.linewidth"] == 9.0
 
 
-def test_only_a_single_open_curve_is_shaded() -> None:
+def shaded(figure: Any, x: float, y: float) -> bool:
+    """Return whether a point of the plane lies in the shading."""
+    ax = figure.axes[0]
+    return any(path.contains_point((x, y)) for patch in ax.collections for path in patch.get_paths())
+
+
+def test_the_curves_of_one_amplitude_are_shaded_where_sliding_is_stable() -> None:
     pytest.importorskip("matplotlib")
-    angle = np.linspace(0, 2 * np.pi, 50)
-    closed = {"eps": 0.1, "V": 10 * np.exp(0.1 * np.cos(angle)), "K_over_W0": 0.02 + 0.01 * np.sin(angle)}
-    counts = [
-        len(plots.stability_diagram(b, hopf=HOPF).axes[0].patches) for b in ([], BRANCHES[:1], BRANCHES, [closed])
-    ]
-    assert counts == [1, 1, 0, 0]
-    dashes = [line.get_linestyle() for line in plots.stability_diagram(BRANCHES).axes[0].lines]
-    assert len(set(dashes)) == 2  # colour never carries meaning alone
+    angle = np.linspace(0, 2 * np.pi, 400)
+    island = {"eps": 0.1, "V": 10 * np.exp(0.3 * np.cos(angle)), "K_over_W0": 0.02 + 0.005 * np.sin(angle)}
+    floor = {"eps": 0.1, "V": [1.0, 100.0], "K_over_W0": [0.01, 0.008]}
+    figure = plots.stability_diagram([island, floor])
+    for V, y, stable in ((10, 0.026, True), (10, 0.02, False), (10, 0.012, True), (10, 0.005, False), (3, 0.02, True)):
+        assert shaded(figure, V, y) == stable
+    alone = plots.stability_diagram([], hopf=HOPF)
+    middle = len(HOPF["V"]) // 2
+    assert shaded(alone, HOPF["V"][middle], HOPF["K_over_W0"][middle] * 1.02)
+    assert not shaded(alone, HOPF["V"][middle], HOPF["K_over_W0"][middle] * 0.9)
+
+
+def test_several_amplitudes_are_told_apart_without_colour() -> None:
+    pytest.importorskip("matplotlib")
+    axes = plots.stability_diagram(BRANCHES).axes[0]
+    assert not axes.collections
+    assert len({line.get_linestyle() for line in axes.lines}) == 2
 
 
 def test_an_orbit_has_a_panel_for_each_variable() -> None:
     pytest.importorskip("matplotlib")
     t = np.linspace(0, 1, 20)
-    figure = plots.orbit(t, u=t, v=t + 1, states={"phi": t + 1, "phi_2": t + 1}, mu=t, W=t)
-    assert [ax.get_yscale() for ax in figure.axes] == ["linear", "log", "log", "log", "linear", "linear"]
+    figure = plots.orbit(t, u=t, v=t + 0.1, states={"phi": t + 0.1, "phi_2": t + 1}, mu=t, W=t)
+    assert [ax.get_yscale() for ax in figure.axes] == ["linear", "log", "log", "linear", "linear", "linear"]
     assert all("[" in ax.get_ylabel() for ax in figure.axes if ax.get_ylabel() != "µ")
 
 

@@ -64,7 +64,11 @@ Progress = Callable[[str], None]
 
 
 def find_components(
-    model: GeneratedModel, plane: Plane, settings: AtlasSettings | None = None, *, progress: Progress = lambda text: None
+    model: GeneratedModel,
+    plane: Plane,
+    settings: AtlasSettings | None = None,
+    *,
+    progress: Progress = lambda text: None,
 ) -> Iterator[Atlas]:
     """Yield the atlas as it grows, after each component; the last one yielded is complete and says so in its notes.
 
@@ -82,7 +86,9 @@ def find_components(
                 if start is None:
                     missed += 1
                     continue
-                for curve, branches in _follow_finely(model, plane, start, settings, lambda n: progress(_said(curves, n))):
+                for curve, branches in _follow_finely(
+                    model, plane, start, settings, lambda n: progress(_said(curves, n))
+                ):
                     curves.append(curve)
                     atlas.branches.extend(branches)
                     if curve.end is Status.INTERRUPTED:
@@ -120,11 +126,17 @@ def _follow_finely(
         branches = polish_curve(model, plane, curve, settings)
         failed = sum(not pt.status.ok for b in branches for pt in b.points)
         N = start.orbit.x.shape[-2]
-        if interrupted or not failed or attempt == FINER_MESHES or 4 * N > settings.max_mesh:
+        if interrupted or not failed or attempt == FINER_MESHES or settings.max_mesh < 4 * N:
             yield curve, branches
             return
         finer = correct(
-            model, plane, start.q, interpolate(start.orbit, uniform_mesh(2 * N)), start.rho, start.tangent_q, np.zeros(start.orbit.x.shape[-1])
+            model,
+            plane,
+            start.q,
+            interpolate(start.orbit, uniform_mesh(2 * N)),
+            start.rho,
+            start.tangent_q,
+            np.zeros(start.orbit.x.shape[-1]),
         )
         if finer is None:
             yield curve, branches
@@ -141,7 +153,14 @@ def _scan_lines(model: GeneratedModel, plane: Plane, settings: AtlasSettings, pr
         base = plane.base.copy()
         base[model.index(plane.x.name)] = x
         scan = scan_line(
-            model, base, plane.y.name, values, intervals=INTERVALS, guess=guess, resolution=settings.resolution, log=plane.y.log
+            model,
+            base,
+            plane.y.name,
+            values,
+            intervals=INTERVALS,
+            guess=guess,
+            resolution=settings.resolution,
+            log=plane.y.log,
         )
         kept = np.searchsorted(scan.values, values)
         guess = scan.orbit.part(np.clip(kept, 0, len(scan.values) - 1))
@@ -156,7 +175,9 @@ def _unclaimed(model: GeneratedModel, plane: Plane, scan: LineScan, curves: list
     y = np.asarray(plane.y.unit(scan.values))
     for i in scan.brackets():
         reach = 0.5 * (y[i + 1] - y[i]) + 2e-3
-        if not any(y[i] - reach <= c <= y[i + 1] + reach and up == (scan.g[i] < scan.g[i + 1]) for c, up in _heights(curves, x)):
+        if not any(
+            y[i] - reach <= c <= y[i + 1] + reach and up == (scan.g[i] < scan.g[i + 1]) for c, up in _heights(curves, x)
+        ):
             yield i
 
 
@@ -174,7 +195,9 @@ def _heights(curves: list[Curve], x: float) -> list[tuple[float, bool]]:
     return found
 
 
-def _starting_point(model: GeneratedModel, plane: Plane, scan: LineScan, bracket: int, settings: AtlasSettings) -> CurvePoint | None:
+def _starting_point(
+    model: GeneratedModel, plane: Plane, scan: LineScan, bracket: int, settings: AtlasSettings
+) -> CurvePoint | None:
     """Return the boundary point in a sign change of a scan, ready to be followed, or None."""
     point = polish_brackets(model, scan, [bracket], tol=1e-4, max_mesh=settings.max_mesh)[0]
     if point.status is Status.NO_CONVERGENCE:
@@ -197,7 +220,7 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
     edge move along the edge.
     """
     pts = curve.points
-    normals = np.array([[-t[1], t[0]] / np.linalg.norm(t) for t in (pt.tangent_q for pt in pts)])
+    normals = np.array([np.array([-t[1], t[0]]) / np.linalg.norm(t) for t in (pt.tangent_q for pt in pts)])
     for k in (0, -1):
         for axis in (0, 1):
             if min(abs(pts[k].q[axis]), abs(pts[k].q[axis] - 1)) < 1e-9:
@@ -206,7 +229,9 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)  # distances in ln(parameter)
     direction = Direction(plane.names, vectors, (plane.x.log, plane.y.log))
     p = np.stack([pt.p for pt in pts], axis=1)
-    orbit = Discretisation(np.stack([pt.orbit.x for pt in pts]), np.stack([pt.orbit.stages for pt in pts]), pts[0].orbit.edges)
+    orbit = Discretisation(
+        np.stack([pt.orbit.x for pt in pts]), np.stack([pt.orbit.stages for pt in pts]), pts[0].orbit.edges
+    )
     rho = np.array([pt.rho for pt in pts])
     growth = np.stack([pt.growth for pt in pts])
     polished = polish(model, p, orbit, rho, direction, tol=settings.tol, max_mesh=settings.max_mesh, growth=growth)
@@ -220,7 +245,11 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
     branches.append(part)
     whole = len(branches) == 1
     return [
-        Branch(tuple(b), curve.start if whole or i == 0 else Status.OK, curve.end if whole or i == len(branches) - 1 else Status.OK)
+        Branch(
+            tuple(b),
+            curve.start if whole or i == 0 else Status.OK,
+            curve.end if whole or i == len(branches) - 1 else Status.OK,
+        )
         for i, b in enumerate(branches)
         if len(b) > 1
     ]
@@ -236,7 +265,9 @@ def _notes(atlas: Atlas, settings: AtlasSettings, missed: int) -> list[str]:
         f"a component that closes between two lines, or a narrower tongue, is not looked for (--scan-lines for more)"
     ]
     if lost:
-        notes.append(f"no forced periodic state was found at {lost} samples of the scan; boundaries beside them may be missing")
+        notes.append(
+            f"no forced periodic state was found at {lost} samples of the scan; boundaries beside them may be missing"
+        )
     if missed:
         notes.append(f"{missed} sign changes on the lines could not be polished to a point of a boundary")
     return notes

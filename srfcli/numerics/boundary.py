@@ -9,11 +9,20 @@ generated bilinear forms supply d(w . J v). The bordered system is regular at fo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import Array, ComplexArray, Condensed, Discretisation, condense, gauss, stage_parameters
+from srfcli.numerics.collocation import (
+    Array,
+    ComplexArray,
+    Condensed,
+    Discretisation,
+    condense,
+    gauss,
+    stage_parameters,
+)
 
 Names = tuple[str, ...]
 
@@ -102,7 +111,7 @@ def slope_in_last(linear: BoundaryLinear) -> Array:
     """Return d ln|rho| / d(last parameter) along the branch of orbits, the other parameters fixed, (...,)."""
     n = linear.periodic.shape[-2]
     inner = linear.periodic[..., :n]
-    usable = np.isfinite(inner).all(axis=(-1, -2))
+    usable: Any = np.isfinite(inner).all(axis=(-1, -2))
     usable &= np.abs(np.linalg.det(np.where(usable[..., None, None], inner, 0.0))) > 1e-300
     response = np.linalg.solve(np.where(usable[..., None, None], inner, np.eye(n)), linear.periodic[..., -1:])[..., 0]
     return linear.growth[..., -1] - np.einsum("...n,...n->...", linear.growth[..., :n], response)

@@ -10,14 +10,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.model import GeneratedModel
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+Array = NDArray[Any]  # real; shapes are in the docstrings
+ComplexArray = NDArray[Any]
 STAGES = 4
 
 
@@ -109,7 +110,9 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     scheme = gauss(m)
     tau, ps = orbit.phases, stage_parameters(p)
     inverse = scheme.inverse / h[:, None, None]  # (N, m, m)
-    block = np.broadcast_to((inverse[:, :, None, :, None] * np.eye(n)[:, None, :]), (*X.shape[:-3], len(h), m, n, m, n)).copy()
+    block = np.broadcast_to(
+        (inverse[:, :, None, :, None] * np.eye(n)[:, None, :]), (*X.shape[:-3], len(h), m, n, m, n)
+    ).copy()
     diagonal = np.einsum("...jajb->...jab", block)
     diagonal -= model.cycle_jacobian(tau, X, ps)
     away = X - x[..., None, :]

@@ -133,13 +133,26 @@ def correct(
             moduli = np.abs(linear.multipliers)
             pair = np.minimum(np.abs(linear.multipliers - rho), np.abs(linear.multipliers - np.conj(rho))) < 1e-9
             others = float(np.where(pair, 0.0, moduli).max())
-            point = CurvePoint(q, plane.point(model, q), orbit, rho, others, tangent_full[n:], tangent_orbit, growth, slope_y, correction=first)
+            point = CurvePoint(
+                q,
+                plane.point(model, q),
+                orbit,
+                rho,
+                others,
+                tangent_full[n:],
+                tangent_orbit,
+                growth,
+                slope_y,
+                correction=first,
+            )
             return _normalised(model, point, orientation)
         growth = None if change > STALE * reach or change > 0.05 else growth
     return None
 
 
-def _matrix(model: GeneratedModel, plane: Plane, p: Array, linear: BoundaryLinear, normal_q: Array, normal_x: Array) -> Array:
+def _matrix(
+    model: GeneratedModel, plane: Plane, p: Array, linear: BoundaryLinear, normal_q: Array, normal_x: Array
+) -> Array:
     n = normal_x.shape[0]
     matrix = np.empty((n + 2, n + 2))
     rate = plane.rates(model, p)
@@ -193,7 +206,18 @@ def follow(
         q, orbit = predict(current, before, ds)
         size = orbit_size(model, current)
         normal_x = current.tangent_orbit.x[0] / size**2 * ORBIT_WEIGHT**2
-        point = correct(model, plane, q, orbit, current.rho, current.tangent_q, normal_x, orientation=current, tol=settings.tol, reach=ds)
+        point = correct(
+            model,
+            plane,
+            q,
+            orbit,
+            current.rho,
+            current.tangent_q,
+            normal_x,
+            orientation=current,
+            tol=settings.tol,
+            reach=ds,
+        )
         turned = np.inf if point is None else _angle(current, point)
         if point is None or turned > 2 * settings.turn or abs(np.angle(point.rho / current.rho)) > 0.5:
             ds *= 0.4
@@ -265,7 +289,9 @@ def reversed_tangent(point: CurvePoint) -> CurvePoint:
     return replace(point, tangent_q=-point.tangent_q, tangent_orbit=Discretisation(-t.x, -t.stages, t.edges))
 
 
-def trace(model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings | None = None) -> Iterator[Curve]:
+def trace(
+    model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings | None = None
+) -> Iterator[Curve]:
     """Yield the growing curve through `start` after each point, both ways; the last one yielded is complete."""
     settings = settings or StepSettings()
     curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)

@@ -50,7 +50,13 @@ def critical_line(
     """
     values = np.geomspace(lo, hi, samples) if guess is None else guess.values
     scan = scan_line(
-        model, base, name, values, intervals=INTERVALS, guess=None if guess is None else guess.orbit, resolution=resolution
+        model,
+        base,
+        name,
+        values,
+        intervals=INTERVALS,
+        guess=None if guess is None else guess.orbit,
+        resolution=resolution,
     )
     points = locate_crossings(model, base, scan, tol=tol, max_mesh=max_mesh)
     first = np.nonzero(np.isfinite(scan.g))[0]
@@ -120,8 +126,12 @@ def polish_brackets(
 def _notes(scan: LineScan, points: list[BoundaryPoint], crossings: tuple[int, ...]) -> list[str]:
     notes = []
     if scan.lost.size:
-        notes.append(f"no forced periodic state was found at {scan.lost.size} of {len(scan.values)} samples of {scan.name}")
+        notes.append(
+            f"no forced periodic state was found at {scan.lost.size} of {len(scan.values)} samples of {scan.name}"
+        )
     for point, crossing in zip(points, crossings, strict=True):
         if point.slope and (point.slope > 0) != (crossing % 2 == 1):
-            notes.append(f"crossing {crossing} has the wrong direction: a crossing closer than {scan.resolution:.1g} was missed")
+            notes.append(
+                f"crossing {crossing} has the wrong direction: a crossing closer than {scan.resolution:.1g} was missed"
+            )
     return notes

@@ -90,7 +90,11 @@ def waveforms(model: GeneratedModel, p: Array, orbit: Discretisation, samples: i
     tau = np.arange(samples) / samples
     x = interpolate(orbit, np.concatenate([tau, [1.0]])).x
     return Waveforms(
-        tau, x, model.cycle_friction(tau, x, p.tolist()), model.cycle_load(tau, x, p.tolist()), model.cycle_elongation(tau, x, p.tolist())
+        tau,
+        x,
+        model.cycle_friction(tau, x, p.tolist()),
+        model.cycle_load(tau, x, p.tolist()),
+        model.cycle_elongation(tau, x, p.tolist()),
     )
 
 

@@ -41,7 +41,7 @@ class HopfPoint:
 
 def hopf_points(model: GeneratedModel, p: Array) -> list[HopfPoint]:
     """Return every Hopf bifurcation in W0 at the parameters `p` (n_parameters,), by rising load; W0 in `p` is not used."""
-    points = []
+    points: list[HopfPoint] = []
     for W0 in _candidates(model, p):
         point = _polish(model, p, W0)
         if point is not None and not any(abs(point.W0 / q.W0 - 1) < 1e-9 for q in points):
@@ -61,6 +61,22 @@ def weakening(model: GeneratedModel, p: Array) -> float:
     """Return -d mu_ss / d ln V, positive for velocity weakening (states of the same steady age law)."""
     slopes = model.slopes(p)
     return float(slopes[..., 1:].sum(axis=-1) - slopes[..., 0])
+
+
+def closed_forms(model: GeneratedModel, p: Array) -> dict[str, float]:
+    """Return the generated closed forms at `p`, where the system has them and they are positive.
+
+    `K_over_W0_rigid` and `Omega_rigid` for kappa to infinity, `K_over_W0_quasistatic` with M to 0 besides (paper's eqs.).
+    """
+    K, found = float(p[model.index("K")]), {}
+    for name, key in (("limit_load", "K_over_W0_rigid"), ("quasistatic_load", "K_over_W0_quasistatic")):
+        if name in model.namespace:
+            load = float(model.namespace[name](p))
+            if np.isfinite(load) and load > 0:
+                found[key] = K / load
+    if "closed_frequency" in model.namespace and weakening(model, p) > 0:
+        found["Omega_rigid"] = float(model.closed_frequency(p))
+    return found
 
 
 def _with_load(model: GeneratedModel, p: Array, W0: Array | complex | float) -> list[Array | complex | float]:

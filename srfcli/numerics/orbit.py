@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -170,7 +171,7 @@ def _newton(model: GeneratedModel, p: Array, orbit: Discretisation) -> tuple[Con
         linear = _condense_each(model, p, orbit)
     matrix = np.eye(n) - linear.monodromy
     right = linear.prefix[..., -1, :n, n]
-    finite = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
+    finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
     matrix = np.where(finite[..., None, None], matrix, np.eye(n))
     singular = finite & (np.abs(np.linalg.det(matrix)) < 1e-300)
     matrix[singular] = np.eye(n)
@@ -190,9 +191,18 @@ def _condense_each(model: GeneratedModel, p: Array, orbit: Discretisation) -> Co
             n, size = orbit.x.shape[-1], orbit.stages.shape[-2] * orbit.stages.shape[-1]
             N = orbit.x.shape[-2]
             nan = np.full((1, N, size // n, n, n + 1), np.nan)
-            parts.append(Condensed(np.full((1, N, size, size), np.nan), nan, np.full((1, N, n + 1, n + 1), np.nan),
-                                   np.full((1, N + 1, n + 1, n + 1), np.nan), np.full(1, np.nan)))
-    return Condensed(*(np.concatenate([getattr(q, k) for q in parts]) for k in ("block", "local", "maps", "prefix", "residual")))
+            parts.append(
+                Condensed(
+                    np.full((1, N, size, size), np.nan),
+                    nan,
+                    np.full((1, N, n + 1, n + 1), np.nan),
+                    np.full((1, N + 1, n + 1, n + 1), np.nan),
+                    np.full(1, np.nan),
+                )
+            )
+    return Condensed(
+        *(np.concatenate([getattr(q, k) for q in parts]) for k in ("block", "local", "maps", "prefix", "residual"))
+    )
 
 
 def status_of(converged: bool) -> Status:

@@ -26,7 +26,9 @@ class Axis:
 
     def unit(self, value: Array | float) -> Array | float:
         """Return `value` as a coordinate that is 0 at `lo` and 1 at `hi`."""
-        return np.log(np.asarray(value) / self.lo) / self.span if self.log else (np.asarray(value) - self.lo) / self.span
+        return (
+            np.log(np.asarray(value) / self.lo) / self.span if self.log else (np.asarray(value) - self.lo) / self.span
+        )
 
     def value(self, unit: Array | float) -> Array | float:
         """Return the parameter at a unit coordinate."""

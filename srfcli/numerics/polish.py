@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,11 @@ class Direction:
     def moved(self, values: Array, distance: Array) -> Array:
         """Return `values` (k, B) moved by `distance` (B,)."""
         shift = self.vectors.T * distance
-        return np.where(np.array(self.log)[:, None], values * np.exp(np.where(np.array(self.log)[:, None], shift, 0)), values + shift)
+        return np.where(
+            np.array(self.log)[:, None],
+            values * np.exp(np.where(np.array(self.log)[:, None], shift, 0)),
+            values + shift,
+        )
 
 
 def along(name: str, count: int) -> Direction:
@@ -133,15 +138,19 @@ def polish(
         fine = _newton(model, coarse.p, finer, coarse.rho, direction.part(index), coarse.growth, tol)
         error = np.abs(fine.moved) / RELIED_ON + 1e-12
         converged = coarse.converged & fine.converged
-        done = (converged & (error <= tol)) | ~fine.converged | (4 * N > max_mesh)
+        done = (converged & (error <= tol)) | ~fine.converged | (max_mesh < 4 * N)
         for j in np.nonzero(done)[0]:
-            points[index[j]] = _point(model, fine, j, direction.names[-1], float(error[j]), bool(converged[j]), tol)
+            points[index[j]] = _point(
+                model, fine, int(j), direction.names[-1], float(error[j]), bool(converged[j]), tol
+            )
         keep = np.nonzero(~done)[0]
         index, coarse = index[keep], _select(fine, keep)
     return [q for q in points if q is not None]
 
 
-def _point(model: GeneratedModel, r: _Polished, j: int, name: str, error: float, converged: bool, tol: float) -> BoundaryPoint:
+def _point(
+    model: GeneratedModel, r: _Polished, j: int, name: str, error: float, converged: bool, tol: float
+) -> BoundaryPoint:
     value = float(r.p[model.index(name), j])
     status = Status.OK if error <= tol else Status.TOLERANCE
     return BoundaryPoint(
@@ -202,9 +211,15 @@ def _newton_chunk(
     B, n = p.shape[1], orbit.x.shape[-1]
     rows = [model.index(name) for name in direction.names]
     r = _Polished(
-        p.copy(), Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges), target.astype(complex).copy(),
+        p.copy(),
+        Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges),
+        target.astype(complex).copy(),
         np.full((B, n + 1 + len(rows)), np.nan) if growth is None else growth.copy(),
-        np.full(B, np.inf), np.full(B, np.nan), np.full(B, np.nan), np.zeros(B), np.zeros(B, bool),
+        np.full(B, np.inf),
+        np.full(B, np.nan),
+        np.full(B, np.nan),
+        np.zeros(B),
+        np.zeros(B, bool),
     )
     active, before, chord = np.arange(B), np.full(B, np.inf), growth is not None
     for _ in range(max_iterations):
@@ -219,7 +234,7 @@ def _newton_chunk(
             except np.linalg.LinAlgError:
                 break
             matrix, right = _bordered(linear, unit, n, chord)
-            finite = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
+            finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
             matrix[~finite] = np.eye(n + 1)
             step = np.linalg.solve(matrix, np.where(finite[:, None], right, 0.0)[..., None])[..., 0]
             dq = np.clip(step[:, n], -LARGEST_STEP, LARGEST_STEP)
@@ -228,11 +243,11 @@ def _newton_chunk(
             change = np.abs(dx / scales(model, q)[:, None, :]).max(axis=(-1, -2))
         r.rho[active], r.growth[active] = linear.rho, linear.growth
         r.others[active] = _largest_other(linear.multipliers, linear.rho)
-        usable = finite & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
+        usable: Any = finite & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
         limit = np.where(usable, limit, 0.0)
         dq = np.where(usable, limit * dq, 0.0)
         r.moved[active] += dq
-        r.p[np.ix_(rows, active)] = line.moved(q[rows], dq)
+        r.p[np.asarray(rows)[:, None], active] = line.moved(q[rows], dq)
         r.orbit.x[active] += np.where(usable[:, None, None], limit[:, None, None] * dx, 0.0)
         r.orbit.stages[active] += np.where(usable[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
         size = np.maximum(0.1 * change, np.abs(dq))
@@ -258,7 +273,9 @@ def _bordered(linear: BoundaryLinear, unit: Array, n: int, chord: bool) -> tuple
     matrix[:, :n, n] = np.einsum("bik,bk->bi", linear.periodic[..., n + 1 :], unit)
     matrix[:, n, :n] = linear.growth[..., :n]
     matrix[:, n, n] = np.einsum("bk,bk->b", linear.growth[..., n + 1 :], unit)
-    right = -np.concatenate([linear.periodic[..., n], (linear.g + (0 if chord else linear.growth[..., n]))[:, None]], axis=-1)
+    right = -np.concatenate(
+        [linear.periodic[..., n], (linear.g + (0 if chord else linear.growth[..., n]))[:, None]], axis=-1
+    )
     return matrix, right
 
 

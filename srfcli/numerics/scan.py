@@ -37,7 +37,10 @@ class LineScan:
     def brackets(self) -> list[int]:
         """Return the indices i for which g changes sign between values[i] and values[i+1]."""
         g = self.g
-        return [int(i) for i in np.nonzero(np.isfinite(g[:-1]) & np.isfinite(g[1:]) & (g[:-1] * g[1:] <= 0) & (g[:-1] != 0))[0]]
+        return [
+            int(i)
+            for i in np.nonzero(np.isfinite(g[:-1]) & np.isfinite(g[1:]) & (g[:-1] * g[1:] <= 0) & (g[:-1] != 0))[0]
+        ]
 
 
 def growth(batch: OrbitBatch) -> tuple[ComplexArray, Array]:
@@ -46,7 +49,9 @@ def growth(batch: OrbitBatch) -> tuple[ComplexArray, Array]:
     return multipliers, np.log(np.abs(multipliers[:, 0]))
 
 
-def robust_orbits(model: GeneratedModel, p: Array, guess: Discretisation | None, edges: Array, *, tol: float = 1e-7) -> OrbitBatch:
+def robust_orbits(
+    model: GeneratedModel, p: Array, guess: Discretisation | None, edges: Array, *, tol: float = 1e-7
+) -> OrbitBatch:
     """Return orbits at `p`, from `guess`, else from steady sliding, else by raising eps in steps."""
     rest = steady_guess(model, p, edges)
     batch = solve_orbits(model, p, guess or rest, tol=tol, max_iterations=14 if guess is not None else 40)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import itertools
 import logging
-import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -118,41 +118,70 @@ def stability_diagram(
     xlabel: str = "V  [µm/s]",
     ylabel: str = "K/W$_0$  [1/µm]",
 ) -> Figure:
-    """Return the stability boundaries K/W0 (1/um) against V (um/s, logarithmic); sliding is stable above each of them.
+    """Return the stability boundaries K/W0 (1/um) against V (um/s, logarithmic).
 
     A branch is {eps, V, K_over_W0, component, label}, of which component and label may be missing; the branches of one
-    eps share colour and line style. `hopf`, {V, K_over_W0}, is the boundary under constant load. A curve that stands
-    alone is shaded on its stable side; a closed one never is.
+    eps share colour and line style. `hopf`, {V, K_over_W0}, is the boundary under constant load. The curves of a single
+    eps are shaded where sliding is stable: at the top, and beyond every second crossing on the way down.
     """
     with house_style():
         figure, (ax,) = new_figure()
         ax.set_xscale("log")
         if hopf is not None:
             ax.plot(hopf["V"], _gaps(hopf["K_over_W0"]), color="#555555", linestyle=DOTTED, label="ε = 0 (Hopf)")
-        order = list(dict.fromkeys(b["eps"] for b in branches))
-        named: set[str] = set()
-        for branch in branches:
-            index = order.index(branch["eps"])
-            label = branch.get("label") or f"ε = {branch['eps']:g}"
-            ax.plot(
-                branch["V"],
-                _gaps(branch["K_over_W0"]),
-                color=COLOURS[index % len(COLOURS)],
-                linestyle=DASHES[index % len(DASHES)],
-                label=label if label not in named else None,
-            )
-            named.add(label)
-        single = branches[0] if len(branches) == 1 else hopf if not branches else None
+        named = _draw_branches(ax, branches)
+        amplitudes = {b["eps"] for b in branches}
         _finish_axes(ax, xlabel=xlabel, ylabel=ylabel, title=title, legend=len(named) + (hopf is not None) > 1)
         _frame_curves(ax)
-        if single is not None:
-            _shade_above(ax, single["V"], single["K_over_W0"], COLOURS[0] if branches else "#555555")
+        if len(amplitudes) == 1 or (hopf is not None and not branches):
+            curves = [(b["V"], b["K_over_W0"]) for b in branches] or [(hopf["V"], hopf["K_over_W0"])]  # type: ignore[index]
+            _shade_stable(ax, curves, COLOURS[0] if branches else "#555555")
         elif branches:
-            closed = any(_is_closed(b["V"], b["K_over_W0"]) for b in branches)
-            text = "stable above each open curve" if closed else "stable above each curve"
+            folded = any(_folds(b["V"]) for b in branches)
+            text = "stable above, and right of a fold" if folded else "stable above each curve"
             ax.annotate(text, (0.99, 0.985), xycoords="axes fraction", ha="right", va="top", color="#555555")
         _decade_ticks(ax)
         return figure
+
+
+def boundaries(
+    branches: Sequence[Mapping[str, Any]],
+    *,
+    xlabel: str,
+    ylabel: str,
+    logx: bool = True,
+    logy: bool = False,
+    title: str = "",
+) -> Figure:
+    """Return boundaries in a plane of any two parameters; branches as in `stability_diagram`, x under V, y under K_over_W0."""
+    with house_style():
+        figure, (ax,) = new_figure()
+        ax.set_xscale("log" if logx else "linear")
+        ax.set_yscale("log" if logy else "linear")
+        named = _draw_branches(ax, branches)
+        _finish_axes(ax, xlabel=xlabel, ylabel=ylabel, title=title, legend=len(named) > 1)
+        if logx:
+            _decade_ticks(ax)
+        return figure
+
+
+def _draw_branches(ax: Axes, branches: Sequence[Mapping[str, Any]]) -> set[str]:
+    """Draw the branches, one colour and line style for each eps, and return the labels that were given."""
+    order = list(dict.fromkeys(b["eps"] for b in branches))
+    named: set[str] = set()
+    for branch in branches:
+        index = order.index(branch["eps"])
+        label = branch.get("label") or f"ε = {branch['eps']:g}"
+        ax.plot(
+            branch["V"],
+            _gaps(branch["K_over_W0"]),
+            color=COLOURS[index % len(COLOURS)],
+            linestyle=DASHES[index % len(DASHES)],
+            label=label if label not in named else None,
+            marker="o" if len(branch["V"]) == 1 else None,
+        )
+        named.add(label)
+    return named
 
 
 def _frame_curves(ax: Axes) -> None:
@@ -167,25 +196,41 @@ def _gaps(values: Values) -> list[float]:
     return [float("nan") if v is None else float(v) for v in values]
 
 
-def _is_closed(x: Values, y: Values) -> bool:
-    """Return whether a curve ends where it began, to drawing accuracy."""
-    points = list(zip(map(float, x), _gaps(y), strict=True))
-    ends = (points[0], points[-1]) if len(points) > 2 else ()
-    return bool(ends) and all(math.isclose(a, b, rel_tol=1e-6) for a, b in zip(*ends, strict=True))
+def _folds(x: Values) -> bool:
+    values = [float(v) for v in x]
+    rising = [b > a for a, b in itertools.pairwise(values) if a != b]
+    return any(rising) and not all(rising)
 
 
-def _shade_above(ax: Axes, x: Values, y: Values, colour: str) -> None:
-    """Shade between an open curve and the top, which is right through folds too: no curve crosses itself."""
-    points = [(float(a), b) for a, b in zip(x, _gaps(y), strict=True) if b == b]
-    if len(points) < 2 or _is_closed(x, y):
-        return
-    top = ax.get_ylim()[1]
-    ax.fill(
-        *zip(*points, (points[-1][0], top), (points[0][0], top), strict=True), color=colour, alpha=0.10, linewidth=0
-    )
+def _shade_stable(ax: Axes, curves: Sequence[tuple[Values, Values]], colour: str) -> None:
+    """Shade where sliding is stable: from the top down to the first crossing at each x, then between every second pair."""
+    import numpy as np
+
+    low, high = ax.get_xlim()
+    bottom, top = ax.get_ylim()
+    columns = np.geomspace(low, high, 1200)
+    edges: list[list[float]] = [[] for _ in columns]
+    covered = np.zeros(columns.size, bool)
+    for x, y in curves:
+        xs, ys = np.log(np.asarray(list(x), float)), np.asarray(_gaps(y))
+        for i in range(len(xs) - 1):
+            if not (np.isfinite(ys[i]) and np.isfinite(ys[i + 1])) or xs[i] == xs[i + 1]:
+                continue
+            inside = np.nonzero((np.log(columns) - xs[i]) * (np.log(columns) - xs[i + 1]) <= 0)[0]
+            share = (np.log(columns[inside]) - xs[i]) / (xs[i + 1] - xs[i])
+            covered[inside] = True
+            for column, height in zip(inside.tolist(), ys[i] + share * (ys[i + 1] - ys[i]), strict=True):
+                edges[column].append(float(height))
+    most = max((len(e) for e in edges), default=0)
+    levels = np.full((most + 2, columns.size), bottom)
+    levels[0] = top
+    for j, heights in enumerate(edges):
+        levels[1 : len(heights) + 1, j] = sorted(heights, reverse=True)
+    for k in range(0, most + 1, 2):
+        # where a column has fewer crossings than k the levels coincide, so that nothing is drawn there
+        ax.fill_between(columns, levels[k + 1], levels[k], where=covered, color=colour, alpha=0.10, linewidth=0)
     ax.annotate("stable", (0.98, 0.97), xycoords="axes fraction", ha="right", va="top", color="#333333")
-    below = (0.02, 0.03)
-    ax.annotate("oscillates", below, xycoords="axes fraction", ha="left", va="bottom", color="#333333")
+    ax.annotate("oscillates", (0.02, 0.03), xycoords="axes fraction", ha="left", va="bottom", color="#333333")
 
 
 def lines(
@@ -236,7 +281,8 @@ def orbit(
         figure, axes = new_figure(len(panels), size=(6.0, 1.15 * len(panels) + 0.9))
         for index, (ax, (label, values, log)) in enumerate(zip(axes, panels, strict=True)):
             ax.plot(_gaps(tau), _gaps(values), color=COLOURS[index % len(COLOURS)])
-            if log:
+            positive = [y for y in _gaps(values) if y > 0]
+            if log and positive and max(positive) > 3 * min(positive):
                 ax.set_yscale("log")
             else:
                 ax.ticklabel_format(axis="y", useOffset=False)
