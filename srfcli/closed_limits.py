@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import sympy as sp
 
-from srfcli.derive import ageing_slopes, characteristic_polynomial, friction_slopes, interface_meaning, slope_symbols
+from srfcli.derive import abbreviated_polynomial, ageing_slopes, friction_slopes, interface_meaning, slope_symbols
 from srfcli.expression import symbol
 from srfcli.laws import Interface
 from srfcli.system import System
@@ -18,17 +18,18 @@ from srfcli.system import System
 
 @dataclass(frozen=True)
 class ClosedLimits:
-    """W0c and Omega_c^2 in mu_v, mu_phi, mu_ss, the interface's and the apparatus' symbols; `load` None where not closed.
+    """W0c and Omega_c^2 in mu_v, mu_phi, mu_ss, the interface's and the apparatus' symbols; None where not closed.
 
-    `limit_load` is kappa to infinity, `quasistatic_load` that without inertia. `common_ageing` says that the ageing law
-    is linearised as -(V/D0) (d ln v + d ln phi), for which Omega_c is the paper's. W0c counts where it is positive and
+    `load` is exact for any kappa and M and holds the symbol Omega_c where inertia counts; `limit_load` is that for kappa to
+    infinity, `quasistatic_load` for kappa to infinity without inertia. `common_ageing` says that the ageing law is
+    linearised as -(V/D0) (d ln v + d ln phi), for which Omega_c is the paper's. A load counts where it is positive and
     Omega_c is real.
     """
 
-    omega_squared: sp.Expr
+    omega_squared: sp.Expr | None
     load: sp.Expr | None
-    limit_load: sp.Expr
-    quasistatic_load: sp.Expr
+    limit_load: sp.Expr | None
+    quasistatic_load: sp.Expr | None
     common_ageing: bool
 
 
@@ -47,36 +48,29 @@ def common_ageing(system: System) -> bool:
 
 
 def closed_limits(system: System) -> ClosedLimits | None:
-    """Return the closed forms of `system`, or None: more than one state, or Omega_c and W0c that cannot be told apart.
+    """Return the closed forms of `system`, or None where there is none: more than one state, say.
 
-    Under an inclined spring an ageing law that feels W_dot has none in general, but in the limits.
+    Under an inclined spring an ageing law that feels W_dot has the quasi-static one alone.
     """
     if len(system.friction.states) != 1:
         return None
     rigid = replace(system, interface=Interface("rigid"))
-    limit = _eliminate(rigid)
-    if limit is None:
-        return None
     slow = _eliminate(replace(rigid, inertia=False))
-    exact = _eliminate(system)
-    if exact is None and system.elastic:  # kappa a number of its own: Omega_c may still be closed
+    limit = _eliminate(rigid) if system.inertia else slow
+    exact = _eliminate(system) if system.elastic else limit
+    free = exact
+    if exact is None and system.elastic:  # with kappa as a number of its own Omega_c may still be closed
         free = _eliminate(system, stiffness=False)
-        omega, load = (free[1] if free else limit[1]), None
-        if free is None or sp.simplify(free[1] - limit[1]) != 0:
-            return None
-    elif exact is None:
+    if free is None and limit is None and slow is None:
         return None
-    else:
-        load, omega = exact
-    if slow is None:
-        return None
-    return ClosedLimits(omega, load, limit[0], slow[0], common_ageing(system))
+    load, limit_load, quasistatic_load = (None if e is None else e[0] for e in (exact, limit, slow))
+    return ClosedLimits(None if free is None else free[1], load, limit_load, quasistatic_load, common_ageing(system))
 
 
 def closed_critical_load(system: System) -> tuple[sp.Expr, sp.Expr] | None:
     """Return (W0c, Omega_c) for any kappa and M, or None where they are not closed."""
     found = closed_limits(system)
-    if found is None or found.load is None:
+    if found is None or found.load is None or found.omega_squared is None:
         return None
     return found.load, sp.sqrt(found.omega_squared)
 
@@ -91,52 +85,59 @@ def in_law_parameters(system: System, expression: sp.Expr) -> sp.Expr:
 
 def _eliminate(system: System, *, stiffness: bool = True) -> tuple[sp.Expr, sp.Expr] | None:
     """Return (W0c, Omega_c^2), W0c with Omega_c left in as the symbol Omega_c where inertia counts, or None."""
-    X, W0, M = sp.Symbol("X"), symbol("W0"), symbol("M")
-    a = characteristic_polynomial(system)
-    stand_ins: dict[sp.Expr, sp.Symbol] = {}
+    X, W0 = sp.Symbol("X"), symbol("W0")
+    coefficients, back = abbreviated_polynomial(system)
+    tangent = sp.Symbol("tangent", real=True)
+    back = {**back, tangent: sp.tan(symbol("angle"))}
     meaning = interface_meaning(system) if stiffness else []
-    a = tuple(_rational(sp.cancel(e.subs(meaning)), stand_ins) for e in a)
+    a = [sp.cancel(e.subs(meaning).subs(back[tangent], tangent)) for e in coefficients]
     even = sum(((-X) ** k * c for k, c in enumerate(a[0::2])), sp.S.Zero)
-    odd = sum(((-X) ** k * c for k, c in enumerate(a[1::2])), sp.S.Zero)
-    numerator = sp.numer(sp.together(odd))
-    if not numerator.is_polynomial(W0) or sp.degree(numerator, W0) != 1:
+    odd = sp.numer(sp.together(sum(((-X) ** k * c for k, c in enumerate(a[1::2])), sp.S.Zero)))
+    if not odd.is_polynomial(W0) or sp.degree(odd, W0) != 1:
         return None
-    slope, offset = sp.Poly(numerator, W0).all_coeffs()
+    slope, offset = sp.Poly(odd, W0).all_coeffs()
     load = sp.cancel(-offset / slope)
     rest = sp.numer(sp.together(even.subs(W0, load)))
     if not rest.is_polynomial(X):
         return None
-    roots = []
-    for factor, _ in sp.factor_list(rest, X)[1]:
-        if sp.degree(factor, X) == 0 or sp.rem(sp.numer(load), factor, X) == 0:  # W0 = 0: a slider without load
-            continue
-        if sp.degree(factor, X) != 1:
-            return None
-        one, zero = sp.Poly(factor, X).all_coeffs()
-        roots.append(sp.factor(-zero / one))
-    if len(roots) != 1 or roots[0].has(M):
+    frequencies = [f for f, _ in sp.factor_list(rest, X)[1] if f.has(X) and not _degenerate(load, f, X)]
+    if len(frequencies) != 1 or sp.degree(frequencies[0], X) != 1 or frequencies[0].has(symbol("M")):
         return None
-    back = {s: e for e, s in stand_ins.items()}
-    Omega = symbol("Omega_c")
-    return _arrange(load.subs(X, Omega**2)).xreplace(back), roots[0].xreplace(back)
+    one, zero = sp.Poly(frequencies[0], X).all_coeffs()
+    omega_squared = sp.factor(-zero / one)
+    return _arranged(load.subs(X, symbol("Omega_c") ** 2)).xreplace(back), omega_squared.xreplace(back)
 
 
-def _rational(expression: sp.Expr, stand_ins: dict[sp.Expr, sp.Symbol]) -> sp.Expr:
-    """Return `expression` with its transcendental parts as symbols, which `stand_ins` collects."""
-    for atom in sorted(expression.atoms(sp.exp, sp.log, sp.LambertW, sp.tan), key=lambda e: (-sp.count_ops(e), str(e))):
-        expression = expression.xreplace({atom: stand_ins.setdefault(atom, sp.Symbol(f"part{len(stand_ins)}", real=True))})
-    return expression
+def _degenerate(load: sp.Expr, factor: sp.Expr, X: sp.Symbol) -> bool:
+    """Return whether `factor` = 0 puts no load, or an infinite one, on the slider."""
+    return any(sp.rem(part, factor, X) == 0 for part in sp.fraction(load) if part.has(X))
 
 
-def _arrange(load: sp.Expr) -> sp.Expr:
-    """Return the load as a product of factors, the stiffness left over by inertia written K - M Omega_c^2."""
-    factored = sp.factor(load)
-    numerator, denominator = sp.fraction(factored)
-    if sp.Poly(denominator, *sorted(denominator.free_symbols, key=str)).LC() < 0:
-        numerator, denominator = -numerator, -denominator
-    signed = sp.Mul(*[_positive_first(f) for f in sp.Mul.make_args(sp.factor(numerator))])
-    return signed / denominator
+def _arranged(load: sp.Expr) -> sp.Expr:
+    """Return the load as a product of factors that are positive where friction weakens."""
+    numerator, denominator = (sp.Mul.make_args(sp.factor(part)) for part in sp.fraction(sp.factor(load)))
+    if not all(isinstance(f, sp.Expr) for f in (*numerator, *denominator)):
+        return load
+    negative = sum(_negative(f) for f in (*numerator, *denominator)) % 2
+    above, below = (sp.Mul(*[_grouped(-f if _negative(f) else f) for f in part]) for part in (numerator, denominator))
+    return -above / below if negative else above / below
 
 
-def _positive_first(factor: sp.Expr) -> sp.Expr:
-    return factor
+def _negative(factor: sp.Expr) -> bool:
+    """Return whether `factor` is negative in a typical state: weakening friction, weak inertia, a short elastic length."""
+    small = {"mu_v": "0.01", "mu_phi": "0.02", "mu_ss": "0.3", "tangent": "0.1", "M": "0.001"}
+    typical = {s: sp.Rational(small.get(s.name, "1")) for s in factor.free_symbols}
+    return bool(factor.subs(typical) < 0)
+
+
+def _grouped(factor: sp.Expr) -> sp.Expr:
+    """Return a sum with what multiplies lambda and K gathered, differences of slopes as mu_phi - mu_v."""
+    if not factor.is_Add:
+        return factor
+    return sp.collect(factor, [symbol("lambda"), symbol("K")], func=weakening_first)
+
+
+def weakening_first(inside: sp.Expr) -> sp.Expr:
+    """Return a factor written as the one that is positive where friction weakens, with a sign in front where need be."""
+    inside = sp.factor_terms(inside)
+    return sp.Mul(-1, -inside, evaluate=False) if inside.is_Add and _negative(inside) else inside

@@ -6,6 +6,7 @@ With perturbations proportional to exp(i Omega t) the paper writes C_4 Omega^4 +
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 
 import sympy as sp
@@ -45,7 +46,7 @@ def slope_symbols(system: System) -> tuple[sp.Symbol, tuple[sp.Symbol, ...]]:
 def linearise(system: System) -> Linearisation:
     """Return the linear stability problem of `system` about steady sliding at V under W0."""
     mu_v, mu_phi, mu_ss = friction_slopes(system)
-    abbreviated, back = _abbreviated_polynomial(system)
+    abbreviated, back = abbreviated_polynomial(system)
     symbolic = tuple(c.xreplace(back) for c in abbreviated)
     m_v, m_phi = slope_symbols(system)
     meaning: list[tuple[sp.Expr, sp.Expr]] = [(m_v, mu_v), *zip(m_phi, mu_phi, strict=True), (symbol("mu_ss"), mu_ss)]
@@ -83,11 +84,12 @@ def characteristic_polynomial(system: System) -> tuple[sp.Expr, ...]:
 
     Normalised so that a_0 = K V/D0 for the paper's system.
     """
-    coefficients, back = _abbreviated_polynomial(system)
+    coefficients, back = abbreviated_polynomial(system)
     return tuple(c.xreplace(back) for c in coefficients)
 
 
-def _abbreviated_polynomial(system: System) -> tuple[tuple[sp.Expr, ...], dict[sp.Symbol, sp.Expr]]:
+@functools.lru_cache(maxsize=32)
+def abbreviated_polynomial(system: System) -> tuple[tuple[sp.Expr, ...], dict[sp.Symbol, sp.Expr]]:
     """Return a_0..a_n with long slopes of the ageing law as single symbols, and what these stand for.
 
     Rows: force balance, slip relation, one ageing law a state; columns: position x, ln v, ln phi of each state. The
@@ -130,6 +132,7 @@ def _abbreviate(slope: sp.Expr, name: str, back: dict[sp.Symbol, sp.Expr]) -> sp
     return stand_in
 
 
+@functools.lru_cache(maxsize=32)
 def ageing_slopes(system: System) -> tuple[dict[str, sp.Expr], ...]:
     """Return for each state what d(ln phi)/dt changes by with ln v, ln phi, mu, W and the rates, in steady sliding."""
     v, V = symbol("v"), symbol("V")
@@ -164,7 +167,7 @@ def hurwitz_determinant(a: tuple[sp.Expr, ...]) -> sp.Expr:
 
 
 def _hurwitz_in_load(coefficients: tuple[sp.Expr, ...], stiffness: list[tuple[sp.Expr, sp.Expr]]) -> tuple[sp.Expr, ...] | None:
-    """Return the coefficients in W0 of the Hurwitz determinant times a power of W0, lowest first, or None."""
+    """Return the coefficients in W0 of the Hurwitz determinant over a power of W0, lowest first, or None."""
     W0 = symbol("W0")
     fractions = [sp.fraction(sp.cancel(a.subs(stiffness))) for a in coefficients]
     common = sp.S.One
@@ -181,4 +184,20 @@ def _hurwitz_in_load(coefficients: tuple[sp.Expr, ...], stiffness: list[tuple[sp
         parts.update({s: sp.factor_terms(c) for s, c in zip(names, terms, strict=True) if c != 0})
         short.append(sum((s * W0**j for j, s in enumerate(names)), sp.S.Zero))
     determinant = sp.Poly(hurwitz_determinant(tuple(short)), W0)
-    return tuple(c.xreplace(parts) for c in determinant.all_coeffs()[::-1])
+    found = [c.xreplace(parts) for c in determinant.all_coeffs()[::-1]]
+    found = [sp.S.Zero if _vanishes(c) else c for c in found]  # else rounding makes roots next to 0 and to infinity
+    while found and found[0] == 0:
+        found.pop(0)
+    while found and found[-1] == 0:
+        found.pop()
+    return tuple(found) or None
+
+
+def _vanishes(expression: sp.Expr) -> bool:
+    """Return whether a rational function of symbols and function values is zero, by exact arithmetic at an arbitrary point."""
+    atoms = sorted(expression.atoms(sp.Function), key=lambda e: (-sp.count_ops(e), str(e)))
+    for atom in atoms:
+        expression = expression.xreplace({atom: sp.Symbol(f"value_of_{atom}")})
+    symbols = sorted(expression.free_symbols, key=str)
+    point = {s: sp.Rational(sp.prime(i + 20), sp.prime(2 * i + 51)) for i, s in enumerate(symbols)}
+    return bool(sp.cancel(expression.xreplace(point)) == 0)

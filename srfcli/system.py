@@ -6,7 +6,7 @@ Units are um, s, N; mass is N s^2/um. The spring elongation is u = V t - x, z = 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
 import sympy as sp
@@ -164,6 +164,7 @@ def state_rate(system: System, state: State) -> sp.Expr:
     return rate.subs(own, simultaneous=True)
 
 
+@lru_cache(maxsize=32)
 def steady_states(system: System) -> tuple[sp.Expr, ...]:
     """Return each state variable in steady sliding at velocity v, as a formula in v.
 

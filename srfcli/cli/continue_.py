@@ -109,8 +109,8 @@ def command(
     with Progress("continue") as progress:
         for plane in planes:
             atlas: Atlas | None = None
-            for atlas in find_components(model, plane, settings, progress=lambda text: progress.advance(0, note=text)):
-                pass
+            for found in find_components(model, plane, settings, progress=lambda said: progress.advance(0, note=said)):
+                atlas = found
             if atlas is not None:
                 atlases.append(atlas)
             if atlas is None or atlas.status is Status.INTERRUPTED:

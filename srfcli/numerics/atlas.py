@@ -15,7 +15,6 @@ from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array, Discretisation
 from srfcli.numerics.continuation import Curve, CurvePoint, StepSettings, correct, trace
 from srfcli.numerics.critical import INTERVALS, polish_brackets
-from srfcli.numerics.orbit import interpolate, uniform_mesh
 from srfcli.numerics.plane import Plane
 from srfcli.numerics.polish import BoundaryPoint, Direction, polish
 from srfcli.numerics.scan import LineScan, scan_line
@@ -59,7 +58,6 @@ class Atlas:
     status: Status = Status.OK
 
 
-FINER_MESHES = 2  # how often a curve is followed again on twice the mesh
 Progress = Callable[[str], None]
 
 
@@ -86,14 +84,13 @@ def find_components(
                 if start is None:
                     missed += 1
                     continue
-                for curve, branches in _follow_finely(
-                    model, plane, start, settings, lambda n: progress(_said(curves, n))
-                ):
+                curve = _follow(model, plane, start, settings, lambda n: progress(_said(curves, n)))
+                if len(curve.points) > 1:
                     curves.append(curve)
-                    atlas.branches.extend(branches)
-                    if curve.end is Status.INTERRUPTED:
-                        raise KeyboardInterrupt
-                    yield atlas
+                    atlas.branches.extend(polish_curve(model, plane, curve, settings))
+                if curve.end is Status.INTERRUPTED:
+                    raise KeyboardInterrupt
+                yield atlas
     except KeyboardInterrupt:
         atlas.status = Status.INTERRUPTED
     atlas.notes = _notes(atlas, settings, missed)
@@ -109,39 +106,17 @@ def _said(curves: list[Curve], points: int) -> str:
     return f"component {len(curves) + 1}: {points} points"
 
 
-def _follow_finely(
+def _follow(
     model: GeneratedModel, plane: Plane, start: CurvePoint, settings: AtlasSettings, count: Callable[[int], None]
-) -> Iterator[tuple[Curve, list[Branch]]]:
-    """Yield the curve through `start` and its polished branches; on a finer mesh where the polish shows the first one to lack."""
-    for attempt in range(FINER_MESHES + 1):
-        curve, interrupted = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED), False
-        try:
-            for curve in trace(model, plane, start, settings.steps):
-                count(len(curve.points))
-        except KeyboardInterrupt:
-            interrupted = True
-            curve.end = Status.INTERRUPTED
-        if len(curve.points) < 2:
-            return
-        branches = polish_curve(model, plane, curve, settings)
-        failed = sum(not pt.status.ok for b in branches for pt in b.points)
-        N = start.orbit.x.shape[-2]
-        if interrupted or not failed or attempt == FINER_MESHES or settings.max_mesh < 4 * N:
-            yield curve, branches
-            return
-        finer = correct(
-            model,
-            plane,
-            start.q,
-            interpolate(start.orbit, uniform_mesh(2 * N)),
-            start.rho,
-            start.tangent_q,
-            np.zeros(start.orbit.x.shape[-1]),
-        )
-        if finer is None:
-            yield curve, branches
-            return
-        start = finer
+) -> Curve:
+    """Return the curve through `start`, both ways; after a KeyboardInterrupt as far as it was followed."""
+    curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
+    try:
+        for curve in trace(model, plane, start, settings.steps):
+            count(len(curve.points))
+    except KeyboardInterrupt:
+        curve.end = Status.INTERRUPTED
+    return curve
 
 
 def _scan_lines(model: GeneratedModel, plane: Plane, settings: AtlasSettings, progress: Progress) -> Iterator[LineScan]:
@@ -199,18 +174,12 @@ def _starting_point(
     model: GeneratedModel, plane: Plane, scan: LineScan, bracket: int, settings: AtlasSettings
 ) -> CurvePoint | None:
     """Return the boundary point in a sign change of a scan, ready to be followed, or None."""
-    point = polish_brackets(model, scan, [bracket], tol=1e-4, max_mesh=settings.max_mesh)[0]
+    point = polish_brackets(model, scan, [bracket], tol=settings.steps.mesh_error, max_mesh=settings.max_mesh)[0]
     if point.status is Status.NO_CONVERGENCE:
         return None
-    orbit = interpolate(point.orbit, uniform_mesh(mesh_for(point, settings)))
-    single = Discretisation(orbit.x[0], orbit.stages[0], orbit.edges)
+    single = Discretisation(point.orbit.x[0], point.orbit.stages[0], point.orbit.edges)
     q = plane.coordinates(model, point.p)
     return correct(model, plane, q, single, point.rho, np.array([1.0, 0.0]), np.zeros(single.x.shape[-1]))
-
-
-def mesh_for(point: BoundaryPoint, settings: AtlasSettings) -> int:
-    """Return the mesh on which a curve is followed: half of what the start needed, at least 16 intervals."""
-    return int(np.clip(point.orbit.x.shape[-2] // 2, INTERVALS, settings.max_mesh // 4))
 
 
 def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: AtlasSettings) -> list[Branch]:
@@ -228,16 +197,30 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
     vectors = normals * np.array([plane.x.span, plane.y.span])
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)  # distances in ln(parameter)
     direction = Direction(plane.names, vectors, (plane.x.log, plane.y.log))
-    p = np.stack([pt.p for pt in pts], axis=1)
-    orbit = Discretisation(
-        np.stack([pt.orbit.x for pt in pts]), np.stack([pt.orbit.stages for pt in pts]), pts[0].orbit.edges
-    )
-    rho = np.array([pt.rho for pt in pts])
-    growth = np.stack([pt.growth for pt in pts])
-    polished = polish(model, p, orbit, rho, direction, tol=settings.tol, max_mesh=settings.max_mesh, growth=growth)
+    polished: list[BoundaryPoint | None] = [None] * len(pts)
+    meshes = np.array([len(pt.orbit.edges) for pt in pts])
+    for edges in np.unique(meshes):
+        index = np.nonzero(meshes == edges)[0]
+        group = [pts[i] for i in index]
+        found = polish(
+            model,
+            np.stack([pt.p for pt in group], axis=1),
+            Discretisation(
+                np.stack([pt.orbit.x for pt in group]),
+                np.stack([pt.orbit.stages for pt in group]),
+                group[0].orbit.edges,
+            ),
+            np.array([pt.rho for pt in group]),
+            direction.part(index),
+            tol=settings.tol,
+            max_mesh=settings.max_mesh,
+            growth=np.stack([pt.growth for pt in group]),
+        )
+        for i, point in zip(index, found, strict=True):
+            polished[i] = point
     branches, part = [], []
     for point in polished:
-        if point.others < 1.0:
+        if point is not None and point.others < 1.0:
             part.append(point)
         elif part:
             branches.append(part)

@@ -21,6 +21,7 @@ from srfcli.numerics.collocation import (
     Discretisation,
     condense,
     gauss,
+    running_products,
     stage_parameters,
 )
 
@@ -84,12 +85,8 @@ def _growth_row(
     v_mesh = (c.prefix[..., :-1, :n, :n] @ r[..., None, :, None])[..., 0]  # (..., N, n)
     v = (c.local[..., :n] @ v_mesh[..., None, :, None])[..., 0]  # (..., N, m, n)
     # l carried backwards: l_{i+1} = (l G_{N-1} ... G_{i+1}); G_i is the n x n corner of the interval's map
-    l_mesh = np.empty_like(v_mesh)
-    corner = c.maps[..., :n, :n]
-    row = l
-    for i in range(l_mesh.shape[-2] - 1, -1, -1):
-        l_mesh[..., i, :] = row
-        row = (row[..., None, :] @ corner[..., i, :, :])[..., 0, :]
+    backwards = running_products(np.swapaxes(c.maps[..., ::-1, :n, :n], -1, -2))  # transposes, from the end
+    l_mesh = (backwards[..., -2::-1, :, :] @ l[..., None, :, None])[..., 0]
     seed = (scheme.step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
     both = np.stack([seed.real, seed.imag], axis=-1)
     w = np.linalg.solve(np.swapaxes(c.block, -1, -2), both)

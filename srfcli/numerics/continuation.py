@@ -14,8 +14,8 @@ import numpy as np
 
 from srfcli.model import GeneratedModel
 from srfcli.numerics.boundary import BoundaryLinear, linearise_boundary, slope_in_last
-from srfcli.numerics.collocation import Array, Discretisation, expand
-from srfcli.numerics.orbit import scales
+from srfcli.numerics.collocation import Array, Discretisation, mesh_error, respond, wanted_mesh
+from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
 from srfcli.numerics.plane import Plane
 from srfcli.status import Status
 
@@ -34,6 +34,8 @@ class StepSettings:
     correction: float = 2e-3  # first Newton correction aimed at: a single step then suffices
     tol: float = 1e-5
     max_steps: int = 3000
+    mesh_error: float = 2e-4  # on the mesh that is followed; beyond it the mesh is refined on the way
+    max_mesh: int = 512
 
 
 @dataclass
@@ -110,7 +112,10 @@ def correct(
             if not np.isfinite(solution).all():
                 return None
             rate = plane.rates(model, p)
-            dx, dstages = expand(linear.condensed, solution[:n, 0], solution[n:, 0] * rate)
+            head = np.zeros((n + 3, 2))
+            head[:n], head[n, 0], head[n + 1 :] = solution[:n], 1.0, solution[n:] * rate[:, None]
+            dxs, dall = respond(linear.condensed, head)
+            dx, dstages = dxs[..., 0], dall[..., 0]
         change = max(float(np.abs(solution[n:, 0]).max()), 0.1 * float((np.abs(dx) / scales(model, p)).max()))
         if iteration and change > 0.7 * previous:
             return None
@@ -120,9 +125,7 @@ def correct(
             return None
         if growth is None:
             tangent_full = solution[:, 1]
-            response = expand(linear.condensed, tangent_full[:n], tangent_full[n:] * rate)
-            rest = expand(linear.condensed, np.zeros(n), np.zeros(2))
-            tangent_orbit = Discretisation(response[0] - rest[0], response[1] - rest[1], orbit.edges)
+            tangent_orbit = Discretisation(dxs[..., 1], dall[..., 1], orbit.edges)
             growth, slope_y = linear.growth, float(slope_in_last(linear))
         small = change < min(np.sqrt(tol), STALE * reach)
         q = q + solution[n:, 0]
@@ -242,10 +245,28 @@ def follow(
             yield Status.CLOSED
             return
         before, current = current, point
+        if mesh_error(point.orbit, model.logarithmic) > settings.mesh_error:
+            finer = refined(model, plane, point, settings)
+            before, current = (None, finer) if finer is not None else (before, current)
         wanted = min(settings.correction, 0.7 * STALE * ds)
         growth = min(0.6 * settings.turn / max(turned, 1e-9), (wanted / max(point.correction, 1e-9)) ** (1 / 3))
         ds = min(settings.largest, ds * float(np.clip(growth, 0.5, 1.6)))
     yield Status.MAX_STEPS
+
+
+def refined(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: StepSettings) -> CurvePoint | None:
+    """Return `point` on a mesh whose error is half of what the settings allow, or None where it does not converge there."""
+    N = len(point.orbit.edges) - 1
+    mesh = wanted_mesh(mesh_error(point.orbit, model.logarithmic), N, settings.mesh_error, settings.max_mesh)
+    if mesh <= N:
+        return None
+    edges = uniform_mesh(int(mesh))
+    seen = replace(point, tangent_orbit=interpolate(point.tangent_orbit, edges))
+    normal_x = np.zeros(point.orbit.x.shape[-1])
+    start = interpolate(point.orbit, edges)
+    return correct(
+        model, plane, point.q, start, point.rho, point.tangent_q, normal_x, orientation=seen, reach=point.step
+    )
 
 
 def _angle(a: CurvePoint, b: CurvePoint) -> float:

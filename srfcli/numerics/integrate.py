@@ -10,6 +10,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -71,14 +72,16 @@ def simulate(
     """
     t, q = np.asarray(t, dtype=float), _parameters(model, p, drive, load, t)
     load.check(t[0], t[-1])
-    x = np.full((t.size, len(model.states)), np.nan)
+    n = len(model.states)
+    x = np.full((t.size, n), np.nan)
     x[0] = _start(model, q, start)
     tolerances = _absolute(model, drive, t, rtol) if atol is None else np.broadcast_to(np.asarray(atol, float), x[0].shape)
     rates, jacobian = (scalar_function(model, name, q) for name in ("rates", "rates_jacobian"))
     status, reached, state = Status.OK, float(t[0]), x[0]
     for a, b in _pieces(t, drive, load):
         middle = 0.5 * (a + b)
-        f, df = _frozen(rates, drive, load, middle), _frozen(jacobian, drive, load, middle)
+        f = _frozen(rates, (n,), drive, load, middle)
+        df = _frozen(jacobian, (n, n), drive, load, middle)
         wanted = np.nonzero((t > a) & (t <= b))[0]
         times = np.unique([a, *t[wanted], b])
         y, good = _lsoda(f, df, state, times, rtol, tolerances, load.longest_step)
@@ -106,7 +109,7 @@ def _parameters(model: GeneratedModel, p: Array, drive: Drive, load: Load, t: Ar
 def _start(model: GeneratedModel, q: Array, start: Array | None) -> Array:
     if start is None:
         if q[model.index("V")] <= 0:
-            raise SrfError("the drive is not moving forward at first, so that there is no steady sliding to start from", "give start")
+            raise SrfError("the drive does not move forward at first: there is no steady sliding to start from", "give start")
         return np.asarray(model.steady(q))
     x = np.array(start, dtype=float)
     if x.shape != (len(model.states),) or not np.isfinite(x).all():
@@ -125,14 +128,15 @@ def _pieces(t: Array, drive: Drive, load: Load) -> Iterator[tuple[float, float]]
     """Yield the intervals between output's ends and the breaks of drive and load."""
     inside = (b for b in (*drive.breaks, *load.breaks) if t[0] < b < t[-1])
     edges = np.unique([t[0], *inside, t[-1]]).tolist()
-    yield from zip(edges[:-1], edges[1:], strict=True)
+    yield from pairwise(edges)
 
 
-def _frozen(function: ScalarFunction, drive: Drive, load: Load, within: float) -> Callable[[float, Array], object]:
-    """Return `function` of (t, x) on the smooth piece that holds at `within`."""
+def _frozen(
+    function: ScalarFunction, shape: tuple[int, ...], drive: Drive, load: Load, within: float
+) -> Callable[[float, Array], object]:
+    """Return `function`, whose values have this shape, of (t, x) on the smooth piece that holds at `within`."""
     W_at = load.piece(within)
     V0, acceleration, since = drive.piece(within)
-    n = None
 
     def at(t: float, x: Array) -> object:
         W, W_dot = W_at(t)
@@ -140,9 +144,8 @@ def _frozen(function: ScalarFunction, drive: Drive, load: Load, within: float) -
         try:
             return function(x.tolist(), V, W, W_dot)
         except (ArithmeticError, ValueError):
-            return np.full(n, BEYOND)
+            return np.full(shape, BEYOND)
 
-    n = np.shape(function([0.0] * 16, 1.0, 1.0, 0.0))
     return at
 
 

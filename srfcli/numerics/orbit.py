@@ -20,7 +20,6 @@ from srfcli.numerics.collocation import (
     gauss,
     join,
 )
-from srfcli.status import Status
 
 CHUNK = 48  # parameter points solved together: their blocks fit the cache
 LOG_STEP = 2.0  # a Newton step changes no velocity or age by more than a factor e^2
@@ -55,9 +54,10 @@ def ordered_eigenvalues(matrix: Array, valid: Array) -> ComplexArray:
 
 def scales(model: GeneratedModel, p: Array) -> Array:
     """Return the size of each unknown, (..., n): logarithms 1, velocities V, lengths 1 um."""
-    V = p[model.index("V")]
-    columns = [V if name == "z" else np.ones_like(V) for name in model.states]
-    return np.stack(columns, axis=-1)
+    size = np.ones((*p.shape[1:], len(model.states)))
+    if "z" in model.states:
+        size[..., model.states.index("z")] = p[model.index("V")]
+    return size
 
 
 def uniform_mesh(intervals: int) -> Array:
@@ -149,7 +149,7 @@ def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: fl
         iteration += 1
         part = Discretisation(x[active], stages[active], guess.edges)
         with np.errstate(all="ignore"):  # a diverging point overflows; it is dropped below
-            linear, dx, dstages, finite = _newton(model, p[:, active], part)
+            linear, dx, dstages, finite = newton_step(model, p[:, active], part)
             limit = step_limit(model, dx, dstages)
             change = (np.abs(dx) / size[active][:, None, :]).max(axis=(-1, -2))
         limit = np.where(finite, limit, 0.0)
@@ -162,7 +162,7 @@ def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: fl
     return OrbitBatch(p, Discretisation(x, stages, guess.edges), monodromy, converged, iteration)
 
 
-def _newton(model: GeneratedModel, p: Array, orbit: Discretisation) -> tuple[Condensed, Array, Array, Array]:
+def newton_step(model: GeneratedModel, p: Array, orbit: Discretisation) -> tuple[Condensed, Array, Array, Array]:
     """Return the linearisation and the Newton corrections; the last array says which points are finite."""
     n = orbit.x.shape[-1]
     try:
@@ -197,14 +197,6 @@ def _condense_each(model: GeneratedModel, p: Array, orbit: Discretisation) -> Co
                     nan,
                     np.full((1, N, n + 1, n + 1), np.nan),
                     np.full((1, N + 1, n + 1, n + 1), np.nan),
-                    np.full(1, np.nan),
                 )
             )
-    return Condensed(
-        *(np.concatenate([getattr(q, k) for q in parts]) for k in ("block", "local", "maps", "prefix", "residual"))
-    )
-
-
-def status_of(converged: bool) -> Status:
-    """Return the status of one orbit."""
-    return Status.OK if converged else Status.NO_CONVERGENCE
+    return Condensed(*(np.concatenate([getattr(q, k) for q in parts]) for k in ("block", "local", "maps", "prefix")))

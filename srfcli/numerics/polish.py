@@ -9,13 +9,13 @@ import numpy as np
 
 from srfcli.model import GeneratedModel
 from srfcli.numerics.boundary import BoundaryLinear, linearise_boundary, slope_in_last
-from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, expand, join
-from srfcli.numerics.orbit import interpolate, scales, step_limit, uniform_mesh
+from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, expand, join, mesh_error, wanted_mesh
+from srfcli.numerics.orbit import interpolate, newton_step, scales, step_limit, uniform_mesh
 from srfcli.status import Status
 
 CHUNK = 24
 LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
-RELIED_ON = 15.0  # halving an interval divides the error by 2^8 in theory; 2^4 is what the estimate relies on
+CHORD_GAIN = 0.02  # a chord step is taken to leave this share of the correction, until a second one shows its own
 
 
 @dataclass(frozen=True)
@@ -101,11 +101,10 @@ class _Polished:
     residual: Array
     others: Array
     slope: Array
-    moved: Array
     converged: Array
 
 
-_POINTWISE = ("rho", "growth", "residual", "others", "slope", "moved", "converged")
+_POINTWISE = ("rho", "growth", "residual", "others", "slope", "converged")
 
 
 def polish(
@@ -119,38 +118,39 @@ def polish(
     max_mesh: int = 512,
     growth: Array | None = None,
 ) -> list[BoundaryPoint]:
-    """Return boundary points near `p` (n_parameters, B), moved along `direction`, on meshes doubled until `tol` is met.
+    """Return boundary points near `p` (n_parameters, B), moved along `direction`, each on a mesh whose error is below `tol`.
 
-    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess. With the gradients `growth` (B, n+1+k) of
-    ln |rho| they are taken for the solution on their own mesh, and what they lack counts as an error of that mesh. A point
-    that does not converge, or whose estimated error stays above `tol` on `max_mesh` intervals, says so in its status.
+    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess, `growth` (B, n+1+k) gradients of ln |rho| where
+    they are known. A point that does not converge, or whose estimated error stays above `tol` on `max_mesh` intervals,
+    says so in its status.
     """
     points: list[BoundaryPoint | None] = [None] * p.shape[1]
-    index = np.arange(p.shape[1])
-    if growth is not None:
-        nothing = np.zeros(p.shape[1])
-        coarse = _Polished(p, orbit, target, growth, nothing, nothing, nothing, nothing, np.ones(p.shape[1], bool))
-    else:
-        coarse = _newton(model, p, orbit, target, direction, None, tol)
-    while index.size:
+    count = p.shape[1]
+    rows = np.full((count, orbit.x.shape[-1] + 1 + len(direction.names)), np.nan) if growth is None else growth
+    blank = (*(np.full(count, np.nan),) * 3, np.ones(count, bool))
+    waiting = [(np.arange(count), _Polished(p, orbit, target, rows, *blank), growth is not None)]
+    while waiting:
+        index, coarse, known = waiting.pop()
         N = coarse.orbit.x.shape[-2]
-        finer = interpolate(coarse.orbit, uniform_mesh(2 * N))
-        fine = _newton(model, coarse.p, finer, coarse.rho, direction.part(index), coarse.growth, tol)
-        error = np.abs(fine.moved) / RELIED_ON + 1e-12
-        converged = coarse.converged & fine.converged
-        done = (converged & (error <= tol)) | ~fine.converged | (max_mesh < 4 * N)
-        for j in np.nonzero(done)[0]:
-            points[index[j]] = _point(
-                model, fine, int(j), direction.names[-1], float(error[j]), bool(converged[j]), tol
-            )
-        keep = np.nonzero(~done)[0]
-        index, coarse = index[keep], _select(fine, keep)
+        wanted = wanted_mesh(mesh_error(coarse.orbit, model.logarithmic), N, tol, max_mesh)
+        for mesh in np.unique(wanted):
+            here = np.nonzero(wanted == mesh)[0]
+            part = _select(coarse, here)
+            start = part.orbit if mesh == N else interpolate(part.orbit, uniform_mesh(int(mesh)))
+            lines = direction.part(index[here])
+            fine = _newton(model, part.p, start, part.rho, lines, part.growth if known else None, tol)
+            error = mesh_error(fine.orbit, model.logarithmic) + np.where(fine.converged, fine.residual, 0.0)
+            done = (error <= tol) | ~fine.converged | (mesh >= max_mesh)
+            for j in np.nonzero(done)[0]:
+                end = int(index[here[j]])
+                points[end] = _point(model, fine, int(j), direction.names[-1], float(error[j]), tol)
+            again = np.nonzero(~done)[0]
+            if again.size:
+                waiting.append((index[here[again]], _select(fine, again), True))
     return [q for q in points if q is not None]
 
 
-def _point(
-    model: GeneratedModel, r: _Polished, j: int, name: str, error: float, converged: bool, tol: float
-) -> BoundaryPoint:
+def _point(model: GeneratedModel, r: _Polished, j: int, name: str, error: float, tol: float) -> BoundaryPoint:
     value = float(r.p[model.index(name), j])
     status = Status.OK if error <= tol else Status.TOLERANCE
     return BoundaryPoint(
@@ -163,7 +163,7 @@ def _point(
         residual=float(r.residual[j]),
         others=float(r.others[j]),
         slope=float(r.slope[j]),
-        status=status if converged else Status.NO_CONVERGENCE,
+        status=status if r.converged[j] else Status.NO_CONVERGENCE,
         orbit=r.orbit.part(slice(j, j + 1)),
     )
 
@@ -218,51 +218,81 @@ def _newton_chunk(
         np.full(B, np.inf),
         np.full(B, np.nan),
         np.full(B, np.nan),
-        np.zeros(B),
         np.zeros(B, bool),
     )
-    active, before, chord = np.arange(B), np.full(B, np.inf), growth is not None
+    before, chord = np.full(B, np.inf), np.full(B, growth is not None)
+    if growth is not None:
+        _orbits_only(model, r)
+    active = np.arange(B)
     for _ in range(max_iterations):
+        going = []
+        for by_chord in (True, False):
+            index = active[chord[active] == by_chord]
+            if index.size:
+                going.append(_step(model, r, index, direction.part(index), rows, by_chord, before, chord, tol))
+        active = np.concatenate(going) if going else active[:0]
         if not active.size:
             break
-        part, q, line = r.orbit.part(active), r.p[:, active], direction.part(active)
-        unit = line.rates(q[rows])  # dp/d(distance), (B, k)
-        with np.errstate(all="ignore"):
-            try:
-                known = r.growth[active] if chord else None
-                linear = linearise_boundary(model, q, part, direction.names, r.rho[active], known)
-            except np.linalg.LinAlgError:
-                break
-            matrix, right = _bordered(linear, unit, n, chord)
-            finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
-            matrix[~finite] = np.eye(n + 1)
-            step = np.linalg.solve(matrix, np.where(finite[:, None], right, 0.0)[..., None])[..., 0]
-            dq = np.clip(step[:, n], -LARGEST_STEP, LARGEST_STEP)
-            dx, dstages = expand(linear.condensed, step[:, :n], dq[:, None] * unit)
-            limit = step_limit(model, dx, dstages)
-            change = np.abs(dx / scales(model, q)[:, None, :]).max(axis=(-1, -2))
-        r.rho[active], r.growth[active] = linear.rho, linear.growth
-        r.others[active] = _largest_other(linear.multipliers, linear.rho)
-        usable: Any = finite & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
-        limit = np.where(usable, limit, 0.0)
-        dq = np.where(usable, limit * dq, 0.0)
-        r.moved[active] += dq
-        r.p[np.asarray(rows)[:, None], active] = line.moved(q[rows], dq)
-        r.orbit.x[active] += np.where(usable[:, None, None], limit[:, None, None] * dx, 0.0)
-        r.orbit.stages[active] += np.where(usable[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
-        size = np.maximum(0.1 * change, np.abs(dq))
-        gain = np.where(np.isfinite(before[active]), size / before[active], 0.1)
-        left = size * np.clip(gain, size, 1.0) if chord else size * size  # what the step just made leaves behind
-        done = usable & (left < 0.01 * tol) & (size < 1e-3)
-        r.residual[active] = np.where(done, left, np.abs(linear.g))
-        if done.any():
-            r.slope[active] = slope_in_last(linear) * q[rows[-1]]
-        r.converged[active[done]] = True
-        before[active] = size
-        if chord and np.any(usable & ~done & (gain > 0.1)):
-            chord = False
-        active = active[usable & ~done]
     return r
+
+
+def _orbits_only(model: GeneratedModel, r: _Polished) -> None:
+    """Make one Newton step of the orbits at fixed parameters: a gradient from elsewhere does not know what that does to g."""
+    with np.errstate(all="ignore"):
+        _, dx, dstages, finite = newton_step(model, r.p, r.orbit)
+        limit = step_limit(model, dx, dstages)
+    r.orbit.x[finite] += limit[finite, None, None] * dx[finite]
+    r.orbit.stages[finite] += limit[finite, None, None, None] * dstages[finite]
+
+
+def _step(
+    model: GeneratedModel,
+    r: _Polished,
+    index: Array,
+    direction: Direction,
+    rows: list[int],
+    by_chord: bool,
+    before: Array,
+    chord: Array,
+    tol: float,
+) -> Array:
+    """Make one Newton or chord step of the points `index` of `r`, in place, and return those that are not finished."""
+    n, part, q = r.orbit.x.shape[-1], r.orbit.part(index), r.p[:, index]
+    unit = direction.rates(q[rows])  # dp/d(distance), (B, k)
+    with np.errstate(all="ignore"):
+        try:
+            known = r.growth[index] if by_chord else None
+            linear = linearise_boundary(model, q, part, direction.names, r.rho[index], known)
+        except np.linalg.LinAlgError:
+            return index[:0]  # they stay marked as not converged
+        matrix, right = _bordered(linear, unit, n, by_chord)
+        finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
+        matrix[~finite] = np.eye(n + 1)
+        step = np.linalg.solve(matrix, np.where(finite[:, None], right, 0.0)[..., None])[..., 0]
+        dq = np.clip(step[:, n], -LARGEST_STEP, LARGEST_STEP)
+        dx, dstages = expand(linear.condensed, step[:, :n], dq[:, None] * unit)
+        limit = step_limit(model, dx, dstages)
+        change = np.abs(dx / scales(model, q)[:, None, :]).max(axis=(-1, -2))
+    usable: Any = finite & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
+    limit = np.where(usable, limit, 0.0)
+    dq = np.where(usable, limit * dq, 0.0)
+    r.rho[index], r.growth[index] = linear.rho, linear.growth
+    r.others[index] = _largest_other(linear.multipliers, linear.rho)
+    r.p[np.asarray(rows)[:, None], index] = direction.moved(q[rows], dq)
+    r.orbit.x[index] += np.where(usable[:, None, None], limit[:, None, None] * dx, 0.0)
+    r.orbit.stages[index] += np.where(usable[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
+    size = np.maximum(0.1 * change, np.abs(dq))
+    gain = np.where(np.isfinite(before[index]), size / before[index], CHORD_GAIN)
+    left = size * np.clip(gain, size, 1.0) if by_chord else size * size  # what the step just made leaves behind
+    enough = np.maximum(0.1 * tol, 0.1 * mesh_error(part, model.logarithmic))  # a tenth of the mesh's own error
+    done = usable & (left < enough) & (size < 1e-3)
+    r.residual[index] = np.where(done, left, np.abs(linear.g))
+    if done.any():
+        r.slope[index] = slope_in_last(linear) * q[rows[-1]]
+    r.converged[index[done]] = True
+    before[index] = size
+    chord[index] &= gain <= 0.3  # kept up while steps gain a factor of three
+    return index[usable & ~done]
 
 
 def _bordered(linear: BoundaryLinear, unit: Array, n: int, chord: bool) -> tuple[Array, Array]:

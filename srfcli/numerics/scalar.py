@@ -22,9 +22,10 @@ ScalarFunction = Callable[..., Any]
 
 
 def scalar_function(model: GeneratedModel, name: str, p: Any) -> ScalarFunction:
-    """Return generated function `name` at the parameters `p` as a function of one state (a sequence of floats) and what follows it.
+    """Return generated function `name`, parameters `p` bound, as a function of one state and of what follows the state.
 
-    A vector comes back as a tuple, a matrix as a tuple of rows. Float overflow and logarithms of nothing raise, as `math` does.
+    The state is a sequence of floats; a vector comes back as a tuple, a matrix as a tuple of rows. Overflow and logarithms
+    of nothing raise, as `math` does.
     """
     return _factory(model.source, name)([float(value) for value in p])
 
@@ -47,7 +48,10 @@ def scalar_source(source: str, name: str) -> str:
     function = next((d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef) and d.name == name), None)
     if function is None:
         raise SrfError(f"generated module has no function '{name}'")
-    once, inside, cells, shape = [], [], {}, ()
+    once: list[str] = []
+    inside: list[str] = []
+    cells: dict[Any, str] = {}
+    shape: tuple[int, ...] = ()
     fixed = set(_MATH) | set(_ALIASES) | {"lambertw", "p"}
     result = ""
     for statement in function.body[1:]:  # the first is the docstring

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, join
-from srfcli.numerics.orbit import OrbitBatch, solve_orbits, steady_guess, uniform_mesh
+from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, join, mesh_error, wanted_mesh
+from srfcli.numerics.orbit import OrbitBatch, interpolate, solve_orbits, steady_guess, uniform_mesh
 
-HIDING = 4.0  # halve where |g| is below this many interpolation errors
+MESH_ERROR = 1e-5  # a hump of g lower than this cannot be told from none
+FINEST = 64
 
 
 @dataclass
@@ -98,10 +99,9 @@ def scan_line(
 
     `resolution` is the smallest spacing, in ln(value) where `log`, that halving reaches.
     """
-    edges = uniform_mesh(intervals)
     p = np.repeat(base[:, None], len(values), axis=1)
     p[model.index(name)] = values
-    batch = robust_orbits(model, p, guess, edges)
+    batch = _on_sufficient_mesh(model, robust_orbits(model, p, guess, uniform_mesh(intervals) if guess is None else guess.edges))
     multipliers, g = growth(batch)
     scan = LineScan(name, p, np.asarray(values, float), multipliers, g, batch.orbit, np.inf)
     coordinate = np.log if log else np.asarray
@@ -117,16 +117,49 @@ def scan_line(
     return scan
 
 
+def _on_sufficient_mesh(model: GeneratedModel, batch: OrbitBatch) -> OrbitBatch:
+    """Return the batch on a mesh that shows a growth rate as small as MESH_ERROR, up to FINEST intervals."""
+    N = len(batch.orbit.edges) - 1
+    if not batch.converged.any():
+        return batch
+    worst = mesh_error(batch.orbit, model.logarithmic)[batch.converged].max(keepdims=True)
+    mesh = int(wanted_mesh(worst, N, MESH_ERROR, FINEST)[0])
+    if mesh <= N:
+        return batch
+    edges = uniform_mesh(mesh)
+    return robust_orbits(model, batch.p, interpolate(batch.orbit, edges), edges)
+
+
 def _suspects(position: Array, g: Array, resolution: float) -> Array:
-    """Return for each interval whether a pair of crossings could hide in it and it is wider than `resolution`."""
+    """Return for each interval whether a pair of crossings could hide in it and it is wider than twice `resolution`.
+
+    It could where the cubic through the interval's ends and their neighbours comes within its error of zero.
+    """
     usable = np.isfinite(g)
     error = interpolation_error(position, g)
     worst = np.maximum(error[:-1], error[1:])
-    smallest = np.minimum(np.abs(g[:-1]), np.abs(g[1:]))
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        nearest = np.minimum(np.minimum(np.abs(g[:-1]), np.abs(g[1:])), _closest_inside(position, g))
+        close = ~(nearest > worst + MESH_ERROR)
     same_side = np.sign(g[:-1]) == np.sign(g[1:])
-    with np.errstate(invalid="ignore"):
-        close = smallest < HIDING * worst
     return usable[:-1] & usable[1:] & close & (np.diff(position) > 2 * resolution) & (same_side | (worst > 0.1))
+
+
+def _closest_inside(position: Array, g: Array) -> Array:
+    """Return how near to zero, on its ends' side, the cubic through four samples comes in each interval; below 0 if across."""
+    count = len(g) - 1
+    first = np.clip(np.arange(count) - 1, 0, max(count - 3, 0))
+    window = first[:, None] + np.arange(min(4, len(g)))
+    xs, ys = position[window], g[window]  # (intervals, 4)
+    at = position[:-1, None] + np.diff(position)[:, None] * np.linspace(0.1, 0.9, 9)
+    value = np.zeros_like(at)
+    for i in range(xs.shape[1]):
+        basis = np.ones_like(at)
+        for j in range(xs.shape[1]):
+            if j != i:
+                basis *= (at - xs[:, j, None]) / (xs[:, i, None] - xs[:, j, None])
+        value += ys[:, i, None] * basis
+    return (value * np.sign(g[:-1])[:, None]).min(axis=1)
 
 
 def interpolation_error(position: Array, g: Array) -> Array:

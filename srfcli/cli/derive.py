@@ -1,0 +1,71 @@
+"""`srf derive`: what follows from a law by algebra, and the paper's equations held against it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import click
+
+from srfcli.cli.options import SrfCommand, SystemOptions, system_options
+from srfcli.cli.text_out import out_option, put
+from srfcli.errors import SrfError
+
+EPILOG = """
+srf derive                                       the paper's model
+srf derive --law log-log --ageing ruina --with all
+srf derive --law two-state --format latex --out two-state.tex
+srf derive --format python                       C0..C4 as a NumPy function
+srf derive --check-paper                         what the paper misprints
+"""
+FORMATS = ("text", "json", "latex", "python")
+EXTRAS = {"jacobian": ("jacobian",), "parameters": ("parameters",), "all": ("jacobian", "parameters")}
+
+
+@click.command("derive", cls=SrfCommand, epilog=EPILOG)
+@system_options
+@click.option("--format", "form", type=click.Choice(FORMATS), default="text", show_default=True, help="What to write.")
+@click.option(
+    "--with", "extra", type=click.Choice(tuple(EXTRAS)), multiple=True, help="Add long parts; JSON has all of them."
+)
+@click.option(
+    "--check-paper", is_flag=True, help="Compare the paper's printed equations and claims with its own model."
+)
+@out_option
+def command(
+    system: SystemOptions, form: str, extra: tuple[str, ...], check_paper: bool, out: Path | None, force: bool
+) -> None:
+    """Steady state, slopes, equations, dispersion relation and closed critical loads of a system, by algebra.
+
+    The coefficients C0, C1, ... are in the form and normalisation of the paper's appendix. --check-paper looks at the
+    paper's own model, whatever law is chosen.
+    """
+    put(_paper(form) if check_paper else _derive(system, form, extra, plain=out is not None), out, force=force)
+
+
+def _derive(system: SystemOptions, form: str, extra: tuple[str, ...], *, plain: bool) -> str:
+    from srfcli import render
+    from srfcli.derivation import derivation
+
+    chosen = system.system()
+    if form == "python":
+        return render.to_python(chosen)
+    wanted = EXTRAS["all"] if form == "json" else [part for name in extra for part in EXTRAS[name]]
+    sections = derivation(chosen, wanted)
+    if form == "json":
+        return json.dumps(render.to_document(chosen, sections), indent=2, allow_nan=False) + "\n"
+    if form == "latex":
+        return render.to_latex(chosen, sections)
+    return render.to_text(chosen, sections, unicode=not plain and sys.stdout.isatty())
+
+
+def _paper(form: str) -> str:
+    from srfcli import paper, render
+
+    if form not in ("text", "json"):
+        raise SrfError(f"--check-paper has no format {form}", "Choose --format text or --format json.")
+    findings = paper.check_paper()
+    if form == "json":
+        return json.dumps(render.paper_document(findings), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return render.paper_text(findings)

@@ -1,0 +1,55 @@
+"""Shared fixtures: models by the names of their parts, built once in a session; --runslow."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--runslow", action="store_true", help="run the long proofs too")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--runslow"):
+        for item in items:
+            if "slow" in item.keywords:
+                item.add_marker(pytest.mark.skip(reason="slow: run with --runslow"))
+
+
+@pytest.fixture(scope="session")
+def make_model() -> Callable[..., Any]:
+    """`make_model(law=..., ageing=..., interface=..., loading=..., inertia=...)`: the model, built once in a session."""
+    from srfcli.model import open_model
+    from srfcli.registry import load_registry
+
+    registry = load_registry()
+    built: dict[tuple[tuple[str, Any], ...], Any] = {}
+
+    def make(**names: Any) -> Any:
+        key = tuple(sorted(names.items()))
+        if key not in built:
+            built[key] = open_model(registry, **names)
+        return built[key]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def model(make_model: Callable[..., Any]) -> Any:
+    """The paper's system."""
+    return make_model()
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of reference data: SRF_SHARED, else `shared` beside the checkout; without it the test is skipped."""
+    default = Path(__file__).resolve().parent.parent.parent / "shared"
+    folder = Path(os.environ.get("SRF_SHARED", default))
+    if not (folder / "reference").is_dir():
+        pytest.skip(f"REFERENCE DATA ABSENT: {folder}/reference does not exist; set SRF_SHARED to check against it")
+    return folder

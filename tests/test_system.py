@@ -1,0 +1,149 @@
+"""Every kind of system: its linear stability and all its derivatives, held against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any
+
+import mpmath
+import numpy as np
+import pytest
+
+from srfcli.errors import SrfError
+from srfcli.registry import bundled_registry
+from srfcli.system import build_system
+
+REGISTRY = bundled_registry()
+LAWS = [e.name for e in REGISTRY.entries("friction")]
+AGEINGS = [e.name for e in REGISTRY.entries("ageing")]
+AGEINGS += [f"{AGEINGS[i % len(AGEINGS)]}+{e.name}" for i, e in enumerate(REGISTRY.entries("modifier"))]
+INTERFACES = [e.name for e in REGISTRY.entries("interface")]
+EVERY = list(product(LAWS, AGEINGS, INTERFACES, ("vertical", "inclined"), (True, False)))
+H = 1e-30
+
+
+def sample() -> list[tuple[Any, ...]]:
+    """Return few systems that hold every law, ageing law and interface, and those two by two with loading and inertia."""
+    found = []
+    for i in range(16):
+        interface, loading, inertia = INTERFACES[i % 4], ("vertical", "inclined")[i // 4 % 2], i // 8 == 0
+        found.append((LAWS[i % len(LAWS)], AGEINGS[i % len(AGEINGS)], interface, loading, inertia))
+    return found
+
+
+def names(case: tuple[Any, ...]) -> dict[str, Any]:
+    return dict(zip(("law", "ageing", "interface", "loading", "inertia"), case, strict=True))
+
+
+def label(case: tuple[Any, ...]) -> str:
+    return "-".join(str(part) for part in case)
+
+
+CASES = [pytest.param(case, id=label(case)) for case in sample()]
+SLOW = [pytest.param(case, id=label(case), marks=pytest.mark.slow) for case in EVERY if case not in sample()]
+
+
+def test_sample_holds_everything() -> None:
+    for i, kind in enumerate((LAWS, AGEINGS, INTERFACES, ("vertical", "inclined"), (True, False))):
+        assert {case[i] for case in sample()} == set(kind)
+
+
+def point(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return a state near, not at, steady sliding, and parameters."""
+    p = model.vector({"V": 7.0, "W0": 8.0, "eps": 0.2})
+    x = np.array(model.steady(p), dtype=float)
+    return x + 0.05 * np.cos(np.arange(1, x.size + 1)), p
+
+
+def agree(found: Any, expected: Any, tol: float = 1e-9) -> None:
+    found, expected = np.asarray(found), np.asarray(expected)
+    scale = np.abs(expected).max() or 1.0
+    assert found.shape == expected.shape
+    assert np.isfinite(expected).all()
+    # each entry to tol of itself, but for what cancels to rounding within the whole
+    assert np.all(np.abs(found - expected) <= tol * np.abs(expected) + 1e-13 * scale)
+
+
+def step_state(function: Callable[[Any], Any], x: np.ndarray) -> np.ndarray:
+    """Return d function/dx by complex step, the derivative's axis last."""
+    columns = []
+    for i in range(x.size):
+        y = x.astype(complex)
+        y[i] += 1j * H
+        columns.append(np.imag(function(y)) / H)
+    return np.stack(columns, axis=-1)
+
+
+def step_parameter(function: Callable[[Any], Any], p: np.ndarray, i: int) -> np.ndarray:
+    q: list[Any] = list(p)
+    q[i] = complex(q[i], H)
+    return np.imag(function(q)) / H
+
+
+@pytest.mark.parametrize("case", [*CASES, *SLOW])
+def test_characteristic_roots_are_eigenvalues(case: tuple[Any, ...], make_model: Callable[..., Any]) -> None:
+    model = make_model(**names(case))
+    for V in (0.3, 12.0, 90.0):
+        p = model.vector({"V": V, "W0": 9.0})
+        jacobian = model.rates_jacobian(model.steady(p), V, 9.0, 0.0, p)
+        with mpmath.workdps(40):  # the matrices are stiff: double precision would blur the small eigenvalues
+            eigenvalues = mpmath.eig(mpmath.matrix(jacobian.tolist()), left=False, right=False)
+            coefficients = [mpmath.mpf(float(c)) for c in model.characteristic(p)[::-1]]
+            roots = mpmath.polyroots(coefficients, maxsteps=500, extraprec=400)
+            assert len(roots) == len(eigenvalues) == len(model.states)
+            for root in roots:
+                nearest = min(eigenvalues, key=lambda e: abs(e - root))
+                assert abs(root - nearest) <= 1e-10 * abs(root)
+
+
+@pytest.mark.parametrize("case", [*CASES, *SLOW])
+def test_steady_is_steady(case: tuple[Any, ...], make_model: Callable[..., Any]) -> None:
+    model = make_model(**names(case))
+    p = model.vector({"V": 3.0, "W0": 9.0})
+    x = model.steady(p)
+    assert np.abs(model.rates(x, 3.0, 9.0, 0.0, p)).max() < 1e-8
+    K = p[model.index("K")]
+    assert model.elongation(x, 3.0, 9.0, 0.0, p) * K == pytest.approx(9.0 * model.steady_friction(p), rel=1e-12)
+    assert model.cycle_load(0.25, x, p) == pytest.approx(9.0, rel=1e-12)  # W0 is the load in steady sliding, at any angle
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_state_derivatives(case: tuple[Any, ...], make_model: Callable[..., Any]) -> None:
+    model = make_model(**names(case))
+    x, p = point(model)
+    n = x.size
+    w, a, b, c = (np.sin(np.arange(k, k + n)) for k in (1.0, 2.5, 4.0, 5.5))
+    W0 = p[model.index("W0")]
+    drive = (7.0, 8.5, 40.0)
+    agree(model.rates_jacobian(x, *drive, p), step_state(lambda y: model.rates(y, *drive, p), x))
+    agree(model.cycle_jacobian(0.3, x, p), step_state(lambda y: model.cycle(0.3, y, p), x))
+    agree(model.cycle_bilinear(0.3, x, p, w, a), step_state(lambda y: w @ model.cycle_jacobian(0.3, y, p) @ a, x))
+    calm = step_state(lambda y: model.rates_jacobian(y, 7.0, W0, 0.0, p) @ a, x)
+    agree(model.second(x, p, a, b), calm @ b, 1e-8)
+    agree(model.third(x, p, a, b, c), step_state(lambda y: model.second(y, p, a, b), x) @ c, 1e-8)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_parameter_derivatives(case: tuple[Any, ...], make_model: Callable[..., Any]) -> None:
+    model = make_model(**names(case))
+    x, p = point(model)
+    w, a = np.sin(np.arange(1.0, x.size + 1)), np.cos(np.arange(2.0, x.size + 2))
+    for i, name in enumerate(model.names):
+        found = model.cycle_parameter(name)(0.3, x, p)
+        agree(found, step_parameter(lambda q: model.cycle(0.3, x, q), p, i))
+        mixed = step_parameter(lambda q: w @ model.cycle_jacobian(0.3, x, q) @ a, p, i)
+        agree(model.cycle_bilinear_parameter(name)(0.3, x, p, w, a), mixed)
+
+
+def test_cycle_is_rates_over_one_period(model: Any) -> None:
+    x, p = point(model)
+    f, W0, eps = (p[model.index(n)] for n in ("f", "W0", "eps"))
+    angle = 2 * np.pi * 0.3
+    load, rate = W0 * (1 + eps * np.cos(angle)), -2 * np.pi * f * W0 * eps * np.sin(angle)
+    agree(model.cycle(0.3, x, p), model.rates(x, 7.0, load, rate, p) / f)
+
+
+def test_unknown_loading_is_named() -> None:
+    with pytest.raises(SrfError, match="unknown loading 'tilted'"):
+        build_system(REGISTRY, loading="tilted")
