@@ -7,6 +7,7 @@ The odd part is linear in W0; put into the even part it leaves one factor linear
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import sympy as sp
 
@@ -47,6 +48,7 @@ def common_ageing(system: System) -> bool:
     return True
 
 
+@lru_cache(maxsize=32)
 def closed_limits(system: System) -> ClosedLimits | None:
     """Return the closed forms of `system`, or None where there is none: more than one state, say.
 

@@ -59,6 +59,7 @@ def linearise(system: System) -> Linearisation:
     return Linearisation(symbolic, characteristic, mu_v, mu_phi, hurwitz, names)
 
 
+@functools.lru_cache(maxsize=32)
 def friction_slopes(system: System) -> tuple[sp.Expr, tuple[sp.Expr, ...], sp.Expr]:
     """Return mu_v, mu_phi of each state and mu_ss, in steady sliding at V, in the law's own parameters."""
     v, V, mu = symbol("v"), symbol("V"), system.friction.mu

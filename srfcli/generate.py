@@ -305,7 +305,9 @@ NAMES = {{
 
 def _empty(like, trailing):
     """Zeros of the shape that the arguments share, with `trailing` axes added."""
-    return zeros(broadcast_shapes(*[shape(a) for a in like]) + trailing, dtype=result_type(float, *like))
+    shapes = [shape(a) for a in like]
+    common = shapes[0] if shapes.count(shapes[0]) == len(shapes) else broadcast_shapes(*shapes)
+    return zeros(common + trailing, dtype=result_type(float, *like))
 {helpers}
 
 '''

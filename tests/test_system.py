@@ -105,7 +105,9 @@ def test_steady_is_steady(case: tuple[Any, ...], make_model: Callable[..., Any])
     assert np.abs(model.rates(x, 3.0, 9.0, 0.0, p)).max() < 1e-8
     K = p[model.index("K")]
     assert model.elongation(x, 3.0, 9.0, 0.0, p) * K == pytest.approx(9.0 * model.steady_friction(p), rel=1e-12)
-    assert model.cycle_load(0.25, x, p) == pytest.approx(9.0, rel=1e-12)  # W0 is the load in steady sliding, at any angle
+    assert model.cycle_load(0.25, x, p) == pytest.approx(
+        9.0, rel=1e-12
+    )  # W0 is the load in steady sliding, at any angle
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -216,8 +216,8 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
             max_mesh=settings.max_mesh,
             growth=np.stack([pt.growth for pt in group]),
         )
-        for i, point in zip(index, found, strict=True):
-            polished[i] = point
+        for i, located in zip(index, found, strict=True):
+            polished[i] = located
     branches, part = [], []
     for point in polished:
         if point is not None and point.others < 1.0:

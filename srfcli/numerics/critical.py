@@ -96,7 +96,8 @@ def _distinct(points: list[BoundaryPoint], model: GeneratedModel, name: str) -> 
     for point in points:
         if kept:
             apart = point.value(model, name) / kept[-1].value(model, name) - 1
-            if apart < 1e-7 and (point.slope > 0) == (kept[-1].slope > 0):
+            reach = max(1e-9, 20 * (point.error + kept[-1].error))
+            if apart < reach and (point.slope > 0) == (kept[-1].slope > 0):
                 continue
         kept.append(point)
     return kept

@@ -14,6 +14,7 @@ from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array
 from srfcli.status import Status
 
+WORST_RESIDUAL = 1e-9
 SCAN = np.geomspace(1e-9, 1e9, 1801)  # times K * 1 um: loads at which a non-polynomial determinant is looked at
 
 
@@ -146,6 +147,8 @@ def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
         residual = min(residual, moved)
         if moved < 4e-16 or stalled:  # rounding reached
             break
+    if residual > WORST_RESIDUAL:
+        return None  # not a root: rounding in the determinant
     _, by_s, by_load = _polynomial(model, p, W0, 1j * Omega)
     roots = np.roots(np.asarray(model.characteristic(_with_load(model, p, W0)))[::-1])
     others = roots[np.abs(np.abs(roots.imag) - Omega) + np.abs(roots.real) > 1e-5 * Omega]

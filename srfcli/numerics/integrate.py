@@ -75,7 +75,9 @@ def simulate(
     n = len(model.states)
     x = np.full((t.size, n), np.nan)
     x[0] = _start(model, q, start)
-    tolerances = _absolute(model, drive, t, rtol) if atol is None else np.broadcast_to(np.asarray(atol, float), x[0].shape)
+    tolerances = (
+        _absolute(model, drive, t, rtol) if atol is None else np.broadcast_to(np.asarray(atol, float), x[0].shape)
+    )
     rates, jacobian = (scalar_function(model, name, q) for name in ("rates", "rates_jacobian"))
     status, reached, state = Status.OK, float(t[0]), x[0]
     for a, b in _pieces(t, drive, load):
@@ -99,7 +101,9 @@ def _parameters(model: GeneratedModel, p: Array, drive: Drive, load: Load, t: Ar
     if t.ndim != 1 or t.size < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
         raise SrfError("output times must be two or more finite numbers that rise", "t = np.linspace(0, 10, 2001), say")
     if q.shape != (len(model.names),):
-        raise SrfError(f"one set of {len(model.names)} parameters is needed, not an array of shape {q.shape}", "model.vector()")
+        raise SrfError(
+            f"one set of {len(model.names)} parameters is needed, not an array of shape {q.shape}", "model.vector()"
+        )
     V, rate, since = drive.piece(float(t[0]))
     q[model.index("V")] = V + rate * (float(t[0]) - since) if rate else V
     q[model.index("W0")] = load.rest(float(t[0]))
@@ -109,11 +113,15 @@ def _parameters(model: GeneratedModel, p: Array, drive: Drive, load: Load, t: Ar
 def _start(model: GeneratedModel, q: Array, start: Array | None) -> Array:
     if start is None:
         if q[model.index("V")] <= 0:
-            raise SrfError("the drive does not move forward at first: there is no steady sliding to start from", "give start")
+            raise SrfError(
+                "the drive does not move forward at first: there is no steady sliding to start from", "give start"
+            )
         return np.asarray(model.steady(q))
     x = np.array(start, dtype=float)
     if x.shape != (len(model.states),) or not np.isfinite(x).all():
-        raise SrfError(f"start must be {len(model.states)} finite numbers: {', '.join(model.states)}", "model.steady(p) is one")
+        raise SrfError(
+            f"start must be {len(model.states)} finite numbers: {', '.join(model.states)}", "model.steady(p) is one"
+        )
     return x
 
 

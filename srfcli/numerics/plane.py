@@ -32,7 +32,9 @@ class Axis:
 
     def value(self, unit: Array | float) -> Array | float:
         """Return the parameter at a unit coordinate."""
-        return self.lo * np.exp(np.asarray(unit) * self.span) if self.log else self.lo + np.asarray(unit) * self.span
+        unit = np.asarray(unit)
+        inside = self.lo * np.exp(unit * self.span) if self.log else self.lo + unit * self.span
+        return np.where(unit == 1.0, self.hi, inside)  # the window's edge exactly
 
     def rate(self, value: Array | float) -> Array | float:
         """Return d(value)/d(unit coordinate)."""

@@ -15,6 +15,8 @@ from srfcli.status import Status
 
 CHUNK = 24
 LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
+FINE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
+SHALLOW = 0.1  # slopes in ln|rho| per ln(parameter) below this are computed anew
 CHORD_GAIN = 0.02  # a chord step is taken to leave this share of the correction, until a second one shows its own
 
 
@@ -140,6 +142,7 @@ def polish(
             lines = direction.part(index[here])
             fine = _newton(model, part.p, start, part.rho, lines, part.growth if known else None, tol)
             error = mesh_error(fine.orbit, model.logarithmic) + np.where(fine.converged, fine.residual, 0.0)
+            _renew_gradients(model, fine, lines, tol)
             done = (error <= tol) | ~fine.converged | (mesh >= max_mesh)
             for j in np.nonzero(done)[0]:
                 end = int(index[here[j]])
@@ -293,6 +296,21 @@ def _step(
     before[index] = size
     chord[index] &= gain <= 0.3  # kept up while steps gain a factor of three
     return index[usable & ~done]
+
+
+def _renew_gradients(model: GeneratedModel, r: _Polished, direction: Direction, tol: float) -> None:
+    """Bring the multipliers and gradients up to date, in place, where a stale one would show.
+
+    That is everywhere at a tight tolerance, and beside folds, where a gradient carried along may have the wrong sign.
+    """
+    index = np.nonzero(r.converged & ((tol < FINE) | ~(np.abs(r.slope) > SHALLOW)))[0]
+    for a in range(0, len(index), CHUNK):
+        here = index[a : a + CHUNK]
+        q = r.p[:, here]
+        linear = linearise_boundary(model, q, r.orbit.part(here), direction.names, r.rho[here])
+        r.rho[here], r.growth[here] = linear.rho, linear.growth
+        r.others[here] = _largest_other(linear.multipliers, linear.rho)
+        r.slope[here] = slope_in_last(linear) * q[model.index(direction.names[-1])]
 
 
 def _bordered(linear: BoundaryLinear, unit: Array, n: int, chord: bool) -> tuple[Array, Array]:

@@ -194,7 +194,9 @@ class SampledLoad(Load):
         if not (np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()):
             raise SrfError("a sampled load needs finite loads at rising times", "drop gaps and repeated times first")
         if values.min() <= 0:
-            raise SrfError(f"the load is {values.min():g} N at t = {t[values.argmin()]:g} s", "the slider must stay in contact")
+            raise SrfError(
+                f"the load is {values.min():g} N at t = {t[values.argmin()]:g} s", "the slider must stay in contact"
+            )
         self.times, self.W = t, values
         self.longest_step = float(4 * np.median(np.diff(t)))
         self._knots = t.tolist()

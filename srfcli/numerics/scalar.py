@@ -72,7 +72,13 @@ def scalar_source(source: str, name: str) -> str:
             if constant:
                 fixed.add(target.id)
     arguments = ", ".join(a.arg for a in function.args.args if a.arg != "p")
-    lines = [*once, f"def {name}({arguments}):", *(f"    {line}" for line in inside), f"    return {result}", f"return {name}"]
+    lines = [
+        *once,
+        f"def {name}({arguments}):",
+        *(f"    {line}" for line in inside),
+        f"    return {result}",
+        f"return {name}",
+    ]
     return "def bind(p):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
 
 

@@ -101,7 +101,9 @@ def scan_line(
     """
     p = np.repeat(base[:, None], len(values), axis=1)
     p[model.index(name)] = values
-    batch = _on_sufficient_mesh(model, robust_orbits(model, p, guess, uniform_mesh(intervals) if guess is None else guess.edges))
+    batch = _on_sufficient_mesh(
+        model, robust_orbits(model, p, guess, uniform_mesh(intervals) if guess is None else guess.edges)
+    )
     multipliers, g = growth(batch)
     scan = LineScan(name, p, np.asarray(values, float), multipliers, g, batch.orbit, np.inf)
     coordinate = np.log if log else np.asarray
@@ -140,7 +142,11 @@ def _suspects(position: Array, g: Array, resolution: float) -> Array:
     worst = np.maximum(error[:-1], error[1:])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         nearest = np.minimum(np.minimum(np.abs(g[:-1]), np.abs(g[1:])), _closest_inside(position, g))
-        close = ~(nearest > worst + MESH_ERROR)
+        steepness = np.abs(np.diff(g) / np.diff(position))
+        around = np.maximum(
+            np.maximum(steepness, np.r_[steepness[:1], steepness[:-1]]), np.r_[steepness[1:], steepness[-1:]]
+        )
+        close = ~(nearest > worst + MESH_ERROR * around)  # the mesh shifts g by about its slope times that
     same_side = np.sign(g[:-1]) == np.sign(g[1:])
     return usable[:-1] & usable[1:] & close & (np.diff(position) > 2 * resolution) & (same_side | (worst > 0.1))
 
