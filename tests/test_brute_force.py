@@ -43,6 +43,17 @@ def test_rates_agree_with_the_paper_written_by_hand(model):
     assert jacobian(s, 0.3 / s.f, x[2], x[3]) == pytest.approx(model.cycle_jacobian(0.3, x, p) * s.f, rel=1e-12, abs=1e-12)
 
 
+@pytest.mark.parametrize(("V", "f", "eps"), [(20.0, 10.0, 0.2), (3.0, 3.0, 0.4)])
+def test_a_period_doubling_against_brute_force(model, V, f, eps):
+    """At low forcing frequency stability is lost through a multiplier at -1."""
+    values = model.vector({"V": V, "f": f, "eps": eps})
+    (point,) = critical_line(model, values, lo=2.5, hi=6.0, tol=1e-9).points
+    assert point.kind == "pd" and point.theta == pytest.approx(np.pi, abs=1e-12)
+    orbit = shoot(replace(Slider(V, point.value(model, "W0"), eps), f=f), point.orbit.x[0, 0])
+    nearest = orbit.multipliers[np.argmin(np.abs(orbit.multipliers + 1))]
+    assert abs(nearest + 1) < 1e-6 * max(1.0, abs(point.slope))
+
+
 RESOLVED = -22.0  # ln of the smallest product of multipliers that rounding in the monodromy matrix leaves six digits of
 FAST = [(8.0, 0.045, 1), (28.0, 0.13, 3), (7.0, 0.18, 3)]
 SLOW = [(1.0, 0.045, 1), (100.0, 0.045, 1), (2.0, 0.09, 1), (60.0, 0.09, 1), (25.0, 0.13, 3), (60.0, 0.13, 1),

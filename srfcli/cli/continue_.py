@@ -97,6 +97,12 @@ def command(
         raise SrfError(
             f"--step {step:g} is not a share of the window", "Choose it between 0.0001 and 0.5; 0.035 is usual."
         )
+    spanned = {r.name for r in over} or {"V"}
+    if len(spanned) < 2:
+        spanned.add("W0")
+    for name, value in (("V", V), ("W0", W0)):
+        if value is not None and name in spanned:
+            raise SrfError(f"{name} is an axis and has a value too", f"Leave out --{name}, or take {name} out of --over.")
     model = system.model()
     resolved = system.resolve(model.parameters, V=V, W0=W0)
     tolerance = system.tolerance(tol).value

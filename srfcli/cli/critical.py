@@ -10,6 +10,7 @@ import click
 from srfcli.cli.boundary_rows import COLUMNS, boundary_row, worst
 from srfcli.cli.options import (
     OutputOptions,
+    Range,
     SrfCommand,
     SystemOptions,
     output_options,
@@ -83,18 +84,12 @@ def command(
     from srfcli.output.tables import Table
 
     if not 1e-12 < tol < 0.1 or not 1e-8 < resolution < 1:
-        raise SrfError(
-            f"--tol {tol:g} or --resolution {resolution:g} is out of range", "Try --tol 1e-8 --resolution 1e-3."
-        )
+        raise SrfError(f"--tol {tol:g} or --resolution {resolution:g} is out of range", "--tol 1e-8 --resolution 1e-3")
     model = system.model()
     resolved = system.resolve(model.parameters)
     velocities = V or (resolved.values["V"],)
     amplitudes = eps or (resolved.values["eps"],)
-    limits = None
-    if window is not None:
-        limits = parse_over(f"W0={window}").fitted(model.parameters, where=model.title)
-        if not limits.lo > 0:
-            raise SrfError(f"--window {window!r} is not LOW:HIGH with loads above 0", "Write --window 4:500.")
+    limits = None if window is None else _window(window).fitted(model.parameters, where=model.title)
     begun, rows, notes, statuses = time.perf_counter(), [], [], []
     interrupted = False
     with Progress("critical", total=len(velocities) * len(amplitudes)) as progress:
@@ -128,6 +123,19 @@ def command(
         figure=lambda: _figure(rows, model.title),
     )
     finish(status)
+
+
+def _window(text: str) -> Range:
+    """Return the loads that LOW:HIGH spans, with or without a unit; raises SrfError that shows the form."""
+    from srfcli.errors import SrfError
+
+    try:
+        found = parse_over(f"W0={text}") if text.count(":") == 1 else None
+    except SrfError:
+        found = None
+    if found is None or not found.lo > 0:
+        raise SrfError(f"--window {text!r} is not LOW:HIGH, two rising loads above 0", "Write --window 4:500.")
+    return found
 
 
 def _side(g: object) -> str:

@@ -38,7 +38,8 @@ def emit(
     """Write the table where the options say, then the figure if --plot asks for it, each file with its sidecar.
 
     `figure` may be a function that draws it, called only for --plot. `laws`, `inputs`, `seed` and `timings` go into
-    the sidecar, as do the table's parameters. A terminal gets a formatted table, a pipe plain text in full precision.
+    the sidecar, as do the table's parameters. A terminal gets a formatted table, a pipe plain text in full precision;
+    beside CSV and a file the notes go to stderr.
     """
     provenance = Provenance(
         arguments=Session.current().arguments,
@@ -54,6 +55,9 @@ def emit(
         content = render(table, options.format).encode("utf-8")
         write_atomic(options.out, content)
         _wrote(options.out, content, provenance, options)
+    if options.format == "csv" or options.out is not None:
+        for note in table.notes:  # CSV has no place for them, and a file is not looked at at once
+            Session.current().say(f"Note: {note}")
     if options.plot is not None:
         if figure is None:
             raise SrfError(f"--plot {options.plot}: there is nothing to draw", "Leave --plot out.")

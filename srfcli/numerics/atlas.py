@@ -14,7 +14,7 @@ import numpy as np
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array, Discretisation
 from srfcli.numerics.continuation import Curve, CurvePoint, StepSettings, correct, trace
-from srfcli.numerics.critical import INTERVALS, polish_brackets
+from srfcli.numerics.critical import INTERVALS, locate_crossings
 from srfcli.numerics.plane import Plane
 from srfcli.numerics.polish import BoundaryPoint, Direction, polish
 from srfcli.numerics.scan import LineScan, scan_line
@@ -174,9 +174,13 @@ def _starting_point(
     model: GeneratedModel, plane: Plane, scan: LineScan, bracket: int, settings: AtlasSettings
 ) -> CurvePoint | None:
     """Return the boundary point in a sign change of a scan, ready to be followed, or None."""
-    point = polish_brackets(model, scan, [bracket], tol=settings.steps.mesh_error, max_mesh=settings.max_mesh)[0]
-    if point.status is Status.NO_CONVERGENCE:
+    base = scan.p[:, bracket]
+    tol = settings.steps.mesh_error
+    points = locate_crossings(model, base, scan, tol=tol, max_mesh=settings.max_mesh, brackets=[bracket])
+    usable = [q for q in points if q.status is not Status.NO_CONVERGENCE and q.others < 1]
+    if not usable:
         return None
+    point = usable[0]
     single = Discretisation(point.orbit.x[0], point.orbit.stages[0], point.orbit.edges)
     q = plane.coordinates(model, point.p)
     return correct(model, plane, q, single, point.rho, np.array([1.0, 0.0]), np.zeros(single.x.shape[-1]))

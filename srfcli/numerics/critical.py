@@ -66,14 +66,21 @@ def critical_line(
 
 
 def locate_crossings(
-    model: GeneratedModel, base: Array, scan: LineScan, *, tol: float, max_mesh: int = 512, depth: int = 0
+    model: GeneratedModel,
+    base: Array,
+    scan: LineScan,
+    *,
+    tol: float,
+    max_mesh: int = 512,
+    brackets: list[int] | None = None,
+    depth: int = 0,
 ) -> list[BoundaryPoint]:
-    """Return the polished boundary point of every sign change of a scan, rising.
+    """Return the polished boundary point of every sign change of a scan, or of those in `brackets`, rising.
 
     Newton's method may leave its bracket for a neighbour's root, and a coarse mesh may misplace a bracket; such a bracket is
     scanned again, nine samples on twice the mesh, down to DEPTH levels.
     """
-    brackets = scan.brackets()
+    brackets = scan.brackets() if brackets is None else brackets
     found = []
     for i, point in zip(brackets, polish_brackets(model, scan, brackets, tol=tol, max_mesh=max_mesh), strict=True):
         lower, upper = scan.values[i], scan.values[i + 1]

@@ -160,8 +160,7 @@ def boundaries(
         ax.set_yscale("log" if logy else "linear")
         named = _draw_branches(ax, branches)
         _finish_axes(ax, xlabel=xlabel, ylabel=ylabel, title=title, legend=len(named) > 1)
-        if logx:
-            _decade_ticks(ax)
+        _decade_ticks(ax)
         return figure
 
 
@@ -258,8 +257,7 @@ def lines(
             ax.set_yscale("log")
         ax.margins(x=0.0 if len(x) > 1 else 0.05)
         _finish_axes(ax, xlabel=xlabel, ylabel=ylabel, title=title, legend=len(labels) > 1)
-        if logx:
-            _decade_ticks(ax)
+        _decade_ticks(ax)
         return figure
 
 
@@ -308,13 +306,16 @@ def _finish_axes(ax: Axes, *, xlabel: str, ylabel: str, title: str, legend: bool
 
 
 def _decade_ticks(ax: Axes) -> None:
-    """Write 1, 10, 100 rather than powers of ten, and 2 and 5 between them where the axis spans few decades."""
+    """Write 1, 10, 100 rather than powers of ten on logarithmic axes, and 2 and 5 between where they span few decades."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    low, high = ax.get_xlim()
-    if low <= 0 or not 1e-4 <= low <= high <= 1e5:
-        return
-    between = (1.0, 2.0, 5.0) if high / low < 2e3 else (1.0,)
-    ax.xaxis.set_major_locator(LogLocator(subs=between))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.xaxis.set_minor_formatter(NullFormatter())
+    for axis, (low, high), scale in (
+        (ax.xaxis, ax.get_xlim(), ax.get_xscale()),
+        (ax.yaxis, ax.get_ylim(), ax.get_yscale()),
+    ):
+        if scale != "log" or not 1e-4 <= low <= high <= 1e5:
+            continue
+        between = (1.0, 2.0, 5.0) if high / low < 2e3 else (1.0,)
+        axis.set_major_locator(LogLocator(subs=between))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())

@@ -1,0 +1,241 @@
+"""One converged orbit with its multipliers at eps = 0.18: collocation against shooting with SciPy's integrators.
+
+Timed, ours: `solve_orbits` from steady sliding under the mean load to the converged periodic state, and the eigenvalues of the
+monodromy matrix, on the smallest mesh (a multiple of 4 intervals) whose multipliers are right to GOAL. Also
+`solve_floquet`, which finds its own mesh and estimates its own error.
+
+Timed, the baseline: Newton's method on the period map from the same start, with the same limit on the step and the same
+tolerance on the last one; each evaluation of the map integrates the orbit and its 16 variational equations in one
+system of 20 by `solve_ivp`, from the start of the period to its end, without dense output. The rates, the Jacobian and
+the second derivatives are written by hand with scalar arithmetic (`math`, not NumPy, where numbers are scalars), the
+variational part is one matrix product; Radau and LSODA are given the exact Jacobian of all 20 equations. Variables,
+scaling and the scaled time are those of the collocation.
+
+Equal accuracy: the error is the largest difference between the multipliers and those of a shot by DOP853 at rtol 3e-13. Each
+integrator gets the loosest of a ladder of tolerances (four to a decade) whose error is at most three times ours.
+
+Not timed: loading the model, the choice of mesh and tolerance, the reference. Times are CPU seconds, one thread, median of
+interleaved repeats; a point is taken on every branch of the boundary, just below its critical load.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import common  # before NumPy: it fixes the number of threads
+import numpy as np
+from brute import Slider, steady
+from common import Report, interleaved, repeated
+from scipy.integrate import solve_ivp
+
+from srfcli.model import GeneratedModel, open_model
+from srfcli.numerics.critical import critical_line
+from srfcli.numerics.floquet import solve_floquet
+from srfcli.numerics.orbit import solve_orbits, steady_guess, uniform_mesh
+from srfcli.registry import load_registry
+
+EPS = 0.18
+VELOCITIES = (2.0, 7.0, 20.0, 60.0)
+BELOW = 0.99  # of the critical load
+GOAL = 1e-6  # error of the multipliers
+STEP_TOL = 1e-7  # on the last Newton step of either method
+LADDER = 10.0 ** -np.arange(2.0, 12.01, 0.25)
+METHODS = ("Radau", "DOP853", "LSODA")
+TARGET = 200.0
+Matrix = np.ndarray
+
+
+@dataclass(frozen=True)
+class Equations:
+    """The orbit and its variational equations, time in periods: y = (x, vec of the 4 x 4 derivative by the first state)."""
+
+    s: Slider
+
+    def rates(self, tau: float, y: Matrix) -> Matrix:
+        """The 20 rates."""
+        out = np.empty(20)
+        rates, J, _ = self._local(tau, y)
+        out[:4] = rates
+        np.matmul(J, y[4:].reshape(4, 4), out=out[4:].reshape(4, 4))
+        return out
+
+    def jacobian(self, tau: float, y: Matrix) -> Matrix:
+        """Their exact 20 x 20 Jacobian: J in every diagonal block, the second derivatives below the first."""
+        _, J, (h11, h22, h23, h33, g23, g33) = self._local(tau, y)
+        a, b = y[4:].reshape(4, 4)[2], y[4:].reshape(4, 4)[3]  # the derivatives of ln v and ln phi
+        full = np.zeros((20, 20))
+        full[:4, :4] = J
+        full[4:, 4:] = np.kron(J, np.eye(4))
+        full[8:12, 3] = h11 * b  # row z
+        full[12:16, 2] = h22 * a + h23 * b  # row ln v
+        full[12:16, 3] = h23 * a + h33 * b
+        full[16:20, 2] = g23 * a  # row ln phi
+        full[16:20, 3] = g33 * b
+        return full
+
+    def _local(self, tau: float, y: Matrix) -> tuple[tuple[float, ...], Matrix, tuple[float, ...]]:
+        """Rates, Jacobian and the second derivatives that are not zero, per period."""
+        s, T = self.s, 1 / self.s.f
+        u, z, ln_v, ln_phi = y[:4].tolist()
+        v, phi = math.exp(min(ln_v, 200.0)), math.exp(max(min(ln_phi, 200.0), -200.0))  # a trial step may be wild
+        W = s.W0 * (1 + s.eps * math.cos(2 * math.pi * tau))
+        r = s.Vsat * phi / s.D0
+        mu = s.mu0 + s.A * (ln_v - math.log(s.V0)) + s.B * math.log1p(r)
+        share = r / (1 + r)
+        d1 = share * (1 - share)
+        d2 = d1 * (1 - 2 * share)
+        q, w, c = 1 / phi, v / s.D0, s.B / s.A
+        ageing = q - w
+        slip = (z - v) / (s.lam * s.A)
+        rates = (T * (s.V - z), T * (s.K * u - W * mu) / s.M, T * (slip - c * share * ageing), T * ageing)
+        m = T / s.M
+        J = np.array(
+            (
+                (0.0, -T, 0.0, 0.0),
+                (m * s.K, 0.0, -m * W * s.A, -m * W * s.B * share),
+                (0.0, T / (s.lam * s.A), T * (c * share * w - v / (s.lam * s.A)), -T * c * (d1 * ageing - share * q)),
+                (0.0, 0.0, -T * w, -T * q),
+            )
+        )
+        second = (
+            -m * W * s.B * d1,
+            T * (c * share * w - v / (s.lam * s.A)),
+            T * c * d1 * w,
+            -T * c * (d2 * ageing - 2 * d1 * q + share * q),
+            -T * w,
+            T * q,
+        )
+        return rates, J, second
+
+
+def one_period(equations: Equations, x: Matrix, method: str, rtol: float) -> tuple[Matrix, Matrix]:
+    """Return the state after one period and its derivative by the first state."""
+    size = np.array([1.0, equations.s.V, 1.0, 1.0])
+    y = np.concatenate([x, np.diag(size).ravel()])
+    atol = rtol * np.concatenate([size, np.repeat(size, 4)])
+    extra = {} if method == "DOP853" else {"jac": equations.jacobian}
+    end = solve_ivp(equations.rates, (0.0, 1.0), y, method=method, rtol=rtol, atol=atol, t_eval=(1.0,), **extra)
+    if not end.success:
+        raise ArithmeticError(end.message)
+    y = end.y[:, -1]
+    return y[:4], y[4:].reshape(4, 4) / size
+
+
+def shoot(s: Slider, start: Matrix, method: str, rtol: float, tol: float = STEP_TOL) -> tuple[Matrix, Matrix, int]:
+    """Return the periodic state, its multipliers and the number of Newton steps; the log variables' step is limited to 2."""
+    equations, size = Equations(s), np.array([1.0, s.V, 1.0, 1.0])
+    x, best = start.copy(), np.inf
+    for count in range(1, 31):
+        end, M = one_period(equations, x, method, rtol)
+        step = np.linalg.solve(np.eye(4) - M, end - x)
+        change = float(np.abs(step / size).max())
+        x = x + step * min(1.0, 2.0 / float(np.abs(step[2:]).max() + 1e-300))
+        if change < max(tol, 3 * rtol) or (change < 1e-4 and change > 0.5 * best):  # the integrator's noise is reached
+            return x, np.linalg.eigvals(M), count
+        best = min(best, change)
+    raise ArithmeticError(f"no convergence, last step {change:.1e}")
+
+
+def difference(a: Matrix, b: Matrix) -> float:
+    """Return the largest distance between two sets of multipliers, the best order taken."""
+    left, worst = list(b), 0.0
+    for value in sorted(a, key=lambda q: -abs(q)):
+        gaps = [abs(value - other) for other in left]
+        worst = max(worst, min(gaps))
+        left.pop(int(np.argmin(gaps)))
+    return float(worst)
+
+
+def ours(model: GeneratedModel, p: Matrix, intervals: int) -> Matrix:
+    """Return the multipliers by collocation from steady sliding."""
+    batch = solve_orbits(model, p, steady_guess(model, p, uniform_mesh(intervals)), tol=STEP_TOL)
+    if not batch.converged.all():
+        raise ArithmeticError("no convergence")
+    return batch.multipliers[0]
+
+
+def own_mesh(model: GeneratedModel, p: Matrix, reference: Matrix) -> tuple[int, float]:
+    """Return the smallest number of intervals that meets GOAL, and its error."""
+    for intervals in range(12, 257, 4):
+        try:
+            error = difference(ours(model, p, intervals), reference)
+        except ArithmeticError:
+            continue
+        if error <= GOAL:
+            return intervals, error
+    raise SystemExit(f"no mesh of up to 256 intervals meets {GOAL:g}")
+
+
+def loosest(s: Slider, start: Matrix, method: str, reference: Matrix, allowed: float) -> tuple[float, float]:
+    """Return the loosest rtol of the ladder whose error, from the converged orbit on, is at most `allowed`."""
+    for rtol in LADDER:
+        try:
+            error = difference(shoot(s, start, method, float(rtol))[1], reference)
+        except ArithmeticError:
+            continue
+        if error <= allowed:
+            return float(rtol), error
+    raise SystemExit(f"{method} does not reach {allowed:.1e}")
+
+
+def compare(report: Report, model: GeneratedModel, V: float, W0: float, crossing: int, repeats: int) -> list[list[str]]:
+    """Time one point; return the rows of the table."""
+    s, p = Slider(V, W0, EPS), model.vector({"V": V, "W0": W0, "eps": EPS})[:, None]
+    state, reference, _ = shoot(s, steady(s), "DOP853", 3e-13, tol=1e-9)
+    intervals, error = own_mesh(model, p, reference)
+    rest = steady(s)
+    tasks: dict[str, Callable[[], object]] = {
+        "ours": repeated(partial(ours, model, p, intervals), 20),
+        "floquet": repeated(partial(solve_floquet, model, p[:, 0], tol=GOAL), 20),
+    }
+    errors, notes = {"ours": error}, {"ours": f"N = {intervals}"}
+    floquet = solve_floquet(model, p[:, 0], tol=GOAL)
+    errors["floquet"], notes["floquet"] = difference(floquet.multipliers, reference), f"N = {len(floquet.orbit.edges) - 1}"
+    for method in METHODS:
+        rtol, _ = loosest(s, state, method, reference, 3 * error)
+        while True:  # from the distant start the error may differ from that beside the orbit
+            _, found, steps = shoot(s, rest, method, rtol)
+            errors[method] = difference(found, reference)
+            if errors[method] <= 3 * error:
+                break
+            rtol *= 10**-0.25
+        notes[method] = f"rtol {rtol:.1e}, {steps} Newton steps"
+        tasks[method] = partial(shoot, s, rest, method, rtol)
+    seconds = interleaved(tasks, repeats)
+    for name in ("ours", "floquet"):
+        seconds[name] /= 20
+    place = f"V = {V:g}, W0 = {W0:.3f} (below crossing {crossing})"
+    return [
+        [place, name, f"{1e3 * seconds[name]:.2f}", f"{errors[name]:.1e}", f"{seconds[name] / seconds['ours']:.0f}", notes[name]]
+        for name in tasks
+    ]
+
+
+def main() -> None:
+    """Compare at every critical load of VELOCITIES and print one table."""
+    report = Report("orbit", __doc__)
+    assert common.ROOT.exists()
+    model, rows, ratios = open_model(load_registry()), [], {name: [] for name in METHODS}
+    for V in VELOCITIES:
+        base = model.vector({"V": V, "eps": EPS})
+        points = critical_line(model, base, lo=4.0, hi=400.0, tol=1e-6).points
+        for crossing, point in enumerate(points, 1):
+            found = compare(report, model, V, BELOW * point.value(model, "W0"), crossing, repeats=3)
+            for row in found:
+                if row[1] in ratios:
+                    ratios[row[1]].append(float(row[4]))
+            rows += found
+    report.say()
+    report.table(("point (um/s, N)", "method", "CPU ms", "error of multipliers", "times ours", "with"), rows)
+    report.say()
+    for name, values in ratios.items():
+        report.say(f"{name}: {min(values):.0f} to {max(values):.0f} times ours, median {np.median(values):.0f}")
+    met = min(ratios["Radau"]) >= TARGET
+    report.say(f"target: at least {TARGET:.0f} times faster than Radau at every point: {'met' if met else 'MISSED'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""What a start of `srf` costs, in CPU seconds of the child process, and what `srf --help` imports.
+
+Timed: user plus system time of a new Python process from its start to its exit (os.wait4), for `srf --help`, `srf laws`,
+`srf linear` with a filled cache of generated modules and `srf linear` with an empty one, which derives the system with sympy.
+The commands run in turn; the median and the largest of the repeats are shown. A bare `python -c pass` and `import numpy` stand
+beside them: nothing that uses NumPy can be faster than the latter.
+
+Not timed: compiling .pyc files (a first run of each is not counted), reading from a cold disk, and the console script's own
+wrapper, which differs from `python -c "from srfcli.cli.main import main; main()"` by a few lines of Python.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from statistics import median
+
+from common import ROOT, Report
+
+REPEATS = 9
+START = "from srfcli.cli.main import main; main()"
+HEAVY = ("sympy", "scipy", "numpy", "matplotlib", "rich", "pint", "numba")
+
+
+def child_seconds(code: str, *arguments: str, cache: Path) -> float:
+    """Return user + system seconds of a Python process that runs `code`; its exit status must be 0."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "SRF_CACHE": str(cache)}
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        cwd=tempfile.gettempdir(),
+    )
+    errors = process.stderr.read() if process.stderr else b""
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"srf {' '.join(arguments)} ended with {process.returncode}: {errors.decode()}")
+    return usage.ru_utime + usage.ru_stime
+
+
+def modules_of_help() -> list[str]:
+    """Return the modules loaded when `srf --help` has run."""
+    code = (
+        "import sys\nfrom srfcli.cli.main import cli\n"
+        "try: cli.main(['--help'], prog_name='srf')\nexcept SystemExit: pass\n"
+        "print('\\n'.join(sorted(sys.modules)), file=sys.stderr)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    return done.stderr.split()
+
+
+def main() -> None:
+    """Time the starts in turn and print two tables."""
+    report = Report("startup", __doc__)
+    folder = Path(tempfile.mkdtemp())
+    warm = folder / "warm"
+    cases = {
+        "python -c pass": ("pass", (), warm),
+        "python -c 'import numpy'": ("import numpy", (), warm),
+        "srf --help": (START, ("--help",), warm),
+        "srf laws": (START, ("laws",), warm),
+        "srf linear, warm": (START, ("linear",), warm),
+        "srf linear, cold cache": (START, ("linear",), None),
+    }
+    seen: dict[str, list[float]] = {name: [] for name in cases}
+    for count in range(REPEATS + 1):
+        for name, (code, arguments, cache) in cases.items():
+            seconds = child_seconds(code, *arguments, cache=cache or folder / f"cold{count}")
+            if count:
+                seen[name].append(seconds)
+    shutil.rmtree(folder)
+    report.say()
+    rows = [(name, f"{median(s):.3f}", f"{min(s):.3f}", f"{max(s):.3f}") for name, s in seen.items()]
+    report.table(("command", "CPU s, median", "least", "most"), rows)
+    linear = median(seen["srf linear, warm"])
+    report.say()
+    report.say(f"target: warm srf linear under 0.5 s of CPU: {'met' if linear < 0.5 else 'MISSED'} ({linear:.3f} s)")
+    modules = modules_of_help()
+    packages = sorted({m.partition(".")[0] for m in modules} - set(sys.stdlib_module_names) - {"__main__"})
+    report.say(f"srf --help loads {len(modules)} modules; packages outside the standard library: {', '.join(packages)}")
+    heavy = [m for m in HEAVY if m in packages]
+    report.say(f"of the heavy ones ({', '.join(HEAVY)}): {', '.join(heavy) or 'none'}")
+    report.say("its srfcli modules: " + " ".join(m for m in modules if m.partition(".")[0] == "srfcli"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,167 @@
+"""README and docs hold: every ```console command runs in an empty folder, and prints what is shown below it."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NUMBER = re.compile(r"[-+]?(?:\d+\.\d*|\.\d+|\d+)(?:[eE][-+]?\d+)?")
+RTOL, ROUNDING = 3e-6, 1e-6  # six digits; below 1e-6 stand estimated errors and residuals, whose digits are chance
+
+
+@dataclass
+class Example:
+    """A command and the lines that are shown below it; the line `...` stands for any lines."""
+
+    command: str
+    shown: list[str] = field(default_factory=list)
+
+
+def examples(path: Path) -> list[Example]:
+    """Return the examples of a document in their order, from its ```console blocks."""
+    found: list[Example] = []
+    for block in re.findall(r"^```console\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S):
+        begun = False
+        for line in block.splitlines():
+            if line.startswith("$ "):
+                found.append(Example(line[2:]))
+                begun = True
+            else:
+                assert begun, f"{path.name}: {line!r} stands before any command"
+                found[-1].shown.append(line)
+    return found
+
+
+def words(line: str) -> list[str]:
+    return line.split()
+
+
+def same(shown: str, printed: str) -> bool:
+    """Whether a printed line is the shown one: equal words, numbers to six digits, `...` at the end for any rest."""
+    left, right = words(shown), words(printed)
+    if left and left[-1] == "...":
+        left = left[:-1]
+        right = right[: len(left)]
+    return len(left) == len(right) and all(map(same_word, left, right))
+
+
+def same_word(shown: str, printed: str) -> bool:
+    if NUMBER.sub("#", shown) != NUMBER.sub("#", printed):
+        return False
+    pairs = zip(NUMBER.findall(shown), NUMBER.findall(printed), strict=True)
+    return all(same_number(float(a), float(b)) for a, b in pairs)
+
+
+def same_number(a: float, b: float) -> bool:
+    return math.isclose(a, b, rel_tol=RTOL) or max(abs(a), abs(b)) < ROUNDING
+
+
+def missing(shown: list[str], printed: list[str]) -> str | None:
+    """Return the first shown line that is not printed where it should be, or None."""
+    place, skipping = 0, False
+    for line in shown:
+        if line.strip() == "...":
+            skipping = True
+            continue
+        if skipping:
+            place = next((i for i in range(place, len(printed)) if same(line, printed[i])), len(printed))
+        if place >= len(printed) or not same(line, printed[place]):
+            return f"shown:   {line}\nprinted: {printed[place] if place < len(printed) else '(nothing more)'}"
+        place, skipping = place + 1, False
+    if shown and not skipping and place < len(printed):
+        return f"printed, not shown: {printed[place]}"
+    return None
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    """An environment with `srf` on PATH, no settings of the caller and folders of its own."""
+    shim = tmp_path / "bin" / "srf"
+    shim.parent.mkdir()
+    shim.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m srfcli.cli.main "$@"\n', encoding="utf-8")
+    shim.chmod(0o755)
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("SRF_") or k == "SRF_CACHE"}
+    paths = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    path = f"{shim.parent}{os.pathsep}{os.environ['PATH']}"
+    return {**kept, "PATH": path, "PYTHONPATH": paths, "XDG_DATA_HOME": str(tmp_path / "data"), "COLUMNS": "100"}
+
+
+@pytest.mark.parametrize("path", [p for p in DOCUMENTS if examples(p)], ids=lambda p: p.name)
+def test_commands_print_what_is_shown(path: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    for example in examples(path):
+        done = subprocess.run(
+            ["bash", "-c", f"set -o pipefail; {example.command}"],
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert done.returncode == 0, f"$ {example.command}\n{done.stderr}"
+        assert "Traceback" not in done.stderr
+        fault = missing(example.shown, done.stdout.splitlines())
+        assert fault is None, f"{path.name}: $ {example.command}\n{fault}"
+
+
+def test_a_law_of_ones_own_takes_three_commands() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    story = text.partition("### From nothing to your own law")[2].partition("\n## ")[0]
+    commands = [line[2:] for line in story.splitlines() if line.startswith("$ ")]
+    assert [c.split()[:3] for c in commands] == [
+        ["srf", "law", "new"],
+        ["srf", "law", "check"],
+        ["srf", "continue", "--plugins"],
+    ]
+
+
+@pytest.mark.parametrize("marker", ["diagram-command", "test-command"])
+def test_each_installation_is_one_line(marker: str) -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    found = re.findall(rf"<!-- {marker} -->\n```sh\n([^\n]+)\n```\n<!-- /{marker} -->", text)
+    assert len(found) == 1 and found[0].startswith("python3 -m venv .venv && ")
+
+
+def test_ci_runs_the_line_in_readme() -> None:
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert "<!-- test-command -->" in script and "pip install" not in script and "pytest" not in script
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
+def test_links_lead_somewhere(path: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)\)", path.read_text(encoding="utf-8")):
+        assert "://" in target or (path.parent / target).exists(), target
+
+
+def test_commands_shown_in_other_blocks_exist() -> None:
+    from srfcli.cli.main import COMMANDS
+
+    for path in DOCUMENTS:
+        for name in re.findall(r"`srf ([a-z-]+)", path.read_text(encoding="utf-8")):
+            assert name in COMMANDS, f"{path.name}: srf {name}"
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "equal"),
+    [
+        ("a  1.00000001 b", "a 1.0 b", True),
+        ("1.0001,x", "1.0,x", False),
+        ("error 9e-09", "error 2e-12", True),
+        ("one ...", "one two three", True),
+        ("one two", "one two three", False),
+    ],
+)
+def test_the_comparison(shown: str, printed: str, equal: bool) -> None:
+    assert same(shown, printed) is equal
