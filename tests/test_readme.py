@@ -149,7 +149,7 @@ def test_commands_shown_in_other_blocks_exist() -> None:
     from srfcli.cli.main import COMMANDS
 
     for path in DOCUMENTS:
-        for name in re.findall(r"`srf ([a-z-]+)", path.read_text(encoding="utf-8")):
+        for name in re.findall(r"`srf ([a-z]+)", path.read_text(encoding="utf-8")):
             assert name in COMMANDS, f"{path.name}: srf {name}"
 
 

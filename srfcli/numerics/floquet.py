@@ -7,13 +7,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, condense, gauss, stage_parameters
+from srfcli.numerics.collocation import (
+    Array,
+    ComplexArray,
+    Discretisation,
+    condense,
+    gauss,
+    mesh_error,
+    stage_parameters,
+)
 from srfcli.numerics.orbit import interpolate, solve_orbits, uniform_mesh
 from srfcli.numerics.scan import robust_orbits
 from srfcli.status import Status
 
 FIRST_MESH = 16
-RELIED_ON = 15.0  # as in polish: an interval halved gains 2^8 in theory, 2^4 is relied on
+RELIED_ON = 31.0  # an interval halved gains 2^8 in theory, 2^5 is relied on
 
 
 @dataclass(frozen=True)
@@ -56,7 +64,10 @@ class Waveforms:
 def solve_floquet(
     model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mesh: int = 1024, harmonics: int = 8
 ) -> FloquetResult:
-    """Return the forced periodic state at `p` (n_parameters,), its mesh doubled until the multipliers' error is below `tol`."""
+    """Return the forced periodic state at `p` (n_parameters,), its mesh doubled until the multipliers' error is below `tol`.
+
+    The error is the larger of two estimates: what the last doubling changed, and what the orbit's polynomials still carry.
+    """
     column = p[:, None]
     batch = robust_orbits(model, column, None, uniform_mesh(FIRST_MESH), tol=1e-10)
     error = np.inf
@@ -64,7 +75,7 @@ def solve_floquet(
         finer = interpolate(batch.orbit, uniform_mesh(2 * (len(batch.orbit.edges) - 1)))
         fine = solve_orbits(model, column, finer, tol=1e-10)
         shift = np.abs(np.sort_complex(fine.multipliers[0]) - np.sort_complex(batch.multipliers[0])).max()
-        error = float(shift) / RELIED_ON + 1e-12
+        error = max(float(shift) / RELIED_ON, float(mesh_error(fine.orbit, model.logarithmic)[0])) + 1e-12
         batch = fine
     status = Status.NO_CONVERGENCE if not batch.converged[0] else Status.OK if error <= tol else Status.TOLERANCE
     orbit = Discretisation(batch.orbit.x[0], batch.orbit.stages[0], batch.orbit.edges)

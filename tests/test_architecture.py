@@ -1,0 +1,215 @@
+"""The arrows of docs/architecture.md, light imports, short files, and commands that are documented."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+from srfcli.cli.main import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "srfcli"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+LONGEST = 400
+LONG_FILES: dict[str, str] = {}  # path -> the reason why it is longer
+
+# each module and what it may import of the package, also inside functions; a folder stands for all that is in it
+BASE = {"errors", "status"}
+LAWS = BASE | {"laws"}
+LAW_FILES = LAWS | {"expression", "dimensions", "lawfile", "pylaw"}
+SYMBOLS = LAW_FILES | {"registry", "system", "derive", "closed_limits"}
+MAY: dict[str, set[str]] = {
+    "errors": set(),
+    "status": set(),
+    "units": BASE,
+    "expression": BASE,
+    "laws": BASE | {"expression"},
+    "dimensions": BASE,
+    "lawfile": LAW_FILES,
+    "lawtemplate": BASE,
+    "pylaw": LAW_FILES,
+    "registry": LAW_FILES,
+    "api": LAW_FILES,
+    "lawcheck": LAW_FILES | {"registry"},
+    "notation": {"expression"},
+    "system": LAWS | {"expression", "registry"},
+    "derive": LAWS | {"expression", "system"},
+    "closed_limits": LAWS | {"expression", "system", "derive"},
+    "generate": SYMBOLS,
+    "cache": set(),
+    "model": SYMBOLS | {"generate", "cache", "units"},
+    "derivation": SYMBOLS | {"notation", "units"},
+    "paper_forms": SYMBOLS,
+    "paper": SYMBOLS | {"paper_forms", "units"},
+    "render": SYMBOLS | {"derivation", "generate", "notation", "paper"},
+    "settings": LAWS | {"units"},
+    "numerics": BASE | {"model", "numerics"},
+    "output": LAWS | {"output"},
+}
+HEAVY = {"sympy", "scipy", "numpy", "matplotlib", "pint", "numba"}
+FORBIDDEN = {
+    "numerics": {"sympy", "click", "rich"},
+    "output": {"sympy", "scipy", "click"},
+    "model": {"sympy"},
+    "settings": HEAVY,
+    "registry": HEAVY,
+    "lawfile": HEAVY,
+}
+
+
+def unit_of(path: Path) -> str:
+    """Return the name in MAY that a module goes by: its own, or that of its folder."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return parts[0]
+
+
+def imports(path: Path, *, top_only: bool = False) -> Iterator[str]:
+    """Yield the dotted names that a module imports, also inside functions and for type checking only if not `top_only`."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    nodes = tree.body if top_only else list(ast.walk(tree))
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: a relative import"
+            module = node.module or ""
+            yield module
+            if module == "srfcli":
+                yield from (f"srfcli.{alias.name}" for alias in node.names)
+
+
+def typing_only(path: Path) -> set[str]:
+    """Return what a module imports under TYPE_CHECKING: no arrow at run time."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            found |= {n.module for n in ast.walk(node) if isinstance(n, ast.ImportFrom) and n.module}
+    return found
+
+
+def inside(path: Path) -> set[str]:
+    """Return the parts of the package that a module imports."""
+    return {name.split(".")[1] for name in set(imports(path)) - typing_only(path) if name.startswith("srfcli.")}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_arrows(path: Path) -> None:
+    unit = unit_of(path)
+    if unit in ("cli", "__init__"):
+        return
+    assert unit in MAY, f"srfcli/{unit} has no line in MAY: say what it may import"
+    known = {unit_of(p) for p in MODULES}
+    assert inside(path) & known <= MAY[unit] | {unit}
+    roots = {name.split(".")[0] for name in set(imports(path)) - typing_only(path)}
+    assert not roots & FORBIDDEN.get(unit, set())
+
+
+def test_nobody_imports_the_command_line() -> None:
+    for path in MODULES:
+        if unit_of(path) != "cli":
+            assert not [n for n in imports(path) if n.startswith("srfcli.cli")], path
+
+
+def test_laws_import_nothing_above_them() -> None:
+    above = {"system", "derive", "generate", "model", "numerics", "output", "cli"}
+    for name in ("errors", "status", "expression", "laws", "lawfile", "dimensions", "pylaw", "registry", "api"):
+        assert not MAY[name] & above
+        assert not inside(PACKAGE / f"{name}.py") & above
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_files_are_short_and_say_what_they_are(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    name = str(path.relative_to(ROOT))
+    assert len(text.splitlines()) <= LONGEST or LONG_FILES.get(name), f"{name} is longer than {LONGEST} lines"
+    assert ast.get_docstring(ast.parse(text)), f"{name} has no docstring"
+
+
+def test_command_modules_are_light() -> None:
+    for path in (PACKAGE / "cli").glob("*.py"):
+        roots = {name.split(".")[0] for name in imports(path, top_only=True)}
+        assert not roots & HEAVY, path
+
+
+def test_importing_the_package_does_no_work(tmp_path: Path) -> None:
+    modules = [".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for p in MODULES]
+    script = f"""
+import sys
+sys.path.insert(0, {str(ROOT)!r})
+import importlib
+for name in {modules!r}:
+    importlib.import_module(name)
+late = sorted({{"matplotlib", "pint", "numba", "IPython"}} & set(sys.modules))
+print(late)
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")  # nothing is printed, nothing heavy comes along
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["linear", "--help"], ["continue", "--help"], ["--version"]])
+def test_help_is_light(arguments: list[str], tmp_path: Path) -> None:
+    script = f"""
+import sys
+sys.path.insert(0, {str(ROOT)!r})
+from srfcli.cli.main import main
+try:
+    main({arguments!r})
+finally:
+    print(sorted({HEAVY!r} & set(sys.modules)), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr.strip()) == (0, "[]")
+
+
+def commands(group: click.Group = cli, path: str = "srf") -> Iterator[tuple[str, click.Command]]:
+    """Yield the full name of every command, and the command."""
+    for name, command in group.commands.items():
+        if isinstance(command, click.Group):
+            yield from commands(command, f"{path} {name}")
+        else:
+            yield f"{path} {name}", command
+
+
+@pytest.mark.parametrize(("name", "command"), list(commands()), ids=lambda v: v if isinstance(v, str) else "")
+def test_every_command_is_documented(name: str, command: click.Command) -> None:
+    assert command.help and command.help.strip()
+    assert name in (command.epilog or ""), f"{name} --help shows no example of it"
+    for option in command.params:
+        assert not isinstance(option, click.Option) or option.help, f"{name} {option.name}"
+    assert f"`{name}`" in (ROOT / "README.md").read_text(encoding="utf-8")
+    section = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8").partition(f"\n## `{name}`\n")[2].partition("\n## ")[0]
+    assert f"\n$ {name}" in section or f" {name} " in section, f"docs/cli.md has no section with an example of {name}"
+
+
+@pytest.mark.parametrize(("name", "command"), list(commands()), ids=lambda v: v if isinstance(v, str) else "")
+def test_documented_options_exist(name: str, command: click.Command) -> None:
+    import re
+
+    text = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
+    section = text.partition(f"\n## `{name}`\n")[2].partition("\n## ")[0]
+    known = {o for p in command.params for o in (*p.opts, *p.secondary_opts)} | {"--help"}
+    prose = re.sub(r"```.*?```", "", section, flags=re.S)
+    assert set(re.findall(r"`(--[\w-]+)", prose)) <= known
+
+
+def test_every_command_of_the_list_exists() -> None:
+    from srfcli.cli.main import COMMANDS
+
+    for place in COMMANDS.values():
+        module, _, attribute = place.partition(":")
+        assert isinstance(getattr(importlib.import_module(module), attribute), click.Command)
+
+
+def test_the_map_names_every_module() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    for name in ("errors", "status", "expression", "laws", "registry", "system", "derive", "generate", "model"):
+        assert f"`{name}.py`" in text
