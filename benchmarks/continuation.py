@@ -82,7 +82,13 @@ def moved(model: GeneratedModel, plane: Plane, curve: Curve) -> np.ndarray:
     """Return how far, in ln(V) and ln(W0), each polished point lies from the same point polished at 1e-10."""
     fine = replace(SETTINGS, tol=1e-10, max_mesh=1024)
     coarse, exact = (
-        np.array([[pt.value(model, name) for name in plane.names] for b in polish_curve(model, plane, curve, s) for pt in b.points])
+        np.array(
+            [
+                [pt.value(model, name) for name in plane.names]
+                for b in polish_curve(model, plane, curve, s)
+                for pt in b.points
+            ]
+        )
         for s in (SETTINGS, fine)
     )
     if coarse.shape != exact.shape:
@@ -138,9 +144,20 @@ def main() -> None:
         rows.append([name, count, *(f"{ms:.2f}" for ms in (*parts, both)), f"{count * both / 1e3:.2f}", auto, ends])
         missed += [name] if both >= TARGET else []
     report.say()
-    head = ["curve", "points", "trace ms/pt", "polish ms/pt", "both ms/pt", "whole curve s", "AUTO-07p ms/pt (quoted)", "ends"]
+    head = [
+        "curve",
+        "points",
+        "trace ms/pt",
+        "polish ms/pt",
+        "both ms/pt",
+        "whole curve s",
+        "AUTO-07p ms/pt (quoted)",
+        "ends",
+    ]
     report.table(head, rows)
-    report.say(f"target: under {TARGET:g} ms a point on all of them: {'MISSED on ' + ', '.join(missed) if missed else 'met'}")
+    report.say(
+        f"target: under {TARGET:g} ms a point on all of them: {'MISSED on ' + ', '.join(missed) if missed else 'met'}"
+    )
     report.say()
     rows = []
     for eps in (0.09, 0.18):
@@ -155,9 +172,20 @@ def main() -> None:
         brute = brute_errors(model, eps, branches[name])
         estimates = [pt.error for b in branches[name] for pt in b.points]
         bad = sum(not pt.status.ok for b in branches[name] for pt in b.points)
-        rows.append([name, *(f"{q:.1e}" for q in (np.median(error), np.quantile(error, 0.99), error.max())), int((error > 1e-6).sum()),
-                     bad, f"{max(estimates):.1e}", len(brute), f"{max(brute):.1e}"])  # fmt: skip
-    head = ["error", "median", "99 %", "largest", "above 1e-6", "status not ok", "largest estimate", "brute points", "brute largest"]
+        quantiles = [f"{q:.1e}" for q in (np.median(error), np.quantile(error, 0.99), error.max())]
+        above = int((error > 1e-6).sum())
+        rows.append([name, *quantiles, above, bad, f"{max(estimates):.1e}", len(brute), f"{max(brute):.1e}"])
+    head = [
+        "error",
+        "median",
+        "99 %",
+        "largest",
+        "above 1e-6",
+        "status not ok",
+        "largest estimate",
+        "brute points",
+        "brute largest",
+    ]
     report.table(head, rows)
     report.say(f"({time.process_time() - begun:.0f} s of CPU in all)")
 

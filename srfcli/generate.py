@@ -13,6 +13,7 @@ from sympy.printing.numpy import NumPyPrinter
 from srfcli.closed_limits import closed_limits, in_law_parameters
 from srfcli.derive import Linearisation, linearise
 from srfcli.expression import symbol
+from srfcli.staged import Staged, Step, joined, staged
 from srfcli.system import Equations, System, tidy
 
 FUNCTIONS = ("arcsinh", "arctan", "cos", "cosh", "exp", "expm1", "log", "log1p", "pi", "sin", "sinh", "sqrt", "tan", "tanh")
@@ -71,6 +72,7 @@ class _Writer:
         doc: str,
         outputs: Sequence[tuple[str, sp.Expr]],
         *,
+        steps: Sequence[Step] = (),
         head: Sequence[str] = (),
         tail: Sequence[str] = (),
         vectors: Sequence[str] = (),
@@ -80,7 +82,11 @@ class _Writer:
     ) -> None:
         """Write one function; `outputs` are (index text, expression), index '' returns the expression itself."""
         outputs = [(i, e) for i, e in outputs if e != 0 or i in ("", "0")]
-        shared, reduced = sp.cse([e for _, e in outputs], symbols=sp.numbered_symbols("_"), order="canonical")
+        if steps:
+            kept = Staged(tuple(e for _, e in outputs), tuple(steps))
+            shared, reduced = list(kept.needed()), list(kept.outputs)
+        else:
+            shared, reduced = sp.cse([e for _, e in outputs], symbols=sp.numbered_symbols("_"), order="canonical")
         used = {str(s) for e in [*(e for _, e in shared), *reduced] for s in e.free_symbols}
         arguments = [*head, *(["x"] if state else []), *tail, "p", *(f"_{w}" for w in vectors)]  # a law may have a parameter c
         lines = [f"def {name}({', '.join(arguments)}):", f'    """{doc}"""']
@@ -95,6 +101,16 @@ class _Writer:
             lines += [f"    out[..., {i}] = {self.text(e)}" for (i, _), e in zip(outputs, reduced, strict=True)]
             lines.append("    return out")
         self.parts.append("\n".join(lines))
+
+    def vector(self, name: str, doc: str, formulas: Staged, **more: Any) -> None:
+        """Write a function of one output for each unknown."""
+        self.function(name, doc, [(str(i), e) for i, e in enumerate(formulas.outputs)], steps=formulas.steps, **more)
+
+    def square(self, name: str, doc: str, formulas: Staged, **more: Any) -> None:
+        """Write a function of a square matrix of outputs, given row by row."""
+        n = len(self.equations.unknowns)
+        indexed = [(f"{k // n}, {k % n}", e) for k, e in enumerate(formulas.outputs)]
+        self.function(name, doc, indexed, steps=formulas.steps, shape=f"({n}, {n})", **more)
 
     def text(self, expression: sp.Expr) -> str:
         return self.printer.doprint(self._renamed(expression))
@@ -206,29 +222,39 @@ def numpy_text(expression: sp.Expr) -> str:
 def _write_rates(writer: _Writer, eq: Equations) -> None:
     """Write what a simulator needs (any drive and load) and the multilinear forms of the normal form at rest."""
     n = range(len(eq.unknowns))
-    rates = eq.rates
+    rates = staged(eq.rates)
     inputs = ("V", "W", "W_dot")
-    shape, square = f"({len(n)},)", f"({len(n)}, {len(n)})"
-    writer.function("rates", "dx/dt under drive V, imposed load W and its rate W_dot.",
-                    [(str(i), e) for i, e in enumerate(rates)], tail=inputs, shape=shape)
-    writer.function("rates_jacobian", "d(rates)/dx.",
-                    [(f"{i}, {j}", tidy(eq.derivative(rates[i], j))) for i in n for j in n], tail=inputs, shape=square)
+    shape = f"({len(n)},)"
+    writer.vector("rates", "dx/dt under drive V, imposed load W and its rate W_dot.", rates, tail=inputs, shape=shape)
+    writer.square("rates_jacobian", "d(rates)/dx.", _jacobian(eq, rates), tail=inputs)
     writer.function("friction", "Friction coefficient.", [("", eq.mu)], tail=inputs)
     writer.function("elongation", "Spring elongation u.", [("", eq.spring)], tail=inputs)
-    at_rest = {symbol("W"): symbol("W0"), symbol("W_dot"): sp.S.Zero}
-    calm = [e.subs(at_rest) for e in rates]
+    calm = rates.substituted({symbol("W"): symbol("W0"), symbol("W_dot"): sp.S.Zero})
     a, b, c = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "abc")
-    first = [_directional(eq, e, a) for e in calm]
-    second = [_directional(eq, e, b) for e in first]
-    third = [_directional(eq, e, c) for e in second]
-    writer.function("second", "Second derivative of the rates at constant load, in the directions a, b.",
-                    [(str(i), e) for i, e in enumerate(second)], vectors=("a", "b"), shape=shape)
-    writer.function("third", "Third derivative of the rates at constant load, in the directions a, b, c.",
-                    [(str(i), e) for i, e in enumerate(third)], vectors=("a", "b", "c"), shape=shape)
+    second = calm.derivative(_direction(eq, a)).derivative(_direction(eq, b))
+    third = second.derivative(_direction(eq, c))
+    writer.vector("second", "Second derivative of the rates at constant load, in the directions a, b.",
+                  second, vectors=("a", "b"), shape=shape)
+    writer.vector("third", "Third derivative of the rates at constant load, in the directions a, b, c.",
+                  third, vectors=("a", "b", "c"), shape=shape)
 
 
-def _directional(eq: Equations, expression: sp.Expr, direction: Sequence[sp.Symbol]) -> sp.Expr:
-    return sum((eq.derivative(expression, j) * d for j, d in enumerate(direction)), sp.S.Zero)
+def _direction(eq: Equations, by: Sequence[sp.Expr]) -> dict[sp.Symbol, sp.Expr]:
+    """Return the rate of each symbol in the formulas as the unknowns change by `by`: v, not ln v, stands in the formulas."""
+    return {s: s * d if log else d for s, log, d in zip(eq.unknowns, eq.logarithmic, by, strict=True)}
+
+
+def _gradient(eq: Equations, formulas: Staged) -> list[Staged]:
+    """Return the derivatives by each unknown."""
+    n = len(eq.unknowns)
+    return [formulas.derivative({k: v for k, v in _direction(eq, sp.eye(n).row(j)).items() if v != 0}) for j in range(n)]
+
+
+def _jacobian(eq: Equations, formulas: Staged) -> Staged:
+    """Return the Jacobian, row by row."""
+    columns = _gradient(eq, formulas)
+    entries = [column.outputs[i] for i in range(len(eq.unknowns)) for column in columns]
+    return joined(columns).with_outputs(entries if joined(columns).steps else [tidy(e) for e in entries])
 
 
 def _write_cycle(writer: _Writer, eq: Equations) -> None:
@@ -237,27 +263,27 @@ def _write_cycle(writer: _Writer, eq: Equations) -> None:
     phase, f, eps, W0 = sp.Symbol("tau"), symbol("f"), symbol("eps"), symbol("W0")
     angle = 2 * sp.pi * phase
     load = {symbol("W"): W0 * (1 + eps * sp.cos(angle)), symbol("W_dot"): -2 * sp.pi * f * W0 * eps * sp.sin(angle)}
-    field = [e.subs(load) / f for e in eq.rates]
-    shape, square = f"({len(n)},)", f"({len(n)}, {len(n)})"
-    jacobian = [[tidy(eq.derivative(e, j)) for j in n] for e in field]
+    field = staged(eq.rates).substituted(load)
+    field = field.with_outputs([e / f for e in field.outputs])
+    shape = f"({len(n)},)"
+    jacobian = _jacobian(eq, field)
     head = ("tau",)
-    writer.function("cycle", "dx/dtau over one forcing period, W = W0 (1 + eps cos 2 pi tau).",
-                    [(str(i), e) for i, e in enumerate(field)], head=head, shape=shape)
-    writer.function("cycle_jacobian", "d(cycle)/dx.",
-                    [(f"{i}, {j}", jacobian[i][j]) for i in n for j in n], head=head, shape=square)
+    writer.vector("cycle", "dx/dtau over one forcing period, W = W0 (1 + eps cos 2 pi tau).", field, head=head, shape=shape)
+    writer.square("cycle_jacobian", "d(cycle)/dx.", jacobian, head=head)
     writer.function("cycle_friction", "Friction coefficient.", [("", eq.mu.subs(load))], head=head)
     writer.function("cycle_load", "Normal load W.", [("", eq.load.subs(load))], head=head)
     writer.function("cycle_elongation", "Spring elongation u.", [("", eq.spring.subs(load))], head=head)
     w, a = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "wa")
-    form = sum((w[i] * jacobian[i][j] * a[j] for i in n for j in n), sp.S.Zero)
-    writer.function("cycle_bilinear", "Gradient over x of w . (d(cycle)/dx) a.",
-                    [(str(k), eq.derivative(form, k)) for k in n], head=head, vectors=("w", "a"), shape=shape)
+    entries = {(i, j): jacobian.outputs[len(n) * i + j] for i in n for j in n}
+    form = jacobian.with_outputs([sum((w[i] * entries[i, j] * a[j] for i in n for j in n), sp.S.Zero)])
+    writer.vector("cycle_bilinear", "Gradient over x of w . (d(cycle)/dx) a.",
+                  joined(_gradient(eq, form)), head=head, vectors=("w", "a"), shape=shape)
     for name in writer.parameters:
-        q = symbol(name)
-        writer.function(f"cycle_d_{python_name(name)}", f"d(cycle)/d({name}).",
-                        [(str(i), sp.diff(e, q)) for i, e in enumerate(field)], head=head, shape=shape)
+        by = {symbol(name): sp.S.One}
+        writer.vector(f"cycle_d_{python_name(name)}", f"d(cycle)/d({name}).", field.derivative(by), head=head, shape=shape)
+        slope = form.derivative(by)
         writer.function(f"cycle_bilinear_d_{python_name(name)}", f"d/d({name}) of w . (d(cycle)/dx) a.",
-                        [("", sp.diff(form, q))], head=head, vectors=("w", "a"))
+                        [("", slope.outputs[0])], steps=slope.steps, head=head, vectors=("w", "a"))
 
 
 _LAMBERTW = '''

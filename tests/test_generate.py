@@ -24,9 +24,9 @@ from srfcli.generate import generate
 from srfcli.registry import bundled_registry
 from srfcli.system import build_system
 
-for names in ({}, {"ageing": "nagata", "interface": "rigid", "loading": "inclined"}):
+for names in ({}, {"ageing": "kato-tullis", "interface": "rigid", "loading": "inclined"}):
     system = build_system(bundled_registry(), **names)
-    text = generate(system) + render.to_latex(system, derivation(system)) + render.to_python(system)
+    text = generate(system) + render.to_latex(system, derivation(system, ())) + render.to_python(system)
     print(hashlib.sha256(text.encode()).hexdigest())
 """
 

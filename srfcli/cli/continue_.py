@@ -102,7 +102,9 @@ def command(
         spanned.add("W0")
     for name, value in (("V", V), ("W0", W0)):
         if value is not None and name in spanned:
-            raise SrfError(f"{name} is an axis and has a value too", f"Leave out --{name}, or take {name} out of --over.")
+            raise SrfError(
+                f"{name} is an axis and has a value too", f"Leave out --{name}, or take {name} out of --over."
+            )
     model = system.model()
     resolved = system.resolve(model.parameters, V=V, W0=W0)
     tolerance = system.tolerance(tol).value

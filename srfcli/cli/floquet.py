@@ -105,12 +105,16 @@ def _table(model: GeneratedModel, r: FloquetResult, parameters: dict[str, Any]) 
     }
     notes = (
         f"{'stable' if r.stable else 'unstable'}; error of the multipliers {r.error:.1g} on {meta['intervals']} intervals, "
-        f"product of the multipliers against exp(integrated trace) {r.liouville:.1g}",
+        f"product of the multipliers against exp(integrated trace) {_checked(r.liouville)}",
         f"mean friction {r.mean_friction:.8f}, shift from eps = 0 {r.friction_shift:+.8f}",
         "harmonics of u [um]: " + ", ".join(f"{k}: {abs(c):.4g}" for k, c in enumerate(r.u_harmonics)),
         "harmonics of mu: " + ", ".join(f"{k}: {abs(c):.4g}" for k, c in enumerate(r.mu_harmonics)),
     )
     return Table("srf.floquet/1", columns, rows, model.title, notes, parameters, meta, r.status.value)
+
+
+def _checked(mismatch: float) -> str:
+    return f"{mismatch:.1g}" if mismatch == mismatch else "not compared: the fastest multiplier is far below rounding"
 
 
 def _figure(model: GeneratedModel, r: FloquetResult) -> Figure:

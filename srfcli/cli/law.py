@@ -23,6 +23,11 @@ srf law new my-law                  write my-law.toml, ready to be changed
 srf law check my-law.toml           does it stand up?
 srf linear --law my-law --plugins . its critical load
 """
+SHOW_EPILOG = """
+srf law show srf-vsat
+srf law show my-law.toml
+srf law show dieterich --json
+"""
 NEW_EPILOG = """
 srf law new my-law
 srf law new my-ageing --kind ageing --python
@@ -38,7 +43,7 @@ def law() -> None:
     """Show, write and check laws."""
 
 
-@law.command(cls=SrfCommand)
+@law.command(cls=SrfCommand, epilog=SHOW_EPILOG)
 @click.argument("name")
 @click.option("--kind", type=KIND, help="Which one, where two kinds of law share a name.")
 @click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")

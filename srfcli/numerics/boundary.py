@@ -9,7 +9,6 @@ generated bilinear forms supply d(w . J v). The bordered system is regular at fo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -105,10 +104,13 @@ def _growth_row(
 
 
 def slope_in_last(linear: BoundaryLinear) -> Array:
-    """Return d ln|rho| / d(last parameter) along the branch of orbits, the other parameters fixed, (...,)."""
+    """Return d ln|rho| / d(last parameter) along the branch of orbits, the other parameters fixed, (...,); NaN at its fold."""
     n = linear.periodic.shape[-2]
-    inner = linear.periodic[..., :n]
-    usable: Any = np.isfinite(inner).all(axis=(-1, -2))
-    usable &= np.abs(np.linalg.det(np.where(usable[..., None, None], inner, 0.0))) > 1e-300
-    response = np.linalg.solve(np.where(usable[..., None, None], inner, np.eye(n)), linear.periodic[..., -1:])[..., 0]
+    inner, last = linear.periodic[..., :n], linear.periodic[..., -1:]
+    try:
+        response = np.linalg.solve(inner, last)[..., 0]
+    except np.linalg.LinAlgError:  # one singular point spoils the batch
+        usable = np.abs(np.linalg.det(np.nan_to_num(inner))) > 1e-300
+        response = np.linalg.solve(np.where(usable[..., None, None], inner, np.eye(n)), last)[..., 0]
+        response = np.where(usable[..., None], response, np.nan)
     return linear.growth[..., -1] - np.einsum("...n,...n->...", linear.growth[..., :n], response)

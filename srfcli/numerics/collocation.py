@@ -153,6 +153,19 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     return Condensed(block, local.reshape(*batch, m, n, n + 1 + k), maps, running_products(maps))
 
 
+def log_determinant(condensed: Condensed, orbit: Discretisation) -> float:
+    """Return ln |det M| of one orbit's monodromy matrix, also where its entries are far below rounding.
+
+    An interval's map r I + D L^-1 B has the determinant r^n det(L + B D/r) / det L, two well-conditioned determinants.
+    """
+    m, n = orbit.stages.shape[-2:]
+    step = gauss(m).step
+    r = 1 - step.sum()
+    outer = _frame(orbit.edges.tobytes(), m, n).first @ np.kron(step, np.eye(n)) / r
+    above = np.linalg.slogdet(condensed.block + outer)[1]
+    return float((above - np.linalg.slogdet(condensed.block)[1] + n * np.log(abs(r))).sum())
+
+
 def running_products(maps: Array) -> Array:
     """Return I, A_0, A_1 A_0, ... of `maps` (..., N, k, k) as (..., N+1, k, k), by blocks of about sqrt(N)."""
     N, k = maps.shape[-3], maps.shape[-1]

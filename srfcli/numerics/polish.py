@@ -13,10 +13,10 @@ from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, exp
 from srfcli.numerics.orbit import interpolate, newton_step, scales, step_limit, uniform_mesh
 from srfcli.status import Status
 
-CHUNK = 24
+CHUNK = 48
 LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
 FINE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
-SHALLOW = 0.1  # slopes in ln|rho| per ln(parameter) below this are computed anew
+SHALLOW = 0.02  # slopes in ln|rho| per ln(parameter) below this are computed anew
 CHORD_GAIN = 0.02  # a chord step is taken to leave this share of the correction, until a second one shows its own
 
 
