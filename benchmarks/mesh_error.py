@@ -112,7 +112,7 @@ def one(model: GeneratedModel, p: np.ndarray, scan: object, i: int, N: int) -> S
         eps=float(p[model.index("eps"), 0]),
         W0=W0,
         intervals=N,
-        estimate=float(mesh_error(coarse.orbit, model.logarithmic)[0]),
+        estimate=float(mesh_error(model, coarse.orbit)[0]),
         load_error=abs(fine.value(model, "W0") / W0 - 1),
         critical_error=float(abs(a[np.abs(a - coarse.rho).argmin()] - b[np.abs(b - coarse.rho).argmin()])),
         multiplier_error=float(max(np.abs(a[:, None] - b).min(axis=1).max(), np.abs(a[:, None] - b).min(axis=0).max())),

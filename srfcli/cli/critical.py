@@ -142,7 +142,8 @@ def _side(g: object) -> str:
     import numpy as np
 
     values = np.asarray(g)
-    values = values[np.isfinite(values)]
+    if not np.isfinite(values).all():
+        return "no sign change among the samples that were found"
     return (
         "stable throughout"
         if values.size and (values < 0).all()

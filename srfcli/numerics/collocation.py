@@ -20,6 +20,8 @@ from srfcli.model import GeneratedModel
 Array = NDArray[Any]  # real; shapes are in the docstrings
 ComplexArray = NDArray[Any]
 STAGES = 4
+COVERING = 10.0
+COVERING_RIGID = 30.0  # without the interface's compliance the slip velocity follows the load without delay
 
 
 @dataclass(frozen=True)
@@ -218,23 +220,24 @@ def _top_coefficient(m: int) -> Array:
     return np.linalg.inv(np.polynomial.legendre.legvander(nodes, m))[m]
 
 
-def mesh_error(orbit: Discretisation, logarithmic: tuple[bool, ...]) -> Array:
-    """Return the estimated relative error (...,) of a critical parameter, and of the multipliers, that the mesh leaves.
+def mesh_error(model: GeneratedModel, orbit: Discretisation) -> Array:
+    """Return the estimated relative error (...,) that the mesh leaves in a critical parameter.
 
     At the mesh points the error of Gauss collocation goes with the square of what the polynomials' last coefficient still
-    carries: four times its mean square, over the logarithmic unknowns, was above the true error in 99 of 100 critical loads
-    at eps from 0.045 to 0.4, and within a factor of twenty of it in most (benchmarks/mesh_error.py).
+    carries: COVERING times its mean square over the logarithmic unknowns is above the true error of nearly all critical
+    loads, of every law tried (benchmarks/mesh_error.py). It says nothing of multipliers far inside the unit circle.
     """
     weights = _top_coefficient(orbit.stages.shape[-2])
     top = weights[0] * orbit.x + np.einsum("j,...jn->...n", weights[1:], orbit.stages)
-    return 4.0 * (top[..., list(logarithmic)] ** 2).sum(axis=-1) @ orbit.steps
+    factor = COVERING if model.namespace["ELASTIC"] else COVERING_RIGID
+    return factor * (top[..., list(model.logarithmic)] ** 2).sum(axis=-1) @ orbit.steps
 
 
 def wanted_mesh(error: Array, intervals: int, tol: float, max_mesh: int) -> Array:
-    """Return for each point the intervals that would bring `error` on `intervals` below half of `tol`: the error goes as N^-8.
+    """Return for each point the intervals that would bring `error` on `intervals` below two thirds of `tol`: the error goes as N^-8.
 
     A multiple of 8, between the present mesh and four times it.
     """
-    ratio = np.clip((2 * np.nan_to_num(error, nan=np.inf) / tol) ** 0.125, 1.0, 4.0)
+    ratio = np.clip((1.5 * np.nan_to_num(error, nan=np.inf) / tol) ** 0.125, 1.0, 4.0)
     finer = 8 * np.ceil(intervals * ratio / 8).astype(int)
     return np.minimum(np.where(ratio > 1, np.maximum(finer, intervals + 8), intervals), max(max_mesh, intervals))

@@ -245,7 +245,7 @@ def follow(
             yield Status.CLOSED
             return
         before, current = current, point
-        if mesh_error(point.orbit, model.logarithmic) > settings.mesh_error:
+        if mesh_error(model, point.orbit) > settings.mesh_error:
             finer = refined(model, plane, point, settings)
             before, current = (None, finer) if finer is not None else (before, current)
         wanted = min(settings.correction, 0.7 * STALE * ds)
@@ -257,7 +257,7 @@ def follow(
 def refined(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: StepSettings) -> CurvePoint | None:
     """Return `point` on a mesh whose error is half of what the settings allow, or None where it does not converge there."""
     N = len(point.orbit.edges) - 1
-    mesh = wanted_mesh(mesh_error(point.orbit, model.logarithmic), N, settings.mesh_error, settings.max_mesh)
+    mesh = wanted_mesh(mesh_error(model, point.orbit), N, settings.mesh_error, settings.max_mesh)
     if mesh <= N:
         return None
     edges = uniform_mesh(int(mesh))

@@ -77,7 +77,7 @@ def solve_floquet(
         finer = interpolate(batch.orbit, uniform_mesh(2 * (len(batch.orbit.edges) - 1)))
         fine = solve_orbits(model, column, finer, tol=1e-10)
         shift = np.abs(np.sort_complex(fine.multipliers[0]) - np.sort_complex(batch.multipliers[0])).max()
-        error = max(float(shift) / RELIED_ON, float(mesh_error(fine.orbit, model.logarithmic)[0])) + 1e-12
+        error = max(float(shift) / RELIED_ON, float(mesh_error(model, fine.orbit)[0])) + 1e-12
         batch = fine
     status = Status.NO_CONVERGENCE if not batch.converged[0] else Status.OK if error <= tol else Status.TOLERANCE
     orbit = Discretisation(batch.orbit.x[0], batch.orbit.stages[0], batch.orbit.edges)

@@ -134,14 +134,14 @@ def polish(
     while waiting:
         index, coarse, known = waiting.pop()
         N = coarse.orbit.x.shape[-2]
-        wanted = wanted_mesh(mesh_error(coarse.orbit, model.logarithmic), N, tol, max_mesh)
+        wanted = wanted_mesh(mesh_error(model, coarse.orbit), N, tol, max_mesh)
         for mesh in np.unique(wanted):
             here = np.nonzero(wanted == mesh)[0]
             part = _select(coarse, here)
             start = part.orbit if mesh == N else interpolate(part.orbit, uniform_mesh(int(mesh)))
             lines = direction.part(index[here])
             fine = _newton(model, part.p, start, part.rho, lines, part.growth if known else None, tol)
-            error = mesh_error(fine.orbit, model.logarithmic) + np.where(fine.converged, fine.residual, 0.0)
+            error = mesh_error(model, fine.orbit) + np.where(fine.converged, fine.residual, 0.0)
             _renew_gradients(model, fine, lines, tol)
             done = (error <= tol) | ~fine.converged | (mesh >= max_mesh)
             for j in np.nonzero(done)[0]:
@@ -287,7 +287,7 @@ def _step(
     size = np.maximum(0.1 * change, np.abs(dq))
     gain = np.where(np.isfinite(before[index]), size / before[index], CHORD_GAIN)
     left = size * np.clip(gain, size, 1.0) if by_chord else size * size  # what the step just made leaves behind
-    enough = np.maximum(0.1 * tol, 0.1 * mesh_error(part, model.logarithmic))  # a tenth of the mesh's own error
+    enough = np.maximum(0.1 * tol, 0.1 * mesh_error(model, part))  # a tenth of the mesh's own error
     done = usable & (left < enough) & (size < 1e-3)
     r.residual[index] = np.where(done, left, np.abs(linear.g))
     if done.any():

@@ -122,10 +122,11 @@ def scan_line(
 def _on_sufficient_mesh(model: GeneratedModel, batch: OrbitBatch) -> OrbitBatch:
     """Return the batch on a mesh that shows a growth rate as small as MESH_ERROR, up to FINEST intervals."""
     N = len(batch.orbit.edges) - 1
-    if not batch.converged.any():
-        return batch
-    worst = mesh_error(batch.orbit, model.logarithmic)[batch.converged].max(keepdims=True)
-    mesh = int(wanted_mesh(worst, N, MESH_ERROR, FINEST)[0])
+    if batch.converged.all():
+        worst = mesh_error(model, batch.orbit).max(keepdims=True)
+        mesh = int(wanted_mesh(worst, N, MESH_ERROR, FINEST)[0])
+    else:  # a finer mesh may find what this one could not
+        mesh = FINEST
     if mesh <= N:
         return batch
     edges = uniform_mesh(mesh)
