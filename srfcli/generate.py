@@ -95,7 +95,8 @@ class _Writer:
         like = [*head, *(["x[..., 0]"] if state else []), *tail, *(f"_{w}[..., 0]" for w in vectors)]
         like += [] if state else ["*p"]
         if len(outputs) == 1 and outputs[0][0] == "":
-            lines.append(f"    return _empty(({', '.join(like)},), ()) + {self.printer.parenthesize(self._renamed(reduced[0]), 40)}")
+            value = self.printer.parenthesize(self._renamed(reduced[0]), 40)
+            lines.append(f"    return _empty(({', '.join(like)},), ()) + {value}")
         else:
             lines.append(f"    out = _empty(({', '.join(like)},), {shape})")
             lines += [f"    out[..., {i}] = {self.text(e)}" for (i, _), e in zip(outputs, reduced, strict=True)]
@@ -183,8 +184,9 @@ def _write_statics(writer: _Writer, eq: Equations, linear: Linearisation) -> Non
     slopes = [("0", linear.mu_v), *((str(i + 1), e) for i, e in enumerate(linear.mu_phi))]
     writer.function("slopes", "d mu/d ln v, then d mu/d ln phi for each state, in steady sliding.", slopes,
                     shape=f"({len(slopes)},)", state=False)
-    writer.function("characteristic", "Real coefficients a_0..a_n of the characteristic polynomial in s.",
-                    [(str(i), e) for i, e in enumerate(linear.characteristic)], shape=f"({len(linear.characteristic)},)", state=False)
+    polynomial = [(str(i), e) for i, e in enumerate(linear.characteristic)]
+    writer.function("characteristic", "Real coefficients a_0..a_n of the characteristic polynomial in s.", polynomial,
+                    shape=f"({len(polynomial)},)", state=False)
     if linear.hurwitz is not None:
         writer.function("hurwitz_in_load", "Coefficients, lowest first, of the last Hurwitz determinant but one in W0.",
                         [(str(i), e) for i, e in enumerate(linear.hurwitz)], shape=f"({len(linear.hurwitz)},)", state=False)

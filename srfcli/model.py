@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -101,9 +103,9 @@ def open_model(
     wanted = [("friction", law), ("ageing", base), *(("modifier", m) for m in modifiers), ("interface", interface)]
     parts, laws = [__version__, str(FORMAT), loading, str(inertia)], []
     for kind, name in wanted:
-        entry = registry.find(kind, name.strip())
-        parts += [kind, name, registry.fingerprint(entry)]
-        laws.append(Law(entry.name, about=entry.about, source=str(entry.location)))
+        found, fingerprint = _source(registry, kind, name.strip())
+        parts += [kind, name, fingerprint]
+        laws.append(found)
     key = content_key(parts)
 
     def build() -> str:
@@ -114,6 +116,17 @@ def open_model(
         return generate(system)
 
     return load_source(cached_source(key, build), key=key, laws=tuple(laws))
+
+
+def _source(registry: Registry, kind: str, name: str) -> tuple[Law, str]:
+    """Return a law without its formula, and the hash of its source: a registered name or a file, as Registry.get takes them."""
+    if name.endswith((".toml", ".py")):
+        try:
+            return Law(name, source=name), hashlib.sha256(Path(name).read_bytes()).hexdigest()
+        except OSError as error:
+            raise SrfError(f"cannot read the law file '{name}': {error.strerror}", "check the path") from error
+    entry = registry.find(kind, name)
+    return Law(entry.name, about=entry.about, source=str(entry.location)), registry.fingerprint(entry)
 
 
 def load_source(source: str, *, key: str = "", laws: tuple[Law, ...] = ()) -> GeneratedModel:

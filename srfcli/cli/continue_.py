@@ -55,7 +55,7 @@ AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation ampli
 @click.option(
     "--samples",
     type=click.IntRange(8, 100_000),
-    default=48,
+    default=64,
     show_default=True,
     help="Points looked at first, on each line.",
 )

@@ -26,7 +26,7 @@ class AtlasSettings:
     """How a window is searched: `lines` of constant x, `samples` along each before refinement, down to `resolution` in ln y."""
 
     lines: int = 10
-    samples: int = 48
+    samples: int = 64
     resolution: float = 1e-3
     tol: float = 1e-6
     max_mesh: int = 512
@@ -58,6 +58,7 @@ class Atlas:
     status: Status = Status.OK
 
 
+SAME = 1e-3  # of the window's height
 Progress = Callable[[str], None]
 
 
@@ -84,6 +85,10 @@ def find_components(
                 if start is None:
                     missed += 1
                     continue
+                if any(
+                    abs(h - start.q[1]) < SAME and up == (start.slope_y > 0) for h, up in _heights(curves, start.q[0])
+                ):
+                    continue  # a curve that was followed already, met again from a bracket that the scan's mesh misplaced
                 curve = _follow(model, plane, start, settings, lambda n: progress(_said(curves, n)))
                 if len(curve.points) > 1:
                     curves.append(curve)
@@ -177,10 +182,12 @@ def _starting_point(
     base = scan.p[:, bracket]
     tol = settings.steps.mesh_error
     points = locate_crossings(model, base, scan, tol=tol, max_mesh=settings.max_mesh, brackets=[bracket])
-    usable = [q for q in points if q.status is not Status.NO_CONVERGENCE and q.others < 1]
+    rising = scan.g[bracket] < scan.g[bracket + 1]
+    usable = [q for q in points if q.status is not Status.NO_CONVERGENCE and q.others < 1 and (q.slope > 0) == rising]
     if not usable:
         return None
-    point = usable[0]
+    middle = np.log(scan.values[bracket] * scan.values[bracket + 1]) / 2
+    point = min(usable, key=lambda q: abs(np.log(q.value(model, scan.name)) - middle))
     single = Discretisation(point.orbit.x[0], point.orbit.stages[0], point.orbit.edges)
     q = plane.coordinates(model, point.p)
     return correct(model, plane, q, single, point.rho, np.array([1.0, 0.0]), np.zeros(single.x.shape[-1]))

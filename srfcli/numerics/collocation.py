@@ -234,9 +234,9 @@ def mesh_error(model: GeneratedModel, orbit: Discretisation) -> Array:
 
 
 def wanted_mesh(error: Array, intervals: int, tol: float, max_mesh: int) -> Array:
-    """Return for each point the intervals that would bring `error` on `intervals` below two thirds of `tol`: the error goes as N^-8.
+    """Return for each point the intervals that would bring `error` on `intervals` below two thirds of `tol`.
 
-    A multiple of 8, between the present mesh and four times it.
+    The error goes as N^-8; a multiple of 8, between the present mesh and four times it.
     """
     ratio = np.clip((1.5 * np.nan_to_num(error, nan=np.inf) / tol) ** 0.125, 1.0, 4.0)
     finer = 8 * np.ceil(intervals * ratio / 8).astype(int)

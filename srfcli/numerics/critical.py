@@ -12,7 +12,7 @@ from srfcli.numerics.polish import BoundaryPoint, along, polish
 from srfcli.numerics.scan import LineScan, scan_line
 from srfcli.status import Status
 
-SAMPLES = 64
+SAMPLES = 192
 INTERVALS = 16
 DEPTH = 4  # rescans of a bracket that Newton's method left
 
