@@ -22,7 +22,8 @@ from srfcli.numerics.collocation import (
 )
 
 CHUNK = 48  # parameter points solved together: their blocks fit the cache
-LOG_STEP = 2.0  # a Newton step changes no velocity or age by more than a factor e^2
+LOG_STEP = 3.0  # a Newton step changes no velocity or age by more than a factor e^3
+LARGEST_SWING = 2.0  # of a logarithm in the linear response that is a first guess
 
 
 @dataclass
@@ -72,6 +73,27 @@ def steady_guess(model: GeneratedModel, p: Array, edges: Array, m: int = STAGES)
     x = np.broadcast_to(rest[..., None, :], (*rest.shape[:-1], N, n)).copy()
     stages = np.broadcast_to(rest[..., None, None, :], (*rest.shape[:-1], N, m, n)).copy()
     return Discretisation(x, stages, edges)
+
+
+def forced_guess(model: GeneratedModel, p: Array, edges: Array, m: int = STAGES) -> Discretisation:
+    """Return steady sliding with its linear response to the modulation as a first guess of the orbits at `p` (n_parameters, B).
+
+    The response is scaled down where a logarithm would swing by more than LARGEST_SWING either way.
+    """
+    guess = steady_guess(model, p, edges, m)
+    rest, n = model.steady(p), len(model.states)
+    calm = p.copy()
+    calm[model.index("eps")] = 0.0
+    tau = np.arange(16) / 16
+    field = model.cycle(tau, np.broadcast_to(rest[..., None, :], (*rest.shape[:-1], 16, n)), p[..., None])
+    forcing = np.fft.fft(field, axis=-2)[..., 1, :] / 8
+    matrix = 2j * np.pi * np.eye(n) - model.cycle_jacobian(0.0, rest, calm)
+    response = np.linalg.solve(matrix, forcing[..., None])[..., 0]
+    swing = np.abs(response[..., np.array(model.logarithmic)]).max(axis=-1)
+    response *= np.minimum(1.0, LARGEST_SWING / np.maximum(swing, 1e-300))[..., None]
+    guess.x += (np.exp(2j * np.pi * edges[:-1])[:, None] * response[..., None, :]).real
+    guess.stages += (np.exp(2j * np.pi * guess.phases)[..., None] * response[..., None, None, :]).real
+    return guess
 
 
 def interpolate(orbit: Discretisation, edges: Array) -> Discretisation:

@@ -12,7 +12,7 @@ import numpy as np
 
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array, ComplexArray, Discretisation, join, mesh_error, wanted_mesh
-from srfcli.numerics.orbit import OrbitBatch, interpolate, solve_orbits, steady_guess, uniform_mesh
+from srfcli.numerics.orbit import OrbitBatch, forced_guess, interpolate, solve_orbits, steady_guess, uniform_mesh
 
 MESH_ERROR = 1e-5  # a hump of g lower than this cannot be told from none
 FINEST = 64
@@ -53,15 +53,15 @@ def growth(batch: OrbitBatch) -> tuple[ComplexArray, Array]:
 def robust_orbits(
     model: GeneratedModel, p: Array, guess: Discretisation | None, edges: Array, *, tol: float = 1e-7
 ) -> OrbitBatch:
-    """Return orbits at `p`, from `guess`, else from steady sliding, else by raising eps in steps."""
-    rest = steady_guess(model, p, edges)
-    batch = solve_orbits(model, p, guess or rest, tol=tol, max_iterations=14 if guess is not None else 40)
+    """Return orbits at `p`, from `guess`, else from the linear response, else by raising eps in steps."""
+    batch = solve_orbits(model, p, guess or forced_guess(model, p, edges), tol=tol, max_iterations=14 if guess else 40)
     if guess is not None and not batch.converged.all():
-        _retry(model, batch, rest, tol)
+        bad = np.nonzero(~batch.converged)[0]
+        _retry(model, batch, _scatter(batch.orbit, forced_guess(model, p[:, bad], edges), bad), tol)
     if not batch.converged.all():
         bad = np.nonzero(~batch.converged)[0]
         i = model.index("eps")
-        ladder = rest.part(bad)
+        ladder = steady_guess(model, p[:, bad], edges)
         for fraction in (0.25, 0.5, 0.75, 1.0):
             q = p[:, bad].copy()
             q[i] *= fraction
