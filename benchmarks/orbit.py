@@ -1,10 +1,10 @@
 """One converged orbit with its multipliers at eps = 0.18: collocation against shooting with SciPy's integrators.
 
-Timed, ours: `solve_orbits` from steady sliding under the mean load to the converged periodic state, and the eigenvalues of the
-monodromy matrix, on the smallest mesh (a multiple of 4 intervals) whose multipliers are right to 1e-6, then 1e-8. Also
+Timed, ours: `solve_orbits` from the linear response to the modulation (its cost included) to the converged periodic state,
+and the eigenvalues of the monodromy matrix, on the smallest mesh (a multiple of 4 intervals) whose multipliers are right to 1e-6, then 1e-8. Also
 `solve_floquet`, which finds its own mesh and estimates its own error.
 
-Timed, the baseline: Newton's method on the period map from the same start, with the same limit on the step and the same
+Timed, the baseline: Newton's method on the period map from the state at tau = 0 of the same response, with the same limit on the step and the same
 tolerance on the last one; each evaluation of the map integrates the orbit and its 16 variational equations in one
 system of 20 by `solve_ivp`, from the start of the period to its end, without dense output. The rates, the Jacobian and
 the second derivatives are written by hand with scalar arithmetic (`math`, not NumPy, where numbers are scalars), the
@@ -36,7 +36,7 @@ from scipy.integrate import solve_ivp
 from srfcli.model import GeneratedModel, open_model
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.floquet import solve_floquet
-from srfcli.numerics.orbit import solve_orbits, steady_guess, uniform_mesh
+from srfcli.numerics.orbit import forced_guess, solve_orbits, uniform_mesh
 from srfcli.registry import load_registry
 
 EPS = 0.18
@@ -152,8 +152,8 @@ def difference(a: Matrix, b: Matrix) -> float:
 
 
 def ours(model: GeneratedModel, p: Matrix, intervals: int, goal: float) -> Matrix:
-    """Return the multipliers by collocation from steady sliding."""
-    batch = solve_orbits(model, p, steady_guess(model, p, uniform_mesh(intervals)), tol=0.1 * goal)
+    """Return the multipliers by collocation from the linear response."""
+    batch = solve_orbits(model, p, forced_guess(model, p, uniform_mesh(intervals)), tol=0.1 * goal)
     if not batch.converged.all():
         raise ArithmeticError("no convergence")
     return batch.multipliers[0]
@@ -190,7 +190,7 @@ def compare(model: GeneratedModel, V: float, W0: float, crossing: int, goal: flo
     s, p = Slider(V, W0, EPS), model.vector({"V": V, "W0": W0, "eps": EPS})[:, None]
     state, reference, _ = shoot(s, steady(s), "DOP853", 3e-13, tol=1e-9)
     intervals, error = own_mesh(model, p, reference, goal)
-    rest = steady(s)
+    rest = forced_guess(model, p, uniform_mesh(16)).x[0, 0]
     tasks: dict[str, Callable[[], object]] = {
         "ours": repeated(partial(ours, model, p, intervals, goal), 20),
         "floquet": repeated(partial(solve_floquet, model, p[:, 0], tol=goal), 20),
