@@ -1,23 +1,24 @@
 """One converged orbit with its multipliers at eps = 0.18: collocation against shooting with SciPy's integrators.
 
-Timed, ours: `solve_orbits` from the linear response to the modulation (its cost included) to the converged periodic state,
-and the eigenvalues of the monodromy matrix, on the smallest mesh (a multiple of 4 intervals) whose multipliers are right to 1e-6, then 1e-8. Also
-`solve_floquet`, which finds its own mesh and estimates its own error.
+Timed, ours: `solve_orbits` from the linear response to the modulation (its cost included) to the converged periodic
+state, and the eigenvalues of the monodromy matrix, on the smallest mesh (a multiple of 4 intervals) whose multipliers
+are right to 1e-6, then 1e-8. Also `solve_floquet`, which finds its own mesh and estimates its own error.
 
-Timed, the baseline: Newton's method on the period map from the state at tau = 0 of the same response, with the same limit on the step and the same
-tolerance on the last one; each evaluation of the map integrates the orbit and its 16 variational equations in one
-system of 20 by `solve_ivp`, from the start of the period to its end, without dense output. The rates, the Jacobian and
-the second derivatives are written by hand with scalar arithmetic (`math`, not NumPy, where numbers are scalars), the
-variational part is one matrix product; Radau and LSODA are given the exact Jacobian of all 20 equations. Variables,
-scaling and the scaled time are those of the collocation.
+Timed, the baseline: Newton's method on the period map from the state at tau = 0 of the same response, with the same
+limit on the step and the same tolerance on the last one; each evaluation of the map integrates the orbit and its 16
+variational equations in one system of 20 by `solve_ivp`, from the start of the period to its end, without dense
+output. The rates, the Jacobian and the second derivatives are written by hand with scalar arithmetic (`math`, not
+NumPy, where numbers are scalars), the variational part is one matrix product; Radau and LSODA are given the exact
+Jacobian of all 20 equations. Variables, scaling and the scaled time are those of the collocation.
 
-Equal accuracy: the error is the largest difference between the multipliers and those of a shot by DOP853 at rtol 3e-13. Each
-integrator gets the loosest of a ladder of tolerances (four to a decade) whose error is at most three times ours: a
-looser one than equality asks for. Where the integrator's noise exceeds it, the tolerance on the last Newton step is loosened
-for the baseline. Shooting needs more Newton steps than collocation from the same start; their number is shown.
+Equal accuracy: the error is the largest difference between the multipliers and those of a shot by DOP853 at rtol
+3e-13. Each integrator gets the loosest of a ladder of tolerances (four to a decade) whose error is at most three
+times ours: a looser one than equality asks for. Where the integrator's noise exceeds it, the tolerance on the last
+Newton step is loosened for the baseline. Shooting needs more Newton steps than collocation from the same start; their
+number is shown.
 
-Not timed: loading the model, the choice of mesh and tolerance, the reference. Times are CPU seconds, one thread, median of
-interleaved repeats; a point is taken on every branch of the boundary, just below its critical load.
+Not timed: loading the model, the choice of mesh and tolerance, the reference. Times are CPU seconds, one thread,
+median of interleaved repeats; a point is taken on every branch of the boundary, just below its critical load.
 """
 
 from __future__ import annotations

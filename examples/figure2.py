@@ -67,7 +67,9 @@ def print_critical_velocities(model: GeneratedModel) -> None:
     still = root_in_V(lambda V: hopf_load(model, V) - W0, 1.0, 30.0)
     shaken = root_in_V(lambda V: lowest_load(model, V, 0.09) - W0, 0.05, 5.0)
     progress()
-    print(f"at K/W0 = {STIFFNESS_PER_LOAD:g} /um (W0 = {W0:.6f} N): sliding is stable from V = {still:.6f} um/s on at eps = 0,")
+    print(
+        f"at K/W0 = {STIFFNESS_PER_LOAD:g} /um (W0 = {W0:.6f} N): sliding is stable from V = {still:.6f} um/s on at eps = 0,"
+    )
     print(f"  from V = {shaken:.6f} um/s on at eps = 0.09: {still / shaken:.4f} times lower")
 
 
@@ -84,8 +86,10 @@ def main() -> None:
         for number, branch in enumerate(atlas.branches, 1):
             V, W0 = (np.array([q.value(model, name) for q in branch.points]) for name in ("V", "W0"))
             folds = int(np.sum(np.diff(np.sign(np.diff(V))) != 0))
-            print(f"  {number}: {len(V)} points, V = {V.min():g} to {V.max():g} um/s, W0 = {W0.min():.4f} to {W0.max():.4f} N, "
-                  f"{folds} folds, {branch.start.value} / {branch.end.value}")
+            print(
+                f"  {number}: {len(V)} points, V = {V.min():g} to {V.max():g} um/s, W0 = {W0.min():.4f} to {W0.max():.4f} N, "
+                f"{folds} folds, {branch.start.value} / {branch.end.value}"
+            )
             branches.append({"eps": eps, "V": V, "K_over_W0": K / W0, "component": number})
     V = np.geomspace(*V_RANGE, 81)
     hopf = {"V": V, "K_over_W0": [K / hopf_load(model, float(x)) for x in V]}

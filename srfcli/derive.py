@@ -167,7 +167,9 @@ def hurwitz_determinant(a: tuple[sp.Expr, ...]) -> sp.Expr:
     return sp.Matrix(n - 1, n - 1, lambda i, j: coefficient(2 * (j + 1) - (i + 1))).det(method="berkowitz")
 
 
-def _hurwitz_in_load(coefficients: tuple[sp.Expr, ...], stiffness: list[tuple[sp.Expr, sp.Expr]]) -> tuple[sp.Expr, ...] | None:
+def _hurwitz_in_load(
+    coefficients: tuple[sp.Expr, ...], stiffness: list[tuple[sp.Expr, sp.Expr]]
+) -> tuple[sp.Expr, ...] | None:
     """Return the coefficients in W0 of the Hurwitz determinant over a power of W0, lowest first, or None."""
     W0 = symbol("W0")
     fractions = [sp.fraction(sp.cancel(a.subs(stiffness))) for a in coefficients]
@@ -177,7 +179,9 @@ def _hurwitz_in_load(coefficients: tuple[sp.Expr, ...], stiffness: list[tuple[sp
     whole = tuple(sp.cancel(n * common / d) for n, d in fractions)
     if not all(a.is_polynomial(W0) for a in whole):
         return None
-    parts: dict[sp.Symbol, sp.Expr] = {}  # each coefficient of a power of W0 as one symbol: its inside plays no role here
+    parts: dict[
+        sp.Symbol, sp.Expr
+    ] = {}  # each coefficient of a power of W0 as one symbol: its inside plays no role here
     short = []
     for k, a in enumerate(whole):
         terms = sp.Poly(a, W0).all_coeffs()[::-1]

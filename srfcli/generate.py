@@ -16,7 +16,22 @@ from srfcli.expression import symbol
 from srfcli.staged import Staged, Step, joined, staged
 from srfcli.system import Equations, System, tidy
 
-FUNCTIONS = ("arcsinh", "arctan", "cos", "cosh", "exp", "expm1", "log", "log1p", "pi", "sin", "sinh", "sqrt", "tan", "tanh")
+FUNCTIONS = (
+    "arcsinh",
+    "arctan",
+    "cos",
+    "cosh",
+    "exp",
+    "expm1",
+    "log",
+    "log1p",
+    "pi",
+    "sin",
+    "sinh",
+    "sqrt",
+    "tan",
+    "tanh",
+)
 
 
 class _Printer(NumPyPrinter):
@@ -88,7 +103,13 @@ class _Writer:
         else:
             shared, reduced = sp.cse([e for _, e in outputs], symbols=sp.numbered_symbols("_"), order="canonical")
         used = {str(s) for e in [*(e for _, e in shared), *reduced] for s in e.free_symbols}
-        arguments = [*head, *(["x"] if state else []), *tail, "p", *(f"_{w}" for w in vectors)]  # a law may have a parameter c
+        arguments = [
+            *head,
+            *(["x"] if state else []),
+            *tail,
+            "p",
+            *(f"_{w}" for w in vectors),
+        ]  # a law may have a parameter c
         lines = [f"def {name}({', '.join(arguments)}):", f'    """{doc}"""']
         lines += [f"    {line}" for line in self._unpack(used - set(tail), vectors, state)]
         lines += [f"    {s} = {self.text(e)}" for s, e in shared]
@@ -146,18 +167,23 @@ def generate(system: System) -> str:
     _write_cycle(writer, eq)
     body = "\n\n\n".join(writer.parts)
     names = [f for f in FUNCTIONS if re.search(rf"\b{f}\b", body)]
-    return _HEAD.format(
-        title=system.title,
-        names=", ".join(names),
-        helpers="".join(h for name, h in _HELPERS.items() if f"{name}(" in body),
-        states=_tuple(eq.names),
-        logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
-        parameters="\n".join(f"    {_parameter(p)}," for p in system.parameters),
-        elastic=system.elastic,
-        inertia=system.inertia,
-        polynomial=linear.polynomial_degree,
-        forms=textwrap.indent("\n".join(f'"{k}": {v!r},' for k, v in linear.names.items()), "    "),
-    ) + body + "\n\n\n" + _tables(writer.parameters)
+    return (
+        _HEAD.format(
+            title=system.title,
+            names=", ".join(names),
+            helpers="".join(h for name, h in _HELPERS.items() if f"{name}(" in body),
+            states=_tuple(eq.names),
+            logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
+            parameters="\n".join(f"    {_parameter(p)}," for p in system.parameters),
+            elastic=system.elastic,
+            inertia=system.inertia,
+            polynomial=linear.polynomial_degree,
+            forms=textwrap.indent("\n".join(f'"{k}": {v!r},' for k, v in linear.names.items()), "    "),
+        )
+        + body
+        + "\n\n\n"
+        + _tables(writer.parameters)
+    )
 
 
 def _parameter(p: Any) -> str:
@@ -177,19 +203,38 @@ def _tables(parameters: Sequence[str]) -> str:
 
 def _write_statics(writer: _Writer, eq: Equations, linear: Linearisation) -> None:
     n = len(eq.unknowns)
-    steady = [(str(i), sp.log(e) if log else e) for i, (e, log) in enumerate(zip(eq.steady, eq.logarithmic, strict=True))]
+    steady = [
+        (str(i), sp.log(e) if log else e) for i, (e, log) in enumerate(zip(eq.steady, eq.logarithmic, strict=True))
+    ]
     writer.function("steady", "Steady sliding at V under W0.", steady, shape=f"({n},)", state=False)
     at_rest = dict(zip(eq.unknowns, eq.steady, strict=True)) | {symbol("W"): symbol("W0")}
-    writer.function("steady_friction", "Friction coefficient in steady sliding at V.", [("", eq.mu.subs(at_rest))], state=False)
+    writer.function(
+        "steady_friction", "Friction coefficient in steady sliding at V.", [("", eq.mu.subs(at_rest))], state=False
+    )
     slopes = [("0", linear.mu_v), *((str(i + 1), e) for i, e in enumerate(linear.mu_phi))]
-    writer.function("slopes", "d mu/d ln v, then d mu/d ln phi for each state, in steady sliding.", slopes,
-                    shape=f"({len(slopes)},)", state=False)
+    writer.function(
+        "slopes",
+        "d mu/d ln v, then d mu/d ln phi for each state, in steady sliding.",
+        slopes,
+        shape=f"({len(slopes)},)",
+        state=False,
+    )
     polynomial = [(str(i), e) for i, e in enumerate(linear.characteristic)]
-    writer.function("characteristic", "Real coefficients a_0..a_n of the characteristic polynomial in s.", polynomial,
-                    shape=f"({len(polynomial)},)", state=False)
+    writer.function(
+        "characteristic",
+        "Real coefficients a_0..a_n of the characteristic polynomial in s.",
+        polynomial,
+        shape=f"({len(polynomial)},)",
+        state=False,
+    )
     if linear.hurwitz is not None:
-        writer.function("hurwitz_in_load", "Coefficients, lowest first, of the last Hurwitz determinant but one in W0.",
-                        [(str(i), e) for i, e in enumerate(linear.hurwitz)], shape=f"({len(linear.hurwitz)},)", state=False)
+        writer.function(
+            "hurwitz_in_load",
+            "Coefficients, lowest first, of the last Hurwitz determinant but one in W0.",
+            [(str(i), e) for i, e in enumerate(linear.hurwitz)],
+            shape=f"({len(linear.hurwitz)},)",
+            state=False,
+        )
 
 
 def _write_closed(writer: _Writer, system: System) -> None:
@@ -235,10 +280,20 @@ def _write_rates(writer: _Writer, eq: Equations) -> None:
     a, b, c = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "abc")
     second = calm.derivative(_direction(eq, a)).derivative(_direction(eq, b))
     third = second.derivative(_direction(eq, c))
-    writer.vector("second", "Second derivative of the rates at constant load, in the directions a, b.",
-                  second, vectors=("a", "b"), shape=shape)
-    writer.vector("third", "Third derivative of the rates at constant load, in the directions a, b, c.",
-                  third, vectors=("a", "b", "c"), shape=shape)
+    writer.vector(
+        "second",
+        "Second derivative of the rates at constant load, in the directions a, b.",
+        second,
+        vectors=("a", "b"),
+        shape=shape,
+    )
+    writer.vector(
+        "third",
+        "Third derivative of the rates at constant load, in the directions a, b, c.",
+        third,
+        vectors=("a", "b", "c"),
+        shape=shape,
+    )
 
 
 def _direction(eq: Equations, by: Sequence[sp.Expr]) -> dict[sp.Symbol, sp.Expr]:
@@ -249,7 +304,9 @@ def _direction(eq: Equations, by: Sequence[sp.Expr]) -> dict[sp.Symbol, sp.Expr]
 def _gradient(eq: Equations, formulas: Staged) -> list[Staged]:
     """Return the derivatives by each unknown."""
     n = len(eq.unknowns)
-    return [formulas.derivative({k: v for k, v in _direction(eq, sp.eye(n).row(j)).items() if v != 0}) for j in range(n)]
+    return [
+        formulas.derivative({k: v for k, v in _direction(eq, sp.eye(n).row(j)).items() if v != 0}) for j in range(n)
+    ]
 
 
 def _jacobian(eq: Equations, formulas: Staged) -> Staged:
@@ -270,7 +327,9 @@ def _write_cycle(writer: _Writer, eq: Equations) -> None:
     shape = f"({len(n)},)"
     jacobian = _jacobian(eq, field)
     head = ("tau",)
-    writer.vector("cycle", "dx/dtau over one forcing period, W = W0 (1 + eps cos 2 pi tau).", field, head=head, shape=shape)
+    writer.vector(
+        "cycle", "dx/dtau over one forcing period, W = W0 (1 + eps cos 2 pi tau).", field, head=head, shape=shape
+    )
     writer.square("cycle_jacobian", "d(cycle)/dx.", jacobian, head=head)
     writer.function("cycle_friction", "Friction coefficient.", [("", eq.mu.subs(load))], head=head)
     writer.function("cycle_load", "Normal load W.", [("", eq.load.subs(load))], head=head)
@@ -278,14 +337,28 @@ def _write_cycle(writer: _Writer, eq: Equations) -> None:
     w, a = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "wa")
     entries = {(i, j): jacobian.outputs[len(n) * i + j] for i in n for j in n}
     form = jacobian.with_outputs([sum((w[i] * entries[i, j] * a[j] for i in n for j in n), sp.S.Zero)])
-    writer.vector("cycle_bilinear", "Gradient over x of w . (d(cycle)/dx) a.",
-                  joined(_gradient(eq, form)), head=head, vectors=("w", "a"), shape=shape)
+    writer.vector(
+        "cycle_bilinear",
+        "Gradient over x of w . (d(cycle)/dx) a.",
+        joined(_gradient(eq, form)),
+        head=head,
+        vectors=("w", "a"),
+        shape=shape,
+    )
     for name in writer.parameters:
         by = {symbol(name): sp.S.One}
-        writer.vector(f"cycle_d_{python_name(name)}", f"d(cycle)/d({name}).", field.derivative(by), head=head, shape=shape)
+        writer.vector(
+            f"cycle_d_{python_name(name)}", f"d(cycle)/d({name}).", field.derivative(by), head=head, shape=shape
+        )
         slope = form.derivative(by)
-        writer.function(f"cycle_bilinear_d_{python_name(name)}", f"d/d({name}) of w . (d(cycle)/dx) a.",
-                        [("", slope.outputs[0])], steps=slope.steps, head=head, vectors=("w", "a"))
+        writer.function(
+            f"cycle_bilinear_d_{python_name(name)}",
+            f"d/d({name}) of w . (d(cycle)/dx) a.",
+            [("", slope.outputs[0])],
+            steps=slope.steps,
+            head=head,
+            vectors=("w", "a"),
+        )
 
 
 _LAMBERTW = '''

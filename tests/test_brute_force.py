@@ -40,7 +40,9 @@ def test_rates_agree_with_the_paper_written_by_hand(model):
     x = steady(s) + np.array((0.3, -2.0, 0.7, -0.4))
     assert steady(s) == pytest.approx(model.steady(p), rel=1e-14)
     assert rates(s, 0.3 / s.f, *x) == pytest.approx(model.cycle(0.3, x, p) * s.f, rel=1e-12)
-    assert jacobian(s, 0.3 / s.f, x[2], x[3]) == pytest.approx(model.cycle_jacobian(0.3, x, p) * s.f, rel=1e-12, abs=1e-12)
+    assert jacobian(s, 0.3 / s.f, x[2], x[3]) == pytest.approx(
+        model.cycle_jacobian(0.3, x, p) * s.f, rel=1e-12, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(("V", "f", "eps"), [(20.0, 10.0, 0.2), (3.0, 3.0, 0.4)])
@@ -60,9 +62,7 @@ SLOW = [(1.0, 0.045, 1), (100.0, 0.045, 1), (2.0, 0.09, 1), (60.0, 0.09, 1), (25
         (2.0, 0.18, 3), (20.0, 0.18, 3), (50.0, 0.18, 3), (90.0, 0.18, 1)]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("V", "eps", "count"), [*FAST, *(pytest.param(*row, marks=pytest.mark.slow) for row in SLOW)]
-)
+@pytest.mark.parametrize(("V", "eps", "count"), [*FAST, *(pytest.param(*row, marks=pytest.mark.slow) for row in SLOW)])
 def test_critical_loads_against_brute_force(model, V, eps, count):
     """Every critical load at this V, to 1e-6, with theta and all multipliers."""
     points = loads(model, V, eps)
@@ -74,7 +74,9 @@ def test_critical_loads_against_brute_force(model, V, eps, count):
         assert (point.slope > 0) == (number % 2 == 1)
         assert point.theta == pytest.approx(abs(np.angle(orbit.multipliers[0])), abs=1e-6)
         assert point.orbit.x[0, 0] == pytest.approx(orbit.start, rel=1e-5, abs=1e-5)
-        assert orbit.multipliers.size == 4 and max(np.abs(orbit.multipliers[2:])) == pytest.approx(point.others, abs=1e-6)
+        assert orbit.multipliers.size == 4 and max(np.abs(orbit.multipliers[2:])) == pytest.approx(
+            point.others, abs=1e-6
+        )
 
 
 @pytest.mark.parametrize(("lo", "hi"), [(4.0, 400.0), (14.0, 16.0), (14.3, 15.8)])

@@ -134,7 +134,7 @@ def test_what_is_required_is_written_down() -> None:
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     text = (ROOT / "docs" / "dependencies.md").read_text(encoding="utf-8")
-    extras = [r for name in ("plot", "units", "fast", "dev") for r in project["optional-dependencies"][name]]
+    extras = [r for name in ("plot", "units", "dev") for r in project["optional-dependencies"][name]]
     for requirement in (*project["dependencies"], *extras):
         name = requirement.split(">")[0].split("[")[0]
         assert name == "srfcli" or f"| {name} |" in text, name
