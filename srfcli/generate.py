@@ -8,68 +8,13 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import sympy as sp
-from sympy.printing.numpy import NumPyPrinter
 
 from srfcli.closed_limits import closed_limits, in_law_parameters
 from srfcli.derive import Linearisation, linearise
 from srfcli.expression import symbol
+from srfcli.numpytext import FUNCTIONS, NumPyText, python_name, renamed
 from srfcli.staged import Staged, Step, joined, staged
 from srfcli.system import Equations, System, tidy
-
-FUNCTIONS = (
-    "arcsinh",
-    "arctan",
-    "cos",
-    "cosh",
-    "exp",
-    "expm1",
-    "log",
-    "log1p",
-    "pi",
-    "sin",
-    "sinh",
-    "sqrt",
-    "tan",
-    "tanh",
-)
-
-
-class _Printer(NumPyPrinter):
-    """NumPy source with products in place of small integer powers, which NumPy computes by pow()."""
-
-    def __init__(self) -> None:
-        super().__init__({"fully_qualified_modules": False, "allow_unknown_functions": True})
-
-    def _print_Pow(self, expr: sp.Pow, rational: bool = False, sqrt: str = "sqrt") -> str:
-        base, exponent = expr.as_base_exp()
-        if exponent.is_Integer and 2 <= abs(int(exponent)) <= 4:
-            inner = self.parenthesize(base, 60)
-            product = "*".join([inner] * abs(int(exponent)))
-            return f"({product})" if exponent > 0 else f"(1/({product}))"
-        if exponent == -1:
-            return f"(1/{self.parenthesize(base, 60)})"
-        if exponent == sp.S.Half:
-            return f"sqrt({self._print(base)})"
-        return f"{self.parenthesize(base, 60)}**{self.parenthesize(exponent, 60)}"
-
-    def _print_log1p(self, expr: sp.Expr) -> str:
-        return f"log1p({self._print(expr.args[0])})"
-
-    def _print_expm1(self, expr: sp.Expr) -> str:
-        return f"expm1({self._print(expr.args[0])})"
-
-    def _print_LambertW(self, expr: sp.Expr) -> str:
-        return f"lambertw({self._print(expr.args[0])})"
-
-    def _print_Pi(self, expr: sp.Expr) -> str:
-        return "pi"
-
-
-def python_name(name: str) -> str:
-    """Return `name` as it is written in generated code: `lambda` becomes `lambda_`."""
-    import keyword
-
-    return f"{name}_" if keyword.iskeyword(name) else name
 
 
 class _Writer:
@@ -78,7 +23,7 @@ class _Writer:
     def __init__(self, system: System, equations: Equations) -> None:
         self.system, self.equations = system, equations
         self.parameters = [p.name for p in system.parameters]
-        self.printer = _Printer()
+        self.printer = NumPyText()
         self.parts: list[str] = []
 
     def function(
@@ -116,7 +61,7 @@ class _Writer:
         like = [*head, *(["x[..., 0]"] if state else []), *tail, *(f"_{w}[..., 0]" for w in vectors)]
         like += [] if state else ["*p"]
         if len(outputs) == 1 and outputs[0][0] == "":
-            value = self.printer.parenthesize(self._renamed(reduced[0]), 40)
+            value = self.printer.parenthesize(renamed(reduced[0]), 40)
             lines.append(f"    return _empty(({', '.join(like)},), ()) + {value}")
         else:
             lines.append(f"    out = _empty(({', '.join(like)},), {shape})")
@@ -135,12 +80,7 @@ class _Writer:
         self.function(name, doc, indexed, steps=formulas.steps, shape=f"({n}, {n})", **more)
 
     def text(self, expression: sp.Expr) -> str:
-        return self.printer.doprint(self._renamed(expression))
-
-    @staticmethod
-    def _renamed(expression: sp.Expr) -> sp.Expr:
-        renamed = {s: sp.Symbol(python_name(s.name)) for s in expression.free_symbols if python_name(s.name) != s.name}
-        return expression.xreplace(renamed)
+        return self.printer.doprint(renamed(expression))
 
     def _unpack(self, used: set[str], vectors: Sequence[str], state: bool) -> Iterable[str]:
         for i, name in enumerate(self.parameters):
@@ -259,11 +199,6 @@ def _write_closed(writer: _Writer, system: System) -> None:
                 value = value.subs(Omega_squared, limits.omega_squared)
             value = ratio(*sp.fraction(value, exact=True))  # exact: exp(-V/Vc) stays above
         writer.function(name, doc, [("", in_law_parameters(system, value))], state=False)
-
-
-def numpy_text(expression: sp.Expr) -> str:
-    """Return `expression` as generated code writes it."""
-    return _Printer().doprint(_Writer._renamed(expression))
 
 
 def _write_rates(writer: _Writer, eq: Equations) -> None:

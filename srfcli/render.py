@@ -11,8 +11,8 @@ import sympy as sp
 from srfcli.derivation import Section, dispersion_coefficients
 from srfcli.derive import friction_slopes, interface_meaning, slope_symbols
 from srfcli.expression import symbol
-from srfcli.generate import FUNCTIONS, numpy_text, python_name
 from srfcli.notation import latex, pretty, text
+from srfcli.numpytext import FUNCTIONS, numpy_text, python_name
 from srfcli.paper import Finding
 from srfcli.system import System
 
