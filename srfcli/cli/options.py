@@ -89,31 +89,20 @@ class SystemOptions:
 
         return load_registry(self.plugins)
 
+    def _chosen(self) -> dict[str, Any]:
+        return {key: getattr(self, key).value for key in ("law", "ageing", "interface", "loading", "inertia")}
+
     def system(self) -> System:
         """Return the system that the options name."""
         from srfcli.system import build_system
 
-        return build_system(
-            self.registry(),
-            law=self.law.value,
-            ageing=self.ageing.value,
-            interface=self.interface.value,
-            loading=self.loading.value,
-            inertia=self.inertia.value,
-        )
+        return build_system(self.registry(), **self._chosen())
 
     def model(self) -> GeneratedModel:
         """Return the numerical model of that system; sympy runs only where the cache has none."""
         from srfcli.model import open_model
 
-        return open_model(
-            self.registry(),
-            law=self.law.value,
-            ageing=self.ageing.value,
-            interface=self.interface.value,
-            loading=self.loading.value,
-            inertia=self.inertia.value,
-        )
+        return open_model(self.registry(), **self._chosen())
 
     def resolve(self, parameters: Sequence[Parameter], **given: str | float | None) -> Resolved:
         """Return every parameter's value and origin.

@@ -41,11 +41,6 @@ class Branch:
     start: Status
     end: Status
 
-    @property
-    def closed(self) -> bool:
-        """True where the curve returned to its start."""
-        return self.end is Status.CLOSED
-
 
 @dataclass
 class Atlas:

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any, TextIO
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
-Cell = float | int | bool | str | None
-
 
 @dataclass(frozen=True)
 class Column:
