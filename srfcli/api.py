@@ -6,13 +6,18 @@
     def my_law(v, phi, p):
         return p.mu0 + p.A * log(v / p.V0) + p.B * log(1 + p.Vsat * phi / p.D0)
 
-The function is called once, with symbols; its arguments are the variables of the law by name, and `p`, the parameters.
+    @reader(name="my-logger", suffixes=(".dat",))
+    def my_logger(path):
+        return {"time [s]": times, "elongation [um]": elongations}
+
+A law's function is called once, with symbols; its arguments are the variables of the law by name, and `p`, the parameters.
 """
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import sympy
@@ -33,6 +38,7 @@ from srfcli.lawfile import (
     valid_name,
 )
 from srfcli.laws import AgeingLaw, AgeingModifier, Check, FrictionLaw, Interface, Parameter, State
+from srfcli.reader import Reader, Source
 
 __all__ = [
     "AgeingLaw",
@@ -41,6 +47,9 @@ __all__ = [
     "FrictionLaw",
     "Interface",
     "Parameter",
+    "Reader",
+    "Source",
+    "SrfError",
     "State",
     "ageing_law",
     "asinh",
@@ -54,6 +63,7 @@ __all__ = [
     "log",
     "log1p",
     "modifier",
+    "reader",
     "sinh",
     "sqrt",
     "tanh",
@@ -126,6 +136,30 @@ def interface(
 ) -> Callable[[Callable[..., Any]], Interface]:
     """Turn a function of W and p into an `Interface`."""
     return _decorator("interface", name, parameters, about, cites, checks)
+
+
+def reader(
+    *,
+    name: str | None = None,
+    suffixes: Iterable[str] = (),
+    sniff: Callable[[bytes], bool] | None = None,
+    about: str = "",
+) -> Callable[[Callable[[Path], Source | Mapping[str, Any]]], Reader]:
+    """Turn a function of a path, which returns a `Source` or a mapping from headings to arrays, into a `Reader`."""
+
+    def decorate(function: Callable[[Path], Source | Mapping[str, Any]]) -> Reader:
+        own = name or function.__name__.replace("_", "-")
+        if not valid_name(own):
+            raise SrfError(f"reader name {own!r}: expected small letters, digits and single dashes", "Like my-logger.")
+        endings = tuple(suffixes)
+        if not all(isinstance(s, str) and s.startswith(".") for s in endings):
+            raise SrfError(
+                f"reader '{own}': suffixes are {endings!r}", 'Write them with their dot: suffixes=(".dat",).'
+            )
+        told = about or (inspect.getdoc(function) or "").split("\n")[0]
+        return Reader(own, function, endings, sniff, told, inspect.getsourcefile(function) or "")
+
+    return decorate
 
 
 def _decorator(

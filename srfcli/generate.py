@@ -209,6 +209,7 @@ def _write_rates(writer: _Writer, eq: Equations) -> None:
     shape = f"({len(n)},)"
     writer.vector("rates", "dx/dt under drive V, imposed load W and its rate W_dot.", rates, tail=inputs, shape=shape)
     writer.square("rates_jacobian", "d(rates)/dx.", _jacobian(eq, rates), tail=inputs)
+    _write_rates_by_parameters(writer, rates, inputs)
     writer.function("friction", "Friction coefficient.", [("", eq.mu)], tail=inputs)
     writer.function("elongation", "Spring elongation u.", [("", eq.spring)], tail=inputs)
     calm = rates.substituted({symbol("W"): symbol("W0"), symbol("W_dot"): sp.S.Zero})
@@ -229,6 +230,16 @@ def _write_rates(writer: _Writer, eq: Equations) -> None:
         vectors=("a", "b", "c"),
         shape=shape,
     )
+
+
+def _write_rates_by_parameters(writer: _Writer, rates: Staged, inputs: Sequence[str]) -> None:
+    """Write d(rates)/dp, a column for each parameter, as a fit's sensitivity equations need it."""
+    columns = [rates.derivative({symbol(name): sp.S.One}) for name in writer.parameters]
+    both = joined(columns)
+    n, m = len(rates.outputs), len(columns)
+    indexed = [(f"{i}, {j}", columns[j].outputs[i]) for i in range(n) for j in range(m)]
+    doc = "d(rates)/dp, a column for each of PARAMETERS."
+    writer.function("rates_parameters", doc, indexed, steps=both.steps, tail=inputs, shape=f"({n}, {m})")
 
 
 def _direction(eq: Equations, by: Sequence[sp.Expr]) -> dict[sp.Symbol, sp.Expr]:

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from srfcli.dimensions import QUANTITY_UNITS, parse_unit
 from srfcli.errors import ExpressionError, SrfError, did_you_mean
 from srfcli.laws import AgeingLaw, AgeingModifier, Check, FrictionLaw, Interface, Law, Parameter, State
+from srfcli.reader import Reader
 
 if TYPE_CHECKING:
     import sympy
 
 FORMAT = "srf-law/1"
 KINDS = ("friction", "ageing", "modifier", "interface")
+PLUGIN_KINDS = (*KINDS, "reader")
 FORMULA = {"friction": "mu", "ageing": "rate", "modifier": "term", "interface": "kappa"}  # also the checked quantity
 COMMON = ("mu0", "A", "B", "D0", "V0")  # friction parameters that an ageing law may name
 AGEING_SYMBOLS = ("v", "phi", "mu", "mu_dot", "W", "W_dot", "F_dot_over_W")
@@ -38,8 +40,10 @@ _CHECK_KEYS = ("quantity", "at", "value", "rtol")
 _STATE_KEYS = ("name", "length", "weight")
 
 
-def kind_of(law: Law) -> str:
-    """Return 'friction', 'ageing', 'modifier' or 'interface'."""
+def kind_of(law: Law | Reader) -> str:
+    """Return 'friction', 'ageing', 'modifier', 'interface' or, of what reads files, 'reader'."""
+    if isinstance(law, Reader):
+        return "reader"
     return next(kind for kind, cls in LAW_CLASSES.items() if isinstance(law, cls))
 
 

@@ -15,8 +15,15 @@ from types import ModuleType
 from srfcli.errors import SrfError
 from srfcli.lawfile import kind_of, valid_name
 from srfcli.laws import Law
+from srfcli.reader import Reader
 
-DECORATORS = {"friction_law": "friction", "ageing_law": "ageing", "modifier": "modifier", "interface": "interface"}
+DECORATORS = {
+    "friction_law": "friction",
+    "ageing_law": "ageing",
+    "modifier": "modifier",
+    "interface": "interface",
+    "reader": "reader",
+}
 
 
 def scan_python(path: Path) -> list[tuple[str, str, str]]:
@@ -60,9 +67,7 @@ def load_module(location: Path, module: str | None) -> ModuleType:
 
 def laws_in(module: ModuleType) -> Iterator[Law]:
     """Yield the law values among a module's attributes."""
-    for value in vars(module).values():
-        if isinstance(value, Law):
-            yield value
+    return (value for value in vars(module).values() if isinstance(value, Law))
 
 
 def find_law(location: Path, module: str | None, kind: str, name: str) -> Law:
@@ -71,6 +76,14 @@ def find_law(location: Path, module: str | None, kind: str, name: str) -> Law:
         if kind_of(law) == kind and law.name == name:
             return law
     raise SrfError(f"{location}: once imported, there is no {kind} law '{name}' in it")
+
+
+def find_reader(location: Path, module: str | None, name: str) -> Reader:
+    """Return the reader of that name from a plugin, imported now."""
+    for value in vars(load_module(location, module)).values():
+        if isinstance(value, Reader) and value.name == name:
+            return value
+    raise SrfError(f"{location}: once imported, there is no reader '{name}' in it")
 
 
 def _from_file(path: Path) -> ModuleType:

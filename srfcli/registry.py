@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from srfcli.errors import SrfError, did_you_mean
-from srfcli.lawfile import KINDS, kind_of, read_header, read_law
+from srfcli.lawfile import PLUGIN_KINDS, kind_of, read_header, read_law
 from srfcli.laws import AgeingLaw, AgeingModifier, Law
-from srfcli.pylaw import find_law, laws_in, load_module, scan_python
+from srfcli.pylaw import find_law, find_reader, laws_in, load_module, scan_python
+from srfcli.reader import Reader
 
 GROUP = "srf.laws"
 
@@ -46,14 +47,15 @@ class Registry:
     """The laws that were found, by kind and name; a law is loaded when it is first asked for, and then kept."""
 
     def __init__(self, entries: Sequence[Entry], problems: Sequence[Problem] = ()) -> None:
-        self._entries = tuple(sorted(entries, key=lambda e: (KINDS.index(e.kind), e.name, str(e.location))))
+        self._entries = tuple(sorted(entries, key=lambda e: (PLUGIN_KINDS.index(e.kind), e.name, str(e.location))))
         self.problems = tuple(problems)
         self._loaded: dict[Entry, Law] = {}
+        self._readers: dict[Entry, Reader] = {}
 
     def entries(self, kind: str | None = None) -> tuple[Entry, ...]:
         """Return all entries, or those of one kind, sorted by kind and name; clashing ones are all there."""
-        if kind is not None and kind not in KINDS:
-            raise SrfError(f"unknown kind '{kind}'", did_you_mean(kind, KINDS))
+        if kind is not None and kind not in PLUGIN_KINDS:
+            raise SrfError(f"unknown kind '{kind}'", did_you_mean(kind, PLUGIN_KINDS))
         return tuple(e for e in self._entries if kind in (None, e.kind))
 
     def clashes(self, entry: Entry) -> tuple[Entry, ...]:
@@ -63,15 +65,16 @@ class Registry:
     def find(self, kind: str, name: str) -> Entry:
         """Return the one entry of that kind and name; raises `SrfError` where there is none, or more than one."""
         found = [e for e in self.entries(kind) if e.name == name]
+        what = kind if kind == "reader" else f"{kind} law"
         if len(found) == 1:
             return found[0]
         if found:
             places = " and ".join(f"{e.location} ({e.origin})" for e in found)
-            raise SrfError(f"two {kind} laws are called '{name}': {places}", "Rename one or take its folder away.")
+            raise SrfError(f"two {what}s are called '{name}': {places}", "Rename one or take its folder away.")
         for problem in self.problems:
             if problem.name == name:
                 raise SrfError(problem.message, problem.hint)
-        raise SrfError(f"unknown {kind} law '{name}'", did_you_mean(name, (e.name for e in self.entries(kind))))
+        raise SrfError(f"unknown {what} '{name}'", did_you_mean(name, (e.name for e in self.entries(kind))))
 
     def get(self, kind: str, name: str) -> Law:
         """Return the law of that kind and name, or in the file of that name where it ends in .toml or .py."""
@@ -87,6 +90,12 @@ class Registry:
             else:
                 self._loaded[entry] = find_law(entry.location, entry.module, entry.kind, entry.name)
         return self._loaded[entry]
+
+    def reader(self, entry: Entry) -> Reader:
+        """Return the reader of an entry, imported at the first call."""
+        if entry not in self._readers:
+            self._readers[entry] = find_reader(entry.location, entry.module, entry.name)
+        return self._readers[entry]
 
     def ageing(self, spelling: str) -> tuple[AgeingLaw, tuple[AgeingModifier, ...]]:
         """Return the ageing law and the modifiers of a spelling such as `dieterich+linker-dieterich`."""
@@ -230,11 +239,11 @@ class _Collector:
 
 
 def _law_files(folder: Path) -> Iterator[Path]:
-    """Yield the law files of a folder and of its subfolders friction, ageing, modifier and interface."""
+    """Yield the law files of a folder and of its subfolders friction, ageing, modifier, interface and readers."""
     if folder.is_file():
         yield folder
         return
-    for place in (folder, *(folder / kind for kind in KINDS)):
+    for place in (folder, *(folder / kind for kind in (*PLUGIN_KINDS, "readers"))):
         if place.is_dir():
             yield from sorted(
                 p for p in place.iterdir() if p.suffix in (".toml", ".py") and not p.name.startswith(("_", "."))

@@ -17,6 +17,7 @@ class Status(Enum):
     CLOSED = "closed"
     NO_HOPF = "no-hopf"
     INTEGRATION = "integration-stopped"
+    EVALUATIONS = "max-evaluations"
     INTERRUPTED = "interrupted"
 
     @property
@@ -40,5 +41,6 @@ _ADVICE = {
     Status.CLOSED: "The curve returned to its start.",
     Status.NO_HOPF: "Velocity strengthening: no Hopf bifurcation.",
     Status.INTEGRATION: "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
+    Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise --max-evaluations, or start nearer.",
     Status.INTERRUPTED: "Interrupted; what was finished is kept.",
 }

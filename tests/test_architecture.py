@@ -22,7 +22,7 @@ LONG_FILES: dict[str, str] = {}  # path -> the reason why it is longer
 
 # each module and what it may import of the package, also inside functions; a folder stands for all that is in it
 BASE = {"errors", "status"}
-LAWS = BASE | {"laws"}
+LAWS = BASE | {"laws", "reader"}
 LAW_FILES = LAWS | {"expression", "dimensions", "lawfile", "pylaw"}
 SYMBOLS = LAW_FILES | {"registry", "system", "derive", "closed_limits"}
 MAY: dict[str, set[str]] = {
@@ -31,6 +31,7 @@ MAY: dict[str, set[str]] = {
     "units": BASE,
     "expression": BASE,
     "laws": BASE | {"expression"},
+    "reader": set(),
     "dimensions": BASE,
     "lawfile": LAW_FILES,
     "lawtemplate": BASE,
@@ -52,7 +53,9 @@ MAY: dict[str, set[str]] = {
     "paper": SYMBOLS | {"paper_forms", "units"},
     "render": SYMBOLS | {"derivation", "notation", "numpytext", "paper"},
     "settings": LAWS | {"units"},
-    "numerics": BASE | {"model", "numerics"},
+    "recording": LAW_FILES | {"registry", "units", "numerics"},
+    "numerics": BASE | {"cache", "model", "numerics"},
+    "inference": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "settings", "units"},
     "output": LAWS | {"output"},
 }
 HEAVY = {"sympy", "scipy", "numpy", "matplotlib", "pint", "numba"}

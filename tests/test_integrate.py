@@ -10,7 +10,7 @@ from brute import Slider, rates, steady
 from scipy.integrate import solve_ivp
 
 from srfcli.errors import SrfError
-from srfcli.numerics import integrate
+from srfcli.numerics import motion
 from srfcli.numerics.integrate import simulate
 from srfcli.numerics.orbit import solve_orbits, steady_guess, uniform_mesh
 from srfcli.numerics.program import ConstantLoad, Drive, Modulation, SampledLoad
@@ -139,7 +139,7 @@ def test_switch_on_is_smooth():
 
 
 def test_an_integration_that_stops_is_a_status(model, monkeypatch):
-    monkeypatch.setattr(integrate, "MAX_STEPS", 300)
+    monkeypatch.setattr(motion, "MAX_STEPS", 300)
     t = np.array([0.0, 1e-4, 2e-4, 1.0, 2.0])
     trace = simulate(
         model, model.vector(), drive=Drive.constant(8.0), load=Modulation(8.0, 0.18, 120.0), t=t, rtol=1e-10

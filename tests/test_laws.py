@@ -78,7 +78,7 @@ def test_the_shipped_laws_are_there() -> None:
     assert not SHIPPED.problems
 
 
-@pytest.mark.parametrize("entry", SHIPPED.entries(), ids=lambda e: e.name)
+@pytest.mark.parametrize("entry", [e for e in SHIPPED.entries() if e.kind != "reader"], ids=lambda e: e.name)
 def test_every_shipped_law_passes_its_checks(entry: Entry) -> None:
     law = SHIPPED.load(entry)
     outcomes = check_law(law)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -29,6 +29,7 @@ def emit(
     table: Table,
     options: OutputOptions,
     *,
+    more: Sequence[Table] = (),
     figure: Figure | Callable[[], Figure] | None = None,
     laws: Iterable[Law] = (),
     inputs: Iterable[Path] = (),
@@ -37,6 +38,7 @@ def emit(
 ) -> None:
     """Write the table where the options say, then the figure if --plot asks for it, each file with its sidecar.
 
+    `more` are tables that text shows below the first; in JSON its `meta` should hold what they say, CSV has the first only.
     `figure` may be a function that draws it, called only for --plot. `laws`, `inputs`, `seed` and `timings` go into
     the sidecar, as do the table's parameters. A terminal gets a formatted table, a pipe plain text in full precision;
     beside CSV and a file the notes go to stderr.
@@ -49,10 +51,14 @@ def emit(
         seed=seed,
         timings=timings or {},
     )
+    shown = [table, *more] if options.format == "text" else [table]
     if options.out is None:
-        _to_stdout(table, options.format)
+        for index, one in enumerate(shown):
+            if index:
+                click.echo()
+            _to_stdout(one, options.format)
     else:
-        content = render(table, options.format).encode("utf-8")
+        content = "\n".join(render(one, options.format) for one in shown).encode("utf-8")
         write_atomic(options.out, content)
         _wrote(options.out, content, provenance, options)
     if options.format == "csv" or options.out is not None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from srfcli.output.tables import Table
     from srfcli.registry import Registry
 
-KIND = click.Choice(["friction", "ageing", "modifier", "interface"])
+KIND = click.Choice(["friction", "ageing", "modifier", "interface", "reader"])
 
 plugins_option = click.option(
     "--plugins",
@@ -34,7 +34,7 @@ srf laws --json | jq .rows          for a program
 
 
 @click.command(cls=SrfCommand, epilog=EPILOG)
-@click.option("--kind", type=KIND, help="One kind of law only.")
+@click.option("--kind", type=KIND, help="One kind of law only, or the readers of data files.")
 @click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
 @plugins_option
 def laws(kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
@@ -62,6 +62,8 @@ def laws_table(registry: Registry, kind: str | None = None) -> Table:
     columns = [Column("kind"), Column("name"), Column("origin"), Column("about"), Column("location"), Column("clash")]
     rows: list[tuple[Any, ...]] = []
     for e in registry.entries(kind):
+        if kind is None and e.kind == "reader":
+            continue  # not a law: listed on request
         others = ", ".join(str(other.location) for other in registry.clashes(e))
         rows.append((e.kind, e.name, e.origin, e.about, str(e.location), others or None))
     if not any(row[-1] for row in rows):

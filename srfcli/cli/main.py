@@ -22,6 +22,8 @@ COMMANDS = {
     "critical": "srfcli.cli.critical:command",
     "continue": "srfcli.cli.continue_:command",
     "floquet": "srfcli.cli.floquet:command",
+    "fit": "srfcli.cli.fit:command",
+    "simulate": "srfcli.cli.simulate:command",
     "config": "srfcli.cli.config:command",
 }
 

@@ -1,28 +1,22 @@
-"""Time integration of one slider under any drive and load, from discontinuity to discontinuity of what is imposed.
+"""Time integration of one slider under any drive and load, as an experimenter would plot it.
 
-LSODA in the unknowns of the model, of which velocities and ages are logarithms: stick is then a large negative number, not a
-singularity. It changes by itself between Adams and backward differentiation formulas.
+The unknowns are those of the model, of which velocities and ages are logarithms: stick is then a large negative number, not a
+singularity. What is imposed is smooth from discontinuity to discontinuity, and no step crosses one.
 """
 
 from __future__ import annotations
 
-import math
-import warnings
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from srfcli.errors import SrfError
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array
-from srfcli.numerics.program import Drive, Load
-from srfcli.numerics.scalar import ScalarFunction, scalar_function
+from srfcli.numerics.load import Load
+from srfcli.numerics.motion import integrate
+from srfcli.numerics.program import Drive
 from srfcli.status import Status
-
-MAX_STEPS = 200_000  # between two output times
-BEYOND = 1e100  # a rate where the formula overflows: the step is then rejected and cut
 
 
 @dataclass(frozen=True)
@@ -73,27 +67,9 @@ def simulate(
     t, q = np.asarray(t, dtype=float), _parameters(model, p, drive, load, t)
     load.check(t[0], t[-1])
     n = len(model.states)
-    x = np.full((t.size, n), np.nan)
-    x[0] = _start(model, q, start)
-    tolerances = (
-        _absolute(model, drive, t, rtol) if atol is None else np.broadcast_to(np.asarray(atol, float), x[0].shape)
-    )
-    rates, jacobian = (scalar_function(model, name, q) for name in ("rates", "rates_jacobian"))
-    status, reached, state = Status.OK, float(t[0]), x[0]
-    for a, b in _pieces(t, drive, load):
-        middle = 0.5 * (a + b)
-        f = _frozen(rates, (n,), drive, load, middle)
-        df = _frozen(jacobian, (n, n), drive, load, middle)
-        wanted = np.nonzero((t > a) & (t <= b))[0]
-        times = np.unique([a, *t[wanted], b])
-        y, good = _lsoda(f, df, state, times, rtol, tolerances, load.longest_step)
-        places = np.searchsorted(times, t[wanted])
-        x[wanted[places < good]] = y[places[places < good]]
-        reached, state = float(times[good - 1]), y[-1]
-        if good < times.size:
-            status = Status.INTEGRATION
-            break
-    return _trace(model, q, drive, load, t, x, status, reached)
+    tolerances = _absolute(model, drive, t, rtol) if atol is None else np.broadcast_to(np.asarray(atol, float), (n,))
+    motion = integrate(model, q, drive=drive, load=load, t=t, start=_start(model, q, start), rtol=rtol, atol=tolerances)
+    return _trace(model, q, drive, load, t, motion.x, motion.status, motion.reached)
 
 
 def _parameters(model: GeneratedModel, p: Array, drive: Drive, load: Load, t: Array) -> Array:
@@ -130,58 +106,6 @@ def _absolute(model: GeneratedModel, drive: Drive, t: Array, rtol: float) -> Arr
     ends = drive(np.unique([*t[[0, -1]], *(b for b in drive.breaks if t[0] < b < t[-1])]))
     fastest = max(float(np.abs(ends).max()), 1e-3)
     return rtol * np.array([fastest if name == "z" else 1.0 for name in model.states])
-
-
-def _pieces(t: Array, drive: Drive, load: Load) -> Iterator[tuple[float, float]]:
-    """Yield the intervals between output's ends and the breaks of drive and load."""
-    inside = (b for b in (*drive.breaks, *load.breaks) if t[0] < b < t[-1])
-    edges = np.unique([t[0], *inside, t[-1]]).tolist()
-    yield from pairwise(edges)
-
-
-def _frozen(
-    function: ScalarFunction, shape: tuple[int, ...], drive: Drive, load: Load, within: float
-) -> Callable[[float, Array], object]:
-    """Return `function`, whose values have this shape, of (t, x) on the smooth piece that holds at `within`."""
-    W_at = load.piece(within)
-    V0, acceleration, since = drive.piece(within)
-
-    def at(t: float, x: Array) -> object:
-        W, W_dot = W_at(t)
-        V = V0 + acceleration * (t - since) if acceleration else V0
-        try:
-            return function(x.tolist(), V, W, W_dot)
-        except (ArithmeticError, ValueError):
-            return np.full(shape, BEYOND)
-
-    return at
-
-
-def _lsoda(
-    f: Callable[[float, Array], object],
-    df: Callable[[float, Array], object],
-    start: Array,
-    times: Array,
-    rtol: float,
-    atol: Array,
-    longest: float,
-) -> tuple[Array, int]:
-    """Return the states (times, n) and how many of them were reached."""
-    from scipy.integrate import ODEintWarning, odeint
-
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore", ODEintWarning)  # told by the status instead
-        y, info = odeint(
-            f, start, times, Dfun=df, tfirst=True, rtol=rtol, atol=atol, tcrit=[times[-1]],
-            hmax=longest if math.isfinite(longest) else 0.0, mxstep=MAX_STEPS, full_output=True,
-        )  # fmt: skip
-    if info["message"] == "Integration successful.":
-        finite = np.isfinite(y).all(axis=1)
-        return y, times.size if finite.all() else int(np.argmin(finite))
-    # LSODA's own clock `tcur` stands still at the output interval it failed in; what lies beyond is not filled
-    reached = info["tcur"]
-    failed = np.nonzero(reached < times[1:])[0]
-    return y, int(failed[0]) + 1 if failed.size else 1
 
 
 def _trace(

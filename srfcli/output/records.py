@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 from typing import Any
 
 from srfcli import __version__
@@ -22,6 +23,8 @@ def to_csv(table: Table) -> str:
 
 
 def _csv_cell(value: Any) -> str:
+    if type(value) is float:  # nearly all cells of long records
+        return repr(value) if math.isfinite(value) else ""
     simple = plain_value(value)
     if simple is None:
         return ""

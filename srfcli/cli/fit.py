@@ -1,0 +1,147 @@
+"""`srf fit`: parameters from recordings, or from a table of critical loads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from srfcli.cli.options import OutputOptions, Session, SrfCommand, SystemOptions, output_options, system_options
+from srfcli.errors import SrfError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from srfcli.inference.fit import Fit, Problem
+    from srfcli.inference.profile import Interval
+
+EXAMPLES = """
+srf fit EXPERIMENT                                  a folder with experiment.toml, or that file
+srf fit EXPERIMENT --profile --starts 5 --json
+srf fit EXPERIMENT --trend slip --free A,B,D0
+srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c, sigma
+"""
+
+
+@click.command("fit", cls=SrfCommand, epilog=EXAMPLES)
+@click.argument("source", metavar="EXPERIMENT|THRESHOLDS.csv", type=click.Path(path_type=Path))
+@click.option(
+    "--free", multiple=True, metavar="NAMES", help="Parameters to fit; else those that the experiment leaves free."
+)
+@click.option(
+    "--starts", type=click.IntRange(1, 1000), default=1, show_default=True, help="Starting points to fit from."
+)
+@click.option("--profile", is_flag=True, help="Profile-likelihood intervals.")
+@click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
+@click.option(
+    "--sample", type=click.IntRange(100, 1_000_000), metavar="N", help="Draw N points of the posterior (emcee)."
+)
+@click.option("--seed", type=int, default=0, show_default=True, help="Of further starts and of the sampler.")
+@click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
+@click.option(
+    "--bounds", multiple=True, metavar="NAME=LO:HI", help="Bounds of a parameter, for a table of critical loads."
+)
+@click.option("--method", multiple=True, help="Minimiser of the critical loads' cost; both unless named.")
+@click.option("--tol", type=float, help="Relative error of a critical load.")
+@click.option(
+    "--max-evaluations", type=click.IntRange(1), help="Of the cost over the critical loads, for each minimiser."
+)
+@system_options
+@output_options
+def command(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
+    """Fit the model of an experiment to its recordings, all runs together, by maximum likelihood.
+
+    The noise of each run, its level and colour, is estimated with the parameters and counts in their errors. A CSV file is taken
+    for a table of critical loads, which the paper's procedure fits: the laws are then those of the options below.
+    """
+    if source.suffix.lower() == ".csv":
+        from srfcli.cli.fit_thresholds import fit_thresholds
+
+        _refuse(options, ("starts", "profile", "trend", "sample", "reader"), "recordings")
+        fit_thresholds(
+            source, system=system, output=output, free=options["free"], bounds=options["bounds"],
+            methods=options["method"], tol=options["tol"], max_evaluations=options["max_evaluations"],
+        )  # fmt: skip
+        return
+    _refuse(options, ("bounds", "method", "tol", "max_evaluations"), "critical loads")
+    for name in ("law", "ageing", "interface", "loading", "inertia"):
+        if getattr(system, name).origin == "flag":
+            raise SrfError(f"--{name} is given, and an experiment names its own", "Change [model] in experiment.toml.")
+    _fit_recordings(
+        source, system, output, **{k: v for k, v in options.items() if k not in ("bounds", "method", "tol")}
+    )
+
+
+def _refuse(options: dict[str, Any], names: tuple[str, ...], purpose: str) -> None:
+    """Raise where an option is given that has no meaning for this kind of source."""
+    context = click.get_current_context()
+    for name in names:
+        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            flag = "format" if name == "reader" else name.replace("_", "-")
+            raise SrfError(f"--{flag} is for fits of {purpose}", "Leave it out here.")
+
+
+def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
+    import time
+    from dataclasses import asdict
+
+    from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.cli.fit_tables import parameter_table, run_table
+    from srfcli.inference.fit import Interrupted, fit_problem, held_fit
+    from srfcli.inference.profile import profile
+    from srfcli.inference.starts import fit_from_several
+    from srfcli.model import open_model
+    from srfcli.recording.experiment import read_experiment
+    from srfcli.status import Status
+
+    registry = system.registry()
+    experiment = read_experiment(source, registry=registry, format=options["reader"])
+    model = open_model(registry, **asdict(experiment.choice))
+    free = [n.strip() for text in options["free"] for n in text.split(",") if n.strip()] or None
+    problem = fit_problem(model, experiment, free=free, trend=options["trend"])
+    begun, status = time.perf_counter(), Status.OK
+    starts: list[tuple[float, bool]] = []
+    intervals: list[Interval] = []
+    draws = None
+    with Progress("fit") as progress:
+
+        def report(text: str) -> None:
+            progress.advance(note=text)
+
+        try:
+            fit, starts = fit_from_several(problem, count=options["starts"], seed=options["seed"], progress=report)
+            status = fit.status
+            if options["profile"]:
+                for name in problem.names:
+                    intervals.append(profile(problem, fit, name, progress=report))
+            if options["sample"]:
+                from srfcli.inference.sample import sample
+
+                draws = sample(problem, fit, options["sample"], seed=options["seed"], progress=report)
+        except Interrupted as stopped:
+            fit, status = held_fit(problem, stopped.values), Status.INTERRUPTED
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+    for run in experiment.runs:
+        for notice in run.notices:
+            Session.current().detail(f"{run.name}: {notice}")
+    runs = run_table(fit)
+    table = parameter_table(problem, fit, intervals, starts, draws, runs, status)
+    emit(
+        table, output, more=[runs], laws=model.laws, inputs=[experiment.path, *(r.file for r in experiment.runs)],
+        seed=options["seed"], timings={"fit": time.perf_counter() - begun}, figure=_figure(problem, fit),
+    )  # fmt: skip
+    finish(status)
+
+
+def _figure(problem: Problem, fit: Fit) -> Callable[[], Any]:
+    def draw() -> Any:
+        from srfcli.output.fits import fit_figure
+
+        runs = {r.name: r for r in problem.experiment.runs}
+        rows = [(f.name, f.holdout, runs[f.name].t, runs[f.name].observed, f.prediction.y, f.white) for f in fit.runs]
+        unit = {"elongation": "um", "force": "N", "friction": "1"}[next(iter(runs.values())).observable]
+        return fit_figure(rows, quantity=next(iter(runs.values())).observable, unit=unit)
+
+    return draw

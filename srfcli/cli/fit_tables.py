@@ -1,0 +1,125 @@
+"""The tables that `srf fit` prints: parameters with their errors and flags, and how each run is fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from srfcli.output.tables import Column, Table
+from srfcli.status import Status
+from srfcli.units import from_base
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from srfcli.inference.fit import Fit, Problem
+    from srfcli.inference.profile import Interval
+
+PARAMETERS = (
+    Column("parameter", "", "name"),
+    Column("value", "", "estimate, in the unit beside it"),
+    Column("stderr", "", "standard error; coloured noise allowed for", ".3g"),
+    Column("low", "", "lower end of the 95 % interval"),
+    Column("high", "", "upper end of the 95 % interval"),
+    Column("unit", "", "unit of all the columns before"),
+    Column("start", "", "where the fit began"),
+    Column("flag", "", "what is to be known before the value is used"),
+)
+RUNS = (
+    Column("run", "", "name"),
+    Column("role", "", "fit, or held out"),
+    Column("samples", "", "compared"),
+    Column("rms", "", "of the residual, in the observable's unit"),
+    Column("noise", "", "standard deviation of white noise, from differences of the residual"),
+    Column("rms_over_noise", "", "1 where the model explains all but the noise", ".4g"),
+    Column("lag1", "", "correlation of neighbouring residuals", ".3g"),
+    Column("order", "", "of the autoregressive noise"),
+)
+CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
+
+
+def parameter_table(
+    problem: Problem,
+    fit: Fit,
+    intervals: Sequence[Interval],
+    starts: Sequence[tuple[float, bool]],
+    draws: NDArray[Any] | None,
+    runs: Table,
+    status: Status,
+) -> Table:
+    """Return the estimates as a table whose `meta` has the runs, the correlations and all that has no column."""
+    by_name = {i.name: i for i in intervals}
+    rows = []
+    for k, name in enumerate(fit.names):
+        unit = unit_of(problem, name)
+        value, error = fit.values[name], fit.stderr[name]
+        found = by_name.get(name)
+        ends = (value - 1.96 * error, value + 1.96 * error) if found is None else (found.low, found.high)
+        cells = [value, error, *ends]
+        shown = [None if c is None else from_base(c, unit) for c in cells]
+        rows.append((name, *shown, unit, from_base(float(problem.start[k]), unit), flag(fit, k)))
+    notes = _notes(fit, intervals, starts)
+    meta = {
+        "runs": [dict(zip((c.name for c in RUNS), row, strict=True)) for row in runs.rows],
+        "correlation": fit.correlation,
+        "log_likelihood": fit.log_likelihood,
+        "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
+        "evaluations": fit.evaluations,
+        "noise": {f.name: {"innovation": f.noise.innovation, "coefficients": f.noise.coefficients} for f in fit.runs},
+        "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in starts],
+        "posterior": None if draws is None else {"names": fit.names, "draws": draws},
+    }
+    return Table("srf.fit/1", PARAMETERS, rows, problem.experiment.title, tuple(notes), {}, meta, status=status.value)
+
+
+def run_table(fit: Fit) -> Table:
+    """Return one row for each run, fitted or held out."""
+    from srfcli.inference.noise import lag_one
+
+    rows = []
+    for f in fit.runs:
+        size = sum(b - a for a, b in f.parts)
+        rows.append(
+            (f.name, "held out" if f.holdout else "fit", size, f.rms, f.white, f.rms / f.white if f.white else None,
+             lag_one(f.residual, f.parts), f.noise.order)
+        )  # fmt: skip
+    return Table("srf.fit.runs/1", RUNS, rows, "runs")
+
+
+def unit_of(problem: Problem, name: str) -> str:
+    """Return the unit that a parameter is declared in; K that of the stated stiffness, what belongs to a run 1 or s."""
+    listed = {q.name: q.unit for q in problem.experiment.parameters}
+    return listed.get(name, "1")
+
+
+def flag(fit: Fit, k: int) -> str:
+    """Return what stands against an estimate: at a bound, not determined, or tied to another parameter."""
+    import numpy as np
+
+    name = fit.names[k]
+    width = fit.upper[k] - fit.lower[k]
+    if min(fit.values[name] - fit.lower[k], fit.upper[k] - fit.values[name]) < CLOSE * width:
+        return "at its lower bound" if fit.values[name] - fit.lower[k] < CLOSE * width else "at its upper bound"
+    if fit.stderr[name] > WIDE * width / 4:
+        return "not identifiable: its error is as wide as its bounds"
+    tied = np.abs(fit.correlation[k]).copy()
+    tied[k] = 0
+    other = int(np.argmax(tied)) if tied.size > 1 else k
+    return f"tied to {fit.names[other]}: correlation {fit.correlation[k][other]:.3f}" if tied[other] > ALIKE else ""
+
+
+def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float, bool]]) -> list[str]:
+    notes = [f"rms over noise {fit.rms_over_noise():.4g} in the runs fitted"]
+    if any(f.holdout for f in fit.runs):
+        notes[0] += f", {fit.rms_over_noise(holdout=True):.4g} in those held out"
+    notes.append(
+        "intervals: " + ("profile likelihood" if intervals else "1.96 standard errors; --profile refits") + ", 95 %"
+    )
+    if len(starts) > 1:
+        notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
+    coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
+    if coloured:
+        notes.append(
+            f"residuals are coloured in {', '.join(coloured)}: noise of that colour, or physics that is missing"
+        )
+    return notes

@@ -1,0 +1,246 @@
+"""`srf simulate`: records of one slider over time, under a program of drive and load or as in an experiment."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from srfcli.cli.options import OutputOptions, Session, SrfCommand, SystemOptions, output_options, system_options
+from srfcli.errors import SrfError
+from srfcli.status import Status
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from srfcli.cli.simulated import Record, Work
+
+EXAMPLES = """
+srf simulate --V 8 --W0 9 --eps 0.09 --for 4 --rate 1000 --out run.csv
+srf simulate --W0 5 --drive '1:10, 100:0, 5:10' --plot slide-hold-slide.svg
+srf simulate --V 8 --load '2:5, 0.2:5->7, 4:7' --csv
+srf simulate --drive '0.5:12, 4:8' --W0 9 --eps 0.09 --onset 2 --noise 0.02 --lag1 0.8 --quantum 0.005 --out-dir made
+srf simulate EXPERIMENT --run onset --plot onset.svg
+srf simulate EXPERIMENT --set lambda=0.5 --out-dir predicted
+"""
+RISE = 0.02  # s; five times the slider's bounce on its interface, at usual loads
+OWN_RECORD = {  # what describes a record of one's own: an experiment brings its own
+    "V": "--V", "W0": "--W0", "eps": "--eps", "drive": "--drive", "load": "--load", "load_file": "--load-file",
+    "onset": "--onset", "duration": "--for", "rate": "--rate", "observable": "--observe", "free": "--free",
+}  # fmt: skip
+EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load_file"), ("load", "load_file"))
+
+
+def _options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options of `srf simulate` that it shares with no other command."""
+    options = [
+        click.argument("experiment", required=False, type=click.Path(exists=True, path_type=Path)),
+        click.option("--V", "V", metavar="VALUE", help="Constant driving velocity, in um/s."),
+        click.option("--W0", "W0", metavar="VALUE", help="Constant normal load, in N."),
+        click.option(
+            "--eps", "eps", metavar="VALUE", help="Relative amplitude of a modulation at --f, on top of any load."
+        ),
+        click.option(
+            "--for", "duration", metavar="TIME", help="Length of the record, in s.  [default: 40 um of driving]"
+        ),
+        click.option(
+            "--drive",
+            metavar="PIECES",
+            help="Driving velocity as DURATION:VELOCITY, ... in s and um/s; 0 is a hold, 5->20 a ramp.",
+        ),
+        click.option("--load", metavar="PIECES", help="Normal load as DURATION:LOAD, ... in s and N; 5->7 is a ramp."),
+        click.option(
+            "--load-rise",
+            metavar="TIME",
+            default=f"{RISE:g} s",
+            show_default=True,
+            help="Time over which steps and corners of --load are rounded.",
+        ),
+        click.option(
+            "--load-file",
+            type=click.Path(exists=True, dir_okay=False, path_type=Path),
+            help="A recorded load: a file with columns time and normal_load.",
+        ),
+        click.option(
+            "--onset", metavar="TIME", help="When the modulation begins to rise.  [default: at the first sample]"
+        ),
+        click.option("--rate", metavar="HZ", help="Samples per second, or one rate for each piece of --drive."),
+        click.option(
+            "--start",
+            metavar="STATE",
+            default="steady",
+            show_default=True,
+            help="Steady sliding at the first velocity, at another (--start 10), or values: --start 'v=1e-3, phi=100 s'.",
+        ),
+        click.option(
+            "--rtol", type=float, default=1e-8, show_default=True, help="Local relative error of integration."
+        ),
+        click.option(
+            "--run", "runs", multiple=True, metavar="NAME", help="Only this run of EXPERIMENT; may be repeated."
+        ),
+        click.option(
+            "--observe",
+            "observable",
+            type=click.Choice(["elongation", "force", "friction"]),
+            help="What the apparatus records.  [default: elongation]",
+        ),
+        click.option(
+            "--noise", metavar="SIZE", help="Standard deviation of the gauge's noise, in the observable's unit."
+        ),
+        click.option("--lag1", type=float, default=0.0, help="Correlation of the noise from sample to sample, as 0.8."),
+        click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded."),
+        click.option(
+            "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is random."
+        ),
+        click.option(
+            "--out-dir",
+            "--experiment",
+            "folder",
+            type=click.Path(path_type=Path),
+            metavar="DIR",
+            help="Write the records as an experiment folder, whole or not at all.",
+        ),
+        click.option(
+            "--start-values",
+            default="true",
+            show_default=True,
+            metavar="true|perturb:10%",
+            help="Start values written to DIR: the true ones, or off by up to so much.",
+        ),
+        click.option(
+            "--free", metavar="NAMES", help="Parameters that DIR leaves to a fit.  [default: the law's, not V0]"
+        ),
+    ]
+    for option in reversed(options):
+        function = option(function)
+    return function
+
+
+@click.command("simulate", cls=SrfCommand, epilog=EXAMPLES)
+@_options
+@system_options
+@output_options
+def command(system: SystemOptions, experiment: Path | None, output: OutputOptions, **given: Any) -> None:
+    """Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding.
+
+    Drive and load are programs of pieces, or those of the runs of EXPERIMENT, a folder or its experiment.toml. Errors are
+    controlled; slip velocities may fall to 1e-12 um/s and below. The records can be written as a new experiment, with noise.
+    """
+    from srfcli.cli.emit import emit, finish
+    from srfcli.cli.simulated import curves, record_table
+
+    _check(given, experiment, output)
+    work = _own(system, given) if experiment is None else _repeated(system, experiment, given)
+    begun = time.perf_counter()
+    records, status = _simulate_all(work, given["rtol"])
+    timings = {"simulate": time.perf_counter() - begun}
+    table = record_table(work, records, status=status)
+
+    def figure() -> Figure:
+        from srfcli.output.traces import traces
+
+        return traces(curves(records), title=work.model.title)
+
+    folder = given["folder"]
+    if folder is not None and output.out is None and output.format == "text":
+        table = dataclasses.replace(table, columns=(), rows=())  # the records are in the folder
+    emit(table, output, figure=figure, laws=work.model.laws, inputs=work.inputs, seed=work.gauge.seed, timings=timings)
+    if folder is not None:
+        _write(work, records, status, folder, given, output, timings)
+    finish(status)
+
+
+def _own(system: SystemOptions, given: dict[str, Any]) -> Work:
+    from srfcli.cli.simulate_own import own_record
+
+    return own_record(system, given)
+
+
+def _repeated(system: SystemOptions, experiment: Path, given: dict[str, Any]) -> Work:
+    from srfcli.cli.simulate_runs import repeated_runs
+
+    return repeated_runs(system, experiment, given)
+
+
+def _check(given: dict[str, Any], experiment: Path | None, output: OutputOptions) -> None:
+    """Raise SrfError for options that contradict each other, before anything is computed."""
+    if not 1e-13 <= given["rtol"] <= 1e-2:
+        raise SrfError(f"--rtol {given['rtol']:g} is out of range", "Choose it between 1e-13 and 1e-2: --rtol 1e-8.")
+    for name, option in OWN_RECORD.items():
+        if experiment is not None and given[name] is not None:
+            hint = "Its runs say how they are driven, loaded and sampled."
+            raise SrfError(f"{option} does not go with an experiment", hint)
+    if experiment is None and given["runs"]:
+        raise SrfError(
+            "--run chooses among the runs of an experiment, and none is given", "srf simulate DIR --run NAME"
+        )
+    for one, other in EXCLUSIVE:
+        if given[one] is not None and given[other] is not None:
+            hint = f"Leave out {OWN_RECORD[one]} or {OWN_RECORD[other]}."
+            raise SrfError(f"{OWN_RECORD[one]} and {OWN_RECORD[other]} exclude each other", hint)
+    _check_folder(given, experiment, output)
+
+
+def _check_folder(given: dict[str, Any], experiment: Path | None, output: OutputOptions) -> None:
+    folder = given["folder"]
+    if folder is None:
+        for name, option, unset in (("start_values", "--start-values", "true"), ("free", "--free", None)):
+            if given[name] != unset:
+                raise SrfError(f"{option} is about an experiment that is written", "Name its folder: --out-dir DIR.")
+        return
+    from srfcli.recording.writing import check_folder
+
+    source = experiment and (experiment if experiment.is_dir() else experiment.parent)
+    if source and folder.resolve() == source.resolve():
+        raise SrfError(
+            f"--out-dir {folder} is the experiment itself", "Recordings are never replaced; name another folder."
+        )
+    check_folder(folder, force=output.force)
+
+
+def _simulate_all(work: Work, rtol: float) -> tuple[list[Record], Status]:
+    """Return the records that were finished, and ok, the first failure's status, or that of an interruption."""
+    from srfcli.cli.emit import Progress
+    from srfcli.cli.simulated import Record, measure, observe, worst
+    from srfcli.numerics.integrate import simulate
+
+    records: list[Record] = []
+    with Progress("simulate", total=len(work.jobs)) as progress:
+        try:
+            for job in work.jobs:
+                progress.advance(0, note=job.name)
+                trace = simulate(work.model, job.p, drive=job.drive, load=job.load, t=job.t, start=job.start, rtol=rtol)
+                observed = observe(work.model, job, trace)
+                records.append(Record(job, trace, observed, measure(work.gauge, job, observed)))
+                progress.advance()
+        except KeyboardInterrupt:
+            return records, Status.INTERRUPTED
+    return records, worst([r.trace.status for r in records])
+
+
+def _write(
+    work: Work,
+    records: list[Record],
+    status: Status,
+    folder: Path,
+    given: dict[str, Any],
+    output: OutputOptions,
+    timings: dict[str, float],
+) -> None:
+    """Write the experiment folder and its sidecar; an unfinished one is not written, as nothing in it would say so."""
+    from srfcli.output.provenance import Provenance, write_sidecar
+    from srfcli.recording.writing import write_experiment
+
+    session = Session.current()
+    if not status.ok:
+        session.say(f"Not written: {folder}, as its records are not complete")
+        return
+    files = write_experiment(work.experiment(records), folder, force=output.force)
+    if output.provenance:
+        made = Provenance(session.arguments, work.parameters, work.model.laws, work.inputs, work.gauge.seed, timings)
+        session.detail(f"Wrote {write_sidecar(files[0], files[0].read_bytes(), made)}")
+    session.say(f"Wrote {folder} ({len(files) - 1} run{'s' if len(files) != 2 else ''})")

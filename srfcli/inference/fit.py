@@ -1,0 +1,372 @@
+"""Maximum likelihood over all runs of an experiment together: whitened residuals, exact gradients, growing horizons.
+
+Stick-slip makes a least-squares surface full of false minima: a cycle too early fits as well as any. So a sample takes part only
+once the parameters are known well enough for the prediction there to be linear in what is still unknown of them; the horizon of
+each run grows from fit to fit until it covers the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from srfcli.errors import SrfError, did_you_mean
+from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
+from srfcli.inference.nuisance import own_names, own_start
+from srfcli.inference.prediction import Prediction, predict, run_parameters
+from srfcli.model import GeneratedModel
+from srfcli.numerics.collocation import Array
+from srfcli.recording.values import Experiment, Run
+from srfcli.status import Status
+
+LINEAR = 0.25  # of a run's amplitude: a prediction that bends by more is not used yet
+STAGES = 12
+GROWN = 3.0  # standard deviations of the last fit over which the next stage wants linearity
+SHORTER = (1.0, 0.5, 0.25, 0.12)  # of the first horizons
+POOR = 4.0  # reduced chi-squared of a first stage that is not believed before shorter ones were tried
+CONVERGED = 0.1  # standard errors: how far the minimum may still be, by the gradient
+BAD = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
+
+
+@dataclass(frozen=True)
+class RunFit:
+    """How one run is fitted: residual (n,), its noise model, the part of its samples that took part."""
+
+    name: str
+    holdout: bool
+    prediction: Prediction
+    residual: Array
+    parts: list[tuple[int, int]]
+    noise: Noise
+    white: float  # standard deviation of white noise, from differences of the residual
+
+    @property
+    def rms(self) -> float:
+        """Return the root mean square of the residual over the samples that are compared."""
+        values = np.concatenate([self.residual[a:b] for a, b in self.parts])
+        return float(np.sqrt(np.mean(values**2)))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Estimates in um, s, N: `values` by name for the free parameters, `covariance` in their order; `fixed` the others."""
+
+    names: tuple[str, ...]
+    values: dict[str, float]
+    covariance: Array
+    lower: Array
+    upper: Array
+    runs: tuple[RunFit, ...]
+    log_likelihood: float
+    status: Status
+    evaluations: int
+    trail: tuple[tuple[float, str], ...] = ()
+
+    @property
+    def stderr(self) -> dict[str, float]:
+        """Return the standard errors by name."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def correlation(self) -> Array:
+        """Return the correlation matrix of the estimates."""
+        sd = np.sqrt(np.diag(self.covariance))
+        return np.asarray(self.covariance / np.outer(sd, sd))
+
+    def rms_over_noise(self, *, holdout: bool = False) -> float:
+        """Return the residuals' root mean square over the white noise level, all runs fitted (or held out) together."""
+        chosen = [r for r in self.runs if r.holdout == holdout]
+        sizes = np.array([sum(b - a for a, b in r.parts) for r in chosen], dtype=float)
+        ratios = np.array([(r.rms / r.white) ** 2 if r.white else np.nan for r in chosen])
+        return float(np.sqrt(np.sum(sizes * ratios) / np.sum(sizes))) if chosen else float("nan")
+
+
+class Interrupted(Exception):
+    """Carries the best parameters found before the user stopped the fit."""
+
+    def __init__(self, values: dict[str, float]) -> None:
+        super().__init__("interrupted")
+        self.values = values
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is fitted to what: the free parameters with their bounds, and the runs that judge them."""
+
+    model: GeneratedModel
+    experiment: Experiment
+    runs: tuple[Run, ...]
+    names: tuple[str, ...]
+    start: Array
+    lower: Array
+    upper: Array
+    trend: str | None = None
+    held: Mapping[str, float] = field(default_factory=dict)
+
+    def named(self, theta: Array) -> dict[str, float]:
+        """Return parameters by name, those that are held among them."""
+        return {**self.held, **dict(zip(self.names, np.asarray(theta).tolist(), strict=True))}
+
+    def predicted(self, run: Run, theta: Array, *, until: float = np.inf, slopes: bool = True) -> Prediction:
+        """Return the prediction of a run, with derivatives by the free parameters."""
+        by = self.names if slopes else ()
+        return predict(
+            self.model,
+            self.experiment,
+            run,
+            self.named(theta),
+            by=by,
+            until=until,
+            trend=None if run.holdout else self.trend,
+        )
+
+
+def fit_problem(
+    model: GeneratedModel, experiment: Experiment, *, free: Sequence[str] | None = None, trend: str | None = None
+) -> Problem:
+    """Return the problem that an experiment states; `free` replaces its own choice of parameters, `trend` is slip or time."""
+    listed = {q.name: q for q in experiment.parameters}
+    names = list(free) if free is not None else [q.name for q in experiment.parameters if not q.fixed]
+    for name in names:
+        if name not in listed:
+            raise SrfError(f"'{name}' has no start value in [parameters]", did_you_mean(name, listed))
+    runs = tuple(r for r in experiment.runs if not r.holdout)
+    if not runs:
+        raise SrfError("every run is held out", "set holdout = false for those that are to be fitted")
+    if not names:
+        raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
+    rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names]
+    for run in runs:
+        own = own_names(model, run, trend)
+        p = run_parameters(model, experiment, run, {})
+        rows += [own_start(model, run, p, name) for name in own]
+        names += own
+    start, lower, upper = np.array(rows, dtype=float).T
+    for name, low, high in zip(names, lower, upper, strict=True):
+        if not (np.isfinite(low) and np.isfinite(high)):
+            raise SrfError(f"'{name}' has no bounds", "give lower and upper in [parameters]")
+    return Problem(model, experiment, runs, tuple(names), start, lower, upper, trend)
+
+
+def fit(
+    problem: Problem,
+    *,
+    start: Array | None = None,
+    noises: Mapping[str, Noise] | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+    refinements: int = 3,
+) -> Fit:
+    """Return the maximum-likelihood fit from `start` (k,), the problem's own start values if left out.
+
+    First with white noise of the level that the recordings' differences show and growing horizons, then with the noise that the
+    residuals show, until the two agree. KeyboardInterrupt becomes `Interrupted`, with the best parameters so far.
+    """
+    search = Search(problem, progress)
+    theta = np.clip(problem.start if start is None else start, problem.lower, problem.upper)
+    noise = {r.name: Noise(_first_level(r)) for r in problem.runs} if noises is None else dict(noises)
+    try:
+        theta, status = search.grow(theta, noise)
+        for _ in range(refinements if noises is None else 0):
+            before = theta
+            noise = search.noise(theta)
+            theta, status = search.minimise(theta, noise, {})
+            if np.all(np.abs(theta - before) <= 1e-2 * np.sqrt(np.diag(search.covariance))):
+                break
+    except KeyboardInterrupt as error:
+        raise Interrupted(problem.named(search.best)) from error
+    return search.result(theta, noise, status)
+
+
+def _first_level(run: Run) -> float:
+    level = white_level(run.observed, stretches(run.t, run.used))
+    return max(level, run.quantum / np.sqrt(12), 1e-9 * float(np.ptp(run.observed)), 1e-300)
+
+
+class Search:
+    """One minimisation: counts evaluations, keeps the best, and knows the covariance of the last."""
+
+    def __init__(self, problem: Problem, progress: Callable[[str], None]) -> None:
+        self.problem, self.progress = problem, progress
+        self.evaluations = 0
+        self.reduced = 1.0  # chi-squared for each degree of freedom
+        self.best, self.covariance = problem.start, np.zeros((problem.start.size,) * 2)
+        self.trail: list[tuple[float, str]] = []
+        self.scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
+
+    def grow(self, theta: Array, noise: Mapping[str, Noise]) -> tuple[Array, Status]:
+        """Return the minimum over all samples, reached by horizons that grow."""
+        width = np.minimum((self.problem.upper - self.problem.lower) / 6, 0.15 * self.scale)
+        theta, status, horizons = self.first_stage(theta, noise, np.diag(width))
+        covered = self.covered(horizons)
+        for stage in range(2, STAGES + 1):
+            if covered >= 1.0:
+                break
+            directions = GROWN * _root(self.covariance) * np.sqrt(max(self.reduced, 1.0))
+            linear = {r.name: self.horizon(r, theta, directions) for r in self.problem.runs}
+            horizons = {name: max(linear[name], horizons[name]) for name in linear}
+            share = self.covered(horizons)
+            if share <= covered or stage == STAGES:  # no horizon has grown: the rest is tried all the same
+                horizons, share = {}, 1.0
+            self.progress(f"stage {stage}: {100 * share:.0f} % of the samples")
+            theta, status = self.minimise(theta, noise, horizons)
+            covered = share
+        return theta, status
+
+    def first_stage(
+        self, start: Array, noise: Mapping[str, Noise], directions: Array
+    ) -> tuple[Array, Status, dict[str, float]]:
+        """Return the first minimum and its horizons: shorter ones where they fit far better.
+
+        Start values under which sliding is steady look linear for ever, whatever the recording does.
+        """
+        linear = {r.name: self.horizon(r, start, directions) for r in self.problem.runs}
+        found: tuple[Array, Status, dict[str, float]] | None = None
+        best = state = None
+        for share in SHORTER:
+            begins = {r.name: float(r.t[0]) for r in self.problem.runs}
+            horizons = {n: begins[n] + share * (h - begins[n]) for n, h in linear.items()}
+            self.progress(f"stage 1: {100 * self.covered(horizons):.0f} % of the samples")
+            theta, status = self.minimise(start, noise, horizons)
+            if best is None or self.reduced < best / 4:
+                best, found, state = self.reduced, (theta, status, horizons), (self.best, self.covariance, self.reduced)
+            if best < POOR:
+                break
+        assert found is not None and state is not None
+        self.best, self.covariance, self.reduced = state
+        return found
+
+    def covered(self, horizons: Mapping[str, float]) -> float:
+        """Return the share of all samples within the horizons."""
+        inside = sum(int(np.sum(r.t <= horizons[r.name])) for r in self.problem.runs)
+        return inside / sum(r.t.size for r in self.problem.runs)
+
+    def horizon(self, run: Run, theta: Array, directions: Array) -> float:
+        """Return the time up to which the prediction is linear over these directions (k, k), its columns."""
+        problem = self.problem
+        base = problem.predicted(run, theta)
+        self.evaluations += 1
+        amplitude = max(float(np.std(run.observed)), 10 * _first_level(run))
+        limit = float(run.t[-1])
+        for d in directions.T:
+            moved = np.clip(theta + d, problem.lower, problem.upper)
+            bent = problem.predicted(run, moved, until=limit, slopes=False)
+            n = bent.y.size
+            with np.errstate(invalid="ignore"):
+                bend = np.abs(bent.y - base.y[:n] - base.J[:n] @ (moved - theta))
+            off = np.nonzero(~(bend <= LINEAR * amplitude))[0]
+            if off.size:
+                limit = float(run.t[max(off[0] - 1, 1)])
+        return limit
+
+    def minimise(self, theta: Array, noise: Mapping[str, Noise], horizons: Mapping[str, float]) -> tuple[Array, Status]:
+        """Return the minimum of the whitened residuals up to the horizons, and how the minimiser ended."""
+        from scipy.optimize import least_squares
+
+        problem = self.problem
+        cache: dict[bytes, tuple[Array, Array]] = {}
+
+        def both(x: Array) -> tuple[Array, Array]:
+            key = x.tobytes()
+            if key not in cache:
+                cache.clear()
+                cache[key] = self.residuals(x * self.scale, noise, horizons)
+            return cache[key]
+
+        low, high = problem.lower / self.scale, problem.upper / self.scale
+        inside = np.clip(theta / self.scale, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
+        found = least_squares(
+            lambda x: both(x)[0], inside, jac=lambda x: both(x)[1], bounds=(low, high), x_scale="jac",
+            ftol=1e-9, xtol=1e-9, gtol=1e-12, max_nfev=60,
+        )  # fmt: skip
+        self.best = found.x * self.scale
+        information = found.jac.T @ found.jac
+        self.covariance = _inverse(information) * np.outer(self.scale, self.scale)
+        free = found.active_mask == 0
+        gradient = (found.jac.T @ found.fun)[free]
+        away = float(np.sqrt(max(gradient @ _inverse(information[np.ix_(free, free)]) @ gradient, 0.0)))
+        self.reduced = 2 * found.cost / max(found.fun.size - theta.size, 1)
+        self.trail.append(
+            (2 * float(found.cost), f"{found.nfev} evaluations, {away:.1e} standard errors from the minimum")
+        )
+        return self.best, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE
+
+    def residuals(self, theta: Array, noise: Mapping[str, Noise], horizons: Mapping[str, float]) -> tuple[Array, Array]:
+        """Return the whitened residuals and their derivatives by the scaled parameters."""
+        values, slopes = [], []
+        self.evaluations += 1
+        for run in self.problem.runs:
+            until = horizons.get(run.name, float("inf"))
+            found = self.problem.predicted(run, theta, until=until)
+            n = found.y.size
+            used = run.used[:n]
+            parts = stretches(run.t[:n], used)
+            own = noise[run.name]
+            difference = found.y - run.observed[:n]
+            bad = ~np.isfinite(difference)
+            difference = np.where(bad, BAD * own.innovation, difference)
+            J = np.where(bad[:, None], 0.0, found.J) * self.scale
+            values.append(whiten(own, difference, parts))
+            slopes.append(whiten(own, J, parts))
+        return np.concatenate(values), np.concatenate(slopes)
+
+    def noise(self, theta: Array) -> dict[str, Noise]:
+        """Return the noise of each run's residuals."""
+        return {f.name: f.noise for f in judge(self.problem, theta, self.problem.runs)}
+
+    def result(self, theta: Array, noise: Mapping[str, Noise], status: Status) -> Fit:
+        problem = self.problem
+        runs = [replace(f, noise=noise[f.name]) for f in judge(problem, theta, problem.runs)]
+        total = 0.0
+        for f in runs:
+            white = whiten(f.noise, f.residual, f.parts)
+            total -= (
+                0.5 * float(white @ white) + log_determinant(f.noise, f.parts) + 0.5 * white.size * np.log(2 * np.pi)
+            )
+        held = judge(problem, theta, [r for r in problem.experiment.runs if r.holdout])
+        return Fit(
+            problem.names, problem.named(theta), self.covariance, problem.lower, problem.upper, (*runs, *held), total,
+            status, self.evaluations, tuple(self.trail),
+        )  # fmt: skip
+
+
+def judge(problem: Problem, theta: Array, runs: Sequence[Run]) -> list[RunFit]:
+    """Return how these runs, fitted or held out, agree with the parameters."""
+    found = []
+    for run in runs:
+        prediction = problem.predicted(run, theta)
+        residual = run.observed - prediction.y
+        parts = stretches(run.t, run.used & np.isfinite(residual))
+        found.append(
+            RunFit(
+                run.name, run.holdout, prediction, residual, parts, estimate_noise(residual, parts),
+                white_level(residual, parts),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse, after scaling; a direction that nothing determines gets an enormous variance, not a failure."""
+    d = np.maximum(np.sqrt(np.diag(information)), 1e-8)  # of scaled parameters: nothing that matters is so flat
+    values, vectors = np.linalg.eigh(information / np.outer(d, d))
+    inverse = (vectors / np.maximum(values, 1e-14)) @ vectors.T
+    return np.asarray(inverse / np.outer(d, d))
+
+
+def _root(covariance: Array) -> Array:
+    """Return the principal directions of a covariance, one standard deviation long each, as columns."""
+    d = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(d, d))
+    return np.asarray((d[:, None] * vectors) * np.sqrt(np.maximum(values, 0.0)))
+
+
+def held_fit(problem: Problem, values: Mapping[str, float]) -> Fit:
+    """Return the state of a fit that was stopped: its parameters, with errors as if they were the minimum."""
+    theta = np.array([values[n] for n in problem.names])
+    search = Search(problem, lambda text: None)
+    noise = search.noise(theta)
+    _, slopes = search.residuals(theta, noise, {})
+    search.covariance = _inverse(slopes.T @ slopes) * np.outer(search.scale, search.scale)
+    return search.result(theta, noise, Status.INTERRUPTED)

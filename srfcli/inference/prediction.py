@@ -1,0 +1,114 @@
+"""What a model with given parameters predicts for a run, and the exact derivatives of that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from srfcli.inference.nuisance import TINY, basis, start_state
+from srfcli.model import GeneratedModel
+from srfcli.numerics.collocation import Array
+from srfcli.numerics.motion import integrate
+from srfcli.recording.values import Experiment, Run
+from srfcli.status import Status
+from srfcli.units import split_quantity
+
+RTOL = 1e-6  # errors of some 1e-5 um after minutes of stick-slip, a thousandth of a good gauge's noise
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The observable `y` (n,) of a run in um, N or 1, and `J` (n, k), its derivatives by the names asked for; x (n, states)."""
+
+    y: Array
+    J: Array
+    x: Array
+    status: Status
+    reached: float
+
+
+def run_parameters(model: GeneratedModel, experiment: Experiment, run: Run, values: Mapping[str, float]) -> Array:
+    """Return p for this run: the experiment's values, overridden by `values`, with the run's own stiffness, V and W0."""
+    base = {"K": run.stiffness}
+    if experiment.mass is not None and "M" in model.names:
+        base["M"] = experiment.mass
+    listed = {q.name: q.value for q in experiment.parameters} | dict(values)
+    base |= {name: value for name, value in listed.items() if name in model.names}
+    if "K" in listed:
+        base["K"] = listed["K"] * stiffness_share(experiment, run)
+    first = float(run.t[0])
+    V, rate, since = run.drive.piece(first)
+    return model.vector({**base, "V": V + rate * (first - since) if rate else V, "W0": run.load.rest(first)})
+
+
+def stiffness_share(experiment: Experiment, run: Run) -> float:
+    """Return a run's stiffness in N/um for each unit of the stated one: its first load where that is friction per um, else 1."""
+    unit = split_quantity(experiment.stiffness_text, name="stiffness")[1]
+    return run.load.rest(float(run.t[0])) if "N" not in unit else 1.0
+
+
+def predict(
+    model: GeneratedModel,
+    experiment: Experiment,
+    run: Run,
+    values: Mapping[str, float],
+    *,
+    by: Sequence[str] = (),
+    until: float = np.inf,
+    rtol: float = RTOL,
+    trend: str | None = None,
+) -> Prediction:
+    """Return the observable of `run` at its sample times up to `until` s, with derivatives by the parameters `by`.
+
+    It starts in steady sliding, or where `values` say (see `nuisance`). A trend is added to the observable: values["RUN.trend"]
+    times displacement or time. Values are in um, s, N.
+    """
+    p = run_parameters(model, experiment, run, values)
+    t = run.t[: max(int(np.sum(run.t <= until)), 2)]
+    own = [k for k, name in enumerate(by) if name in model.names or name.startswith(f"{run.name}.")]
+    moving = [k for k in own if not by[k].endswith(".trend")]
+    names = [by[k] for k in moving]
+    places = [model.index(n) if n in model.names else -1 for n in names]
+    share = np.array([stiffness_share(experiment, run) if n == "K" else 1.0 for n in names])
+    x0, S0 = start_state(model, run, p, values, names)
+    size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
+    motion = integrate(
+        model, p, drive=run.drive, load=run.load, t=t, start=x0, by=places, S0=S0, rtol=rtol, atol=rtol * size
+    )
+    y, slopes = _observe(model, run, t, motion.x, motion.S, p, places)
+    J = np.zeros((t.size, len(by)))
+    J[:, moving] = slopes * share
+    if trend:
+        y = y + values[f"{run.name}.trend"] * basis(run, trend)[: t.size]
+        J[:, [k for k in own if k not in moving]] = basis(run, trend)[: t.size, None]
+    return Prediction(y, J, motion.x, motion.status, motion.reached)
+
+
+def _observe(
+    model: GeneratedModel, run: Run, t: Array, x: Array, S: Array, p: Array, places: Sequence[int]
+) -> tuple[Array, Array]:
+    """Return the recorded quantity and its derivatives: elongation u, spring force K u, or friction K u/W."""
+    V, (W, W_dot) = run.drive(t), run.load(t)
+    K = p[model.index("K")]
+    factor = {"elongation": np.ones_like(W), "force": np.full_like(W, K), "friction": K / W}[run.observable]
+    J = np.zeros((t.size, len(places)))
+    if "u" in model.states:
+        i = model.states.index("u")
+        u, J = x[:, i], S[:, i, :].copy()
+    else:
+        with np.errstate(all="ignore"):
+            u = np.asarray(model.elongation(x, V, W, W_dot, p))
+            for j in range(x.shape[1] if places else 0):
+                moved = x.astype(complex)
+                moved[:, j] += 1j * TINY
+                J += (np.asarray(model.elongation(moved, V, W, W_dot, p)).imag / TINY)[:, None] * S[:, j, :]
+            for k, i in enumerate(places):
+                if i >= 0:
+                    q = p.astype(complex)
+                    q[i] += 1j * TINY
+                    J[:, k] += np.asarray(model.elongation(x.astype(complex), V, W, W_dot, q)).imag / TINY
+    if run.observable != "elongation" and model.index("K") in places:
+        J[:, list(places).index(model.index("K"))] += u / K
+    return factor * u, factor[:, None] * J

@@ -1,0 +1,203 @@
+"""Tables of measured critical loads, `V, eps, W0c, sigma`: read, checked line by line, in um, s, N."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from srfcli.errors import SrfError, did_you_mean
+from srfcli.numerics.collocation import Array
+from srfcli.units import find_unit, tidy
+
+UNITS = {"V": "um/s", "eps": "1", "W0c": "N", "sigma": "N"}
+REQUIRED = ("V", "eps", "W0c")
+RELATIVE_ERROR = 0.03  # of the critical load, where the table gives none: the paper's "typically 3 %"
+PERCENT = ("eps", "sigma")  # columns that may be given in %
+_HEADER = re.compile(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*")
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Measured critical loads: velocities `V` (um/s), amplitudes `eps`, loads `W0c` and their errors `sigma` (N), each (n,).
+
+    `lines` are the rows' line numbers in `source`; `notes` say what was assumed.
+    """
+
+    source: str
+    V: Array
+    eps: Array
+    W0c: Array
+    sigma: Array
+    lines: tuple[int, ...]
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.V)
+
+
+def thresholds(
+    V: Sequence[float] | Array,
+    eps: Sequence[float] | Array,
+    W0c: Sequence[float] | Array,
+    *,
+    sigma: Sequence[float] | Array | None = None,
+    source: str = "data",
+) -> Thresholds:
+    """Return a table of these values (n,), in um/s and N; without `sigma` the paper's 3 % of each load."""
+    loads = np.asarray(W0c, float)
+    error = RELATIVE_ERROR * loads if sigma is None else np.asarray(sigma, float)
+    lines = tuple(range(2, len(loads) + 2))
+    return Thresholds(source, np.asarray(V, float), np.asarray(eps, float), loads, error, lines)
+
+
+def thresholds_csv(table: Thresholds) -> str:
+    """Return the table as CSV that `read_thresholds` reads back to the same numbers."""
+    rows = zip(table.V, table.eps, table.W0c, table.sigma, strict=True)
+    body = "".join(",".join(repr(float(v)) for v in row) + "\n" for row in rows)
+    return f"V [um/s],eps,W0c [N],sigma [N]\n{body}"
+
+
+def is_threshold_table(path: Path) -> bool:
+    """Return whether the first line of the file at `path` that says something names the columns V, eps and W0c."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            _, header = next(_filled(stream), (0, ""))
+    except (OSError, UnicodeDecodeError):
+        return False
+    names = {(_HEADER.fullmatch(cell) or _HEADER.fullmatch(""))[1] for cell in _split(header)}  # type: ignore[index]
+    return names >= set(REQUIRED)
+
+
+def read_thresholds(path: Path) -> Thresholds:
+    """Return the table in the CSV file at `path`: comma, semicolon or tab, `#` begins a comment, units in brackets.
+
+    Raises SrfError that names the line for anything that is not a measurement; 1 is the exit code of a file that cannot
+    be read.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise SrfError(f"{path} cannot be read: {error.strerror}", exit_code=1) from error
+    except UnicodeDecodeError as error:
+        raise SrfError(f"{path} is not text in UTF-8", "Save it as CSV in UTF-8.") from error
+    lines = list(_filled(text.splitlines()))
+    if not lines:
+        raise SrfError(f"{path} is empty", "Begin it with a line of names: V [um/s],eps,W0c [N],sigma [N]")
+    number, header = lines[0]
+    columns = _columns(header, f"{path.name} line {number}")
+    delimiter = _delimiter(header)
+    rows, given, assumed = [], [], 0
+    for number, line in lines[1:]:
+        row, without = _row(_split(line, delimiter), columns, f"{path.name} line {number}")
+        rows.append(row)
+        given.append(number)
+        assumed += without
+    if not rows:
+        raise SrfError(f"{path} has names but no measurements", "Add a line for each: 10,0.09,11.0,0.33")
+    notes: tuple[str, ...] = ()
+    if assumed:
+        which = "all rows" if assumed == len(rows) else f"{assumed} of {len(rows)} rows"
+        notes = (f"{path.name}: no sigma in {which}; taken as {RELATIVE_ERROR:.0%} of the load, the paper's error",)
+    V, eps, W0c, sigma = np.array(rows).T
+    return Thresholds(path.name, V, eps, W0c, sigma, tuple(given), notes)
+
+
+def _filled(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """Yield number and text of every line that is neither blank nor a comment."""
+    for number, line in enumerate(lines, start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield number, line.rstrip("\r\n")
+
+
+def _delimiter(header: str) -> str:
+    return "\t" if "\t" in header else ";" if ";" in header else ","
+
+
+def _split(line: str, delimiter: str | None = None) -> list[str]:
+    """Return the cells of a line; one that quotes cannot be parsed comes back in one cell, which no column takes."""
+    try:
+        return next(csv.reader([line], delimiter=delimiter or _delimiter(line), strict=True), [])
+    except csv.Error:
+        return [line]
+
+
+def _columns(header: str, where: str) -> list[tuple[str, float]]:
+    """Return name and factor to base units of each column; the factor of a relative sigma is negative."""
+    found: list[tuple[str, float]] = []
+    for cell in _split(header):
+        match = _HEADER.fullmatch(cell)
+        name, unit = (match[1], match[2]) if match else (cell.strip(), None)
+        if name not in UNITS:
+            hint = f"{did_you_mean(name, UNITS)}; other columns have no place in a table of critical loads."
+            raise SrfError(f"{where}: unknown column {name!r}", hint)
+        if name in dict(found):
+            raise SrfError(f"{where}: two columns are called {name}", "Keep one of them.")
+        found.append((name, _factor(name, unit, where)))
+    missing = [name for name in REQUIRED if name not in dict(found)]
+    if missing:
+        raise SrfError(
+            f"{where}: there is no column {' and no column '.join(missing)}",
+            "A table has V, eps and W0c and, if known, sigma: V [um/s],eps,W0c [N],sigma [N]",
+        )
+    return found
+
+
+def _factor(name: str, unit: str | None, where: str) -> float:
+    wanted = UNITS[name]
+    if unit == "%" and name in PERCENT:
+        return 0.01 if name == "eps" else -0.01
+    if not unit:
+        return 1.0
+    place = f"{where}: column {name}"
+    source, target = find_unit(unit, where=place), find_unit(wanted)
+    if source.powers != target.powers:
+        also = " or %" if name in PERCENT else ""
+        raise SrfError(f"{place}: {unit!r} is the wrong unit", f"Write {name} [{wanted}]{also}, or the like.")
+    return tidy(source.factor / target.factor)
+
+
+def _row(cells: list[str], columns: list[tuple[str, float]], where: str) -> tuple[list[float], bool]:
+    """Return V, eps, W0c, sigma of one line in base units, and whether sigma was assumed."""
+    if len(cells) != len(columns):
+        raise SrfError(
+            f"{where}: {len(cells)} cells under {len(columns)} names",
+            "Give every line one cell for each name; decimals take a point, not a comma.",
+        )
+    values: dict[str, float] = {}
+    for (name, factor), cell in zip(columns, cells, strict=True):
+        if name == "sigma" and not cell.strip():
+            continue
+        values[name] = factor * _number(name, cell, where)
+    for name, low, text in (("V", 0.0, "above 0"), ("W0c", 0.0, "above 0")):
+        if not values[name] > low:
+            raise SrfError(f"{where}: {name} = {values[name]:g} {UNITS[name]} is not {text}", "Correct or remove it.")
+    if not 0 <= values["eps"] < 1:
+        raise SrfError(
+            f"{where}: eps = {values['eps']:g} is not in [0, 1)", "eps is relative to W0; in percent head it eps [%]."
+        )
+    assumed = "sigma" not in values
+    sigma = RELATIVE_ERROR * values["W0c"] if assumed else values["sigma"]
+    if dict(columns).get("sigma", 1.0) < 0 and not assumed:
+        sigma = -sigma * values["W0c"]
+    if not sigma > 0:
+        raise SrfError(f"{where}: sigma = {sigma:g} N is not above 0", "Leave the cell empty where it is not known.")
+    return [values["V"], values["eps"], values["W0c"], sigma], assumed
+
+
+def _number(name: str, cell: str, where: str) -> float:
+    try:
+        value = float(cell.strip().replace("_", "x"))  # float would take 1_0 for ten
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise SrfError(
+            f"{where}: {name} = {cell.strip()!r} is not a finite number",
+            "Write a number as in 11.25, units in the header.",
+        )
+    return value

@@ -1,0 +1,107 @@
+"""The integrator in C, compiled with a model's own rates by whatever C compiler there is, and kept by content.
+
+Without a compiler everything still works, an order of magnitude slower, on LSODA: `compiled(model)` is then None. SRF_CC names
+the compiler; an empty SRF_CC turns compilation off.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import importlib.util
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+from srfcli.cache import cache_folder, content_key
+from srfcli.errors import SrfError
+from srfcli.model import GeneratedModel
+from srfcli.numerics.ctext import LAMBERTW, c_function
+
+FLAGS = ("-O3", "-std=c99", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math")
+FUNCTIONS = {"rates": "srf_rates", "rates_jacobian": "srf_jacobian", "rates_parameters": "srf_parameters"}
+
+
+def c_source(model: GeneratedModel) -> str:
+    """Return the C text of the integrator for this model."""
+    head = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n"
+    needs = LAMBERTW if "lambertw(" in model.source else ""
+    body = "\n".join(c_function(model.source, name, label=label) for name, label in FUNCTIONS.items())
+    return head + needs + body + (files("srfcli") / "data" / "radau.c").read_text(encoding="utf-8")
+
+
+@cache
+def compiler() -> tuple[str, ...] | None:
+    """Return the command of the C compiler: SRF_CC, CC, cc, gcc, clang or the package ziglang; None where there is none."""
+    named = os.environ.get("SRF_CC")
+    if named is not None:
+        return tuple(shlex.split(named)) or None
+    for candidate in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
+        words = shlex.split(candidate)
+        if words and shutil.which(words[0]):
+            return tuple(words)
+    if importlib.util.find_spec("ziglang"):
+        return (sys.executable, "-m", "ziglang", "cc")
+    return None
+
+
+@cache
+def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
+    """Return the compiled integrator of this model, or None where there is no compiler; SrfError where it fails on the text."""
+    command = compiler()
+    if command is None:
+        return None
+    source = c_source(model)
+    key = content_key([source, " ".join(command), " ".join(FLAGS), platform.platform(), platform.machine()])
+    folder = cache_folder()
+    if folder is None:
+        return _load(_build(command, source, Path(tempfile.mkdtemp(prefix="srf-")) / f"{key}.so"))
+    path = folder / f"{key}.so"
+    if _intact(path):
+        with contextlib.suppress(OSError):
+            return _load(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        return _load(_build(command, source, path))
+    except OSError:  # a cache that cannot be written, or a disk from which nothing may be run
+        return _load(_build(command, source, Path(tempfile.mkdtemp(prefix="srf-")) / f"{key}.so"))
+
+
+def _build(command: tuple[str, ...], source: str, path: Path) -> Path:
+    """Compile to a file beside `path`, then put it in place: a reader sees a whole library or none."""
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
+        text, library = Path(folder) / "model.c", Path(folder) / "model.so"
+        text.write_text(source, encoding="utf-8")
+        end = [] if sys.platform == "win32" else ["-lm"]
+        done = subprocess.run(
+            [*command, *FLAGS, "-o", str(library), str(text), *end], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
+            raise SrfError(f"{' '.join(command)} cannot compile the integrator: {first}", "SRF_CC= turns compiling off")
+        digest = hashlib.sha256(library.read_bytes()).hexdigest()
+        library.replace(path)
+        path.with_suffix(".sum").write_text(digest, encoding="ascii")
+    return path
+
+
+def _intact(path: Path) -> bool:
+    """Return whether a library lies there as it was built: loading half of one would end the process."""
+    try:
+        return path.with_suffix(".sum").read_text(encoding="ascii") == hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return False
+
+
+def _load(path: Path) -> ctypes.CDLL:
+    library = ctypes.CDLL(str(path))
+    library.srf_integrate.restype = ctypes.c_int
+    return library

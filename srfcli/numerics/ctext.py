@@ -1,0 +1,115 @@
+"""Generated array functions as C: `x[..., i]` becomes `x[i]`, `out[..., i, j] = e` one assignment to a flat array.
+
+The text of the generated module is the only source, as it is for `scalar`; no formula is derived or printed twice.
+"""
+
+from __future__ import annotations
+
+import ast
+from functools import singledispatch
+
+from srfcli.errors import SrfError
+
+_FUNCTIONS = {
+    name: name for name in ("cos", "cosh", "exp", "expm1", "log", "log1p", "sin", "sinh", "sqrt", "tan", "tanh")
+}
+_FUNCTIONS |= {"arctan": "atan", "arcsinh": "asinh", "lambertw": "srf_lambertw"}
+_OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
+_PI = "3.14159265358979323846"
+
+LAMBERTW = """
+static double srf_lambertw(double x) { /* principal branch, x > -1/e */
+    double w = x < 1.0 ? x / (1.0 + x) : log(x) - log(1.0 + log(x));
+    for (int i = 0; i < 50; i++) {
+        double e = exp(w), f = w * e - x, step = f / (e * (w + 1.0) - (w + 2.0) * f / (2.0 * w + 2.0));
+        w -= step;
+        if (fabs(step) <= 1e-15 * (1.0 + fabs(w))) break;
+    }
+    return w;
+}
+"""
+
+
+def c_function(source: str, name: str, *, label: str) -> str:
+    """Return function `name` of the generated module `source` as `static void label(x, V, W, W_dot, p, out)`.
+
+    Entries of `out` that the formulas leave at zero are not written: the caller clears it. Raises SrfError for no such function.
+    """
+    function = next((d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef) and d.name == name), None)
+    if function is None:
+        raise SrfError(f"generated module has no function '{name}'")
+    lines, shape = [], (1,)
+    for statement in function.body[1:]:  # the first is the docstring
+        if isinstance(statement, ast.Return):
+            continue
+        assert isinstance(statement, ast.Assign)
+        target, value = statement.targets[0], statement.value
+        if isinstance(target, ast.Subscript):
+            lines.append(f"out[{_flat(target, shape)}] = {_text(value)};")
+        elif isinstance(target, ast.Name) and target.id == "out":
+            assert isinstance(value, ast.Call)
+            shape = ast.literal_eval(value.args[1])
+        elif isinstance(target, ast.Name):
+            lines.append(f"const double {_safe(target.id)} = {_text(value)};")
+    arguments = [a.arg for a in function.args.args]
+    unused = "".join(f" (void){_safe(a)};" for a in arguments)
+    declared = ", ".join(f"const double {'*' if a in ('x', 'p') else ''}{_safe(a)}" for a in arguments)
+    body = "\n".join(f"    {line}" for line in lines)
+    return f"static void {label}({declared}, double *out) {{\n   {unused}\n{body}\n}}\n"
+
+
+def _flat(target: ast.Subscript, shape: tuple[int, ...]) -> int:
+    """Return the place in a flat array that out[..., i] or out[..., i, j] names."""
+    assert isinstance(target.slice, ast.Tuple)
+    places = [ast.literal_eval(e) for e in target.slice.elts[1:]]
+    return places[0] if len(places) == 1 else places[0] * shape[1] + places[1]
+
+
+def _safe(name: str) -> str:
+    """Return a name that no keyword or macro of C shadows."""
+    return f"q_{name}" if name not in ("x", "p") else name
+
+
+@singledispatch
+def _text(node: ast.AST) -> str:
+    raise SrfError(f"{type(node).__name__} in a generated function has no form in C")
+
+
+@_text.register
+def _(node: ast.Constant) -> str:
+    assert isinstance(node.value, (int, float))
+    return repr(float(node.value))
+
+
+@_text.register
+def _(node: ast.Name) -> str:
+    return _PI if node.id == "pi" else _safe(node.id)
+
+
+@_text.register
+def _(node: ast.Subscript) -> str:
+    index = node.slice.elts[-1] if isinstance(node.slice, ast.Tuple) else node.slice
+    assert isinstance(node.value, ast.Name) and isinstance(index, ast.Constant) and isinstance(index.value, int)
+    return f"{node.value.id}[{index.value}]"
+
+
+@_text.register
+def _(node: ast.UnaryOp) -> str:
+    assert isinstance(node.op, (ast.USub, ast.UAdd))
+    return f"(-{_text(node.operand)})" if isinstance(node.op, ast.USub) else _text(node.operand)
+
+
+@_text.register
+def _(node: ast.BinOp) -> str:
+    left, right = _text(node.left), _text(node.right)
+    if isinstance(node.op, ast.Pow):
+        return f"pow({left}, {right})"
+    return f"({left} {_OPERATORS[type(node.op)]} {right})"
+
+
+@_text.register
+def _(node: ast.Call) -> str:
+    assert isinstance(node.func, ast.Name)
+    if node.func.id not in _FUNCTIONS:
+        raise SrfError(f"function {node.func.id} of a generated module has no form in C")
+    return f"{_FUNCTIONS[node.func.id]}({', '.join(_text(a) for a in node.args)})"

@@ -1,0 +1,131 @@
+"""States over time, and their derivatives by parameters and by the initial state: compiled where that is possible, else LSODA.
+
+The sensitivities solve S' = f_x S + f_p. The compiled integrator differentiates its own discrete solution, so that a gradient
+belongs to the very number it is the gradient of; LSODA carries S along as further unknowns.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from srfcli.model import GeneratedModel
+from srfcli.numerics.collocation import Array
+from srfcli.numerics.compiled import compiled
+from srfcli.numerics.load import Load
+from srfcli.numerics.program import Drive
+from srfcli.status import Status
+
+MAX_STEPS = 20_000_000  # of the compiled integrator, in all; a hundred times an hour of modulation
+
+
+@dataclass(frozen=True)
+class Motion:
+    """States `x` (times, n) and `S` (times, n, k), their derivatives by the k quantities asked for; NaN after `reached` s."""
+
+    x: Array
+    S: Array
+    status: Status
+    reached: float
+    steps: int
+
+
+def integrate(
+    model: GeneratedModel,
+    p: Array,
+    *,
+    drive: Drive,
+    load: Load,
+    t: Array,
+    start: Array,
+    by: Sequence[int] = (),
+    S0: Array | None = None,
+    rtol: float = 1e-8,
+    atol: Array,
+) -> Motion:
+    """Return the motion from `start` (n,) at t[0] (s) to the rising times `t`, with the model's parameters `p` (n_parameters,).
+
+    `by` are places in `p`, or -1 for a direction of the initial state alone; S0 (n, k) is the derivative of `start`, zero if left
+    out. `atol` (n,). Errors are local, per step; those of S are held to some tens of times the bound on x.
+    """
+    library = compiled(model)
+    S0 = np.zeros((start.size, len(by))) if S0 is None else np.ascontiguousarray(S0, dtype=float)
+    if library is None:
+        from srfcli.numerics.lsoda import integrate_lsoda
+
+        return integrate_lsoda(model, p, drive, load, t, start, by, S0, rtol, atol)
+    return _integrate_compiled(library, p, drive, load, t, start, by, S0, rtol, atol)
+
+
+def pieces(t: Array, drive: Drive, load: Load) -> Iterator[tuple[float, float]]:
+    """Yield the intervals between output's ends and the breaks of drive and load."""
+    inside = (b for b in (*drive.breaks, *load.breaks) if t[0] < b < t[-1])
+    yield from pairwise(np.unique([t[0], *inside, t[-1]]).tolist())
+
+
+def _integrate_compiled(
+    library: ctypes.CDLL,
+    p: Array,
+    drive: Drive,
+    load: Load,
+    t: Array,
+    start: Array,
+    by: Sequence[int],
+    S0: Array,
+    rtol: float,
+    atol: Array,
+) -> Motion:
+    segments = list(pieces(t, drive, load))
+    edges = np.array([segments[0][0], *(b for _, b in segments)])
+    knots, coefficients = load.polynomials(float(edges[0]), float(edges[-1]))
+    places = np.clip(np.searchsorted(knots, edges + 1e-12 * np.abs(edges).max(), side="right") - 1, 0, len(knots) - 2)
+    low = places[:-1]
+    high = np.clip(
+        np.searchsorted(knots, edges[1:] - 1e-12 * np.abs(edges).max(), side="left"), low + 1, len(knots) - 1
+    )
+    ranges = np.column_stack([low, high]).astype(np.intc)
+    middle = [drive.piece(0.5 * (a + b)) for a, b in segments]
+    n, k = start.size, len(by)
+    x, S = np.full((t.size, n), np.nan), np.full((t.size, n, k), np.nan)
+    stats = np.zeros(4)
+    filled = library.srf_integrate(
+        len(segments), _d(edges), _d(np.array(middle, dtype=float)), _i(ranges), len(knots), coefficients.shape[1] - 1,
+        _d(knots), _d(coefficients), _d(np.asarray(p, dtype=float)), _d(np.asarray(start, dtype=float)), k,
+        _i(np.array(by or [-1], dtype=np.intc)), _d(sensitivity_scale(p, by)), _d(S0), ctypes.c_double(rtol_of_estimate(rtol)),
+        _d(np.asarray(atol) * rtol_of_estimate(rtol) / rtol),
+        ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(MAX_STEPS),
+        t.size, _d(np.asarray(t, dtype=float)), _d(x), _d(S), _d(stats),
+    )  # fmt: skip
+    status = Status.OK if filled == t.size else Status.INTEGRATION
+    return Motion(x, S, status, float(stats[3]), int(stats[0]))
+
+
+def sensitivity_scale(p: Array, by: Sequence[int]) -> Array:
+    """Return, for each derivative, the unit of its absolute error: 1 over the parameter's size, 1 for an initial state."""
+    return np.array([1.0 if i < 0 else 1.0 / max(abs(float(p[i])), 1e-12) for i in by] or [1.0])
+
+
+def rtol_of_estimate(rtol: float) -> float:
+    """Return the bound on the embedded estimate, which is of order 3 where the method is of order 5 (Hairer and Wanner, IV.8)."""
+    return 0.1 * rtol ** (2 / 3)
+
+
+def _d(array: Array) -> ctypes.c_void_p:
+    array = (
+        array if array.flags.c_contiguous and array.dtype == np.float64 else np.ascontiguousarray(array, dtype=float)
+    )
+    pointer = ctypes.c_void_p(array.ctypes.data)
+    pointer.array = array  # type: ignore[attr-defined]  # keeps it alive through the call
+    return pointer
+
+
+def _i(array: Array) -> ctypes.c_void_p:
+    array = np.ascontiguousarray(array, dtype=np.intc)
+    pointer = ctypes.c_void_p(array.ctypes.data)
+    pointer.array = array  # type: ignore[attr-defined]
+    return pointer

@@ -1,0 +1,88 @@
+"""What an experiment is once it has been read: frozen values in um, s, N."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.numerics.program import Drive, Load
+
+Array = NDArray[np.float64]
+OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something that was found in the data: its kind, the place, and one sentence on what it is and what was done."""
+
+    kind: str
+    where: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {self.where}: {self.what}"
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """The names that `open_model` takes: friction law, ageing law with modifiers, interface, and whether mass counts."""
+
+    law: str
+    ageing: str
+    interface: str
+    inertia: bool
+
+
+@dataclass(frozen=True)
+class FitParameter:
+    """A parameter's start value and bounds in um, s, N; `unit` is the one it is declared in."""
+
+    name: str
+    value: float
+    lower: float
+    upper: float
+    fixed: bool
+    unit: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording: times (n,) in s that rise strictly, the observable (n,) in um, N or 1, and what was imposed.
+
+    `observed` is finite everywhere; where `used` is False it is a placeholder and a notice says why. `drive` and `load` hold
+    on all of [t[0], t[-1]]. `start` is the place on the track in um, `initial` "steady" or "free", `stiffness` K in N/um,
+    `modulation` the declared frequency (Hz), relative amplitude and onset (s), `quantum` the quantisation step, or 0.
+    """
+
+    name: str
+    file: Path
+    holdout: bool
+    start: float
+    initial: str
+    t: Array = field(repr=False)
+    observed: Array = field(repr=False)
+    observable: str
+    used: NDArray[np.bool_] = field(repr=False)
+    drive: Drive = field(repr=False)
+    load: Load = field(repr=False)
+    stiffness: float
+    modulation: tuple[float, float, float] | None
+    quantum: float
+    notices: tuple[Notice, ...]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Runs under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider."""
+
+    path: Path
+    title: str
+    choice: ModelChoice
+    mass: float | None
+    stiffness_text: str
+    parameters: tuple[FitParameter, ...]
+    runs: tuple[Run, ...]
+    notices: tuple[Notice, ...]

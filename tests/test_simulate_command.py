@@ -1,0 +1,371 @@
+"""`srf simulate` as a user meets it: programs, numbers held against theory, folders that read back, errors."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from srfcli.cli.main import cli
+from srfcli.recording.experiment import Experiment, read_experiment
+from srfcli.registry import load_registry
+
+SHS = ("--W0", "5", "--drive", "1:10, 100:0, 3:10")
+
+
+@pytest.fixture(autouse=True)
+def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An empty folder to work in, without settings of the caller; only the cache of generated code is shared."""
+    for name in [n for n in os.environ if n.startswith("SRF_") and n not in ("SRF_CACHE", "SRF_SHARED")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "none"))
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def simulate(*arguments: str, code: int = 0) -> Result:
+    """Run the command in this process; `code` is the exit code that is expected."""
+    done = CliRunner().invoke(cli, ["simulate", *arguments], prog_name="srf")
+    assert done.exit_code == code, done.stderr
+    return done
+
+
+def columns(*arguments: str) -> dict[str, Any]:
+    rows = list(csv.DictReader(io.StringIO(simulate(*arguments, "--csv").stdout)))
+    return {name: np.array([float(r[name]) if r[name] else np.nan for r in rows]) for name in rows[0] if name != "run"}
+
+
+def read(folder: str) -> Experiment:
+    return read_experiment(Path(folder), registry=load_registry())
+
+
+# what is computed
+
+
+def test_steady_sliding_is_the_laws_own() -> None:
+    c = columns("--V", "8", "--W0", "6", "--for", "2", "--rate", "100")
+    mu = 0.33 + 0.0126 * math.log(8) + 0.0241 * math.log1p(256 / 8)
+    assert c["t"].tolist() == (np.arange(201) / 100).tolist()
+    assert c["mu"] == pytest.approx(np.full(201, mu), rel=1e-9)
+    assert c["tau"] == pytest.approx(6 * c["mu"], rel=1e-14)
+    assert c["u"] == pytest.approx(np.full(201, 6 * mu / 0.21), rel=1e-8)
+    assert c["phi"] == pytest.approx(np.full(201, 0.402 / 8), rel=1e-8)
+
+
+def test_columns_and_their_units() -> None:
+    done = json.loads(simulate("--V", "8", "--W0", "6", "--for", "1", "--rate", "10", "--json").stdout)
+    assert done["schema"] == "srf.simulate/1" and len(done["rows"]) == 11
+    units = {name: c["unit"] for name, c in done["columns"].items()}
+    assert units == {"t": "s", "V": "um/s", "W": "N", "u": "um", "v": "um/s", "phi": "s", "mu": "1", "tau": "N"}
+    assert done["parameters"]["W0"] == {"value": 6.0, "unit": "N", "origin": "flag"}
+    assert done["meta"]["samples"] == {"simulated": 11}
+
+
+def test_two_states_have_two_ages() -> None:
+    c = columns("--law", "two-state", "--V", "2", "--W0", "4", "--for", "1", "--rate", "10")
+    assert c["phi"][0] == pytest.approx(0.201, rel=1e-9) and c["phi2"][0] == pytest.approx(2.01, rel=1e-9)
+
+
+def test_stick_slip_is_reported_with_its_period() -> None:
+    notes = simulate("--drive", "0.5:12, 30:8", "--W0", "9", "--no-inertia", "--rate", "200").stdout
+    line = next(n for n in notes.splitlines() if "stick-slip at V = 8 um/s" in n)
+    c = columns("--drive", "0.5:12, 30:8", "--W0", "9", "--no-inertia", "--rate", "200")
+    late = c["t"] > 15
+    u, t = c["u"][late], c["t"][late]
+    tops = np.nonzero((u[1:-1] > u[:-2]) & (u[1:-1] >= u[2:]))[0] + 1
+    told = float(line.split("every ")[1].split(" s")[0])
+    assert told == pytest.approx(np.diff(t[tops]).mean(), rel=0.03)
+    drop = float(line.split("falls by ")[1].split(" um")[0])
+    assert drop == pytest.approx(np.ptp(u), rel=0.1)
+    assert "no stick-slip" in simulate("--drive", "0.5:12, 8:8", "--W0", "7", "--rate", "200").stdout
+
+
+def test_a_modulation_that_stabilises() -> None:
+    """At W0 = 9 N sliding at 8 um/s is unstable without a modulation, and stable at eps = 0.09."""
+    arguments = ("--drive", "0.5:12, 9:8", "--W0", "9", "--rate", "500")
+    assert "stick-slip at V = 8" in simulate(*arguments).stdout
+    told = simulate(*arguments, "--eps", "0.09", "--onset", "5").stdout
+    assert "from t = " in told and "1.2" in told  # before the onset it oscillates
+    c = columns(*arguments, "--eps", "0.09", "--onset", "5")
+    spread = [np.ptp(c["u"][(c["t"] > a) & (c["t"] < a + 0.5)]) for a in (5.0, 9.0)]
+    assert spread[1] < 0.15 * spread[0]
+
+
+@pytest.mark.parametrize("ageing", ["dieterich", "ruina", "kato-tullis", "dieterich+linker-dieterich"])
+def test_a_hold_of_ten_thousand_seconds_and_sliding_again(ageing: str) -> None:
+    c = columns("--ageing", ageing, "--W0", "5", "--drive", "1:10, 1e4:0, 4:10", "--rate", "100,0.1,200")
+    held = (c["t"] > 1) & (c["t"] <= 10001)
+    assert np.isfinite(c["v"]).all() and c["v"][held].min() < (1e-8 if ageing != "ruina" else 1e-5)
+    assert (np.diff(c["v"][held]) < 0).all()  # it only creeps ever more slowly
+    assert c["v"][-1] == pytest.approx(10.0, rel=0.02)
+    assert c["mu"].max() > c["mu"][0] + (0.03 if ageing.startswith("dieterich") else 0.0)
+
+
+def test_slip_at_a_velocity_of_1e_12() -> None:
+    c = columns("--W0", "5", "--drive", "1:10, 1e9:1e-12, 1:10", "--rate", "100,1e-6,1000", "--start", "steady")
+    assert np.isfinite(c["mu"]).all() and c["v"].min() < 1e-12
+    slow = columns("--W0", "5", "--V", "1e-12", "--for", "1e12", "--rate", "1e-10")
+    assert slow["v"] == pytest.approx(np.full(101, 1e-12), rel=1e-6)
+
+
+def test_interface_inertia_and_steps_of_the_load() -> None:
+    for flags in ((), ("--no-inertia",), ("--interface", "rigid"), ("--interface", "rigid", "--no-inertia")):
+        low = 3.0 if flags == ("--interface", "rigid") else 0.5  # below, a rigid slider with inertia recoils
+        c = columns("--V", "8", "--load", f"1:5, 4:{low}", "--for", "5", "--rate", "100", *flags)
+        assert c["u"][-1] / c["u"][0] == pytest.approx(low / 5, rel=1e-3), flags
+        assert c["W"][[0, -1]] == pytest.approx([5.0, low], rel=1e-12)
+
+
+def test_a_recorded_load_is_the_load(empty_folder: Path) -> None:
+    t = np.arange(2001) / 500
+    W = 5 + 0.5 * np.sin(2 * np.pi * 0.5 * t)
+    rows = "\n".join(f"{a!r},{b!r}" for a, b in zip((t + 10).tolist(), (W * 1e3).tolist(), strict=True))
+    (empty_folder / "load.csv").write_text(f"time [s],normal_load [mN]\n{rows}\n")
+    c = columns("--V", "8", "--load-file", "load.csv", "--rate", "100")
+    assert c["t"][[0, -1]].tolist() == [10.0, 14.0]
+    assert c["W"] == pytest.approx(W[::5], abs=2e-6)
+    for name, head in (("bare.csv", "time,force"), ("none.csv", "seconds,normal_load")):
+        (empty_folder / name).write_text(f"{head}\n{rows}\n")
+        assert "no column" in simulate("--load-file", name, code=2).stderr
+
+
+def test_runs_of_an_experiment_at_its_true_values(shared: Path) -> None:
+    """With the parameters that made them, the example's recordings differ from the simulation by their noise alone."""
+    truth = json.loads((shared / "cases" / "truth.json").read_text())["open-01"]["parameters"]
+    given = [
+        f"--set={name}={truth[own]!r}"
+        for name, own in zip(("A", "B", "D0", "Vsat", "lambda"), ("A", "B", "D0", "Vsat", "lam"), strict=True)
+    ]
+    done = simulate(str(shared / "cases" / "open-01"), *given, "--out", "x.csv")
+    distances = [float(n.split("recording ")[1].split()[0]) for n in done.stderr.splitlines() if "distance" in n]
+    assert len(distances) == 7 and distances == pytest.approx([0.02] * 7, rel=0.03)
+    header, first = Path("x.csv").read_text().splitlines()[:2]
+    assert header == "run,t,V,W,u,v,phi,mu,tau,recorded" and first.startswith("steps,0.0,5.0,5.0,")
+
+
+# what is written
+
+
+def test_a_folder_reads_back_what_was_simulated() -> None:
+    arguments = ("--drive", "0.5:12, 2:8->4, 1.5:4", "--load", "1:5, 3:5->7", "--eps", "0.05", "--f", "30", "--onset", "1.5",
+                 "--rate", "1000")  # fmt: skip
+    simulate(*arguments, "--out-dir", "made")
+    c, run = columns(*arguments), read("made").runs[0]
+    assert np.array_equal(run.t, c["t"]) and np.array_equal(run.observed, c["u"]) and run.used.all()
+    assert run.load(run.t)[0] == pytest.approx(c["W"], rel=1e-9)
+    assert run.drive(run.t) == pytest.approx(c["V"], abs=0.01)
+    assert (run.modulation, run.stiffness, run.initial) == ((30.0, 0.05, 1.5), 0.21, "steady")
+    again = columns("made")
+    assert again["u"] == pytest.approx(c["u"], abs=2e-4)
+    assert again["recorded"].tolist() == c["u"].tolist()
+
+
+def test_a_folder_names_the_truth_and_what_is_free() -> None:
+    simulate(*SHS, "--set", "A=0.011", "--out-dir", "made", "--observe", "force", "--M", "3")
+    e = read("made")
+    values = {p.name: (p.value, p.fixed) for p in e.parameters}
+    assert values["A"] == (0.011, False) and values["V0"] == (1.0, True) and values["lambda"] == (0.56, False)
+    assert (e.mass, e.runs[0].observable, e.runs[0].drive.velocities) == (3e-6, "force", (10.0, 0.0, 10.0))
+    assert all(p.lower < p.value < p.upper for p in e.parameters)
+    simulate(*SHS, "--out-dir", "other", "--free", "A,K")
+    assert [p.name for p in read("other").parameters if not p.fixed] == ["K", "A"]
+
+
+def test_start_values_can_be_off(empty_folder: Path) -> None:
+    for seed in ("1", "1", "2"):
+        folder = f"made{len(list(empty_folder.iterdir()))}"
+        simulate(*SHS, "--out-dir", folder, "--start-values", "perturb:10%", "--seed", seed)
+    folders = sorted(p.name for p in empty_folder.iterdir())
+    one, same, other = ({p.name: p for p in read(f).parameters} for f in folders)
+    true = {"mu0": 0.33, "A": 0.0126, "B": 0.0241, "D0": 0.402, "Vsat": 256.0, "lambda": 0.56}
+    assert one == same and one != other and one["V0"].value == 1.0
+    for name, value in true.items():
+        assert one[name].value != value and abs(one[name].value / value - 1) <= 0.1
+
+
+def test_noise_rounding_and_seed() -> None:
+    clean = columns(*SHS)["u"]
+    simulate(
+        *SHS,
+        "--noise",
+        "20 nm".replace("20 nm", "0.02 um"),
+        "--lag1",
+        "0.8",
+        "--quantum",
+        "0.005",
+        "--seed",
+        "4",
+        "--out-dir",
+        "made",
+    )
+    run = read("made").runs[0]
+    rest = run.observed - clean
+    assert rest.std() == pytest.approx(0.02, rel=0.05)
+    assert np.corrcoef(rest[1:], rest[:-1])[0, 1] == pytest.approx(0.8, abs=0.03)
+    assert run.observed * 200 == pytest.approx(np.round(run.observed * 200), abs=1e-9)
+    again = columns(*SHS, "--noise", "0.02", "--lag1", "0.8", "--quantum", "0.005", "--seed", "4")
+    assert again["measured"].tolist() == run.observed.tolist() and np.array_equal(again["u"], clean)
+
+
+def test_an_experiment_is_repeated_as_a_new_one() -> None:
+    simulate(*SHS, "--noise", "0.05", "--out-dir", "made")
+    simulate("made", "--set", "A=0.013", "--set", "K=0.25", "--out-dir", "again")
+    old, new = read("made"), read("again")
+    assert new.title.endswith("(simulated)") and new.runs[0].stiffness == 0.25
+    assert {p.name: p.value for p in new.parameters}["A"] == 0.013
+    assert np.array_equal(new.runs[0].t, old.runs[0].t) and new.runs[0].drive == old.runs[0].drive
+    direct = columns(*SHS, "--set", "A=0.013", "--K", "0.25")
+    assert new.runs[0].observed == pytest.approx(direct["u"], rel=1e-7)
+    simulate("made", "--law", "dieterich-ruina", "--set", "mu0=0.46", "--interface", "rigid", "--out-dir", "third")
+    third = read("third")
+    assert (third.choice.law, third.choice.interface) == ("dieterich-ruina", "rigid")
+    assert "Vsat" not in {p.name for p in third.parameters}
+
+
+def test_one_runs_noise_does_not_hang_on_the_others(shared: Path) -> None:
+    source = str(shared / "cases" / "open-01")
+    gauge = ("--noise", "0.02", "--seed", "9")
+    simulate(source, *gauge, "--out-dir", "all")
+    simulate(source, *gauge, "--run", "loadstep", "--out-dir", "one")
+    whole = {r.name: r for r in read("all").runs}
+    assert list(whole) == ["steps", "stickslip", "onset", "strong", "loadstep", "holdout-mod", "holdout-shs"]
+    assert whole["holdout-mod"].holdout and not whole["steps"].holdout
+    assert np.array_equal(read("one").runs[0].observed, whole["loadstep"].observed)
+
+
+def test_a_start_of_ones_own_is_written_as_free() -> None:
+    simulate("--W0", "5", "--drive", "10:0, 2:10", "--start", "10", "--out-dir", "made")
+    assert read("made").runs[0].initial == "free"
+    assert "not known" in simulate("made", "--start", "10").stdout
+
+
+def test_sidecars_and_figures(empty_folder: Path) -> None:
+    simulate(*SHS, "--out-dir", "made", "--out", "t.csv", "--plot", "t.svg", "--seed", "3", "--noise", "0.1")
+    assert sorted(p.name for p in empty_folder.iterdir()) == [
+        "made", "t.csv", "t.csv.provenance.json", "t.svg", "t.svg.provenance.json",
+    ]  # fmt: skip
+    side = json.loads((empty_folder / "made" / "experiment.toml.provenance.json").read_text())
+    assert side["seed"] == 3 and side["parameters"]["A"]["value"] == 0.0126
+    assert "slip v" in (empty_folder / "t.svg").read_text() or "<svg" in (empty_folder / "t.svg").read_text()
+    simulate("made", "--out", "u.json", "--no-provenance")
+    assert "made/experiment.toml" not in os.listdir()  # noqa: PTH208
+    assert not (empty_folder / "u.json.provenance.json").exists()
+
+
+def test_nothing_is_overwritten_and_no_recording_replaced(empty_folder: Path) -> None:
+    simulate(*SHS, "--out-dir", "made")
+    content = (empty_folder / "made" / "simulated.csv").read_bytes()
+    assert "exists already" in simulate(*SHS, "--out-dir", "made", code=2).stderr
+    assert "is the experiment itself" in simulate("made", "--out-dir", "made", "--force", code=2).stderr
+    assert (empty_folder / "made" / "simulated.csv").read_bytes() == content
+    simulate(*SHS, "--K", "0.3", "--out-dir", "made", "--force")
+    assert (empty_folder / "made" / "simulated.csv").read_bytes() != content
+
+
+def test_what_stops_early_is_written_as_far_as_it_went(monkeypatch: pytest.MonkeyPatch) -> None:
+    import dataclasses
+
+    from srfcli.numerics import integrate
+    from srfcli.status import Status
+
+    real = integrate.simulate
+
+    def stops(*args: Any, **options: Any) -> Any:
+        trace = real(*args, **options)
+        trace.x[500:] = np.nan
+        return dataclasses.replace(trace, status=Status.INTEGRATION, reached=float(trace.t[499]))
+
+    monkeypatch.setattr(integrate, "simulate", stops)
+    done = simulate("--V", "8", "--W0", "5", "--for", "2", "--out-dir", "made", "--csv", code=3)
+    assert len(done.stdout.splitlines()) == 501 and "stopped at t = 0.499 s of 2 s" in done.stderr
+    assert "Not written: made" in done.stderr and not Path("made").exists()
+
+
+def test_ctrl_c_keeps_the_runs_that_are_done(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from srfcli.numerics import integrate
+
+    real, calls = integrate.simulate, []
+
+    def interrupted(*args: Any, **options: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(*args, **options)
+
+    monkeypatch.setattr(integrate, "simulate", interrupted)
+    done = simulate(str(shared / "cases" / "open-01"), "--csv", code=130)
+    assert {line.split(",")[0] for line in done.stdout.splitlines()[1:]} == {"steps", "stickslip"}
+
+
+# what is asked
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message", "hint"),
+    [
+        (["--drive", "10:0, 5:10"], "begins at 0 um/s", "--start 10"),
+        (["--drive", "1:10, 5"], "piece 2, '5', is not DURATION:VALUE", "0.5:12, 4:8"),
+        (["--drive", "1:5->"], "piece 1", "0.5:12"),
+        (["--drive", ""], "--drive is empty", "0.5:12"),
+        (["--drive", "0:5"], "lasts 0 s", "above 0"),
+        (["--drive", "1:5 N"], "wrong unit", "um/s"),
+        (["--drive", "0,5:12"], "piece 1, '0',", "0.5:12"),
+        (["--load", "1:5, 1:0"], "lifts the slider off", "above 0"),
+        (["--V", "8", "--drive", "1:5"], "--V and --drive exclude", "Leave out"),
+        (["--W0", "8", "--load", "1:5"], "--W0 and --load exclude", "Leave out"),
+        (["--for", "8", "--drive", "1:5"], "--for and --drive exclude", "Leave out"),
+        (["--for", "-1"], "not a length of time", "--for 4"),
+        (["--for", "1e6", "--rate", "1000"], "1e+09 samples", "Lower --rate"),
+        (["--for", "1", "--rate", "0.5"], "only one sample", "Raise it"),
+        (["--drive", "1:5,1:6", "--rate", "1,2,3"], "3 rates for 2 pieces", "one for each"),
+        (["--rate", "-5"], "a rate lies between", "--rate 1000"),
+        (["--onset", "1"], "nothing is modulated", "--eps"),
+        (["--eps", "0.1", "--onset", "-1"], "before the record", "begins with it"),
+        (["--start", "q=3"], "'q' is no state", "Known: phi, u, v, z"),
+        (["--start", "v=0"], "not above 0", "--start v"),
+        (["--start", "soon"], "neither steady, nor a velocity", "--start"),
+        (["--start", "0"], "from 1e-12", "--start 10"),
+        (["--rtol", "1"], "out of range", "1e-8"),
+        (["--run", "a"], "none is given", "--run NAME"),
+        (["--noise", "-1"], "noise = -1", "0 or more"),
+        (["--noise", "1 N"], "wrong unit", "um"),
+        (["--lag1", "0.5"], "noise of size 0", "standard deviation"),
+        (["--start-values", "perturb:10%"], "about an experiment", "--out-dir"),
+        (["--out-dir", "m", "--start-values", "wrong"], "neither true nor", "perturb:10%"),
+        (["--out-dir", "m", "--free", "Q"], "'Q' is no parameter", "Known"),
+        (["--out-dir", "no/where"], "does not exist", "mkdir"),
+        (["--out-dir", "m", "--loading", "inclined"], "inclined", "--loading"),
+        (["--load-rise", "0", "--load", "1:5,1:6"], "positive time", "20 ms"),
+    ],
+)  # fmt: skip
+def test_errors_say_what_and_what_instead(arguments: list[str], message: str, hint: str, empty_folder: Path) -> None:
+    lines = simulate(*arguments, code=2).stderr.splitlines()
+    assert lines[0].startswith("Error: ") and message in lines[0]
+    assert lines[1].startswith("Try: ") and hint in lines[1]
+    assert not list(empty_folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--V", "3"], "--V does not go with an experiment"),
+        (["--drive", "1:3"], "--drive does not go"),
+        (["--run", "simulatd"], "no run 'simulatd'"),
+        (["--set", "W0=3"], "W0 is what the runs impose"),
+        (["--set", "Vast=3"], "unknown parameter 'Vast'"),
+        (["--loading", "inclined"], "loaded from above"),
+    ],
+)
+def test_errors_about_an_experiment(arguments: list[str], message: str) -> None:
+    simulate("--V", "8", "--W0", "5", "--for", "1", "--rate", "50", "--out-dir", "made")
+    assert message in simulate("made", *arguments, code=2).stderr
