@@ -261,9 +261,9 @@ def _heights(t: Array, x: Array, sigma: Array, knots: Array) -> Array:
     j = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
     share = (t - knots[j]) / np.diff(knots)[j]
     weight = 1 / sigma**2
-  # type: ignore[return-value]
+
     def total(values: Array) -> Array:
-        return np.bincount(j, weights=values * weight, minlength=knots.size - 1)
+        return np.asarray(np.bincount(j, weights=values * weight, minlength=knots.size - 1), dtype=float)
 
     band = np.zeros((2, knots.size))
     band[1, :-1] += total((1 - share) ** 2)
