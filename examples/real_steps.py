@@ -72,8 +72,16 @@ CASES = [
 def fitted(data: Path, case: dict[str, object], ageing: str, stiffness: str, K: str, D0: float) -> Fit:
     """Return the fit of one recording with a slip trend; K is "free" or empty."""
     with tempfile.TemporaryDirectory() as folder:
-        values = {**case, "file": (data / str(case["file"])).resolve(), "ageing": ageing, "stiffness": stiffness, "D0": D0}
-        text = EXPERIMENT.format(**values, K=FREE_K.format(stiffness).replace("{{", "{").replace("}}", "}") if K else "")
+        values = {
+            **case,
+            "file": (data / str(case["file"])).resolve(),
+            "ageing": ageing,
+            "stiffness": stiffness,
+            "D0": D0,
+        }
+        text = EXPERIMENT.format(
+            **values, K=FREE_K.format(stiffness).replace("{{", "{").replace("}}", "}") if K else ""
+        )
         path = Path(folder) / "experiment.toml"
         path.write_text(text, encoding="utf-8")
         registry = load_registry()
@@ -87,10 +95,15 @@ def main() -> None:
         raise SystemExit("usage: python examples/real_steps.py DATA")
     for case, ageing, stiffness, K, D0, published in CASES:
         found = fitted(Path(sys.argv[1]), case, ageing, stiffness, K, D0)
-        cells = [f"{n} {found.values[n]:.5g} ({found.stderr[n]:.2g})" for n in found.names if n in ("A", "B", "D0", "K")]
+        cells = [
+            f"{n} {found.values[n]:.5g} ({found.stderr[n]:.2g})" for n in found.names if n in ("A", "B", "D0", "K")
+        ]
         run = found.runs[0]
         print(f"{case['title']}, {ageing}, k {stiffness}{' free' if K else ''}: {', '.join(cells)}")
-        print(f"    published {published}; rms {run.rms:.2e}, noise of order {run.noise.order}, {found.status.value}", flush=True)
+        print(
+            f"    published {published}; rms {run.rms:.2e}, noise of order {run.noise.order}, {found.status.value}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":
