@@ -1,19 +1,26 @@
 """Do the intervals of `srf fit` cover? Seeded repeats of one experiment, with white and with coloured gauge noise.
 
-    python benchmarks/coverage.py [--repeats 100] [--workers 2]
+    python benchmarks/coverage.py [--repeats 100] [--workers 2] [--only-print]
 
 The runs are those of a slider on PMMA: velocity steps, stick-slip, the onset of a modulation, a strong modulation. Each repeat
 draws new noise, starts from values that are off by up to 15 %, and asks whether each 95 % interval holds the true value.
+
+Each fit is kept in `results/coverage.jsonl` as soon as it is done: an interrupted run goes on where it stopped, and one with more
+repeats adds to what is there. `--only-print` tells what is there and fits nothing.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any
 
+import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
+from common import RESULTS, Report
 
 from srfcli.inference.fit import fit, fit_problem
 from srfcli.inference.prediction import predict
@@ -33,6 +40,8 @@ BOUNDS = {
     "lambda": (0.2, 1.5),
 }
 NOISE, QUANTUM = 0.02, 0.005
+LAGS = (0.0, 0.85)
+KEPT = RESULTS / "coverage.jsonl"
 RUNS = [
     ("steps", Drive.steps([(0, 5.0), (1, 20.0), (2, 5.0), (3.5, 50.0), (4.2, 10.0)]), ConstantLoad(5.0), 6.0, 250),
     ("stickslip", Drive.steps([(0, 12.0), (0.5, 8.0)]), ConstantLoad(9.0), 4.0, 250),
@@ -71,42 +80,98 @@ def coloured(rng: np.random.Generator, n: int, lag: float) -> np.ndarray:
     return out
 
 
-def one(task: tuple[int, float]) -> tuple[list[float], float, float, str]:
-    """Return the errors of one repeat in standard errors, the CPU time, rms over noise and how it ended."""
+def one(task: tuple[int, float]) -> dict[str, Any]:
+    """Return what is kept of one repeat: the errors in standard errors, the CPU time, rms over noise and how it ended."""
     seed, lag = task
     problem = fit_problem(open_model(load_registry()), experiment(seed, lag))
     begun = time.process_time()
     found = fit(problem)
-    z = [(found.values[n] - TRUE[n]) / found.stderr[n] for n in TRUE]
-    return z, time.process_time() - begun, found.rms_over_noise(), found.status.value
+    spent = time.process_time() - begun
+    z = [float((found.values[n] - TRUE[n]) / found.stderr[n]) for n in TRUE]
+    return {
+        "seed": seed,
+        "lag": lag,
+        "z": z,
+        "cpu": spent,
+        "rms": float(found.rms_over_noise()),
+        "status": found.status.value,
+    }
+
+
+def kept() -> dict[tuple[int, float], dict[str, Any]]:
+    """Return the repeats of earlier runs; a last line that was cut short counts as not done."""
+    done = {}
+    for line in KEPT.read_text(encoding="utf-8").splitlines() if KEPT.exists() else ():
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        done[row["seed"], row["lag"]] = row
+    return done
+
+
+def fit_missing(repeats: int, workers: int) -> None:
+    """Fit what is not kept yet, both kinds of noise in turn, so that what was done by an interruption serves both."""
+    done = kept()
+    tasks = [(seed, lag) for seed in range(repeats) for lag in LAGS if (seed, lag) not in done]
+    KEPT.parent.mkdir(exist_ok=True)
+    with KEPT.open("a", encoding="utf-8") as file, ProcessPoolExecutor(workers) as pool:
+        if file.tell() and not KEPT.read_bytes().endswith(b"\n"):
+            file.write("\n")
+        waiting = [pool.submit(one, task) for task in tasks]
+        try:
+            for number, future in enumerate(as_completed(waiting), start=1):
+                file.write(json.dumps(future.result()) + "\n")
+                file.flush()
+                print(f"{number} of {len(tasks)}", flush=True)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def tell(report: Report, lag: float, rows: list[dict[str, Any]]) -> None:
+    """Say how well the intervals cover in the repeats with noise of this lag-1 correlation."""
+    z = np.array([row["z"] for row in rows])
+    seeds = sorted(row["seed"] for row in rows)
+    report.say()
+    report.say(
+        f"gauge noise {NOISE} um, lag-1 {lag}, quantised at {QUANTUM} um: {len(rows)} repeats, seeds {seeds[0]} to {seeds[-1]}"
+    )
+    inside = np.abs(z) < 1.96
+    table = [
+        [
+            name,
+            f"{100 * inside[:, k].mean():.1f} %",
+            f"{z[:, k].std():.3f}",
+            f"{z[:, k].mean():+.3f}",
+            f"{np.abs(z[:, k]).max():.2f}",
+        ]
+        for k, name in enumerate(TRUE)
+    ]
+    report.table(["parameter", "inside 95 %", "sd of z", "mean of z", "worst |z|"], table)
+    rms, cpu = np.array([row["rms"] for row in rows]), np.array([row["cpu"] for row in rows])
+    report.say(
+        f"all: {100 * inside.mean():.1f} % inside; CPU {np.median(cpu):.1f} s a fit (median), {cpu.max():.1f} s the longest"
+    )
+    report.say(
+        f"rms over noise {rms.mean():.4f} +- {rms.std():.4f}; statuses {sorted({row['status'] for row in rows})}"
+    )
 
 
 def main() -> None:
-    """Print coverage for white and for coloured noise."""
+    """Fit, then print coverage for white and for coloured noise."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--repeats", type=int, default=100)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--only-print", action="store_true")
     chosen = parser.parse_args()
-    for lag in (0.0, 0.85):
-        with ProcessPoolExecutor(chosen.workers) as pool:
-            found = list(pool.map(one, [(seed, lag) for seed in range(chosen.repeats)]))
-        z = np.array([f[0] for f in found])
-        print(f"gauge noise {NOISE} um, lag-1 {lag}, quantised at {QUANTUM} um, {chosen.repeats} repeats, seeds 0..")
-        print("parameter   inside 95 %   sd of z   mean of z   worst |z|")
-        for k, name in enumerate(TRUE):
-            c = z[:, k]
-            print(
-                f"{name:9s}   {100 * np.mean(np.abs(c) < 1.96):9.1f} %   {c.std():7.3f}   "
-                f"{c.mean():+9.3f}   {np.abs(c).max():9.2f}"
-            )
-        print(
-            f"all: {100 * np.mean(np.abs(z) < 1.96):.1f} % inside; CPU {np.median([f[1] for f in found]):.1f} s a fit (median)"
-        )
-        ratio = np.array([f[2] for f in found])
-        print(
-            f"rms over noise {ratio.mean():.4f} +- {ratio.std():.4f}; statuses {sorted({f[3] for f in found})}\n",
-            flush=True,
-        )
+    if not chosen.only_print:
+        fit_missing(chosen.repeats, chosen.workers)
+    report = Report("coverage", __doc__ or "")
+    for lag in LAGS:
+        rows = [row for (seed, of), row in sorted(kept().items()) if of == lag and seed < chosen.repeats]
+        if rows:
+            tell(report, lag, rows)
 
 
 if __name__ == "__main__":

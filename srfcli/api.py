@@ -6,6 +6,10 @@
     def my_law(v, phi, p):
         return p.mu0 + p.A * log(v / p.V0) + p.B * log(1 + p.Vsat * phi / p.D0)
 
+    @effect(name="my-effect", parameters=[Parameter("c", 0.01)], neutral={"c": 0.0})
+    def my_effect(mu, v, p):
+        return {"mu": mu + p.c * v / p.V0}
+
     @reader(name="my-logger", suffixes=(".dat",))
     def my_logger(path):
         return {"time [s]": times, "elongation [um]": elongations}
@@ -22,8 +26,9 @@ from typing import Any
 
 import sympy
 from sympy import LambertW as lambertw
-from sympy import asinh, atan, cosh, exp, log, sinh, sqrt, tanh
+from sympy import asinh, atan, cos, cosh, exp, log, sin, sinh, sqrt, tanh
 
+from srfcli.effectfile import SCAN, SLOTS, check_names, finished, known_names
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.expression import FUNCTIONS, expm1, log1p, symbol
 from srfcli.lawfile import (
@@ -37,13 +42,15 @@ from srfcli.lawfile import (
     known_symbols,
     valid_name,
 )
-from srfcli.laws import AgeingLaw, AgeingModifier, Check, FrictionLaw, Interface, Parameter, State
+from srfcli.laws import AgeingLaw, AgeingModifier, Check, Effect, ExtraState, FrictionLaw, Interface, Parameter, State
 from srfcli.reader import Reader, Source
 
 __all__ = [
     "AgeingLaw",
     "AgeingModifier",
     "Check",
+    "Effect",
+    "ExtraState",
     "FrictionLaw",
     "Interface",
     "Parameter",
@@ -54,7 +61,9 @@ __all__ = [
     "ageing_law",
     "asinh",
     "atan",
+    "cos",
     "cosh",
+    "effect",
     "exp",
     "expm1",
     "friction_law",
@@ -64,6 +73,7 @@ __all__ = [
     "log1p",
     "modifier",
     "reader",
+    "sin",
     "sinh",
     "sqrt",
     "tanh",
@@ -136,6 +146,48 @@ def interface(
 ) -> Callable[[Callable[..., Any]], Interface]:
     """Turn a function of W and p into an `Interface`."""
     return _decorator("interface", name, parameters, about, cites, checks)
+
+
+def effect(
+    *,
+    name: str | None = None,
+    parameters: Parameters = (),
+    neutral: Mapping[str, float] | None = None,
+    about: str = "",
+    cites: Iterable[str] = (),
+    states: Iterable[str] = (),
+    needs: Iterable[str] = (),
+    lacks: Iterable[str] = (),
+    observed: str = "",
+    constitutive: bool = True,
+) -> Callable[[Callable[..., Any]], Effect]:
+    """Turn a function into an `Effect`: it returns a mapping from slots (mu, rate, kappa, W, force, V) to formulas.
+
+    Its arguments are the slots' names for what was there before, and any other name that a formula of an effect may hold;
+    `neutral` are the values at which the model is the baseline, `states` the unknowns that the effect adds: the mapping then
+    holds, under the name of each, an `ExtraState`.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Effect:
+        own = name or function.__name__.replace("_", "-")
+        if not valid_name(own):
+            raise SrfError(f"effect name {own!r}: expected small letters, digits and single dashes", "Like my-effect.")
+        listed, brought, needed = _parameter_list(parameters), tuple(states), tuple(needs)
+        check_names(listed)
+        sizes = dict(neutral or {})
+        known = (*known_names([p.name for p in listed], brought, needed), *SLOTS)
+        changes, extra = _changes(function, [*(p.name for p in listed), *COMMON, *needed], known, brought)
+        told = about or (inspect.getdoc(function) or "").split("\n")[0]
+        return finished(
+            Effect(
+                name=own, parameters=listed, about=told, cites=tuple(cites), source=inspect.getsourcefile(function) or "",
+                changes=changes, states=extra, neutral=tuple((n, float(v)) for n, v in sizes.items()),
+                scans=tuple((p.name, SCAN) for p in listed if p.name not in sizes), needs=needed, lacks=tuple(lacks),
+                observed=observed, constitutive=constitutive,
+            )
+        )  # fmt: skip
+
+    return decorate
 
 
 def reader(
@@ -219,6 +271,40 @@ def _formula(function: Callable[..., Any], kind: str, parameters: tuple[Paramete
     if result is None and kind == "interface":
         return None  # rigid
     return _exact(function.__name__, result, known)
+
+
+def _changes(
+    function: Callable[..., Any], parameters: Iterable[str], known: tuple[str, ...], states: tuple[str, ...]
+) -> tuple[tuple[tuple[str, sympy.Expr], ...], tuple[ExtraState, ...]]:
+    """Return what an effect's function makes of each slot, and the unknowns that it adds."""
+    where, own, variables = function.__name__, tuple(parameters), [n for n in known if n not in tuple(parameters)]
+    arguments: dict[str, Any] = {}
+    for argument in inspect.signature(function).parameters:
+        if argument != "p" and argument not in variables:
+            raise SrfError(f"{where}: unknown argument '{argument}'", did_you_mean(argument, [*variables, "p"]))
+        arguments[argument] = Symbols(own) if argument == "p" else symbol(argument)
+    result = function(**arguments)
+    if not isinstance(result, Mapping):
+        raise SrfError(f"{where}: returned {type(result).__name__}, expected a mapping", 'Like {"mu": mu + ...}.')
+    for key, value in result.items():
+        if key not in (*SLOTS, *states):
+            raise SrfError(f"{where}: '{key}' is no slot", did_you_mean(str(key), (*SLOTS, *states)))
+        if isinstance(value, ExtraState) != (key in states):
+            raise SrfError(
+                f"{where}: found {type(value).__name__} under '{key}'",
+                "A formula for a slot, an ExtraState for a state.",
+            )
+    lacking = [n for n in states if n not in result]
+    if lacking:
+        raise SrfError(f"{where}: nothing is returned for the state '{lacking[0]}'", "Return an ExtraState for it.")
+    changes = tuple((s, _exact(where, result[s], (*known, s))) for s in SLOTS if s in result)
+    extra = tuple(
+        ExtraState(
+            n, _exact(where, result[n].rate, known), _exact(where, result[n].steady, known), result[n].logarithmic
+        )
+        for n in states
+    )
+    return changes, extra
 
 
 def _exact(where: str, result: Any, known: tuple[str, ...]) -> sympy.Expr:

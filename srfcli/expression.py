@@ -80,6 +80,8 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "log1p": log1p,
     "expm1": expm1,
     "sqrt": sympy.sqrt,
+    "sin": sympy.sin,
+    "cos": sympy.cos,
     "sinh": sympy.sinh,
     "cosh": sympy.cosh,
     "tanh": sympy.tanh,
@@ -91,7 +93,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 _HYPERBOLIC = frozenset({"sinh", "cosh", "tanh", "asinh", "atan"})
 # Names that generated modules use themselves; a parameter of that name would shadow them.
 RESERVED = frozenset(
-    {"np", "numpy", "x", "t", "tau", "p", "out", "pi", "sin", "cos", "tan", "arctan", "arcsinh", *FUNCTIONS}
+    {"np", "numpy", "x", "t", "tau", "p", "out", "pi", "tan", "arctan", "arcsinh", *FUNCTIONS}
 )
 
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")

@@ -17,7 +17,7 @@ from srfcli.staged import Staged, Step, joined, staged
 from srfcli.system import Equations, System, tidy
 
 
-class _Writer:
+class Writer:
     """Collects functions of (head, x, p) and writes each with its own common subexpressions."""
 
     def __init__(self, system: System, equations: Equations) -> None:
@@ -100,7 +100,7 @@ def generate(system: System) -> str:
     """Return the source of the module that computes everything numerical about `system`."""
     eq = system.equations
     linear = linearise(system)
-    writer = _Writer(system, eq)
+    writer = Writer(system, eq)
     _write_statics(writer, eq, linear)
     _write_closed(writer, system)
     _write_rates(writer, eq)
@@ -111,10 +111,10 @@ def generate(system: System) -> str:
         _HEAD.format(
             title=system.title,
             names=", ".join(names),
-            helpers="".join(h for name, h in _HELPERS.items() if f"{name}(" in body),
-            states=_tuple(eq.names),
+            helpers="".join(h for name, h in HELPERS.items() if f"{name}(" in body),
+            states=tuple_text(eq.names),
             logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
-            parameters="\n".join(f"    {_parameter(p)}," for p in system.parameters),
+            parameters=parameter_rows(system),
             elastic=system.elastic,
             inertia=system.inertia,
             polynomial=linear.polynomial_degree,
@@ -126,12 +126,18 @@ def generate(system: System) -> str:
     )
 
 
+def parameter_rows(system: System) -> str:
+    """Return the rows of PARAMETERS."""
+    return "\n".join(f"    {_parameter(p)}," for p in system.parameters)
+
+
 def _parameter(p: Any) -> str:
     bounds = [repr(float(b)).replace("inf", 'float("inf")') for b in (p.lower, p.upper)]
     return f"({p.name!r}, {float(p.default)!r}, {p.unit!r}, {bounds[0]}, {bounds[1]}, {p.about!r})"
 
 
-def _tuple(names: Sequence[str]) -> str:
+def tuple_text(names: Sequence[str]) -> str:
+    """Return the text of a tuple of names."""
     return "(" + ", ".join(f'"{n}"' for n in names) + ",)"
 
 
@@ -141,7 +147,7 @@ def _tables(parameters: Sequence[str]) -> str:
     return f"CYCLE_PARAMETER = {{\n{rows}\n}}\n\nCYCLE_BILINEAR_PARAMETER = {{\n{bilinear}\n}}\n"
 
 
-def _write_statics(writer: _Writer, eq: Equations, linear: Linearisation) -> None:
+def _write_statics(writer: Writer, eq: Equations, linear: Linearisation) -> None:
     n = len(eq.unknowns)
     steady = [
         (str(i), sp.log(e) if log else e) for i, (e, log) in enumerate(zip(eq.steady, eq.logarithmic, strict=True))
@@ -177,7 +183,7 @@ def _write_statics(writer: _Writer, eq: Equations, linear: Linearisation) -> Non
         )
 
 
-def _write_closed(writer: _Writer, system: System) -> None:
+def _write_closed(writer: Writer, system: System) -> None:
     """Write the critical load and frequency that have a closed form; the functions that have none are left out."""
     limits = closed_limits(system)
     if limits is None:
@@ -201,17 +207,22 @@ def _write_closed(writer: _Writer, system: System) -> None:
         writer.function(name, doc, [("", in_law_parameters(system, value))], state=False)
 
 
-def _write_rates(writer: _Writer, eq: Equations) -> None:
-    """Write what a simulator needs (any drive and load) and the multilinear forms of the normal form at rest."""
-    n = range(len(eq.unknowns))
-    rates = staged(eq.rates)
-    inputs = ("V", "W", "W_dot")
-    shape = f"({len(n)},)"
-    writer.vector("rates", "dx/dt under drive V, imposed load W and its rate W_dot.", rates, tail=inputs, shape=shape)
+def rates_functions(writer: Writer, eq: Equations) -> Staged:
+    """Write the rates under any drive and load, their derivatives, friction and elongation; return the rates."""
+    rates, inputs = staged(eq.rates), ("V", "W", "W_dot")
+    doc = "dx/dt under drive V, imposed load W and its rate W_dot."
+    writer.vector("rates", doc, rates, tail=inputs, shape=f"({len(eq.unknowns)},)")
     writer.square("rates_jacobian", "d(rates)/dx.", _jacobian(eq, rates), tail=inputs)
     _write_rates_by_parameters(writer, rates, inputs)
     writer.function("friction", "Friction coefficient.", [("", eq.mu)], tail=inputs)
     writer.function("elongation", "Spring elongation u.", [("", eq.spring)], tail=inputs)
+    return rates
+
+
+def _write_rates(writer: Writer, eq: Equations) -> None:
+    """Write what a simulator needs (any drive and load) and the multilinear forms of the normal form at rest."""
+    rates, n = rates_functions(writer, eq), range(len(eq.unknowns))
+    shape = f"({len(n)},)"
     calm = rates.substituted({symbol("W"): symbol("W0"), symbol("W_dot"): sp.S.Zero})
     a, b, c = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "abc")
     second = calm.derivative(_direction(eq, a)).derivative(_direction(eq, b))
@@ -232,7 +243,7 @@ def _write_rates(writer: _Writer, eq: Equations) -> None:
     )
 
 
-def _write_rates_by_parameters(writer: _Writer, rates: Staged, inputs: Sequence[str]) -> None:
+def _write_rates_by_parameters(writer: Writer, rates: Staged, inputs: Sequence[str]) -> None:
     """Write d(rates)/dp, a column for each parameter, as a fit's sensitivity equations need it."""
     columns = [rates.derivative({symbol(name): sp.S.One}) for name in writer.parameters]
     both = joined(columns)
@@ -262,7 +273,7 @@ def _jacobian(eq: Equations, formulas: Staged) -> Staged:
     return joined(columns).with_outputs(entries if joined(columns).steps else [tidy(e) for e in entries])
 
 
-def _write_cycle(writer: _Writer, eq: Equations) -> None:
+def _write_cycle(writer: Writer, eq: Equations) -> None:
     """Write the field over one forcing period, tau = f t in [0, 1], and what continuation differentiates."""
     n = range(len(eq.unknowns))
     phase, f, eps, W0 = sp.Symbol("tau"), symbol("f"), symbol("eps"), symbol("W0")
@@ -327,7 +338,7 @@ def positive_ratio(above, below):
     return where(ratio > 0, ratio, nan)
 '''
 
-_HELPERS = {"lambertw": _LAMBERTW, "positive_ratio": _RATIO}
+HELPERS = {"lambertw": _LAMBERTW, "positive_ratio": _RATIO}
 
 _HEAD = '''"""Generated by srf from {title}.
 

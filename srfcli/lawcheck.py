@@ -2,61 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import sympy
 from scipy.optimize import brentq
-from scipy.special import lambertw
 
+from srfcli.checking import STEP, Outcome, Skipped, Values, evaluate, reference_values, run_checks
 from srfcli.dimensions import QUANTITY_UNITS, SYMBOL_UNITS, Dimension, describe, dimension_of, parse_unit
 from srfcli.errors import SrfError
-from srfcli.expression import expm1, log1p, symbol
+from srfcli.expression import symbol
 from srfcli.lawfile import COMMON, FORMULA, formula_of, kind_of
-from srfcli.laws import AgeingLaw, AgeingModifier, FrictionLaw, Interface, Law, Parameter, State
+from srfcli.laws import AgeingLaw, AgeingModifier, Effect, FrictionLaw, Interface, Law, Parameter, State
 from srfcli.registry import Registry, bundled_registry
 
 REFERENCE = "srf-vsat"  # the friction law whose parameters stand in where an ageing law is checked by itself
 VELOCITIES = np.logspace(-3, 3, 7)  # um/s
 LOADS = np.logspace(-1, 3, 9)  # N
-STEP = 1e-30  # complex step: no difference is taken, so it may be this small
 DERIVATIVE_RTOL = 1e-9
-Values = Mapping[str, Any]
-
-
-def _lambertw(value: Any) -> Any:
-    found = lambertw(value)  # complex also where the argument is real
-    return found if np.iscomplexobj(value) else found.real
-
-
-_NUMPY: dict[Any, Callable[[Any], Any]] = {
-    sympy.exp: np.exp,
-    sympy.log: np.log,
-    log1p: np.log1p,
-    expm1: np.expm1,
-    sympy.sinh: np.sinh,
-    sympy.cosh: np.cosh,
-    sympy.tanh: np.tanh,
-    sympy.asinh: np.arcsinh,
-    sympy.atan: np.arctan,
-    sympy.LambertW: _lambertw,
-}
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The outcome of one check: `verdict` is ok, FAIL or skipped, `text` says what was found or why it was skipped."""
-
-    check: str
-    verdict: str
-    text: str
 
 
 def check_law(law: Law) -> list[Outcome]:
-    """Return the outcome of every check of a law; the shipped laws are what it is combined with."""
+    """Return the outcome of every check of a law or an effect; the shipped laws are what it is combined with."""
     registry = bundled_registry()
+    if isinstance(law, Effect):
+        from srfcli.effectcheck import check_effect
+
+        return check_effect(law, registry)
     steps: list[tuple[str, Callable[[Law, Registry], str]]] = [
         ("parameters", check_parameters_used),
         ("units", check_units),
@@ -65,49 +39,8 @@ def check_law(law: Law) -> list[Outcome]:
         ("derivatives", check_derivatives),
         ("worked values", check_worked_values),
     ]
-    outcomes = [Outcome("parses", "ok", f"{kind_of(law)} law {law.name}: {FORMULA[kind_of(law)]} = {formula_of(law)}")]
-    for name, step in steps:
-        try:
-            with np.errstate(all="ignore"):  # a formula outside its range shows as nan, and is reported as such
-                outcomes.append(Outcome(name, "ok", step(law, registry)))
-        except _Skipped as reason:
-            outcomes.append(Outcome(name, "skipped", str(reason)))
-        except SrfError as error:
-            text = error.message + (f". {error.hint}" if error.hint else "")
-            outcomes.append(Outcome(name, "FAIL", text))
-        except (ArithmeticError, ValueError, TypeError) as error:  # numbers of a formula far outside floating point
-            outcomes.append(Outcome(name, "FAIL", f"the formula cannot be computed: {error}"))
-    return outcomes
-
-
-class _Skipped(Exception):
-    """A check that does not apply; the text says why."""
-
-
-def evaluate(expr: sympy.Expr, values: Values) -> Any:
-    """Return the number of a formula at `values`, walking its tree: independent of sympy's derivatives and printers."""
-    if expr.is_Symbol:
-        return values[expr.name]
-    if expr.is_Rational:
-        return int(expr.p) / int(expr.q)
-    if isinstance(expr, sympy.NumberSymbol):
-        return float(expr)
-    arguments = [evaluate(a, values) for a in expr.args]
-    if isinstance(expr, sympy.Add):
-        return sum(arguments[1:], start=arguments[0])
-    if isinstance(expr, sympy.Mul):
-        product = arguments[0]
-        for factor in arguments[1:]:
-            product = product * factor
-        return product
-    if isinstance(expr, sympy.Pow):
-        return np.power(arguments[0], arguments[1])
-    return _NUMPY[expr.func](arguments[0])
-
-
-def reference_values(parameters: Iterable[Parameter]) -> dict[str, float]:
-    """Return the defaults of parameters in um, s, N."""
-    return {p.name: p.default * parse_unit(p.unit).factor for p in parameters}
+    first = Outcome("parses", "ok", f"{kind_of(law)} law {law.name}: {FORMULA[kind_of(law)]} = {formula_of(law)}")
+    return [first, *run_checks([(name, partial(step, law, registry)) for name, step in steps])]
 
 
 def steady_age(rate: sympy.Expr, v: float, length: float, values: Values) -> float | None:
@@ -144,7 +77,7 @@ def check_units(law: Law, registry: Registry) -> str:
     """Raise `SrfError` where a formula adds unlike things, takes log of a length or has the wrong dimension."""
     formula, quantity = formula_of(law), FORMULA[kind_of(law)]
     if formula is None:
-        raise _Skipped("a rigid interface has no formula")
+        raise Skipped("a rigid interface has no formula")
     states = law.states if isinstance(law, FrictionLaw) else ()
     units = {name: parse_unit(unit).dimension for name, unit in SYMBOL_UNITS.items()}
     units |= {state.name: units["phi"] for state in states}
@@ -185,7 +118,7 @@ def check_steady_state(law: Law, registry: Registry) -> str:
 def check_direct_effect(law: Law, registry: Registry) -> str:
     """Raise `SrfError` where mu does not rise with v at fixed age, at a steady state."""
     if not isinstance(law, FrictionLaw):
-        raise _Skipped("only a friction law has mu")
+        raise Skipped("only a friction law has mu")
     slope = sympy.diff(law.mu, symbol("v"))
     values = reference_values(law.parameters)
     found = []
@@ -205,7 +138,7 @@ def check_derivatives(law: Law, registry: Registry) -> str:
     """Raise `SrfError` where a first derivative by sympy differs from complex-step differentiation."""
     formula = formula_of(law)
     if formula is None:
-        raise _Skipped("a rigid interface has no formula")
+        raise Skipped("a rigid interface has no formula")
     names = sorted(s.name for s in formula.free_symbols)
     points = _sample(law, registry)
     worst = 0.0
@@ -225,7 +158,7 @@ def check_worked_values(law: Law, registry: Registry) -> str:
     """Raise `SrfError` where a worked value is not met."""
     formula = formula_of(law)
     if not law.checks:
-        raise _Skipped("the law gives none; add [[checks]]")
+        raise Skipped("the law gives none; add [[checks]]")
     if formula is None:
         raise SrfError("a rigid interface has no formula to check")
     units = {p.name: parse_unit(p.unit).factor for p in _parameters(law, registry)}
@@ -243,7 +176,7 @@ def check_worked_values(law: Law, registry: Registry) -> str:
 
 def _check_stiffness(law: Interface) -> str:
     if law.kappa is None:
-        raise _Skipped("a rigid interface has no stiffness")
+        raise Skipped("a rigid interface has no stiffness")
     found = [float(evaluate(law.kappa, {**reference_values(law.parameters), "W": W})) for W in LOADS]
     for W, kappa in zip(LOADS, found, strict=True):
         if not (np.isfinite(kappa) and kappa > 0):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from srfcli.dimensions import QUANTITY_UNITS, parse_unit
 from srfcli.errors import ExpressionError, SrfError, did_you_mean
-from srfcli.laws import AgeingLaw, AgeingModifier, Check, FrictionLaw, Interface, Law, Parameter, State
+from srfcli.laws import AgeingLaw, AgeingModifier, Check, Effect, FrictionLaw, Interface, Law, Parameter, State
 from srfcli.reader import Reader
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 FORMAT = "srf-law/1"
 KINDS = ("friction", "ageing", "modifier", "interface")
-PLUGIN_KINDS = (*KINDS, "reader")
+PLUGIN_KINDS = (*KINDS, "effect", "reader")
 FORMULA = {"friction": "mu", "ageing": "rate", "modifier": "term", "interface": "kappa"}  # also the checked quantity
 COMMON = ("mu0", "A", "B", "D0", "V0")  # friction parameters that an ageing law may name
 AGEING_SYMBOLS = ("v", "phi", "mu", "mu_dot", "W", "W_dot", "F_dot_over_W")
@@ -41,9 +41,11 @@ _STATE_KEYS = ("name", "length", "weight")
 
 
 def kind_of(law: Law | Reader) -> str:
-    """Return 'friction', 'ageing', 'modifier', 'interface' or, of what reads files, 'reader'."""
+    """Return 'friction', 'ageing', 'modifier', 'interface', 'effect' or, of what reads files, 'reader'."""
     if isinstance(law, Reader):
         return "reader"
+    if isinstance(law, Effect):
+        return "effect"
     return next(kind for kind, cls in LAW_CLASSES.items() if isinstance(law, cls))
 
 
@@ -76,13 +78,18 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def read_header(path: Path) -> tuple[str, str, str]:
     """Return kind, name and about of a law file without reading its formula."""
-    reader = _Reader(path, read_toml(path))
+    reader = LawReader(path, read_toml(path))
     return reader.kind(), reader.name(), reader.text("about")
 
 
 def read_law(path: Path) -> Law:
-    """Return the law in a TOML file."""
-    return _Reader(path, read_toml(path)).law()
+    """Return the law, or the effect, in a TOML file."""
+    table = read_toml(path)
+    if table.get("kind") == "effect":
+        from srfcli.effectfile import EffectReader
+
+        return EffectReader(path, table).effect()
+    return LawReader(path, table).law()
 
 
 def valid_name(name: object) -> bool:
@@ -141,7 +148,7 @@ def check_uses(law: Law) -> None:
             raise SrfError(f"mu does not depend on '{name}'", "A friction law depends on v and on each of its states.")
 
 
-class _Reader:
+class LawReader:
     """One TOML table on its way to a law."""
 
     def __init__(self, path: Path, table: dict[str, Any]) -> None:
@@ -173,9 +180,10 @@ class _Reader:
             said = "nothing" if found is None else _shown(found)
             self.fail("format", f"found {said}, expected {FORMAT!r}", f'Start the file with format = "{FORMAT}".')
         kind = self.table.get("kind")
-        if kind not in KINDS:
+        known = (*KINDS, "effect")
+        if kind not in known:
             said = "nothing" if kind is None else _shown(kind)
-            self.fail("kind", f"found {said}, expected one of {', '.join(KINDS)}", did_you_mean(str(kind), KINDS))
+            self.fail("kind", f"found {said}, expected one of {', '.join(known)}", did_you_mean(str(kind), known))
         return kind
 
     def name(self) -> str:

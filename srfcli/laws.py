@@ -83,3 +83,49 @@ class Interface(Law):
     """The shear stiffness kappa of the interface as a function of W and parameters; None for a rigid one."""
 
     kappa: sympy.Expr | None = None
+
+
+@dataclass(frozen=True)
+class ExtraState:
+    """An unknown that an effect brings along: its rate, its value in steady sliding; its logarithm is solved for, or itself."""
+
+    name: str
+    rate: sympy.Expr
+    steady: sympy.Expr
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
+class Effect(Law):
+    """A piece of physics nested in a baseline: at the `neutral` values of its parameters the model is the baseline.
+
+    `changes` holds (slot, formula): mu, rate, kappa, W (the load on the asperities), force (along the track, on the slider) or V;
+    in a formula the slot's own name is what was there before. `settings` replace choices of the model (interface, inertia),
+    `frees` names parameters of the apparatus that are fitted instead. `neutral` holds the sizes' neutral values, `scans` the
+    inner parameters (unseen at neutral sizes) with the number of values to try. `answers` is the name under which it is reported.
+    `constants` are numbers with units that formulas in `written` name; in `changes` and `states` their values stand, um, s, N.
+    """
+
+    changes: tuple[tuple[str, sympy.Expr], ...] = ()
+    states: tuple[ExtraState, ...] = ()
+    settings: tuple[tuple[str, str | bool], ...] = ()
+    frees: tuple[str, ...] = ()
+    neutral: tuple[tuple[str, float], ...] = ()
+    scans: tuple[tuple[str, int], ...] = ()
+    needs: tuple[str, ...] = ()
+    lacks: tuple[str, ...] = ()
+    observed: str = ""
+    constitutive: bool = True
+    answers: str = ""
+    constants: tuple[Parameter, ...] = ()
+    written: tuple[tuple[str, sympy.Expr], ...] = field(default=(), compare=False)
+
+    @property
+    def reported(self) -> str:
+        """Return the name under which a verdict has it: variants of one effect share one."""
+        return self.answers or self.name
+
+    @property
+    def sizes(self) -> tuple[str, ...]:
+        """Return the parameters that vanish, or are 1, in the baseline."""
+        return tuple(name for name, _ in self.neutral)

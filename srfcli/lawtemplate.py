@@ -95,6 +95,34 @@ quantity = "kappa"
 at = { W = 10.0, lambda = 0.5 }
 value = 20.0
 """,
+    "effect": """\
+format = "srf-law/1"
+kind = "effect"
+name = "$name"
+about = "One line for `srf laws`"
+cites = ["Author, Title, Journal volume, page (year)"]
+
+# An effect is physics that a baseline may lack. Give a formula for one or more of
+#   mu     friction coefficient
+#   rate   of ageing, d(phi)/dt
+#   kappa  shear stiffness of the interface, N/um
+#   W      load on the asperities, N
+#   force  on the slider along the track, N, with the drive
+#   V      velocity of the stage, um/s
+# in which the slot's own name is what was there before. A formula may hold v, phi, mu, mu_dot, W, W_dot, F_dot_over_W,
+# the friction law's mu0, A, B, D0, V0, slip (um from where the track begins), stage (um), time (s), u (um), W0, K, V,
+# of a modulated load theta (its phase), envelope (0 to 1), eps, f, modulated (1 or 0), and the parameters below.
+rate = "rate + v*phi/D0 - (v*phi/D0)**n"
+
+# `neutral` is the value at which the model is the baseline. Any other parameter is an inner one, which shows only where
+# the size is not neutral: a diagnosis tries `scan` values of it. Bounds are those of a fit.
+[parameters]
+n = { default = 1.2, neutral = 1.0, unit = "1", bounds = [0.3, 3.0], about = "sharpness of renewal" }
+
+# Numbers with a unit, which are never fitted.
+# [constants]
+# Wref = { value = 7.0, unit = "N", about = "reference load" }
+""",
 }
 
 _HEAD = '''\
@@ -163,6 +191,20 @@ def $function(phi, W, W_dot, p):
 def $function(W, p):
     """Called once, with symbols: W in N; the stiffness is in N/um. p["lambda"], since lambda is a Python keyword."""
     return W / p["lambda"]
+''',
+    "effect": _HEAD.replace("$imports", "Parameter, effect")
+    + '''
+@effect(
+    name="$name",
+    about="One line for `srf laws`",
+    cites=["Author, Title, Journal volume, page (year)"],
+    parameters=[Parameter("n", 1.2, lower=0.3, upper=3.0, about="sharpness of renewal")],
+    neutral={"n": 1.0},
+)
+def $function(rate, v, phi, p):
+    """Called once, with symbols; what is returned for mu, rate, kappa, W, force or V takes the place of what was there."""
+    worn = v * phi / p.D0
+    return {"rate": rate + worn - worn**p.n}
 ''',
 }
 

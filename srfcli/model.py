@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -97,11 +97,17 @@ def open_model(
     interface: str = "elastic",
     loading: str = "vertical",
     inertia: bool = True,
+    effects: Sequence[str] = (),
+    tables: Sequence[tuple[str, str]] = (),
 ) -> GeneratedModel:
-    """Return the model of the system that these names describe, from the cache where it was built before."""
+    """Return the model of the system that these names describe, from the cache where it was built before.
+
+    With effects or tables it holds what motion in time needs, and nothing of stability.
+    """
     base, *modifiers = ageing.split("+")
     wanted = [("friction", law), ("ageing", base), *(("modifier", m) for m in modifiers), ("interface", interface)]
-    parts, laws = [__version__, str(FORMAT), loading, str(inertia)], []
+    wanted += [("effect", name) for name in effects]
+    parts, laws = [__version__, str(FORMAT), loading, str(inertia), repr(tuple(tables))], []
     for kind, name in wanted:
         found, fingerprint = _source(registry, kind, name.strip())
         parts += [kind, name, fingerprint]
@@ -110,10 +116,14 @@ def open_model(
 
     def build() -> str:
         from srfcli.generate import generate
+        from srfcli.generate_motion import generate_motion
         from srfcli.system import build_system
 
-        system = build_system(registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia)
-        return generate(system)
+        system = build_system(
+            registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia, effects=effects,
+            tables=tables,
+        )  # fmt: skip
+        return generate_motion(system) if effects or tables else generate(system)
 
     return load_source(cached_source(key, build), key=key, laws=tuple(laws))
 

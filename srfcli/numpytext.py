@@ -52,6 +52,12 @@ class NumPyText(NumPyPrinter):
     def _print_LambertW(self, expr: sp.Expr) -> str:
         return f"lambertw({self._print(expr.args[0])})"
 
+    def _print_lut(self, expr: sp.Expr) -> str:
+        number, argument = expr.args
+        return f"{type(expr).__name__}(p, {int(number)}, {self._print(argument)})"
+
+    _print_lut1 = _print_lut2 = _print_lut
+
     def _print_Pi(self, expr: sp.Expr) -> str:
         return "pi"
 

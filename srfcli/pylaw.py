@@ -22,6 +22,7 @@ DECORATORS = {
     "ageing_law": "ageing",
     "modifier": "modifier",
     "interface": "interface",
+    "effect": "effect",
     "reader": "reader",
 }
 

@@ -16,6 +16,7 @@ class Source:
 
     `blocks((2, 0))` yields pairs of equally long arrays, of columns 2 and 0. `rows` is their number where the file says it.
     `whole` is True where a column cannot be read in parts. `remarks` is what the user of a column should know, by heading.
+    `about` is an estimate of their number, by which a file that is far too large is refused unread.
     """
 
     headings: tuple[str, ...]
@@ -23,6 +24,7 @@ class Source:
     rows: int | None = None
     whole: bool = False
     remarks: Mapping[str, str] = field(default_factory=dict)
+    about: int | None = None
 
 
 @dataclass(frozen=True)

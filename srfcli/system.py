@@ -5,15 +5,18 @@ Units are um, s, N; mass is N s^2/um. The spring elongation is u = V t - x, z = 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
 import sympy as sp
+from sympy.solvers.solveset import NonlinearError
 
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.expression import symbol
-from srfcli.laws import AgeingLaw, AgeingModifier, FrictionLaw, Interface, Law, Parameter, State
+from srfcli.laws import AgeingLaw, AgeingModifier, Effect, ExtraState, FrictionLaw, Interface, Law, Parameter, State
 
 if TYPE_CHECKING:
     from srfcli.registry import Registry
@@ -29,6 +32,15 @@ APPARATUS = (
 )
 MASS = Parameter("M", 2.37, "kg", 1e-12, 1e12, "mass of the slider")
 ANGLE = Parameter("angle", 15.0, "deg", -60.0, 60.0, "inclination of the spring: W gains K (u - u_ss) tan(angle)")
+RUN = (  # of one run: what an effect may ask of the recording
+    Parameter("start", 0.0, "um", about="where on the track the run begins"),
+    Parameter("begin", 0.0, "s", about="the clock at the run's first sample"),
+    Parameter("psi", 0.0, "1", about="phase of the load modulation at clock 0"),
+    Parameter("modulated", 0.0, "1", about="1 where the load is modulated"),
+    Parameter("rise0", 0.02, "s", about="time scale of the switch-on of the modulation"),
+    Parameter("onset0", -1e6, "s", about="when half of the load modulation was switched on"),
+)
+EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "kappa", "force", "rate", "V")
 LOADINGS = ("vertical", "inclined")
 MAX_CANCEL = 80  # operations: beyond it a common denominator takes a minute to find and shortens nothing
 
@@ -43,11 +55,15 @@ class System:
     interface: Interface = field(default_factory=lambda: Interface("rigid"))
     loading: str = "vertical"
     inertia: bool = True
+    effects: tuple[Effect, ...] = ()
+    tables: tuple[
+        tuple[str, str], ...
+    ] = ()  # (mu, force or V, an unknown): a function of it, given by numbers, is added
 
     @property
     def laws(self) -> tuple[Law, ...]:
         """Return every law that takes part."""
-        return (self.friction, self.ageing, *self.modifiers, self.interface)
+        return (self.friction, self.ageing, *self.modifiers, self.interface, *self.effects)
 
     @property
     def elastic(self) -> bool:
@@ -62,6 +78,8 @@ class System:
             own.append(MASS)
         if self.loading == "inclined":
             own.append(ANGLE)
+        if self.effects or self.tables:
+            own += RUN
         seen = {p.name for p in own}
         for law in self.laws:
             for parameter in law.parameters:
@@ -71,8 +89,13 @@ class System:
         return tuple(own)
 
     @property
+    def extra_states(self) -> tuple[ExtraState, ...]:
+        """Return the unknowns that effects bring along."""
+        return tuple(state for effect in self.effects for state in effect.states)
+
+    @property
     def states(self) -> tuple[str, ...]:
-        """Return the names of the first-order system's unknowns, in order."""
+        """Return the names of the first-order system's unknowns, in order; those of effects come after these."""
         mechanical = ("u", "z") if self.elastic else ("u",)
         return (*(mechanical if self.inertia else ()), "ln_v", *(f"ln_{s.name}" for s in self.friction.states))
 
@@ -80,11 +103,16 @@ class System:
     def title(self) -> str:
         """Return one line that names the system."""
         ageing = "+".join([self.ageing.name, *(m.name for m in self.modifiers)])
-        return f"{self.friction.name}, {ageing}, {self.interface.name}, {self.loading}, inertia {'on' if self.inertia else 'off'}"
+        inertia = f"inertia {'on' if self.inertia else 'off'}"
+        return ", ".join(
+            [self.friction.name, ageing, self.interface.name, self.loading, inertia, *(e.name for e in self.effects)]
+        )
 
     @cached_property
     def equations(self) -> Equations:
         """Return the first-order equations of this system."""
+        from srfcli.equations import build_equations
+
         return build_equations(self)
 
 
@@ -119,8 +147,14 @@ def build_system(
     interface: str = "elastic",
     loading: str = "vertical",
     inertia: bool = True,
+    effects: Sequence[str] = (),
+    tables: Sequence[tuple[str, str]] = (),
 ) -> System:
     """Return the system that these registered names describe; `ageing` may carry modifiers, `dieterich+linker-dieterich`."""
+    added = apart([_of(Effect, registry.get("effect", name)) for name in effects])
+    for effect in added:
+        chosen = dict(effect.settings)
+        interface, inertia = str(chosen.get("interface", interface)), bool(chosen.get("inertia", inertia))
     if loading not in LOADINGS:
         raise SrfError(f"unknown loading '{loading}'", did_you_mean(loading, LOADINGS))
     ageing_law, modifiers = registry.ageing(ageing)
@@ -131,9 +165,41 @@ def build_system(
         interface=_of(Interface, registry.get("interface", interface)),
         loading=loading,
         inertia=inertia,
+        effects=added,
+        tables=tuple((slot, argument) for slot, argument in tables),
     )
     _check_symbols(system)
     return system
+
+
+def with_effects(system: System, effects: Sequence[Effect]) -> System:
+    """Return the system with these effects, which have no settings; SrfError where one names what the system does not have."""
+    joined = replace(system, effects=apart(effects))
+    _check_symbols(joined)
+    return joined
+
+
+def apart(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Return the effects with parameters of one name told apart by their effects: drive_ripple_amplitude."""
+    count = Counter(p.name for e in effects for p in e.parameters)
+    return tuple(_renamed(e, {n: f"{e.name.replace('-', '_')}_{n}" for n in own if count[n] > 1}) for e, own in
+                 ((e, [p.name for p in e.parameters]) for e in effects))  # fmt: skip
+
+
+def _renamed(effect: Effect, names: Mapping[str, str]) -> Effect:
+    if not names:
+        return effect
+    swap = {symbol(a): symbol(b) for a, b in names.items()}
+    return replace(
+        effect,
+        parameters=tuple(replace(p, name=names.get(p.name, p.name)) for p in effect.parameters),
+        changes=tuple(
+            (slot, f.xreplace({k: v for k, v in swap.items() if str(k) != slot})) for slot, f in effect.changes
+        ),
+        states=tuple(replace(s, rate=s.rate.xreplace(swap), steady=s.steady.xreplace(swap)) for s in effect.states),
+        neutral=tuple((names.get(n, n), v) for n, v in effect.neutral),
+        scans=tuple((names.get(n, n), v) for n, v in effect.scans),
+    )
 
 
 def _of(kind: type[L], law: Law) -> L:
@@ -149,6 +215,18 @@ def _check_symbols(system: System) -> None:
     rates = [state_rate(system, s) for s in system.friction.states]
     used = {str(s) for e in (system.friction.mu, *rates, system.interface.kappa or sp.S.Zero) for s in e.free_symbols}
     inputs = {"v", "W", "mu", "mu_dot", "W_dot", "F_dot_over_W", *(s.name for s in system.friction.states)}
+    _check_apart(system)
+    for effect in system.effects:
+        formulas = [*(f for _, f in effect.changes), *(e for x in effect.states for e in (x.rate, x.steady))]
+        lacking = sorted({str(s) for f in formulas for s in f.free_symbols} - declared - inputs - {*EFFECT_INPUTS})
+        lacking = [name for name in lacking if name not in {x.name for e in system.effects for x in e.states}]
+        if lacking:
+            raise SrfError(
+                f"effect '{effect.name}' uses '{lacking[0]}', which {system.friction.name} and {system.ageing.name} lack",
+                "the effect does not apply to this law",
+            )
+    if system.effects:
+        inputs |= {*EFFECT_INPUTS, *(x.name for x in system.extra_states)}
     missing = sorted(used - declared - inputs)
     if missing:
         raise SrfError(
@@ -157,11 +235,56 @@ def _check_symbols(system: System) -> None:
         )
 
 
+def _check_apart(system: System) -> None:
+    """Raise where an effect brings a parameter or an unknown that a law has already: one symbol would mean two things."""
+    own = {p.name for law in system.laws if not isinstance(law, Effect) for p in law.parameters}
+    own |= {state.name for state in system.friction.states}
+    for effect in system.effects:
+        brought = [*(() if effect.settings else (p.name for p in effect.parameters)), *(s.name for s in effect.states)]
+        twice = [name for name in brought if name in own]
+        if twice:
+            raise SrfError(
+                f"effect '{effect.name}' brings '{twice[0]}', which a law of {system.friction.name} and {system.ageing.name} has",
+                "the law has this physics already; or give the effect's parameter another name",
+            )
+        own |= {s.name for s in effect.states}
+
+
 def state_rate(system: System, state: State) -> sp.Expr:
     """Return d(state)/dt with the ageing law's phi, D0 and B replaced by this state's own."""
     rate = system.ageing.rate + sum((m.term for m in system.modifiers), sp.S.Zero)
+    for effect in system.effects:
+        for slot, formula in effect.changes:
+            if slot == "rate":
+                rate = formula.xreplace({symbol("rate"): rate})
     own = {symbol("phi"): symbol(state.name), symbol("D0"): symbol(state.length), symbol("B"): symbol(state.weight)}
     return rate.subs(own, simultaneous=True)
+
+
+class lut(sp.Function):
+    """lut(i, x): the i-th table, a cubic spline of x whose numbers follow the parameters."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return the slope by x."""
+        return lut1(*self.args)
+
+
+class lut1(sp.Function):
+    """The first derivative of a table."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return the slope by x."""
+        return lut2(*self.args)
+
+
+class lut2(sp.Function):
+    """The second derivative of a table; nothing needs its slope."""
+
+    nargs = 2
 
 
 @lru_cache(maxsize=32)
@@ -198,94 +321,10 @@ def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
     return roots[0]
 
 
-def build_equations(system: System) -> Equations:
-    """Return x' = f(x, t) of `system`, solved for the derivatives.
-
-    The slip relation d(W mu/kappa)/dt = z - v, the force balance and the ageing laws are linear in the unknown derivatives
-    as long as each law is linear in mu_dot, W_dot and F_dot_over_W; otherwise SrfError.
-    """
-    s = symbol
-    v, V, K, M, W0 = s("v"), s("V"), s("K"), s("M"), s("W0")
-    u, z, W_imposed, W_imposed_dot = s("u"), s("z"), s("W"), s("W_dot")
-    states = system.friction.states
-    phis = [s(state.name) for state in states]
-    steady = steady_states(system)
-    mu_law = system.friction.mu
-    mu_ss = mu_law.subs(dict(zip(phis, steady, strict=True))).subs(v, V)
-
-    d_ln_v, mu_dot, W_rate, x_rate = sp.symbols("d_ln_v mu_dot_ W_rate_ x_rate_")
-    d_ln_phi = sp.symbols(f"d_ln_phi0:{len(states)}")
-    mu, load = sp.Symbol("mu_"), sp.Symbol("load_")
-    m_v, m_phi = sp.Symbol("mu_v_"), sp.symbols(f"mu_phi0:{len(states)}")
-    slip, slip_w = sp.Symbol("S_"), sp.Symbol("S_W_")
-    tangent = sp.tan(s("angle")) if system.loading == "inclined" else sp.S.Zero
-
-    u_rate = V - (z if system.elastic else v) if system.inertia else V - (x_rate if system.elastic else v)
-    balance = [
-        mu_dot - m_v * d_ln_v - sum(a * b for a, b in zip(m_phi, d_ln_phi, strict=True)),
-        W_rate - W_imposed_dot - tangent * K * u_rate,
-    ]
-    stand_ins = {
-        s("mu"): mu,
-        s("mu_dot"): mu_dot,
-        s("W"): load,
-        s("W_dot"): W_rate,
-        s("F_dot_over_W"): mu_dot + mu * W_rate / load,
-    }
-    for state, rate in zip(states, d_ln_phi, strict=True):
-        balance.append(s(state.name) * rate - state_rate(system, state).subs(stand_ins, simultaneous=True))
-    wanted = [d_ln_v, mu_dot, W_rate, *d_ln_phi]
-    if system.elastic:
-        balance.append(slip * mu_dot + mu * slip_w * W_rate - ((z if system.inertia else x_rate) - v))
-    if system.inertia and not system.elastic:
-        balance.append(M * v * d_ln_v - (K * u - load * mu))
-    if not system.inertia:
-        balance.append(K * u_rate - load * mu_dot - mu * W_rate)
-        if system.elastic:
-            wanted.append(x_rate)
-    solution = _solve_linear(balance, wanted, system)
-
-    W_total = W_imposed
-    if system.loading == "inclined":
-        shift = tangent * W0 * mu_ss
-        W_total = (
-            W_imposed + tangent * K * u - shift if system.inertia else (W_imposed - shift) / (1 - tangent * mu_law)
-        )
-    kappa = system.interface.kappa
-    S = sp.simplify(s("W") / kappa) if kappa is not None else sp.S.Zero
-    meaning = [
-        (slip, S.subs(s("W"), load)),
-        (slip_w, sp.diff(S, s("W")).subs(s("W"), load)),
-        (m_v, tidy(v * sp.diff(mu_law, v))),
-        *((m, tidy(p * sp.diff(mu_law, p))) for m, p in zip(m_phi, phis, strict=True)),
-        (mu, mu_law),
-        (load, W_total),
-    ]
-    z_rate = (K * u - load * mu) / M
-    rates = [solution[r].subs(meaning) for r in (d_ln_v, *d_ln_phi)]
-    names, unknowns, first = list(system.states), [v, *phis], []
-    if system.inertia:
-        first = [u_rate, z_rate.subs(meaning)] if system.elastic else [u_rate]
-        unknowns = [u, z, *unknowns] if system.elastic else [u, *unknowns]
-    spring = u if system.inertia else W_total * mu_law / K
-    at_drive = [e.subs(v, V) for e in (v, *steady)]
-    resting = [W0 * mu_ss / K, V][: len(unknowns) - len(at_drive)]
-    return Equations(
-        names=tuple(names),
-        unknowns=tuple(unknowns),
-        logarithmic=tuple(n.startswith("ln_") for n in names),
-        rates=tuple([*first, *rates]),
-        spring=spring,
-        load=W_total,
-        mu=mu_law,
-        steady=tuple([*resting, *at_drive]),
-    )
-
-
-def _solve_linear(balance: list[sp.Expr], wanted: list[sp.Symbol], system: System) -> dict[sp.Symbol, sp.Expr]:
+def solve_linear(balance: list[sp.Expr], wanted: list[sp.Symbol], system: System) -> dict[sp.Symbol, sp.Expr]:
     try:
         matrix, right = sp.linear_eq_to_matrix(balance, wanted)
-    except sp.solvers.solveset.NonlinearError as error:
+    except NonlinearError as error:
         raise SrfError(
             f"ageing law '{system.ageing.name}' is not linear in mu_dot, W_dot or F_dot_over_W",
             "write the coupling to the rates of friction and load as a factor times mu_dot, W_dot or F_dot_over_W",

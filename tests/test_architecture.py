@@ -23,7 +23,7 @@ LONG_FILES: dict[str, str] = {}  # path -> the reason why it is longer
 # each module and what it may import of the package, also inside functions; a folder stands for all that is in it
 BASE = {"errors", "status"}
 LAWS = BASE | {"laws", "reader"}
-LAW_FILES = LAWS | {"expression", "dimensions", "lawfile", "pylaw"}
+LAW_FILES = LAWS | {"expression", "dimensions", "lawfile", "effectfile", "pylaw"}
 SYMBOLS = LAW_FILES | {"registry", "system", "derive", "closed_limits"}
 MAY: dict[str, set[str]] = {
     "errors": set(),
@@ -34,34 +34,45 @@ MAY: dict[str, set[str]] = {
     "reader": set(),
     "dimensions": BASE,
     "lawfile": LAW_FILES,
+    "effectfile": LAW_FILES,
     "lawtemplate": BASE,
     "pylaw": LAW_FILES,
     "registry": LAW_FILES,
     "api": LAW_FILES,
-    "lawcheck": LAW_FILES | {"registry"},
+    "checking": LAW_FILES,
+    "lawcheck": LAW_FILES | {"registry", "checking", "effectcheck"},
+    "effectcheck": SYMBOLS | {"checking", "generate_motion", "model"},
     "notation": {"expression"},
     "staged": set(),
-    "system": LAWS | {"expression", "registry"},
+    "system": LAWS | {"expression", "registry", "equations"},
+    "equations": LAWS | {"expression", "system"},
     "derive": LAWS | {"expression", "system"},
     "closed_limits": LAWS | {"expression", "system", "derive"},
     "numpytext": {"expression"},
     "generate": SYMBOLS | {"numpytext", "staged"},
+    "generate_motion": SYMBOLS | {"generate", "numpytext", "staged"},
+    "splines": set(),
     "cache": set(),
-    "model": SYMBOLS | {"generate", "cache", "units"},
+    "model": SYMBOLS | {"generate", "generate_motion", "cache", "units"},
     "derivation": SYMBOLS | {"notation", "units"},
     "paper_forms": SYMBOLS,
     "paper": SYMBOLS | {"paper_forms", "units"},
     "render": SYMBOLS | {"derivation", "notation", "numpytext", "paper"},
     "settings": LAWS | {"units"},
-    "recording": LAW_FILES | {"registry", "units", "numerics"},
-    "numerics": BASE | {"cache", "model", "numerics"},
-    "inference": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "settings", "units"},
+    "recording": LAW_FILES | {"registry", "units", "numerics", "system"},
+    "numerics": BASE | {"cache", "model", "numerics", "splines"},
+    "inference": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "settings", "splines", "units"},
+    "diagnosis": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "inference", "splines", "units"},
     "output": LAWS | {"output"},
+    "parallel": BASE | {"output"},
+    "trial": BASE | {"registry", "recording", "diagnosis", "model", "output", "parallel", "proof"},
+    "proof": {"errors", "output"},  # shares no equation and no integrator with what it is to prove
 }
 HEAVY = {"sympy", "scipy", "numpy", "matplotlib", "pint", "numba"}
 FORBIDDEN = {
     "numerics": {"sympy", "click", "rich"},
     "output": {"sympy", "scipy", "click"},
+    "proof": {"sympy", "click", "rich"},
     "model": {"sympy"},
     "settings": HEAVY,
     "registry": HEAVY,

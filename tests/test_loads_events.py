@@ -216,15 +216,25 @@ def test_what_is_no_record_is_refused(t: np.ndarray, u: np.ndarray, options: dic
     [("k168Nm_v42", 86, 0.056, 4.3), ("k1002Nm_v42", 501, 0.082, 0.75), ("k168Nm_v1100", 63, 0.064, 0.22)],
 )
 def test_a_real_recording(shared: Path, name: str, events: int, drop: float, every: float) -> None:
-    """Against a count by another method (peaks by prominence 0.04 after a running median), which its README tells."""
+    """Against the count that its README tells: peaks by prominence in every 20th sample of a running median.
+
+    Tops of equal height, common in a quantised force, are each given the whole fall behind them there: 7 and 14 events twice.
+    """
     from scipy.io import loadmat
     from scipy.ndimage import median_filter
+    from scipy.signal import find_peaks
 
     path = shared / "data" / "paper-on-paper-stickslip" / f"{name}.mat"
     if not path.is_file():
         pytest.skip(f"REAL DATA ABSENT: {path}")
     data = loadmat(path)
-    found = stick_slip(data["t"].ravel(), median_filter(data["Fnorm"].ravel(), 41), smallest=0.04)
-    assert found.times.size == pytest.approx(events, rel=0.08)
-    assert found.drop == pytest.approx(drop, rel=0.08)
-    assert np.mean(found.recurrence) == pytest.approx(every, rel=0.12)
+    t, force = data["t"].ravel(), median_filter(data["Fnorm"].ravel(), 41)
+    assert find_peaks(force[::20], prominence=0.04)[0].size == pytest.approx(events, abs=1)
+    for sparse in (1, 20):
+        found = stick_slip(t[::sparse], force[::sparse], smallest=0.04)
+        tilted = force[::sparse] - 1e-9 * np.arange(t[::sparse].size)  # no two tops are equal
+        assert found.times.size == pytest.approx(
+            find_peaks(tilted, prominence=0.04)[0].size, abs=1
+        )  # the last may be cut
+        assert found.drop == pytest.approx(drop, rel=0.04)
+        assert np.mean(found.recurrence) == pytest.approx(every, rel=0.12)

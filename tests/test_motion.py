@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
 import numpy as np
 import pytest
 
@@ -9,9 +16,11 @@ from srfcli.errors import SrfError
 from srfcli.numerics import compiled as compiled_module
 from srfcli.numerics.compiled import compiled, compiler
 from srfcli.numerics.load import ConstantLoad, Modulation
+from srfcli.numerics.loads import LoadSteps
 from srfcli.numerics.lsoda import integrate_lsoda
 from srfcli.numerics.motion import integrate
 from srfcli.numerics.program import Drive
+from srfcli.status import Status
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler on this machine")
 SYSTEMS = [
@@ -86,6 +95,140 @@ def test_error_follows_the_tolerance(model, rtol):
     found = motion_of(model, "compiled", rtol=rtol).x
     error = np.abs(found - exact)[:, 2].max()
     assert error < 300 * rtol + 1e-9
+
+
+def moved(model, drive, load, t, *, rtol=1e-8, W0, how=integrate):
+    """Return the motion of the model from steady sliding at 8 um/s under W0, all tolerances `rtol`."""
+    p = model.vector({"V": 8.0, "W0": W0})
+    x0, atol = np.asarray(model.steady(p)), np.full(len(model.states), rtol)
+    if how is integrate_lsoda:
+        return integrate_lsoda(model, p, drive, load, t, x0, (), np.zeros((x0.size, 0)), rtol, atol)
+    return integrate(model, p, drive=drive, load=load, t=t, start=x0, rtol=rtol, atol=atol)
+
+
+@needs_compiler
+@pytest.mark.parametrize("rtol, error", [(1e-6, 0.05), (1e-8, 1e-3), (1e-10, 1e-4)])
+def test_output_between_steps_holds_at_rest(make_model, rtol, error):
+    """At 1e-9 um/s the rates are the noise of Newton's method times 1e12 / s: no slope to draw a curve by."""
+    model, t, load = make_model(interface="rigid"), np.linspace(0.0, 0.12, 6001), Modulation(9.0, 0.5, 120.0, 0.0)
+    expected = moved(model, Drive.constant(8.0), load, t, rtol=1e-11, W0=9.0, how=integrate_lsoda).x
+    found = moved(model, Drive.constant(8.0), load, t, rtol=rtol, W0=9.0)
+    assert found.status.ok
+    assert expected[:, 1].min() < -18
+    assert np.abs(found.x - expected)[:, 1].max() < error
+
+
+@needs_compiler
+def test_a_rigid_slider_pushed_back_comes_to_rest_and_slides_again(make_model):
+    """v = a (t_0 - t) passes through a hundred decades in less time than t resolves; then the spring is filled."""
+    model, t = make_model(interface="rigid"), np.linspace(0.0, 5.0, 5001)
+    load = LoadSteps.sequence([(1, 5.0, 5.0), (4, 0.5, 0.5)], start=0.0, rise=0.01)
+    found = moved(model, Drive.constant(8.0), load, t, W0=5.0)
+    assert found.status.ok
+    u, ln_v, ln_phi = found.x.T
+    rest = ln_v < -100
+    assert 0.5 < np.ptp(t[rest]) < 1.5
+    # where the mass plays no part K u = W mu(v, phi): checked by the law as it stands in the paper
+    p = dict(zip(model.names, model.vector({}), strict=True))
+    settled = rest & (t > t[rest][0] + 0.01)
+    mu = (
+        p["mu0"]
+        + p["A"] * (ln_v[settled] - np.log(p["V0"]))
+        + p["B"] * np.log(1 + p["Vsat"] * np.exp(ln_phi[settled]) / p["D0"])
+    )
+    assert 0.5 * mu == pytest.approx(p["K"] * u[settled], rel=1e-6)
+    assert np.diff(u[settled]) == pytest.approx(8.0 * 0.001, abs=2e-6)  # it does not move, the drive does
+    assert found.x[-1] == pytest.approx(np.asarray(model.steady(model.vector({"V": 8.0, "W0": 0.5}))), abs=1e-6)
+
+
+@needs_compiler
+def test_no_step_of_the_clock_is_lost_in_short_steps(make_model):
+    """Thousands of steps below the resolution of t must add up: the age grows by just the time that passes at rest."""
+    model, t = make_model(interface="rigid"), np.linspace(0.0, 1.6, 1601)
+    load = LoadSteps.sequence([(1, 5.0, 5.0), (1, 0.5, 0.5)], start=0.0, rise=0.01)
+    found = moved(model, Drive.constant(8.0), load, t, W0=5.0)
+    rest = found.x[:, 1] < -100
+    assert rest.sum() > 300
+    assert np.diff(np.exp(found.x[rest, 2])) == pytest.approx(0.001, rel=1e-5)
+
+
+@needs_compiler
+@pytest.mark.parametrize("names", [{}, {"inertia": False}, {"interface": "rigid"}], ids=str)
+def test_age_that_collapses_after_a_long_hold(make_model, names):
+    model = make_model(ageing="perrin-rice-zheng", **names)
+    t = np.concatenate([np.linspace(0.0, 1010.0, 102), np.linspace(1010.0, 1012.0, 2001)[1:], [1030.0]])
+    found = moved(model, Drive.steps([(0, 8.0), (10, 0.0), (1010, 8.0)]), ConstantLoad(5.0), t, W0=5.0)
+    assert found.status.ok
+    assert found.x[101, -1] == pytest.approx(np.log(1000), abs=0.02)  # age in time while at rest
+    assert found.x[:, -2].max() > 6  # it then slips in one event
+    assert found.x[-1] == pytest.approx(np.asarray(model.steady(model.vector({"V": 8.0, "W0": 5.0}))), abs=1e-4)
+
+
+@needs_compiler
+@pytest.mark.parametrize("inertia", [True, False])
+def test_what_the_equations_cannot_follow_is_said(make_model, inertia):
+    """Friction that vanishes with v lets the slider turn, which ln v cannot; without inertia B > A runs away in finite time."""
+    model, t = (
+        make_model(law="rice-regularized", ageing="kato-tullis", interface="rigid", inertia=inertia),
+        np.linspace(0, 5, 501),
+    )
+    load = LoadSteps.sequence([(1, 9.0, 9.0), (4, 0.9, 0.9)], start=0.0, rise=0.01)
+    begun = time.process_time()
+    found = moved(model, Drive.steps([(0, 8.0), (0.5, 20.0)]), load, t, W0=9.0)
+    assert found.status is Status.INTEGRATION
+    assert 0.5 < found.reached < 1.1
+    assert time.process_time() - begun < 5
+    assert np.isfinite(found.x[t <= found.reached - 0.01]).all() and np.isnan(found.x[t > found.reached]).all()
+
+
+LONG = """
+import numpy as np
+from srfcli.model import open_model
+from srfcli.numerics.load import Modulation
+from srfcli.numerics.motion import integrate
+from srfcli.numerics.program import Drive
+from srfcli.registry import load_registry
+
+model = open_model(load_registry())
+p = model.vector({"V": 8.0, "W0": 9.0})
+def go(end):
+    return integrate(model, p, drive=Drive.constant(8.0), load=Modulation(9.0, 0.1, 120.0, 0.0), t=np.array([0.0, end]),
+                     start=np.asarray(model.steady(p)), rtol=1e-11, atol=np.full(4, 1e-11))
+go(0.01)  # compiled from here on
+print("begun", flush=True)
+try:
+    go(300.0)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+@needs_compiler
+@pytest.mark.skipif(os.name == "nt", reason="no SIGINT for one process there")
+def test_an_interruption_acts_within_compiled_code():
+    process = subprocess.Popen([sys.executable, "-c", LONG], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        time.sleep(0.5)  # within the integration, which would take half a minute
+        sent = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == "interrupted\n"
+        assert time.monotonic() - sent < 1.0  # 0.03 s on an idle machine
+        assert process.wait(timeout=20) == 0
+    finally:
+        process.kill()
+        process.stdout.close()
+        process.wait()
+
+
+@needs_compiler
+def test_other_threads_integrate_as_the_main_one_does(model):
+    found = []
+    worker = threading.Thread(target=lambda: found.append(motion_of(model, "compiled", rtol=1e-8).x))
+    worker.start()
+    worker.join()
+    assert (found[0] == motion_of(model, "compiled", rtol=1e-8).x).all()
 
 
 def test_without_a_compiler_lsoda_does_it(model, monkeypatch):

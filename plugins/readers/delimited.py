@@ -12,6 +12,7 @@ from srfcli.api import Source, SrfError, reader
 
 BLOCK = 4 * 2**20  # bytes that are parsed at a time
 LONGEST = 2**20  # bytes of a line
+SAMPLE = 2**16  # bytes by which the number of lines is estimated
 NOTHING = {"", "nan", "na", "n/a", "null", "none", "-nan", "#n/a"}
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+-]?\d+)?")
 INFINITE = re.compile(r"[+-]?inf(?:inity)?", re.IGNORECASE)
@@ -60,7 +61,19 @@ def _open(path: Path, delimiters: str) -> Source:
             "Begin the file with one, as in: time [s],normal_load [N],elongation [um]",
         )
     table = _Table(path, headings, delimiter, number, offset)
-    return Source(headings, table.blocks)
+    return Source(headings, table.blocks, about=_about(path, offset))
+
+
+def _about(path: Path, offset: int) -> int | None:
+    """Return how many lines there are below the headings, going by some of them at the beginning, the middle and the end."""
+    size, lines, length = path.stat().st_size - offset, 0, 0
+    with path.open("rb") as stream:
+        for at in sorted({0, max(size // 2 - SAMPLE, 0), max(size - SAMPLE, 0)}):
+            stream.seek(offset + at)
+            part = stream.read(SAMPLE).partition(b"\0")[0].replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+            lines += part.count(b"\n")
+            length += part.rfind(b"\n") + 1
+    return size * lines // length if length else None
 
 
 def _heading(path: Path) -> tuple[str, int, int]:

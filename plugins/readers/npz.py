@@ -3,12 +3,14 @@
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
 from srfcli.api import Source, SrfError, reader
 
 ROWS = 2**18  # read at a time
+WHOLE = "Was the file copied to its end?"
 
 
 @reader(name="npz", suffixes=(".npz",), sniff=lambda head: head.startswith(b"PK\x03\x04") and b".npy" in head)
@@ -16,8 +18,8 @@ def npz(path: Path) -> Source:
     """NumPy archive, an array for each column; units in the names, in an array `units`, or in [columns]"""
     try:
         archive = zipfile.ZipFile(path)
-    except zipfile.BadZipFile as error:
-        raise SrfError(f"{path}: not a whole archive: {error}", "Was the file copied to its end?") from None
+    except Exception as error:  # a damaged archive fails in many ways
+        raise SrfError(f"{path}: not a whole archive: {_told(error)}", WHOLE) from None
     with archive:
         members = [m for m in archive.namelist() if m.endswith(".npy")]
         shapes = {m: _header(path, archive, m) for m in members}
@@ -55,42 +57,60 @@ def _length(shape: tuple[int, ...]) -> int | None:
 
 
 def _header(path: Path, archive: zipfile.ZipFile, member: str) -> tuple[tuple[int, ...], np.dtype]:
-    with archive.open(member) as stream:
+    with _opened(path, archive, member) as stream:
         return _start(path, member, stream)
 
 
-def _start(path: Path, member: str, stream) -> tuple[tuple[int, ...], np.dtype]:
+def _opened(path: Path, archive: zipfile.ZipFile, member: str) -> IO[bytes]:
+    try:
+        return archive.open(member)
+    except Exception as error:  # damaged, encrypted, or packed in a way of its own
+        raise SrfError(
+            f"{path}: array '{member.removesuffix('.npy')}' cannot be opened: {_told(error)}", WHOLE
+        ) from None
+
+
+def _told(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _start(path: Path, member: str, stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     try:
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read(stream)
-    except (ValueError, zipfile.BadZipFile, OSError, EOFError) as error:
-        raise SrfError(f"{path}: array '{member.removesuffix('.npy')}' cannot be read: {error}") from None
+    except Exception as error:  # the header is text, parsed
+        raise SrfError(f"{path}: array '{member.removesuffix('.npy')}' cannot be read: {_told(error)}", WHOLE) from None
+    if not all(isinstance(n, int) and n >= 0 for n in shape):
+        raise SrfError(f"{path}: array '{member.removesuffix('.npy')}' has the shape {shape}", WHOLE)
     return shape, dtype
 
 
 def _units(path: Path, archive: zipfile.ZipFile) -> list[str]:
-    with archive.open("units.npy") as stream:
+    with _opened(path, archive, "units.npy") as stream:
         shape, dtype = _start(path, "units.npy", stream)
         if dtype.kind not in "US" or len(shape) != 1 or shape[0] > 10_000:
             raise SrfError(f"{path}: `units` is no list of texts", 'Save np.array(["s", "um/s", "N", "um"]).')
-        found = np.frombuffer(stream.read(dtype.itemsize * shape[0]), dtype=dtype)
-    return [u.decode("utf-8", "replace") if isinstance(u, bytes) else str(u) for u in found.tolist()]
+        try:
+            found = np.frombuffer(stream.read(dtype.itemsize * shape[0]), dtype=dtype)
+            return [u.decode("utf-8", "replace") if isinstance(u, bytes) else str(u) for u in found.tolist()]
+        except Exception as error:
+            raise SrfError(f"{path}: `units` cannot be read: {_told(error)}", WHOLE) from None
 
 
 class _Stream:
     """One array of an archive, taken from front to back without ever being held whole."""
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, member: str) -> None:
-        self.path, self.member, self.stream = path, member, archive.open(member)
+        self.path, self.member, self.stream = path, member, _opened(path, archive, member)
         _, self.dtype = _start(path, member, self.stream)
 
     def take(self, count: int) -> np.ndarray:
         """Return the next `count` numbers."""
         try:
             data = self.stream.read(count * self.dtype.itemsize)
-        except (zipfile.BadZipFile, OSError, EOFError) as error:
-            raise SrfError(f"{self.path}: {self.member}: {error}", "Was the file copied to its end?") from None
+        except Exception as error:
+            raise SrfError(f"{self.path}: {self.member}: {_told(error)}", WHOLE) from None
         if len(data) != count * self.dtype.itemsize:
-            raise SrfError(f"{self.path}: {self.member}: ends early", "Was the file copied to its end?")
+            raise SrfError(f"{self.path}: {self.member}: ends early", WHOLE)
         return np.frombuffer(data, dtype=self.dtype).astype(float)

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import EXIT_USAGE, SrfCommand, SrfGroup
-from srfcli.cli.laws import KIND, plugins_option
+from srfcli.cli.laws import LAW_KIND, plugins_option
 from srfcli.errors import ExpressionError, SrfError, did_you_mean
 
 if TYPE_CHECKING:
-    from srfcli.laws import Law
+    from srfcli.laws import Effect, Law
     from srfcli.registry import Registry
 
 EPILOG = """
@@ -31,6 +31,7 @@ srf law show dieterich --json
 NEW_EPILOG = """
 srf law new my-law
 srf law new my-ageing --kind ageing --python
+srf law new my-effect --kind effect
 """
 CHECK_EPILOG = """
 srf law check my-law.toml
@@ -45,7 +46,7 @@ def law() -> None:
 
 @law.command(cls=SrfCommand, epilog=SHOW_EPILOG)
 @click.argument("name")
-@click.option("--kind", type=KIND, help="Which one, where two kinds of law share a name.")
+@click.option("--kind", type=LAW_KIND, help="Which one, where two kinds of law share a name.")
 @click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
 @plugins_option
 def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
@@ -62,7 +63,7 @@ def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) 
 
 @law.command(cls=SrfCommand, epilog=NEW_EPILOG)
 @click.argument("name")
-@click.option("--kind", type=KIND, default="friction", show_default=True, help="What kind of law.")
+@click.option("--kind", type=LAW_KIND, default="friction", show_default=True, help="What kind of law.")
 @click.option("--python", is_flag=True, help="Write a Python file in place of TOML.")
 @click.option("--force", is_flag=True, help="Overwrite a file, or take a name that a law already has.")
 def new(name: str, kind: str, python: bool, force: bool) -> None:
@@ -82,18 +83,26 @@ def new(name: str, kind: str, python: bool, force: bool) -> None:
         raise SrfError(f"{path} exists", "Give --force to overwrite it, or another name.")
     path.write_text(template(kind, name, python=python), encoding="utf-8")
     click.echo(str(path))
+    click.echo(f"Next: srf law check {path}" + _use(kind, name), err=True)
+
+
+def _use(kind: str, name: str) -> str:
+    """Return the command that shows a new law at work, after a semicolon; an effect has no stability analysis of its own."""
     use = {"friction": f"--law {name}", "ageing": f"--ageing {name}", "interface": f"--interface {name}"}
     option = use.get(kind, f"--ageing dieterich+{name}")
-    click.echo(f"Next: srf law check {path}; srf linear {option} --plugins .", err=True)
+    return "" if kind == "effect" else f"; srf linear {option} --plugins ."
 
 
 @law.command(cls=SrfCommand, epilog=CHECK_EPILOG)
 @click.argument("name", metavar="FILE|NAME")
-@click.option("--kind", type=KIND, help="Which one, where two kinds of law share a name.")
+@click.option("--kind", type=LAW_KIND, help="Which one, where two kinds of law share a name.")
 @plugins_option
 @click.pass_context
 def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, ...]) -> None:
-    """Check a law: parses, units, steady state, mu_v > 0, derivatives, worked values. Exit 2 if one fails."""
+    """Check a law: parses, units, steady state, mu_v > 0, derivatives, worked values. Exit 2 if one fails.
+
+    Of an effect: parses, units, a neutral value at which the model is the baseline, derivatives.
+    """
     from srfcli.lawcheck import Outcome, check_law
     from srfcli.registry import load_registry
 
@@ -136,9 +145,9 @@ def _find(registry: Registry, name: str, kind: str | None) -> list[Law]:
 
 
 def _document(one: Law) -> dict[str, Any]:
-    from srfcli.lawfile import FORMULA, formula_of, kind_of
+    from srfcli.lawfile import kind_of
+    from srfcli.laws import Effect
 
-    formula = formula_of(one)
     parameters = {
         p.name: {
             "default": p.default,
@@ -149,34 +158,84 @@ def _document(one: Law) -> dict[str, Any]:
         }
         for p in one.parameters
     }
+    own = _effect_document(one) if isinstance(one, Effect) else _law_document(one)
     checks = [{"quantity": c.quantity, "at": dict(c.at), "value": c.value, "rtol": c.rtol} for c in one.checks]
-    states = [{"name": s.name, "length": s.length, "weight": s.weight} for s in getattr(one, "states", ())]
     return {
         "name": one.name,
         "kind": kind_of(one),
         "about": one.about,
-        FORMULA[kind_of(one)]: None if formula is None else str(formula),
-        "states": states,
+        **own,
         "parameters": parameters,
         "cites": list(one.cites),
-        "checks": checks,
+        **({} if isinstance(one, Effect) else {"checks": checks}),
         "source": one.source,
     }
 
 
-def _text(one: Law) -> str:
+def _law_document(one: Law) -> dict[str, Any]:
     from srfcli.lawfile import FORMULA, formula_of, kind_of
 
-    kind = kind_of(one)
     formula = formula_of(one)
-    lines = [f"{one.name}  ({kind})", one.about, "", f"{FORMULA[kind]} = {'rigid' if formula is None else formula}"]
-    for state in getattr(one, "states", ()):
-        lines.append(f"state {state.name}: length {state.length}, weight {state.weight}")
+    states = [{"name": s.name, "length": s.length, "weight": s.weight} for s in getattr(one, "states", ())]
+    return {FORMULA[kind_of(one)]: None if formula is None else str(formula), "states": states}
+
+
+def _effect_document(one: Effect) -> dict[str, Any]:
+    from srfcli.effectfile import formula_text
+
+    states = [
+        {"name": s.name, "rate": formula_text(s.rate), "steady": formula_text(s.steady), "logarithmic": s.logarithmic}
+        for s in one.states
+    ]
+    return {
+        "changes": {slot: formula_text(formula) for slot, formula in one.written or one.changes},
+        "states": states,
+        "neutral": dict(one.neutral),
+        "constants": {c.name: {"value": c.default, "unit": c.unit, "about": c.about} for c in one.constants},
+        "settings": dict(one.settings),
+        "frees": list(one.frees),
+        "needs": list(one.needs),
+        "lacks": list(one.lacks),
+        "observed": one.observed or None,
+        "reported": one.reported,
+    }
+
+
+def _text(one: Law) -> str:
+    from srfcli.lawfile import kind_of
+    from srfcli.laws import Effect
+
+    lines = [
+        f"{one.name}  ({kind_of(one)})",
+        one.about,
+        "",
+        *(_effect_lines(one) if isinstance(one, Effect) else _law_lines(one)),
+    ]
     if one.parameters:
         lines += ["", *_parameter_lines(one)]
     if one.cites:
         lines += ["", *(f"[{number}] {cite}" for number, cite in enumerate(one.cites, 1))]
     return "\n".join([*lines, "", f"from {one.source}"])
+
+
+def _law_lines(one: Law) -> list[str]:
+    from srfcli.lawfile import FORMULA, formula_of, kind_of
+
+    formula = formula_of(one)
+    lines = [f"{FORMULA[kind_of(one)]} = {'rigid' if formula is None else formula}"]
+    return lines + [f"state {s.name}: length {s.length}, weight {s.weight}" for s in getattr(one, "states", ())]
+
+
+def _effect_lines(one: Effect) -> list[str]:
+    from srfcli.effectfile import formula_text, summary
+
+    lines = summary(one).split("; ")
+    lines += [f"{s.name} = {formula_text(s.steady)} in steady sliding" for s in one.states]
+    lines += [f"{c.name} = {c.default:g} {c.unit}" + (f", {c.about}" if c.about else "") for c in one.constants]
+    lines += [f"the baseline has {name} = {value:g}" for name, value in one.neutral]
+    lines += [f"for laws with {', '.join(one.needs)}"] if one.needs else []
+    lines += [f"for models without {', '.join(one.lacks)}"] if one.lacks else []
+    return lines + ([f"reported as {one.reported}"] if one.reported != one.name else [])
 
 
 def _parameter_lines(one: Law) -> list[str]:

@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from srfcli.output.tables import Table
     from srfcli.registry import Registry
 
-KIND = click.Choice(["friction", "ageing", "modifier", "interface", "reader"])
+KINDS = ["friction", "ageing", "modifier", "interface", "effect"]
+KIND = click.Choice([*KINDS, "reader"])
+LAW_KIND = click.Choice(KINDS)
 
 plugins_option = click.option(
     "--plugins",

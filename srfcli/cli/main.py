@@ -22,8 +22,14 @@ COMMANDS = {
     "critical": "srfcli.cli.critical:command",
     "continue": "srfcli.cli.continue_:command",
     "floquet": "srfcli.cli.floquet:command",
+    "map": "srfcli.cli.map:command",
+    "response": "srfcli.cli.response:command",
+    "compare": "srfcli.cli.compare:command",
+    "check": "srfcli.cli.check:command",
     "fit": "srfcli.cli.fit:command",
+    "diagnose": "srfcli.cli.diagnose:command",
     "simulate": "srfcli.cli.simulate:command",
+    "prove": "srfcli.cli.prove:command",
     "config": "srfcli.cli.config:command",
 }
 

@@ -70,7 +70,8 @@ def parse_over(text: str) -> Range:
     Spacing is logarithmic unless said where the ends are positive and a decade or more apart. Raises SrfError.
     """
     name, equals, body = (part.strip() for part in text.partition("="))
-    if not (equals and body and name.isidentifier()):
+    parts = name.split("/")  # K/W0 is a ratio, for the commands that take one
+    if not (equals and body and len(parts) <= 2 and all(part.isidentifier() for part in parts)):
         raise SrfError(f"--over {text!r} is not a range", FORM)
     if ":" not in body:
         values, unit = _numbers(name, body.split(","), text)

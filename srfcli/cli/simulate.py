@@ -66,6 +66,9 @@ def _options(function: Callable[..., Any]) -> Callable[..., Any]:
             help="A recorded load: a file with columns time and normal_load.",
         ),
         click.option(
+            "--format", "reader", metavar="READER", help="Read --load-file, or the runs' files, by this reader."
+        ),
+        click.option(
             "--onset", metavar="TIME", help="When the modulation begins to rise.  [default: at the first sample]"
         ),
         click.option("--rate", metavar="HZ", help="Samples per second, or one rate for each piece of --drive."),
@@ -177,6 +180,10 @@ def _check(given: dict[str, Any], experiment: Path | None, output: OutputOptions
     if experiment is None and given["runs"]:
         raise SrfError(
             "--run chooses among the runs of an experiment, and none is given", "srf simulate DIR --run NAME"
+        )
+    if given["reader"] is not None and experiment is None and given["load_file"] is None:
+        raise SrfError(
+            "--format names the reader of a file, and none is read", "Give --load-file FILE or an experiment."
         )
     for one, other in EXCLUSIVE:
         if given[one] is not None and given[other] is not None:

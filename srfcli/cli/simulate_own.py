@@ -43,7 +43,7 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     resolved = system.resolve(model.parameters, **{name: given[name] for name in ("V", "W0", "eps")})
     values, observable = resolved.values, given["observable"] or "elongation"
     p = model.vector(values)
-    recorded, begin, span, found = _recorded_load(system, given["load_file"])
+    recorded, begin, span, found = _recorded_load(system, given["load_file"], given["reader"])
     pieces = _drive_pieces(given, values["V"], span)
     f = values["f"] if values["eps"] else None
     rates = _rates(given["rate"], pieces, f)
@@ -93,14 +93,14 @@ def _drive_pieces(given: Mapping[str, Any], V: float, span: float | None) -> tup
 
 
 def _recorded_load(
-    system: SystemOptions, path: Path | None
+    system: SystemOptions, path: Path | None, reader: str | None
 ) -> tuple[Load | None, float, float | None, tuple[str, ...]]:
     """Return the load of --load-file, its first time, how long it is known, and what was found in it."""
     if path is None:
         return None, 0.0, None, ()
     from srfcli.recording.loadfile import read_load
 
-    load, t, notices = read_load(path, registry=system.registry())
+    load, t, notices = read_load(path, registry=system.registry(), format=reader)
     return load, float(t[0]), float(t[-1] - t[0]), tuple(map(str, notices))
 
 

@@ -26,7 +26,7 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
     from srfcli.recording.experiment import read_experiment
 
     registry = system.registry()
-    experiment = read_experiment(path, registry=registry)
+    experiment = read_experiment(path, registry=registry, format=given["reader"])
     choice = _choice(system, experiment.choice)
     model = _open(registry, choice)
     flags = _flags(system, model)
@@ -67,7 +67,8 @@ def _open(registry: Registry, choice: ModelChoice) -> GeneratedModel:
     from srfcli.model import open_model
 
     return open_model(
-        registry, law=choice.law, ageing=choice.ageing, interface=choice.interface, inertia=choice.inertia
+        registry, law=choice.law, ageing=choice.ageing, interface=choice.interface, inertia=choice.inertia,
+        effects=choice.effects,
     )
 
 

@@ -14,6 +14,7 @@
 #define NZ (3 * NX)
 #define MAX_NEWTON 12
 #define SHARE 30.0                          /* sensitivities are held to so much less than the states */
+#define MAX_UNSEEN 100000                   /* steps shorter than the resolution of t */
 #define NODES 4                             /* kept for output between steps */
 #define UNEVEN 50.0                         /* a neighbour so much shorter or longer would spoil the interpolation */
 
@@ -25,6 +26,8 @@ static const double A[3][3] = {
 /* error estimate: weights of the stage increments, and the real eigenvalue of A^-1 */
 static const double E[3] = {-10.04880939982741556, 1.38214273316074890, -0.33333333333333333};
 static const double U1 = 3.63783425274449573;
+/* last row of A^-1: the slope of the collocation polynomial at the step's end from the stage increments */
+static const double D[3] = {5.531972647421808261859, -7.531972647421808261859, 5.0};
 
 typedef struct {
     int n_knots, degree;
@@ -129,7 +132,7 @@ static int finite_all(const double *x, int n) {
 }
 
 typedef struct {
-    double t, x[NX], f[NX];
+    double t, x[NX], f[NX];                 /* f is the slope for output: from the increments, see segment() */
 } Node;
 
 /* weights of x and f at three nodes for the quintic Hermite polynomial at t; returns the number of nodes used */
@@ -146,31 +149,100 @@ static void hermite(int n, const double *node, double t, double *on_x, double *o
     }
 }
 
+#ifdef NT
+#define TN NT
+#else
+#define TN 1
+#endif
+
+/* the tables at one state: the first of the four numbers that count, their bumps, and what value and slope do to the rates */
 typedef struct {
-    int ns;
+    int cell[TN];
+    double value[4 * TN], slope[4 * TN], G[NX * 2 * TN];
+} Felt;
+
+static void feel(Felt *felt, const double *x, double V, double W, double W_dot, const double *p) {
+#ifdef NT
+    double arguments[NT], share, unused[4];
+    memset(arguments, 0, sizeof arguments);
+    memset(felt->G, 0, sizeof felt->G);
+    srf_table_arguments(x, V, W, W_dot, p, arguments);
+    srf_rates_tables(x, V, W, W_dot, p, felt->G);
+    for (int i = 0; i < NT; i++) {
+        const double *head = p + NP + 4 * i;
+        felt->cell[i] = -1;
+        if (head[3] < 4.0) continue;
+        felt->cell[i] = srf_cell(p, i, arguments[i], &share);
+        srf_weights(share, felt->value + 4 * i, felt->slope + 4 * i, unused);
+        int outside = arguments[i] < head[1] || arguments[i] > head[1] + head[2] * (head[3] - 3.0);
+        for (int k = 0; k < 4; k++) felt->slope[4 * i + k] = outside ? 0.0 : felt->slope[4 * i + k] / head[2];
+    }
+#else
+    (void)felt; (void)x; (void)V; (void)W; (void)W_dot; (void)p;
+#endif
+}
+
+static double bump(const Felt *felt, int r, int i, int k) {
+    return felt->G[r * 2 * TN + 2 * i] * felt->value[4 * i + k] + felt->G[r * 2 * TN + 2 * i + 1] * felt->slope[4 * i + k];
+}
+
+typedef struct {
+    int ns, own;                            /* all columns; those of parameters and starts come first, tables after them */
     const int *which;
+    int column[TN];                         /* where a table's columns begin, -1 for none */
     const double *scale;                    /* of each column: a unit of change of what it is the derivative by */
     double *S, *Sf, *work;                  /* NX x ns at each node, one after another */
+    int *active, stride;                    /* columns that the last step solved for, and how wide `work` is */
+    double *Sf_now;                         /* NX x ns, evaluated at the last node; Sf holds slopes for output */
     int nodes;
     Node node[NODES];
 } History;
 
 static void sensitivity_rates(History *q, int slot, Imposed *force) {
     if (!q->ns) return;
+    Felt felt;
     double V, W, W_dot, J[NX * NX], P[NX * NP];
     const Node *n = &q->node[slot];
-    double *S = q->S + (size_t)slot * NX * q->ns, *F = q->Sf + (size_t)slot * NX * q->ns;
+    double *S = q->S + (size_t)slot * NX * q->ns, *F = q->Sf_now;
     imposed(force, n->t, &V, &W, &W_dot);
     memset(J, 0, sizeof J);
     memset(P, 0, sizeof P);
     srf_jacobian(n->x, V, W, W_dot, force->p, J);
     srf_parameters(n->x, V, W, W_dot, force->p, P);
-    for (int r = 0; r < NX; r++)
-        for (int k = 0; k < q->ns; k++) {
-            double sum = q->which[k] < 0 ? 0.0 : P[r * NP + q->which[k]];
-            for (int c = 0; c < NX; c++) sum += J[r * NX + c] * S[c * q->ns + k];
-            F[r * q->ns + k] = sum;
+    feel(&felt, n->x, V, W, W_dot, force->p);
+    for (int r = 0; r < NX; r++) {
+        double *out = F + (size_t)r * q->ns;
+        memset(out, 0, q->ns * sizeof(double));
+        for (int c = 0; c < NX; c++) {
+            double j = J[r * NX + c];
+            const double *from = S + (size_t)c * q->ns;
+            for (int k = 0; k < q->ns; k++) out[k] += j * from[k];
         }
+        for (int k = 0; k < q->own; k++)
+            if (q->which[k] >= 0) out[k] += P[r * NP + q->which[k]];
+        for (int i = 0; i < TN; i++)
+            for (int k = 0; q->column[i] >= 0 && felt.cell[i] >= 0 && k < 4; k++) out[q->column[i] + felt.cell[i] + k] += bump(&felt, r, i, k);
+    }
+}
+
+/* slopes of S at the step's end, from the increments that step_sensitivities left in q->work */
+static void output_slopes(History *q, double h) {
+    int ns = q->ns, m = q->stride, carried = ns > q->own, na = m - (carried ? NX : 0);
+    size_t rows = (size_t)NX * m;
+    const double *S = q->S + (size_t)(q->nodes - 1) * NX * ns;
+    double *F = q->Sf + (size_t)q->nodes * NX * ns, slope[NX];
+    for (int r = 0; r < NX; r++) {
+        const double *B = q->work + (size_t)r * m;
+        double *out = F + (size_t)r * ns;
+        if (carried) {
+            memset(out, 0, ns * sizeof(double));
+            for (int c = 0; c < NX; c++) {
+                slope[c] = (D[0] * B[na + c] + D[1] * B[rows + na + c] + D[2] * B[2 * rows + na + c]) / h;
+                for (int k = q->own; k < ns; k++) out[k] += slope[c] * S[(size_t)c * ns + k];
+            }
+        }
+        for (int k = 0; k < na; k++) out[q->active[k]] = (D[0] * B[k] + D[1] * B[rows + k] + D[2] * B[2 * rows + k]) / h;
+    }
 }
 
 static void drop_oldest(History *q) {
@@ -260,13 +332,13 @@ static int stages(Imposed *force, const Node *from, double h, const double *Z0, 
 }
 
 /* the embedded estimate of order 3, filtered by the Jacobian at the step's start */
-static double estimate(Imposed *force, const Node *from, double h, const double *Z, const double *J0, double rtol, const double *atol, int cautious) {
+static double estimate(Imposed *force, const Node *from, const double *f0, double h, const double *Z, const double *J0, double rtol, const double *atol, int cautious) {
     double matrix[NX * NX], known[NX], e[NX], x[NX], f[NX], V, W, W_dot;
     int pivot[NX];
     for (int r = 0; r < NX; r++) {
         for (int c = 0; c < NX; c++) matrix[r * NX + c] = (r == c ? U1 / h : 0.0) - J0[r * NX + c];
         known[r] = (E[0] * Z[r] + E[1] * Z[NX + r] + E[2] * Z[2 * NX + r]) / h;
-        e[r] = known[r] + from->f[r];
+        e[r] = known[r] + f0[r];
     }
     if (!factor(NX, matrix, pivot)) return INFINITY;
     solve(NX, matrix, pivot, e, 1);
@@ -285,52 +357,106 @@ static double estimate(Imposed *force, const Node *from, double h, const double 
     return isfinite(size) ? fmax(size, 1e-10) : INFINITY;
 }
 
-/* S after the step: the linear equations of the stages with their converged Jacobians */
+/* how far the output's polynomial passes by the inner stages. The estimate's filter forgives a stiff component everything
+   between the nodes: at rest ln v follows the load as if there were no inertia, and turns within what u would take in one step. */
+static double between(const Node *from, double h, const double *Z, double rtol, const double *atol) {
+    double worst = 0.0, gap[NX];
+    for (int i = 0; i < 2; i++) {
+        double s = C[i];
+        for (int r = 0; r < NX; r++) {
+            double end = Z[2 * NX + r], slope = D[0] * Z[r] + D[1] * Z[NX + r] + D[2] * end;
+            gap[r] = Z[i * NX + r] - s * (1 - s) * (1 - s) * h * from->f[r] - s * s * (3 - 2 * s) * end - s * s * (s - 1) * slope;
+        }
+        worst = fmax(worst, norm(gap, from->x, rtol, atol));
+    }
+    return worst;
+}
+
+/* S after the step: the linear equations of the stages with their converged Jacobians. A column that nothing feeds during the
+   step, as that of a table's number which is not felt there, is only carried on. */
 static int step_sensitivities(History *q, Imposed *force, const Node *from, double h, const double *Z) {
-    int ns = q->ns, pivot[NZ];
-    double matrix[NZ * NZ], J[3][NX * NX], P[NX * NP], x[NX], V, W, W_dot, *B = q->work;
+    int ns = q->ns, na = q->own, pivot[NZ], carried = ns > q->own;
+    double matrix[NZ * NZ], J[3][NX * NX], P[3][NX * NP], x[NX], V, W, W_dot, *B = q->work;
+    Felt felt[3];
     const double *S = q->S + (size_t)(q->nodes - 1) * NX * ns;
-    double *G = B + (size_t)NZ * ns;
     for (int i = 0; i < 3; i++) {
         imposed(force, from->t + C[i] * h, &V, &W, &W_dot);
         for (int r = 0; r < NX; r++) x[r] = from->x[r] + Z[i * NX + r];
         memset(J[i], 0, sizeof J[i]);
-        memset(P, 0, sizeof P);
+        memset(P[i], 0, sizeof P[i]);
         srf_jacobian(x, V, W, W_dot, force->p, J[i]);
-        srf_parameters(x, V, W, W_dot, force->p, P);
-        for (int r = 0; r < NX; r++)
-            for (int k = 0; k < ns; k++) {
-                double sum = q->which[k] < 0 ? 0.0 : P[r * NP + q->which[k]];
-                for (int c = 0; c < NX; c++) sum += J[i][r * NX + c] * S[c * ns + k];
-                G[((size_t)i * NX + r) * ns + k] = sum;
-            }
+        srf_parameters(x, V, W, W_dot, force->p, P[i]);
+        if (carried) feel(&felt[i], x, V, W, W_dot, force->p);
     }
+    int *active = q->active;
+    for (int k = 0; k < na; k++) active[k] = k;
+    for (int t = 0; carried && t < TN; t++)
+        for (int i = 0; q->column[t] >= 0 && i < 3; i++)
+            for (int k = 0; felt[i].cell[t] >= 0 && k < 4; k++) {
+                int column = q->column[t] + felt[i].cell[t] + k, known = 0;
+                for (int j = q->own; j < na; j++) known |= active[j] == column;
+                if (!known) active[na++] = column;
+            }
+    int m = na + (carried ? NX : 0);
+    double *G = B + (size_t)NZ * m;
+    q->stride = m;
     for (int i = 0; i < 3; i++)
-        for (int r = 0; r < NX * ns; r++)
-            B[(size_t)i * NX * ns + r] = h * (A[i][0] * G[r] + A[i][1] * G[(size_t)NX * ns + r] + A[i][2] * G[(size_t)2 * NX * ns + r]);
+        for (int r = 0; r < NX; r++) {
+            double *out = G + ((size_t)i * NX + r) * m;
+            for (int k = 0; k < na; k++) {
+                double sum = k < q->own && q->which[k] >= 0 ? P[i][r * NP + q->which[k]] : 0.0;
+                for (int c = 0; c < NX; c++) sum += J[i][r * NX + c] * S[(size_t)c * ns + active[k]];
+                out[k] = sum;
+            }
+            for (int k = na; k < m; k++) out[k] = J[i][r * NX + k - na];
+            for (int t = 0; carried && t < TN; t++)
+                for (int k = 0; q->column[t] >= 0 && felt[i].cell[t] >= 0 && k < 4; k++)
+                    for (int j = q->own; j < na; j++)
+                        if (active[j] == q->column[t] + felt[i].cell[t] + k) out[j] += bump(&felt[i], r, t, k);
+        }
+    size_t rows = (size_t)NX * m;
+    for (int i = 0; i < 3; i++)
+        for (size_t r = 0; r < rows; r++)
+            B[(size_t)i * rows + r] = h * (A[i][0] * G[r] + A[i][1] * G[rows + r] + A[i][2] * G[2 * rows + r]);
     if (!stage_matrix((const double(*)[NX * NX])J, h, matrix, pivot)) return 0;
-    solve(NZ, matrix, pivot, B, ns);
+    solve(NZ, matrix, pivot, B, m);
     double *after = q->S + (size_t)q->nodes * NX * ns;
-    for (int r = 0; r < NX * ns; r++) after[r] = S[r] + B[(size_t)2 * NX * ns + r];
+    for (int r = 0; r < NX; r++) {
+        double *out = after + (size_t)r * ns;
+        const double *gained = B + 2 * rows + (size_t)r * m;
+        if (carried) {
+            memcpy(out, S + (size_t)r * ns, ns * sizeof(double));
+            for (int c = 0; c < NX; c++) {
+                const double *before = S + (size_t)c * ns, through = gained[na + c];
+                for (int k = q->own; k < ns; k++) out[k] += through * before[k];
+            }
+        }
+        for (int k = 0; k < na; k++) out[active[k]] = S[(size_t)r * ns + active[k]] + gained[k];
+    }
     return finite_all(after, NX * ns);
 }
 
-/* the same estimate for the sensitivities, from the increments that step_sensitivities left in q->work; its largest norm */
+/* the same estimate for parameters and starts, from the increments that step_sensitivities left in q->work; its largest norm */
 static double estimate_sensitivities(const History *q, double h, const double *J0, double rtol, const double *atol) {
-    int ns = q->ns, pivot[NX];
-    double matrix[NX * NX], worst = 0.0, *B = q->work, *e = B + (size_t)NZ * ns;
-    size_t size = (size_t)NX * ns;
-    const double *S = q->S + (q->nodes - 1) * size, *F = q->Sf + (q->nodes - 1) * size;
+    int ns = q->ns, own = q->own, pivot[NX];
+    size_t size = (size_t)NX * ns, rows = (size_t)NX * q->stride;
+    double matrix[NX * NX], worst = 0.0, *B = q->work, *e = B + 3 * rows;
+    const double *S = q->S + (q->nodes - 1) * size, *F = q->Sf_now;
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < NX; c++) matrix[r * NX + c] = (r == c ? U1 / h : 0.0) - J0[r * NX + c];
+    if (!own) return 0.0;
     if (!factor(NX, matrix, pivot)) return INFINITY;
-    for (size_t r = 0; r < size; r++) e[r] = (E[0] * B[r] + E[1] * B[size + r] + E[2] * B[2 * size + r]) / h + F[r];
-    solve(NX, matrix, pivot, e, ns);
-    for (int k = 0; k < ns; k++) {
+    for (int r = 0; r < NX; r++)
+        for (int k = 0; k < own; k++) {
+            const double *b = B + (size_t)r * q->stride + k;
+            e[r * own + k] = (E[0] * b[0] + E[1] * b[rows] + E[2] * b[2 * rows]) / h + F[(size_t)r * ns + k];
+        }
+    solve(NX, matrix, pivot, e, own);
+    for (int k = 0; k < own; k++) {
         double sum = 0.0;
         for (int r = 0; r < NX; r++) {
-            double x = S[r * ns + k], own = e[r * ns + k] / (SHARE * (atol[r] * q->scale[k] + rtol * fabs(x)));
-            sum += own * own;
+            double x = S[(size_t)r * ns + k], one = e[r * own + k] / (SHARE * (atol[r] * q->scale[k] + rtol * fabs(x)));
+            sum += one * one;
         }
         worst = fmax(worst, sum);
     }
@@ -369,24 +495,29 @@ static double first_step(Imposed *force, const Node *n, double span, double rtol
 }
 
 /* integrates one smooth segment [a, b]; returns the next output index, or -1 - (it) where it stopped early */
-static int segment(Imposed *force, History *q, double a, double b, double rtol, const double *atol, double longest, long max_steps, int next, int nt, const double *t, double *X, double *S, double *stats) {
-    double V, W, W_dot, Z[NZ], Z0[NZ], J[3][NX * NX], J0[NX * NX], before = 0.0, last_error = 1.0, last_h = 0.0;
-    int rejected = 0, first = 1;
+static int segment(Imposed *force, History *q, double a, double b, double rtol, const double *atol, double longest, long max_steps, int next, int nt, const double *t, double *X, double *S, double *stats, const volatile int *stop) {
+    double V, W, W_dot, Z[NZ], Z0[NZ], J[3][NX * NX], J0[NX * NX], f0[NX], before = 0.0, last_error = 1.0, last_h = 0.0;
+    double carry = 0.0;
+    int rejected = 0, first = 1, unseen = 0;
     Node *now = &q->node[0];
     now->t = a;
     imposed(force, a, &V, &W, &W_dot);
     memset(now->f, 0, sizeof now->f);
     srf_rates(now->x, V, W, W_dot, force->p, now->f);
+    memcpy(f0, now->f, sizeof f0);
     q->nodes = 1;
     sensitivity_rates(q, 0, force);
+    if (q->ns) memcpy(q->Sf, q->Sf_now, (size_t)NX * q->ns * sizeof(double));
     double h = fmin(first_step(force, now, b - a, rtol, atol), longest);
     while (now->t < b) {
-        if (stats[0] + stats[1] >= max_steps) return -1 - next;
+        if (*stop || stats[0] + stats[1] >= max_steps) return -1 - next;
         double left = b - now->t;
         int final = h >= left * (1.0 - 1e-12);
         if (final) h = left;
         else if (2.0 * h > left) h = 0.5 * left;
-        if (h < 4.0 * DBL_EPSILON * fmax(fabs(now->t), fabs(b)) && !final) return -1 - next;
+        /* A slider that stops passes through many decades of v in less time than t can tell apart: t is summed with its carry,
+           and the steps may be as small as they like, though not for ever. */
+        if (h < 4.0 * DBL_EPSILON * fmax(fabs(now->t), fabs(b)) && !final && ++unseen > MAX_UNSEEN) return -1 - next;
         if (before > 0.0) predict(Z, before, h, Z0);
         else memset(Z0, 0, sizeof Z0);
         double kept[NZ];
@@ -401,7 +532,8 @@ static int segment(Imposed *force, History *q, double a, double b, double rtol, 
             imposed(force, now->t, &V, &W, &W_dot);
             memset(J0, 0, sizeof J0);
             srf_jacobian(now->x, V, W, W_dot, force->p, J0);
-            error = estimate(force, now, h, Z, J0, rtol, atol, first || rejected);
+            error = estimate(force, now, f0, h, Z, J0, rtol, atol, first || rejected);
+            if (!first) error = fmax(error, between(now, h, Z, rtol, atol));
             if (error < 1.0 && q->ns) {
                 double other = step_sensitivities(q, force, now, h, Z) ? estimate_sensitivities(q, h, J0, rtol, atol) : INFINITY;
                 error = fmax(error, other);
@@ -419,19 +551,27 @@ static int segment(Imposed *force, History *q, double a, double b, double rtol, 
             continue;
         }
         Node after;
-        after.t = final ? b : now->t + h;
+        double ahead = h + carry;
+        after.t = final ? b : now->t + ahead;
+        carry = final ? 0.0 : ahead - (after.t - now->t);
         for (int r = 0; r < NX; r++) after.x[r] = now->x[r] + Z[2 * NX + r];
-        memset(after.f, 0, sizeof after.f);
+        double f_after[NX];
+        memset(f_after, 0, sizeof f_after);
         imposed(force, after.t, &V, &W, &W_dot);
-        srf_rates(after.x, V, W, W_dot, force->p, after.f);
-        if (!finite_all(after.x, NX) || !finite_all(after.f, NX)) {
+        srf_rates(after.x, V, W, W_dot, force->p, f_after);
+        /* The rates at the step's end are J times what Newton's method left: at 1e-6 um/s J is 1e10 / s and they are noise.
+           The same slope from the increments carries that remainder over h. */
+        for (int r = 0; r < NX; r++) after.f[r] = (D[0] * Z[r] + D[1] * Z[NX + r] + D[2] * Z[2 * NX + r]) / h;
+        if (!finite_all(after.x, NX) || !finite_all(f_after, NX)) {
             h *= 0.25;
             rejected = 1;
             stats[1] += 1;
             before = 0.0;
             continue;
         }
+        memcpy(f0, f_after, sizeof f0);
         q->node[q->nodes] = after;
+        output_slopes(q, h);
         q->nodes++;
         sensitivity_rates(q, q->nodes - 1, force);
         stats[0] += 1;
@@ -454,9 +594,10 @@ static int segment(Imposed *force, History *q, double a, double b, double rtol, 
 }
 
 /* Returns how many output times were filled; stats: steps, rejected, Newton iterations, time reached.
-   X (nt, NX), S (nt, NX, ns); column k of S belongs to parameter which[k], or to an initial condition where which[k] < 0.
-   The output at t[0], the start, is the caller's. */
-int srf_integrate(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, int ns, const int *which, const double *scale, const double *S0, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, double *X, double *S, double *stats) {
+   X (nt, NX), S (nt, NX, ns); column k < own of S belongs to parameter which[k], or to an initial condition where which[k] < 0;
+   the numbers of table i, all of them, own the columns from column[i] on, if that is not negative.
+   The output at t[0], the start, is the caller's. Another thread may set *stop: the motion then ends with the step in hand. */
+int srf_integrate(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, int ns, int own, const int *column, const int *which, const double *scale, const double *S0, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, double *X, double *S, double *stats, const volatile int *stop) {
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, p};
     History q;
     size_t size = (size_t)NX * ns;
@@ -464,14 +605,19 @@ int srf_integrate(int n_segments, const double *edges, const double *drive, cons
     double *block = NULL;
     memset(&q, 0, sizeof q);
     q.ns = ns;
+    q.own = own;
+    for (int i = 0; i < TN; i++) q.column[i] = column[i];
     q.which = which;
     q.scale = scale;
     if (ns) {
-        block = malloc((2 * NODES + 6) * size * sizeof(double));
+        size_t widest = own + 12 * TN + NX;
+        block = malloc(((2 * NODES + 1) * size + 2 * NZ * widest) * sizeof(double) + widest * sizeof(int));
         if (!block) return -1;
         q.S = block;
         q.Sf = block + NODES * size;
         q.work = block + 2 * NODES * size;
+        q.Sf_now = q.work + 2 * NZ * widest;
+        q.active = (int *)(q.Sf_now + size);
         memcpy(q.S, S0, size * sizeof(double));
     }
     memcpy(q.node[0].x, x0, NX * sizeof(double));
@@ -488,7 +634,7 @@ int srf_integrate(int n_segments, const double *edges, const double *drive, cons
         force.V = drive[3 * k];
         force.acceleration = drive[3 * k + 1];
         force.since = drive[3 * k + 2];
-        int done = segment(&force, &q, edges[k], edges[k + 1], rtol, atol, longest, max_steps, next, nt, t, X, S, stats);
+        int done = segment(&force, &q, edges[k], edges[k + 1], rtol, atol, longest, max_steps, next, nt, t, X, S, stats, stop);
         if (done < 0) {
             stats[3] = q.node[q.nodes - 1].t;
             free(block);

@@ -27,6 +27,7 @@ GROWN = 3.0  # standard deviations of the last fit over which the next stage wan
 SHORTER = (1.0, 0.5, 0.25, 0.12)  # of the first horizons
 POOR = 4.0  # reduced chi-squared of a first stage that is not believed before shorter ones were tried
 CONVERGED = 0.1  # standard errors: how far the minimum may still be, by the gradient
+HOPELESS = 30.0  # chi-squared per degree of freedom at which a rough fit's horizons grow no more: the model cannot follow
 BAD = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
 
 
@@ -157,15 +158,17 @@ def fit(
     noises: Mapping[str, Noise] | None = None,
     progress: Callable[[str], None] = lambda text: None,
     refinements: int = 3,
+    rough: bool = False,
 ) -> Fit:
     """Return the maximum-likelihood fit from `start` (k,), the problem's own start values if left out.
 
     First with white noise of the level that the recordings' differences show and growing horizons, then with the noise that the
-    residuals show, until the two agree. KeyboardInterrupt becomes `Interrupted`, with the best parameters so far.
+    residuals show, until the two agree. KeyboardInterrupt becomes `Interrupted`, with the best parameters so far. A `rough` fit
+    stops early: it is where a better one starts from.
     """
-    search = Search(problem, progress)
+    search = Search(problem, progress, rough=rough)
     theta = np.clip(problem.start if start is None else start, problem.lower, problem.upper)
-    noise = {r.name: Noise(_first_level(r)) for r in problem.runs} if noises is None else dict(noises)
+    noise = {r.name: Noise(first_level(r)) for r in problem.runs} if noises is None else dict(noises)
     try:
         theta, status = search.grow(theta, noise)
         for _ in range(refinements if noises is None else 0):
@@ -179,20 +182,33 @@ def fit(
     return search.result(theta, noise, status)
 
 
-def _first_level(run: Run) -> float:
+def first_level(run: Run) -> float:
+    """Return the standard deviation of white noise that the recording itself shows."""
     level = white_level(run.observed, stretches(run.t, run.used))
     return max(level, run.quantum / np.sqrt(12), 1e-9 * float(np.ptp(run.observed)), 1e-300)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Where a growing fit stood: samples up to the horizons (s, by run) fitted, chi-squared for each degree of freedom."""
+
+    theta: Array
+    horizons: Mapping[str, float]
+    reduced: float
 
 
 class Search:
     """One minimisation: counts evaluations, keeps the best, and knows the covariance of the last."""
 
-    def __init__(self, problem: Problem, progress: Callable[[str], None]) -> None:
+    def __init__(self, problem: Problem, progress: Callable[[str], None], *, rough: bool = False) -> None:
         self.problem, self.progress = problem, progress
+        self.tolerance, self.most = (1e-4, 12) if rough else (1e-9, 60)
+        self.hopeless = HOPELESS if rough else np.inf
         self.evaluations = 0
         self.reduced = 1.0  # chi-squared for each degree of freedom
         self.best, self.covariance = problem.start, np.zeros((problem.start.size,) * 2)
         self.trail: list[tuple[float, str]] = []
+        self.stages: list[Stage] = []
         self.scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
 
     def grow(self, theta: Array, noise: Mapping[str, Noise]) -> tuple[Array, Status]:
@@ -200,6 +216,9 @@ class Search:
         width = np.minimum((self.problem.upper - self.problem.lower) / 6, 0.15 * self.scale)
         theta, status, horizons = self.first_stage(theta, noise, np.diag(width))
         covered = self.covered(horizons)
+        self.stages.append(Stage(theta, dict(horizons), self.reduced))
+        if self.reduced > self.hopeless:
+            return theta, status
         for stage in range(2, STAGES + 1):
             if covered >= 1.0:
                 break
@@ -211,7 +230,10 @@ class Search:
                 horizons, share = {}, 1.0
             self.progress(f"stage {stage}: {100 * share:.0f} % of the samples")
             theta, status = self.minimise(theta, noise, horizons)
+            self.stages.append(Stage(theta, dict(horizons), self.reduced))
             covered = share
+            if self.reduced > self.hopeless and covered < 1.0:
+                break
         return theta, status
 
     def first_stage(
@@ -247,7 +269,7 @@ class Search:
         problem = self.problem
         base = problem.predicted(run, theta)
         self.evaluations += 1
-        amplitude = max(float(np.std(run.observed)), 10 * _first_level(run))
+        amplitude = max(float(np.std(run.observed)), 10 * first_level(run))
         limit = float(run.t[-1])
         for d in directions.T:
             moved = np.clip(theta + d, problem.lower, problem.upper)
@@ -278,7 +300,7 @@ class Search:
         inside = np.clip(theta / self.scale, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
         found = least_squares(
             lambda x: both(x)[0], inside, jac=lambda x: both(x)[1], bounds=(low, high), x_scale="jac",
-            ftol=1e-9, xtol=1e-9, gtol=1e-12, max_nfev=60,
+            ftol=self.tolerance, xtol=1e-9, gtol=1e-12, max_nfev=self.most,
         )  # fmt: skip
         self.best = found.x * self.scale
         information = found.jac.T @ found.jac

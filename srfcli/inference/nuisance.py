@@ -48,13 +48,22 @@ def basis(run: Run, trend: str) -> Array:
 
 
 def start_state(
-    model: GeneratedModel, run: Run, p: Array, values: Mapping[str, float], by: Sequence[str]
+    model: GeneratedModel,
+    run: Run,
+    p: Array,
+    values: Mapping[str, float],
+    by: Sequence[str],
+    numbers: Sequence[int] = (),
 ) -> tuple[Array, Array]:
     """Return the state (n,) at the first sample and its derivatives (n, k): steady sliding, or what `values` say of a free start.
+
+    `numbers` are places in `p`, beyond the parameters, of tables' numbers: columns after those of `by`.
 
     A free start is in balance: the friction law gives the slip velocity at which mu and the ages meet, z follows it.
     """
     places = {name: model.index(name) for name in by if name in model.names}
+    places |= {f"[{place}]": place for place in numbers}
+    by = [*by, *(f"[{place}]" for place in numbers)]
     if run.initial != "free":
         x0 = np.asarray(model.steady(p))
         S0 = np.zeros((x0.size, len(by)))

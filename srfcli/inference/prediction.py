@@ -10,8 +10,11 @@ import numpy as np
 from srfcli.inference.nuisance import TINY, basis, start_state
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array
+from srfcli.numerics.load import Load
 from srfcli.numerics.motion import integrate
+from srfcli.recording.load import find_modulation
 from srfcli.recording.values import Experiment, Run
+from srfcli.splines import Spline, appended
 from srfcli.status import Status
 from srfcli.units import split_quantity
 
@@ -40,7 +43,56 @@ def run_parameters(model: GeneratedModel, experiment: Experiment, run: Run, valu
         base["K"] = listed["K"] * stiffness_share(experiment, run)
     first = float(run.t[0])
     V, rate, since = run.drive.piece(first)
+    if "begin" in model.names:
+        base |= of_run(run)
     return model.vector({**base, "V": V + rate * (first - since) if rate else V, "W0": run.load.rest(first)})
+
+
+def of_run(run: Run) -> dict[str, float]:
+    """Return what effects ask of a recording: where and when it begins, and the load's modulation as it is in the data."""
+    return {"start": run.start, "begin": float(run.t[0]), **_modulation(run)}
+
+
+def _modulation(run: Run) -> dict[str, float]:
+    """Return frequency, amplitude and phase at clock 0 of the load's modulation, onset and time scale of its switch-on."""
+    known = _MODULATIONS.get(id(run.load))
+    if known is not None and known[0] is run.load:
+        return known[1]
+    W = run.load(run.t)[0]
+    found = find_modulation(run.t, W)
+    answer = {"f": 1.0, "eps": 0.0, "psi": 0.0, "onset0": -1e6, "rise0": 0.02, "modulated": 0.0}
+    if found is not None:
+        answer |= {"f": found.frequency, "modulated": 1.0} | _switched(
+            run, W, found.frequency, found.amplitude, found.onset
+        )
+    _MODULATIONS[id(run.load)] = (run.load, answer)
+    while len(_MODULATIONS) > 64:
+        _MODULATIONS.pop(next(iter(_MODULATIONS)))
+    return answer
+
+
+def _switched(run: Run, W: Array, f: float, eps: float, onset: float) -> dict[str, float]:
+    """Return amplitude, phase, onset and time scale by least squares on the load, W0 (1 + eps (1 + tanh)/2 cos)."""
+    from scipy.optimize import least_squares
+
+    t, begin = run.t, float(run.t[0])
+    on = t > (onset if np.isfinite(onset) else begin) + 10 / f
+    on = on if on.any() else t > t[t.size // 2]
+    mean = float(W[on].mean())
+    turned = (W[on] / mean - 1) * np.exp(-2j * np.pi * f * t[on])
+    psi = float(np.angle(turned.mean()))
+    if not np.isfinite(onset):
+        return {"eps": eps, "psi": psi}
+
+    def rest(x: Array) -> Array:
+        envelope = (1 + np.tanh((t - x[2]) / max(abs(x[3]), 1e-4))) / 2
+        return np.asarray(mean * (1 + x[0] * envelope * np.cos(2 * np.pi * f * t + x[1])) - W)
+
+    x = least_squares(rest, [eps, psi, onset, 0.02], x_scale=[eps, 0.1, 0.01, 0.01]).x
+    return {"eps": float(x[0]), "psi": float(x[1]), "onset0": float(x[2]), "rise0": max(abs(float(x[3])), 1e-4)}
+
+
+_MODULATIONS: dict[int, tuple[Load, dict[str, float]]] = {}  # it is asked for at every prediction
 
 
 def stiffness_share(experiment: Experiment, run: Run) -> float:
@@ -59,27 +111,35 @@ def predict(
     until: float = np.inf,
     rtol: float = RTOL,
     trend: str | None = None,
+    tables: Sequence[Spline] = (),
+    by_tables: Sequence[int] = (),
 ) -> Prediction:
     """Return the observable of `run` at its sample times up to `until` s, with derivatives by the parameters `by`.
+
+    Of a model with tables, J goes on with a column for each number of the tables in `by_tables`.
 
     It starts in steady sliding, or where `values` say (see `nuisance`). A trend is added to the observable: values["RUN.trend"]
     times displacement or time. Values are in um, s, N.
     """
     p = run_parameters(model, experiment, run, values)
+    if tables:
+        p = appended(p, tables)
     t = run.t[: max(int(np.sum(run.t <= until)), 2)]
     own = [k for k, name in enumerate(by) if name in model.names or name.startswith(f"{run.name}.")]
     moving = [k for k in own if not by[k].endswith(".trend")]
     names = [by[k] for k in moving]
     places = [model.index(n) if n in model.names else -1 for n in names]
-    share = np.array([stiffness_share(experiment, run) if n == "K" else 1.0 for n in names])
-    x0, S0 = start_state(model, run, p, values, names)
+    numbers = [int(p[len(model.names) + 4 * i]) + j for i in by_tables for j in range(tables[i].numbers.size)]
+    share = np.array([stiffness_share(experiment, run) if n == "K" else 1.0 for n in names] + [1.0] * len(numbers))
+    x0, S0 = start_state(model, run, p, values, names, numbers)
     size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
     motion = integrate(
-        model, p, drive=run.drive, load=run.load, t=t, start=x0, by=places, S0=S0, rtol=rtol, atol=rtol * size
-    )
-    y, slopes = _observe(model, run, t, motion.x, motion.S, p, places)
-    J = np.zeros((t.size, len(by)))
-    J[:, moving] = slopes * share
+        model, p[: len(model.names)], drive=run.drive, load=run.load, t=t, start=x0, by=places, S0=S0, tables=tables,
+        by_tables=by_tables, rtol=rtol, atol=rtol * size,
+    )  # fmt: skip
+    y, slopes = _observe(model, run, t, motion.x, motion.S, p, [*places, *numbers])
+    J = np.zeros((t.size, len(by) + len(numbers)))
+    J[:, [*moving, *range(len(by), J.shape[1])]] = slopes * share
     if trend:
         y = y + values[f"{run.name}.trend"] * basis(run, trend)[: t.size]
         J[:, [k for k in own if k not in moving]] = basis(run, trend)[: t.size, None]
@@ -94,8 +154,9 @@ def _observe(
     K = p[model.index("K")]
     factor = {"elongation": np.ones_like(W), "force": np.full_like(W, K), "friction": K / W}[run.observable]
     J = np.zeros((t.size, len(places)))
-    if "u" in model.states:
-        i = model.states.index("u")
+    recorded = model.namespace.get("OBSERVED") or "u"
+    if recorded in model.states:
+        i = model.states.index(recorded)
         u, J = x[:, i], S[:, i, :].copy()
     else:
         with np.errstate(all="ignore"):

@@ -24,17 +24,22 @@ from pathlib import Path
 from srfcli.cache import cache_folder, content_key
 from srfcli.errors import SrfError
 from srfcli.model import GeneratedModel
-from srfcli.numerics.ctext import LAMBERTW, c_function
+from srfcli.numerics.ctext import LAMBERTW, TABLES, c_function
 
 FLAGS = ("-O3", "-std=c99", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math")
 FUNCTIONS = {"rates": "srf_rates", "rates_jacobian": "srf_jacobian", "rates_parameters": "srf_parameters"}
+TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
 
 
 def c_source(model: GeneratedModel) -> str:
     """Return the C text of the integrator for this model."""
     head = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n"
-    needs = LAMBERTW if "lambertw(" in model.source else ""
-    body = "\n".join(c_function(model.source, name, label=label) for name, label in FUNCTIONS.items())
+    tables, functions = model.namespace.get("TABLES", ()), FUNCTIONS
+    if tables:
+        head += f"#define NT {len(tables)}\n"
+        functions = FUNCTIONS | TABLE_FUNCTIONS
+    needs = (LAMBERTW if "lambertw(" in model.source else "") + (TABLES if tables else "")
+    body = "\n".join(c_function(model.source, name, label=label) for name, label in functions.items())
     return head + needs + body + (files("srfcli") / "data" / "radau.c").read_text(encoding="utf-8")
 
 

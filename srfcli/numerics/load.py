@@ -6,6 +6,7 @@ import abc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 from itertools import pairwise
 
 import numpy as np
@@ -140,6 +141,16 @@ class Modulation(Load):
     def rest(self, t: float) -> float:
         return self.W0
 
+    def _on_piece(self, t: Array, at: float) -> Array:
+        """Return W at many times by the formula that holds at `at`: a record has tens of thousands of knots."""
+        if at < self.onset or not self.eps:
+            return np.full(t.shape, self.W0)
+        wave = self.eps * self.W0 * np.cos(2 * math.pi * self.f * t + self.phase)
+        if at < self.full:
+            r = (t - self.onset) / (self.full - self.onset)
+            wave *= r * r * r * (10 - 15 * r + 6 * r * r)
+        return self.W0 + wave
+
     def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
         _check_interval(start, end)
         inside = [b for b in self.breaks if start < b < end]
@@ -150,28 +161,34 @@ class Modulation(Load):
             if self.eps and middle >= self.onset:
                 length = 1 / self.f if middle >= self.full else min(1 / self.f, self.full - self.onset)
                 edges = np.linspace(a, b, math.ceil((b - a) * PIECES / length) + 1)
-            rows.append(fit_polynomials(self.piece(middle), edges))
+            rows.append(fit_polynomials(partial(self._on_piece, at=middle), edges))
             knots.append(edges[1:])
         return np.concatenate(knots), np.concatenate(rows)
 
 
-def fit_polynomials(function: LoadPiece, edges: Array) -> Array:
+def fit_polynomials(function: Callable[[Array], Array], edges: Array) -> Array:
     """Return the polynomials of degree 7 through W at the Chebyshev-Lobatto points of each interval, (k, 8), lowest first.
 
     They meet at the edges, and are written in the time since the interval's start.
     """
-    angles = np.pi * np.arange(DEGREE + 1) / DEGREE
-    shares = 0.5 - 0.5 * np.cos(angles)  # of the interval, rising
+    shares, to_powers = _interpolation()
     widths = np.diff(edges)
     times = edges[:-1, None] + widths[:, None] * shares
     times[:, -1] = edges[1:]
-    values = np.array([function(s)[0] for s in times.ravel().tolist()]).reshape(times.shape)
+    values = function(times)
     offset = values[:, :1]
-    series = np.polynomial.chebyshev.chebfit(2 * shares - 1, (values - offset).T, DEGREE)  # (8, k): interpolates
-    to_powers = np.array([_shifted_chebyshev(j) for j in range(DEGREE + 1)])  # row j: T_j(2 r - 1) in powers of r
-    powers = series.T @ to_powers
+    powers = (values - offset) @ to_powers
     powers[:, 0] += offset[:, 0]
     return powers / widths[:, None] ** np.arange(DEGREE + 1)
+
+
+@cache
+def _interpolation() -> tuple[Array, Array]:
+    """Return the points in [0, 1], rising, and the matrix that turns values there into coefficients of powers."""
+    shares = 0.5 - 0.5 * np.cos(np.pi * np.arange(DEGREE + 1) / DEGREE)
+    series = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * shares - 1, DEGREE))
+    to_powers = np.array([_shifted_chebyshev(j) for j in range(DEGREE + 1)])  # row j: T_j(2 r - 1) in powers of r
+    return shares, (series.T @ to_powers)
 
 
 def _shifted_chebyshev(degree: int) -> Array:

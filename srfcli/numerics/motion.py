@@ -8,19 +8,24 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
+from srfcli.errors import SrfError
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array
 from srfcli.numerics.compiled import compiled
 from srfcli.numerics.load import Load
 from srfcli.numerics.program import Drive
+from srfcli.splines import Spline, appended
 from srfcli.status import Status
 
+PATIENCE = 0.1  # s between looks for a signal where waiting for a thread cannot be interrupted (Windows)
 MAX_STEPS = 20_000_000  # of the compiled integrator, in all; a hundred times an hour of modulation
 
 
@@ -45,21 +50,32 @@ def integrate(
     start: Array,
     by: Sequence[int] = (),
     S0: Array | None = None,
+    tables: Sequence[Spline] = (),
+    by_tables: Sequence[int] = (),
     rtol: float = 1e-8,
     atol: Array,
 ) -> Motion:
     """Return the motion from `start` (n,) at t[0] (s) to the rising times `t`, with the model's parameters `p` (n_parameters,).
 
     `by` are places in `p`, or -1 for a direction of the initial state alone; S0 (n, k) is the derivative of `start`, zero if left
-    out. `atol` (n,). Errors are local, per step; those of S are held to some tens of times the bound on x.
+    out. A model with tables takes them in order; S then ends with a column for each number of the tables in `by_tables`, which
+    rises. `atol` (n,). Errors are local, per step; those of S are held to some tens of times the bound on x.
     """
     library = compiled(model)
-    S0 = np.zeros((start.size, len(by))) if S0 is None else np.ascontiguousarray(S0, dtype=float)
+    count = len(by) + sum(tables[i].numbers.size for i in by_tables)
+    S0 = np.zeros((start.size, count)) if S0 is None else np.ascontiguousarray(S0, dtype=float)
+    missing = len(model.namespace.get("TABLES", ())) - len(tables)
+    p = appended(np.asarray(p, dtype=float), [*tables, *[Spline.none()] * missing]) if tables or missing else p
     if library is None:
         from srfcli.numerics.lsoda import integrate_lsoda
 
+        if by_tables:
+            raise SrfError("derivatives by a table's numbers need a C compiler", "install one, or the package ziglang")
         return integrate_lsoda(model, p, drive, load, t, start, by, S0, rtol, atol)
-    return _integrate_compiled(library, p, drive, load, t, start, by, S0, rtol, atol)
+    own, columns = len(by), np.full(max(len(tables), 1), -1, dtype=np.intc)
+    for i in by_tables:
+        columns[i], own = own, own + tables[i].numbers.size
+    return _integrate_compiled(library, p, drive, load, t, start, by, columns, S0, rtol, atol)
 
 
 def pieces(t: Array, drive: Drive, load: Load) -> Iterator[tuple[float, float]]:
@@ -76,6 +92,7 @@ def _integrate_compiled(
     t: Array,
     start: Array,
     by: Sequence[int],
+    columns: NDArray[np.intc],
     S0: Array,
     rtol: float,
     atol: Array,
@@ -90,19 +107,41 @@ def _integrate_compiled(
     )
     ranges = np.column_stack([low, high]).astype(np.intc)
     middle = [drive.piece(0.5 * (a + b)) for a, b in segments]
-    n, k = start.size, len(by)
+    n, k = start.size, S0.shape[1]
     x, S = np.full((t.size, n), np.nan), np.full((t.size, n, k), np.nan)
-    stats = np.zeros(4)
-    filled = library.srf_integrate(
+    stats, stop = np.zeros(4), ctypes.c_int(0)
+    arguments = (
         len(segments), _d(edges), _d(np.array(middle, dtype=float)), _i(ranges), len(knots), coefficients.shape[1] - 1,
         _d(knots), _d(coefficients), _d(np.asarray(p, dtype=float)), _d(np.asarray(start, dtype=float)), k,
-        _i(np.array(by or [-1], dtype=np.intc)), _d(sensitivity_scale(p, by)), _d(S0), ctypes.c_double(rtol_of_estimate(rtol)),
+        len(by), _i(columns), _i(np.array(by or [-1], dtype=np.intc)), _d(sensitivity_scale(p, by)), _d(S0),
+        ctypes.c_double(rtol_of_estimate(rtol)),
         _d(np.asarray(atol) * rtol_of_estimate(rtol) / rtol),
         ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(MAX_STEPS),
-        t.size, _d(np.asarray(t, dtype=float)), _d(x), _d(S), _d(stats),
+        t.size, _d(np.asarray(t, dtype=float)), _d(x), _d(S), _d(stats), ctypes.byref(stop),
     )  # fmt: skip
+    filled = _interruptible(lambda: library.srf_integrate(*arguments), stop)
     status = Status.OK if filled == t.size else Status.INTEGRATION
     return Motion(x, S, status, float(stats[3]), int(stats[0]))
+
+
+def _interruptible(call: Callable[[], int], stop: ctypes.c_int) -> int:
+    """Return call(), which ends early once `stop` is set: by whatever a signal's handler raises, Ctrl-C as a rule.
+
+    Python's handlers run in the main thread alone, and only between its own instructions: compiled code there would hold them up.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return call()
+    answer: list[int] = []
+    worker = threading.Thread(target=lambda: answer.append(call()), daemon=True)
+    worker.start()
+    try:
+        while worker.is_alive():
+            worker.join(PATIENCE)
+    except BaseException:
+        stop.value = 1
+        worker.join()  # the arrays it writes into are still its own
+        raise
+    return answer[0]
 
 
 def sensitivity_scale(p: Array, by: Sequence[int]) -> Array:

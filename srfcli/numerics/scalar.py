@@ -14,6 +14,7 @@ from typing import Any
 
 from srfcli.errors import SrfError
 from srfcli.model import GeneratedModel
+from srfcli.splines import tables_after
 
 _ALIASES = {"arctan": math.atan, "arcsinh": math.asinh}
 _MATH = ("cos", "cosh", "exp", "expm1", "log", "log1p", "pi", "sin", "sinh", "sqrt", "tan", "tanh")
@@ -27,12 +28,13 @@ def scalar_function(model: GeneratedModel, name: str, p: Any) -> ScalarFunction:
     The state is a sequence of floats; a vector comes back as a tuple, a matrix as a tuple of rows. Overflow and logarithms
     of nothing raise, as `math` does.
     """
-    return _factory(model.source, name)([float(value) for value in p])
+    return _factory(model.source, name, len(model.names))([float(value) for value in p])
 
 
 @lru_cache(maxsize=64)
-def _factory(source: str, name: str) -> Callable[[list[float]], ScalarFunction]:
+def _factory(source: str, name: str, n: int) -> Callable[[list[float]], ScalarFunction]:
     namespace: dict[str, Any] = {f: getattr(math, f) for f in _MATH} | _ALIASES | {"lambertw": _lambertw}
+    namespace |= dict(zip(("lut", "lut1", "lut2"), tables_after(n), strict=True))
     exec(compile(scalar_source(source, name), f"<scalar {name}>", "exec"), namespace)
     return namespace["bind"]
 

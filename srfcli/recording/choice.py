@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from srfcli.errors import SrfError, did_you_mean
-from srfcli.laws import Parameter
+from srfcli.laws import Effect, Parameter
 from srfcli.recording.description import Apparatus
 from srfcli.recording.node import Node
 from srfcli.recording.values import FitParameter, ModelChoice, Notice
@@ -25,7 +25,7 @@ _IMPOSED = {
 
 def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[ModelChoice, tuple[Parameter, ...]]:
     """Return the chosen model and all parameters that its laws and the apparatus have, in declared units."""
-    node.keys(("law", "ageing", "interface", "inertia"))
+    node.keys(("law", "ageing", "interface", "inertia", "effects"))
     law = node.require("law", 'Name a friction law: law = "srf-vsat"; `srf laws` lists them.')
     ageing = node.require("ageing", 'Name an ageing law: ageing = "dieterich"; `srf laws` lists them.')
     interface, inertia = node.get("interface"), node.get("inertia")
@@ -52,7 +52,35 @@ def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[M
     parameters.append(Parameter("K", apparatus.stiffness, apparatus.unit, 0.0, math.inf, "stiffness"))
     if heavy and apparatus.mass is not None:
         parameters.append(Parameter("M", apparatus.mass * 1e6, "kg", 0.0, math.inf, "mass"))
-    return ModelChoice(names[0], names[1], surface, heavy), tuple(parameters)
+    effects = node.get("effects")
+    added, own = read_effects(effects, registry) if effects else ((), ())
+    return ModelChoice(names[0], names[1], surface, heavy, added), (*parameters, *own)
+
+
+def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple[Parameter, ...]]:
+    """Return the effects that a model has besides its laws, as `open_model` names them, and their parameters."""
+    from srfcli.system import apart  # only for a description that has effects
+
+    if not isinstance(node.value, list):
+        node.expected("a list of effects", 'Write effects = ["load-transmission"]; `srf laws --kind effect` lists them.')
+    names, found = [], []
+    for index in range(len(node.value)):
+        entry = node.child(index)
+        name = _place(entry.text(), node)
+        if name in names:
+            entry.fail(f"'{name}' is named twice", "Once is enough.")
+        try:
+            effect = registry.get("effect", name)
+        except SrfError as error:
+            entry.fail(error.message, error.hint)
+        assert isinstance(effect, Effect)
+        if effect.settings or effect.frees:
+            instead = [f"{key} = {str(value).lower()} in [model]" for key, value in effect.settings]
+            instead += [{"K": "another stiffness in [apparatus]", "M": "a mass in [apparatus]"}.get(n, n) for n in effect.frees]
+            entry.fail(f"'{effect.name}' only replaces what the description says itself", f"Write {', '.join(instead)}.")
+        names.append(name)
+        found.append(effect)
+    return tuple(names), tuple(p for effect in apart(found) for p in effect.parameters)
 
 
 def _place(name: str, node: Node) -> str:

@@ -16,6 +16,7 @@ from srfcli.recording.description import ROLES, ColumnSpec, RunDescription, chec
 from srfcli.recording.values import OBSERVABLES, Array, Notice
 
 LIMIT = 512 * 2**20  # bytes of needed columns that are held at a time
+HUGE = 1e30  # um, s, N: no measurement, but a gauge's word for none
 _HEADING = re.compile(r"\s*(.*?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
 
 
@@ -196,6 +197,9 @@ def _refuse_large(run: RunDescription, source: Source, columns: int, limit: int)
         )
     if needed > limit and run.window is None:
         _too_large(run, f"{source.rows} samples of {columns} needed columns are {_megabytes(needed)}", limit)
+    guess = (source.about or 0) * (columns + 1) * 8
+    if guess > 1.5 * limit and run.window is None:  # an estimate may be off; what is nearer is counted while it is read
+        _too_large(run, f"some {source.about:.2g} samples of {columns} needed columns are {_megabytes(guess)}", limit)
 
 
 def _too_large(run: RunDescription, what: str, limit: int) -> None:
@@ -225,7 +229,7 @@ def _collect(
                 arrays[0] = _integrated(run.file, channels[0], arrays[0], clock, row)
                 clock = float(arrays[0][-1]) if arrays[0].size else clock
         for values in arrays:
-            values[~np.isfinite(values)] = np.nan
+            values[~(np.abs(values) < HUGE)] = np.nan
         if np.isnan(first) and np.isfinite(arrays[0]).any():
             first = float(arrays[0][np.isfinite(arrays[0])][0])
         with np.errstate(invalid="ignore"):

@@ -13,6 +13,7 @@ from srfcli.recording.values import Array
 WIDEST = 3  # samples of a spike
 BESIDE = 5  # samples before and after that tell the level
 FACTOR = 8.0  # robust standard deviations
+FEW = 0.02  # share of samples that move: below it they are the accidents of a constant, and not its noise
 SATURATED = 10  # samples in a row at the extreme value
 LARGE = 0.05  # share of the level from which a jump is a transducer's for certain
 MOST_RESETS = 5  # more jumps than this are what the recording is about
@@ -55,7 +56,7 @@ def local_scale(x: Array, m: Array, width: int = 101) -> Array:
     rest = np.abs(x - m)
     near = median_filter(rest, size=min(width, x.size), mode="nearest")
     moving = rest[rest > 0]
-    overall = float(np.median(moving)) if moving.size else 0.0
+    overall = float(np.median(moving)) if moving.size > FEW * x.size else 0.0
     return np.asarray(2.0 * np.maximum(near, 0.5 * overall))  # the running median follows the noise by a quarter
 
 

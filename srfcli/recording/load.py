@@ -17,6 +17,9 @@ from srfcli.recording.values import Array, Notice
 
 NEGLIGIBLE = 1e-5  # of the range: noise that an interpolation may keep
 BLOCKS = 16  # in which a constant load has one mean
+ACCIDENTS = 5  # spikes that a load may have, and one more in 500 samples; so many more are what was imposed
+NOTHING = 1e-15  # N: no contact
+SMALLEST = 5e-4  # relative amplitude of a modulation: a servo wobbles by less
 DIFFERS = 0.05  # relative difference between a declared and a found modulation that is told
 
 
@@ -46,12 +49,6 @@ def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
         raise SrfError(f"{place.column}: no number in it", 'Give the run load = "5 N", or the column its numbers.')
     notices = spots("nan", ~known, path, rows, t, f"without a number in '{place.heading}'; the load is bridged")
     filled = np.interp(t, t[known], W[known])
-    if filled.min() <= 0:
-        at = int(filled.argmin())
-        raise SrfError(
-            f"{span(path, rows, t, at, at)}, column '{place.heading}': the load is {filled[at]:.6g} N",
-            "The slider must stay in contact: zero the gauge ([columns] offset), or take a window without this part.",
-        )
     clipped = saturation(filled, fewest=4)  # one such plateau may be the load that was set
     if clipped.any():
         first, last = np.flatnonzero(clipped)[[0, -1]]
@@ -60,14 +57,19 @@ def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
             f"value {filled[first]:.6g} N: the gauge is saturated, the load unknown",
             "Take a window without this part.",
         )
-    bad = spikes(filled, quantisation(filled), least=2e-3 * float(np.median(filled)))
-    if (
-        bad.sum() > 5 + W.size // 500
-    ):  # so many are no accidents: a modulation that begins in mid-record looks like this
+    least = 2e-3 * float(np.median(np.abs(filled)))
+    bad = spikes(filled, min(quantisation(filled), least), least=least)  # a spike on a constant is a lattice of its own
+    if bad.sum() > ACCIDENTS + W.size // 500:  # a modulation that begins in mid-record looks like this
         bad[:] = False
-    notices += spots("spike", bad, path, rows, t, f"that stand out in '{place.heading}'; the load is bridged")
+    notices += spots("spike", bad, path, rows, t, f"standing out in '{place.heading}'; the load is bridged")
     good = known & ~bad
     filled = np.interp(t, t[good], filled[good])
+    if filled.min() < NOTHING:
+        at = int(filled.argmin())
+        raise SrfError(
+            f"{span(path, rows, t, at, at)}, column '{place.heading}': the load is {filled[at]:.6g} N",
+            "The slider must stay in contact: zero the gauge ([columns] offset), or take a window without this part.",
+        )
     load, told = _smooth(place, filled)
     return load, [*notices, *told]
 
@@ -133,7 +135,7 @@ def find_modulation(t: Array, W: Array) -> Found | None:
         return None
     frequency, amplitude = _refined(tail_times, tail, line)
     mean = float(tail.mean())
-    if amplitude < 1e-5 * mean:
+    if amplitude < SMALLEST * mean:
         return None
     return Found(frequency, amplitude / mean, _onset(even, values, frequency, amplitude))
 

@@ -20,13 +20,15 @@ from srfcli.registry import Registry
 LOADS = ("normal_load", "normal_stress")
 
 
-def read_load(path: Path, *, registry: Registry, limit: int = LIMIT) -> tuple[Load, Array, tuple[Notice, ...]]:
+def read_load(
+    path: Path, *, registry: Registry, format: str | None = None, limit: int = LIMIT
+) -> tuple[Load, Array, tuple[Notice, ...]]:
     """Return the load in the columns `time` and `normal_load` (or `normal_stress`) of a data file, its times (n,) in s, and
-    what was found in the data. Units are those of the headings, else s, N and MPa.
+    what was found in the data. Units are those of the headings, else s, N and MPa. `format` names the file's reader.
 
     Raises SrfError for a missing column, fewer than four samples, and more than `limit` bytes.
     """
-    source = open_source(path, registry=registry)
+    source = open_source(path, registry=registry, format=format)
     columns, heading = _find(path, source)
     t, W = _read(path, source, columns, limit)
     rows = np.arange(1, t.size + 1)

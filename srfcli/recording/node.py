@@ -37,7 +37,7 @@ class Node:
 
     def fail(self, message: str, hint: str | None = None) -> NoReturn:
         """Raise SrfError that names this place."""
-        raise SrfError(f"{self.where}: {message}", hint)
+        raise SrfError(_plain(f"{self.where}: {message}"), hint)
 
     def expected(self, what: str, hint: str | None = None) -> NoReturn:
         """Raise SrfError that says what was found here and what was expected."""
@@ -54,7 +54,7 @@ class Node:
     def require(self, key: str, hint: str) -> Node:
         """Return the value under a key; raises SrfError where there is none."""
         if key not in self.value:
-            raise SrfError(f"{self._where((*self.place, key))}: missing", hint)
+            raise SrfError(_plain(f"{self._where((*self.place, key))}: missing"), hint)
         return self.child(key)
 
     def keys(self, known: Iterable[str]) -> None:
@@ -108,7 +108,8 @@ class Node:
                 self.expected(f"a number in {unit}" if unit != "1" else "a number", f"Write {example}.")
             return self.number()
         try:
-            return parse_quantity(self.value, unit, name=str(self.place[-1]))
+            name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
+            return parse_quantity(self.value, unit, name=name)
         except SrfError as error:
             self.fail(error.message, error.hint)
 
@@ -145,6 +146,11 @@ def shown(value: object) -> str:
     except (ValueError, RecursionError):
         return "a value too long to show"
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _plain(text: str) -> str:
+    """Return the text with what is no printable character escaped, so that it stays on its line."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _spelled(place: Place) -> str:

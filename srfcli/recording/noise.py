@@ -9,6 +9,8 @@ import numpy as np
 from srfcli.recording.values import Array
 
 SEGMENT = 256  # samples of a periodogram
+WILD, ROUNDS = 3.0, 4  # standard deviations of a stretch's mean square, and how often the calm ones are chosen anew
+LEAST = 0.2  # share of the noise that a trend may leave: what is slower is signal
 TREND = 64  # samples over which a parabola is the trend
 
 
@@ -50,8 +52,8 @@ def describe_noise(x: Array, cycles: float | None = None) -> Noise:
     """Return level and colour of the noise in x (n,), evenly sampled, about a parabola over each 64 samples.
 
     `cycles`, in periods per sample, is a modulation whose first three harmonics are taken out, too. Stretches in which the
-    signal bends faster than that, as at stick-slip events, are left out: only the calmest quarter of the stretches counts, and
-    the level is corrected for the choice.
+    signal bends faster than that, as at stick-slip events, are left out: what counts are the calmest quarter of the stretches,
+    the level corrected for the choice, and then all that are no wilder than noise like theirs can be.
     """
     length = min(TREND, x.size)
     if length < 32:
@@ -60,16 +62,22 @@ def describe_noise(x: Array, cycles: float | None = None) -> Noise:
     pieces = x[: count * length].reshape(count, length)
     basis = _trend(length, cycles)
     rest = pieces - (pieces @ basis) @ basis.T
-    kept = max(count // 4, 1)
-    calm = rest[np.argsort((rest**2).sum(axis=1))[:kept]]
-    freedom = length - basis.shape[1]
-    rho = _lag1(calm, basis)
+    lags, freedom = _lags(basis), length - basis.shape[1]
+    power = (rest**2).sum(axis=1) / freedom
+    calm = np.argsort(power)[: max(count // 4, 1)]
+    rho = _lag1(rest[calm], lags)
+    # the mean of a normal variate's lowest quarter is 1.27 below its own
+    level = float(power[calm].mean()) / max(1.0 - (1.27 * _spread(rho, freedom) if count > 4 else 0.0), 0.3)
+    for _ in range(ROUNDS if count > 4 else 0):
+        calm = np.flatnonzero(power <= level * (1 + WILD * _spread(rho, freedom)))
+        rho, level = _lag1(rest[calm], lags), float(power[calm].mean())
+    return Noise(white_level(x), float(np.sqrt(level / _left(rho, lags, freedom))), rho, int(calm.size) * length)
+
+
+def _spread(rho: float, freedom: int) -> float:
+    """Return the relative standard deviation of the mean square of so many samples of AR(1) noise."""
     colour = (1 + rho**2) / (1 - rho**2) if np.isfinite(rho) else 1.0
-    chosen = 1.0 - (
-        1.27 * np.sqrt(2 * colour / freedom) if kept > 1 else 0.0
-    )  # mean of a normal variate's lowest quarter
-    total = np.sqrt((calm**2).sum() / (calm.shape[0] * freedom) / max(chosen, 0.3))
-    return Noise(white_level(x), float(total), rho, int(calm.size))
+    return float(np.sqrt(2 * colour / freedom))
 
 
 def _trend(length: int, cycles: float | None) -> Array:
@@ -83,20 +91,31 @@ def _trend(length: int, cycles: float | None) -> Array:
     return np.asarray(np.linalg.qr(np.column_stack(columns))[0])
 
 
-def _lag1(rest: Array, basis: Array) -> float:
+def _lags(basis: Array) -> tuple[Array, Array]:
+    """Return a and b (n,): AR(1) noise of variance 1 and correlation rho has, about the trend, the power sum(a rho^d).
+
+    And sum(b rho^d) is the sum of the products of its neighbouring samples.
+    """
+    n = basis.shape[0]
+    P = np.eye(n) - basis @ basis.T
+    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n))).ravel()
+    a, b = (np.bincount(apart, weights=M.ravel()) for M in (P, P[:-1].T @ P[1:]))
+    return np.asarray(a), np.asarray(b)
+
+
+def _lag1(rest: Array, lags: tuple[Array, Array]) -> float:
     """Return the rho of an AR(1) noise whose residuals about the trend have the lag-1 correlation found in `rest`."""
     power = float((rest**2).sum())
     if power == 0:
         return float("nan")
     found = float((rest[:, 1:] * rest[:, :-1]).sum()) / power
     rhos = np.linspace(-0.95, 0.99, 98)
-    expected = np.array([_expected(rho, basis) for rho in rhos])  # the trend takes some of the correlation away
-    return float(np.interp(found, expected, rhos))
+    powers = rhos[:, None] ** np.arange(rest.shape[1])
+    return float(np.interp(found, (powers @ lags[1]) / (powers @ lags[0]), rhos))  # the trend takes some of it away
 
 
-def _expected(rho: float, basis: Array) -> float:
-    n = basis.shape[0]
-    covariance = rho ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-    left = covariance - basis @ (basis.T @ covariance)
-    left = left - (left @ basis) @ basis.T
-    return float(np.trace(left, offset=1) / np.trace(left))
+def _left(rho: float, lags: tuple[Array, Array], freedom: int) -> float:
+    """Return the share of AR(1) noise's variance that the trend leaves, over the share of white noise's."""
+    if not np.isfinite(rho):
+        return 1.0
+    return max(float(rho ** np.arange(lags[0].size) @ lags[0]) / freedom, LEAST)

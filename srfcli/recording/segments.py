@@ -17,6 +17,8 @@ STRETCH = 128  # samples over which noise has its colour
 BURST = 100  # samples for which a gauge may go astray
 AROUND = 15  # stretches that share their colour
 NEAR = 200  # samples on each side by which a jump is told from a corner
+EVEN = 1e-5  # of the largest noise: what is quieter would be lost in the rounding of the running sums
+LEAST = 1e-100  # um or um/s: what is squared must not vanish
 WOBBLE = 0.02  # relative change of slope that is none
 
 
@@ -35,13 +37,13 @@ def local_noise(x: Array, width: int = 101) -> Array:
     from scipy.ndimage import median_filter
 
     if x.size < 8:
-        return np.full(x.size, float(np.std(x)) or 1.0)
+        return np.full(x.size, max(float(np.std(x)), LEAST) if np.ptp(x) else 1.0)
     third = np.abs(np.diff(x, 3)) / np.sqrt(20.0)  # the sum of the squared weights 1, 3, 3, 1
-    level = median_filter(third, size=min(width, third.size), mode="nearest") / 0.6745
+    level = median_filter(third, size=min(width, third.size), mode="reflect") / 0.6745  # the end is not its last sample
     padded = np.concatenate([[level[0]], level, [level[-1]] * 2])
     overall = float(np.median(third)) / 0.6745
     span = float(np.ptp(x)) or 1.0
-    return np.maximum(padded, max(0.05 * overall, 1e-9 * span))
+    return np.maximum(padded, max(0.05 * overall, 1e-9 * span, LEAST))
 
 
 def split(t: Array, x: Array, sigma: Array, *, straight: bool, penalty: float) -> list[int]:
@@ -65,7 +67,7 @@ class _Sums:
     """Running weighted sums, from which the misfit of any piece follows at once."""
 
     def __init__(self, t: Array, x: Array, sigma: Array, straight: bool) -> None:
-        w = 1.0 / sigma**2
+        w = 1.0 / np.maximum(sigma, EVEN * float(sigma.max())) ** 2
         self.straight = straight
         columns = [w, w * t, w * t * t, w * x, w * t * x, w * x * x]
         self.sums = [np.concatenate([[0.0], np.cumsum(c)]) for c in columns]
@@ -114,7 +116,7 @@ def coloured_noise(t: Array, x: Array) -> Array:
         rho = min(max(float(z[1:] @ z[:-1]) / power, 0.0), 0.98) if power > 0 else 0.0
         found[k] = power / max(length - 3, 1) * (1 + rho) / (1 - rho)
     if found.size >= AROUND:
-        near = percentile_filter(found, 75, size=AROUND, mode="nearest")
+        near = percentile_filter(found, 75, size=AROUND, mode="reflect")
     else:
         near = np.full(found.size, np.median(found))
     stretch = np.minimum(np.arange(x.size) // length, near.size - 1)

@@ -39,6 +39,7 @@ def open_source(path: Path, *, registry: Registry, format: str | None = None) ->
         source.rows,
         source.whole,
         source.remarks,
+        source.about,
     )
 
 
@@ -49,6 +50,8 @@ def _head(path: Path) -> bytes:
     except FileNotFoundError:
         near = did_you_mean(path.name, (p.name for p in path.parent.glob("*"))) if path.parent.is_dir() else None
         raise SrfError(f"no file {path}", near or f"There is no folder {path.parent}.") from None
+    except IsADirectoryError:
+        raise SrfError(f"no file {path}, but a folder", "Name a file in it.") from None
     except OSError as error:
         raise SrfError(
             f"{path}: cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1
@@ -70,6 +73,8 @@ def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
     if len(found) > 1:  # content alone does not decide: the ending does
         found = [(e, r) for e, r in found if path.suffix.lower() in r.suffixes] or found
     names = ", ".join(sorted({e.name for e, _ in readers}))
+    if not found and head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise SrfError(f"{path}: UTF-16 text", "Save the file as UTF-8.")
     if not found:
         raise SrfError(f"{path}: no reader knows this kind of file", f'Name one with format = "...": {names}.')
     if len(found) > 1:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +29,17 @@ class Notice:
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """The names that `open_model` takes: friction law, ageing law with modifiers, interface, and whether mass counts."""
+    """The names that `open_model` takes: friction law, ageing law with modifiers, interface, whether mass counts, effects."""
 
     law: str
     ageing: str
     interface: str
     inertia: bool
+    effects: tuple[str, ...] = ()
+
+    def plus(self, effects: Iterable[str]) -> ModelChoice:
+        """Return the choice with these effects besides."""
+        return replace(self, effects=(*self.effects, *effects))
 
 
 @dataclass(frozen=True)

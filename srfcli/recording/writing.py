@@ -154,6 +154,8 @@ def _description(experiment: Experiment, files: list[str]) -> str:
         lines.append(f"mass = {_text(f'{shortest(experiment.mass, KILOGRAM)!r} kg')}")
     lines += ["", "[model]", f"law = {_text(choice.law)}", f"ageing = {_text(choice.ageing)}"]
     lines += [f"interface = {_text(choice.interface)}", f"inertia = {_truth(choice.inertia)}"]
+    if choice.effects:
+        lines.append(f"effects = [{', '.join(map(_text, choice.effects))}]")
     if experiment.parameters:
         lines += ["", "[parameters]", *map(_parameter_line, experiment.parameters)]
     for run, file in zip(experiment.runs, files, strict=True):

@@ -1,0 +1,171 @@
+"""What `srf compare` shows: a row for each law and amplitude, a sentence for each pair, the overlaid figure."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any
+
+from srfcli.output.tables import Column
+from srfcli.status import Status
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from srfcli.model import GeneratedModel
+    from srfcli.numerics.compare import LawStudy, Window
+    from srfcli.numerics.comparematch import Match, Observables
+
+COLUMNS = (
+    Column("law", "", "friction law, ageing law, or both"),
+    Column("eps", "1", "modulation amplitude"),
+    Column("reentrance_eps", "1", "smallest amplitude at which a line of constant V meets more than one boundary"),
+    Column(
+        "destabilised",
+        "1",
+        "share of the window, in ln V and ln K/W0, stable at a smaller amplitude, unstable at this one",
+    ),
+    Column("stabilised", "1", "share of the window unstable without modulation, stable at this amplitude"),
+    Column("folds", "1", "how often V turns round along the boundaries"),
+    Column("components", "1", "connected boundaries in the window"),
+    Column("V_fold", "um/s", "highest velocity at which a boundary turns back to lower ones"),
+    Column("miss", "1", "what matching left, relative", ".2g"),
+    Column("status"),
+)
+
+
+def law_rows(
+    names: list[str],
+    matches: list[Match],
+    studies: dict[int, LawStudy],
+    amplitudes: tuple[float, ...],
+    wanted: list[float],
+    window: Window,
+) -> tuple[list[tuple[Any, ...]], Status]:
+    """Return a row under COLUMNS for each law and wanted amplitude, and the worst status among them."""
+    from srfcli.numerics.compare import changed_areas
+
+    rows: list[tuple[Any, ...]] = []
+    statuses = []
+    for k, name in enumerate(names):
+        if k not in studies:
+            rows.append((name, None, *(None,) * 6, matches[k].miss, matches[k].status.value))
+            statuses.append(matches[k].status)
+            continue
+        study, miss = studies[k], matches[k].miss
+        onset = study.onset[1] if math.isfinite(study.onset[1]) else None
+        for eps in wanted:
+            i = amplitudes.index(eps)
+            shape = (study.folds[i], len(study.curves[i]), highest_fold(study, i))
+            areas = changed_areas(study.crossings[: i + 1], window)
+            rows.append((name, eps, onset, *areas, *shape, miss, study.status[i].value))
+            statuses.append(study.status[i])
+    return rows, next((s for s in statuses if not s.ok), Status.OK)
+
+
+def law_notes(
+    names: list[str], models: list[GeneratedModel], matches: list[Match], goal: Observables, window: Window
+) -> list[str]:
+    """Return what laws were brought to, with which parameters, and where was looked."""
+    return [
+        f"reference {names[0]} at {goal.V:g} um/s: friction {goal.friction:.6g}, slope -d mu/d ln V {goal.slope:.6g}, "
+        f"critical load {goal.W0:.6g} N, period {2 * math.pi / goal.Omega:.6g} s",
+        *(_said(names[k], models[k], m) for k, m in enumerate(matches) if m.adjusted),
+        f"looked at V from {window.V[0]:g} to {window.V[1]:g} um/s and W0 from {window.W0[0]:.4g} to {window.W0[1]:.4g} N, "
+        f"{window.columns} x {window.rows} points a map",
+    ]
+
+
+def law_meta(
+    names: list[str],
+    models: list[GeneratedModel],
+    matches: list[Match],
+    goal: Observables,
+    pairs: list[dict[str, Any]],
+) -> dict[str, Any]:
+    """Return what JSON holds beside the rows."""
+    fitted = {
+        names[k]: {n: models[k].declared(n, float(m.p[models[k].index(n)])) for n in m.adjusted}
+        for k, m in enumerate(matches)
+    }
+    observed = {"V": goal.V, "friction": goal.friction, "slope": goal.slope, "W0": goal.W0, "Omega": goal.Omega}
+    return {"pairs": pairs, "adjusted": fitted, "observables": observed}
+
+
+def _said(name: str, model: GeneratedModel, m: Match) -> str:
+    values = ", ".join(f"{n} = {model.declared(n, float(m.p[model.index(n)])):.6g}" for n in m.adjusted)
+    if m.status.ok:
+        return f"{name} matched with {values}"
+    return f"{name} could not be matched: {m.miss:.2g} is left with {values}"
+
+
+def highest_fold(study: LawStudy, i: int) -> float | None:
+    """Return the highest velocity at which a boundary that came from lower ones turns back, None where none does."""
+    tops = [
+        float(v)
+        for curve in study.curves[i]
+        for before, v, after in zip(curve[:-2, 0], curve[1:-1, 0], curve[2:, 0], strict=True)
+        if before < v > after
+    ]
+    return max(tops, default=None)
+
+
+def sentences(
+    names: list[str],
+    models: list[GeneratedModel],
+    matches: list[Match],
+    studies: dict[int, LawStudy],
+    amplitudes: tuple[float, ...],
+    window: Window,
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return for each pair of laws where their critical loads differ most, as data and as a sentence."""
+    from srfcli.numerics.compare import EXPERIMENT, contrast
+
+    pairs, said = [], []
+    for a, b in itertools.combinations(sorted(studies), 2):
+        best = contrast(studies[a], studies[b], amplitudes, window)
+        if best is None:
+            said.append(f"{names[a]} and {names[b]}: no velocity at which both have a critical load in the window")
+            continue
+        K = [float(matches[k].p[models[k].index("K")]) for k in (a, b)]
+        ratios = [k / w for k, w in zip(K, best.W0, strict=True)]
+        times = best.difference / EXPERIMENT
+        told = (
+            f"{times:.1f} times the {EXPERIMENT:.0%} of the paper's critical loads"
+            if best.seen
+            else f"not to be told apart by an experiment good to {EXPERIMENT:.0%}"
+        )
+        apart = f"a factor of {1 + best.difference:.3g}" if best.difference > 1 else f"{best.difference:.1%}"
+        said.append(
+            f"{names[a]} and {names[b]} differ most at V = {best.V:.3g} um/s, eps = {best.eps:.3g}: W0c = {best.W0[0]:.4g} "
+            f"and {best.W0[1]:.4g} N (K/W0 = {ratios[0]:.4g} and {ratios[1]:.4g} /um), {apart}, {told}"
+        )
+        pairs.append(
+            {
+                "laws": [names[a], names[b]],
+                "eps": best.eps,
+                "V": best.V,
+                "W0": list(best.W0),
+                "K_over_W0": ratios,
+                "difference": best.difference,
+                "seen": bool(best.seen),
+            }
+        )
+    return pairs, said
+
+
+def compare_figure(
+    names: list[str], studies: dict[int, LawStudy], amplitudes: tuple[float, ...], window: Window, K: float
+) -> Figure:
+    """Return the laws' boundaries at the largest amplitude over each other."""
+    from srfcli.output import plots
+
+    branches = [
+        {"eps": k, "label": names[k], "V": curve[:, 0].tolist(), "K_over_W0": (K / curve[:, 1]).tolist()}
+        for k, study in sorted(studies.items())
+        for curve in study.curves[-1]
+    ]
+    first = studies[min(studies)].crossings[0][:, 0]
+    hopf = {"V": window.velocities().tolist(), "K_over_W0": (K / first).tolist()}
+    title = f"matched at low velocity, ε = {amplitudes[-1]:g}"
+    return plots.stability_diagram(branches, hopf=hopf, title=title)

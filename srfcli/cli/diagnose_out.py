@@ -1,0 +1,162 @@
+"""The folder that `srf diagnose --out` writes: whole or not at all, never over anything but another diagnosis."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from srfcli.cli.base import Session
+from srfcli.errors import SrfError
+from srfcli.output.files import write_atomic
+
+if TYPE_CHECKING:
+    from srfcli.diagnosis.answer import RunView
+    from srfcli.diagnosis.locate import Location
+    from srfcli.diagnosis.verdict import Diagnosis
+    from srfcli.registry import Registry
+
+ANSWER = "answer.json"
+SCHEMA = "srf.diagnose/"
+UNITS = {"elongation": "um", "force": "N", "friction": "1"}
+
+
+def check_answer(folder: Path, *, force: bool) -> None:
+    """Raise SrfError now if a diagnosis could not be written to `folder` later."""
+    parent = folder.resolve().parent
+    if not parent.is_dir():
+        raise SrfError(f"--out {folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
+    if not os.access(parent, os.W_OK):
+        raise SrfError(
+            f"--out {folder}: the directory {parent} is not writable", "Name a folder elsewhere.", exit_code=1
+        )
+    if not os.path.lexists(folder):
+        return
+    if not folder.is_dir() or folder.is_symlink():
+        raise SrfError(f"--out {folder} exists and is not a folder", "Name another folder.")
+    if not any(folder.iterdir()):
+        return
+    if not _is_diagnosis(folder):
+        raise SrfError(f"--out {folder} holds something else than a diagnosis", "It is never replaced; name another.")
+    if not force:
+        raise SrfError(f"--out {folder} holds a diagnosis already", "Replace it with --force, or name another folder.")
+
+
+def _is_diagnosis(folder: Path) -> bool:
+    try:
+        data = json.loads((folder / ANSWER).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(data, dict) and str(data.get("schema", "")).startswith(SCHEMA)
+
+
+@contextmanager
+def whole_folder(folder: Path, *, force: bool) -> Iterator[Path]:
+    """Give a folder to write to, which takes the place of `folder` when all went well and vanishes otherwise."""
+    target = folder.resolve()
+    scratch = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part"))
+    fresh, old = scratch / target.name, scratch / ".old"
+    try:
+        fresh.mkdir()  # with the usual permissions, which mkdtemp's folder does not have
+        yield fresh
+        check_answer(folder, force=force)  # an hour may have passed
+        if target.exists():
+            target.rename(old)
+        try:
+            fresh.rename(target)
+        except BaseException:
+            if old.exists():
+                old.rename(target)
+            raise
+    finally:
+        with contextlib.suppress(OSError):
+            shutil.rmtree(scratch)
+
+
+def write_answer(
+    folder: Path,
+    found: dict[str, Any],
+    diagnosis: Diagnosis,
+    location: Location,
+    registry: Registry,
+    *,
+    reader: str | None,
+    seed: int,
+    seconds: float,
+    force: bool = False,
+) -> None:
+    """Write answer, predictions, augmented experiment, report and figures."""
+    from srfcli.diagnosis.answer import final, material, run_views
+    from srfcli.diagnosis.augment import augment
+    from srfcli.output.provenance import Provenance, write_sidecar
+
+    last = final(diagnosis)
+    with whole_folder(folder, force=force) as fresh:
+        text = (json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+        write_atomic(fresh / ANSWER, text)
+        runs = diagnosis.experiment.runs
+        inputs = (diagnosis.experiment.path, *dict.fromkeys(r.file for r in runs))
+        made = Provenance(
+            arguments=Session.current().arguments, laws=last.fit.problem.model.laws, inputs=inputs, seed=seed,
+            timings={"diagnose": seconds},
+        )  # fmt: skip
+        write_sidecar(fresh / ANSWER, text, made)
+        for name, view in zip(
+            prediction_names([v.run.name for v in run_views(diagnosis)]), run_views(diagnosis), strict=True
+        ):
+            write_atomic(fresh / name, prediction_csv(view))
+        augmented = augment(
+            registry, diagnosis.experiment, last.hypothesis, last.fit, folder=folder / "augmented", reader=reader
+        )
+        (fresh / "augmented").mkdir()
+        for name, content in augmented.files.items():
+            write_atomic(fresh / "augmented" / name, content)
+        for name, source in augmented.copies.items():
+            shutil.copyfile(source, fresh / "augmented" / name)
+        _report(fresh, found, material(diagnosis, location))
+    Session.current().say(f"Wrote {folder}")
+
+
+def _report(folder: Path, found: dict[str, Any], made: dict[str, Any]) -> None:
+    try:
+        from srfcli.output.report import write_report
+
+        write_report(folder, found, made)
+    except ModuleNotFoundError as error:
+        Session.current().say(f"Note: no report and no figures, as {error.name} is not installed")
+    except Exception as error:  # minutes of computing are not to be lost for a figure
+        if Session.current().debug:
+            raise
+        Session.current().say(f"Warning: no report: {type(error).__name__}: {error}")
+
+
+def prediction_names(runs: list[str]) -> list[str]:
+    """Return one file name per run, none twice even where case does not count."""
+    names: list[str] = []
+    for run in runs:
+        stem = re.sub(r"[^\w .-]+", "-", run).strip(" .") or "run"
+        name, number = f"prediction-{stem}.csv", 2
+        while name.lower() in (other.lower() for other in names):
+            name, number = f"prediction-{stem}-{number}.csv", number + 1
+        names.append(name)
+    return names
+
+
+def prediction_csv(view: RunView) -> str:
+    """Return a run as recorded and as predicted by both models, in full precision; empty where there is nothing."""
+    import numpy as np
+
+    unit = UNITS[view.run.observable]
+    lines = [f"time [s],observed [{unit}],baseline [{unit}],augmented [{unit}]"]
+    observed = np.where(view.run.used, view.run.observed, np.nan)
+    columns = (view.run.t, observed, view.baseline, view.augmented)
+    for row in zip(*(c.tolist() for c in columns), strict=True):
+        lines.append(",".join(repr(x) if np.isfinite(x) else "" for x in row))
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,139 @@
+"""The axes of a map from the command line: parameters, or ratios of two such as K/W0."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from srfcli.cli.ranges import Range, parse_over
+from srfcli.errors import SrfError
+
+if TYPE_CHECKING:
+    from srfcli.model import GeneratedModel
+    from srfcli.numerics.collocation import Array
+    from srfcli.numerics.mapgrid import MapAxis, MapGrid
+
+BASE_UNITS = ("um", "s", "N", "rad")
+COLUMNS, ROWS = 80, 120  # points of an axis for which none were given
+
+
+def read_grid(model: GeneratedModel, base: Array, over: tuple[Range, ...]) -> MapGrid:
+    """Return the grid that `over` spans; V from 1 to 100 um/s and a window of K/W0 stand in for an axis not given.
+
+    Raises SrfError for more than two axes, for lists of values, and for what is no parameter of the model.
+    """
+    from srfcli.numerics.mapgrid import MapGrid, check_grid
+
+    if len(over) > 2:
+        raise SrfError(
+            f"--over is given {len(over)} times", "A map has two axes: --over V=1:100:120 --over K/W0=0.005:0.03:200."
+        )
+    ranges = over or (replace(parse_over("V=1:100"), n=COLUMNS),)
+    axes = [read_axis(model, r) for r in ranges]
+    if len(axes) == 1:
+        axes.append(_load_axis(model, base, axes[0]))
+    grid = MapGrid(base, axes[0], axes[1])
+    check_grid(model, grid)
+    return grid
+
+
+def read_axis(model: GeneratedModel, given: Range) -> MapAxis:
+    """Return the axis that a range describes, in um, s, N."""
+    from srfcli.numerics.mapgrid import MapAxis
+    from srfcli.units import to_base
+
+    if given.values is not None:
+        hint = f"An axis runs from a low to a high end: --over {given.name}=1:100:60."
+        raise SrfError(f"--over {given.name} lists values", hint)
+    log = given.spacing == "log"
+    if "/" not in given.name:
+        fitted = given.fitted(model.parameters, where=model.title)
+        lo, hi = to_base(fitted.lo, fitted.unit), to_base(fitted.hi, fitted.unit)
+        return MapAxis(given.name, lo, hi, given.n, log)
+    held, moved = given.name.split("/")
+    factor = _ratio_factor(model, given, held, moved)
+    return MapAxis(moved, given.lo * factor, given.hi * factor, given.n, log, held)
+
+
+def _ratio_factor(model: GeneratedModel, given: Range, held: str, moved: str) -> float:
+    """Return what a ratio's numbers are multiplied with: they are in um, s, N unless a unit is written."""
+    from srfcli.units import find_unit
+
+    powers = ratio_powers(model, held, moved)
+    if not given.unit:
+        return 1.0
+    unit = find_unit(given.unit, where=f"--over {given.name}")
+    if unit.powers != powers:
+        raise SrfError(
+            f"--over {given.name}: {given.unit!r} is the wrong unit",
+            f"Write it in {unit_text(powers)}, or leave it out.",
+        )
+    return unit.factor
+
+
+def ratio_powers(model: GeneratedModel, held: str, moved: str) -> tuple[int, ...]:
+    """Return the powers of (um, s, N, rad) of the ratio of two parameters."""
+    from srfcli.units import find_unit
+
+    top, bottom = (find_unit(model.parameters[model.index(n)].unit).powers for n in (held, moved))
+    return tuple(a - b for a, b in zip(top, bottom, strict=True))
+
+
+def unit_text(powers: tuple[int, ...]) -> str:
+    """Return powers of the base units as a unit: 1/um, N s/um^2, 1."""
+
+    def side(sign: int) -> str:
+        parts = [
+            name if abs(p) == 1 else f"{name}^{abs(p)}"
+            for name, p in zip(BASE_UNITS, powers, strict=True)
+            if p * sign > 0
+        ]
+        return " ".join(parts)
+
+    top, bottom = side(1), side(-1)
+    return f"{top or '1'}/{bottom}" if bottom else top or "1"
+
+
+def axis_unit(model: GeneratedModel, axis: MapAxis) -> str:
+    """Return the unit in which an axis is shown: the parameter's declared one, um, s, N for a ratio."""
+    return (
+        unit_text(ratio_powers(model, axis.held, axis.moved))
+        if axis.held
+        else model.parameters[model.index(axis.moved)].unit
+    )
+
+
+def shown(model: GeneratedModel, axis: MapAxis, value: float) -> float:
+    """Return a quantity in the unit it is shown in."""
+    return float(value) if axis.held else model.declared(axis.moved, float(value))
+
+
+def column_name(axis: MapAxis) -> str:
+    """Return an axis' name as a column: V, K_over_W0."""
+    return f"{axis.held}_over_{axis.moved}" if axis.held else axis.moved
+
+
+def label(model: GeneratedModel, axis: MapAxis) -> str:
+    """Return an axis' label with its unit."""
+    unit = axis_unit(model, axis)
+    name = axis.name.replace("W0", "W$_0$")
+    return name if unit in ("", "1") else f"{name}  [{unit.replace('um', 'µm')}]"
+
+
+def _load_axis(model: GeneratedModel, base: Array, x: MapAxis) -> MapAxis:
+    """Return K/W0 over the loads at which boundaries are expected along `x`."""
+    from srfcli.numerics.mapgrid import MapAxis
+    from srfcli.numerics.windows import load_window
+
+    if "W0" in (x.moved, x.held):
+        raise SrfError(f"--over {x.name} alone spans no plane", "Add the other axis: --over V=1:100:80.")
+    corners = []
+    for value in x.samples()[:: max(1, (x.count - 1) // 4)]:
+        corner = base.copy()
+        corner[model.index(x.moved)] = x.parameter(model, base, value)
+        corners.append(corner)
+    lo, hi = load_window(model, corners)
+    if "K" in (x.moved, x.held):
+        return MapAxis("W0", lo, hi, ROWS)
+    K = float(base[model.index("K")])
+    return MapAxis("W0", K / hi, K / lo, ROWS, True, "K")

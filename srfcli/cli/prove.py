@@ -1,0 +1,168 @@
+"""`srf prove`: sealed cases are diagnosed blind, then the seal is broken and the answers are marked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from srfcli.cli.laws import plugins_option
+from srfcli.cli.options import OutputOptions, Session, SrfCommand
+
+if TYPE_CHECKING:
+    from srfcli.trial.run import Trial
+
+EXAMPLES = """
+srf prove --out proof                                      ten cases: a first look, half an hour
+srf prove --cases 200 --seed 4 --workers 0 --out proof     two hundred cases on all cores
+srf prove --out proof --resume                             go on with what was interrupted
+srf prove --cases 40 --kind none --out nulls               false alarms alone
+srf prove --report-only proof --json | jq .meta.rates      the tables again
+"""
+KINDS = ("none", "single", "pair", "outside")
+
+
+@click.command("prove", cls=SrfCommand, epilog=EXAMPLES)
+@click.option("--cases", type=click.IntRange(1, 100_000), help="How many cases to make.  [default: 10]")
+@click.option("--seed", type=click.IntRange(0), help="Seed of the cases; keep it to yourself.  [default: 1]")
+@click.option(
+    "--kind",
+    "kinds",
+    multiple=True,
+    type=click.Choice(KINDS),
+    help="Make cases of this kind only; may be given several times.",
+)
+@click.option(
+    "--workers", type=click.IntRange(0, 4096), default=1, show_default=True, help="Processes, 0 for all cores."
+)
+@click.option("--out", metavar="DIR", type=click.Path(path_type=Path), help="New folder for bank, answers and report.")
+@click.option("--resume", is_flag=True, help="Go on with the trial in --out.")
+@click.option(
+    "--report-only",
+    "report",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Diagnose nothing; mark the answers in DIR again.",
+)
+@click.option("--unfinished", is_flag=True, help="Give up the cases without an answer: the trial ends here.")
+@click.option(
+    "--limit",
+    type=click.FloatRange(min=0, min_open=True),
+    default=30.0,
+    show_default=True,
+    metavar="MINUTES",
+    help="CPU time after which a case has failed.",
+)
+@plugins_option
+@click.option("--json", "as_json", is_flag=True, help="Print JSON, in full precision.")
+@click.option("--csv", "as_csv", is_flag=True, help="Print the marks as CSV, one case a line.")
+def command(
+    cases: int | None,
+    seed: int | None,
+    kinds: tuple[str, ...],
+    workers: int,
+    out: Path | None,
+    resume: bool,
+    report: Path | None,
+    unfinished: bool,
+    limit: float,
+    plugins: tuple[Path, ...],
+    as_json: bool,
+    as_csv: bool,
+) -> None:
+    """Prove the diagnosis on experiments whose truth nobody has seen.
+
+    Makes a bank of concealed cases by equations and a solver of its own, prints the digest of the truths, and diagnoses
+    every case from its folder alone. When all are answered it verifies the seal, reads the truths, and prints what was
+    right, with intervals. Each answer is kept as it comes.
+    """
+    import os
+
+    from srfcli.errors import SrfError
+    from srfcli.trial.run import Trial
+
+    if as_json and as_csv:
+        raise SrfError("--json and --csv exclude each other", "--report-only prints the other at no cost.")
+    if (out is None) == (report is None):
+        said = (
+            "neither --out nor --report-only is given" if out is None else "--out and --report-only exclude each other"
+        )
+        raise SrfError(said, "srf prove --out DIR makes a trial, srf prove --report-only DIR reads one.")
+    count = workers or os.cpu_count() or 1
+    if report is None:
+        assert out is not None
+        trial = _answered(out, cases, seed, kinds, resume, unfinished, count, limit, plugins)
+    else:
+        given = {"--cases": cases is not None, "--seed": seed is not None, "--kind": bool(kinds), "--resume": resume}
+        for option in (name for name, present in given.items() if present):
+            raise SrfError(f"{option} has no meaning with --report-only", "Leave it out.")
+        trial = Trial(report)
+        trial.asked()
+    _report(trial, count, unfinished, "json" if as_json else "csv" if as_csv else "text")
+
+
+def _answered(
+    folder: Path,
+    cases: int | None,
+    seed: int | None,
+    kinds: tuple[str, ...],
+    resume: bool,
+    unfinished: bool,
+    workers: int,
+    limit: float,
+    plugins: tuple[Path, ...],
+) -> Trial:
+    """Return the trial with an answer to every case; Ctrl-C ends the command, and what was answered is kept."""
+    from srfcli.cli.base import EXIT_INTERRUPTED
+    from srfcli.cli.emit import Progress
+    from srfcli.errors import SrfError
+    from srfcli.trial.run import answer_all, begin
+
+    if unfinished:
+        raise SrfError("--unfinished ends a trial that was begun", f"srf prove --report-only {folder} --unfinished")
+    session = Session.current()
+    try:
+        with Progress("bank") as progress:
+            trial = begin(
+                folder,
+                cases=cases,
+                seed=seed,
+                kinds=kinds,
+                resume=resume,
+                workers=workers,
+                told=lambda k, n: progress.advance(),
+            )
+        waiting = trial.waiting()
+        session.say(f"SHA-256 of the sealed truths: {trial.digest()}")
+        with Progress("diagnosed", total=len(waiting)) as progress:
+            for answer in answer_all(trial, workers=workers, plugins=plugins, limit=60 * limit):
+                progress.advance(note=f"{answer.case} in {answer.cpu:.0f} s of CPU")
+    except KeyboardInterrupt:
+        click.echo(f"Interrupted: the answers so far are kept.\nTry: srf prove --out {folder} --resume", err=True)
+        raise click.exceptions.Exit(EXIT_INTERRUPTED) from None
+    return trial
+
+
+def _report(trial: Trial, workers: int, unfinished: bool, format: str) -> None:
+    """Unseal, mark every answer, print the tables and keep them beside the answers."""
+    from srfcli.cli.emit import Progress, emit
+    from srfcli.trial.mark import mark
+    from srfcli.trial.report import cases, tables
+    from srfcli.trial.run import open_truths
+    from srfcli.trial.sight import see_all
+
+    truths, answers = open_truths(trial, unfinished=unfinished)
+    sights = {}
+    with Progress("truth", total=len(truths)) as progress:
+        for sight in see_all(trial.bank, truths, workers=workers, kept=trial.folder / "known.jsonl"):
+            sights[sight.case] = sight
+            progress.advance(note=sight.case)
+    marks = [mark(truths[name], answers[name], sights[name]) for name in truths]
+    asked = trial.asked()
+    table, more = tables(marks, digest=trial.digest(), seed=asked["seed"], of=asked["cases"])
+    listed, inputs = cases(marks), [trial.answers, trial.apart]
+    emit(table, OutputOptions("json", trial.folder / "report.json"), inputs=inputs, seed=asked["seed"])
+    emit(table, OutputOptions("text", trial.folder / "report.txt"), more=more, inputs=inputs, seed=asked["seed"])
+    emit(listed, OutputOptions("csv", trial.folder / "cases.csv"), inputs=inputs, seed=asked["seed"])
+    emit(listed if format == "csv" else table, OutputOptions(format), more=more)

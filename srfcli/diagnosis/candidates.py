@@ -1,0 +1,153 @@
+"""Which registered effects may be missing in an experiment, and the experiments that have them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from srfcli.inference.fit import Problem, fit_problem
+from srfcli.laws import Effect, Parameter
+from srfcli.model import GeneratedModel, open_model
+from srfcli.recording.values import Experiment, FitParameter
+from srfcli.registry import Registry
+from srfcli.units import split_quantity, to_base
+
+TRACK = ("mu", "slip")
+
+
+@dataclass(frozen=True)
+class Excluded:
+    """An effect that cannot be found in this experiment, and why."""
+
+    effect: str
+    reason: str
+
+
+def applicable(
+    registry: Registry, experiment: Experiment, effects: Sequence[str] | None = None
+) -> tuple[list[Effect], list[Excluded]]:
+    """Return the effects that the baseline lacks and could have, and those that these recordings cannot show."""
+    base = open_model(registry, **asdict(experiment.choice))
+    found, excluded = [], []
+    free = {p.name for p in experiment.parameters if not p.fixed}
+    for entry in registry.entries("effect"):
+        effect = registry.load(entry)
+        assert isinstance(effect, Effect)
+        if effects is not None and effect.reported not in effects and effect.name not in effects:
+            continue
+        if any(n not in base.names for n in effect.needs) or any(n in base.names for n in effect.lacks):
+            continue
+        if any(p.name in base.names for p in effect.parameters) and not effect.settings:
+            continue  # the law has a parameter of that name already
+        if set(effect.frees) & free:
+            continue
+        reason = _unseen(effect, experiment)
+        if reason:
+            excluded.append(Excluded(effect.reported, reason))
+        else:
+            found.append(effect)
+    return found, excluded
+
+
+def _unseen(effect: Effect, experiment: Experiment) -> str:
+    """Return why these recordings cannot show an effect at all, or nothing."""
+    formulas = {slot: f for slot, f in effect.changes}
+    used = {str(s) for f in formulas.values() for s in f.free_symbols}
+    loads = [run.load(run.t)[0] for run in experiment.runs]
+    spread = max(float(np.ptp(np.log(W))) for W in loads)
+    between = float(np.ptp([np.log(W.mean()) for W in loads])) if len(loads) > 1 else 0.0
+    if ("W_dot" in used or "W" in formulas or "force" in formulas) and spread < 1e-3:
+        return f"the load varies by {100 * spread:.2g} %" if spread > 0 else "the load is constant"
+    if {"kappa", "W"} & (used | set(formulas)) and "W" in used and max(spread, between) < 1e-3:
+        return f"the loads of all runs lie within {100 * max(spread, between):.2g} %"
+    if "eps" in used and all(run.modulation is None for run in experiment.runs) and spread < 1e-3:
+        return "no run has a modulated load"
+    return ""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Effects that together with the baseline might have made the recording; none of them for the baseline itself."""
+
+    effects: tuple[Effect, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Return the effects' names, or none."""
+        return "+".join(e.name for e in self.effects) or "none"
+
+    @property
+    def reported(self) -> tuple[str, ...]:
+        """Return the names under which a verdict has the effects."""
+        return tuple(e.reported for e in self.effects)
+
+    def model(self, registry: Registry, experiment: Experiment, *, rough: bool) -> GeneratedModel:
+        """Return the model, with a table along the track if it is rough."""
+        return open_model(
+            registry, **asdict(experiment.choice.plus(_key(registry, e) for e in self.effects)),
+            tables=(TRACK,) if rough else (),
+        )  # fmt: skip
+
+    def problem(self, registry: Registry, experiment: Experiment, *, rough: bool, at: Mapping[str, float] | None = None,
+                trend: str | None = None) -> Problem:  # fmt: skip
+        """Return the fit of baseline and effects together, from the values in `at` where there are some."""
+        model = self.model(registry, experiment, rough=rough)
+        added = [q for e in self.effects for q in fit_parameters(e, model, experiment)]
+        at = at or {}
+        names = {q.name for q in added}
+        kept = [q for q in experiment.parameters if q.name not in names]
+        listed = tuple(
+            replace(q, value=float(np.clip(at.get(q.name, q.value), q.lower, q.upper))) for q in (*kept, *added)
+        )
+        problem = fit_problem(model, replace(experiment, parameters=listed), trend=trend)
+        start = [at.get(n, s) for n, s in zip(problem.names, problem.start, strict=True)]
+        return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper))
+
+
+def _key(registry: Registry, effect: Effect) -> str:
+    """Return what `open_model` knows an effect by."""
+    return effect.name
+
+
+def own_parameters(effect: Effect, model: GeneratedModel) -> dict[str, Parameter]:
+    """Return an effect's parameters by the names they have in a model, where two effects may have one of the same name."""
+    found = {}
+    for p in effect.parameters:
+        long = f"{effect.name.replace('-', '_')}_{p.name}"
+        found[long if long in model.names else p.name] = p
+    return found
+
+
+def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment) -> list[FitParameter]:
+    """Return start values and bounds of an effect's parameters in um, s, N: sizes at their neutral values, or just inside."""
+    neutral, found = dict(effect.neutral), []
+    for name, p in own_parameters(effect, model).items():
+        low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
+        value = float(np.clip(to_base(neutral.get(p.name, p.default), p.unit), low, high))
+        found.append(FitParameter(name, value, low, high, False, p.unit))
+    for name in effect.frees:
+        if name == "K":
+            size, unit = split_quantity(experiment.stiffness_text, name="stiffness")
+            value = to_base(size, unit)
+            found.append(FitParameter("K", value, 0.2 * value, 5 * value, False, unit))
+        elif name == "M":
+            found.append(FitParameter("M", 1e-6, 1e-9, 1e-4, False, "kg"))
+    return found
+
+
+def inner_grid(effect: Effect) -> list[dict[str, float]]:
+    """Return the values, in um, s, N, at which an effect's inner parameters are tried, all combinations."""
+    axes = []
+    bounds = {p.name: p for p in effect.parameters}
+    for name, count in effect.scans:
+        p = bounds[name]
+        low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
+        if name == "phase":
+            axes.append([(name, v) for v in np.linspace(0.0, np.pi, count, endpoint=False).tolist()])
+        else:
+            spaced = np.geomspace(low, high, count) if low > 0 else np.linspace(max(low, 0.0), high, count)
+            axes.append([(name, v) for v in spaced.tolist()])
+    return [dict(combination) for combination in product(*axes)]

@@ -1,0 +1,205 @@
+"""From what was fitted to what is said: a set of hypotheses that may be it, the gate of held-out runs, and a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from srfcli.diagnosis.adequacy import Adequacy, judge_residuals
+from srfcli.diagnosis.candidates import Excluded, Hypothesis
+from srfcli.diagnosis.score import Score
+from srfcli.diagnosis.search import CLOSE, Refit, Search, spent
+from srfcli.inference.latent import fit_latent, tracks_for
+from srfcli.inference.noise import Noise
+from srfcli.numerics.collocation import Array
+from srfcli.recording.values import Experiment, Run
+
+VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
+SAME = 0.97  # likeness of two effects' projected columns beyond which they are one class
+TEMPER = 3.0  # by which evidence is divided before it becomes a stated confidence: found on a bank of its own
+HELD_RMS = 1.25  # over what the fitted runs have, in held-out runs, that a model which misses nothing may reach
+
+
+@dataclass(frozen=True)
+class Held:
+    """One held-out run under the baseline and under the final model: predictions (n,) and gain in log likelihood."""
+
+    run: Run
+    baseline: Array
+    augmented: Array
+    gain: float
+    rms_baseline: float
+    rms_augmented: float
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Everything that is said and what it rests on."""
+
+    experiment: Experiment
+    verdict: str
+    best: Refit
+    baseline: Refit
+    ranked: tuple[Refit, ...]
+    close: tuple[Refit, ...]
+    confidence: dict[str, float]
+    scores: tuple[Score, ...]
+    not_identifiable: tuple[Excluded, ...]
+    detectable: dict[str, float]
+    equivalent: tuple[tuple[str, ...], ...]
+    held: tuple[Held, ...]
+    noise: dict[str, Noise]
+    reasons: tuple[str, ...]
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Return the names that the verdict carries."""
+        if self.verdict == "identified":
+            return self.best.hypothesis.reported
+        if self.verdict == "ambiguous":
+            return tuple(dict.fromkeys(n for r in self.close for n in r.hypothesis.reported))
+        return ()
+
+    @property
+    def augmented(self) -> Refit:
+        """Return the model that the report shows beside the baseline: the best, whatever the verdict calls it."""
+        return self.best
+
+
+def conclude(search: Search, held_out: Experiment) -> Diagnosis:
+    """Return the verdict on a finished search; `held_out` is the experiment read with its held-out runs, opened only now."""
+    ranked = tuple(search.ranked())
+    best, baseline = ranked[0], next(r for r in ranked if not r.hypothesis.effects)
+    close = tuple(r for r in ranked if r.adequacy.fine and best.evidence - r.evidence < CLOSE)
+    if len(close) > 1:  # a hypothesis that holds a smaller one, and gains nothing by it, is not another answer
+        close = tuple(
+            r for r in close if not any(set(o.hypothesis.reported) < set(r.hypothesis.reported) for o in close)
+        )
+    held = judge_held(search, best, baseline, held_out)
+    found, reasons = _verdict(best, baseline, close, held, search)
+    listed = search.scored.get((baseline.name, baseline.rough), [])
+    unseen = [*search.excluded, *_unidentifiable(listed)]
+    return Diagnosis(
+        held_out, found, best, baseline, ranked, close, _confidence(ranked, found, best), tuple(listed), tuple(unseen),
+        {s.effect.reported: s.detectable for s in listed}, _equivalent(listed, close),
+        held, search.noise, tuple(reasons),
+    )  # fmt: skip
+
+
+def _verdict(
+    best: Refit, baseline: Refit, close: Sequence[Refit], held: Sequence[Held], search: Search
+) -> tuple[str, list[str]]:
+    reasons = [f"{best.name}: rms over noise {best.adequacy.rms_over_noise:.3f}, p = {best.adequacy.p_value:.2g}"]
+    if not best.adequacy.fine:
+        return "unknown", [*reasons, "no registered effect, nor two of them, brings the residuals down to noise"]
+    if any(not r.hypothesis.effects for r in close):
+        looked = search.scored.get((baseline.name, baseline.rough), [])
+        seen = [s for s in looked if s.detectable < interesting(s)]
+        if 2 * len(seen) >= len(looked):
+            return "none", [*reasons, "the baseline leaves noise alone"]
+        return "inconclusive", [
+            *reasons,
+            "nothing is needed, and most effects of interesting size could not have been seen",
+        ]
+    gain = sum(h.gain for h in held)
+    if held and gain < 0:
+        return "unknown", [
+            *reasons,
+            f"held-out runs are predicted worse than by the baseline: log likelihood {gain:+.1f}",
+        ]
+    if len({frozenset(r.hypothesis.reported) for r in close}) > 1:
+        return "ambiguous", [*reasons, "several hypotheses do equally well: " + ", ".join(r.name for r in close)]
+    return "identified", reasons
+
+
+def interesting(score: Score) -> float:
+    """Return the size of an effect that matters: what its plugin gives as default, from its neutral value."""
+    if not score.effect.sizes:
+        return 0.1
+    parameter = next(p for p in score.effect.parameters if p.name == score.effect.sizes[0])
+    return abs(parameter.default - dict(score.effect.neutral)[parameter.name])
+
+
+def _unidentifiable(scores: Sequence[Score]) -> list[Excluded]:
+    found = []
+    for s in scores:
+        if s.surviving < 2e-3 and s.detectable > interesting(s):
+            lost = 100 * (1 - s.surviving)
+            found.append(
+                Excluded(s.effect.reported, f"the baseline's parameters and the track absorb {lost:.2f} % of it")
+            )
+    return found
+
+
+def _confidence(ranked: Sequence[Refit], verdict: str, best: Refit) -> dict[str, float]:
+    """Return the stated confidence in each hypothesis, by evidence; where nothing leaves noise alone, in `unknown`."""
+    weights: dict[str, float] = {}
+    for r in ranked:
+        key = "+".join(sorted(r.hypothesis.reported)) or "none"
+        lacking = 0.0 if r.adequacy.fine else 40.0
+        weights[key] = max(weights.get(key, -np.inf), r.evidence - lacking)
+    weights["unknown"] = best.evidence - (20.0 if best.adequacy.fine else 5.0)
+    top = max(weights.values())
+    share = {k: float(np.exp(max((w - top) / TEMPER, -60.0))) for k, w in weights.items()}
+    total = sum(share.values())
+    return {k: v / total for k, v in sorted(share.items(), key=lambda kv: -kv[1])}
+
+
+def _equivalent(scores: Sequence[Score], close: Sequence[Refit]) -> tuple[tuple[str, ...], ...]:
+    """Return the classes of effects whose signals no parameter change tells apart, and that matter here."""
+    names = {n for r in close for n in r.hypothesis.reported}
+    found = []
+    for i, a in enumerate(scores):
+        for b in scores[i + 1 :]:
+            alike = abs(float(a.direction @ b.direction)) if a.direction.size == b.direction.size else 0.0
+            if (
+                alike > SAME
+                and a.effect.reported != b.effect.reported
+                and (not names or {a.effect.reported, b.effect.reported} & names)
+            ):
+                found.append((a.effect.reported, b.effect.reported))
+    return tuple(found)
+
+
+def judge_held(search: Search, best: Refit, baseline: Refit, experiment: Experiment) -> tuple[Held, ...]:
+    """Return how the final model and the baseline predict the held-out runs; a rough track there is integrated out."""
+    found = []
+    for run in (r for r in experiment.runs if r.holdout):
+        answers = [_predicted(search, refit, experiment, run) for refit in (baseline, best)]
+        (y0, l0, s0), (y1, l1, s1) = answers
+        found.append(Held(run, y0, y1, l1 - l0, s0, s1))
+    return tuple(found)
+
+
+def _predicted(search: Search, refit: Refit, experiment: Experiment, run: Run) -> tuple[Array, float, float]:
+    """Return prediction, log likelihood and rms over noise of a held-out run at the fitted parameters."""
+    problem = refit.fit.problem
+    as_fitted = replace(run, holdout=False)
+    fixed = tuple(replace(q, value=refit.fit.values.get(q.name, q.value)) for q in problem.experiment.parameters)
+    alone = replace(experiment, runs=(as_fitted,), parameters=fixed)
+    held = {n: v for n, v in refit.fit.values.items() if "." not in n}
+    own = Hypothesis(refit.hypothesis.effects).problem(search.registry, alone, rough=refit.rough, at=held)
+    names = [i for i, n in enumerate(own.names) if "." in n]  # only a free start is estimated
+    small = replace(
+        own,
+        names=tuple(own.names[i] for i in names),
+        start=own.start[names],
+        lower=own.lower[names],
+        upper=own.upper[names],
+        held=held,
+    )
+    noise = {run.name: _noise_for(search.noise, run)}
+    rough = refit.rough and refit.fit.point.roughness.amplitude > 0
+    tracks = tracks_for([as_fitted], shared=False) if rough else None
+    fitted = fit_latent(small, small.start, noise, tracks=tracks, known_noise=True)
+    adequacy: Adequacy = judge_residuals(
+        [as_fitted], {run.name: run.observed - fitted.point.predictions[run.name].y}, noise, freedom=spent(fitted)
+    )
+    return fitted.point.predictions[run.name].y, fitted.log_likelihood, adequacy.rms_over_noise
+
+
+def _noise_for(noises: Mapping[str, Noise], run: Run) -> Noise:
+    """Return the noise of a run that was not fitted: the gauge's, as the fitted runs have it."""
+    return next(iter(noises.values()))

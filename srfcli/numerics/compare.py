@@ -1,0 +1,250 @@
+"""One law's boundaries at several amplitudes, and what two laws' boundaries say of each other.
+
+A law is studied in a window of V and W0: its boundary components at each amplitude, from maps; where they cross lines of constant
+V; and the smallest amplitude at which a line meets more than one boundary (re-entrance).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from srfcli.model import GeneratedModel, load_source
+from srfcli.numerics.atlas import AtlasSettings, Branch, find_components
+from srfcli.numerics.collocation import Array
+from srfcli.numerics.hopf import hopf_points
+from srfcli.numerics.map import compute_map
+from srfcli.numerics.mapcurves import find_boundaries, unexplained
+from srfcli.numerics.mapgrid import MapAxis, MapGrid, MapSettings
+from srfcli.numerics.plane import Axis, Plane
+from srfcli.numerics.special import polyline_heights
+from srfcli.status import Status
+
+EXPERIMENT = 0.03  # relative error of the paper's critical loads
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where laws are compared: velocities and loads, from low to high, with the numbers of columns and rows of the maps."""
+
+    V: tuple[float, float]
+    W0: tuple[float, float]
+    columns: int = 40
+    rows: int = 60
+
+    def velocities(self) -> Array:
+        """Return the lines of constant V on which boundaries are counted."""
+        return np.geomspace(*self.V, 4 * self.columns + 1)
+
+
+@dataclass(frozen=True)
+class LawTask:
+    """All that the study of a law depends on: its model's source, parameters, rising amplitudes, window, and tolerances."""
+
+    source: str
+    key: str
+    p: Array
+    amplitudes: tuple[float, ...]
+    window: Window
+    tol: float = 1e-5
+    onset: float = 2e-3  # how closely the amplitude at which re-entrance begins is bracketed
+
+
+@dataclass(frozen=True)
+class LawStudy:
+    """A law's boundaries, for each of the task's amplitudes: `crossings` (lines, most) rising loads, NaN where there are no more.
+
+    `curves` are its components as (points, 2) arrays of V and W0, `folds` how often V turns round on them all, `unexplained` the
+    number of map points that the curves do not account for. `onset` brackets the amplitude at which re-entrance begins:
+    (nan, nan) where it does not up to the largest amplitude, (0, 0) where it is there without modulation.
+    """
+
+    crossings: tuple[Array, ...]
+    curves: tuple[tuple[Array, ...], ...]
+    folds: tuple[int, ...]
+    unexplained: tuple[int, ...]
+    onset: tuple[float, float]
+    status: tuple[Status, ...]
+
+
+def study_law(task: LawTask) -> dict[str, Array]:
+    """Return the study of a law as plain arrays, which `read_study` puts together; it depends on nothing but `task`."""
+    model = load_source(task.source, key=task.key)
+    out: dict[str, Array] = {"amplitudes": np.array(task.amplitudes)}
+    several = []
+    for k, eps in enumerate(task.amplitudes):
+        curves, folds, odd, status = _boundaries(model, task, eps) if eps > 0 else _without(model, task)
+        several.append(_reentrant(curves, task.window))
+        lines = _padded(curves, task.window)
+        out |= {f"crossings_{k}": lines, f"folds_{k}": np.array(folds), f"odd_{k}": np.array(odd)}
+        out[f"status_{k}"] = np.array(list(Status).index(status))
+        out[f"sizes_{k}"] = np.array([len(c) for c in curves], dtype=int)
+        out[f"curves_{k}"] = np.concatenate([np.zeros((0, 2)), *curves])
+    out["onset"] = np.array(_onset(model, task, several))
+    return out
+
+
+def read_study(arrays: dict[str, Array]) -> LawStudy:
+    """Return the study that `study_law` made plain arrays of."""
+    count = range(len(arrays["amplitudes"]))
+    curves = []
+    for k in count:
+        cuts = np.cumsum(arrays[f"sizes_{k}"])[:-1]
+        parts = np.split(arrays[f"curves_{k}"], cuts) if arrays[f"sizes_{k}"].size else []
+        curves.append(tuple(parts))
+    low, high = arrays["onset"].tolist()
+    return LawStudy(
+        tuple(arrays[f"crossings_{k}"] for k in count),
+        tuple(curves),
+        tuple(int(arrays[f"folds_{k}"]) for k in count),
+        tuple(int(arrays[f"odd_{k}"]) for k in count),
+        (low, high),
+        tuple(list(Status)[int(arrays[f"status_{k}"])] for k in count),
+    )
+
+
+def _boundaries(model: GeneratedModel, task: LawTask, eps: float) -> tuple[list[Array], int, int, Status]:
+    """Return components, folds in V, unexplained map points and the status at one amplitude, from a map."""
+    window = task.window
+    base = task.p.copy()
+    base[model.index("eps")] = eps
+    grid = MapGrid(base, MapAxis("V", *window.V, window.columns), MapAxis("W0", *window.W0, window.rows))
+    found = compute_map(model, grid, MapSettings(depth=3))
+    *_, atlas = find_boundaries(model, found, AtlasSettings(tol=task.tol))
+    curves = [_curve(model, b) for b in atlas.branches]
+    odd = len(unexplained(model, found, atlas))
+    status = Status.NO_CONVERGENCE if odd or found.lost else atlas.status
+    return curves, sum(turns(c[:, 0]) for c in curves), odd, status
+
+
+def _curve(model: GeneratedModel, branch: Branch) -> Array:
+    """Return V and W0 of a branch, (points, 2)."""
+    p = np.stack([pt.p for pt in branch.points], axis=1)
+    return np.stack([p[model.index("V")], p[model.index("W0")]], axis=1)
+
+
+def _without(model: GeneratedModel, task: LawTask) -> tuple[list[Array], int, int, Status]:
+    """Return the boundary without modulation: the leading Hopf points at the window's lines, one curve for each number."""
+    low, high = task.window.W0
+    by_number: dict[int, list[tuple[float, float]]] = {}
+    for V in task.window.velocities():
+        p = task.p.copy()
+        p[model.index("V")] = V
+        loads = [q.W0 for q in hopf_points(model, p) if q.leading and low <= q.W0 <= high]
+        for number, load in enumerate(loads):
+            by_number.setdefault(number, []).append((float(V), load))
+    return [np.array(points) for points in by_number.values()], 0, 0, Status.OK
+
+
+def turns(values: Array) -> int:
+    """Return how often a sequence turns round."""
+    steps = np.sign(np.diff(values))
+    steps = steps[steps != 0]
+    return int((steps[:-1] != steps[1:]).sum())
+
+
+def _heights(curves: Sequence[Array], window: Window) -> list[list[float]]:
+    """Return for each line of the window the loads, rising, at which the curves cross it."""
+    x, y = Axis("V", *window.V), Axis("W0", *window.W0)
+    lines = [np.stack([np.asarray(x.unit(c[:, 0])), np.asarray(y.unit(c[:, 1]))], axis=1) for c in curves]
+    found = polyline_heights(lines, np.asarray(x.unit(window.velocities())))
+    return [np.asarray(y.value(np.array(h))).reshape(-1).tolist() for h in found]
+
+
+def _padded(curves: Sequence[Array], window: Window) -> Array:
+    """Return the crossings of the window's lines as an array (lines, most), NaN where a line has fewer."""
+    found = _heights(curves, window)
+    out = np.full((len(found), max(1, *map(len, found))), np.nan)
+    for row, loads in zip(out, found, strict=True):
+        row[: len(loads)] = loads
+    return out
+
+
+def _reentrant(curves: Sequence[Array], window: Window) -> bool:
+    """Return whether some line of constant V meets more than one boundary: a fold in V, or several crossings of a line."""
+    return any(turns(c[:, 0]) for c in curves) or any(len(h) > 1 for h in _heights(curves, window))
+
+
+def _onset(model: GeneratedModel, task: LawTask, several: Sequence[bool]) -> tuple[float, float]:
+    """Return the bracket of the smallest amplitude with re-entrance, by halving; see LawStudy."""
+    first = next((k for k, r in enumerate(several) if r), None)
+    if first is None:
+        return np.nan, np.nan
+    low, high = (task.amplitudes[first - 1] if first else 0.0), task.amplitudes[first]
+    if first == 0 and (high == 0 or _reentrant(_without(model, task)[0], task.window)):
+        return 0.0, 0.0
+    while high - low > task.onset:
+        middle = 0.5 * (low + high)
+        if _reentrant(_followed(model, task, middle), task.window):
+            high = middle
+        else:
+            low = middle
+    return low, high
+
+
+def _followed(model: GeneratedModel, task: LawTask, eps: float) -> list[Array]:
+    """Return the components at one amplitude from a search on lines, which is quicker than a map."""
+    base = task.p.copy()
+    base[model.index("eps")] = eps
+    plane = Plane(base, Axis("V", *task.window.V), Axis("W0", *task.window.W0))
+    *_, atlas = find_components(model, plane, AtlasSettings(lines=8, tol=1e-4))
+    return [_curve(model, b) for b in atlas.branches]
+
+
+def changed_areas(crossings: Sequence[Array], window: Window) -> tuple[float, float]:
+    """Return the shares of the window in (ln V, ln K/W0) that the last amplitude destabilises and stabilises.
+
+    `crossings` are those of rising amplitudes. Destabilised: stable at one of the smaller amplitudes, unstable at the last;
+    stabilised: unstable at the first, stable at the last. Sliding is stable below the first crossing of a line, unstable beyond
+    it, and so on in turn.
+    """
+    lost = gained = 0.0
+    low, high = np.log(window.W0)
+    for line in zip(*crossings, strict=True):
+        edges = [np.sort(np.log(np.clip(q[np.isfinite(q)], *window.W0))) for q in line]
+        cuts = np.unique(np.concatenate([[low, high], *edges]))
+        middle, width = 0.5 * (cuts[1:] + cuts[:-1]), np.diff(cuts)
+        unstable = np.array([np.searchsorted(e, middle) % 2 == 1 for e in edges])
+        lost += float(width[~unstable[:-1].all(axis=0) & unstable[-1]].sum())
+        gained += float(width[unstable[0] & ~unstable[-1]].sum())
+    lines = len(crossings[0])
+    return lost / lines / (high - low), gained / lines / (high - low)
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """Where two laws' critical loads differ most: crossing `number` at V and eps, with both loads (N)."""
+
+    eps: float
+    V: float
+    number: int
+    W0: tuple[float, float]
+
+    @property
+    def difference(self) -> float:
+        """Return the larger load over the smaller, less one."""
+        return max(self.W0) / min(self.W0) - 1
+
+    @property
+    def seen(self) -> bool:
+        """True where the difference exceeds twice the relative error of an experiment."""
+        return self.difference > 2 * EXPERIMENT
+
+
+def contrast(a: LawStudy, b: LawStudy, amplitudes: Sequence[float], window: Window) -> Contrast | None:
+    """Return the first crossing (the lowest critical load) in which two laws differ most, None where none is shared."""
+    best: Contrast | None = None
+    velocities = window.velocities()
+    for k, eps in enumerate(amplitudes):
+        pairs = a.crossings[k][:, 0], b.crossings[k][:, 0]
+        with np.errstate(invalid="ignore"):
+            apart = np.abs(np.log(pairs[0] / pairs[1]))
+        if not np.isfinite(apart).any():
+            continue
+        i = int(np.nanargmax(apart))
+        here = Contrast(eps, float(velocities[i]), 1, (float(pairs[0][i]), float(pairs[1][i])))
+        if best is None or here.difference > best.difference:
+            best = here
+    return best

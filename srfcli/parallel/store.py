@@ -1,0 +1,102 @@
+"""Finished tasks kept in a folder, so that a run that was killed goes on where it stopped, to the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import pickle
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from srfcli import __version__
+from srfcli.errors import SrfError
+from srfcli.output.files import write_atomic
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+NOTE = "srf-run.json"
+Arrays = Mapping[str, "NDArray[Any]"]
+Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
+
+
+@dataclass(frozen=True)
+class Store:
+    """A folder of finished tasks, each a mapping of names to arrays, of one run and no other."""
+
+    folder: Path
+
+    def open(self, tasks: Sequence[Any]) -> None:
+        """Make the folder, or check that what it holds is of these very tasks; SrfError where it is not."""
+        said = {"schema": "srf.run/1", "version": __version__, "tasks": len(tasks), "sha256": fingerprint(tasks)}
+        note = self.folder / NOTE
+        if note.exists():
+            try:
+                before = json.loads(note.read_text(encoding="utf-8"))
+            except (OSError, ValueError):
+                before = None
+            if before != said:
+                raise SrfError(
+                    f"--resume {self.folder} holds the parts of another run",
+                    "Give the arguments of that run, or name another folder.",
+                )
+            return
+        if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
+            raise SrfError(f"--resume {self.folder} is not a folder of a run", "Name a new folder, or an empty one.")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_atomic(note, json.dumps(said, indent=2) + "\n")
+
+    def read(self, index: int) -> dict[str, NDArray[Any]] | None:
+        """Return a finished task, or None where there is none or its file is damaged: it is then done again."""
+        import numpy as np
+
+        try:
+            with np.load(io.BytesIO(self._place(index).read_bytes()), allow_pickle=False) as data:
+                return {name: data[name] for name in data.files}
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+            return None
+
+    def write(self, index: int, result: Arrays) -> None:
+        """Keep a finished task, whole or not at all."""
+        import numpy as np
+
+        buffer = io.BytesIO()
+        np.savez(buffer, **result)  # type: ignore[arg-type]
+        write_atomic(self._place(index), buffer.getvalue())
+
+    def _place(self, index: int) -> Path:
+        return self.folder / f"part-{index:05d}.npz"
+
+
+def fingerprint(tasks: Sequence[Any]) -> str:
+    """Return a hash of all that the tasks hold."""
+    # a fixed protocol, and no memory of shared objects: equal tasks then give equal bytes
+    whole = hashlib.sha256()
+    for task in tasks:
+        buffer = io.BytesIO()
+        pickler = pickle.Pickler(buffer, protocol=4)
+        pickler.fast = True
+        pickler.dump(task)
+        whole.update(buffer.getvalue())
+    return whole.hexdigest()
+
+
+def stored(
+    run: Run, store: Store, function: Callable[[Any], Arrays], tasks: Sequence[Any]
+) -> Iterator[tuple[int, Arrays]]:
+    """Yield every task's result: those in the store as they were kept, the others by `run`, kept as they come."""
+    store.open(tasks)
+    missing = []
+    for index in range(len(tasks)):
+        kept = store.read(index)
+        if kept is None:
+            missing.append(index)
+        else:
+            yield index, kept
+    for place, result in run(function, [tasks[i] for i in missing]):
+        store.write(missing[place], result)
+        yield missing[place], result

@@ -1,0 +1,118 @@
+"""Tables of numbers that follow a model's parameters: cubic splines with evenly spaced knots, as generated code calls them.
+
+Behind the parameters in `p` stand, for each table, the place of its numbers in `p`, its first knot, the spacing and how many
+numbers it has, then the numbers. A table of n numbers covers n - 3 intervals; beyond them it is constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Spline:
+    """A function of one unknown: `first` knot, `spacing`, and its numbers (n,), n - 3 of which are intervals."""
+
+    first: float
+    spacing: float
+    numbers: Array
+
+    @classmethod
+    def over(cls, low: float, high: float, spacing: float) -> Spline:
+        """Return a function that vanishes, with knots no further apart than `spacing` from `low` to `high`."""
+        intervals = max(int(np.ceil((high - low) / spacing)), 1)
+        return cls(low, (high - low) / intervals, np.zeros(intervals + 3))
+
+    @classmethod
+    def none(cls) -> Spline:
+        """Return a table without numbers, which is 0 everywhere."""
+        return cls(0.0, 1.0, np.zeros(0))
+
+    @property
+    def last(self) -> float:
+        """Return where the last interval ends."""
+        return self.first + self.spacing * (self.numbers.size - 3)
+
+    @property
+    def nodes(self) -> Array:
+        """Return where each number's own bump is centred (n,)."""
+        return np.asarray(self.first + self.spacing * (np.arange(self.numbers.size) - 1.0))
+
+    def design(self, x: Array) -> Array:
+        """Return the matrix (m, n) that turns the numbers into values at x (m,)."""
+        cell, share = _cells(self.first, self.spacing, self.numbers.size, np.asarray(x, dtype=float))
+        out = np.zeros((np.size(x), self.numbers.size))
+        for k, w in enumerate(_WEIGHTS[0](share)):
+            out[np.arange(np.size(x)), cell + k] += w
+        return out
+
+    def __call__(self, x: Array) -> Array:
+        """Return the values at x."""
+        return self.design(np.atleast_1d(x)) @ self.numbers
+
+    def with_numbers(self, numbers: Array) -> Spline:
+        """Return the same knots with other numbers."""
+        return Spline(self.first, self.spacing, np.asarray(numbers, dtype=float))
+
+
+def appended(p: Array, tables: Sequence[Spline]) -> Array:
+    """Return p (n_parameters,) followed by the tables."""
+    place, heads, numbers = p.size + 4 * len(tables), [], []
+    for table in tables:
+        heads.append([place, table.first, table.spacing, table.numbers.size])
+        numbers.append(table.numbers)
+        place += table.numbers.size
+    return np.concatenate([p, np.ravel(heads), *numbers]) if tables else p
+
+
+def tables_after(n: int) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+    """Return lut, lut1 and lut2 of a model with n parameters: functions of (p, table, x), value, slope and second derivative."""
+    return tuple(partial(_evaluated, n, order) for order in range(3))  # type: ignore[return-value]
+
+
+def _evaluated(n: int, order: int, p: Any, i: int, x: Any) -> Any:
+    """Return a derivative of table i at x, a number or an array, real or complex; 0 where no numbers follow the parameters."""
+    if len(p) <= n or p[n + 4 * i + 3] < 4:
+        return 0.0 * x
+    place, first, spacing, count = (float(np.real(value)) for value in p[n + 4 * i : n + 4 * i + 4])
+    real = np.real(x)
+    cell, _ = _cells(first, spacing, int(count), real)
+    share = (x - first) / spacing - cell
+    low, high = (real <= first), (real >= first + spacing * (count - 3))
+    share = np.where(low, 0.0, np.where(high, 1.0, share))
+    total: Any = 0.0
+    numbers = np.asarray(p[int(place) : int(place) + int(count)])
+    for k, w in enumerate(_WEIGHTS[order](share)):
+        total = total + w * numbers[cell + k]
+    total = total / spacing**order
+    if order:
+        total = np.where(low | high, 0.0, total)
+    return total if np.ndim(x) else total[()]
+
+
+def _cells(first: float, spacing: float, count: int, x: Any) -> tuple[Any, Any]:
+    r = np.clip((x - first) / spacing, 0.0, count - 3.0)
+    cell = np.minimum(r.astype(int) if np.ndim(r) else int(r), count - 4)
+    return cell, r - cell
+
+
+def _value(f: Any) -> tuple[Any, ...]:
+    g = 1 - f
+    b0, b1, b3 = g * g * g / 6, (4 - 6 * f * f + 3 * f * f * f) / 6, f * f * f / 6
+    return b0, b1, 1 - b0 - b1 - b3, b3
+
+
+def _slope(f: Any) -> tuple[Any, ...]:
+    d0, d1, d3 = -0.5 * (1 - f) ** 2, -2 * f + 1.5 * f * f, 0.5 * f * f
+    return d0, d1, -d0 - d1 - d3, d3
+
+
+_WEIGHTS = (_value, _slope, lambda f: (1 - f, 3 * f - 2, 1 - 3 * f, f))

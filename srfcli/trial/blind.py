@@ -1,0 +1,170 @@
+"""The diagnosis of one case, by somebody who has its folder and nothing else. Nothing here can reach a truth."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import signal
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import srfcli
+from srfcli.trial.answer import FAILED, Answer
+
+if TYPE_CHECKING:
+    from srfcli.diagnosis.answer import RunView
+    from srfcli.diagnosis.verdict import Diagnosis
+    from srfcli.registry import Registry
+
+Diagnose = Callable[[Path, tuple[Path, ...]], Answer]  # folder of a case, folders of plugins
+ELSEWHERE = ("cli", "output", "parallel", "proof", "trial")  # parts of the package that no answer depends on
+
+
+@dataclass(frozen=True)
+class Task:
+    """One case to diagnose: its folder, the plugins' folders, by what, and how many seconds of CPU it may take."""
+
+    folder: Path
+    plugins: tuple[Path, ...]
+    diagnose: Diagnose
+    limit: float
+
+
+class _TooLong(BaseException):  # no Exception: a diagnosis that copes with everything must not cope with this
+    pass
+
+
+def answer_case(task: Task) -> Answer:
+    """Return the answer to one case; a diagnosis that raises, or takes too long, has failed, and says how."""
+    begun, used = time.perf_counter(), _cpu()
+    try:
+        with warnings.catch_warnings(), _limited(task.limit):
+            warnings.simplefilter("ignore")  # of optimisers under way: the verdict counts
+            found = task.diagnose(task.folder, task.plugins)
+    except Exception as error:
+        found = failed(task.folder.name, f"{type(error).__name__}: {error}; {_place(error)}")
+    except _TooLong:
+        found = failed(task.folder.name, f"more than {task.limit:g} s of CPU")
+    cpu, wall = round(_cpu() - used, 3), round(time.perf_counter() - begun, 3)
+    return replace(found, case=task.folder.name, code=code_of(task.plugins), cpu=cpu, wall=wall)
+
+
+def failed(case: str, why: str) -> Answer:
+    """Return the answer of a diagnosis that gave none."""
+    return Answer(case, FAILED, failure=" ".join(why.split()))
+
+
+def diagnose_case(folder: Path, plugins: tuple[Path, ...]) -> Answer:
+    """Return what the tool's own diagnosis says of the experiment in `folder`: held-out runs are read when it is done."""
+    from srfcli.diagnosis.search import Search
+    from srfcli.diagnosis.verdict import conclude
+    from srfcli.recording.experiment import read_experiment
+
+    registry = _registry(plugins)
+    search = Search(registry, read_experiment(folder, registry=registry, holdout=False))
+    search.run()
+    return told(conclude(search, read_experiment(folder, registry=registry)), case=folder.name)
+
+
+def told(diagnosis: Diagnosis, *, case: str) -> Answer:
+    """Return a diagnosis as an answer."""
+    from srfcli.diagnosis.answer import final, parameters_of, run_views
+
+    own = {q.name for q in diagnosis.baseline.fit.problem.experiment.parameters}
+    brought = {n: v for n, v in parameters_of(final(diagnosis).fit).items() if n not in own and "." not in n}
+    return Answer(
+        case,
+        diagnosis.verdict,
+        tuple(diagnosis.effects),
+        {name: float(share) for name, share in diagnosis.confidence.items()},
+        tuple(tuple(names) for names in diagnosis.equivalent),
+        tuple(dict.fromkeys(x.effect for x in diagnosis.not_identifiable)),
+        {name: {k: _finite(v) for k, v in value.items()} for name, value in brought.items()},
+        {
+            "baseline": _finite(diagnosis.baseline.adequacy.rms_over_noise),
+            "augmented": _finite(final(diagnosis).adequacy.rms_over_noise),
+        },
+        {view.run.name: _errors(view) for view in run_views(diagnosis) if view.holdout},
+    )
+
+
+def _errors(view: RunView) -> Mapping[str, float | None]:
+    """Return a held-out run's rms in um, and over the noise, under baseline and final model."""
+    run = view.run
+
+    def rms(predicted: np.ndarray) -> float | None:
+        return _finite(float(np.sqrt(np.mean((run.observed - predicted)[run.used] ** 2))))
+
+    before, after = view.rms
+    sizes = {"baseline": rms(view.baseline), "augmented": rms(view.augmented)}
+    return {**sizes, "baseline_over_noise": _finite(before), "augmented_over_noise": _finite(after)}
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, str):
+        return value
+    return float(value) if value is not None and np.isfinite(value) else None
+
+
+@functools.cache
+def _registry(plugins: tuple[Path, ...]) -> Registry:
+    from srfcli.registry import load_registry
+
+    return load_registry(plugins)
+
+
+@functools.cache
+def code_of(plugins: tuple[Path, ...]) -> str:
+    """Return twelve digits that change with any file of the package, or of `plugins`, on which an answer depends."""
+    package = Path(srfcli.__file__).parent
+    parts = [p for p in sorted(package.iterdir()) if p.name not in ELSEWHERE]
+    whole = hashlib.sha256()
+    for path in _sources([*parts, package.parent / "plugins", *plugins]):
+        whole.update(path.name.encode() + path.read_bytes())
+    return whole.hexdigest()[:12]
+
+
+def _sources(places: Sequence[Path]) -> Iterator[Path]:
+    for place in places:
+        files = sorted(place.rglob("*")) if place.is_dir() else [place]
+        yield from (p for p in files if p.suffix in (".py", ".toml", ".c") and p.is_file())
+
+
+def _cpu() -> float:
+    """Return the seconds of CPU that this process and the compilers it called have used."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def _place(error: Exception) -> str:
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{Path(last.filename).name}, line {last.lineno}"
+
+
+@contextmanager
+def _limited(seconds: float) -> Iterator[None]:
+    """Raise _TooLong in what is done inside once this process has used `seconds` of CPU for it."""
+    if sys.platform == "win32":  # it has no such clock
+        yield
+        return
+
+    def stop(number: int, frame: Any) -> None:
+        raise _TooLong
+
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)

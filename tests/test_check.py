@@ -1,0 +1,321 @@
+"""`srf check` as a user meets it, and what it says a load can tell: held against fits, differences and real recordings."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from recording_cases import TOML, data, write
+
+from srfcli.cli.check_sentences import CAN, verdict_of
+from srfcli.cli.main import cli
+from srfcli.inference import reach
+from srfcli.inference.fit import fit, fit_problem
+from srfcli.inference.prediction import predict
+from srfcli.inference.reach import Forecast, Reach, forecast, noise_of
+from srfcli.model import open_model
+from srfcli.recording.checks import check_run
+from srfcli.recording.experiment import Experiment, read_experiment
+from srfcli.registry import load_registry
+
+REGISTRY = load_registry(user=False, entry_points=False)
+
+
+@pytest.fixture(autouse=True)
+def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An empty folder to work in, without settings of the caller; only the cache of generated code is shared."""
+    for name in [n for n in os.environ if n.startswith("SRF_") and n not in ("SRF_CACHE", "SRF_SHARED")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "none"))
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def srf(*arguments: str, code: int = 0) -> Result:
+    done = CliRunner().invoke(cli, list(arguments), prog_name="srf")
+    assert done.exit_code == code, done.stderr
+    return done
+
+
+def told(experiment: Experiment) -> Forecast:
+    return forecast(experiment, [check_run(run) for run in experiment.runs], registry=REGISTRY)
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    folder = tmp_path / "small"
+    folder.mkdir()
+    return write(folder)
+
+
+# the report
+
+
+def test_the_tables_fit_a_page(small: Path) -> None:
+    text = srf("check", str(small)).stdout
+    tables = [line for line in text.splitlines() if not line.startswith("Note: ")]
+    assert max(map(len, tables)) <= 100
+    assert tables[:2] == ["three steps", "srf-vsat, dieterich, elastic, inertia on; stiffness 0.21 N/um, mass 2.37 kg"]
+    for title in ("Samples", "Readings, in um, N or 1", "Imposed", "What the load can tell at best: errors, and"):
+        assert any(line.startswith(title) for line in tables)
+    assert next(line.split() for line in tables if line.startswith("one "))[:5] == ["one", "no", "120", "120", "1.19"]
+
+
+def test_csv_has_a_row_for_each_run_in_full_precision(small: Path) -> None:
+    rows = list(csv.DictReader(io.StringIO(srf("check", str(small), "--csv").stdout)))
+    assert [r["run"] for r in rows] == ["one", "two"]
+    one = rows[0]
+    assert (one["samples"], one["used"], one["gaps"], one["resets"]) == ("120", "120", "0", "0")
+    assert (float(one["duration"]), float(one["rate_low"])) == pytest.approx((1.19, 100.0), rel=1e-9)
+    assert (float(one["V_low"]), float(one["V_high"]), float(one["W_mean"])) == (8.0, 12.0, 5.0)
+    u = [float(line.split(",")[3]) for line in data()[1:]]
+    assert (float(one["lowest"]), float(one["highest"])) == (min(u), max(u))
+    assert one["alpha_error"] == "" and float(one["lambda_error"]) > 0.1
+
+
+def test_json_has_everything(small: Path) -> None:
+    done = json.loads(srf("check", str(small), "--json").stdout)
+    assert done["schema"] == "srf.check/1" and len(done["rows"]) == 2
+    run = done["meta"]["runs"][0]
+    assert run["drive"] == [
+        {"from": 0.0, "velocity": 8.0, "acceleration": 0.0},
+        {"from": 0.5, "velocity": 12.0, "acceleration": 0.0},
+    ]
+    assert run["sampling"][0]["interval"] == pytest.approx(0.01) and run["gaps"] == [] and run["modulation"] is None
+    assert run["tells"]["errors"]["alpha"] is None  # infinite
+    assert run["tells"]["simulation"]["status"] == "ok" and done["meta"]["together"]["variation"] == 0
+    assert done["parameters"]["A"]["value"] == pytest.approx(0.012)
+
+
+def test_one_run_without_simulation(small: Path) -> None:
+    text = srf("check", str(small), "--run", "two", "--no-simulate").stdout
+    assert "two " in text and "one " not in text and "alpha" not in text
+    assert json.loads(srf("check", str(small), "--no-simulate", "--json").stdout)["meta"]["runs"][0]["tells"] is None
+
+
+@pytest.mark.parametrize(
+    ("options", "message", "hint"),
+    [
+        (("--run", "tow"), "--run tow: ", "Did you mean 'two'?"),
+        (("--fail-on", "gaps"), "--fail-on gaps: no such kind of notice", "Did you mean 'gap'?"),
+        (("--format", "cvs"), "unknown reader 'cvs'", "Did you mean 'csv'?"),
+    ],
+)
+def test_wrong_usage(options: tuple[str, ...], message: str, hint: str, small: Path) -> None:
+    stderr = srf("check", str(small), *options, code=2).stderr
+    assert message in stderr and hint in stderr
+
+
+@pytest.mark.parametrize("suffix", ["svg", "png", "pdf"])
+def test_a_figure_with_what_is_not_compared(suffix: str, small: Path) -> None:
+    lines = data()
+    lines[30:60] = [line.rpartition(",")[0] + "," for line in lines[30:60]]  # a band
+    lines[80] = lines[80].rpartition(",")[0] + ","  # a cross
+    write(small, one=lines)
+    srf("check", str(small), "--no-simulate", "--plot", f"c.{suffix}")
+    content = Path(f"c.{suffix}").read_bytes()
+    assert len(content) > 5000 and Path(f"c.{suffix}.provenance.json").exists()
+    if suffix == "svg":
+        assert b"one: 31 samples not compared" in content and b"elongation" in content
+        srf("check", str(small), "--no-simulate", "--plot", "again.svg")
+        assert Path("again.svg").read_bytes() == content
+
+
+def test_the_axes_of_what_is_imposed() -> None:
+    from srfcli.output.recordings import recordings
+
+    t = np.arange(200.0)
+    run = {
+        "name": "a",
+        "t": t,
+        "observed": t,
+        "label": "x",
+        "used": t < 150,
+        "W": np.full(200, 5.0),
+        "gaps": [(20, 30)],
+    }
+    scales = {}
+    for name, V in (("log", np.where(t < 9, 0.1, 10)), ("symlog", np.where(t < 9, -900.0, 2)), ("linear", t + 1e3)):
+        axes = recordings([{**run, "V": V}]).axes
+        scales[name] = axes[1].get_yscale()
+        low, high = axes[2].get_ylim()
+        assert low < 4 and high > 6  # a constant is not drawn as its rounding
+    assert scales == {name: name for name in scales}
+
+
+# what the load can tell
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Modulated and stepped loads, simulated with alpha = 0 and coloured noise; the start values are the true ones."""
+    folder = tmp_path_factory.mktemp("made")
+    system = ("--ageing", "dieterich+linker-dieterich", "--set", "alpha=0", "--free", "mu0,A,B,D0,lambda,alpha")
+    noise = ("--noise", "0.02", "--lag1", "0.6", "--rate", "1000")
+    programs = {
+        "modulated": ("--drive", "0.5:15, 1.5:20", "--W0", "7", "--eps", "0.15", "--onset", "0.6"),
+        "stepped": ("--drive", "4:10", "--load", "1:5, 2:6.5, 1:5"),
+    }
+    for seed, (name, program) in enumerate(programs.items()):
+        srf("simulate", *program, *system, *noise, "--seed", str(seed), "--out-dir", str(folder / name))
+    text = (folder / "modulated" / "experiment.toml").read_text(encoding="utf-8")
+    second = (folder / "stepped" / "experiment.toml").read_text(encoding="utf-8")
+    runs = "[[runs]]" + second.partition("[[runs]]")[2]
+    text = text.replace('name = "simulated"', 'name = "modulated"').replace(
+        '"simulated.csv"', '"modulated/simulated.csv"'
+    )
+    runs = runs.replace('name = "simulated"', 'name = "stepped"').replace('"simulated.csv"', '"stepped/simulated.csv"')
+    (folder / "experiment.toml").write_text(f"{text}\n{runs}", encoding="utf-8")
+    return folder
+
+
+def test_errors_are_those_of_a_fit(made: Path) -> None:
+    """The standard errors of a fit that starts from the true values are what was forecast, alpha and lambda among them."""
+    experiment = read_experiment(made, registry=REGISTRY)
+    found = told(experiment)
+    problem = fit_problem(open_model(REGISTRY, **asdict(experiment.choice)), experiment)
+    errors = fit(problem).stderr
+    lam = next(p.value for p in experiment.parameters if p.name == "lambda")
+    assert found.together is not None and len(found.runs) == 2
+    assert found.together.errors["alpha"] == pytest.approx(errors["alpha"], rel=0.15)
+    assert found.together.errors["lambda"] == pytest.approx(errors["lambda"] / lam, rel=0.15)
+    for name in ("alpha", "lambda", "n"):  # more runs know more
+        assert found.together.errors[name] < min(r.errors[name] for r in found.runs)
+
+
+@pytest.mark.parametrize(("name", "case"), [("onset", "open-01"), ("strong", "open-01"), ("loadstep", "open-01")])
+def test_errors_from_differences(name: str, case: str, shared: Path) -> None:
+    """alpha and lambda with all else known, from simulations at two values each: within a factor of 1.1, where a linear
+    response of the contact is wrong by ten."""
+    experiment = read_experiment(shared / "cases" / case, registry=REGISTRY)
+    fixed = replace(experiment, parameters=tuple(replace(p, fixed=True) for p in experiment.parameters))
+    run = next(r for r in experiment.runs if r.name == name)
+    check = check_run(run)
+    found = forecast(fixed, [check], registry=REGISTRY).runs[0]
+    choice = replace(experiment.choice, ageing="dieterich+linker-dieterich")
+    model = open_model(REGISTRY, **asdict(choice))
+    lam = next(p.value for p in experiment.parameters if p.name == "lambda")
+    sigma, rho = noise_of(check)
+    for asked, low, high, unit in (("alpha", 0.0, 2e-5, 1.0), ("lambda", lam * (1 - 1e-5), lam * (1 + 1e-5), lam)):
+        y = [predict(model, experiment, run, {"alpha": 0.0, asked: x}, rtol=1e-9).y for x in (low, high)]
+        slope = (y[1] - y[0]) / (high - low) * unit / sigma
+        seen = np.r_[slope[0], (slope[1:] - rho[1:] * slope[:-1]) / np.sqrt(1 - rho[1:] ** 2)]
+        assert found.errors[asked] == pytest.approx(1 / np.linalg.norm(seen[run.used]), rel=0.1)
+
+
+def test_a_constant_load_cannot_tell_alpha(shared: Path) -> None:
+    experiment = read_experiment(shared / "cases" / "open-01", registry=REGISTRY)
+    constant = ("steps", "stickslip", "holdout-shs")
+    found = {r.name: r for r in told(experiment).runs}
+    for name in constant:
+        assert found[name].variation == 0 and math.isinf(found[name].errors["alpha"])
+        assert verdict_of("alpha", found[name]) == "cannot be identified"
+        assert found[name].errors["n"] > 1  # from one load no exponent
+    for name in set(found) - set(constant):
+        assert verdict_of("alpha", found[name]) == CAN
+    text = srf("check", str(shared / "cases" / "open-01"), "--run", "steps", "--run", "stickslip").stdout
+    assert "the load is constant in steps and stickslip" in text
+    assert "changes the age) cannot be identified: no fitted run has a load that changes" in text
+
+
+def test_bounds_and_free_starts_cost_what_they_must(made: Path) -> None:
+    experiment = read_experiment(made, registry=REGISTRY)
+    base = told(experiment).runs[0].errors
+    known = replace(experiment, parameters=tuple(replace(p, fixed=True) for p in experiment.parameters))
+    narrow = tuple(
+        replace(p, lower=p.value * (1 - 1e-9) - 1e-9, upper=p.value * (1 + 1e-9) + 1e-9) for p in experiment.parameters
+    )
+    free = replace(experiment, runs=tuple(replace(r, initial="free") for r in experiment.runs))
+    for name in base:
+        assert told(known).runs[0].errors[name] < base[name] < told(free).runs[0].errors[name] * 1.01
+        assert told(replace(experiment, parameters=narrow)).runs[0].errors[name] == pytest.approx(
+            told(known).runs[0].errors[name], rel=1e-3
+        )
+
+
+def test_a_long_run_is_thinned_without_another_answer(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    experiment = read_experiment(made, registry=REGISTRY)
+    whole = told(experiment).runs[1].errors
+    monkeypatch.setattr(reach, "LONGEST", 900)
+    thin = told(experiment).runs[1].errors
+    for name in whole:
+        assert thin[name] == pytest.approx(whole[name], rel=0.2)
+
+
+def test_a_simulation_unlike_the_recording_is_not_believed(small: Path) -> None:
+    """Start values that put friction elsewhere say nothing about this recording."""
+    toml = TOML.replace("[parameters]\n", "[parameters]\nmu0 = { value = 0.9, lower = 0.8, upper = 1.0 }\n")
+    write(small, toml=toml)
+    text = srf("check", str(small)).stdout
+    assert "one: at the start values the simulation is " in text and "what it could tell is left out" in text
+    assert "not estimated: no simulated run resembles its recording" in text
+
+
+@pytest.mark.parametrize(
+    ("error", "peak", "verdict"),
+    [(0.01, 9.0, CAN), (0.01, 2.0, "can hardly be identified"), (0.01, 0.1, "cannot be identified"),
+     (0.2, 9.0, "can hardly be identified"), (2.0, 9.0, "cannot be identified"), (math.inf, 0.0, "cannot be identified")],
+)  # fmt: skip
+def test_verdicts(error: float, peak: float, verdict: str) -> None:
+    assert verdict_of("alpha", Reach("a", False, 0.1, {"alpha": error}, {"alpha": peak})) == verdict
+
+
+@pytest.mark.parametrize(
+    ("law", "ageing", "interface", "asked"),
+    [
+        ("srf-vsat", "ruina", "rigid", {"alpha"}),
+        ("dieterich-ruina", "dieterich+linker-dieterich", "power", {"alpha", "lambda", "n"}),
+    ],
+)
+def test_other_laws_are_asked_what_they_have(
+    law: str, ageing: str, interface: str, asked: set[str], small: Path
+) -> None:
+    toml = TOML.replace("srf-vsat", law).replace('"dieterich"', f'"{ageing}"').replace('"elastic"', f'"{interface}"')
+    experiment = read_experiment(write(small, toml=toml), registry=REGISTRY)
+    assert set(told(experiment).runs[0].errors) == asked
+
+
+# simulate reads by name, too
+
+
+def test_a_load_file_is_read_by_a_named_reader(make_file: Callable[[str], Path]) -> None:
+    path = make_file("load.dat")
+    rows = [
+        srf("simulate", "--V", "8", "--load-file", str(path), *more, "--rate", "50", "--csv").stdout
+        for more in ((), ("--format", "csv"))
+    ]
+    assert rows[0] == rows[1] and len(rows[0].splitlines()) > 50
+    stderr = srf("simulate", "--V", "8", "--load-file", str(path), "--format", "npz", code=2).stderr
+    assert "load.dat: not a whole archive" in stderr
+    assert (
+        "unknown reader 'cvs'"
+        in srf("simulate", "--V", "8", "--load-file", str(path), "--format", "cvs", code=2).stderr
+    )
+    assert "--format names the reader of a file" in srf("simulate", "--V", "8", "--format", "csv", code=2).stderr
+
+
+def test_an_experiment_is_repeated_by_a_named_reader(small: Path) -> None:
+    assert srf("simulate", str(small), "--format", "csv", "--csv").stdout.startswith("run,t,V,W")
+    assert "not a whole archive" in srf("simulate", str(small), "--format", "npz", code=2).stderr
+
+
+@pytest.fixture
+def make_file(tmp_path: Path) -> Callable[[str], Path]:
+    def make(name: str) -> Path:
+        t = np.linspace(0, 2, 101)
+        text = "\n".join(["time [s],normal_load [N]", *(f"{x:.4f},{5 + math.sin(x):.9f}" for x in t)])
+        (tmp_path / name).write_text(text + "\n", encoding="utf-8")
+        return tmp_path / name
+
+    return make

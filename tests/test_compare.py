@@ -1,0 +1,204 @@
+"""Laws side by side: matched to the same observables, studied alike, told apart where they differ."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from srfcli.cli.compare_rows import highest_fold
+from srfcli.cli.main import cli
+from srfcli.errors import SrfError
+from srfcli.numerics.compare import LawStudy, LawTask, Window, changed_areas, contrast, read_study, study_law, turns
+from srfcli.numerics.comparematch import check_adjusted, match, observe
+from srfcli.numerics.critical import critical_line
+from srfcli.numerics.hopf import critical_point
+from srfcli.status import Status
+
+LAWS = [
+    {"law": "log-log"},
+    {"law": "bowden-tabor"},
+    {"law": "dieterich-ruina", "ageing": "ruina"},
+    {"law": "rice-regularized"},
+    {"law": "two-state"},
+    {"law": "dieterich-cutoff", "ageing": "nagata"},
+    {"ageing": "perrin-rice-zheng"},
+    {"ageing": "dieterich+linker-dieterich"},
+]
+
+
+@pytest.mark.parametrize("names", LAWS, ids=lambda n: "+".join(n.values()))
+def test_a_matched_law_has_the_reference_s_observables(model, make_model, names):
+    """Looked at apart from the matching: slope by differences of the steady friction, load and frequency from the roots."""
+    goal = observe(model, model.vector(), 10.0)
+    other = make_model(**names)
+    found = match(other, other.vector(), goal)
+    assert found.status is Status.OK and found.miss < 1e-8
+    p = found.p.copy()
+    p[other.index("V")], p[other.index("W0")] = 10.0, goal.W0
+    roots = np.roots(np.asarray(other.characteristic(p.tolist()))[::-1])
+    leading = roots[np.argmax(roots.real)]
+    assert leading.real == pytest.approx(0.0, abs=1e-6 * goal.Omega)
+    assert abs(leading.imag) == pytest.approx(goal.Omega, rel=1e-6)
+    friction = []
+    for V in (10.0 * np.exp(-1e-4), 10.0, 10.0 * np.exp(1e-4)):
+        p[other.index("V")] = V
+        friction.append(float(other.cycle_friction(0.0, other.steady(p), p.tolist())))
+    assert friction[1] == pytest.approx(goal.friction, rel=1e-9)
+    assert (friction[0] - friction[2]) / 2e-4 == pytest.approx(goal.slope, rel=1e-6)
+
+
+def test_the_reference_matched_to_itself_stays(model):
+    goal = observe(model, model.vector(), 10.0)
+    assert match(model, model.vector(), goal).p == pytest.approx(model.vector(), rel=1e-12)
+    moved = model.vector({"A": 0.02, "B": 0.035, "D0": 0.6})
+    assert match(model, moved, goal).p == pytest.approx(model.vector(), rel=1e-6)
+
+
+def test_a_law_that_strengthens_cannot_be_matched_from_there(model):
+    goal = observe(model, model.vector(), 10.0)
+    assert observe(model, model.vector({"A": 0.05}), 10.0) is None
+    assert match(model, model.vector({"A": 0.05}), goal).status is Status.NO_CONVERGENCE
+
+
+@pytest.mark.parametrize("names", [("A", "B"), ("A", "B", "B"), ("A", "B", "mu0"), ("A", "B", "Q")])
+def test_what_cannot_be_adjusted_is_refused(model, names):
+    with pytest.raises(SrfError):
+        check_adjusted(model, names)
+
+
+WINDOW = Window((5.0, 40.0), (7.0, 40.0), 14, 24)
+
+
+@pytest.fixture(scope="module")
+def study(model):
+    """The paper's law without modulation and at eps = 0.13, in a small window."""
+    task = LawTask(model.source, model.key, model.vector(), (0.0, 0.13), WINDOW, onset=0.01)
+    return read_study(study_law(task))
+
+
+def test_crossings_are_critical_loads(model, study):
+    lines = WINDOW.velocities()
+    for i in (3, 44):
+        base = model.vector({"V": lines[i], "eps": 0.13})
+        line = critical_line(model, base, lo=7.0, hi=40.0, tol=1e-6)
+        seen = study.crossings[1][i]
+        expected = [q.value(model, "W0") for q in line.points]
+        assert seen[np.isfinite(seen)] == pytest.approx(expected, rel=5e-3)
+        hopf, _ = critical_point(model, model.vector({"V": lines[i]}))
+        assert study.crossings[0][i, 0] == pytest.approx(hopf.W0, rel=1e-9)
+
+
+def test_re_entrance_begins_between_one_crossing_and_three(model, study):
+    low, high = study.onset
+    assert 0 < high - low <= 0.01
+    counts = []
+    for eps in (low - 0.01, high + 0.01):
+        task = LawTask(model.source, model.key, model.vector(), (eps,), WINDOW, onset=1.0)
+        counts.append(np.isfinite(read_study(study_law(task)).crossings[0]).sum(axis=1).max())
+    assert counts[0] == 1 and counts[1] == 3
+
+
+def test_a_study_without_re_entrance_says_so(model):
+    task = LawTask(model.source, model.key, model.vector(), (0.0, 0.03), WINDOW)
+    found = read_study(study_law(task))
+    assert np.isnan(found.onset).all() and found.folds == (0, 0)
+
+
+def made(*crossings):
+    """Return a study with the given crossings and nothing else."""
+    count = len(crossings)
+    return LawStudy(tuple(crossings), ((),) * count, (0,) * count, (0,) * count, (np.nan, np.nan), (Status.OK,) * count)
+
+
+def test_areas_of_rectangles():
+    window = Window((1.0, 10.0), (1.0, np.e**4), 1, 1)  # five lines, 4 in ln W0
+    one = np.full((5, 1), np.e**2)  # stable below 2
+    later = np.full((5, 1), np.e**3)  # stable below 3
+    gap = np.full((5, 3), [np.e**1, np.e**1.5, np.e**3])  # unstable from 1 to 1.5 and from 3 on
+    assert changed_areas([one, later], window) == pytest.approx((0.0, 0.25))
+    assert changed_areas([one, gap], window) == pytest.approx((0.125, 0.25))
+    assert changed_areas([one, later, one], window) == pytest.approx((0.25, 0.0))  # stable at the middle amplitude
+    assert changed_areas([np.full((5, 1), np.nan), one], window) == pytest.approx((0.5, 0.0))
+
+
+def test_the_contrast_is_where_the_first_crossings_differ_most():
+    window = Window((1.0, 10.0), (1.0, 100.0), 1, 1)
+    a, b = np.full((5, 1), 10.0), np.full((5, 1), 10.2)
+    b[3] = 13.0
+    b[4] = np.nan
+    best = contrast(made(a, a), made(a, b), (0.0, 0.1), window)
+    assert (best.eps, best.V, best.W0) == (0.1, pytest.approx(10**0.75), (10.0, 13.0))
+    assert best.difference == pytest.approx(0.3) and best.seen
+    assert not contrast(made(a), made(np.full((5, 1), 10.2)), (0.0,), window).seen
+    assert contrast(made(a), made(np.full((5, 1), np.nan)), (0.0,), window) is None
+
+
+@pytest.mark.parametrize(("values", "count"), [([1, 2, 3], 0), ([1, 2, 1], 1), ([1, 2, 2, 1, 3], 2), ([1.0], 0)])
+def test_turns(values, count):
+    assert turns(np.array(values, float)) == count
+
+
+def test_highest_fold():
+    curve = np.array([[1.0, 5], [3, 5], [2, 5], [2.5, 5], [2.2, 5], [4, 5]])
+    found = LawStudy((), ((curve,),), (3,), (0,), (0.0, 0.0), (Status.OK,))
+    assert highest_fold(found, 0) == 3.0
+    assert highest_fold(LawStudy((), ((curve[:2],),), (0,), (0,), (0.0, 0.0), (Status.OK,)), 0) is None
+
+
+def run(*arguments):
+    done = CliRunner().invoke(cli, ["compare", *arguments])
+    return done.exit_code, done.stdout, done.stderr
+
+
+SMALL = ("--over", "V=5:40:12", "--over", "K/W0=0.006:0.03:20", "--eps", "0.13")
+
+
+def test_the_command_compares(tmp_path):
+    code, out, _ = run(
+        "--ageing",
+        "dieterich",
+        "--ageing",
+        "dieterich+linker-dieterich",
+        *SMALL,
+        "--json",
+        "--plot",
+        str(tmp_path / "a.svg"),
+    )
+    data = json.loads(out)
+    assert code == 0 and data["schema"] == "srf.compare/1"
+    first, second = data["rows"]
+    assert first["law"] == "dieterich" and first["miss"] == 0 and second["miss"] < 1e-8
+    assert first["reentrance_eps"] == pytest.approx(0.1, abs=0.01)
+    [pair] = data["meta"]["pairs"]
+    assert pair["difference"] > 0.03
+    assert any("differ most at V = " in note and "times the 3%" in note for note in data["notes"])
+    assert (tmp_path / "a.svg").stat().st_size > 10_000
+
+
+def test_the_command_does_not_depend_on_the_workers():
+    laws = ("--law", "srf-vsat", "--law", "bowden-tabor", *SMALL[:4], "--eps", "0.05", "--csv")
+    alone, spread = run(*laws), run(*laws, "--workers", "2")
+    assert alone[0] == 0 and alone[1] == spread[1]
+    assert len(list(csv.DictReader(io.StringIO(alone[1])))) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--law", "srf-vsat"), "one law is nothing to compare"),
+        (("--law", "srf-vsat", "--law", "log-log", "--eps", "0"), "leaves nothing to compare"),
+        (("--law", "srf-vsat", "--law", "log-log", "--set", "Q=3"), "unknown parameter 'Q' in all of these laws"),
+        (("--law", "srf-vsat", "--law", "log-log", "--set", "A=0.05"), "no critical load at 10 um/s"),
+        (("--law", "srf-vsat", "--law", "log-log", "--adjust", "A,B"), "not three parameters"),
+        (("--law", "srf-vsat", "--law", "log-log", "--over", "f=1:9"), "not an axis of the comparison"),
+        (("--law", "srf-vsat", "--law", "nosuch"), "nosuch"),
+    ],
+)
+def test_misuse_is_told(arguments, said):
+    code, _, err = run(*arguments)
+    assert code == 2 and said in err

@@ -1,0 +1,287 @@
+"""Stability maps: points against brute force, refinement where a boundary hides, every component found, by two methods."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from brute import Slider, shoot, steady
+
+from srfcli.errors import SrfError
+from srfcli.numerics.atlas import AtlasSettings, find_components
+from srfcli.numerics.continuation import StepSettings
+from srfcli.numerics.critical import critical_line
+from srfcli.numerics.map import KINDS, compute_map, join_tiles, kinds, per_slip
+from srfcli.numerics.mapcurves import find_boundaries, unexplained
+from srfcli.numerics.mapgrid import MapAxis, MapGrid, MapSettings, tile_tasks
+from srfcli.numerics.maprefine import _suspects, solve_tile
+from srfcli.numerics.maptile import neighbours
+from srfcli.numerics.orbit import uniform_mesh
+from srfcli.numerics.plane import Axis, Plane
+from srfcli.numerics.scan import robust_orbits
+from srfcli.numerics.special import crossings_at, special_points
+from srfcli.status import Status
+
+
+def window(model, eps, columns, rows, *, V=(1.0, 100.0), ratio=(0.0021, 0.03), **values):
+    return MapGrid(
+        model.vector({"eps": eps, **values}), MapAxis("V", *V, columns), MapAxis("W0", *ratio, rows, True, "K")
+    )
+
+
+def finished(model, found, settings=None):
+    *_, last = find_boundaries(model, found, settings)
+    return last
+
+
+def extents(model, atlas):
+    """Return the ranges of V and W0 of each component, in the order of its lowest load."""
+    spans = []
+    for branch in atlas.branches:
+        V, W0 = (np.array([pt.value(model, name) for pt in branch.points]) for name in ("V", "W0"))
+        spans.append((W0.min(), V.min(), V.max(), W0.max()))
+    return np.array(sorted(spans))
+
+
+@pytest.fixture(scope="module")
+def found(model):
+    """The map of the paper's system at eps = 0.18, coarser than the default."""
+    return compute_map(model, window(model, 0.18, 31, 61))
+
+
+@pytest.fixture(scope="module")
+def atlas(model, found):
+    return finished(model, found)
+
+
+def test_points_are_the_multipliers_of_brute_force(model, found):
+    """A sample over the whole window, orbits and multipliers by shooting from the equations as printed."""
+    rng, p = np.random.default_rng(3), found.points(model)
+    for i, j in zip(rng.integers(0, 31, 5), rng.integers(0, 61, 5), strict=True):
+        V, W0 = p[model.index("V"), i, j], p[model.index("W0"), i, j]
+        growth = brute_growth(model, V=float(V), W0=float(W0), eps=0.18)
+        assert found.growth[i, j] == pytest.approx(growth, abs=3e-4)
+        assert (found.kind[i, j] == KINDS.index("stable")) == (growth < 0)
+
+
+def test_exponent_per_slip_is_that_of_the_linear_theory_without_modulation(model):
+    """At eps = 0 the exponent is the real part of a root of the characteristic polynomial, whatever the frequency."""
+    grid = window(model, 0.0, 3, 4)
+    found = compute_map(model, grid)
+    p = found.points(model)
+    scaled = found.growth * per_slip(model, p)
+    for i, j in np.ndindex(3, 4):
+        roots = np.roots(np.asarray(model.characteristic(list(p[:, i, j])))[::-1])
+        V, D0 = p[model.index("V"), i, j], p[model.index("D0"), i, j]
+        # the fastest roots are not resolved by a mesh that suits the leading one
+        assert scaled[i, j] == pytest.approx(float(roots.real.max()) * D0 / V, rel=1e-3, abs=1e-6)
+
+
+def test_two_components_at_eps_018(model, found, atlas):
+    assert atlas.status is Status.OK
+    small, large = extents(model, atlas)
+    assert small[1:3] == pytest.approx([1.0, 27.387], rel=1e-4)
+    assert large[1:2] == pytest.approx([1.0], rel=1e-9)
+    assert all(pt.status.ok and pt.error <= 1e-6 for b in atlas.branches for pt in b.points)
+    assert not len(unexplained(model, found, atlas))
+
+
+def test_a_missing_component_is_noticed(model, found, atlas):
+    without = dataclasses.replace(atlas, branches=atlas.branches[:1])
+    assert len(unexplained(model, found, without)) > 10
+
+
+def test_number_of_boundaries_on_a_line_is_that_of_a_scan_of_the_line(model, atlas):
+    values = np.array([2.0, 20.0, 41.0])
+    for V, heights in zip(values, crossings_at(model, atlas.plane, atlas.branches, values), strict=True):
+        lo, hi = 0.21 / 0.03, 0.21 / 0.0021
+        line = critical_line(model, model.vector({"eps": 0.18, "V": V}), lo=lo, hi=hi, tol=1e-6)
+        assert len(heights) == len(line.points)
+        assert heights == pytest.approx([pt.value(model, "W0") for pt in line.points], rel=5e-3)
+
+
+def test_folds_lie_where_crossings_appear(model, atlas):
+    """Two crossings just before the fold's velocity are gone just beyond it."""
+    marks = [s for b in atlas.branches for s in special_points(model, atlas.plane, b) if s.axis == "V"]
+    assert all(s.status is Status.OK for s in marks)
+    fold = min(marks, key=lambda s: s.p[model.index("W0")])
+    V, W0 = (float(fold.p[model.index(name)]) for name in ("V", "W0"))
+    assert pytest.approx(27.387153754, rel=1e-6) == V  # a second mesh and step agree to this
+    counts = []
+    for side in (1 - 1e-5, 1 + 1e-5):
+        base = model.vector({"eps": 0.18, "V": V * side})
+        line = critical_line(model, base, lo=0.95 * W0, hi=1.05 * W0, tol=1e-7, samples=48, resolution=1e-4)
+        counts.append(len(line.points))
+    assert counts == [2, 0]
+
+
+@pytest.mark.parametrize(("eps", "count"), [(0.18, 2), (0.4, 4)])
+def test_a_second_method_finds_the_same_components(model, eps, count):
+    """A map, and curves from lines on a finer mesh with other seeds and shorter steps."""
+    grid = window(model, eps, 30, 40, ratio=(0.21 / 200, 0.21 / 8))
+    atlas = finished(model, compute_map(model, grid, MapSettings(depth=2)))
+    other = AtlasSettings(lines=9, samples=100, tol=1e-5, steps=StepSettings(largest=0.025, mesh_error=5e-5))
+    *_, second = find_components(model, Plane(grid.base, Axis("V", 1.0, 100.0), Axis("W0", 8.0, 200.0)), other)
+    assert len(atlas.branches) == len(second.branches) == count
+    assert extents(model, atlas)[:, :2] == pytest.approx(extents(model, second)[:, :2], rel=1e-3)
+    if count == 2:
+        assert special_folds(model, atlas) == pytest.approx(special_folds(model, second), rel=1e-5)
+
+
+def special_folds(model, atlas):
+    """Return the velocities at which boundaries turn round, rising."""
+    return sorted(float(s.p[0]) for b in atlas.branches for s in special_points(model, atlas.plane, b) if s.axis == "V")
+
+
+def test_an_island_is_found_and_closed(model):
+    """A resonance region in the plane of frequency and amplitude that touches no edge of the window."""
+    base = model.vector({"V": 30.0, "W0": 13.0})
+    grid = MapGrid(base, MapAxis("f", 140.0, 200.0, 13, False), MapAxis("eps", 0.12, 0.48, 15, False))
+    found = compute_map(model, grid)
+    atlas = finished(model, found)
+    islands = [b for b in atlas.branches if b.end is Status.CLOSED]
+    assert len(islands) == 1 and islands[0].start is Status.CLOSED
+    f = np.array([pt.value(model, "f") for pt in islands[0].points])
+    assert (f.min(), f.max()) == pytest.approx((155.966, 182.97), rel=2e-3)
+    assert not len(unexplained(model, found, atlas))
+    assert (
+        brute_growth(model, V=30.0, W0=13.0, eps=0.3, f=168.0) * brute_growth(model, V=30.0, W0=13.0, eps=0.15, f=168.0)
+        < 0
+    )
+
+
+def brute_growth(model, **values):
+    """Return ln |leading multiplier| by shooting, which starts from the collocation's orbit."""
+    p = model.vector({"eps": 0.18, **values})
+    start = robust_orbits(model, p[:, None], None, uniform_mesh(32)).orbit.x[0, 0]
+    return shoot(Slider(**values), start, rtol=1e-8, tol=1e-6).growth
+
+
+def test_resonances_lie_where_the_multiplier_is_a_root_of_one(model):
+    """At low frequency the critical multiplier turns far in a period: 1:4, 1:3, and 1:2 where it meets the real axis."""
+    grid = window(model, 0.05, 11, 12, V=(5.0, 20.0), ratio=(0.022, 0.03), f=15.0)
+    atlas = finished(model, compute_map(model, grid))
+    marks = {s.what: s for b in atlas.branches for s in special_points(model, atlas.plane, b)}
+    assert marks["1:4"].theta == pytest.approx(np.pi / 2, abs=1e-7)
+    assert marks["1:3"].theta == pytest.approx(2 * np.pi / 3, abs=1e-7)
+    assert marks["1:4"].error < 1e-6 and marks["1:3"].error < 1e-6
+    assert marks["1:2"].error < 1e-3
+    V, W0 = (float(marks["1:3"].p[model.index(n)]) for n in ("V", "W0"))
+    slider = Slider(V=V, W0=W0, eps=0.05, f=15.0)
+    orbit = shoot(slider, steady(slider), rtol=1e-10)
+    assert abs(np.angle(orbit.multipliers[0])) == pytest.approx(2 * np.pi / 3, abs=1e-5)
+    assert orbit.growth == pytest.approx(0.0, abs=1e-5)
+
+
+def test_a_tongue_between_grid_points_is_found_by_refinement(model):
+    """The tip of the tongue at V = 27.387 lies within one cell, all of whose corners are stable."""
+    grid = window(model, 0.18, 5, 4, V=(27.2, 29.0), ratio=(0.21 / 17.5, 0.21 / 13.0))
+    coarse = compute_map(model, grid, MapSettings(depth=0))
+    assert (coarse.kind == KINDS.index("stable")).all()
+    fine = compute_map(model, grid, MapSettings(depth=4))
+    assert len(fine.extra_at) and (np.abs(fine.extra_leading) > 1).any()
+    assert len(finished(model, fine).branches) == 1
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (17, 49), (33, 7), (5, 200)])
+def test_tiles_cover_every_cell_once(model, shape):
+    cells = np.zeros((shape[0] - 1, shape[1] - 1), dtype=int)
+    for task in tile_tasks(model, window(model, 0.18, *shape)):
+        cells[slice(*task.columns), slice(*task.rows)] += 1
+    assert (cells == 1).all()
+
+
+def test_the_division_into_tiles_matters_little(model):
+    """Another division is another set of guesses and meshes: values agree to the mesh's error."""
+    grid = window(model, 0.18, 13, 17, V=(5.0, 30.0))
+    one = compute_map(model, grid, MapSettings(block=(16, 48), depth=1))
+    many = compute_map(model, grid, MapSettings(block=(4, 5), depth=1))
+    assert one.growth == pytest.approx(many.growth, abs=3e-4)
+
+
+def test_tiles_may_come_in_any_order(model):
+    grid = window(model, 0.18, 9, 9)
+    settings = MapSettings(block=(4, 4), depth=1)
+    tasks = tile_tasks(model, grid, settings)
+    tiles = {t.index: solve_tile(t) for t in reversed(tasks)}
+    late = join_tiles(model, grid, settings, [(t, tiles[t.index]) for t in tasks])
+    assert late.leading.tobytes() == compute_map(model, grid, settings).leading.tobytes()
+
+
+def test_an_interrupted_map_keeps_what_is_finished(model):
+    def interrupted(function, tasks):
+        for index in (3, 1):
+            yield index, function(tasks[index])
+        raise KeyboardInterrupt
+
+    grid, settings = window(model, 0.18, 9, 9), MapSettings(block=(4, 4), depth=1)
+    whole, part = compute_map(model, grid, settings), compute_map(model, grid, settings, run=interrupted)
+    assert whole.finished and not part.finished
+    done = np.isfinite(part.leading)
+    assert 0 < done.sum() < done.size
+    assert (part.leading[done] == whole.leading[done]).all()
+
+
+def test_a_point_without_an_orbit_says_so(model):
+    """A modulation that lifts nearly all the load leaves no orbit on the meshes allowed."""
+    grid = window(model, 0.97, 2, 2, V=(1.0, 1.2), ratio=(0.005, 0.0052))
+    found = compute_map(model, grid, MapSettings(finest=12, depth=0))
+    lost = ~np.isfinite(found.leading)
+    assert found.lost == lost.sum()
+    assert (found.kind[lost] == KINDS.index("unresolved")).all()
+    if found.lost:
+        assert any("no forced periodic state" in note for note in finished(model, found).notes)
+
+
+@pytest.mark.parametrize(
+    ("corners", "error", "wanted"),
+    [
+        ([-1.0, -1.0, -1.0, -1.0], 0.5, False),
+        ([-0.1, -1.0, -1.0, -1.0], 0.5, True),  # could reach zero inside
+        ([0.1, 1.0, 1.0, 1.0], 0.5, True),
+        ([-1.0, 1.0, 1.0, -1.0], 0.0, True),  # a saddle: which corners are joined is not known
+        ([-1.0, -1.0, 1.0, 1.0], 0.1, False),  # a boundary that is plain to see
+        ([-1.0, -1.0, 1.0, 1.0], 0.9, True),
+        ([-1.0, np.nan, 1.0, 1.0], 0.9, False),
+    ],
+)
+def test_which_cells_are_halved(corners, error, wanted):
+    assert _suspects(np.array([corners]), np.array([error])).tolist() == [wanted]
+
+
+def test_neighbours_interpolate_cubics_exactly():
+    known, new = np.array([0, 8, 16, 24, 30]), np.array([4, 20, 28, 12])
+    index, weights = neighbours(known, new)
+    assert (weights * (index**3 - 2.0 * index**2)).sum(axis=1) == pytest.approx(new**3 - 2.0 * new**2)
+
+
+def test_kinds_of_multipliers():
+    rho = np.array([np.nan, 0.5, 1.1 + 0.3j, -1.2, 1.3, 1e-200 + 0j])
+    assert [KINDS[k] for k in kinds(rho)] == ["unresolved", "stable", "ns", "pd", "fold", "stable"]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "said"),
+    [
+        (MapAxis("V", 1, 9, 5), MapAxis("V", 1, 9, 5), "both involve V"),
+        (MapAxis("K", 0.1, 0.3, 5), MapAxis("W0", 0.01, 0.03, 5, True, "K"), "both involve K"),
+        (MapAxis("V", 1, 9, 1), MapAxis("W0", 4, 9, 5), "has 1 point"),
+        (MapAxis("V", 1, 9, 5), MapAxis("W0", 0.0, 0.03, 5, False, "K"), "begins at 0"),
+        (MapAxis("Q", 1, 9, 5), MapAxis("W0", 4, 9, 5), "unknown parameter"),
+    ],
+)
+def test_axes_that_span_no_plane_are_refused(model, x, y, said):
+    with pytest.raises(SrfError, match=said):
+        tile_tasks(model, MapGrid(model.vector({"eps": 0.1}), x, y))
+
+
+def test_a_ratio_moves_its_second_part(model):
+    axis = MapAxis("W0", 0.005, 0.03, 7, False, "K")
+    base = model.vector({})
+    loads = axis.parameter(model, base, axis.samples())
+    assert loads[[0, -1]] == pytest.approx([0.21 / 0.005, 0.21 / 0.03])
+    p = np.repeat(base[:, None], 7, axis=1)
+    p[model.index("W0")] = loads
+    assert axis.quantity(model, p) == pytest.approx(axis.samples())
+    assert (axis.between(np.array([0.0, 6.0])) == [0.005, 0.03]).all()

@@ -1,0 +1,248 @@
+"""Concealed cases and banks of them: folders that read back and give nothing away, strengths, seals that show tampering."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from srfcli.errors import SrfError
+from srfcli.proof.bank import make_bank, plan_bank
+from srfcli.proof.case import known_physics, known_plans, known_traces, make_case
+from srfcli.proof.draw import KINDS, draw_recipe
+from srfcli.proof.effects import NAMES, OUTSIDE_NAMES
+from srfcli.proof.folder import STARTS
+from srfcli.proof.motion import move
+from srfcli.proof.physics import Physics
+from srfcli.proof.protocol import Plan
+from srfcli.proof.seal import SEAL, check_cases, seal, unseal
+from srfcli.recording.experiment import read_experiment
+from srfcli.registry import load_registry
+
+NOISE = float(np.hypot(0.02, 0.005 / np.sqrt(12)))  # um, of a gauge and its quanta
+LAWS = {"srf-vsat", "dieterich-ruina"}
+SHORT = (
+    Plan("wave", ((0.5, 20.0),), 7.0, 0.001, eps=0.2, f=110.0, onset=0.25),
+    Plan("steps", ((0.8, 20.0), (0.8, 40.0), (1.0, 5.0)), 5.0, 0.004, steps=((1.2, 1.5),)),
+)
+
+
+def rms(x):
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Cases of two short runs, one held out."""
+    plans = (SHORT[1], replace(SHORT[0], holdout=True))
+    monkeypatch.setattr("srfcli.proof.draw.draw_protocol", lambda rng: plans)
+
+
+def contents(folder):
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("name", [None, *NAMES, *OUTSIDE_NAMES])
+def test_every_case_reads_back_and_gives_nothing_away(quick, tmp_path, name):
+    truth = make_case(tmp_path / "c", 7, effects=[name] if name else [], size=0.8, rough=False, strengths=False)
+    experiment = read_experiment(tmp_path / "c", registry=load_registry())
+    p, baseline = known_physics(truth), known_physics(truth, baseline=True)
+    assert truth["verdict"] == ("none" if not name else "identified" if name in NAMES else "unknown")
+    assert (p == baseline) == (name is None)
+    assert experiment.choice.law in LAWS
+    assert (experiment.choice.interface == "rigid", not experiment.choice.inertia, experiment.choice.law != "srf-vsat") == (
+        baseline.rigid, baseline.massless, baseline.bare,
+    )  # fmt: skip
+    fitted = {q.name for q in experiment.parameters if not q.fixed}
+    assert fitted == set(STARTS) - ({"lambda"} if baseline.rigid else set()) - ({"Vsat"} if baseline.bare else set())
+    traces = known_traces(truth)
+    for run, plan in zip(experiment.runs, known_plans(truth), strict=True):
+        assert run.used.all()
+        assert {n.kind for n in run.notices} <= ({"quantisation"} if truth["gauge"]["lag1"] else set())
+        assert np.allclose(run.load.rest(0.0), plan.W0)
+        left = rms(run.observed - traces[plan.name].u) / NOISE
+        assert 0.75 < left < 1.25
+    text = b" ".join(contents(tmp_path / "c").values()).decode()
+    assert not [n for n in (*NAMES, *OUTSIDE_NAMES, "effect", "rough", "seed") if n != "inertia" and n in text]
+
+
+def test_same_seed_same_bytes(quick, tmp_path):
+    truths = [make_case(tmp_path / n, s, kind="pair") for n, s in (("a", 3), ("b", 3), ("c", 4))]
+    a, b, c = (contents(tmp_path / n) for n in "abc")
+    assert (a, json.dumps(truths[0])) == (b, json.dumps(truths[1]))
+    assert a["steps.csv"] != c["steps.csv"]
+
+
+def test_strength_is_the_distance_moved(quick, tmp_path):
+    truth = make_case(tmp_path / "c", 11, effects=["viscous-drag", "friction-drift"], size=0.9, rough=3e-4)
+    p = known_physics(truth)
+    assert p.track.size == truth["rough"] == 3e-4
+    steps = known_plans(truth)[0]
+    change = (move(p, steps).u - move(replace(p, drag=0.0), steps).u) / 0.02
+    strength = truth["strength"]["viscous-drag"]
+    assert strength["rms_over_noise"]["steps"] == pytest.approx(rms(change), rel=1e-5)
+    assert strength["noncentrality"] == pytest.approx(change @ change, rel=1e-5)  # the held-out run does not count
+    assert set(truth["strength"]) == {"viscous-drag", "friction-drift"}
+
+
+def test_a_truth_survives_json(quick, tmp_path):
+    truth = make_case(tmp_path / "c", 2, kind="outside", rough=True, strengths=False)
+    again = json.loads(json.dumps(truth, allow_nan=False))
+    assert known_physics(again) == known_physics(truth)
+    assert known_plans(again) == known_plans(truth)
+    assert "strength" not in truth
+
+
+def test_recipes_draw_what_is_asked_for():
+    kinds, odd = {k: 0 for k in KINDS}, 0
+    for seed in range(400):
+        recipe = draw_recipe(np.random.default_rng(seed))
+        count = len(recipe.effects)
+        listed = all(e.listed for e in recipe.effects)
+        kinds[("none", "single", "pair")[count] if listed else "outside"] += 1
+        usual = not (recipe.baseline.rigid or recipe.baseline.massless or recipe.baseline.bare)
+        odd += count == 0 and not usual
+        assert all(0 <= s <= 1 for s in recipe.sizes)
+        assert all(plan.f * plan.interval <= 1 / 8 for plan in recipe.plans)  # eight samples a period or more
+    assert all(
+        0.6 * share < kinds[k] / 400 < 1.5 * share
+        for k, share in {"none": 0.25, "single": 0.4, "pair": 0.15, "outside": 0.2}.items()
+    )
+    assert odd > 4  # a rigid baseline is no proof that compliance is concealed
+
+
+def test_a_slider_that_cannot_be_followed_is_drawn_again_and_in_the_end_told(quick, tmp_path, monkeypatch):
+    monkeypatch.setattr("srfcli.proof.motion.MOST_STEPS", 3)
+    assert not move(Physics(), SHORT[0]).complete
+    with pytest.raises(SrfError, match="none of 8 sliders"):
+        make_case(tmp_path / "c", 1)
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"effects": ["linker"]}, "unknown effect 'linker'"),
+        ({"kind": "nothing"}, "unknown kind"),
+        ({"effects": ["inertia", "inertia"]}, "named twice"),
+        ({"effects": ["inertia"], "size": 1.5}, "size = 1.5"),
+        ({"rough": 3.0}, "rough = 3"),
+    ],
+)
+def test_misuse_is_told(tmp_path, asked, message):
+    with pytest.raises(SrfError, match=message) as caught:
+        make_case(tmp_path / "c", 1, **asked)
+    assert caught.value.hint
+    assert not (tmp_path / "c").exists()
+
+
+def test_a_plan_covers_every_effect():
+    plan = plan_bank(200, 5)
+    assert len(plan) == 200
+    singles = [names[0] for names in plan if len(names) == 1]
+    assert set(singles) == {*NAMES, *OUTSIDE_NAMES}
+    counts = [singles.count(n) for n in NAMES]
+    assert max(counts) - min(counts) <= 1
+    assert (sum(not names for names in plan), sum(len(names) == 2 for names in plan)) == (50, 30)
+    assert plan == plan_bank(200, 5) != plan_bank(200, 6)
+    assert any(a != b for a, b in pairwise(map(len, plan[:40])))  # shuffled
+
+
+@pytest.fixture
+def bank(quick, tmp_path):
+    return make_bank(tmp_path / "bank", 3, 1, strengths=False)
+
+
+def test_a_bank_is_sealed_and_opens(bank, tmp_path):
+    assert check_cases(bank.folder) == bank.cases == ("case-000", "case-001", "case-002")
+    assert set(unseal(bank.folder, bank.apart)) == set(bank.cases)
+    assert bank.digest in (bank.folder / SEAL).read_text()
+    assert bank.apart.parent == tmp_path  # beside the cases, not among them
+    public = b" ".join(contents(bank.folder).values()).decode()
+    assert not [n for n in ("alpha", "physics", 'truth"', "salt", "seed") if n in public]
+    again = make_bank(tmp_path / "again", 3, 1, strengths=False)
+    assert contents(again.folder) == contents(bank.folder)
+    assert again.apart.read_bytes() == bank.apart.read_bytes()
+
+
+@pytest.mark.slow
+def test_a_bank_does_not_depend_on_its_workers(tmp_path):
+    one, two = (make_bank(tmp_path / str(n), 2, 1, strengths=False, workers=n) for n in (1, 2))
+    assert contents(one.folder) == contents(two.folder)
+
+
+def _truths(bank):
+    data = json.loads(bank.apart.read_text())
+    data["truths"]["case-001"]["effects"] = ["inertia"]
+    bank.apart.write_text(json.dumps(data))
+
+
+def _salt(bank):
+    data = json.loads(bank.apart.read_text())
+    data["salt"] = "0" * 64
+    bank.apart.write_text(json.dumps(data))
+
+
+def _reading(bank):
+    path = bank.folder / "case-001" / "steps.csv"
+    path.write_bytes(path.read_bytes().replace(b".005", b".010", 1))
+
+
+def _extra(bank):
+    (bank.folder / "case-000" / "hint.txt").write_text("inertia")
+
+
+def _swapped(bank):
+    a, b = (bank.folder / n for n in ("case-000", "case-001"))
+    a.rename(bank.folder / "x")
+    b.rename(a)
+    (bank.folder / "x").rename(b)
+
+
+def _gone(bank):
+    shutil.rmtree(bank.folder / "case-002")
+
+
+def _unlisted(bank):
+    data = json.loads((bank.folder / SEAL).read_text())
+    del data["cases"]["case-002"]
+    (bank.folder / SEAL).write_text(json.dumps(data))
+
+
+def _garbled(bank):
+    (bank.folder / SEAL).write_text("{")
+
+
+def _foreign(bank):
+    (bank.folder / SEAL).write_text("{}")
+
+
+def _lost(bank):
+    bank.apart.unlink()
+
+
+@pytest.mark.parametrize(
+    "tamper", [_truths, _salt, _reading, _extra, _swapped, _gone, _unlisted, _garbled, _foreign, _lost]
+)
+def test_tampering_is_found(bank, tamper):
+    tamper(bank)
+    with pytest.raises(SrfError) as caught:
+        unseal(bank.folder, bank.apart)
+    assert caught.value.hint
+
+
+def test_banks_are_never_overwritten_and_truths_never_among_cases(bank, tmp_path):
+    with pytest.raises(SrfError, match="exists already"):
+        make_bank(bank.folder, 3, 1)
+    with pytest.raises(SrfError, match="exists already"):
+        make_bank(tmp_path / "other", 3, 1, apart=bank.apart)
+    with pytest.raises(SrfError, match="lies in the folder"):
+        seal(bank.folder, {}, bank.folder / "truths.json", seed=1)
+    with pytest.raises(SrfError, match="exists already"):
+        make_case(bank.folder / "case-000", 1)
+    with pytest.raises(SrfError, match="0 cases"):
+        make_bank(tmp_path / "none", 0, 1)

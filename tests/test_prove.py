@@ -1,0 +1,596 @@
+"""The blind proof: marks by hand, rates by their formulas, trials that resume, lose workers, and refuse what was tampered with."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from srfcli.cli import prove as command
+from srfcli.cli.main import main
+from srfcli.errors import SrfError
+from srfcli.parallel.pool import run_processes
+from srfcli.proof.bank import plan_bank
+from srfcli.proof.case import make_case
+from srfcli.proof.draw import KINDS
+from srfcli.proof.effects import variants
+from srfcli.proof.physics import Physics
+from srfcli.proof.protocol import Plan
+from srfcli.trial import mark as marking
+from srfcli.trial import report, sight
+from srfcli.trial.answer import Answer, from_line, read_answers, to_line, write_answers
+from srfcli.trial.blind import Task, answer_case, code_of, diagnose_case
+from srfcli.trial.mark import INVISIBLE, accepted, mark
+from srfcli.trial.rates import Rate, calibration, quantile, rate
+from srfcli.trial.run import Trial, answer_all, begin, open_truths
+from srfcli.trial.sight import Sight, see, stands_out
+
+ROOT = Path(__file__).resolve().parents[1]
+SHORT = (
+    Plan("wave", ((0.5, 20.0),), 7.0, 0.001, eps=0.2, f=110.0, onset=0.25),
+    Plan("steps", ((0.8, 20.0), (0.8, 40.0), (1.0, 5.0)), 5.0, 0.004, steps=((1.2, 1.5),)),
+)
+SURE = {"none": 0.0, "unknown": 0.01}
+
+
+# ---- diagnoses that are not: they see a folder, as the real one does
+
+
+def says_none(folder, plugins):
+    return Answer(
+        "", "none", confidence={"none": 0.95, "unknown": 0.05}, held={"wave": {"augmented": 0.02, "baseline": 0.02}}
+    )
+
+
+def careless(folder, plugins):
+    """Raise at one case, end the process at another, never end at a third."""
+    number = int(folder.name[-1])
+    if number == 0:
+        raise ValueError("a matrix\nis singular")
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    while number == 2:
+        try:
+            sum(range(1000))
+        except Exception:  # it copes with everything
+            pass
+    return says_none(folder, plugins)
+
+
+def remembers(folder, plugins):
+    """Leave a mark per call, and end the process at the first call on the fourth case."""
+    marks = folder.parent.parent / "calls"
+    marks.mkdir(exist_ok=True)
+    times = len(list(marks.glob(f"{folder.name}*")))
+    (marks / f"{folder.name}.{times}").touch()
+    if folder.name.endswith("3") and not times:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return says_none(folder, plugins)
+
+
+def peeks(folder, plugins):
+    """Say what the folder and all above it up to the trial let one see of a truth."""
+    inside = sorted(p.name for p in folder.rglob("*"))
+    return Answer("", "none", not_identifiable=tuple(inside))
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Cases of two short runs, one held out."""
+    plans = (SHORT[1], replace(SHORT[0], holdout=True))
+    monkeypatch.setattr("srfcli.proof.draw.draw_protocol", lambda rng: plans)
+
+
+def new_trial(folder, n=4, **more):
+    options = {"seed": 3, "kinds": (), "resume": False, "workers": 1, **more}
+    return begin(folder, cases=n, **options)
+
+
+# ---- marks
+
+
+def truth_of(*effects, verdict="identified", rough=0.0, **more):
+    return {"effects": list(effects), "verdict": verdict if effects else "none", "rough": rough,
+            "sizes": dict.fromkeys(effects, 0.5), "truth": {}, **more}  # fmt: skip
+
+
+def marked(truth, verdict, *names, sigmas=50.0, confidence=None, equivalent=(), held=0.021):
+    said = "+".join(sorted(names)) if names else verdict
+    answer = Answer(
+        "case-000", verdict, names, {said: 0.97, "none": 0.01} if confidence is None else confidence, equivalent,
+        held={"a": {"baseline": 0.04, "augmented": held}, "b": {"baseline": 0.04, "augmented": held}},
+    )  # fmt: skip
+    stands = sigmas if isinstance(sigmas, dict) else dict.fromkeys(truth["effects"], sigmas)
+    return mark(truth, answer, Sight("case-000", {"a": 0.02, "b": 0.02}, stands))
+
+
+ALPHA, DRAG, LAG = "linker-dieterich", "viscous-drag", "sensor-lag"
+
+
+@pytest.mark.parametrize(
+    ("truth", "verdict", "names", "right"),
+    [
+        (truth_of(), "none", (), True),
+        (truth_of(), "inconclusive", (), False),
+        (truth_of(), "unknown", (), False),
+        (truth_of(), "identified", (ALPHA,), False),
+        (truth_of(ALPHA), "identified", (ALPHA,), True),
+        (truth_of(ALPHA), "identified", (DRAG,), False),
+        (truth_of(ALPHA), "identified", (ALPHA, DRAG), False),
+        (truth_of(ALPHA), "none", (), False),
+        (truth_of(ALPHA), "ambiguous", (ALPHA, DRAG), False),
+        (truth_of(ALPHA, DRAG), "identified", (DRAG, ALPHA), True),
+        (truth_of(ALPHA, DRAG), "identified", (ALPHA,), False),
+        (truth_of("age-exponent", verdict="unknown"), "unknown", (), True),
+        (truth_of("age-exponent", verdict="unknown"), "identified", ("slip-evolution",), False),
+        (truth_of(ALPHA, accept=["unknown"]), "unknown", (), True),
+        (truth_of(ALPHA, accept=["sensor-lag+viscous-drag"]), "identified", (DRAG, LAG), True),
+        (truth_of(ALPHA), "failed", (), False),
+    ],
+)
+def test_right_is_the_verdict_and_the_set(truth, verdict, names, right):
+    assert marked(truth, verdict, *names).right is right
+
+
+def test_ambiguous_counts_where_the_truth_is_listed_or_equivalent():
+    assert marked(truth_of(ALPHA), "ambiguous", ALPHA, DRAG).class_right
+    assert not marked(truth_of(ALPHA), "ambiguous", LAG, DRAG).class_right
+    assert marked(truth_of(ALPHA), "ambiguous", LAG, DRAG, equivalent=((LAG, ALPHA),)).class_right
+    assert not marked(truth_of(ALPHA), "identified", LAG, equivalent=((LAG, ALPHA),)).class_right
+    assert not marked(truth_of(), "ambiguous", LAG, DRAG).class_right
+    assert not marked(truth_of("age-exponent", verdict="unknown"), "ambiguous", "age-exponent").class_right
+
+
+def test_what_cannot_be_seen_is_not_asked_for():
+    weak = {"sigmas": INVISIBLE - 0.1}
+    for verdict in ("none", "inconclusive", "ambiguous"):
+        assert marked(truth_of(ALPHA), verdict, **weak).right
+        assert not marked(truth_of(ALPHA), verdict, sigmas=INVISIBLE).right
+        assert not marked(truth_of(ALPHA), verdict, sigmas={ALPHA: None}).right  # not known to be invisible
+    assert marked(truth_of(ALPHA), "identified", ALPHA, **weak).right
+    assert not marked(truth_of(ALPHA), "identified", DRAG, **weak).right
+    assert not marked(truth_of(ALPHA), "unknown", **weak).right
+    pair, one = truth_of(ALPHA, DRAG), {"sigmas": {ALPHA: 1.0, DRAG: 80.0}}
+    assert marked(pair, "identified", DRAG, **one).right
+    assert not marked(pair, "identified", ALPHA, **one).right
+    assert not marked(pair, "none", **one).right
+    assert marked(pair, "none", sigmas=1.0).right
+    outside = truth_of("age-exponent", verdict="unknown")
+    assert marked(outside, "none", **weak).right and marked(outside, "unknown", **weak).right
+    assert accepted(truth_of(), ()) == {("none", frozenset())}
+
+
+def test_confidence_alarms_and_wrong_names():
+    wrong = marked(truth_of(ALPHA), "identified", DRAG, LAG)
+    assert (wrong.confident_wrong, wrong.wrong_name, wrong.alarm, wrong.hit) == (True, True, True, False)
+    doubtful = marked(truth_of(ALPHA), "identified", DRAG, confidence={DRAG: 0.9, ALPHA: 0.1})
+    assert (doubtful.confident_wrong, doubtful.wrong_name, doubtful.top, doubtful.stated) == (False, True, DRAG, 0.9)
+    right = marked(truth_of(ALPHA, DRAG), "identified", DRAG, ALPHA)
+    assert (right.hit, right.top, right.confident_wrong) == (True, f"{ALPHA}+{DRAG}", False)
+    assert marked(truth_of(), "none").alarm is False
+    assert marked(truth_of("age-exponent", verdict="unknown"), "unknown").hit
+    assert not marked(truth_of("age-exponent", verdict="unknown"), "none").hit
+
+
+def test_held_out_error_is_over_that_of_the_truth():
+    m = marked(truth_of(ALPHA), "identified", ALPHA, held=0.022)
+    assert (m.error, m.baseline_error) == (pytest.approx(1.1), pytest.approx(2.0))
+    nothing = replace(m.answer, held={})
+    assert mark(truth_of(ALPHA), nothing, Sight("case-000", {"a": 0.02})).error is None
+
+
+# ---- rates
+
+
+@given(st.integers(1, 500), st.data())
+def test_wilson_bounds_are_where_the_score_test_just_rejects(n, data):
+    hits = data.draw(st.integers(0, n))
+    low, high = Rate(hits, n).interval
+    share = hits / n
+    assert 0 <= low <= share <= high <= 1
+
+    def score(p):
+        return (share - p) ** 2 * n - 1.959963984540054**2 * p * (1 - p)
+
+    if hits:
+        assert low == pytest.approx(brentq(score, 1e-12, share), abs=1e-9)
+    if hits < n:
+        assert high == pytest.approx(brentq(score, share, 1 - 1e-15), abs=1e-9)
+
+
+def test_no_cases_have_no_rate():
+    assert (Rate(0, 0).share, Rate(0, 0).interval, quantile([], 0.5), calibration([], [])) == (
+        None,
+        (None, None),
+        None,
+        ((), None),
+    )
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.floats(0, 1))
+def test_quantiles_are_those_of_numpy(values, share):
+    assert quantile(values, share) == pytest.approx(float(np.quantile(values, share)), rel=1e-9, abs=1e-6)
+
+
+def test_calibration_by_hand():
+    stated, hits = [0.95, 0.97, 0.6, 0.6, 1.0, 0.99], [True, False, True, False, True, True]
+    bins, error = calibration(stated, hits)
+    assert [(b.low, b.rate.hits, b.rate.count) for b in bins] == [(0.5, 1, 2), (0.95, 1, 2), (0.99, 2, 2)]
+    assert error == pytest.approx((2 * abs(0.6 - 0.5) + 2 * abs(0.96 - 0.5) + 2 * abs(0.995 - 1.0)) / 6)
+
+
+def test_honest_confidence_is_calibrated_and_boasting_is_not():
+    chance = random.Random(5)
+    stated = [chance.uniform(0.3, 1.0) for _ in range(20000)]
+    hits = [chance.random() < s for s in stated]
+    assert calibration(stated, hits)[1] < 0.01
+    assert calibration([min(s + 0.2, 1.0) for s in stated], hits)[1] > 0.1
+
+
+# ---- tables
+
+
+def sample():
+    rough = 3e-4
+    return [
+        marked(truth_of(), "none"),
+        marked(truth_of(rough=rough), "identified", ALPHA),
+        marked(truth_of(ALPHA), "identified", ALPHA),
+        marked(truth_of(ALPHA), "identified", DRAG),
+        marked(truth_of(DRAG, rough=rough), "ambiguous", DRAG, LAG, sigmas=8.0),
+        marked(truth_of(ALPHA, DRAG), "identified", DRAG),
+        marked(truth_of("age-exponent", verdict="unknown"), "unknown"),
+        marked(truth_of("age-exponent", verdict="unknown"), "identified", "slip-evolution"),
+    ]
+
+
+def rows(table):
+    return {row[table.columns[0].name]: row for row in report.rows_of(table)}
+
+
+def test_tables_count_what_was_marked():
+    marks = sample()
+    first = rows(report.confusion(marks))
+    assert {k: v["cases"] for k, v in first.items()} == {
+        "none": 1, "none, rough track": 1, "single": 2, "single, rough track": 1, "pair": 1, "outside": 2,
+    }  # fmt: skip
+    assert (first["single"]["identified"], first["single"]["right"]) == (2, 1)
+    assert (first["single, rough track"]["right"], first["single, rough track"]["class_right"]) == (0, 1)
+    found = {name: (row["hits"], row["cases"]) for name, row in rows(report.rates(marks)).items()}
+    assert found["right"] == (3, 8)
+    assert found["right, or ambiguous and listed"] == (4, 8)
+    assert (found["right, smooth tracks"], found["right, rough tracks"]) == ((3, 6), (0, 2))
+    assert found["false alarm where nothing is concealed"] == (1, 2)
+    assert (found["false alarm, smooth tracks"], found["false alarm, rough tracks"]) == ((0, 1), (1, 1))
+    assert (found["wrong name, stated above 0.9"], found["wrong name, of all names"]) == ((4, 8), (4, 5))
+    assert found["unknown recognised"] == (1, 2)
+    alone = rows(report.by_effect(marks))
+    assert (alone[ALPHA]["hits"], alone[ALPHA]["cases"], alone[ALPHA]["in_pairs"], alone[ALPHA]["named_in_pairs"]) == (
+        1,
+        2,
+        1,
+        0,
+    )
+    assert (alone[DRAG]["cases"], alone[DRAG]["class_right"], alone[DRAG]["named_in_pairs"]) == (1, 1, 1)
+    assert rows(report.by_outside(marks))["age-exponent"]["called"] == "slip-evolution"
+    power = [r for r in report.rows_of(report.by_strength(marks)) if r["measure"] == "standard errors"]
+    assert [(r["from"], r["cases"], r["seen"], r["named"]) for r in power] == [(5.0, 1, 1, 0), (50.0, 2, 2, 1)]
+    errors = rows(report.held(marks))["named rightly"]
+    assert (errors["cases"], errors["median"], errors["within"], errors["baseline_median"]) == (
+        1,
+        pytest.approx(1.05),
+        1.0,
+        2.0,
+    )
+    assert rows(report.calibrated(marks))
+
+
+def test_a_report_holds_everything_and_survives_json():
+    from srfcli.output.records import envelope, to_json
+    from srfcli.output.tables import to_text
+
+    table, more = report.tables(sample(), digest="ab" * 32, seed=3, of=10)
+    data = json.loads(to_json(table))
+    assert data["schema"] == "srf.prove/1"
+    assert {"rates", "effects", "outside", "power", "calibration", "held", "cost", "marks"} <= set(data["meta"])
+    assert len(data["meta"]["marks"]) == 8 and data["meta"]["calibration_error"] is not None
+    assert "2 further cases were given up" in "".join(data["notes"])
+    assert envelope(table)["rows"]
+    assert all(to_text(t) for t in more)
+    assert report.tables(sample()[:1], digest="", seed=1, of=1)[1]  # one case alone is a report too
+
+
+# ---- answers as lines
+
+
+def test_answers_survive_their_file(tmp_path):
+    answers = [m.answer for m in sample()[:1]] + [
+        Answer("case-001", "failed", failure="x"),
+        Answer(
+            "case-002", "ambiguous", (ALPHA, LAG), {ALPHA: 0.5}, ((ALPHA, LAG),), (DRAG,), {"alpha": {"value": 0.01}}
+        ),
+    ]
+    write_answers(tmp_path / "a", reversed(answers))
+    assert read_answers(tmp_path / "a") == {a.case: a for a in answers}
+    assert len((tmp_path / "a").read_text().splitlines()) == 3
+    assert read_answers(tmp_path / "nothing") == {}
+
+
+@pytest.mark.parametrize("line", ["", "{}", "[]", "{", to_line(Answer("c", "none")).replace('"none"', '"perhaps"'),
+                                  to_line(Answer("c", "none")).replace('"case"', '"name"')])  # fmt: skip
+def test_a_damaged_line_is_named(tmp_path, line):
+    with pytest.raises(SrfError, match="line 7: no answer"):
+        from_line(line, where="line 7")
+    (tmp_path / "a").write_text(to_line(Answer("c", "none")) + "\n" + to_line(Answer("c", "unknown")) + "\n")
+    with pytest.raises(SrfError, match="line 2: c was answered before"):
+        read_answers(tmp_path / "a")
+
+
+# ---- what there was to be seen
+
+
+def test_an_effect_stands_out_by_what_the_baseline_cannot_do():
+    """The size's standard error in a linear fit, by the normal equations, of a drag beside the baseline."""
+    plan, p = SHORT[1], replace(Physics(), drag=3e-5)
+    gauge = replace(sight.Gauge(), lag1=0.6)
+    shown = {plan: sight.move(p, plan).u}
+    drag = variants("viscous-drag")[0]
+    left, raw = stands_out(drag, [], p, gauge=gauge, shown=shown)
+
+    base = sight.move(replace(p, drag=0.0), plan).u
+    columns = [(shown[plan] - base) / p.drag]
+    for name in ("mu0", "A", "B", "D0", "Vsat", "lam"):
+        h = 1e-4 * getattr(p, name)
+        up, down = (sight.move(replace(p, drag=0.0, **{name: getattr(p, name) + s * h}), plan).u for s in (1, -1))
+        columns.append((up - down) / (2 * h))
+    J = np.column_stack(columns)
+    n, level2 = len(base), 0.02**2 + 0.005**2 / 12
+    C = level2 * 0.6 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    J = J * (scale := 1 / np.linalg.norm(J, axis=0))
+    error = np.sqrt(np.linalg.inv(J.T @ np.linalg.solve(C, J))[0, 0]) * scale[0]
+    assert left == pytest.approx(p.drag / error, rel=0.02)
+    assert 0 < left < raw
+
+
+def test_a_shift_of_a_free_parameter_does_not_stand_out():
+    """Wa on a constant load is a shift of mu0, and nothing else."""
+    steady = replace(SHORT[1], steps=(), drive=((1.0, 20.0), (1.0, 40.0)))
+    p = replace(Physics(), Wa=0.05)
+    adhesion = variants("adhesion-offset")[0]
+    for plan, most in ((steady, 0.2), (SHORT[1], np.inf)):
+        left, raw = stands_out(adhesion, [], p, gauge=sight.Gauge(), shown={plan: sight.move(p, plan).u})
+        assert left < most
+        assert raw > 20
+    assert left > 5  # a step of the load shows it
+
+
+def test_the_true_model_leaves_the_noise(quick, tmp_path):
+    truth = make_case(tmp_path / "c", 5, effects=[ALPHA, "friction-drift"], size=0.9, rough=2e-4, strengths=False)
+    found = see((tmp_path / "c", truth))
+    assert set(found.known) == {"wave"}  # the held-out run
+    assert 0.85 < found.known["wave"] / np.hypot(0.02, 0.005 / np.sqrt(12)) < 1.15
+    assert set(found.sigmas) == {ALPHA, "friction-drift"}
+    assert all(0 <= found.sigmas[n] <= found.raw[n] * (1 + 1e-9) for n in found.sigmas)
+
+
+# ---- trials
+
+
+def test_a_case_costs_no_more_than_itself(quick, tmp_path):
+    trial = new_trial(tmp_path / "t")
+    found = {a.case: a for a in answer_all(trial, workers=2, diagnose=careless, limit=1.0)}
+    assert [found[f"case-00{k}"].verdict for k in range(4)] == ["failed", "failed", "failed", "none"]
+    assert found["case-000"].failure.startswith("ValueError: a matrix is singular; test_prove.py, line ")
+    assert "killed" in found["case-001"].failure
+    assert found["case-002"].failure == "more than 1 s of CPU" and found["case-002"].cpu >= 1
+    assert read_answers(trial.answers) == found
+    assert found["case-003"].code == code_of(()) and len(code_of(())) == 12
+
+
+def test_a_killed_worker_costs_nothing_the_first_time(quick, tmp_path):
+    trial = new_trial(tmp_path / "t")
+    assert {a.verdict for a in answer_all(trial, workers=2, diagnose=remembers)} == {"none"}
+    assert len(list((tmp_path / "t" / "calls").iterdir())) == 5
+
+
+def test_a_run_that_was_ended_goes_on_with_the_rest(quick, tmp_path):
+    trial = new_trial(tmp_path / "t")
+    run = answer_all(trial, diagnose=remembers)
+    first = [next(run).case, next(run).case]
+    run.close()
+    assert sorted(read_answers(trial.answers)) == sorted(first)
+    with pytest.raises(SrfError, match="2 of 4 cases have no answer"):
+        open_truths(trial)
+    again = begin(tmp_path / "t", cases=4, seed=None, kinds=(), resume=True, workers=1)
+    assert sorted([a.case for a in answer_all(again, diagnose=says_none)] + first) == [f"case-00{k}" for k in range(4)]
+    truths, answers = open_truths(again)
+    assert list(truths) == sorted(answers)
+    assert list(answer_all(again, diagnose=says_none)) == []  # nothing is left to do, even now
+
+
+def test_a_trial_ends_where_its_truths_are_read(quick, tmp_path):
+    trial = new_trial(tmp_path / "t")
+    run = answer_all(trial, diagnose=says_none)
+    next(run)
+    run.close()
+    truths, answers = open_truths(trial, unfinished=True)
+    assert list(truths) == list(answers) and len(answers) == 1
+    with pytest.raises(SrfError, match="unsealed before"):
+        list(answer_all(trial, diagnose=says_none))
+    assert open_truths(trial)[1] == answers  # a second look at the same answers
+    write_answers(trial.answers, [*answers.values(), Answer("case-009", "none")])
+    with pytest.raises(SrfError, match="changed after the truths were unsealed"):
+        open_truths(trial)
+
+
+def test_tampering_is_told(quick, tmp_path):
+    trial = new_trial(tmp_path / "t", 2)
+    list(answer_all(trial, diagnose=says_none))
+    text = trial.apart.read_text()
+    trial.apart.write_text(text.replace('"verdict": "', '"verdict": "un', 1))
+    with pytest.raises(SrfError, match="sealed was"):
+        open_truths(trial)
+    assert not trial.opened.exists()
+    trial.apart.write_text(text)
+    answers = read_answers(trial.answers)
+    write_answers(trial.answers, [*answers.values(), Answer("case-009", "none")])
+    with pytest.raises(SrfError, match="case-009 is no case of this bank"):
+        open_truths(trial)
+    write_answers(trial.answers, answers.values())
+    (trial.bank / "case-001" / "steps.csv").write_text("time [s]\n")
+    with pytest.raises(SrfError, match="not the files that were sealed"):
+        open_truths(trial)
+    trial.answers.unlink()
+    with pytest.raises(SrfError, match="not the files that were sealed"):
+        list(answer_all(trial, diagnose=says_none))
+
+
+def test_a_bank_that_was_cut_short_is_made_again(quick, tmp_path):
+    whole, cut = new_trial(tmp_path / "a", 2), Trial(tmp_path / "b")
+    cut.folder.mkdir()
+    for name in ("trial.json", "truths.json"):
+        (cut.folder / name).write_bytes((whole.folder / name).read_bytes())
+    (cut.folder / "bank.part" / "case-000").mkdir(parents=True)
+    again = begin(cut.folder, cases=None, seed=None, kinds=(), resume=True, workers=1)
+    assert again.digest() == whole.digest()
+    assert sorted(p.name for p in cut.folder.iterdir()) == ["bank", "trial.json", "truths.json"]
+
+
+def test_a_diagnosis_is_given_the_case_and_nothing_else(quick, tmp_path):
+    trial = new_trial(tmp_path / "t", 1)
+    (found,) = answer_all(trial, diagnose=peeks)
+    assert found.not_identifiable == ("experiment.toml", "steps.csv", "wave.csv")
+    tree = ast.parse((ROOT / "srfcli" / "trial" / "blind.py").read_text())
+    modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
+    assert not [m for m in modules if m.startswith("srfcli.proof") or m in ("srfcli.trial.run", "srfcli.trial.sight")]
+
+
+def test_kinds_of_a_bank():
+    names = {k: {len(p) for p in plan_bank(40, 3, kinds=[k])} for k in KINDS}
+    assert names == {"none": {0}, "single": {1}, "pair": {2}, "outside": {1}}
+    mixed = plan_bank(100, 3, kinds=["none", "outside"])
+    assert (len(mixed), sum(not p for p in mixed)) == (100, 56)
+    assert plan_bank(200, 5, kinds=KINDS) == plan_bank(200, 5)
+    with pytest.raises(SrfError, match="unknown kind of case 'sngle'"):
+        plan_bank(5, 1, kinds=["sngle"])
+    assert command.KINDS == KINDS == marking.KINDS
+
+
+def deadly(task):
+    if task == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return task
+
+
+def test_what_is_lost_has_its_substitute():
+    assert dict(run_processes(deadly, [0, 1, 2], workers=2, lost=lambda k: -k)) == {0: 0, 1: -1, 2: 2}
+
+
+# ---- the command
+
+
+def srf(*arguments):
+    with pytest.raises(SystemExit) as stop:
+        main([str(a) for a in arguments])
+    return stop.value.code
+
+
+@pytest.fixture
+def stub(quick, monkeypatch):
+    """The command with a diagnosis that costs nothing."""
+    monkeypatch.setattr("srfcli.trial.run.diagnose_case.__module__", diagnose_case.__module__)
+    monkeypatch.setattr(
+        "srfcli.trial.run.answer_all.__kwdefaults__", {**answer_all.__kwdefaults__, "diagnose": says_none}
+    )
+
+
+def test_the_command_from_bank_to_report(stub, tmp_path, capsys):
+    folder = tmp_path / "t"
+    assert srf("prove", "--cases", 4, "--seed", 3, "--out", folder) == 0
+    printed = capsys.readouterr()
+    digest = Trial(folder).digest()
+    assert printed.err.startswith(f"SHA-256 of the sealed truths: {digest}\n")
+    assert printed.out == (folder / "report.txt").read_text()
+    for title in ("What was concealed", "Rates", "Stated confidence", "Held-out error", "CPU of a diagnosis"):
+        assert title in printed.out
+    kept = (folder / "report.json").read_bytes()
+    assert srf("prove", "--report-only", folder, "--json") == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data == json.loads(kept) == json.loads((folder / "report.json").read_bytes())
+    assert sum(row["cases"] for row in data["rows"]) == 4 and data["meta"]["digest"] == digest
+    assert srf("prove", "--report-only", folder, "--csv") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("case,kind,concealed") and len(lines) == 5
+    assert srf("prove", "--out", folder, "--resume") == 0
+    assert srf("prove", "--out", folder, "--resume", "--cases", 5) == 2
+    assert "is a trial of cases 4, not 5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "neither --out nor --report-only"),
+        (["--out", "a", "--report-only", "b"], "exclude each other"),
+        (["--out", "a", "--json", "--csv"], "--json and --csv exclude"),
+        (["--report-only", "nowhere"], "no trial"),
+        (["--report-only", "full"], "no trial"),
+        (["--report-only", "full", "--seed", "1"], "--seed has no meaning"),
+        (["--out", "full"], "exists already"),
+        (["--out", "full/notes.txt"], "exists already"),
+        (["--out", "full", "--resume"], "exists already"),
+        (["--out", "a", "--unfinished"], "--unfinished ends a trial"),
+        (["--out", "a", "--cases", "0"], "range"),
+        (["--out", "a", "--kind", "triple"], "triple"),
+    ],
+)
+def test_misuse_is_one_line_and_a_way_out(tmp_path, monkeypatch, capsys, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    assert srf("prove", *arguments) == 2
+    error = capsys.readouterr().err.splitlines()
+    assert error[0].startswith("Error: ") and said in error[0] and error[1].startswith("Try: ") and len(error) == 2
+    assert [p.name for p in tmp_path.rglob("*")] == ["full", "notes.txt"]
+
+
+def test_an_interrupt_keeps_what_was_answered(tmp_path):
+    """Ctrl-C while the bank is made: exit code 130, one sentence, and a folder that goes on."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    run = subprocess.Popen(
+        [sys.executable, "-m", "srfcli.cli.main", "prove", "--cases", "50", "--out", str(tmp_path / "t")],
+        env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        until = time.monotonic() + 60
+        while not (tmp_path / "t" / "bank.part").exists() and time.monotonic() < until:
+            time.sleep(0.05)
+        run.send_signal(signal.SIGINT)
+        out, err = run.communicate(timeout=60)
+    finally:
+        run.kill()
+    assert (run.returncode, out) == (130, "")
+    assert err.splitlines()[-1] == f"Try: srf prove --out {tmp_path / 't'} --resume"
+    assert (tmp_path / "t" / "trial.json").exists()
+
+
+@pytest.mark.slow
+def test_one_real_case_from_bank_to_mark(tmp_path):
+    """A strong drift, told by nothing but its recordings."""
+    truth = make_case(tmp_path / "case-000", 21, effects=["friction-drift"], size=0.9, rough=False, strengths=False)
+    answer = answer_case(Task(tmp_path / "case-000", (), diagnose_case, 1800.0))
+    found = mark(truth, answer, see((tmp_path / "case-000", truth)))
+    assert (answer.failure, answer.verdict, found.right) == ("", "identified", True)
+    assert found.error < 1.1 < found.baseline_error

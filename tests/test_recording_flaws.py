@@ -1,0 +1,330 @@
+"""What real files bring: each flaw is named where it is, of its own kind, and handled as the notice says."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from recording_cases import HEADING, TOML, write
+
+import srfcli
+from srfcli.cli.main import cli
+from srfcli.errors import SrfError
+from srfcli.numerics.program import ConstantLoad
+from srfcli.recording.checks import KINDS, check_run
+from srfcli.recording.experiment import read_experiment
+from srfcli.recording.load import Place, find_modulation, load_from_column
+from srfcli.recording.noise import describe_noise
+from srfcli.recording.values import Run
+from srfcli.registry import load_registry
+
+REGISTRY = load_registry(user=False, entry_points=False)
+N = 1200
+DRIVE = "drive = [{ duration = 6.0, velocity = 8.0 }, { duration = 99.0, velocity = 12.0 }]"
+PLAIN = "\n".join(
+    DRIVE if line.startswith("drive") else line
+    for line in TOML.splitlines()
+    if not line.startswith(("window", "modulation", "title"))
+).partition('[[runs]]\nname = "two"')[0]
+NO_DRIVE = PLAIN.replace(DRIVE + "\n", "")
+
+
+class Columns:
+    """The numbers of a sound recording: t, V, W and u, (n,) each, as a flaw may change them."""
+
+    def __init__(self, n: int = N) -> None:
+        self.random = np.random.default_rng(11)
+        self.t = np.arange(n) / 100
+        self.V = np.where(self.t < 6, 8.0, 12.0)
+        self.W = np.full(n, 5.0)
+        self.u = 9.5 - 0.2 * np.log(self.V / 8) + self.random.normal(0, 0.01, n)
+        self.heading, self.toml = HEADING, PLAIN
+
+    def keep(self, mask: np.ndarray) -> None:
+        self.t, self.V, self.W, self.u = (x[mask] for x in (self.t, self.V, self.W, self.u))
+
+    def read(self, folder: Path) -> Run:
+        rows = zip(self.t, self.V, self.W, self.u, strict=True)
+        lines = [self.heading, *(",".join("" if np.isnan(x) else f"{x:.9g}" for x in row) for row in rows)]
+        return read_experiment(write(folder, toml=self.toml, one=lines), registry=REGISTRY).runs[0]
+
+
+def gap(c: Columns) -> None:
+    c.keep((c.t < 3) | (c.t > 3.5))
+
+
+def sampling_change(c: Columns) -> None:
+    c.keep((c.t < 4) | (np.arange(N) % 10 == 0))
+
+
+def nan(c: Columns) -> None:
+    c.u[300:304] = np.nan
+
+
+def repeated(c: Columns) -> None:
+    c.t[500] = c.t[499]
+
+
+def backward(c: Columns) -> None:
+    c.t[500] = c.t[400]
+
+
+def spike(c: Columns) -> None:
+    c.u[[200, 700, 701]] += 3.0
+
+
+def reset(c: Columns) -> None:
+    c.u[900:] += 3.0
+
+
+def saturation(c: Columns) -> None:
+    c.u = np.minimum(c.u + 0.5 * np.sin(c.t), 9.7)
+
+
+def quantisation(c: Columns) -> None:
+    c.u = np.round(c.u / 0.05) * 0.05
+
+
+def load_constant(c: Columns) -> None:
+    c.W += c.random.normal(0, 0.01, N)
+
+
+def load_smoothed(c: Columns) -> None:
+    c.W += 0.5 * np.sin(c.t) + c.random.normal(0, 0.01, N)
+
+
+def modulation_differs(c: Columns) -> None:
+    c.W *= 1 + 0.08 * np.cos(2 * np.pi * 5 * c.t)
+    c.toml += "modulation = { frequency = 5.0, amplitude = 0.16 }\n"
+
+
+def drive_differs(c: Columns) -> None:
+    c.V[:] = 8.0
+
+
+def drive_segmented(c: Columns) -> None:
+    c.V += c.random.normal(0, 0.2, N)
+    c.toml = NO_DRIVE
+
+
+def drive_fitted(c: Columns) -> None:
+    c.V = np.cumsum(c.V) / 100 + c.random.normal(0, 0.02, N)
+    c.heading, c.toml = HEADING.replace("velocity [um/s]", "displacement [um]"), NO_DRIVE
+
+
+def unit(c: Columns) -> None:
+    c.heading = HEADING.replace("spring", "spring [nm]")
+
+
+def observable(c: Columns) -> None:
+    c.heading, c.V = HEADING.replace("load_point_velocity [um/s]", "force [N]"), 0.21 * c.u
+
+
+def load(c: Columns) -> None:
+    c.heading, c.V = HEADING.replace("load_point_velocity [um/s]", "normal_stress [MPa]"), c.W.copy()
+
+
+def start_value(c: Columns) -> None:
+    c.toml = c.toml.replace("V0 =", "K = { value = 0.3, lower = 0.1, upper = 1.0 }\nV0 =")
+
+
+FLAWS: dict[str, tuple[Callable[[Columns], None], str]] = {
+    "gap": (gap, "one.csv: rows 300-301, t = 2.99 to 3.51 s: 0.52 s without a sample"),
+    "sampling-change": (sampling_change, "changes from 100 Hz to 10 Hz"),
+    "nan": (nan, "one.csv: rows 301-304, t = 3 to 3.03 s: 4 samples without a number in 'spring', not compared"),
+    "repeated-time": (repeated, "one.csv: row 501, t = 4.99 s: 1 sample with the time of the sample before, left out"),
+    "backward-time": (backward, "one.csv: row 501, t = 4 s: 1 sample whose time does not fit"),
+    "spike": (spike, "one.csv: rows 701-702, t = 7 to 7.01 s: 2 samples standing out in 'spring', not compared"),
+    "reset": (reset, "one.csv: rows 900-901, t = 8.99 to 9 s: 'spring' jumps by "),
+    "saturation": (saturation, "at the extreme value 9.7 of 'spring': saturated, not compared"),
+    "quantisation": (quantisation, "one.csv: column 'spring': steps of 0.05, "),
+    "load-constant": (load_constant, "constant to its noise of 0.0021 of 5.0"),
+    "load-smoothed": (load_smoothed, "which dW/dt would amplify: smoothed by a spline"),
+    "modulation-differs": (modulation_differs, "relative amplitude declared 0.16, found 0.08; the column counts"),
+    "drive-differs": (
+        drive_differs,
+        "600 of 1200 velocities differ from the declared drive by more than 5 %, the first 8",
+    ),
+    "drive-segmented": (drive_segmented, "2 constant or straight pieces describe them"),
+    "drive-fitted": (drive_fitted, "a continuous line of 2 straight pieces"),
+    "unit": (unit, "the heading says 'nm', [columns] says 'um', which counts"),
+    "observable": (observable, "elongation is what is compared; the file also has force, left aside"),
+    "load": (load, "normal_load is what counts; the file also has normal_stress, left aside"),
+    "start-value": (start_value, "K starts from another value than [apparatus] gives"),
+}
+
+
+def test_every_kind_of_notice_has_a_case() -> None:
+    """KINDS is what --fail-on takes; the package makes no notice of another kind."""
+    assert set(FLAWS) == set(KINDS)
+    made = set()
+    for path in Path(srfcli.__file__).parent.glob("recording/*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("Notice", "spots"):
+                made |= {a.value for a in node.args[:1] if isinstance(a, ast.Constant)}
+    assert made <= set(KINDS) and len(made) > 15
+    text = (Path(__file__).resolve().parents[1] / "docs" / "recordings.md").read_text(encoding="utf-8")
+    assert {f"`{kind}`" for kind in KINDS} <= set(re.findall(r"`[a-z-]+`", text.partition("### Notices")[2]))
+
+
+@pytest.mark.parametrize("kind", FLAWS)
+def test_a_flaw_is_told_of_its_own_kind_alone(kind: str, tmp_path: Path) -> None:
+    make, told = FLAWS[kind]
+    columns = Columns()
+    make(columns)
+    columns.read(tmp_path)
+    experiment = read_experiment(tmp_path, registry=REGISTRY)
+    notices = [*experiment.notices, *experiment.runs[0].notices]
+    assert {n.kind for n in notices} == {kind}, [str(n) for n in notices]
+    assert any(told in f"{n.where}: {n.what}" for n in notices), [str(n) for n in notices]
+    assert np.isfinite(experiment.runs[0].observed).all()
+
+
+@pytest.mark.parametrize("kind", FLAWS)
+def test_fail_on_a_kind(kind: str, tmp_path: Path) -> None:
+    """Exit code 4 for the kind that is there, and 0 for another."""
+    make, _ = FLAWS[kind]
+    columns = Columns()
+    make(columns)
+    columns.read(tmp_path)
+    other = next(k for k in KINDS if k != kind)
+    for asked, code in ((kind, 4), (other, 0)):
+        done = CliRunner().invoke(cli, ["check", str(tmp_path), "--no-simulate", "--fail-on", asked], prog_name="srf")
+        assert done.exit_code == code, done.stderr
+        assert f"{kind}: " in done.stdout
+
+
+def test_a_sound_recording_has_no_notices(tmp_path: Path) -> None:
+    run = Columns().read(tmp_path)
+    assert run.notices == () and run.used.all() and isinstance(run.load, ConstantLoad)
+
+
+# what is done about them
+
+
+def test_samples_are_left_out_where_the_notice_says(tmp_path: Path) -> None:
+    c = Columns()
+    nan(c), spike(c), repeated(c)
+    run = c.read(tmp_path)
+    assert run.t.size == N - 1 and np.all(np.diff(run.t) > 0)
+    out = set(np.flatnonzero(~run.used).tolist())
+    assert out == {200, 300, 301, 302, 303, 699, 700}  # the repeated sample 500 is gone
+    assert check_run(run).spikes == 3
+
+
+def test_a_reset_is_taken_out(tmp_path: Path) -> None:
+    c = Columns()
+    sound = c.u.copy()
+    reset(c)
+    run = c.read(tmp_path)
+    assert run.observed[run.used] == pytest.approx(sound[run.used], abs=0.08)
+    assert np.flatnonzero(~run.used).tolist() == [899, 900]
+
+
+def test_a_lone_spike_on_a_constant_load_is_bridged(tmp_path: Path) -> None:
+    """Also where it is negative: a transducer's accident is no loss of contact."""
+    for value in (6.0, -5.0):
+        c = Columns()
+        c.W[400] = value
+        run = c.read(tmp_path)
+        assert [n.kind for n in run.notices] == ["spike"]
+        assert isinstance(run.load, ConstantLoad) and run.load.W0 == 5.0
+
+
+@pytest.mark.parametrize("per_period", [8, 12, 25])
+@pytest.mark.parametrize("amplitude", [0.045, 0.5])
+def test_a_modulation_that_begins_in_mid_record_is_no_row_of_spikes(per_period: int, amplitude: float) -> None:
+    t = np.arange(4000) / (10.0 * per_period)
+    begin = 0.6 * t[-1]
+    rise = np.clip((t - begin) / 0.2, 0, 1)
+    W = 5 * (1 + amplitude * rise * np.cos(2 * np.pi * 10 * t))
+    place = Place(Path("x.csv"), "normal_load", np.arange(1, t.size + 1), t)
+    found, notices = load_from_column(place, W)
+    assert not [n for n in notices if n.kind == "spike"]
+    assert found(t)[0] == pytest.approx(W, rel=2e-3)
+    line = find_modulation(t, W)
+    assert line is not None
+    assert (line.frequency, line.amplitude) == pytest.approx((10.0, amplitude), rel=2e-3)
+    assert line.onset == pytest.approx(begin + 0.1, abs=0.11)
+
+
+def test_more_spikes_than_accidents_are_what_was_imposed() -> None:
+    """Five lone peaks and one in 500 samples are bridged; more are kept as the load that they are."""
+    t = np.arange(1000) / 100
+    place = Place(Path("x.csv"), "normal_load", np.arange(1, 1001), t)
+    for count in (7, 8):
+        W = 5 + 1e-4 * np.sin(t)
+        W[np.arange(count) * 100 + 50] += 1
+        _, notices = load_from_column(place, W)
+        assert sum(n.kind == "spike" for n in notices) == (7 if count == 7 else 0)
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 1e-4])
+def test_a_wobbling_servo_is_no_modulation(amplitude: float) -> None:
+    t = np.arange(3000) / 100
+    assert find_modulation(t, 5 * (1 + amplitude * np.cos(2 * np.pi * 0.7 * t))) is None
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
+def test_level_and_colour_of_the_noise(rho: float) -> None:
+    """AR(1) noise of standard deviation 0.02 about a slow curve comes out with its level and its correlation."""
+    random, n = np.random.default_rng(3), 20_000
+    steps = random.normal(0, 0.02 * np.sqrt(1 - rho**2), n)
+    noise = np.zeros(n)
+    for i in range(1, n):
+        noise[i] = rho * noise[i - 1] + steps[i]
+    found = describe_noise(10 + 0.5 * np.sin(np.arange(n) / 3000) + noise)
+    assert found.lag1 == pytest.approx(rho, abs=0.06)
+    assert found.total == pytest.approx(0.02, rel=0.2 if rho < 0.8 else 0.35)
+
+
+def test_noise_under_a_modulation(tmp_path: Path) -> None:
+    """A response at the modulation's frequency and twice that is no noise."""
+    c = Columns(4000)
+    c.W *= 1 + 0.1 * np.cos(2 * np.pi * 7 * c.t)
+    c.u += 0.2 * np.cos(2 * np.pi * 7 * c.t + 1) + 0.05 * np.cos(4 * np.pi * 7 * c.t)
+    check = check_run(c.read(tmp_path))
+    assert check.load.modulation is not None and check.load.modulation.frequency == pytest.approx(7, rel=1e-6)
+    assert check.noise.total == pytest.approx(0.01, rel=0.15)
+    assert (check.slowest, check.fastest) == (8.0, 12.0)
+    assert check.load.rate == pytest.approx(0.1 * 2 * np.pi * 7 / np.sqrt(1 - 0.01), rel=0.01)
+
+
+def test_stress_counts_as_force_on_a_square_millimetre(tmp_path: Path) -> None:
+    c = Columns()
+    c.heading = HEADING.replace("normal_load [N]", "normal_stress [kPa]")
+    c.W *= 1000
+    assert c.read(tmp_path).load(np.array([1.0]))[0] == pytest.approx([5.0], rel=1e-12)
+
+
+def test_scale_offset_and_intervals(tmp_path: Path) -> None:
+    """[columns] turns counts of a converter and a code of sample intervals into quantities."""
+    c = Columns()
+    expected = c.u.copy()
+    c.u, c.t = (c.u - 3) / 0.002, np.full(N, 100.0)
+    c.toml = c.toml.replace(
+        'elongation = { name = "spring", unit = "um" }',
+        'elongation = { name = "spring", unit = "um", scale = 0.002, offset = 3.0 }\n'
+        'time = { name = "time", unit = "s", scale = 1e-4, integrate = true }',
+    )
+    run = c.read(tmp_path)
+    assert run.t == pytest.approx(0.01 * np.arange(1, N + 1), rel=1e-9)
+    assert run.observed == pytest.approx(expected, rel=1e-6)
+    c.t[7] = -1
+    with pytest.raises(
+        SrfError, match=r"one\.csv, row 8, column 'time \[s\]': found -0.0001 s, expected a sample interval"
+    ):
+        c.read(tmp_path)
+
+
+def test_steps_of_the_drive_from_displacements(tmp_path: Path) -> None:
+    c = Columns()
+    drive_fitted(c)
+    drive = c.read(tmp_path).drive
+    assert list(drive.velocities) == pytest.approx([8.0, 12.0], rel=2e-3)
+    assert drive.breaks[0] == pytest.approx(6.0, abs=0.02)
