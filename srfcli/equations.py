@@ -63,7 +63,9 @@ def check_slots(system: System, parts: Parts) -> None:
         formula = getattr(parts, slot)
         found = sorted(names & {str(x) for x in formula.free_symbols}) if formula is not None else []
         if found:
-            raise SrfError(f"{slot} of {system.title} depends on {found[0]}", f"{slot} may not hold {', '.join(sorted(names))}")
+            raise SrfError(
+                f"{slot} of {system.title} depends on {found[0]}", f"{slot} may not hold {', '.join(sorted(names))}"
+            )
 
 
 def _modulated(formula: sp.Expr) -> sp.Expr:
@@ -104,7 +106,9 @@ class _Builder:
         self.m_phi = sp.symbols(f"mu_phi0:{len(self.phis)}")
         self.slip, self.slip_W, self.slip_t = sp.Symbol("S_"), sp.Symbol("S_W_"), sp.S.Zero
         self.imposed = sp.Symbol("Wi_")
-        if self.parts.kappa is not None and {str(x) for x in self.parts.kappa.free_symbols} & {str(n) for n, _ in self.along()}:
+        if self.parts.kappa is not None and {str(x) for x in self.parts.kappa.free_symbols} & {
+            str(n) for n, _ in self.along()
+        }:
             self.slip_t = sp.Symbol("S_t_")
         self.force, self.force_dot, self.W_dot = sp.symbols("F_ F_dot_ We_dot_")
         self.tangent = sp.tan(symbol("angle")) if system.loading == "inclined" else sp.S.Zero
@@ -155,7 +159,13 @@ class _Builder:
         """Return the value of a formula where a run begins: in steady sliding at V under W0, with elongation `u_rest`."""
         s = symbol
         own = {s(e.name): e.steady for e in self.system.extra_states}
-        at_rest = {s("W"): s("W0"), s("W_dot"): sp.S.Zero, s("slip"): s("start"), s("time"): s("begin"), s("stage"): sp.S.Zero}
+        at_rest = {
+            s("W"): s("W0"),
+            s("W_dot"): sp.S.Zero,
+            s("slip"): s("start"),
+            s("time"): s("begin"),
+            s("stage"): sp.S.Zero,
+        }
         found = formula.subs(own).subs(s("u"), u_rest).subs(own).subs(s("mu"), mu_ss)
         return found.subs(s("v"), s("V")).subs(at_rest)
 
@@ -176,7 +186,9 @@ class _Builder:
     def along(self) -> list[tuple[sp.Symbol, sp.Expr]]:
         """Return the unknowns beside v and the ages that a formula may hold, and their rates."""
         s, system = symbol, self.system
-        found = [(s(a), self.aux_rate(a)) for a in self.aux] + [(s(e.name), self.extra_rate(e)) for e in system.extra_states]
+        found = [(s(a), self.aux_rate(a)) for a in self.aux] + [
+            (s(e.name), self.extra_rate(e)) for e in system.extra_states
+        ]
         if system.inertia:
             found.append((s("u"), self.V - (s("z") if system.elastic else s("v"))))
         return found

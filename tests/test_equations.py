@@ -62,9 +62,7 @@ PAIRS = [
     {"effects": ("adhesion-offset", "sensor-lag", "slip-evolution"), "inertia": False},
 ]
 OWN = Path(__file__).resolve().parent / "effects"
-HEARD = str(
-    OWN / "hearsay.toml"
-)  # friction, stiffness, force and ageing hear of an unknown, of u, slip and the clock
+HEARD = str(OWN / "hearsay.toml")  # friction, stiffness, force and ageing hear of an unknown, of u, slip and the clock
 OF_ONES_OWN = [{"effects": (str(path),)} for path in sorted(OWN.glob("*.toml")) if str(path) != HEARD]
 OF_ONES_OWN += [
     {"effects": (HEARD,)},

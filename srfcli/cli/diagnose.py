@@ -13,6 +13,7 @@ from srfcli.errors import SrfError, did_you_mean
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
+    from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.registry import Registry
 
 EXAMPLES = """
@@ -98,7 +99,10 @@ def _diagnose(
         report("location")
         last = None if final(diagnosis) is diagnosis.baseline else final(diagnosis).fit
         location = locate(diagnosis.baseline.fit, diagnosis.noise, last=last, seed=options["seed"])
+        missing = _explained(search, diagnosis) if status is Status.OK else {}
     found = plain_value(answer(diagnosis, location))
+    if missing:
+        found["missing"] = plain_value({k: v for k, v in missing.items() if k not in ("force", "toml")})
     if status is not Status.OK:
         found["status"] = status.value
     if folder is not None:
@@ -107,13 +111,20 @@ def _diagnose(
         seconds = time.perf_counter() - begun
         write_answer(
             folder, found, diagnosis, location, registry, reader=options["reader"], seed=options["seed"], seconds=seconds,
-            force=options["force"],
+            force=options["force"], missing=missing,
         )  # fmt: skip
     if options["as_json"]:
         click.echo(json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False))
     else:
         print_answer(found, diagnosis, location, folder)
     finish(status)
+
+
+def _explained(search: Search, diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return what there is to say of a force that no registered effect explains; nothing for other verdicts."""
+    from srfcli.diagnosis.terms import explain_unknown
+
+    return explain_unknown(search, diagnosis) if diagnosis.verdict == "unknown" else {}
 
 
 def _searched(search: Search) -> Any:

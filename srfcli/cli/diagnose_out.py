@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from srfcli.registry import Registry
 
 ANSWER = "answer.json"
+FORM = "closed-form.toml"
 SCHEMA = "srf.diagnose/"
 UNITS = {"elongation": "um", "force": "N", "friction": "1"}
 
@@ -91,8 +92,9 @@ def write_answer(
     seed: int,
     seconds: float,
     force: bool = False,
+    missing: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write answer, predictions, augmented experiment, report and figures."""
+    """Write answer, predictions, augmented experiment, report and figures; of a `missing` force its closed form, as an effect."""
     from srfcli.diagnosis.answer import final, material, run_views
     from srfcli.diagnosis.augment import augment
     from srfcli.output.provenance import Provenance, write_sidecar
@@ -120,7 +122,12 @@ def write_answer(
             write_atomic(fresh / "augmented" / name, content)
         for name, source in augmented.copies.items():
             shutil.copyfile(source, fresh / "augmented" / name)
-        _report(fresh, found, material(diagnosis, location))
+        made_of = material(diagnosis, location)
+        if missing:
+            made_of["force"] = missing["force"]
+            if missing["toml"] is not None:
+                write_atomic(fresh / FORM, missing["toml"])
+        _report(fresh, found, made_of)
     Session.current().say(f"Wrote {folder}")
 
 

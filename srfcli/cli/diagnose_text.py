@@ -29,7 +29,7 @@ PARAMETERS = (
     Column("augmented", "", "estimate in the final model"),
     Column("stderr ", "", "its standard error", ".2g"),
     Column("unit", "", "of the four before"),
-    Column("bent_by", "", "how far the baseline was off, in standard errors", ".1f"),
+    Column("bent_by", "", "how far the baseline was off, in the final model's standard errors", ".1f"),
 )
 RUNS = (
     Column("run", "", "name"),
@@ -82,7 +82,12 @@ def print_answer(found: dict[str, Any], diagnosis: Diagnosis, location: Location
         rows.append((v.run.name, "held out" if v.holdout else "fit", *v.rms, *told))
     _print(Table("srf.diagnose.runs/1", RUNS, rows, "runs", tuple(_places(location))))
     if folder is not None:
-        click.echo(f"The augmented model: srf fit {folder / 'augmented'}")
+        home = folder / "augmented"
+        laws = (
+            f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
+        )
+        click.echo(f"The augmented model: srf fit {home}")
+        click.echo(f"Its laws' diagram: srf linear {laws}")
 
 
 def _print(table: Table) -> None:
@@ -101,9 +106,26 @@ def _notes(found: dict[str, Any]) -> list[str]:
         notes.append(f"{name}: rms over noise {side['fit']['rms_over_noise']:.4g} in the runs fitted{rest}")
     notes += [f"{a} and {b} cannot be told apart by these recordings" for a, b in found["equivalent"]]
     notes += [f"{x['effect']} is not identifiable: {x['reason']}" for x in found["not_identifiable"]]
+    notes += _missing(found.get("missing") or {})
     for effect, size in found.get("detectable", {}).items():
         notes.append(f"{effect} could have been seen from a size of {size:.3g} on")
     return notes
+
+
+def _missing(missing: dict[str, Any]) -> list[str]:
+    """Return what is known of a force that no registered effect explains."""
+    if not missing:
+        return []
+    latent = missing["latent"]
+    notes = [f"a friction of {latent['amplitude']:.2g} that changes within {latent['time']:.2g} s is missing"]
+    for name, share in list(latent["coordinates"].items())[:1]:
+        notes[0] += f"; a function of {name} is {100 * share:.0f} % of it"
+    if missing["form"] is None:
+        return [*notes, "no closed form over the candidate terms is worth its parameters"]
+    gain, held = missing["gain"], missing["held_gain"]
+    told = "" if held is None else f", {held:+.1f} in held-out runs"
+    left = "" if missing["leaves_noise_alone"] else f"; it leaves {missing['rms_over_noise']:.3g} times the noise"
+    return [*notes, f"it behaves like {missing['form']}: log likelihood {gain:+.1f}{told}{left}"]
 
 
 def _places(location: Location) -> list[str]:

@@ -11,6 +11,9 @@ from srfcli.cli.laws import plugins_option
 from srfcli.cli.options import OutputOptions, Session, SrfCommand
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from srfcli.output.tables import Table
     from srfcli.trial.run import Trial
 
 EXAMPLES = """
@@ -117,10 +120,12 @@ def _answered(
     from srfcli.cli.base import EXIT_INTERRUPTED
     from srfcli.cli.emit import Progress
     from srfcli.errors import SrfError
+    from srfcli.registry import load_registry
     from srfcli.trial.run import answer_all, begin
 
     if unfinished:
         raise SrfError("--unfinished ends a trial that was begun", f"srf prove --report-only {folder} --unfinished")
+    load_registry(plugins)  # a folder that is none must stop the command, not fail every case
     session = Session.current()
     try:
         with Progress("bank") as progress:
@@ -161,8 +166,21 @@ def _report(trial: Trial, workers: int, unfinished: bool, format: str) -> None:
     marks = [mark(truths[name], answers[name], sights[name]) for name in truths]
     asked = trial.asked()
     table, more = tables(marks, digest=trial.digest(), seed=asked["seed"], of=asked["cases"])
-    listed, inputs = cases(marks), [trial.answers, trial.apart]
-    emit(table, OutputOptions("json", trial.folder / "report.json"), inputs=inputs, seed=asked["seed"])
-    emit(table, OutputOptions("text", trial.folder / "report.txt"), more=more, inputs=inputs, seed=asked["seed"])
-    emit(listed, OutputOptions("csv", trial.folder / "cases.csv"), inputs=inputs, seed=asked["seed"])
+    listed = cases(marks)
+    _keep(trial, asked["seed"], table, more, listed)
     emit(listed if format == "csv" else table, OutputOptions(format), more=more)
+
+
+def _keep(trial: Trial, seed: int, table: Table, more: Sequence[Table], listed: Table) -> None:
+    """Write the report beside the answers: for a reader in few digits, for a program in all, and one line per case."""
+    from srfcli.output.files import write_atomic
+    from srfcli.output.provenance import Provenance, write_sidecar
+    from srfcli.output.records import to_csv, to_json
+    from srfcli.output.tables import to_text
+
+    text = "\n".join(to_text(t, full=False) for t in [table, *more])
+    provenance = Provenance(Session.current().arguments, inputs=(trial.answers, trial.apart), seed=seed)
+    for name, content in (("report.txt", text), ("report.json", to_json(table)), ("cases.csv", to_csv(listed))):
+        write_atomic(trial.folder / name, content)
+        write_sidecar(trial.folder / name, content.encode("utf-8"), provenance)
+        Session.current().say(f"Wrote {trial.folder / name}")

@@ -67,7 +67,11 @@ def _open(registry: Registry, choice: ModelChoice) -> GeneratedModel:
     from srfcli.model import open_model
 
     return open_model(
-        registry, law=choice.law, ageing=choice.ageing, interface=choice.interface, inertia=choice.inertia,
+        registry,
+        law=choice.law,
+        ageing=choice.ageing,
+        interface=choice.interface,
+        inertia=choice.inertia,
         effects=choice.effects,
     )
 

@@ -66,6 +66,7 @@ class Adequacy:
     """`p_value` of noise alone in what is slow, over all windows; `rms_over_noise` of whitened residuals.
 
     `shares` is each run's part of the excess, `windows` (run, start s, end s, excess) those that stand out, worst first.
+    `p_tracks` is the p-value of one roughness for all runs: what a track takes up in some runs only is not the track.
     """
 
     p_value: float
@@ -73,11 +74,12 @@ class Adequacy:
     shares: dict[str, float]
     windows: tuple[tuple[str, float, float, float], ...]
     p_values: dict[str, float]
+    p_tracks: float = 1.0
 
     @property
     def fine(self) -> bool:
-        """True where noise may be all that is left."""
-        return self.p_value > DOUBT and self.rms_over_noise < SURE
+        """True where noise may be all that is left, and the tracks what tracks are: as rough in one run as in another."""
+        return min(self.p_value, self.p_tracks) > DOUBT and self.rms_over_noise < SURE
 
 
 def judge_residuals(runs: Sequence[Run], residuals: Mapping[str, Array], noise: Mapping[str, Noise], *,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from srfcli.diagnosis.locate import Location
+from srfcli.diagnosis.places import Row
 from srfcli.diagnosis.search import Refit
 from srfcli.diagnosis.verdict import Diagnosis
 from srfcli.inference.latent import LatentFit
@@ -149,13 +149,24 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
             "rms": list(v.rms),
         }
         runs.append(run | {"modulation": of_run(v.run)})
+    about = {e.reported: e.about for r in diagnosis.ranked for e in r.hypothesis.effects}
     return {
+        "title": diagnosis.experiment.title,
+        "about": about,
         "runs": runs,
-        "atlas": [row.described() for row in location.atlas],
+        "atlas": [atlas_row(row) for row in location.atlas],
         "ranked": ranked_rows(diagnosis),
         "parameters": parameter_rows(diagnosis),
         "scores": score_rows(diagnosis),
     }
+
+
+def atlas_row(row: Row) -> dict[str, Any]:
+    """Return a place of the atlas, v in um/s and phi in s, by whose logarithms samples were sorted."""
+    found: dict[str, Any] = row.described()
+    if row.axis in ("v", "phi"):
+        found |= {"low": float(np.exp(row.low)), "high": float(np.exp(row.high))}
+    return found
 
 
 def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
@@ -168,7 +179,7 @@ def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def parameter_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return each parameter under both models, and how far the baseline had bent it, in standard errors of both together."""
+    """Return each parameter under both models, and how far the baseline had bent it, in the final model's standard errors."""
     before, after = parameters_of(diagnosis.baseline.fit), parameters_of(final(diagnosis).fit)
     rows = []
     for name in dict.fromkeys([*before, *after]):
@@ -176,8 +187,7 @@ def parameter_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"name": name, "unit": (b or a or {})["unit"]}
         row |= {"baseline": a and a["value"], "baseline_stderr": a and a["stderr"]}
         row |= {"augmented": b and b["value"], "augmented_stderr": b and b["stderr"]}
-        error = float(np.hypot(a["stderr"], b["stderr"])) if a and b else 0.0
-        row["shift_sigma"] = (a["value"] - b["value"]) / error if a and b and error > 0 else None
+        row["shift_sigma"] = (a["value"] - b["value"]) / b["stderr"] if a and b and b["stderr"] > 0 else None
         rows.append(row)
     return rows
 
@@ -189,8 +199,3 @@ def score_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
          "detectable": s.detectable}
         for s in diagnosis.scores
     ]  # fmt: skip
-
-
-def rms_table(diagnosis: Diagnosis) -> Mapping[str, tuple[float, float]]:
-    """Return each run's residual over noise, by baseline and final model."""
-    return {v.run.name: v.rms for v in run_views(diagnosis)}

@@ -19,6 +19,10 @@ from srfcli.splines import Spline
 from srfcli.units import to_base
 
 TABLES = (TRACK, ("mu", "time"), ("V", "stage"))
+PROBES, STRAIGHT = (
+    4,
+    0.1,
+)  # tries for a difference that moves no record by more than this part of its standard deviation
 ARGUMENTS = {"slip": 0, "time": 1, "stage": 2}
 
 
@@ -215,12 +219,20 @@ def _probed(
         if effect.frees
         else max(2 * parameter.lower, 1e-4 * parameter.upper)
     )
-    values[parameter.name] = size
-    listed = _listed(experiment, [replace(parameter, value=size)])
-    by_run = {}
-    for run in fitted.problem.runs:
-        moved = predict(model, listed, run, values, tables=(_track(fitted, run),))
-        by_run[run.name] = ((moved.y - fitted.point.predictions[run.name].y) / size)[:, None]
+    for _ in range(PROBES):
+        values[parameter.name] = size
+        listed = _listed(experiment, [replace(parameter, value=size)])
+        by_run, furthest = {}, 0.0
+        for run in fitted.problem.runs:
+            moved = (
+                predict(model, listed, run, values, tables=(_track(fitted, run),)).y
+                - fitted.point.predictions[run.name].y
+            )
+            by_run[run.name] = (moved / size)[:, None]
+            furthest = max(furthest, float(np.max(np.abs(moved))) / max(float(np.std(run.observed)), 1e-12))
+        if furthest < STRAIGHT:
+            break
+        size *= max(0.5 * STRAIGHT / furthest, 0.05)
     return Column(effect, {}, by_run)
 
 

@@ -59,7 +59,7 @@ class RunForce:
 class Force:
     """The missing friction of all runs: standard deviation `amplitude`, correlation time `time` (s).
 
-    `share` is the part of the samples that were looked at, `gain` the log likelihood over the same model without a force,
+    `share` is the part of the samples that were looked at, `gain` the log likelihood over the same model on a smooth track without a force,
     `coordinates` the share of the force's square that is a function of one quantity of state, the same in all runs.
     """
 
@@ -99,7 +99,9 @@ def missing_force(search: Search, refit: Refit, *, knots: int = KNOTS) -> Force:
         problem, problem.start, search.noise, tracks=tracks, known_noise=True, rounds=ROUNDS, steps=STEPS, grid=grid
     )
     search.evaluations += fitted.evaluations
-    return _force(refit, around, fitted)
+    smooth = search.tried.get((refit.name, False)) if near else None
+    bare = smooth.fit if smooth is not None else around
+    return _force(refit, bare, fitted)
 
 
 def _problem(search: Search, refit: Refit, around: LatentFit) -> Problem:
@@ -110,7 +112,7 @@ def _problem(search: Search, refit: Refit, around: LatentFit) -> Problem:
     return replace(problem, model=model, start=np.clip(around.point.theta, problem.lower, problem.upper))
 
 
-def _force(refit: Refit, around: LatentFit, fitted: LatentFit) -> Force:
+def _force(refit: Refit, bare: LatentFit, fitted: LatentFit) -> Force:
     """Return force, bands and states from the fit that has the force."""
     tracks, roughness = fitted.point.tracks, fitted.point.roughness
     covariance = _covariance(fitted)
@@ -128,7 +130,7 @@ def _force(refit: Refit, around: LatentFit, fitted: LatentFit) -> Force:
     whole = sum(r.t.size for r in refit.fit.problem.runs)
     share = sum(r.t.size for r in fitted.problem.runs) / whole
     return Force(
-        found, roughness.amplitude, roughness.length, share, fitted.log_likelihood - around.log_likelihood,
+        found, roughness.amplitude, roughness.length, share, float(fitted.log_likelihood - bare.log_likelihood),
         float(np.sqrt(squares / count)), _coordinates(found), fitted,
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from srfcli.numerics.collocation import Array
 
 LEVEL = 0.01  # p-value, adjusted for all that was looked at, from which a place stands out
 DRAWS = 200
+LARGE = 10.0  # standard deviations of the noise beyond which a residual counts no more, where times are told
 CELLS, HELD = 64, 0.8  # of a run, and the share of its excess that its windows must hold
 OWN = ("run", "window")  # axes along a run's time
 MOST = 5  # windows and lines that are named
@@ -84,7 +85,7 @@ def locate(
     straight = unbent(fitted, noise, last)
     pieces, prior = pieces_of(straight, noise), _prior(straight)[0]
     whole, begun = (_read_kept(some, prior, forcing, draws, seed) for some in (pieces, [p.followed() for p in pieces]))
-    told = max((found.coordinate, begun.coordinate), key=lambda c: c[1] if c else -1.0)
+    told = begun.coordinate or found.coordinate
     rows = [r for r in whole.atlas if r.axis in OWN] + [r for r in begun.atlas if r.axis not in OWN]
     return replace(begun, runs=whole.runs, coordinate=told, p_value=found.p_value, atlas=tuple(rows))
 
@@ -145,7 +146,8 @@ def _windows(piece: Piece, m: Array, spare: Array, rows: Sequence[Row]) -> tuple
 
 def _dense(piece: Piece, m: Array, spare: Array) -> tuple[tuple[float, float], ...]:
     edges = np.linspace(0, m.size, min(CELLS, max(m.size // 16, 1)) + 1).astype(int)
-    excess = np.array([float(np.sum(m[a:b] ** 2 - spare[a:b])) for a, b in pairwise(edges.tolist())])
+    power = np.minimum(m**2, LARGE**2)  # a lost cycle is a misfit as any other
+    excess = np.array([float(np.sum(power[a:b] - spare[a:b])) for a, b in pairwise(edges.tolist())])
     order = np.argsort(-excess)
     reached = np.cumsum(excess[order])
     count = int(np.searchsorted(reached, HELD * reached.max())) + 1
@@ -175,6 +177,8 @@ def _phase(rows: Sequence[Row]) -> tuple[float, float] | None:
         first -= 1
     while last - first < len(rows) - 1 and alike(last + 1):
         last += 1
+    if last - first >= len(rows) - 2:
+        return None  # it is everywhere
     turn = 2 * np.pi
     low = rows[first % len(rows)].low * turn
     high = rows[last % len(rows)].high * turn
@@ -182,32 +186,32 @@ def _phase(rows: Sequence[Row]) -> tuple[float, float] | None:
 
 
 def _lines(rows: Sequence[Row], atlas: Atlas, forcing: Mapping[str, float]) -> tuple[float, ...]:
-    """Return the frequencies of narrow peaks, strongest first; the forcing's harmonic where one is as near as can be told."""
-    peaks: list[tuple[float, float, float]] = []
+    """Return the frequencies of narrow peaks: the forcing's harmonics, where no other is nearer, then others, strongest first."""
+    peaks: list[tuple[bool, float, float, float]] = []  # harmonic or not, statistic, frequency, width
     for piece in atlas.pieces:
         own = [r for r in rows if r.run == piece.name and r.kind == "line"]
         S = np.array([r.statistic for r in own])
+        base = forcing.get(piece.name)
         for i, row in enumerate(own):
-            if i < 3 or row.p_value >= LEVEL:
-                continue
-            beside = np.concatenate([S[max(i - BESIDE, 0) : max(i - 2, 0)], S[i + 3 : i + BESIDE + 1]])
-            if S[i] < S[max(i - 3, 0) : i + 4].max() or S[i] < PROMINENT * np.median(beside):
+            if i < 3 or row.p_value >= LEVEL or not _peaked(S, i):
                 continue
             f, width = 0.5 * (row.low + row.high), row.high - row.low
-            base = forcing.get(piece.name)
-            if base and abs(f - base * round(f / base)) <= 1.5 * width and round(f / base) > 0:
-                f = base * round(f / base)
-            peaks.append((float(S[i]), f, width))
+            order = round(f / base) if base else 0
+            harmonic = bool(base and order > 0 and abs(f - base * order) <= 1.5 * width)
+            peaks.append((harmonic, float(S[i]), base * order if base and harmonic else f, width))
+    strongest = max((strength for _, strength, _, _ in peaks), default=0.0)
     found: list[tuple[float, float]] = []
-    for strength, f, width in sorted(peaks, reverse=True):
-        if strength >= FAINT * peaks_top(peaks) and all(abs(f - g) > max(width, w) for g, w in found):
+    for harmonic, strength, f, width in sorted(peaks, reverse=True):
+        seen = harmonic or strength >= FAINT * strongest
+        if seen and all(abs(f - g) > 1.5 * max(width, w) for g, w in found):
             found.append((f, width))
     return tuple(f for f, _ in found[:MOST])
 
 
-def peaks_top(peaks: Sequence[tuple[float, float, float]]) -> float:
-    """Return the statistic of the strongest line."""
-    return max(strength for strength, _, _ in peaks)
+def _peaked(S: Array, i: int) -> bool:
+    """Return whether a line stands above all beside it, and clearly above what is a little further away."""
+    beside = np.concatenate([S[max(i - BESIDE, 0) : max(i - 2, 0)], S[i + 3 : i + BESIDE + 1]])
+    return bool(S[i] >= S[max(i - 3, 0) : i + 4].max() and S[i] >= PROMINENT * np.median(beside))
 
 
 def _coordinate(rows: Sequence[Row], atlas: Atlas, M: Sequence[Array]) -> tuple[str, float] | None:

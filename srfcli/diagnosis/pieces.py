@@ -42,9 +42,10 @@ def pieces_of(fitted: LatentFit, noise: Mapping[str, Noise]) -> list[Piece]:
         parts = tuple(pairwise(ends))
         columns = (white[:, 0], white[:, 1:], places, noise[run.name], parts)
         known = {k: x for k, x in sorted_by.items() if np.isfinite(x).all()}
-        phases = [None if x is None else x[index] for x in (forcing, cycle)]
-        lost = LOST * float(np.std(run.observed[run.used])) / noise[run.name].innovation
-        found.append(Piece(run.name, run.t[index], *columns, known, *phases, max(lost, LEAST)))
+        forcing, cycle = (None if x is None else x[index] for x in (forcing, cycle))
+        slips = LOST * float(np.std(run.observed[run.used])) / noise[run.name].innovation
+        lost = np.inf if cycle is None else max(slips, LEAST)  # steady sliding has no cycle to lose
+        found.append(Piece(run.name, run.t[index], *columns, known, forcing, cycle, lost))
     return found
 
 

@@ -12,8 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import gammaln
-from scipy.stats import chi2
+from scipy.special import gammaincc, gammaln
 
 from srfcli.inference.noise import Noise, whiten
 from srfcli.numerics.collocation import Array
@@ -22,6 +21,7 @@ WAVES, SHORTEST, HALVINGS = 4, 24, 5  # cosines over a window, samples of the sh
 BINS = 12
 CELLS = 4_000_000  # numbers of simulated residuals held at a time
 OFF = 1.08  # factor by which a run's own noise level may differ from the assumed variance and count as noise
+ABSORBED = 1e-4  # share of a column's squares below which what is left of it is rounding
 LINES = 64  # samples from which a spectrum is looked at
 
 
@@ -102,10 +102,13 @@ class _Item:
 
 def log_tail(x: Array, freedom: Array | float) -> Array:
     """Return ln P(chi-squared > x), also where the probability itself would vanish."""
-    x, k = np.broadcast_arrays(np.asarray(x, dtype=float), np.asarray(freedom, dtype=float))
+    x, half = np.asarray(x, dtype=float), np.asarray(freedom, dtype=float) / 2
+    with np.errstate(divide="ignore"):
+        near = np.log(gammaincc(half, x / 2))
+    if np.isfinite(near).all():
+        return np.asarray(near)
     with np.errstate(all="ignore"):
-        near = np.log(chi2.sf(x, k))
-        far = (k / 2 - 1) * np.log(x / 2) - x / 2 - gammaln(k / 2) - np.log1p(-np.minimum((k - 2) / x, 0.9))
+        far = (half - 1) * np.log(x / 2) - x / 2 - gammaln(half) - np.log1p(-np.minimum((2 * half - 2) / x, 0.9))
     return np.where(np.isfinite(near), near, np.minimum(far, 0.0))
 
 
@@ -213,7 +216,7 @@ class Atlas:
             yield item, S, np.array(signs) if single else None, log_tail(S, item.freedom[:, None])
         for i, (item, f, whole, (cc, cs, ss)) in enumerate(self.spectra):
             if f.size:
-                F = np.fft.rfft(M[i][whole], axis=0)[1 : f.size + 1]
+                F = np.fft.rfft(M[i][whole] * _taper(whole.stop - whole.start), axis=0)[1 : f.size + 1]
                 c, s = F.real, -F.imag
                 S = (ss[:, None] * c**2 - 2 * cs[:, None] * c * s + cc[:, None] * s**2) / (cc * ss - cs**2)[:, None]
                 yield item, S, None, -0.5 * S
@@ -228,7 +231,7 @@ class Atlas:
         step = float(np.median(np.diff(p.t[a:b])))
         m = (n - 1) // 2
         f = np.arange(1, m + 1) / (n * step)
-        F = np.fft.rfft(p.X[a:b], axis=0)[1 : m + 1]
+        F = np.fft.rfft(p.X[a:b] * _taper(n), axis=0)[1 : m + 1]
         c, s, block = F.real, -F.imag, self._block(p, p)
         cc, cs, ss = (np.einsum("ij,ij->i", x @ block, y) for x, y in ((c, c), (c, s), (s, s)))
         half = 0.5 / (n * step)
@@ -288,7 +291,11 @@ class Atlas:
             return []
         parts = [(i, s, H[:, filled].astype(float)) for i, s, H in parts]
         singles = [(k, k + 1) for k in range(len(spans))]
-        return [self._linear(axis, run, "mean", spans, parts, singles), self._power(axis, run, spans, parts)]
+        means = parts
+        if axis in ("forcing", "cycle"):  # what is the same at every phase has nothing to do with it
+            means = [(i, s, H - H.mean(axis=0) * (H.sum(axis=1, keepdims=True) > 0) * (H.shape[0] / max(H.sum(), 1.0)))
+                     for i, s, H in parts]  # fmt: skip
+        return [self._linear(axis, run, "mean", spans, means, singles), self._power(axis, run, spans, parts)]
 
     def _smooth(self, axis: str, chosen: Sequence[tuple[int, Array]], knots: Array) -> _Item:
         """Return the one statistic of any function that is linear between `knots`."""
@@ -309,8 +316,9 @@ class Atlas:
             white.append((i, s, B))
             C[:, p.places] += B.T @ p.X[s]
             G += B.T @ B
-        G -= C @ self.inverse @ C.T
-        roots = [_inverse_root(G[a:b, a:b]) for a, b in groups]
+        scale = np.sqrt(np.maximum(np.diag(G), 1e-300))  # before parameters and track absorb what they can
+        G = (G - C @ self.inverse @ C.T) / np.outer(scale, scale)
+        roots = [_inverse_root(G[a:b, a:b], scale[a:b]) for a, b in groups]
         ranks = np.array([rank for _, rank in roots], dtype=float)
         return _Item(axis, run, kind, spans, tuple(white), tuple(groups), tuple(root for root, _ in roots), ranks)
 
@@ -321,10 +329,14 @@ class Atlas:
         return _Item(axis, run, "power", spans, tuple(parts), freedom=np.maximum(np.asarray(freedom), 1e-6))
 
 
-def _inverse_root(G: Array) -> tuple[Array, int]:
-    """Return R with R'R the pseudo-inverse of G, and its rank; directions that parameters and track absorb do not count."""
-    d = np.sqrt(np.maximum(np.diag(G), 1e-300))
-    values, vectors = np.linalg.eigh(G / np.outer(d, d))
-    good = values > 1e-6 * max(float(values[-1]), 1e-300)
-    root = np.where(good, 1 / np.sqrt(np.maximum(values, 1e-300)), 0.0)[:, None] * vectors.T / d
+def _taper(n: int) -> Array:
+    """Return Hann's window (n, 1), of mean square 1: a slow misfit is not to leak over the lines of the forcing."""
+    return np.asarray(np.sqrt(8 / 3) * np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2)[:, None]
+
+
+def _inverse_root(G: Array, scale: Array) -> tuple[Array, int]:
+    """Return R with R'R the pseudo-inverse of G * scale * scale, and its rank; directions that are absorbed do not count."""
+    values, vectors = np.linalg.eigh(G)
+    good = values > ABSORBED
+    root = np.where(good, 1 / np.sqrt(np.maximum(values, ABSORBED)), 0.0)[:, None] * vectors.T / scale
     return np.asarray(root * (np.sign(root[0, 0]) or 1.0) if G.shape[0] == 1 else root), max(int(good.sum()), 1)

@@ -133,8 +133,10 @@ def _screen(
     def screened(own: Sequence[int]) -> tuple[float, Array, Array, float]:
         i = np.array(own) - k
         G, h = projected[np.ix_(i, i)], forced[i]
-        d = np.sqrt(np.maximum(np.diag(G), 1e-300))
-        covariance = np.linalg.pinv(G / np.outer(d, d), rcond=1e-10, hermitian=True) / np.outer(d, d)
+        d = np.sqrt(np.maximum(np.diag(G), 1e-14 * np.diag(N)[i + k] + 1e-200))  # below is rounding
+        scaled = G / np.outer(d, d)
+        scaled[np.diag_indices_from(scaled)] = 1.0
+        covariance = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True) / np.outer(d, d)
         size = covariance @ h
         share = float(np.trace(G) / max(np.trace(N[np.ix_(i + k, i + k)]), 1e-300))
         return 0.5 * float(h @ size), size, covariance, share

@@ -12,7 +12,7 @@ from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_pa
 from srfcli.diagnosis.score import Score, scores
 from srfcli.inference import fit as fitting
 from srfcli.inference.fit import Problem, Stage, first_level
-from srfcli.inference.latent import STEPS, LatentFit, Tracks, fit_latent
+from srfcli.inference.latent import STEPS, LatentFit, Tracks, evenness, fit_latent
 from srfcli.inference.noise import Noise
 from srfcli.laws import Effect
 from srfcli.numerics.collocation import Array
@@ -26,7 +26,10 @@ RIVAL, RIVAL_SHARE = (
     0.05,
 )  # short of the best score's gain: where the best leaves noise alone, less is not refitted
 NEAR = 2.5  # residual over noise within which slopes at the fit tell where a better one is
+HALFWAY = 1.25  # the same within which a rough track may be what is left
 FOLLOWED, SHORTEST = 2.0, 60  # chi-squared per degree of freedom of a stage that still follows, samples that make a run
+SHAKES = (1.5, 0.67)  # times its size: other starts of an effect
+ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better grow anew
 LOST = 0.3  # of a record's standard deviation: residual beyond which nothing is linear
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
 MOST_EVALUATIONS = 900  # of the recordings by a model with slopes, in all
@@ -73,14 +76,32 @@ class Search:
         return self.ranked()
 
     def rebase(self) -> None:
-        """Fit a baseline that had lost its way from where the best hypothesis leads it: it is to be judged at its own best."""
-        best, baseline = self.best(), self.tried["none", False]
-        if not best.hypothesis.effects or baseline.adequacy.rms_over_noise < NEAR:
-            return
-        problem = Hypothesis().problem(self.registry, self.experiment, rough=False, trend=self.trend)
-        at = [best.fit.values.get(n, v) for n, v in zip(problem.names, problem.start, strict=True)]
-        theta = np.clip(np.array(at), problem.lower, problem.upper)
-        self.keep(Hypothesis(), fit_latent(problem, theta, self.noise, known_noise=True, steps=15), rough=False)
+        """Fit what the best hypothesis is made of, and the baseline, from where the best one stands.
+
+        A simpler hypothesis that had lost its way in a false minimum is to be judged at its own best.
+        """
+        for _ in range(3):
+            best = self.best()
+            if not best.hypothesis.effects:
+                return
+            effects = best.hypothesis.effects
+            simpler = [Hypothesis(tuple(e for e in effects if e is not left)) for left in effects]
+            for hypothesis in {h.name: h for h in (*simpler, Hypothesis())}.values():
+                self.again(hypothesis, best)
+            if self.best() is best:
+                return
+
+    def again(self, hypothesis: Hypothesis, best: Refit) -> None:
+        """Fit a hypothesis from the parameters of a larger one."""
+        problem = hypothesis.problem(
+            self.registry, self.experiment, rough=best.rough, at=best.fit.values, trend=self.trend
+        )
+        tracks = best.fit.point.tracks if best.rough else Tracks((), {})
+        fitted = fit_latent(
+            problem, problem.start, self.noise, tracks=tracks, roughness=best.fit.point.roughness if best.rough else None,
+            known_noise=True, steps=15,
+        )  # fmt: skip
+        self.keep(hypothesis, fitted, rough=best.rough)
 
     def look(self, candidates: Sequence[Effect]) -> None:
         """Fit hypotheses until one leaves noise alone, or what is worth trying has been tried."""
@@ -90,7 +111,13 @@ class Search:
             return
         near = baseline.adequacy.rms_over_noise < NEAR
         self.widen(baseline, candidates, FIRST if near else SINGLES, rough=False)
-        if self.settled(candidates) or (near and self.on_a_rough_track(baseline, candidates)) or self.roughened(candidates):
+        if (
+            self.settled(candidates)
+            or (near and self.on_a_rough_track(baseline, candidates))
+            or self.roughened(candidates)
+        ):
+            return
+        if self.shaken(candidates):
             return
         for refit in self.ranked()[:2]:
             if len(refit.hypothesis.effects) == 1:
@@ -111,6 +138,28 @@ class Search:
             return True
         self.widen(rough, candidates, PAIRS, rough=True)
         return self.settled(candidates)
+
+    def shaken(self, candidates: Sequence[Effect]) -> bool:
+        """Return whether one of the best leaves noise alone once it starts from a larger or smaller effect.
+
+        Stick-slip has false minima, in which cycles are right on average and each is a little off.
+        """
+        for refit in self.ranked()[:3]:
+            effects = refit.hypothesis.effects
+            if len(effects) != 1 or not effects[0].sizes or refit.rough or refit.adequacy.rms_over_noise > HALFWAY:
+                continue
+            problem, neutral = refit.fit.problem, dict(effects[0].neutral)
+            for factor in SHAKES:
+                theta = refit.fit.point.theta.copy()
+                for long, p in own_parameters(effects[0], problem.model).items():
+                    if p.name in neutral and long in problem.names:
+                        i = problem.names.index(long)
+                        theta[i] = neutral[p.name] + factor * (theta[i] - neutral[p.name])
+                theta = np.clip(theta, problem.lower, problem.upper)
+                fitted = fit_latent(problem, theta, self.noise, tracks=Tracks((), {}), known_noise=True)
+                if self.keep(refit.hypothesis, fitted, rough=False).adequacy.fine:
+                    return self.settled(candidates)
+        return False
 
     def roughened(self, candidates: Sequence[Effect]) -> bool:
         """Return whether the best so far leaves noise alone once its track may be rough."""
@@ -194,7 +243,9 @@ class Search:
         self.evaluations += fitted.evaluations
         runs = fitted.problem.runs
         residuals = {r.name: r.observed - fitted.point.predictions[r.name].y for r in runs}
-        adequacy = judge_residuals(runs, residuals, self.noise, freedom=spent(fitted))
+        adequacy = replace(
+            judge_residuals(runs, residuals, self.noise, freedom=spent(fitted)), p_tracks=evenness(fitted.point)
+        )
         n = sum(int(r.used.sum()) for r in runs)
         cost = 0.5 * np.log(n) * (len(fitted.problem.names) - len(self.base_names())) + (4.0 if rough else 0.0)
         cost += 3.0 * len(hypothesis.effects)  # there are some twenty to choose from
@@ -237,7 +288,9 @@ class Search:
                 set(t.hypothesis.effects) == set(hypothesis.effects) and r == rough for (_, r), t in self.tried.items()
             ):
                 continue
-            self.refit(hypothesis, refit, score.values, rough=rough)
+            found = self.refit(hypothesis, refit, score.values, rough=rough)
+            if not rough and not found.adequacy.fine and found.adequacy.rms_over_noise < HALFWAY:
+                self.refit(hypothesis, found, {}, rough=True)
 
     def rivals(self, score: Score, others: Sequence[Score], refit: Refit) -> bool:
         """Return whether an effect may do as well as the best so far: always where that leaves more than noise."""
@@ -266,7 +319,10 @@ class Search:
         problem = hypothesis.problem(
             self.registry, self.experiment, rough=rough, at=at | own if near else own, trend=self.trend
         )
-        theta = self.shortened(hypothesis, problem) if near else self.grown(hypothesis, problem)
+        theta, squares = self.shortened(hypothesis, problem) if near else (problem.start, np.inf)
+        if not near or (not rough and squares > ASTRAY * start.fit.point.chi2):
+            file_start = hypothesis.problem(self.registry, self.experiment, rough=rough, at=own, trend=self.trend)
+            near, theta = False, self.grown(hypothesis, file_start)
         tracks = start.fit.point.tracks if rough and start.rough else None if rough else Tracks((), {})
         roughness = start.fit.point.roughness if rough else None
         steps = 2 if not near and self.lost(hypothesis) else STEPS
@@ -275,15 +331,15 @@ class Search:
         )
         return self.keep(hypothesis, fitted, rough=rough)
 
-    def shortened(self, hypothesis: Hypothesis, problem: Problem) -> Array:
-        """Return the problem's start with the last effect's size cut where the whole of it leads astray."""
+    def shortened(self, hypothesis: Hypothesis, problem: Problem) -> tuple[Array, float]:
+        """Return the problem's start, the last effect's size cut where the whole of it leads astray, and chi-squared there."""
         if not hypothesis.effects or not hypothesis.effects[-1].sizes:
-            return problem.start
+            return problem.start, 0.0
         effect = hypothesis.effects[-1]
         neutral = dict(effect.neutral)
         places = [(problem.names.index(long), neutral[p.name]) for long, p in own_parameters(effect, problem.model).items()
                   if p.name in neutral and long in problem.names]  # fmt: skip
-        best = (np.inf, problem.start)
+        best = (problem.start, np.inf)
         for share in (1.0, 0.3, 0.0):
             theta = problem.start.copy()
             for i, value in places:
@@ -295,9 +351,9 @@ class Search:
                     run.name
                 ].level
                 squares += float(np.sum(np.where(np.isfinite(r), r, 1e6) ** 2))
-            if squares < best[0]:
-                best = (squares, theta)
-        return best[1]
+            if squares < best[1]:
+                best = (theta, squares)
+        return best
 
     def ranked(self) -> list[Refit]:
         """Return everything that was fitted, best evidence first; of the two forms of a hypothesis the better one."""

@@ -25,6 +25,7 @@ from srfcli.diagnosis.search import NEAR, WORTH, Refit, Search
 from srfcli.diagnosis.verdict import Diagnosis, judge_held
 from srfcli.errors import SrfError
 from srfcli.expression import symbol
+from srfcli.inference.latent import STEPS, LatentFit, fit_latent
 from srfcli.lawfile import read_header
 from srfcli.laws import Effect
 from srfcli.registry import Entry, Registry
@@ -33,8 +34,9 @@ from srfcli.units import from_base
 FOLDER = Path(srfcli.__file__).parent / "data" / "terms"
 ORIGIN = "terms"
 MOST_TERMS = 3
-TRIED = 3  # refitted at each step, those that promise most
-TWINS, ALIKE = 2, 0.98  # of so many signals that are so alike
+TRIED = 4  # refitted at each step, those that promise most
+TWINS, ALIKE = 3, 0.98  # of so many signals that are so alike
+BEGUN, WHOLE = 8, 2  # tried at each step on the beginnings of runs, and of these in full, where a fit is far off
 PAYS = 3.0  # gain in log evidence below which a further term is not worth its words
 MOST_EVALUATIONS = 700  # of the recordings by a model with slopes
 
@@ -60,6 +62,7 @@ def best_form(search: Search, diagnosis: Diagnosis) -> ClosedForm | None:
     names = [e.name for e in own.registry.entries("effect") if e.origin == ORIGIN]
     candidates, _ = applicable(own.registry, own.experiment, names)
     best = _Selection(own, candidates).run(diagnosis)
+    best = _smoothed(own, best)
     search.evaluations += own.evaluations
     terms = [e for e in best.hypothesis.effects if e.name in names] if best is not None else []
     if best is None or not terms:
@@ -69,6 +72,14 @@ def best_form(search: Search, diagnosis: Diagnosis) -> ClosedForm | None:
     beside = tuple(e for e in best.hypothesis.effects if e.name not in names)
     gain = best.fit.log_likelihood - diagnosis.baseline.fit.log_likelihood
     return ClosedForm(fitted, beside, best, gain, held)
+
+
+def _smoothed(search: Search, best: Refit | None) -> Refit | None:
+    """Return the refit on a smooth track instead where the term leaves nothing for a rough one to do."""
+    if best is None or not best.rough:
+        return best
+    smooth = search.refit(best.hypothesis, best, {}, rough=False)
+    return max((best, smooth), key=lambda r: r.evidence)
 
 
 def _with_own_terms(search: Search) -> Search:
@@ -105,25 +116,74 @@ class _Selection:
 
     def step(self, start: Refit) -> Refit | None:
         """Return the best refit with one term more than `start`; None where none has evidence enough."""
-        before, present = start.evidence, start.hypothesis.effects
-        found: list[Refit] = []
-        for score in _foremost(self.scored(start)):
-            if self.search.evaluations > MOST_EVALUATIONS:
-                self.search.progress("no further terms are tried: the budget is spent")
-                break
-            hypothesis = Hypothesis((*present, score.effect))
-            key = frozenset(e.name for e in hypothesis.effects)
-            if key not in self.done:
-                self.done.add(key)
-                found.append(self.search.refit(hypothesis, start, score.values, rough=start.rough))
-        best = max(found, key=lambda r: r.evidence, default=None)
-        return best if best is not None and best.evidence > before + PAYS else None
-
-    def scored(self, start: Refit) -> list[Score]:
-        """Return the scores of all terms that a refit lacks, largest gain first; of those that can be joined with it."""
-        search, present = self.search, start.hypothesis.effects
         near = start.rough or start.adequacy.rms_over_noise < NEAR
-        around = start.fit if near else search.partly(start)
+        found = self.near(start) if near else self.far(start)
+        best = max(found, key=lambda r: r.evidence, default=None)
+        return best if best is not None and best.evidence > start.evidence + PAYS else None
+
+    def near(self, start: Refit) -> list[Refit]:
+        """Return refits with one term more, from where a fit that is nearly right stands."""
+        found = []
+        for score in _foremost(self.scored(start, start.fit)):
+            hypothesis = Hypothesis((*start.hypothesis.effects, score.effect))
+            if self.new(hypothesis):
+                found.append(self.search.refit(hypothesis, start, score.values, rough=start.rough))
+        return found
+
+    def far(self, start: Refit) -> list[Refit]:
+        """Return refits with one term more where a fit is far off: tried on the beginnings first, the best of these in full."""
+        search, around = self.search, self.search.partly(start)
+        begun = []
+        for score in self.scored(start, around)[:BEGUN]:
+            hypothesis = Hypothesis((*start.hypothesis.effects, score.effect))
+            if self.new(hypothesis):
+                part = self.begun(hypothesis, score, around)
+                begun.append((part.log_likelihood - self.cost(part), hypothesis, part))
+        found: list[Refit] = []
+        for _, hypothesis, part in sorted(begun, key=lambda b: -b[0])[:WHOLE]:
+            problem = hypothesis.problem(
+                search.registry, search.experiment, rough=False, at=part.values, trend=search.trend
+            )
+            theta = search.grown(hypothesis, problem)
+            steps = 2 if search.lost(hypothesis) else STEPS
+            fitted = fit_latent(problem, theta, search.noise, known_noise=True, steps=steps)
+            found.append(search.keep(hypothesis, fitted, rough=False))
+            if found[-1].adequacy.fine or search.evaluations > MOST_EVALUATIONS:
+                break
+        return found
+
+    def begun(self, hypothesis: Hypothesis, score: Score, around: LatentFit) -> LatentFit:
+        """Return a fit of a hypothesis to the beginnings of the runs that `around` is of."""
+        search, runs, added = self.search, around.problem.runs, dict(score.values)
+        problem = hypothesis.problem(
+            search.registry, search.experiment, rough=False, at=around.values, trend=search.trend
+        )
+        own = {long: p.name for long, p in own_parameters(score.effect, problem.model).items() if p.name in added}
+        start = [added[own[n]] if n in own else x for n, x in zip(problem.names, problem.start.tolist(), strict=True)]
+        start = np.clip(np.array(start), problem.lower, problem.upper)
+        cut = replace(problem, start=start, runs=runs, experiment=replace(problem.experiment, runs=runs))
+        fitted = fit_latent(cut, search.shortened(hypothesis, cut)[0], search.noise, known_noise=True)
+        search.progress(f"{hypothesis.name}: log likelihood {fitted.log_likelihood:.1f} of the beginnings")
+        return fitted
+
+    def new(self, hypothesis: Hypothesis) -> bool:
+        """Return whether a hypothesis was not tried before and there is something left to try it with."""
+        key = frozenset(e.name for e in hypothesis.effects)
+        if key in self.done:
+            return False
+        if self.search.evaluations > MOST_EVALUATIONS:
+            self.search.progress(f"{hypothesis.name} is not tried: the budget is spent")
+            return False
+        self.done.add(key)
+        return True
+
+    def cost(self, fitted: LatentFit) -> float:
+        """Return what a fit's parameters cost in evidence."""
+        return 0.5 * float(np.log(sum(int(r.used.sum()) for r in fitted.problem.runs))) * len(fitted.problem.names)
+
+    def scored(self, start: Refit, around: LatentFit) -> list[Score]:
+        """Return the scores of all terms that a refit lacks and can be joined with, largest gain first, by slopes `around`."""
+        search, present = self.search, start.hypothesis.effects
         left = [e for e in self.candidates if e not in present]
         found: list[Score] = []
         for group in _groups(left, present):

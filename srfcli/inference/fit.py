@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from srfcli.errors import SrfError, did_you_mean
+from srfcli.inference.linear import inverse, root
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
 from srfcli.inference.nuisance import own_names, own_start
 from srfcli.inference.prediction import Prediction, predict, run_parameters
@@ -27,7 +28,8 @@ GROWN = 3.0  # standard deviations of the last fit over which the next stage wan
 SHORTER = (1.0, 0.5, 0.25, 0.12)  # of the first horizons
 POOR = 4.0  # reduced chi-squared of a first stage that is not believed before shorter ones were tried
 CONVERGED = 0.1  # standard errors: how far the minimum may still be, by the gradient
-HOPELESS = 30.0  # chi-squared per degree of freedom at which a rough fit's horizons grow no more: the model cannot follow
+FOLLOWS = 4.0  # chi-squared per degree of freedom up to which a rough fit's minimum is worth reaching exactly
+HOPELESS = 30.0  # the same at which a rough fit's horizons grow no more: the model cannot follow
 BAD = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
 
 
@@ -202,7 +204,7 @@ class Search:
 
     def __init__(self, problem: Problem, progress: Callable[[str], None], *, rough: bool = False) -> None:
         self.problem, self.progress = problem, progress
-        self.tolerance, self.most = (1e-4, 12) if rough else (1e-9, 60)
+        self.rough = rough
         self.hopeless = HOPELESS if rough else np.inf
         self.evaluations = 0
         self.reduced = 1.0  # chi-squared for each degree of freedom
@@ -222,7 +224,7 @@ class Search:
         for stage in range(2, STAGES + 1):
             if covered >= 1.0:
                 break
-            directions = GROWN * _root(self.covariance) * np.sqrt(max(self.reduced, 1.0))
+            directions = GROWN * root(self.covariance) * np.sqrt(max(self.reduced, 1.0))
             linear = {r.name: self.horizon(r, theta, directions) for r in self.problem.runs}
             horizons = {name: max(linear[name], horizons[name]) for name in linear}
             share = self.covered(horizons)
@@ -283,7 +285,19 @@ class Search:
         return limit
 
     def minimise(self, theta: Array, noise: Mapping[str, Noise], horizons: Mapping[str, float]) -> tuple[Array, Status]:
-        """Return the minimum of the whitened residuals up to the horizons, and how the minimiser ended."""
+        """Return the minimum of the whitened residuals up to the horizons, and how the minimiser ended.
+
+        A rough search stops early where the model does not follow the data, and only there.
+        """
+        if self.rough:
+            theta, status = self._minimise(theta, noise, horizons, tolerance=1e-4, most=12)
+            if self.reduced > FOLLOWS:
+                return theta, status
+        return self._minimise(theta, noise, horizons, tolerance=1e-9, most=60)
+
+    def _minimise(
+        self, theta: Array, noise: Mapping[str, Noise], horizons: Mapping[str, float], *, tolerance: float, most: int
+    ) -> tuple[Array, Status]:
         from scipy.optimize import least_squares
 
         problem = self.problem
@@ -300,14 +314,14 @@ class Search:
         inside = np.clip(theta / self.scale, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
         found = least_squares(
             lambda x: both(x)[0], inside, jac=lambda x: both(x)[1], bounds=(low, high), x_scale="jac",
-            ftol=self.tolerance, xtol=1e-9, gtol=1e-12, max_nfev=self.most,
+            ftol=tolerance, xtol=1e-9, gtol=1e-12, max_nfev=most,
         )  # fmt: skip
         self.best = found.x * self.scale
         information = found.jac.T @ found.jac
-        self.covariance = _inverse(information) * np.outer(self.scale, self.scale)
+        self.covariance = inverse(information) * np.outer(self.scale, self.scale)
         free = found.active_mask == 0
         gradient = (found.jac.T @ found.fun)[free]
-        away = float(np.sqrt(max(gradient @ _inverse(information[np.ix_(free, free)]) @ gradient, 0.0)))
+        away = float(np.sqrt(max(gradient @ inverse(information[np.ix_(free, free)]) @ gradient, 0.0)))
         self.reduced = 2 * found.cost / max(found.fun.size - theta.size, 1)
         self.trail.append(
             (2 * float(found.cost), f"{found.nfev} evaluations, {away:.1e} standard errors from the minimum")
@@ -369,26 +383,11 @@ def judge(problem: Problem, theta: Array, runs: Sequence[Run]) -> list[RunFit]:
     return found
 
 
-def _inverse(information: Array) -> Array:
-    """Return the inverse, after scaling; a direction that nothing determines gets an enormous variance, not a failure."""
-    d = np.maximum(np.sqrt(np.diag(information)), 1e-8)  # of scaled parameters: nothing that matters is so flat
-    values, vectors = np.linalg.eigh(information / np.outer(d, d))
-    inverse = (vectors / np.maximum(values, 1e-14)) @ vectors.T
-    return np.asarray(inverse / np.outer(d, d))
-
-
-def _root(covariance: Array) -> Array:
-    """Return the principal directions of a covariance, one standard deviation long each, as columns."""
-    d = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(d, d))
-    return np.asarray((d[:, None] * vectors) * np.sqrt(np.maximum(values, 0.0)))
-
-
 def held_fit(problem: Problem, values: Mapping[str, float]) -> Fit:
     """Return the state of a fit that was stopped: its parameters, with errors as if they were the minimum."""
     theta = np.array([values[n] for n in problem.names])
     search = Search(problem, lambda text: None)
     noise = search.noise(theta)
     _, slopes = search.residuals(theta, noise, {})
-    search.covariance = _inverse(slopes.T @ slopes) * np.outer(search.scale, search.scale)
+    search.covariance = inverse(slopes.T @ slopes) * np.outer(search.scale, search.scale)
     return search.result(theta, noise, Status.INTERRUPTED)

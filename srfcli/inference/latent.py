@@ -28,6 +28,7 @@ GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the roughness that are
 STEPS = 25
 SETTLED = 0.02  # gain of twice the log likelihood below which the minimum is reached
 EARLY = 2.0  # the same while roughness and noise still change
+HUGE = 1e100  # a slope that is no slope any more: its square would overflow
 FAR = 1e-6  # of chi-squared, the same where the model is nowhere near the data
 
 
@@ -150,7 +151,7 @@ class Latent:
             places = [*range(n), *(n + i for i in tracks.columns(run))] if run.name in tracks.of else list(range(n))
             parts, own = stretches(run.t, run.used), noise[run.name]
             difference = run.observed - p.y
-            bad = ~np.isfinite(difference) | ~np.isfinite(p.J).all(axis=1)
+            bad = ~np.isfinite(difference) | ~(np.abs(p.J) < HUGE).all(axis=1)
             difference[bad] = BAD * own.innovation
             J = np.where(bad[:, None], 0.0, p.J)
             J[:, :n] *= self.scale
@@ -261,6 +262,27 @@ def marginal(
             if found > best[0]:
                 best = (found, Roughness(float(amplitude), float(length)))
     return Marginal(best[0], best[1], smooth)
+
+
+def evenness(point: Point) -> float:
+    """Return the p-value of one roughness for all runs, by the likelihood ratio against a roughness for each of them."""
+    from scipy.stats import chi2
+
+    splines, n = point.tracks.splines, point.theta.size
+    if len(splines) < 2 or not point.roughness.amplitude:
+        return 1.0
+    amplitudes, at, curves = np.geomspace(1e-5, 5e-3, 40), n, []
+    for spline in splines:
+        c = slice(at, at + spline.numbers.size)
+        at = c.stop
+        unit = Roughness(1.0, point.roughness.length).root(spline.nodes)
+        G = point.N[c, c]
+        values, vectors = np.linalg.eigh(unit.T @ G @ unit)
+        values, along = np.maximum(values, 0.0), vectors.T @ (unit.T @ (point.g[c] + G @ spline.numbers))
+        s2 = amplitudes[:, None] ** 2
+        curves.append(0.5 * np.sum(s2 * along**2 / (1 + s2 * values) - np.log1p(s2 * values), axis=1))
+    each = np.array(curves)
+    return float(chi2.sf(2 * (each.max(axis=1).sum() - each.sum(axis=0).max()), len(splines) - 1))
 
 
 def solve_scaled(A: Array, b: Array) -> Array:

@@ -62,7 +62,7 @@ def _tables(material: Mapping[str, Any]) -> dict[str, Any]:
     found = {k: plain_value(v) for k, v in material.items() if k not in ("runs", *ARRAYS)}
     found["runs"] = [{"name": str(r["name"]), "rms": plain_value(r.get("rms"))} for r in material.get("runs", ())]
     force, diagram = material.get("force") or {}, material.get("diagram") or {}
-    found["force"] = {str(k): v if k in ("form", "unit") else True for k, v in force.items()}
+    found["force"] = {k: force[k] for k in ("form", "unit") if force.get(k)} | ({"runs": True} if force else {})
     found["diagram"] = {"note": diagram.get("note")}
     return found
 
@@ -89,7 +89,8 @@ def _free(folder: Path, name: str, suffix: str, written: list[Path]) -> Path:
     stem = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "figure"
     stem = stem[:80]
     place, k = folder / f"{stem}{suffix}", 2
-    while place in written:
+    taken = {p.name.lower() for p in written}  # some file systems do not tell capitals apart
+    while place.name.lower() in taken:
         place, k = folder / f"{stem}-{k}{suffix}", k + 1
     return place
 
@@ -101,9 +102,13 @@ def _drawings(traces: tuple[Trace, ...], material: Mapping[str, Any]) -> Iterato
     for one in traces:
         yield f"run {one.name}", partial(run_figure, one)
     yield "atlas", partial(atlas_figure, plain_value(material.get("atlas") or ()))
-    yield "parameters", partial(parameters_figure, plain_value(material.get("parameters") or ()))
+    if not all(one.same for one in traces):
+        yield "parameters", partial(parameters_figure, plain_value(material.get("parameters") or ()))
     force = material.get("force") or {}
-    unit, runs = str(force.get("unit", "N")), {str(k): v for k, v in force.items() if isinstance(v, Mapping)}
+    unit, runs = (
+        str(force.get("unit", "N")),
+        {str(k): v for k, v in force.items() if isinstance(v, Mapping) and "t" in v},
+    )
     for name, one_force in runs.items():
         yield f"force {name}", partial(force_figure, name, one_force, unit=unit)
     if runs:

@@ -27,7 +27,7 @@ CLOSE_UP, FEWEST = 7, 80  # periods of what is missing that a close-up shows, sa
 MOST, SHORT = 0.6, 0.12  # of the misfit, in a part of the run so short that it deserves a close-up
 PEAK = 0.3  # of a residual's power in one line, from which it has a period
 FAINT = 2.0  # of the noise's variance: less than that needs no close-up
-ZOOM = 0.5  # of a run: a close-up of more would show nothing new
+ZOOM = 0.3  # of a run: a close-up of more would show nothing new
 VARIES = 1e-3  # relative variation of a load from which it is worth a panel
 LABELS = {"elongation": "elongation  [µm]", "force": "force  [N]", "friction": "friction coefficient"}
 GAP = 5.0  # usual steps in time after which a record has a gap
@@ -76,8 +76,9 @@ class Trace:
 
     @property
     def worst(self) -> tuple[float, float] | None:
-        """Return the window in which the baseline fails most."""
-        return max(zip(self.heights(), self.windows, strict=True))[1] if self.windows else None
+        """Return the window that holds most of what the baseline does not explain."""
+        over = [float(np.sum(self.before[(self.t >= a) & (self.t <= b)] ** 2 - 1.0)) for a, b in self.windows]
+        return max(zip(over, self.windows, strict=True))[1] if self.windows else None
 
 
 def trace(run: Mapping[str, Any]) -> Trace:
@@ -152,17 +153,18 @@ def overview(traces: Sequence[Trace]) -> Figure:
         axes[0].set_ylim(len(names) - 0.4, -0.6)
         bar = figure.colorbar(shade, ax=list(axes), pad=0.02, aspect=14)
         bar.set_label("residual / noise")
-        _plain_log(bar.ax.yaxis, max(3.0, top))
+        _plain_log(bar.ax.yaxis, max(3.0, top), most=8)
         _settle(figure)
         return figure
 
 
-def _plain_log(axis: Any, top: float) -> None:
-    """Write 1, 2, 5, 10 on a logarithmic axis."""
+def _plain_log(axis: Any, top: float, *, most: int) -> None:
+    """Write 1, 2, 5, 10 on a logarithmic axis, or 1, 10, 100 where those are more than `most`."""
     from matplotlib.ticker import NullLocator
 
-    places = [m * 10.0**d for d in range(6) for m in (1, 2, 5) if m * 10.0**d <= top * 1.001]
-    axis.set_ticks(places[:: 1 if len(places) < 8 else 3], [f"{p:g}" for p in places[:: 1 if len(places) < 8 else 3]])
+    places = [m * 10.0**d for d in range(9) for m in (1, 2, 5) if m * 10.0**d <= top * 1.001]
+    places = places if len(places) <= most else places[::3]
+    axis.set_ticks(places, [f"{p:g}" for p in places])
     axis.set_minor_locator(NullLocator())
 
 
@@ -243,7 +245,7 @@ def _whole(axes: Sequence[Axes], one: Trace) -> None:
     local.set_yscale("log")
     low, high = local.get_ylim()
     local.set_ylim(min(low, 0.7), max(high, 2.0))
-    _plain_log(local.yaxis, local.get_ylim()[1])
+    _plain_log(local.yaxis, local.get_ylim()[1], most=4)
     local.set_ylabel("local rms\n/ noise")
     margin = 0.01 * float(np.ptp(one.t))
     above.set_xlim(one.t[0] - margin, one.t[-1] + margin)

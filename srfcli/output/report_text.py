@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, TypeGuard
 
 UNITS = {"um": "µm", "um/s": "µm/s", "1/um": "1/µm", "N/um": "N/µm", "1": ""}
-SMALLEST_P = 1e-300
+SMALLEST_P = 1e-290
 NARROW = "\u00a0"  # between a number and its unit no line breaks
 PLAIN = (1e-4, 1e6)  # between these a number is written without a power of ten
 SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
@@ -53,7 +53,7 @@ def probability(value: Any) -> str:
     if not finite(value):
         return "–"
     if value < SMALLEST_P:
-        return "< 10⁻³⁰⁰"
+        return "< 10⁻²⁹⁰"
     return f"{value:.3f}" if value >= 0.001 else number(value, 1)
 
 
@@ -73,7 +73,7 @@ def rms(value: Any) -> str:
     """Return a residual in units of the noise: two decimals, fewer where it is large."""
     if not finite(value):
         return "–"
-    return f"{value:.2f}" if value < 100 else number(value, 3)
+    return f"{value:.2f}" if value < 9.995 else number(value, 3)
 
 
 def unit_text(unit: Any) -> str:
@@ -85,7 +85,7 @@ def spans(windows: Sequence[Sequence[float]], most: int = 4) -> str:
     """Return intervals of time in words, the first `most` of them."""
     shown = [f"{number(a)} to {number(b)}{NARROW}s" for a, b in windows[:most]]
     more = len(windows) - len(shown)
-    return ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+    return joined([*shown, f"{more} more"] if more > 0 else shown)
 
 
 def joined(words: Sequence[str], last: str = "and") -> str:

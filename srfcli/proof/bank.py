@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -104,7 +105,11 @@ def _made(tasks: list[Task], workers: int) -> Iterator[tuple[str, Truth]]:
     if workers <= 1:
         yield from map(_make, tasks)
         return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context, deaf = (
+        multiprocessing.get_context("spawn"),
+        (signal.SIGINT, signal.SIG_IGN),
+    )  # the parent decides what Ctrl-C means
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=signal.signal, initargs=deaf) as pool:
         waiting = [pool.submit(_make, task) for task in tasks]
         try:
             for done in as_completed(waiting):

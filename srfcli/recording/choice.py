@@ -62,7 +62,9 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
     from srfcli.system import apart  # only for a description that has effects
 
     if not isinstance(node.value, list):
-        node.expected("a list of effects", 'Write effects = ["load-transmission"]; `srf laws --kind effect` lists them.')
+        node.expected(
+            "a list of effects", 'Write effects = ["load-transmission"]; `srf laws --kind effect` lists them.'
+        )
     names, found = [], []
     for index in range(len(node.value)):
         entry = node.child(index)
@@ -76,8 +78,12 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
         assert isinstance(effect, Effect)
         if effect.settings or effect.frees:
             instead = [f"{key} = {str(value).lower()} in [model]" for key, value in effect.settings]
-            instead += [{"K": "another stiffness in [apparatus]", "M": "a mass in [apparatus]"}.get(n, n) for n in effect.frees]
-            entry.fail(f"'{effect.name}' only replaces what the description says itself", f"Write {', '.join(instead)}.")
+            instead += [
+                {"K": "another stiffness in [apparatus]", "M": "a mass in [apparatus]"}.get(n, n) for n in effect.frees
+            ]
+            entry.fail(
+                f"'{effect.name}' only replaces what the description says itself", f"Write {', '.join(instead)}."
+            )
         names.append(name)
         found.append(effect)
     return tuple(names), tuple(p for effect in apart(found) for p in effect.parameters)

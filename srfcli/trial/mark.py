@@ -8,6 +8,7 @@ from typing import Any
 
 from srfcli.trial.answer import FAILED, VERDICTS, Answer
 from srfcli.trial.sight import Sight
+from srfcli.trial.sizes import deviation
 
 KINDS = ("none", "single", "pair", "outside")
 INVISIBLE = 5.0  # standard errors: an effect whose size even the best fit would know no better cannot be asked for
@@ -22,7 +23,8 @@ class Mark:
 
     `class_right`: right, or ambiguous with the truth among what is listed or equivalent to it. `alarm`: something is said to be
     missing. `top` is the hypothesis with most confidence, `stated` that confidence, `hit` whether it is the truth; `error` the
-    held-out rms of the final model over that of the true one, `baseline_error` that of the baseline.
+    held-out rms of the final model over that of the true one, `baseline_error` that of the baseline; `deviation` is the
+    distance of an effect's size from the true one, where it was named rightly and alone: in standard errors, and relative.
     """
 
     case: str
@@ -40,6 +42,7 @@ class Mark:
     hit: bool
     error: float | None
     baseline_error: float | None
+    deviation: tuple[float, float] | None = None
 
     @property
     def visible(self) -> bool:
@@ -88,6 +91,7 @@ def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
         _key(top) in allowed,
         _ratio(answer, sight, "augmented"),
         _ratio(answer, sight, "baseline"),
+        deviation(truth, answer),
     )
 
 

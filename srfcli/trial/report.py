@@ -33,6 +33,7 @@ def tables(marks: Sequence[Mark], *, digest: str, seed: int, of: int) -> tuple[T
         by_strength(marks),
         calibrated(marks),
         held(marks),
+        sizes(marks),
         cost(marks),
     ]
     more = [t for t in more if t.rows]
@@ -207,6 +208,23 @@ def held(marks: Sequence[Mark]) -> Table:
                 rows.append((title, len(ours), quantile(ours, 0.5), quantile(ours, 0.9), within, quantile(base, 0.5)))
     note = "rms of held-out runs, over that of the model that knows the truth and the track; `within` 1.1 of it"
     return Table("srf.prove.held/1", columns, rows, "Held-out error", (note,) if rows else ())
+
+
+def sizes(marks: Sequence[Mark]) -> Table:
+    """Return how well the sizes of rightly named effects, and their standard errors, hold."""
+    columns = (
+        Column("tracks"), Column("within_2", about="no more than 2 standard errors off"), Column("cases"), *SHARE,
+        Column("median_off", about="median of the distance, in standard errors", format=".2f"),
+        Column("median_relative", about="the same, relative to the size", format=".3f"),
+    )  # fmt: skip
+    rows = []
+    for rough in (False, True):
+        found = [m.deviation for m in marks if m.deviation is not None and m.rough == rough]
+        if found:
+            off = [abs(sigmas) for sigmas, _ in found]
+            medians = (quantile(off, 0.5), quantile([r for _, r in found], 0.5))
+            rows.append(("rough" if rough else "smooth", *_cells(rate(x <= 2 for x in off)), *medians))
+    return Table("srf.prove.sizes/1", columns, rows, "Sizes of the effects that were named rightly, alone")
 
 
 def cost(marks: Sequence[Mark]) -> Table:

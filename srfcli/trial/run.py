@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import signal
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -106,10 +108,42 @@ def _make(trial: Trial, asked: dict[str, Any], *, workers: int, told: Callable[[
     if part.exists():
         shutil.rmtree(part)  # of a run that was killed while it made the bank: nobody has answered it
     trial.apart.unlink(missing_ok=True)
-    made = make_bank(
-        part, asked["cases"], asked["seed"], apart=trial.apart, workers=workers, told=told, kinds=asked["kinds"] or None
-    )
+    with _interruptible():
+        made = make_bank(
+            part,
+            asked["cases"],
+            asked["seed"],
+            apart=trial.apart,
+            workers=workers,
+            told=told,
+            kinds=asked["kinds"] or None,
+            strengths=False,
+        )
     made.folder.rename(trial.bank)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Let Ctrl-C end what is done inside: a solver's compiled code loses it, and tells of a fault of its own instead."""
+    pressed: list[int] = []
+
+    def note(number: int, frame: Any) -> None:
+        pressed.append(number)
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGINT, note)
+    except ValueError:  # not in the main thread: there is no Ctrl-C here
+        yield
+        return
+    try:
+        yield
+    except Exception:
+        if pressed:
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def answer_all(trial: Trial, *, workers: int = 1, plugins: tuple[Path, ...] = (), limit: float = LIMIT,

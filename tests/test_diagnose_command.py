@@ -1,0 +1,274 @@
+"""`srf diagnose` as a user meets it: verdict, folder, the augmented model in other commands, and held-out runs unopened."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from srfcli.cli.diagnose_out import prediction_names
+from srfcli.cli.main import cli
+from srfcli.diagnosis.search import Search
+
+ALPHA = 0.03
+TOML = """format = "srf-experiment/1"
+title = "made"
+
+[apparatus]
+stiffness = "1.0 N/um"
+
+[model]
+law = "srf-vsat"
+ageing = "dieterich"
+interface = "elastic"
+effects = ["linker-dieterich"]
+
+[parameters]
+mu0 = { value = 0.33, lower = 0.2, upper = 0.5 }
+A = { value = 0.0126, lower = 0.006, upper = 0.03 }
+B = { value = 0.0241, lower = 0.01, upper = 0.06 }
+D0 = { value = 0.402, lower = 0.1, upper = 1.5 }
+alpha = { value = 0.03, fixed = true }
+"""
+RUNS = {
+    "steps": ([(1.0, 5.0), (1.0, 20.0), (1.0, 10.0)], 5.0, 5.0, False),
+    "loadstep": ([(3.0, 10.0)], 5.0, 6.5, False),
+    "held out": ([(1.0, 15.0), (2.0, 8.0)], 7.0, 5.5, True),
+}
+EFFECTS = ("--effect", "linker-dieterich", "--effect", "tangential-crosstalk")
+KEYS = {
+    "schema", "verdict", "effects", "equivalent", "not_identifiable", "confidence", "baseline", "augmented", "location",
+    "model",
+}  # fmt: skip
+
+
+def srf(*arguments: object, code: int = 0) -> Result:
+    done = CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="srf")
+    assert done.exit_code == code, done.stderr
+    return done
+
+
+def make(folder: Path) -> Path:
+    """Write a simulated experiment in which a change of load changes the age, and whose model says nothing of it."""
+    base = folder / "base"
+    base.mkdir()
+    text, t = TOML, np.arange(0, 3.0, 0.005)
+    for name, (drive, before, after, holdout) in RUNS.items():
+        steps = ", ".join(f"{{ duration = {d}, velocity = {V} }}" for d, V in drive)
+        text += (
+            f'\n[[runs]]\nname = "{name}"\nfile = "{name}.csv"\nholdout = {str(holdout).lower()}\ndrive = [{steps}]\n'
+        )
+        W = before + (after - before) * (1 + np.tanh((t - 1.5) / 0.05)) / 2
+        rows = [
+            f"{a!r},{b!r},{float(0.45 * b + 1e-3 * np.sin(7 * a))!r}"
+            for a, b in zip(t.tolist(), W.tolist(), strict=True)
+        ]
+        (base / f"{name}.csv").write_text("\n".join(["time [s],normal_load [N],elongation [um]", *rows]) + "\n")
+    (base / "experiment.toml").write_text(text)
+    srf("simulate", base, "--out-dir", folder / "made", "--noise", 0.004, "--quantum", 0.001, "--seed", 3)
+    description = folder / "made" / "experiment.toml"
+    lines = [x for x in description.read_text().splitlines() if not x.startswith(("effects", "alpha"))]
+    description.write_text("\n".join(lines).replace("value = 0.0126,", "value = 0.0135,") + "\n")
+    return folder / "made"
+
+
+@pytest.fixture(scope="module")
+def clean() -> Iterator[pytest.MonkeyPatch]:
+    """No settings of the caller; only the cache of generated code is shared."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [n for n in os.environ if n.startswith("SRF_") and n not in ("SRF_CACHE", "SRF_SHARED")]:
+            patch.delenv(name)
+        patch.setenv("XDG_DATA_HOME", "/nonexistent")
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def experiment(clean: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The experiment."""
+    return make(tmp_path_factory.mktemp("diagnose"))
+
+
+@pytest.fixture(scope="module")
+def found(experiment: Path) -> dict[str, Any]:
+    """The answer, of a run that also writes the folder `found` beside the experiment."""
+    done = srf("diagnose", experiment, *EFFECTS, "--json", "--out", experiment.parent / "found")
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+@pytest.fixture
+def folder(experiment: Path, found: dict[str, Any]) -> Path:
+    """The folder that was written."""
+    return experiment.parent / "found"
+
+
+def test_the_concealed_effect_is_named_with_its_size(found: dict[str, Any]) -> None:
+    assert (found["verdict"], found["effects"]) == ("identified", ["linker-dieterich"])
+    alpha = found["augmented"]["parameters"]["alpha"]
+    assert abs(alpha["value"] - ALPHA) < 4 * alpha["stderr"] < 0.3 * ALPHA
+    assert found["confidence"]["linker-dieterich"] > 0.9
+    assert sum(found["confidence"].values()) == pytest.approx(1.0)
+
+
+def test_the_answer_has_the_form_of_the_format(found: dict[str, Any]) -> None:
+    assert found["schema"] == "srf.diagnose/1"
+    assert set(found) >= KEYS and set(found) - KEYS <= {"reasons"}
+    for side in ("baseline", "augmented"):
+        assert set(found[side]) == {"parameters", "fit", "holdout"}
+        assert all({"value", "stderr"} <= set(p) and p["stderr"] > 0 for p in found[side]["parameters"].values())
+    assert set(found["location"]) == {"runs", "forcing_phase", "frequencies_hz", "coordinate"}
+    assert "alpha" not in found["baseline"]["parameters"]
+
+
+@pytest.mark.parametrize("runs", ["fit", "holdout"])
+def test_the_misfit_is_gone_in_the_augmented_model(found: dict[str, Any], runs: str) -> None:
+    assert found["baseline"][runs]["rms_over_noise"] > 1.1
+    assert found["augmented"][runs]["rms_over_noise"] == pytest.approx(1.0, abs=0.08)
+
+
+def test_the_misfit_is_where_the_load_changes(found: dict[str, Any]) -> None:
+    (first, *_) = found["location"]["runs"]
+    assert first["name"] == "loadstep" and first["share"] > 0.7 and first["p_value"] < 1e-6
+    assert all(a < 2.2 and b > 1.2 for a, b in first["windows"])
+
+
+def test_the_same_is_in_the_folder(found: dict[str, Any], folder: Path) -> None:
+    assert json.loads((folder / "answer.json").read_text()) == found
+    sidecar = json.loads((folder / "answer.json.provenance.json").read_text())
+    assert len(sidecar["inputs"]) == 4 and all(sidecar["inputs"].values())
+    assert (folder / found["model"]).is_file() and not list(folder.parent.glob(".*.part"))
+
+
+@pytest.mark.parametrize("run", list(RUNS))
+def test_predictions_are_written_for_every_run(found: dict[str, Any], folder: Path, run: str) -> None:
+    file = folder / f"prediction-{run}.csv"
+    assert file.read_text().splitlines()[0] == "time [s],observed [um],baseline [um],augmented [um]"
+    t, observed, baseline, augmented = np.genfromtxt(file, delimiter=",", skip_header=1).T
+    assert t.size == 600 and np.isfinite(baseline).all()
+    better, worse = np.nanstd(observed - augmented), np.nanstd(observed - baseline)
+    assert better == pytest.approx(0.004, rel=0.12)
+    assert worse > better * (1.0 if run == "steps" else 1.05)
+
+
+def test_the_augmented_experiment_has_laws_that_say_it(folder: Path) -> None:
+    described = tomllib.loads((folder / "augmented" / "experiment.toml").read_text())
+    assert described["model"]["ageing"] == "ageing.toml" and "effects" not in described["model"]
+    assert described["parameters"]["alpha"]["value"] == pytest.approx(ALPHA, rel=0.1)
+    law = tomllib.loads((folder / "augmented" / "ageing.toml").read_text())
+    assert "W_dot" in law["rate"] and law["parameters"]["alpha"]["default"] == described["parameters"]["alpha"]["value"]
+    assert [r["holdout"] for r in described["runs"]] == [False, False, True]
+
+
+def test_other_commands_accept_the_augmented_experiment(found: dict[str, Any], folder: Path) -> None:
+    shown = json.loads(srf("fit", folder / "augmented", "--json").stdout)
+    rows = {r["parameter"]: r for r in shown["rows"]}
+    for name, value in found["augmented"]["parameters"].items():
+        assert abs(rows[name]["value"] - value["value"]) < 0.5 * value["stderr"], name
+    assert srf("check", folder / "augmented", "--no-simulate", "--csv").stdout.count("\n") == 4
+    assert srf("simulate", folder / "augmented", "--run", "loadstep", "--csv").stdout.count("\n") == 601
+
+
+def test_the_diagram_of_the_augmented_model_is_one_command_away(folder: Path) -> None:
+    laws = [x for k in ("law", "ageing", "interface") for x in (f"--{k}", folder / "augmented" / f"{k}.toml")]
+    laws[1] = folder / "augmented" / "friction.toml"
+    rows = json.loads(srf("linear", *laws, "--K", 1.0, "--over", "V=5:20:2", "--json").stdout)["rows"]
+    assert all(r["status"] == "ok" for r in rows)
+    plain = json.loads(srf("linear", "--K", 1.0, "--over", "V=5:20:2", "--json").stdout)["rows"]
+    assert rows[0]["W0"] == pytest.approx(
+        plain[0]["W0"], rel=0.1
+    )  # the same physics under constant load, fitted numbers
+
+
+def test_a_reader_gets_a_sentence_and_tables(experiment: Path, found: dict[str, Any]) -> None:
+    text = srf("diagnose", experiment, *EFFECTS).stdout
+    assert text.startswith("identified: linker-dieterich\n")
+    for word in ("hypotheses", "parameters", "runs", "held out", "alpha", "rms over noise"):
+        assert word in text
+    assert text == srf("diagnose", experiment, *EFFECTS, "--seed", 0).stdout  # nothing random without a seed
+
+
+def test_a_diagnosis_is_replaced_on_demand_only_and_nothing_else_ever(
+    folder: Path, experiment: Path, tmp_path: Path
+) -> None:
+    assert "--force" in srf("diagnose", experiment, "--out", folder, code=2).stderr
+    strange = tmp_path / "mine"
+    strange.mkdir()
+    (strange / "thesis.tex").write_text("x")
+    for force in ([], ["--force"]):
+        assert "something else" in srf("diagnose", experiment, "--out", strange, *force, code=2).stderr
+    assert "not exist" in srf("diagnose", experiment, "--out", tmp_path / "a" / "b", code=2).stderr
+    assert (strange / "thesis.tex").read_text() == "x"
+
+
+def test_an_unknown_effect_is_told_before_anything_is_fitted(experiment: Path) -> None:
+    done = srf("diagnose", experiment, "--effect", "linker-dietrich", code=2)
+    assert "unknown effect 'linker-dietrich'" in done.stderr and "linker-dieterich" in done.stderr
+
+
+def test_held_out_files_are_opened_when_the_models_are_final(
+    experiment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(experiment, copy)
+    description = tomllib.loads((copy / "experiment.toml").read_text())
+    (held,) = (r["file"] for r in description["runs"] if r["holdout"])
+    (copy / held).unlink()
+    finished = []
+    whole = Search.run
+
+    def run(self: Search) -> Any:
+        found = whole(self)
+        finished.append([r.name for r in found])
+        return found
+
+    monkeypatch.setattr(Search, "run", run)
+    done = srf("diagnose", copy, *EFFECTS, "--out", tmp_path / "out", code=2)
+    assert held in done.stderr and finished and finished[0][0] == "linker-dieterich"
+    assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".*.part"))
+
+
+def test_interrupted_it_keeps_what_it_has(experiment: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def widen(self: Search, *arguments: Any, **named: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Search, "widen", widen)
+    done = srf("diagnose", experiment, *EFFECTS, "--json", "--out", tmp_path / "out", code=130)
+    found = json.loads(done.stdout)
+    assert found["status"] == "interrupted" and found["effects"] == []
+    assert (tmp_path / "out" / "augmented" / "experiment.toml").is_file()
+
+
+def test_interrupted_before_there_is_anything_it_writes_nothing(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def baseline(self: Search) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Search, "baseline", baseline)
+    done = srf("diagnose", experiment, "--json", "--out", tmp_path / "out", code=130)
+    assert done.stdout == "" and not (tmp_path / "out").exists()
+
+
+def test_where_nothing_is_missing_the_augmented_model_is_the_baseline(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "again"
+    found = json.loads(
+        srf("diagnose", folder / "augmented", "--effect", "tangential-crosstalk", "--json", "--out", out).stdout
+    )
+    assert found["verdict"] in ("none", "inconclusive") and found["effects"] == []
+    assert found["augmented"] == found["baseline"] and found["location"]["runs"] == []
+    described = tomllib.loads((out / "augmented" / "experiment.toml").read_text())
+    assert described["parameters"].keys() == found["baseline"]["parameters"].keys() or "V0" in described["parameters"]
+
+
+def test_names_of_prediction_files_do_not_clash() -> None:
+    assert prediction_names(["a/b", "a-b", "A-B", "..", "run 1"]) == [
+        "prediction-a-b.csv", "prediction-a-b-2.csv", "prediction-A-B-3.csv", "prediction-run.csv", "prediction-run 1.csv",
+    ]  # fmt: skip

@@ -1,0 +1,408 @@
+"""The report of a diagnosis: one page that needs nothing else, whatever the verdict and whatever the names in the recordings."""
+
+from __future__ import annotations
+
+import base64
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from srfcli.output import report
+from srfcli.output.plots import figure_bytes
+from srfcli.output.report import write_report
+from srfcli.output.report_atlas import foremost, spots
+from srfcli.output.report_page import VOID, Markup, tag
+from srfcli.output.report_runs import close_up, local_rms, run_figure, trace
+from srfcli.output.report_sections import command_lines, merged
+from srfcli.output.report_text import number, percent, probability, spans, with_error
+
+VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
+NOISE = 0.02
+HOSTILE = '<script>alert("1")</script> & $\\frac{a$ "><img src=x onerror=y>'
+
+
+class Page(HTMLParser):
+    """A page read strictly: every element is closed in its turn."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+        assert not self.open, f"never closed: {self.open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert len(dict(attrs)) == len(attrs), f"<{tag}> has an attribute twice"
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag, f"</{tag}> out of turn"
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+    def all(self, name: str) -> list[dict[str, str | None]]:
+        return [attributes for tag, attributes in self.elements if tag == name]
+
+
+def made_run(
+    name: str, *, holdout: bool = False, n: int = 900, seed: int = 0, windows: Any = ((1.0, 1.5),)
+) -> dict[str, Any]:
+    """A run whose baseline fails from 1 to 1.5 s by a wave of ten times the noise; the augmented model leaves noise."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0.0, 3.0, n)
+    true = 10.0 + np.sin(2 * np.pi * t)
+    missing = np.where((t > 1.0) & (t < 1.5), 10 * NOISE * np.sin(40 * np.pi * t), 0.0)
+    used = np.ones(n, dtype=bool)
+    used[100:110] = False
+    observed = true + NOISE * rng.normal(size=n)
+    observed[100:110] = 1e9  # a placeholder that must not be drawn
+    return {"name": name, "holdout": holdout, "t": t, "observed": observed, "used": used, "baseline": true - missing,
+            "augmented": true, "noise_level": NOISE, "V": np.where(t < 2, 5.0, 50.0), "W": 7 * (1 + 0.1 * np.sin(30 * t)),
+            "slip": 5 * t, "windows": [list(w) for w in windows]}  # fmt: skip
+
+
+def made_answer(verdict: str, name: str = "onset") -> dict[str, Any]:
+    effects = {"identified": ["linker-dieterich"], "ambiguous": ["linker-dieterich", "second-state"]}.get(verdict, [])
+    answer = {
+        "schema": "srf.diagnose/1", "verdict": verdict, "effects": effects, "equivalent": [],
+        "not_identifiable": [{"effect": "inertia", "reason": "the mass is <known>"}],
+        "confidence": {"linker-dieterich": 0.98, "none": 1e-30, "unknown": 0.01},
+        "baseline": {"parameters": {}, "fit": {"rms_over_noise": 3.19}, "holdout": {"rms_over_noise": 4.75}},
+        "augmented": {"parameters": {}, "fit": {"rms_over_noise": 0.9912}, "holdout": {"rms_over_noise": 1.02}},
+        "location": {"runs": [{"name": name, "share": 0.61, "windows": [[1.0, 1.5]], "p_value": 1e-9}],
+                     "forcing_phase": [0.5, 1.5], "frequencies_hz": [120.0], "coordinate": {"name": "dlnW/dt", "r2": 0.7}},
+        "model": "augmented/experiment.toml",
+    }  # fmt: skip
+    if verdict == "ambiguous":
+        answer["equivalent"] = [["linker-dieterich", "second-state"]]
+    if verdict in ("none", "inconclusive"):
+        answer["augmented"] = answer["baseline"]
+        answer["location"] = {"runs": [], "forcing_phase": None, "frequencies_hz": [], "coordinate": None}
+    return answer
+
+
+def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
+    runs = [made_run(name, seed=1)]
+    if verdict == "identified":
+        runs = [made_run("quiet", windows=()), *runs, made_run("later", holdout=True, seed=2, windows=())]
+    if verdict in ("none", "inconclusive"):
+        for run in runs:
+            run["augmented"] = run["baseline"]
+    rows = [{"axis": "v", "run": "", "kind": "mean", "low": 10.0**k, "high": 10.0 ** (k + 1), "statistic": 3.0 * k, "z": 1.0,
+             "freedom": 1.0, "log_p": -5.0 * k, "p_value": 10.0 ** (-2 * k)} for k in range(5)]  # fmt: skip
+    material: dict[str, Any] = {
+        "title": "PMMA <on> PMMA", "runs": runs, "atlas": rows,
+        "ranked": [{"name": "linker-dieterich", "evidence": -10.0, "rms_over_noise": 0.99, "p_value": 0.4},
+                   {"name": "second-state", "evidence": -11.5, "rms_over_noise": 0.993, "p_value": 0.38},
+                   {"name": "none", "evidence": -900.0, "rms_over_noise": 3.19, "p_value": 0.0}],
+        "parameters": [{"name": "B", "unit": "1", "baseline": 0.0259135, "baseline_stderr": 1.1e-4, "augmented": 0.0242,
+                        "augmented_stderr": 1.3e-4, "shift_sigma": 10.06},
+                       {"name": "alpha", "unit": "1", "baseline": None, "baseline_stderr": None, "augmented": 0.012,
+                        "augmented_stderr": 0.0004, "shift_sigma": None}],
+        "scores": [{"effect": "linker-dieterich", "gain": 812.0, "size": 0.011, "stderr": 0.0003, "surviving": 0.12,
+                    "detectable": 0.0011}],
+    }  # fmt: skip
+    if verdict == "unknown":
+        t = runs[0]["t"]
+        force = {"t": t, "force": 0.01 * np.sin(t), "band": np.full(t.size, 0.002), "v": 5 + 40 * np.sin(t) ** 2,
+                 "phi": 0.1 + t, "W": runs[0]["W"]}  # fmt: skip
+        material["force"] = {"quiet": force, "form": "0.3*log(v/V0) < 1", "unit": "1", "terms": {"gain": 1}}
+    if verdict == "identified":
+        V = np.geomspace(1, 100, 30)
+        material["diagram"] = {
+            "V": V,
+            "W0_baseline": 7 + np.log(V),
+            "W0_augmented": 8 + np.log(V),
+            "note": "at eps = 0.18",
+        }
+    if verdict == "ambiguous":
+        material["parting"] = "Step the load from 5 to 9 N."
+    return material
+
+
+@pytest.fixture
+def bare(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No matplotlib: what is written does not depend on it, but for the figures."""
+    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
+
+
+@pytest.fixture(scope="module", params=["identified", "unknown", "none"])
+def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
+    """A report with all its figures, beside an augmented experiment."""
+    folder = tmp_path_factory.mktemp("report") / "out"
+    (folder / "augmented").mkdir(parents=True)
+    for name in ("experiment.toml", "friction.toml", "on set.csv"):
+        (folder / "augmented" / name).write_text("")
+    write_report(folder, made_answer(request.param), made_material(request.param))
+    yield request.param, folder
+
+
+def read(folder: Path) -> Page:
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+def test_the_page_is_well_formed_and_needs_nothing_else(written: tuple[str, Path]) -> None:
+    _, folder = written
+    page = read(folder)
+    names = [tag for tag, _ in page.elements]
+    assert names[:2] == ["html", "head"] and names.count("h1") == 1 and names.count("title") == 1
+    assert not {"script", "link", "iframe", "object", "embed", "base", "form"} & set(names)
+    ids = [a["id"] for _, a in page.elements if "id" in a]
+    assert len(ids) == len(set(ids))
+    for _, attributes in page.elements:
+        assert not [a for a in attributes if a.startswith("on") or a == "srcset"]
+        source, link = attributes.get("src"), attributes.get("href")
+        assert source is None or source.startswith("data:image/svg+xml;base64,")
+        if link is not None and link.startswith("#"):
+            assert link[1:] in ids
+        elif link is not None:
+            assert (folder / link.replace("%20", " ")).is_file()
+    style = (folder / "report.html").read_text(encoding="utf-8").partition("<style>")[2].partition("</style>")[0]
+    assert style and not re.search(r"url\(|@import|expression\(|//", style)
+    assert "default-src 'none'" in str(page.all("meta"))
+
+
+def test_pictures_are_those_of_the_folder_and_say_what_they_show(written: tuple[str, Path]) -> None:
+    verdict, folder = written
+    page = read(folder)
+    inside = [base64.b64decode(str(a["src"]).partition(",")[2]) for a in page.all("img")]
+    files = {p.read_bytes() for p in (folder / "figures").glob("*.svg")}
+    assert set(inside) == files and len(inside) == len(files)
+    assert all(len(str(a["alt"])) > 20 for a in page.all("img"))
+    for content in files:
+        root = ET.fromstring(content)
+        fetched = [v for e in root.iter() for k, v in e.attrib.items() if k.endswith("href")]
+        assert all(v.startswith(("#", "data:")) for v in fetched)
+    names = {p.name for p in (folder / "figures").iterdir()}
+    assert {p.replace(".svg", ".png") for p in names if p.endswith(".svg")} == {p for p in names if p.endswith(".png")}
+    assert {"overview.svg", "atlas.svg", "run-onset.svg"} <= names
+    assert ({"run-quiet.svg", "run-later.svg"} <= names) == (verdict == "identified")
+    assert ("parameters.svg" in names) == (verdict != "none")
+    assert ({"force-quiet.svg", "force-by-state.svg"} <= names) == (verdict == "unknown")
+    assert ("diagram.svg" in names) == (verdict == "identified")
+    for png in (folder / "figures").glob("*.png"):
+        assert png.read_bytes().startswith(b"\x89PNG")
+
+
+def test_equal_answers_give_equal_bytes(tmp_path: Path) -> None:
+    made = [write_report(tmp_path / name, made_answer("none"), made_material("none")) for name in ("one", "two")]
+    assert made[0][-1] == tmp_path / "one" / "report.html"
+    assert len(made[0]) == len(made[1]) == 7
+    for first, second in zip(*made, strict=True):
+        assert first.name == second.name and first.read_bytes() == second.read_bytes(), first.name
+
+
+SENTENCES = {
+    "none": "Nothing is missing: the baseline explains the recordings down to the noise (residuals are 3.19 times the noise "
+    "in the fitted runs, 4.75 times in the held-out ones).",
+    "identified": "The baseline lacks linker-dieterich (contacts lose age when the load rises): with it, residuals fall from "
+    "3.19 to 0.99 times the noise in the fitted runs, and from 4.75 to 1.02 times in runs that the fit never saw.",
+    "ambiguous": "Something is missing, and these recordings cannot tell which of linker-dieterich and second-state it is:",
+    "unknown": "Something is missing that no registered effect explains: even with the best of those tried, linker-dieterich,",
+    "inconclusive": "Nothing has to be added to the baseline, but this experiment could not have seen most effects",
+}
+
+
+@pytest.mark.usefixtures("bare")
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Path) -> None:
+    material = made_material(verdict)
+    material["about"] = {"linker-dieterich": "Contacts lose age when the load rises"}
+    write_report(tmp_path, made_answer(verdict), material)
+    page = read(tmp_path)
+    first = page.text.partition("PMMA <on> PMMA: " + verdict)[2]
+    assert SENTENCES[verdict] in first
+    assert first.index(SENTENCES[verdict]) < first.index("residual / noise") < first.index("What was left out")
+    nothing = verdict in ("none", "inconclusive")
+    assert ("No place stands out beyond what noise does." in page.text) == nothing
+    place = "61 % of the excess misfit is in the run “onset”, from 1.00 to 1.50 s."
+    assert (place in page.text) != nothing
+    assert ("bent B by 10 standard errors" in page.text) != nothing
+    assert ("leave the same trace" in page.text) == (verdict == "ambiguous")
+    assert ("Step the load from 5 to 9 N." in page.text) == (verdict == "ambiguous")
+    assert ("0.3*log(v/V0) < 1" in page.text) == (verdict == "unknown")
+    assert "the mass is <known>" in page.text
+    assert 'matplotlib, which is not installed: pip install "srfcli[plot]"' in page.text
+    assert not (tmp_path / "figures").exists()
+
+
+@pytest.mark.usefixtures("bare")
+def test_the_run_with_most_of_the_misfit_comes_first(tmp_path: Path) -> None:
+    write_report(tmp_path, made_answer("identified"), made_material("identified"))
+    text = read(tmp_path).text.partition("p of noise stands out at")[2]
+    assert text.index("onset") < text.index("quiet") < text.index("later")
+
+
+def test_no_name_breaks_out_of_the_page(tmp_path: Path) -> None:
+    answer, material = made_answer("ambiguous", HOSTILE), made_material("ambiguous", HOSTILE)
+    material |= {"title": HOSTILE, "commands": [HOSTILE], "about": {HOSTILE: HOSTILE}}
+    answer |= {"effects": [HOSTILE], "model": HOSTILE, "confidence": {HOSTILE: 1.0}}
+    answer["not_identifiable"] = [{"effect": HOSTILE, "reason": HOSTILE}]
+    material["ranked"][0]["name"] = material["scores"][0]["effect"] = material["parameters"][0]["name"] = HOSTILE
+    material["atlas"] += [{"axis": HOSTILE, "run": HOSTILE, "bin": HOSTILE + str(k), "statistic": 3.0, "p_value": 0.1}
+                          for k in range(4)]  # fmt: skip
+    material["runs"][0]["name"] = answer["location"]["runs"][0]["name"] = "../../" + HOSTILE
+    write_report(tmp_path / "out", answer, material)
+    page = read(tmp_path / "out")
+    names = {tag for tag, _ in page.elements}
+    assert "script" not in names
+    assert all(str(a["src"]).startswith("data:") and "onerror" not in a for a in page.all("img"))
+    assert page.text.count(" ".join(HOSTILE.split())) >= 10
+    assert {p.name for p in tmp_path.iterdir()} == {"out"}
+    files = [p.name for p in (tmp_path / "out" / "figures").iterdir()]
+    assert files and all(re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*\.(svg|png)", n) for n in files)
+
+
+def test_two_runs_whose_names_make_one_file_name_keep_both_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report, "figure_bytes", lambda figure, suffix: f"{figure}{suffix}".encode())
+    monkeypatch.setattr(report, "overview", lambda traces: None)
+    monkeypatch.setattr(report, "atlas_figure", lambda rows: None)
+    monkeypatch.setattr(report, "run_figure", lambda one: one.name)
+    material = made_material("none")
+    empty = made_run("empty") | {"used": np.zeros(900, dtype=bool)}  # nothing to draw
+    material["runs"] = [run | {"baseline": run["augmented"]} for run in (made_run("a b"), made_run("A/b"), empty)]
+    write_report(tmp_path, made_answer("none"), material)
+    found = {p.name: p.read_text() for p in (tmp_path / "figures").glob("*.svg")}
+    assert found == {"run-a-b.svg": "a b.svg", "run-A-b-2.svg": "A/b.svg"}
+
+
+@pytest.mark.usefixtures("bare")
+def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "report.html").write_text("old")
+
+    def full(self: Path, target: Path) -> Path:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(OSError, match="no space"):
+        write_report(tmp_path, made_answer("none"), made_material("none"))
+    assert (tmp_path / "report.html").read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+@pytest.mark.usefixtures("bare")
+def test_what_is_absent_is_left_out(tmp_path: Path) -> None:
+    answer = {"schema": "srf.diagnose/1", "verdict": "inconclusive", "effects": [], "location": None, "model": None}
+    write_report(tmp_path, answer, {"runs": []})
+    text = read(tmp_path).text
+    assert "No run was held out" in text and "No place stands out" in text
+    assert "stability diagram" not in text and "missing force" not in text.lower()
+
+
+def test_a_long_record_is_drawn_by_extremes() -> None:
+    short, long = (len(figure_bytes(run_figure(trace(made_run("long", n=n))), ".svg")) for n in (3_000, 200_000))
+    assert long < 1_000_000 and long < 4 * short
+
+
+def test_a_trace_has_only_what_is_compared() -> None:
+    one = trace(made_run("a"))
+    assert one.t.size == 890 and float(np.abs(one.observed).max()) < 12
+    assert not one.same and np.std(one.after) == pytest.approx(1.0, abs=0.1) and np.abs(one.before).max() > 8
+    assert trace(made_run("a", windows=((0.2, 0.4), (1.1, 1.4), (2.0, 2.2)))).worst == (1.1, 1.4)
+    borders, values = local_rms(one.t, one.before)
+    assert borders.size == values.size + 1
+    middle = 0.5 * (borders[1:] + borders[:-1])
+    inside = (middle > 1.05) & (middle < 1.45)
+    assert values[inside].min() > 4 > 2 > values[~inside & ((middle < 0.9) | (middle > 1.6))].max()
+
+
+def test_a_close_up_shows_where_and_how_fast_it_fails() -> None:
+    burst = made_run("a", n=6000)
+    seen = close_up(trace(burst))
+    assert seen is None or seen.stop - seen.start < 0.6 * 6000
+    t = burst["t"]
+    spike = burst | {"baseline": burst["augmented"] - 3.0 * np.exp(-(((t - 2.2) / 0.02) ** 2))}
+    part = close_up(trace(spike))
+    assert part is not None
+    shown = trace(spike).t[part]
+    assert shown[0] < 2.18 and shown[-1] > 2.22 and shown[-1] - shown[0] < 0.5
+    fast = burst | {"baseline": burst["augmented"] - 0.2 * np.sin(2 * np.pi * 120 * t), "windows": [[0.0, 3.0]]}
+    part = close_up(trace(fast))
+    assert part is not None
+    shown = trace(fast).t[part]
+    assert 4 / 120 < shown[-1] - shown[0] < 12 / 120
+    assert close_up(trace(burst | {"baseline": burst["augmented"]})) is None  # noise alone
+    assert close_up(trace(burst | {"baseline": burst["augmented"] + 0.2})) is None  # the same everywhere
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.0129, 0.0001, "0.01290 ± 0.00010"),
+        (290.379, 0.105, "290.38 ± 0.10"),
+        (285.158, 0.2301, "285.16 ± 0.23"),
+        (-0.02083, 0.00134, "−0.0208 ± 0.0013"),
+        (9.3243e-5, 1.007e-6, "(9.32 ± 0.10)·10⁻⁵"),
+        (2.5e7, 3.1e5, "(2.500 ± 0.031)·10⁷"),
+        (1234.0, 99.6, "1230 ± 100"),
+        (0.5, None, "0.5000"),
+        (0.5, 0.0, "0.5000"),
+        (None, 1.0, "–"),
+        (float("nan"), 1.0, "–"),
+    ],
+)
+def test_values_have_the_digits_that_their_errors_allow(value: Any, error: Any, text: str) -> None:
+    assert with_error(value, error) == text
+
+
+def test_numbers_have_sensible_digits() -> None:
+    assert [number(x) for x in (0, 0.5, 62100.0, 1.5e-7, -3.0, 999.9, None)] == [
+        "0", "0.500", "62100", "1.50·10⁻⁷", "−3.00", "1000", "–"]  # fmt: skip
+    assert [probability(p) for p in (0.4, 0.00012, 0.0, None)] == ["0.400", "0.0001", "< 10⁻²⁹⁰", "–"]
+    assert [percent(p).replace("\u00a0", " ") for p in (0.0, 1e-9, 0.005, 0.123, 0.999, 1.0)] == [
+        "0 %", "< 0.01 %", "0.5 %", "12 %", "99.9 %", "100 %"]  # fmt: skip
+    assert spans([(0, 1)] * 6, 2).replace("\u00a0", " ") == "0 to 1.00 s, 0 to 1.00 s and 4 more"
+
+
+def test_windows_that_adjoin_are_one_in_words() -> None:
+    assert merged([(2.0, 3.0), (0.0, 1.0), (1.001, 2.0), (8.0, 9.0)]) == [(0.0, 3.0), (8.0, 9.0)]
+    assert merged([]) == []
+
+
+def test_the_atlas_is_read_in_both_forms() -> None:
+    rows = [{"axis": "v", "low": 1.0, "high": 2.0, "log_p": -230.2585, "statistic": 9.0, "p_value": 1e-90},
+            {"axis": "v", "low": 2.0, "high": 3.0, "log_p": -23.0, "statistic": 900.0, "p_value": 1e-3},
+            {"axis": "v", "low": 3.0, "high": 4.0, "log_p": -1.0, "statistic": 1.0, "p_value": 0.9},
+            {"axis": "run", "run": "steps", "bin": "steps", "statistic": None, "p_value": 0.5},
+            {"axis": "frequency", "bin": [119.5, 120.5], "log_p": -50.0, "p_value": 0.5}]  # fmt: skip
+    found = spots(rows)
+    assert [round(s.height, 2) for s in found] == [100.0, 21.71, 9.99, 0.43]
+    assert [s.place.replace("\u00a0", " ") for s in found[:2]] == ["1.00 to 2.00 µm/s", "120 Hz"]
+    assert [s.sure for s in found] == [True, False, True, False]
+    assert [s.axis for s in foremost(found, each=1)] == ["v", "frequency"]
+    assert [s.height for s in spots([{"axis": "a", "bin": "b", "statistic": -4.0}])] == [4.0]
+
+
+def test_command_lines_are_quoted_and_name_the_laws_that_there_are() -> None:
+    files = ["my model/experiment.toml", "my model/friction.toml"]
+    lines = command_lines({"model": "my model/experiment.toml"}, files)
+    assert lines[0] == "srf check 'my model'"
+    assert [x for x in lines if x.startswith("srf linear")] == ["srf linear --law 'my model/friction.toml'"]
+    assert not any("--ageing" in x for x in lines)
+    assert command_lines({"model": None}, files) == []
+
+
+def test_text_is_escaped_unless_it_is_markup() -> None:
+    assert tag("p", "<b>", Markup("<i>x</i>"), ["&"], title='"') == '<p title="&quot;">&lt;b&gt;<i>x</i>&amp;</p>'
+    assert (
+        tag("br") == "<br>"
+        and tag("span", class_="n", aria_hidden="true") == '<span class="n" aria-hidden="true"></span>'
+    )

@@ -1,0 +1,201 @@
+"""Where no registered effect explains a recording: the missing force, candidate terms, and the closed form found among them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from srfcli.diagnosis.candidates import Hypothesis
+from srfcli.diagnosis.closedform import ClosedForm, FittedTerm, with_error
+from srfcli.diagnosis.force import missing_force
+from srfcli.diagnosis.search import Search
+from srfcli.diagnosis.terms import FOLDER, explain_unknown, with_terms
+from srfcli.diagnosis.verdict import conclude
+from srfcli.effectfile import formula_text
+from srfcli.lawcheck import check_law
+from srfcli.lawfile import read_law
+from srfcli.proof.draw import Gauge
+from srfcli.proof.folder import case_files
+from srfcli.proof.gauge import read_gauge
+from srfcli.proof.motion import move
+from srfcli.proof.physics import Physics
+from srfcli.proof.protocol import Plan
+from srfcli.recording.experiment import read_experiment
+from srfcli.registry import bundled_registry
+
+TERMS = sorted(FOLDER.glob("*.toml"))
+SHIPPED = bundled_registry()
+PLANS = (
+    Plan("steps", ((0.6, 5), (0.5, 30), (0.6, 8)), 3.0, 0.004),
+    Plan("down", ((0.5, 40), (0.8, 6)), 3.0, 0.004),
+    Plan("seen-later", ((0.6, 10), (0.5, 50), (0.5, 12)), 3.0, 0.004, holdout=True),
+)
+
+
+def recorded(folder: Path, p: Physics, *, seed: int = 1) -> Path:
+    """Write what a slider `p` shows under PLANS, stated as one without anything concealed, and return the folder."""
+    rng = np.random.default_rng(seed)
+    readings = {plan: read_gauge(move(p, plan).u, Gauge(), rng) for plan in PLANS}
+    for name, text in case_files("small", Physics(), readings).items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def searched(folder: Path, effects: tuple[str, ...] = ("viscous-drag",)) -> tuple[Search, object]:
+    """Return a search among a few registered effects, and what it concludes."""
+    search = Search(SHIPPED, read_experiment(folder, registry=SHIPPED, holdout=False), effects=effects)
+    search.run()
+    return search, conclude(search, read_experiment(folder, registry=SHIPPED))
+
+
+@lru_cache(maxsize=4)
+def answered(base: Path, which: str):
+    """Return search, diagnosis and explanation of a small concealed case, made once in a session."""
+    p = {"age": replace(Physics(), p_age=1.6), "bump": replace(Physics(), bump=0.004, bump_x=14.0, bump_w=1.2)}[which]
+    folder = base / which
+    folder.mkdir()
+    search, diagnosis = searched(recorded(folder, p))
+    return search, diagnosis, explain_unknown(search, diagnosis)
+
+
+@pytest.fixture(scope="session")
+def base(tmp_path_factory):
+    return tmp_path_factory.mktemp("unknown")
+
+
+# ---- the candidates
+
+
+@pytest.mark.parametrize("path", TERMS, ids=lambda p: p.stem)
+def test_a_term_is_nested_and_acts(path):
+    """Neutral values give the baseline back, sizes change something, derivatives are exact, units agree."""
+    outcomes = {o.check: o.verdict for o in check_law(read_law(path))}
+    assert "FAIL" not in outcomes.values(), outcomes
+    assert outcomes["neutral"] == outcomes["derivatives"] == "ok"
+
+
+def test_terms_have_parameters_of_their_own():
+    """Several are in one model: a name that two of them had would be renamed, and a fit's values with it."""
+    names = [p.name for path in TERMS for p in read_law(path).parameters]
+    assert len(TERMS) >= 20 and len(names) == len(set(names))
+
+
+def test_terms_join_the_registry_and_give_way_to_a_registered_effect():
+    wide = with_terms(SHIPPED)
+    names = [e.name for e in wide.entries("effect")]
+    assert {p.stem for p in TERMS} <= set(names) and len(names) == len(set(names))
+    assert with_terms(wide).entries() == wide.entries()
+    assert not {p.stem for p in TERMS} & {e.name for e in SHIPPED.entries("effect")}
+
+
+# ---- the force
+
+
+def test_the_force_stands_where_the_track_is_rough(base):
+    """A bump of 0.004 on 14 um of the track: found in both runs at that place, though neither place nor form is assumed."""
+    search, diagnosis, _ = answered(base, "bump")
+    found = missing_force(search, diagnosis.baseline)
+    assert set(found.runs) == {"steps", "down"} and found.share == 1.0
+    for run in found.runs.values():
+        top = int(np.argmax(run.force))
+        assert abs(run.slip[top] - 14.0) < 1.5
+        assert run.low[top] > 0 and 0.0015 < run.force[top] < 0.006
+        truth = 0.004 * np.exp(-0.5 * ((run.slip - 14.0) / 1.2) ** 2)
+        assert np.corrcoef(run.force, truth)[0, 1] > 0.7
+    assert next(iter(found.coordinates)) == "slip"
+    assert found.gain > 15
+
+
+def test_no_force_where_nothing_is_missing(tmp_path):
+    search, diagnosis = searched(recorded(tmp_path, Physics()))
+    found = missing_force(search, diagnosis.baseline)
+    outside = [float(np.mean((r.low > 0) | (r.high < 0))) for r in found.runs.values() if np.any(r.high > r.low)]
+    assert max(outside, default=0.0) < 0.05
+    assert found.gain < 5
+
+
+# ---- the closed form
+
+
+BUMP = {"place_height": 0.004, "place": 14.0, "place_width": 1.2}
+
+
+@pytest.mark.parametrize(
+    ("which", "name", "truth"), [("age", "age-power", {"age_power": 1.6}), ("bump", "track-place", BUMP)]
+)
+def test_the_form_is_the_generator_s(base, which, name, truth):
+    """One term, the right one, with its numbers within four standard errors; it predicts what was not fitted."""
+    _, _, found = answered(base, which)
+    assert [t["name"] for t in found["terms"]] == [name]
+    for parameter, value in truth.items():
+        got = found["terms"][0]["parameters"][parameter]
+        assert abs(got["value"] - value) < 4 * got["stderr"] < 0.5 * abs(value) + 0.2 * (name == "track-place")
+    assert found["gain"] > 20 and found["held_gain"] > 5 and found["leaves_noise_alone"]
+    assert abs(found["held_rms_over_noise"]["form"] - 1) < 0.06
+    assert found["force"]["form"] == found["form"] and name.split("-")[1] in found["form"]
+    run = found["force"]["steps"]
+    assert run["band"].shape == (2, run["t"].size) and np.all(run["low"] <= run["high"])
+
+
+def test_the_form_is_offered_as_an_effect(base, tmp_path):
+    """The file reads, keeps every check, and a model with it says what the fitted one says."""
+    _, _, found = answered(base, "age")
+    path = tmp_path / "closed-form.toml"
+    path.write_text(found["toml"])
+    effect = read_law(path)
+    assert {o.verdict for o in check_law(effect)} == {"ok"}
+    assert dict(effect.neutral) == {"age_power": 1.0}
+    assert effect.parameters[0].default == pytest.approx(found["terms"][0]["parameters"]["age_power"]["value"])
+    assert formula_text(effect.changes[0][1]) == formula_text(read_law(FOLDER / "age-power.toml").changes[0][1])
+
+
+def test_terms_together_are_one_effect(tmp_path):
+    """Each formula takes the place of what was there before; constants and delays go along."""
+    chosen = ["age-power", "rate-load", "load-log", "load-memory", "age-velocity"]
+    effects = [read_law(FOLDER / f"{n}.toml") for n in chosen]
+    terms = tuple(FittedTerm(e, {p.name: (p.default, 0.1 * p.default) for p in e.parameters}) for e in effects)
+    form = ClosedForm(terms, (), None, 0.0, ())  # type: ignore[arg-type]
+    path = tmp_path / "several.toml"
+    path.write_text(form.as_toml(name="several"))
+    effect = read_law(path)
+    assert "FAIL" not in {o.verdict for o in check_law(effect)}
+    from srfcli.expression import parse_expression, symbol
+
+    rate = dict(effect.changes)["rate"]
+    one = dict.fromkeys(("v", "phi", "D0"), 1.0) | {"W": 20.0, "rate": 0.5, "age_power": 1.3, "rate_load": 2.0}
+    assert float(rate.subs({symbol(k): x for k, x in one.items()})) == pytest.approx(0.5 * 4)
+    assert [s.name for s in effect.states] == ["late_load"] and {c.name for c in effect.constants} == {"Wref"}
+    assert "rate_load = 0.20 ± 0.02" in form.text and "Wref = 10 N" in form.text and "late_load' = " in form.text
+    for slot, formula in form.formulas().items():
+        names = {str(x) for x in formula.free_symbols}
+        assert parse_expression(formula_text(formula), names) == formula, slot
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (1.599372, 0.026682, "1.599 ± 0.027"),
+        (14.1156, 0.0954, "14.116 ± 0.095"),
+        (-120.3, 35.0, "-120.3 ± 35.0"),
+        (1.2345e-7, 3.1e-9, "1.23e-07 ± 3.1e-09"),
+        (0.5, float("inf"), "0.5"),
+        (0.5, 0.0, "0.5"),
+    ],
+)
+def test_values_carry_two_digits_of_their_error(value, error, text):
+    found = with_error(value, error)
+    assert found == text or (text.startswith("1.23") and found in ("1.234e-07 ± 3.1e-09", "1.235e-07 ± 3.1e-09"))
+
+
+def test_the_baseline_with_effects_has_a_force_too(base):
+    """A hypothesis that holds an effect keeps it: only what that leaves is missing."""
+    search, diagnosis, _ = answered(base, "bump")
+    name = "viscous-drag"
+    refit = next(r for r in diagnosis.ranked if r.name == name)
+    found = missing_force(search, refit)
+    assert found.fit.problem.names == refit.fit.problem.names and "c" in found.fit.problem.names
+    assert isinstance(refit.hypothesis, Hypothesis)
