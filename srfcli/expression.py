@@ -92,9 +92,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 }
 _HYPERBOLIC = frozenset({"sinh", "cosh", "tanh", "asinh", "atan"})
 # Names that generated modules use themselves; a parameter of that name would shadow them.
-RESERVED = frozenset(
-    {"np", "numpy", "x", "t", "tau", "p", "out", "pi", "tan", "arctan", "arcsinh", *FUNCTIONS}
-)
+RESERVED = frozenset({"np", "numpy", "x", "t", "tau", "p", "out", "pi", "tan", "arctan", "arcsinh", *FUNCTIONS})
 
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _TOKEN = re.compile(

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.closedform import ClosedForm, FittedTerm, with_error
 from srfcli.diagnosis.force import missing_force
 from srfcli.diagnosis.search import Search
@@ -180,22 +179,20 @@ def test_terms_together_are_one_effect(tmp_path):
     [
         (1.599372, 0.026682, "1.599 ± 0.027"),
         (14.1156, 0.0954, "14.116 ± 0.095"),
-        (-120.3, 35.0, "-120.3 ± 35.0"),
-        (1.2345e-7, 3.1e-9, "1.23e-07 ± 3.1e-09"),
+        (-120.3, 35.0, "-120 ± 35"),
+        (1.2342e-7, 3.1e-9, "1.234e-07 ± 3.1e-09"),
         (0.5, float("inf"), "0.5"),
         (0.5, 0.0, "0.5"),
     ],
 )
 def test_values_carry_two_digits_of_their_error(value, error, text):
-    found = with_error(value, error)
-    assert found == text or (text.startswith("1.23") and found in ("1.234e-07 ± 3.1e-09", "1.235e-07 ± 3.1e-09"))
+    assert with_error(value, error) == text
 
 
 def test_the_baseline_with_effects_has_a_force_too(base):
     """A hypothesis that holds an effect keeps it: only what that leaves is missing."""
-    search, diagnosis, _ = answered(base, "bump")
-    name = "viscous-drag"
-    refit = next(r for r in diagnosis.ranked if r.name == name)
+    search, diagnosis, _ = answered(base, "age")
+    refit = next(r for r in diagnosis.ranked if r.name == "viscous-drag")
     found = missing_force(search, refit)
     assert found.fit.problem.names == refit.fit.problem.names and "c" in found.fit.problem.names
-    assert isinstance(refit.hypothesis, Hypothesis)
+    assert set(found.runs) == {"steps", "down"}

@@ -83,9 +83,7 @@ def print_answer(found: dict[str, Any], diagnosis: Diagnosis, location: Location
     _print(Table("srf.diagnose.runs/1", RUNS, rows, "runs", tuple(_places(location))))
     if folder is not None:
         home = folder / "augmented"
-        laws = (
-            f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
-        )
+        laws = f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
         click.echo(f"The augmented model: srf fit {home}")
         click.echo(f"Its laws' diagram: srf linear {laws}")
 

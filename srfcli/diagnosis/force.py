@@ -59,7 +59,8 @@ class RunForce:
 class Force:
     """The missing friction of all runs: standard deviation `amplitude`, correlation time `time` (s).
 
-    `share` is the part of the samples that were looked at, `gain` the log likelihood over the same model on a smooth track without a force,
+    `share` is the part of the samples that were looked at, `gain` the log likelihood over the same model on a smooth track
+    without a force,
     `coordinates` the share of the force's square that is a function of one quantity of state, the same in all runs.
     """
 

@@ -289,7 +289,8 @@ class Search:
             ):
                 continue
             found = self.refit(hypothesis, refit, score.values, rough=rough)
-            if not rough and not found.adequacy.fine and found.adequacy.rms_over_noise < HALFWAY:
+            halfway = not found.adequacy.fine and found.adequacy.rms_over_noise < HALFWAY
+            if not rough and halfway and self.best() is found:
                 self.refit(hypothesis, found, {}, rough=True)
 
     def rivals(self, score: Score, others: Sequence[Score], refit: Refit) -> bool:
