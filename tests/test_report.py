@@ -142,7 +142,7 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
 
 
-@pytest.fixture(scope="module", params=["identified", "unknown", "none"])
+@pytest.fixture(scope="module", params=["identified", "unknown"])
 def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
     """A report with all its figures, beside an augmented experiment."""
     folder = tmp_path_factory.mktemp("report") / "out"
@@ -193,7 +193,7 @@ def test_pictures_are_those_of_the_folder_and_say_what_they_show(written: tuple[
     assert {p.replace(".svg", ".png") for p in names if p.endswith(".svg")} == {p for p in names if p.endswith(".png")}
     assert {"overview.svg", "atlas.svg", "run-onset.svg"} <= names
     assert ({"run-quiet.svg", "run-later.svg"} <= names) == (verdict == "identified")
-    assert ("parameters.svg" in names) == (verdict != "none")
+    assert "parameters.svg" in names
     assert ({"force-quiet.svg", "force-by-state.svg"} <= names) == (verdict == "unknown")
     assert ("diagram.svg" in names) == (verdict == "identified")
     for png in (folder / "figures").glob("*.png"):

@@ -168,7 +168,7 @@ def test_terms_together_are_one_effect(tmp_path):
     one = dict.fromkeys(("v", "phi", "D0"), 1.0) | {"W": 20.0, "rate": 0.5, "age_power": 1.3, "rate_load": 2.0}
     assert float(rate.subs({symbol(k): x for k, x in one.items()})) == pytest.approx(0.5 * 4)
     assert [s.name for s in effect.states] == ["late_load"] and {c.name for c in effect.constants} == {"Wref"}
-    assert "rate_load = 0.20 ± 0.02" in form.text and "Wref = 10 N" in form.text and "late_load' = " in form.text
+    assert "rate_load = 0.200 ± 0.020" in form.text and "Wref = 10 N" in form.text and "late_load' = " in form.text
     for slot, formula in form.formulas().items():
         names = {str(x) for x in formula.free_symbols}
         assert parse_expression(formula_text(formula), names) == formula, slot

@@ -14,12 +14,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from srfcli.inference.fit import Fit, Problem
+    from srfcli.inference.latent import Roughness
     from srfcli.inference.profile import Interval
+    from srfcli.output.tables import Table
+    from srfcli.recording.values import Experiment
+    from srfcli.registry import Registry
 
 EXAMPLES = """
 srf fit EXPERIMENT                                  a folder with experiment.toml, or that file
 srf fit EXPERIMENT --profile --starts 5 --json
 srf fit EXPERIMENT --trend slip --free A,B,D0
+srf fit EXPERIMENT --track rough                    stick-slip whose phase wanders with the track
 srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c, sigma
 """
 
@@ -34,6 +39,13 @@ srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c,
 )
 @click.option("--profile", is_flag=True, help="Profile-likelihood intervals.")
 @click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
+@click.option(
+    "--track",
+    type=click.Choice(["smooth", "rough"]),
+    default="smooth",
+    show_default=True,
+    help="Rough: mu0 wanders along each run's track.",
+)
 @click.option(
     "--sample", type=click.IntRange(100, 1_000_000), metavar="N", help="Draw N points of the posterior (emcee)."
 )
@@ -58,7 +70,7 @@ def command(source: Path, system: SystemOptions, output: OutputOptions, **option
     if source.suffix.lower() == ".csv":
         from srfcli.cli.fit_thresholds import fit_thresholds
 
-        _refuse(options, ("starts", "profile", "trend", "sample", "reader"), "recordings")
+        _refuse(options, ("starts", "profile", "trend", "track", "sample", "reader"), "recordings")
         fit_thresholds(
             source, system=system, output=output, free=options["free"], bounds=options["bounds"],
             methods=options["method"], tol=options["tol"], max_evaluations=options["max_evaluations"],
@@ -90,6 +102,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     from srfcli.cli.fit_tables import parameter_table, run_table
     from srfcli.inference.fit import Interrupted, fit_problem, held_fit
     from srfcli.inference.profile import profile
+    from srfcli.inference.rough import fit_rough
     from srfcli.inference.starts import fit_from_several
     from srfcli.model import open_model
     from srfcli.recording.experiment import read_experiment
@@ -100,10 +113,14 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     model = open_model(registry, **asdict(experiment.choice))
     free = [n.strip() for text in options["free"] for n in text.split(",") if n.strip()] or None
     problem = fit_problem(model, experiment, free=free, trend=options["trend"])
+    if options["track"] == "rough" and (options["profile"] or options["sample"]):
+        raise SrfError(
+            "--track rough does not go with --profile or --sample", "Its standard errors allow for the tracks."
+        )
     begun, status = time.perf_counter(), Status.OK
     starts: list[tuple[float, bool]] = []
     intervals: list[Interval] = []
-    draws = None
+    draws, roughness = None, None
     with Progress("fit") as progress:
 
         def report(text: str) -> None:
@@ -112,6 +129,8 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
         try:
             fit, starts = fit_from_several(problem, count=options["starts"], seed=options["seed"], progress=report)
             status = fit.status
+            if options["track"] == "rough":
+                fit, roughness = fit_rough(_on_tracks(registry, experiment, problem), fit, progress=report)
             if options["profile"]:
                 for name in problem.names:
                     intervals.append(profile(problem, fit, name, progress=report))
@@ -128,11 +147,32 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
             Session.current().detail(f"{run.name}: {notice}")
     runs = run_table(fit)
     table = parameter_table(problem, fit, intervals, starts, draws, runs, status)
+    if roughness is not None:
+        table = _with_roughness(table, roughness)
     emit(
         table, output, more=[runs], laws=model.laws, inputs=[experiment.path, *(r.file for r in experiment.runs)],
         seed=options["seed"], timings={"fit": time.perf_counter() - begun}, figure=_figure(problem, fit),
     )  # fmt: skip
     finish(status)
+
+
+def _on_tracks(registry: Registry, experiment: Experiment, problem: Problem) -> Problem:
+    """Return the same problem with a model whose mu0 is a function of the slip along each run's track besides."""
+    from dataclasses import asdict, replace
+
+    from srfcli.model import open_model
+
+    return replace(problem, model=open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),)))
+
+
+def _with_roughness(table: Table, roughness: Roughness) -> Table:
+    """Return the table with what was found of the tracks."""
+    from dataclasses import replace
+
+    text = f"tracks: mu0 wanders by {roughness.amplitude:.2g} (standard deviation) over {roughness.length:.2g} um"
+    text = text if roughness.amplitude else "tracks: smooth; none was found to be rough"
+    found = {"amplitude": roughness.amplitude, "length_um": roughness.length}
+    return replace(table, notes=(*table.notes, text), meta={**table.meta, "track": found})
 
 
 def _figure(problem: Problem, fit: Fit) -> Callable[[], Any]:

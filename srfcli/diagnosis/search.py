@@ -114,6 +114,7 @@ class Search:
         if (
             self.settled(candidates)
             or (near and self.on_a_rough_track(baseline, candidates))
+            or (not near and self.shaken(candidates))
             or self.roughened(candidates)
         ):
             return
@@ -134,7 +135,7 @@ class Search:
             if self.settled(candidates):
                 return True
         self.widen(baseline, candidates, SINGLES, rough=False)
-        if self.settled(candidates):
+        if self.settled(candidates) or self.shaken(candidates):
             return True
         self.widen(rough, candidates, PAIRS, rough=True)
         return self.settled(candidates)

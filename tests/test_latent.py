@@ -1,0 +1,95 @@
+"""Rough tracks: the prior, the marginal likelihood against brute force, and a recording of which the truth is known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from srfcli.inference.fit import fit, fit_problem
+from srfcli.inference.latent import AMPLITUDES, LENGTHS, Point, Roughness, Tracks, evenness, marginal
+from srfcli.inference.rough import fit_rough
+from srfcli.model import open_model
+from srfcli.recording.experiment import read_experiment
+from srfcli.registry import load_registry
+from srfcli.splines import Spline
+
+
+def test_prior_is_the_matern_covariance() -> None:
+    nodes = np.linspace(0.0, 12.0, 25)
+    L = Roughness(3e-4, 2.0).root(nodes)
+    d = np.sqrt(3) * np.abs(nodes[:, None] - nodes) / 2.0
+    np.testing.assert_allclose(L @ L.T, 9e-8 * (1 + d) * np.exp(-d), rtol=1e-6, atol=1e-14)
+
+
+def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tracks]:
+    """A linear problem r = J theta + C c + noise of variance 1 on two tracks; returns r, J, C and the tracks."""
+    rng = np.random.default_rng(seed)
+    tracks = Tracks((Spline.over(0.0, 15.0, 0.8), Spline.over(0.0, 20.0, 0.8)), {"a": 0, "b": 1})
+    n, m = 400, tracks.numbers.size
+    J, C = rng.normal(size=(n, 2)), np.zeros((n, m))
+    k = tracks.splines[0].numbers.size
+    C[:200, :k] = 2e4 * tracks.splines[0].design(np.linspace(0, 15, 200))
+    C[200:, k:] = 2e4 * tracks.splines[1].design(np.linspace(0, 20, 200))
+    c = tracks.root(Roughness(amplitude, LENGTHS[1])) @ rng.normal(size=m) if amplitude else np.zeros(m)
+    return J @ [1.0, -2.0] + C @ c + rng.normal(size=n), J, C, tracks
+
+
+def test_marginal_likelihood_is_that_of_the_whole_covariance() -> None:
+    r, J, C, tracks = _linear(1e-4, 1)
+    A = np.column_stack([J, C])
+    base = -0.5 * float(r @ r)
+    found = marginal(A.T @ A, A.T @ r, [0, 1], range(2, A.shape[1]), tracks, base)
+    best = -np.inf
+    for length in LENGTHS:
+        for amplitude in AMPLITUDES:
+            L = tracks.root(Roughness(amplitude, length)) if amplitude else np.zeros((tracks.numbers.size, 1))
+            S = np.eye(r.size) + C @ L @ L.T @ C.T
+            W = np.linalg.solve(S, np.column_stack([J, r]))
+            theta = np.linalg.solve(J.T @ W[:, :2], J.T @ W[:, 2])
+            rest = r - J @ theta
+            flat = (
+                0.5 * np.linalg.slogdet(J.T @ J)[1] - 0.5 * np.linalg.slogdet(J.T @ W[:, :2])[1]
+            )  # integrated out, too
+            value = flat - 0.5 * float(rest @ np.linalg.solve(S, rest)) - 0.5 * np.linalg.slogdet(S)[1]
+            best = max(best, value)
+    assert found.log_likelihood == pytest.approx(best, abs=1e-5)
+    assert 0.3e-4 < found.roughness.amplitude < 3e-4
+
+
+def test_no_roughness_is_found_where_there_is_none() -> None:
+    r, J, C, tracks = _linear(0.0, 2)
+    A = np.column_stack([J, C])
+    found = marginal(A.T @ A, A.T @ r, [0, 1], range(2, A.shape[1]), tracks, -0.5 * float(r @ r))
+    assert found.log_likelihood - found.smooth < 4.0
+
+
+@pytest.mark.parametrize(("first", "second", "even"), [(1e-4, 1e-4, True), (1e-5, 1e-3, False)])
+def test_one_roughness_for_all_runs_is_put_to_the_test(first: float, second: float, even: bool) -> None:
+    rng = np.random.default_rng(3)
+    _, _, C, tracks = _linear(0.0, 4)
+    length, parts = LENGTHS[1], []
+    for spline, amplitude in zip(tracks.splines, (first, second), strict=True):
+        parts.append(Roughness(amplitude, length).root(spline.nodes) @ rng.normal(size=spline.numbers.size))
+    r = C @ np.concatenate(parts) + rng.normal(size=C.shape[0])
+    point = Point(np.zeros(0), tracks, Roughness(1e-4, length), {}, C.T @ C, C.T @ r, 0.0, 0.0)
+    assert (evenness(point) > 1e-4) is even
+
+
+@pytest.mark.slow
+def test_parameters_survive_a_rough_track(shared: Path) -> None:
+    """Without the track they are off by up to 42 standard errors."""
+    registry = load_registry()
+    experiment = read_experiment(shared / "cases" / "open-07", registry=registry)
+    truth = json.loads((shared / "cases" / "truth.json").read_text())["open-07"]["parameters"]
+    choice = asdict(experiment.choice)
+    plain = fit(fit_problem(open_model(registry, **choice), experiment))
+    problem = fit_problem(open_model(registry, **choice, tables=(("mu", "slip"),)), experiment)
+    found, roughness = fit_rough(problem, plain)
+    assert 2e-4 < roughness.amplitude < 5e-4
+    assert found.rms_over_noise() == pytest.approx(1.0, abs=0.03)
+    for name, value in found.values.items():
+        assert abs(value - truth[{"lambda": "lam"}.get(name, name)]) < 4 * found.stderr[name]
