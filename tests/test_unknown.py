@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from srfcli.cli.main import cli
 from srfcli.diagnosis.closedform import ClosedForm, FittedTerm, with_error
 from srfcli.diagnosis.force import missing_force
 from srfcli.diagnosis.search import Search
@@ -54,7 +57,7 @@ def searched(folder: Path, effects: tuple[str, ...] = ("viscous-drag",)) -> tupl
 @lru_cache(maxsize=4)
 def answered(base: Path, which: str):
     """Return search, diagnosis and explanation of a small concealed case, made once in a session."""
-    p = {"age": replace(Physics(), p_age=1.6), "bump": replace(Physics(), bump=0.004, bump_x=14.0, bump_w=1.2)}[which]
+    p = {"age": replace(Physics(), p_age=2.0), "bump": replace(Physics(), bump=0.004, bump_x=14.0, bump_w=1.2)}[which]
     folder = base / which
     folder.mkdir()
     search, diagnosis = searched(recorded(folder, p))
@@ -124,7 +127,7 @@ BUMP = {"place_height": 0.004, "place": 14.0, "place_width": 1.2}
 
 
 @pytest.mark.parametrize(
-    ("which", "name", "truth"), [("age", "age-power", {"age_power": 1.6}), ("bump", "track-place", BUMP)]
+    ("which", "name", "truth"), [("age", "age-power", {"age_power": 2.0}), ("bump", "track-place", BUMP)]
 )
 def test_the_form_is_the_generator_s(base, which, name, truth):
     """One term, the right one, with its numbers within four standard errors; it predicts what was not fitted."""
@@ -196,3 +199,20 @@ def test_the_baseline_with_effects_has_a_force_too(base):
     found = missing_force(search, refit)
     assert found.fit.problem.names == refit.fit.problem.names and "c" in found.fit.problem.names
     assert set(found.runs) == {"steps", "down"}
+
+
+def test_the_command_says_it(tmp_path):
+    """`unknown` comes with the force in the report and the form as an effect that the next search takes."""
+    folder = tmp_path / "case"
+    folder.mkdir()
+    recorded(folder, replace(Physics(), p_age=2.0))
+    out = tmp_path / "found"
+    arguments = ["diagnose", str(folder), "--effect", "viscous-drag", "--out", str(out), "--json"]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 0, result.output
+    found = json.loads((out / "answer.json").read_text())
+    assert found["verdict"] == "unknown"
+    assert [t["name"] for t in found["missing"]["terms"]] == ["age-power"]
+    assert set(found["missing"]) >= {"form", "gain", "held_gain", "latent", "leaves_noise_alone"}
+    assert read_law(out / "closed-form.toml").sizes == ("age_power",)
+    assert "age_power" in (out / "report.html").read_text()

@@ -97,7 +97,9 @@ def write_answer(
     """Write answer, predictions, augmented experiment, report and figures; of a `missing` force its closed form, as an effect."""
     from srfcli.diagnosis.answer import final, material, run_views
     from srfcli.diagnosis.augment import augment
+    from srfcli.diagnosis.diagram import stability
     from srfcli.output.provenance import Provenance, write_sidecar
+    from srfcli.recording.experiment import read_experiment
 
     last = final(diagnosis)
     with whole_folder(folder, force=force) as fresh:
@@ -123,6 +125,10 @@ def write_answer(
         for name, source in augmented.copies.items():
             shutil.copyfile(source, fresh / "augmented" / name)
         made_of = material(diagnosis, location)
+        made_of["diagram"] = stability(
+            registry, diagnosis.experiment, diagnosis.baseline.fit.values,
+            read_experiment(fresh / "augmented", registry=registry, format=reader),
+        )  # fmt: skip
         if missing:
             made_of["force"] = missing["force"]
             if missing["toml"] is not None:

@@ -32,7 +32,7 @@ SHAKES = (1.5, 0.67)  # times its size: other starts of an effect
 ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better grow anew
 LOST = 0.3  # of a record's standard deviation: residual beyond which nothing is linear
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
-MOST_EVALUATIONS = 900  # of the recordings by a model with slopes, in all
+MOST_EVALUATIONS = 1500  # of the recordings by a model with slopes, in all
 FIRST, SINGLES, PAIRS = 2, 8, 3  # refitted in full, at each stage
 
 
@@ -277,7 +277,11 @@ class Search:
     def widen(self, refit: Refit, candidates: Sequence[Effect], most: int, *, rough: bool) -> None:
         """Refit the hypotheses that add one effect to a refit's own, those that promise most first."""
         least = WORTH if refit.adequacy.fine else WORTH / 2
-        promising = [s for s in self.score(refit, candidates) if s.gain > least][:most]
+        scored = self.score(refit, candidates)
+        promising = [s for s in scored if s.gain > least][:most]
+        if not refit.adequacy.fine:  # a mass or an interface that is not there has no first order worth the name
+            built = [s for s in scored if s.effect.settings]
+            promising = [*built, *(s for s in promising if not s.effect.settings)]
         for score in promising:
             if self.evaluations > MOST_EVALUATIONS:
                 self.progress("the search ends here: its budget is spent")
