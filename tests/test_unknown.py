@@ -32,9 +32,9 @@ from srfcli.registry import bundled_registry
 TERMS = sorted(FOLDER.glob("*.toml"))
 SHIPPED = bundled_registry()
 PLANS = (
-    Plan("steps", ((0.6, 5), (0.5, 30), (0.6, 8)), 3.0, 0.004),
-    Plan("down", ((0.5, 40), (0.8, 6)), 3.0, 0.004),
-    Plan("seen-later", ((0.6, 10), (0.5, 50), (0.5, 12)), 3.0, 0.004, holdout=True),
+    Plan("steps", ((0.6, 4), (0.4, 60), (0.6, 8)), 3.0, 0.002),
+    Plan("down", ((0.4, 60), (0.8, 4)), 3.0, 0.002),
+    Plan("seen-later", ((0.6, 10), (0.5, 50), (0.5, 12)), 3.0, 0.002, holdout=True),
 )
 
 
@@ -57,7 +57,7 @@ def searched(folder: Path, effects: tuple[str, ...] = ("viscous-drag",)) -> tupl
 @lru_cache(maxsize=4)
 def answered(base: Path, which: str):
     """Return search, diagnosis and explanation of a small concealed case, made once in a session."""
-    p = {"age": replace(Physics(), p_age=2.0), "bump": replace(Physics(), bump=0.004, bump_x=14.0, bump_w=1.2)}[which]
+    p = {"age": replace(Physics(), p_age=1.7), "bump": replace(Physics(), bump=0.004, bump_x=14.0, bump_w=1.2)}[which]
     folder = base / which
     folder.mkdir()
     search, diagnosis = searched(recorded(folder, p))
@@ -127,7 +127,7 @@ BUMP = {"place_height": 0.004, "place": 14.0, "place_width": 1.2}
 
 
 @pytest.mark.parametrize(
-    ("which", "name", "truth"), [("age", "age-power", {"age_power": 2.0}), ("bump", "track-place", BUMP)]
+    ("which", "name", "truth"), [("age", "age-power", {"age_power": 1.7}), ("bump", "track-place", BUMP)]
 )
 def test_the_form_is_the_generator_s(base, which, name, truth):
     """One term, the right one, with its numbers within four standard errors; it predicts what was not fitted."""
@@ -205,7 +205,7 @@ def test_the_command_says_it(tmp_path):
     """`unknown` comes with the force in the report and the form as an effect that the next search takes."""
     folder = tmp_path / "case"
     folder.mkdir()
-    recorded(folder, replace(Physics(), p_age=2.0))
+    recorded(folder, replace(Physics(), p_age=1.7))
     out = tmp_path / "found"
     arguments = ["diagnose", str(folder), "--effect", "viscous-drag", "--out", str(out), "--json"]
     result = CliRunner().invoke(cli, arguments)

@@ -15,7 +15,7 @@ from srfcli.numerics.hopf import critical_point
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
 
-VELOCITIES = 25
+VELOCITIES = 61
 BEYOND = 3.0  # times the slowest and fastest drive of the recordings: how far the diagram goes
 
 
