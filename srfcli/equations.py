@@ -9,7 +9,7 @@ import sympy as sp
 from srfcli.errors import SrfError
 from srfcli.expression import symbol
 from srfcli.laws import ExtraState
-from srfcli.system import Equations, System, lut, solve_linear, state_rate, steady_states, tidy
+from srfcli.system import FOLLOWED, Equations, System, lut, solve_linear, state_rate, steady_states, tidy
 
 AUXILIARY = {"slip": "v", "stage": "V", "time": "1"}  # unknowns that an effect may name, um, um, s, and their rates
 
@@ -46,6 +46,9 @@ def parts_of(system: System) -> Parts:
             found[slot] = formula.xreplace({symbol(slot): found[slot]})
     for number, (slot, argument) in enumerate(system.tables):
         value = lut(sp.Integer(number), symbol(argument))
+        if slot in FOLLOWED:
+            found["V"] += symbol("pull") * (value / FOLLOWED[slot] - symbol("u"))
+            continue
         found[slot] = found[slot] * (1 + value) if slot == "V" else found[slot] + value
     return Parts(**{slot: _modulated(f) for slot, f in found.items()}, **({} if "kappa" in found else {"kappa": None}))
 
@@ -267,7 +270,9 @@ class _Builder:
         imposed += sp.diff(parts.W, W) * s("W_dot")
         pushed += sp.diff(parts.force, W) * s("W_dot")
         v = s("v")
+        spring = s("u") if self.system.inertia else (load * self.mu - self.force) / s("K")
         return [
+            (self.V, parts.V.subs(s("u"), spring)),
             *([(self.slip_t, on_load(stretched))] if self.slip_t else []),
             (self.slip, on_load(S)),
             (self.slip_W, on_load(sp.diff(S, W))),
@@ -279,7 +284,6 @@ class _Builder:
             (self.force, parts.force),
             (self.force_dot, pushed),
             (self.W_dot, imposed),
-            (self.V, parts.V),
             (load, self.total_load()),
             (self.imposed, W),
         ]

@@ -46,12 +46,17 @@ class Spline:
         """Return where each number's own bump is centred (n,)."""
         return np.asarray(self.first + self.spacing * (np.arange(self.numbers.size) - 1.0))
 
+    def weights(self, x: Array) -> tuple[NDArray[np.int64], Array]:
+        """Return, for each x (m,), the first of the four numbers that count there, and their weights (m, 4)."""
+        cell, share = _cells(self.first, self.spacing, self.numbers.size, np.asarray(x, dtype=float))
+        return cell, np.stack(_WEIGHTS[0](share), axis=-1)
+
     def design(self, x: Array) -> Array:
         """Return the matrix (m, n) that turns the numbers into values at x (m,)."""
-        cell, share = _cells(self.first, self.spacing, self.numbers.size, np.asarray(x, dtype=float))
+        cell, weights = self.weights(x)
         out = np.zeros((np.size(x), self.numbers.size))
-        for k, w in enumerate(_WEIGHTS[0](share)):
-            out[np.arange(np.size(x)), cell + k] += w
+        for k in range(4):
+            out[np.arange(np.size(x)), cell + k] += weights[:, k]
         return out
 
     def __call__(self, x: Array) -> Array:

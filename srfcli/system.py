@@ -40,6 +40,8 @@ RUN = (  # of one run: what an effect may ask of the recording
     Parameter("rise0", 0.02, "s", about="time scale of the switch-on of the modulation"),
     Parameter("onset0", -1e6, "s", about="when half of the load modulation was switched on"),
 )
+PULL = Parameter("pull", 0.0, "1/s", 0.0, 1e9, "how fast the spring is drawn to what was recorded")
+FOLLOWED = {"elongation": 1, "force": symbol("K")}  # what a table of a recording holds, over the spring's elongation
 EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "kappa", "force", "rate", "V")
 LOADINGS = ("vertical", "inclined")
 MAX_CANCEL = 80  # operations: beyond it a common denominator takes a minute to find and shortens nothing
@@ -80,6 +82,8 @@ class System:
             own.append(ANGLE)
         if self.effects or self.tables:
             own += RUN
+        if any(slot in FOLLOWED for slot, _ in self.tables):
+            own.append(PULL)
         seen = {p.name for p in own}
         for law in self.laws:
             for parameter in law.parameters:

@@ -9,7 +9,7 @@ import numpy as np
 
 from srfcli.diagnosis.locate import Location
 from srfcli.diagnosis.places import Row
-from srfcli.diagnosis.search import Refit
+from srfcli.diagnosis.refits import Refit
 from srfcli.diagnosis.verdict import Diagnosis
 from srfcli.inference.latent import LatentFit
 from srfcli.inference.noise import stretches, whiten

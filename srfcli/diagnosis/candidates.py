@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 
 from srfcli.inference.fit import Problem, fit_problem
+from srfcli.inference.prediction import Pull
 from srfcli.laws import Effect, Parameter
 from srfcli.model import GeneratedModel, open_model
 from srfcli.recording.values import Experiment, FitParameter
@@ -84,17 +85,19 @@ class Hypothesis:
         """Return the names under which a verdict has the effects."""
         return tuple(e.reported for e in self.effects)
 
-    def model(self, registry: Registry, experiment: Experiment, *, rough: bool) -> GeneratedModel:
-        """Return the model, with a table along the track if it is rough."""
+    def model(
+        self, registry: Registry, experiment: Experiment, *, rough: bool, pull: Pull | None = None
+    ) -> GeneratedModel:
+        """Return the model, with a table along the track if it is rough, and one for the recording if that pulls."""
         return open_model(
             registry, **asdict(experiment.choice.plus(_key(registry, e) for e in self.effects)),
-            tables=(TRACK,) if rough else (),
+            tables=((TRACK,) if rough else ()) + ((pull.table,) if pull else ()),
         )  # fmt: skip
 
     def problem(self, registry: Registry, experiment: Experiment, *, rough: bool, at: Mapping[str, float] | None = None,
-                trend: str | None = None) -> Problem:  # fmt: skip
+                trend: str | None = None, pull: Pull | None = None) -> Problem:  # fmt: skip
         """Return the fit of baseline and effects together, from the values in `at` where there are some."""
-        model = self.model(registry, experiment, rough=rough)
+        model = self.model(registry, experiment, rough=rough, pull=pull)
         added = [q for e in self.effects for q in fit_parameters(e, model, experiment)]
         at = at or {}
         names = {q.name for q in added}
@@ -104,7 +107,7 @@ class Hypothesis:
         )
         problem = fit_problem(model, replace(experiment, parameters=listed), trend=trend)
         start = [at.get(n, s) for n, s in zip(problem.names, problem.start, strict=True)]
-        return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper))
+        return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper), pull=pull)
 
 
 def _key(registry: Registry, effect: Effect) -> str:

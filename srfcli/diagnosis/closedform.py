@@ -10,7 +10,7 @@ from typing import Any
 
 import sympy as sp
 
-from srfcli.diagnosis.search import Refit
+from srfcli.diagnosis.refits import Refit
 from srfcli.diagnosis.verdict import Held
 from srfcli.effectfile import formula_text
 from srfcli.expression import symbol

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -40,16 +41,18 @@ def columns_of(registry: Registry, experiment: Experiment, fitted: LatentFit, ef
              present: tuple[Effect, ...]) -> list[Column]:  # fmt: skip
     choice = experiment.choice
     found: list[Column] = []
-    tabled = {e.name: shape for e in effects if (shape := _along(e)) is not None}
+    tabled = {e.name: shape for e in effects if (shape := along_table(e)) is not None}
     regular = [
         e for e in effects if e.sizes and not e.settings and not e.frees and not e.observed and e.name not in tabled
     ]
     plain = [e for e in regular if not e.scans]
     names = tuple(e.name for e in (*present, *plain))
-    model = open_model(registry, **asdict(choice.plus(names)), tables=TABLES)
+    model = open_model(registry, **asdict(choice.plus(names)), tables=(*TABLES, *_pulled(fitted)))
     found += _union(model, experiment, fitted, present, plain, [e for e in effects if e.name in tabled], tabled)
     for effect in (e for e in regular if e.scans):
-        own = open_model(registry, **asdict(choice.plus((*(e.name for e in present), effect.name))), tables=(TRACK,))
+        own = open_model(
+            registry, **asdict(choice.plus((*(e.name for e in present), effect.name))), tables=(TRACK, *_pulled(fitted))
+        )
         found += _scanned(own, experiment, fitted, present, effect)
     for effect in (e for e in effects if e.settings or e.observed):
         found.append(_probed(registry, experiment, fitted, present, effect))
@@ -85,7 +88,16 @@ def _union(model: GeneratedModel, experiment: Experiment, fitted: LatentFit, pre
     for run in fitted.problem.runs:
         tables = (_track(fitted, run), _time_table(run), _stage_table(run))
         wanted = [i for name, i in ARGUMENTS.items() if any(shapes[e.name].argument == name for e in tabled)]
-        p = predict(model, experiment, run, values, by=[n for _, n in sizes], tables=tables, by_tables=wanted)
+        p = predict(
+            model,
+            experiment,
+            run,
+            values,
+            by=[n for _, n in sizes],
+            tables=tables,
+            by_tables=wanted,
+            **_as_fitted(fitted),
+        )
         signals[run.name] = {n: p.J[:, k] for k, (_, n) in enumerate(sizes)}
         at = len(sizes)
         for i in wanted:
@@ -95,8 +107,18 @@ def _union(model: GeneratedModel, experiment: Experiment, fitted: LatentFit, pre
     for effect, long in sizes:
         columns.append(Column(effect, {}, {r.name: signals[r.name][long][:, None] for r in fitted.problem.runs}))
     for effect in tabled:
-        columns += _along_table(effect, shapes[effect.name], fitted, signals)
+        columns += _from_table(effect, shapes[effect.name], fitted, signals)
     return columns
+
+
+def _as_fitted(fitted: LatentFit) -> dict[str, Any]:
+    """Return how a fit's own predictions were made: its pull and its tolerance."""
+    return {"pull": fitted.problem.pull, "rtol": fitted.problem.rtol}
+
+
+def _pulled(fitted: LatentFit) -> tuple[tuple[str, str], ...]:
+    """Return the table of the recording that pulls, if one does."""
+    return (fitted.problem.pull.table,) if fitted.problem.pull else ()
 
 
 def _track(fitted: LatentFit, run: Run) -> Spline:
@@ -131,7 +153,7 @@ class Shape:
     inner: tuple[str, ...]
 
 
-def _along(effect: Effect) -> Shape | None:
+def along_table(effect: Effect) -> Shape | None:
     """Return the shape of an effect that adds size * g(slip, time or stage) to mu, or multiplies V by 1 + it; None for others."""
     import sympy as sp
 
@@ -155,7 +177,7 @@ def _along(effect: Effect) -> Shape | None:
     return Shape(argument, sp.lambdify([symbol(argument), *map(symbol, inner)], slope, "numpy"), tuple(inner))
 
 
-def _along_table(
+def _from_table(
     effect: Effect, shape: Shape, fitted: LatentFit, signals: Mapping[str, Mapping[str, Array]]
 ) -> list[Column]:
     """Return the columns of an effect for each of its inner values, from the columns of a table's numbers."""
@@ -199,7 +221,15 @@ def _scanned(
             parts = []
             for inner in group:
                 values = base | {longs[n]: v for n, v in inner.items()}
-                p = predict(model, experiment, run, values, by=[longs[effect.sizes[0]]], tables=(_track(fitted, run),))
+                p = predict(
+                    model,
+                    experiment,
+                    run,
+                    values,
+                    by=[longs[effect.sizes[0]]],
+                    tables=(_track(fitted, run),),
+                    **_as_fitted(fitted),
+                )
                 parts.append(p.J[:, 0])
             by_run[run.name] = np.column_stack(parts)
         out.append(Column(effect, group[0], by_run, phases=len(group)))
@@ -211,7 +241,7 @@ def _probed(
 ) -> Column:
     """Return the column of an effect whose model has other unknowns than the baseline: a difference over a small size."""
     names = (*(e.name for e in present), effect.name)
-    model = open_model(registry, **asdict(experiment.choice.plus(names)), tables=(TRACK,))
+    model = open_model(registry, **asdict(experiment.choice.plus(names)), tables=(TRACK, *_pulled(fitted)))
     values = _values(model, experiment, fitted, present, [effect])
     (parameter,) = [q for q in fit_parameters(effect, model, experiment)]
     size = (
@@ -225,7 +255,7 @@ def _probed(
         by_run, furthest = {}, 0.0
         for run in fitted.problem.runs:
             moved = (
-                predict(model, listed, run, values, tables=(_track(fitted, run),)).y
+                predict(model, listed, run, values, tables=(_track(fitted, run),), **_as_fitted(fitted)).y
                 - fitted.point.predictions[run.name].y
             )
             by_run[run.name] = (moved / size)[:, None]
@@ -239,13 +269,15 @@ def _probed(
 def _freed(
     registry: Registry, experiment: Experiment, fitted: LatentFit, present: Sequence[Effect], effect: Effect
 ) -> Column:
-    model = open_model(registry, **asdict(experiment.choice.plus(e.name for e in present)), tables=(TRACK,))
+    model = open_model(
+        registry, **asdict(experiment.choice.plus(e.name for e in present)), tables=(TRACK, *_pulled(fitted))
+    )
     values = _values(model, experiment, fitted, present, [])
     added = fit_parameters(effect, model, experiment)
     listed = _listed(experiment, added)
     by_run = {}
     for run in fitted.problem.runs:
-        p = predict(model, listed, run, values, by=["K"], tables=(_track(fitted, run),))
+        p = predict(model, listed, run, values, by=["K"], tables=(_track(fitted, run),), **_as_fitted(fitted))
         by_run[run.name] = p.J[:, :1] * added[0].value  # by ln K
     return Column(effect, {}, by_run)
 

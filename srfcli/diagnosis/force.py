@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from srfcli.diagnosis.search import NEAR, Refit, Search
+from srfcli.diagnosis.refits import Refit
+from srfcli.diagnosis.search import NEAR, Search
 from srfcli.inference.fit import Problem
 from srfcli.inference.latent import LatentFit, Tracks, fit_latent
+from srfcli.inference.prediction import Pull
 from srfcli.model import open_model
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Run
@@ -88,29 +90,30 @@ def tracks_over_time(runs: Sequence[Run], *, knots: int = KNOTS) -> Tracks:
 def missing_force(search: Search, refit: Refit, *, knots: int = KNOTS) -> Force:
     """Return the friction that a fitted hypothesis lacks, along the runs that it was fitted to.
 
-    Where the hypothesis is far off, only the beginnings of the runs are looked at, as far as it follows them.
+    Where the hypothesis is far off, the force is found with the spring drawn to the recording first, then without.
     """
     near = refit.adequacy.rms_over_noise < NEAR
-    around = refit.fit if near else search.partly(refit)
-    problem = _problem(search, refit, around)
-    tracks = tracks_over_time(problem.runs, knots=knots)
+    around = refit.fit if near else search.pulled(refit)
+    tracks, roughness = tracks_over_time(around.problem.runs, knots=knots), None
     search.progress(f"{refit.name}: the force that is missing")
-    grid = (TIMES, AMPLITUDES)
-    fitted = fit_latent(
-        problem, problem.start, search.noise, tracks=tracks, known_noise=True, rounds=ROUNDS, steps=STEPS, grid=grid
-    )
-    search.evaluations += fitted.evaluations
-    smooth = search.tried.get((refit.name, False)) if near else None
-    bare = smooth.fit if smooth is not None else around
-    return _force(refit, bare, fitted)
+    for pull in [None] if near else [around.problem.pull, None]:
+        problem = _problem(search, refit, around, pull)
+        fitted = fit_latent(
+            problem, problem.start, search.noise, tracks=tracks, roughness=roughness, known_noise=True, rounds=ROUNDS,
+            steps=STEPS, grid=(TIMES, AMPLITUDES),
+        )  # fmt: skip
+        tracks, roughness, around = fitted.point.tracks, fitted.point.roughness, fitted
+        search.evaluations += fitted.evaluations
+    smooth = search.tried.get((refit.name, False))
+    return _force(refit, smooth.fit if smooth is not None else refit.fit, fitted)
 
 
-def _problem(search: Search, refit: Refit, around: LatentFit) -> Problem:
-    """Return the problem of a refit, cut as `around` is, whose model has the force instead of a track."""
+def _problem(search: Search, refit: Refit, around: LatentFit, pull: Pull | None) -> Problem:
+    """Return the problem of a refit, from where `around` stands, whose model has the force instead of a track."""
     choice = search.experiment.choice.plus(e.name for e in refit.hypothesis.effects)
-    model = open_model(search.registry, **asdict(choice), tables=(TABLE,))
+    model = open_model(search.registry, **asdict(choice), tables=(TABLE, pull.table) if pull else (TABLE,))
     problem = around.problem
-    return replace(problem, model=model, start=np.clip(around.point.theta, problem.lower, problem.upper))
+    return replace(problem, model=model, start=np.clip(around.point.theta, problem.lower, problem.upper), pull=pull)
 
 
 def _force(refit: Refit, bare: LatentFit, fitted: LatentFit) -> Force:

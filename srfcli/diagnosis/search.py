@@ -7,13 +7,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from srfcli.diagnosis.adequacy import Adequacy, gauge_noise, judge_residuals
+from srfcli.diagnosis.adequacy import gauge_noise, judge_residuals
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_parameters
+from srfcli.diagnosis.columns import along_table
+from srfcli.diagnosis.contest import contest
+from srfcli.diagnosis.follower import FAIR, FOLLOWED, LOOSE_ONLY, PULLS, Followed, Follower
+from srfcli.diagnosis.refits import Refit, freedom_spent
 from srfcli.diagnosis.score import Score, scores
-from srfcli.inference import fit as fitting
-from srfcli.inference.fit import Problem, Stage, first_level
+from srfcli.inference.fit import Problem, first_level
 from srfcli.inference.latent import STEPS, LatentFit, Tracks, evenness, fit_latent
 from srfcli.inference.noise import Noise
+from srfcli.inference.prediction import RTOL
 from srfcli.laws import Effect
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment
@@ -21,35 +25,17 @@ from srfcli.registry import Registry
 
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, and noise is never quite as assumed
 CLOSE = 6.0  # hypotheses within so much of the best may be it
-RIVAL, RIVAL_SHARE = (
-    30.0,
-    0.05,
-)  # short of the best score's gain: where the best leaves noise alone, less is not refitted
+RIVAL = 30.0  # short of the best score's gain: where the best leaves noise alone, less is not refitted
+RIVAL_SHARE = 0.05  # the same as a part of that gain
 NEAR = 2.5  # residual over noise within which slopes at the fit tell where a better one is
 HALFWAY = 1.25  # the same within which a rough track may be what is left
-FOLLOWED, SHORTEST = 2.0, 60  # chi-squared per degree of freedom of a stage that still follows, samples that make a run
-SHAKES = (1.5, 0.67)  # times its size: other starts of an effect
-ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better grow anew
-LOST = 0.3  # of a record's standard deviation: residual beyond which nothing is linear
+SHAKES = (2.0, 0.5)  # times its size: other starts of an effect
+ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
 MOST_EVALUATIONS = 1500  # of the recordings by a model with slopes, in all
+QUIET = 1e-3  # noise over a record's standard deviation beyond which the integration need not be exact to 1e-6
+FAINTER = 0.05  # of the first's score: an effect that promises so little less is not tried
 FIRST, SINGLES, PAIRS = 2, 8, 3  # refitted in full, at each stage
-
-
-@dataclass(frozen=True)
-class Refit:
-    """A hypothesis, fitted: its evidence is the log likelihood, tracks integrated out, less what its parameters cost."""
-
-    hypothesis: Hypothesis
-    fit: LatentFit
-    adequacy: Adequacy
-    evidence: float
-    rough: bool
-
-    @property
-    def name(self) -> str:
-        """Return the hypothesis' name."""
-        return self.hypothesis.name
 
 
 @dataclass
@@ -64,9 +50,19 @@ class Search:
     tried: dict[tuple[str, bool], Refit] = field(default_factory=dict)
     scored: dict[tuple[str, bool], list[Score]] = field(default_factory=dict)
     excluded: list[Excluded] = field(default_factory=list)
-    stages: dict[str, list[Stage]] = field(default_factory=dict)
+    followed: dict[str, Followed] = field(default_factory=dict)
+    pulls: dict[str, LatentFit] = field(default_factory=dict)
+    shook: set[str] = field(default_factory=set)
     noise: dict[str, Noise] = field(default_factory=dict)
     evaluations: int = 0
+
+    def __post_init__(self) -> None:
+        self.follower = Follower(self.registry, self.experiment, self.trend)
+        runs = self.follower.strong.records
+        still = min(
+            first_level(r) / max(float(np.std(r.observed)), 1e-300) for r in self.experiment.runs if r.name in runs
+        )
+        self.rtol = FAIR if still > QUIET else RTOL
 
     def run(self) -> list[Refit]:
         """Return everything that was fitted, best evidence first."""
@@ -93,9 +89,7 @@ class Search:
 
     def again(self, hypothesis: Hypothesis, best: Refit) -> None:
         """Fit a hypothesis from the parameters of a larger one."""
-        problem = hypothesis.problem(
-            self.registry, self.experiment, rough=best.rough, at=best.fit.values, trend=self.trend
-        )
+        problem = self.problem(hypothesis, best.fit.values, rough=best.rough)
         tracks = best.fit.point.tracks if best.rough else Tracks((), {})
         fitted = fit_latent(
             problem, problem.start, self.noise, tracks=tracks, roughness=best.fit.point.roughness if best.rough else None,
@@ -141,26 +135,46 @@ class Search:
         return self.settled(candidates)
 
     def shaken(self, candidates: Sequence[Effect]) -> bool:
-        """Return whether one of the best leaves noise alone once it starts from a larger or smaller effect.
-
-        Stick-slip has false minima, in which cycles are right on average and each is a little off.
-        """
-        for refit in self.ranked()[:3]:
-            effects = refit.hypothesis.effects
-            if len(effects) != 1 or not effects[0].sizes or refit.rough or refit.adequacy.rms_over_noise > HALFWAY:
-                continue
-            problem, neutral = refit.fit.problem, dict(effects[0].neutral)
-            for factor in SHAKES:
-                theta = refit.fit.point.theta.copy()
-                for long, p in own_parameters(effects[0], problem.model).items():
-                    if p.name in neutral and long in problem.names:
-                        i = problem.names.index(long)
-                        theta[i] = neutral[p.name] + factor * (theta[i] - neutral[p.name])
-                theta = np.clip(theta, problem.lower, problem.upper)
-                fitted = fit_latent(problem, theta, self.noise, tracks=Tracks((), {}), known_noise=True)
-                if self.keep(refit.hypothesis, fitted, rough=False).adequacy.fine:
-                    return self.settled(candidates)
+        """Return whether one of the best leaves noise alone once its effects start from elsewhere."""
+        for refit in self.ranked()[:2]:
+            if not refit.rough and self.elsewhere(refit).adequacy.fine:
+                return self.settled(candidates)
         return False
+
+    def elsewhere(self, refit: Refit) -> Refit:
+        """Return the best fit of a hypothesis from other starts: larger and smaller effects, other places and wavelengths.
+
+        Where cycles are right on average and each is a little off, a minimum is false.
+        """
+        effects = refit.hypothesis.effects
+        if refit.name in self.shook or refit.adequacy.fine or refit.adequacy.rms_over_noise > NEAR or not effects:
+            return refit
+        self.shook.add(refit.name)
+        values, model = dict(refit.fit.values), refit.fit.problem.model
+        starts: list[dict[str, float]] = []
+        for effect in effects:
+            neutral, own = dict(effect.neutral), own_parameters(effect, model)
+            if along_table(effect) and effect.scans:
+                (score,) = scores(self.registry, refit.fit.problem.experiment, refit.fit, [effect], present=effects)
+                starts.append({long: score.values[p.name] for long, p in own.items() if p.name in score.values})
+            for factor in SHAKES:
+                starts.append({long: neutral[p.name] + factor * (values[long] - neutral[p.name])
+                               for long, p in own.items() if p.name in neutral and long in values})  # fmt: skip
+        for start in starts:
+            if self.spent() or not start:
+                break
+            led = self.follower.follow(refit.hypothesis, values | start, self.noise, [LOOSE_ONLY])
+            if led.lost:
+                continue
+            fitted = fit_latent(refit.fit.problem, led.theta, self.noise, tracks=Tracks((), {}), known_noise=True)
+            refit = self.keep(refit.hypothesis, fitted, rough=False)
+            if refit.adequacy.fine:
+                break
+        return refit
+
+    def spent(self) -> bool:
+        """Return whether the search's budget is used up."""
+        return self.evaluations + self.follower.evaluations > MOST_EVALUATIONS
 
     def roughened(self, candidates: Sequence[Effect]) -> bool:
         """Return whether the best so far leaves noise alone once its track may be rough."""
@@ -190,54 +204,33 @@ class Search:
 
     def baseline(self) -> Refit:
         """Return the baseline's fit, from the file's own start values."""
-        problem = Hypothesis().problem(self.registry, self.experiment, rough=False, trend=self.trend)
         self.progress("baseline")
-        theta = self.grown(Hypothesis(), problem)
-        residuals = {r.name: r.observed - problem.predicted(r, theta, slopes=False).y for r in problem.runs}
-        self.noise = gauge_noise(problem.runs, residuals)
-        steps = 2 if self.lost(Hypothesis()) else STEPS
+        bare, runs = Hypothesis(), [r for r in self.experiment.runs if not r.holdout]
+        level = {r.name: Noise(first_level(r)) for r in runs}
+        for way in PULLS:  # noise is better known after the first
+            found = self.follower.follow(bare, {}, self.noise or level, [way])
+            if bare.name not in self.followed or found.reduced < self.followed[bare.name].reduced:
+                self.followed[bare.name] = found
+            self.noise = gauge_noise(runs, self.smallest(found))
+            if found.reduced < FOLLOWED:
+                break
+        best = self.followed[bare.name]
+        steps = 2 if best.lost else STEPS
         return self.keep(
-            Hypothesis(), fit_latent(problem, theta, self.noise, known_noise=True, steps=steps), rough=False
+            bare, fit_latent(self.problem(bare), best.theta, self.noise, known_noise=True, steps=steps), rough=False
         )
 
-    def grown(self, hypothesis: Hypothesis, problem: Problem) -> Array:
-        """Return the parameters of a fit with growing horizons from the problem's start, and remember its stages."""
-        noise = self.noise or {r.name: Noise(first_level(r)) for r in problem.runs}
-        growing = fitting.Search(problem, lambda text: self.progress(f"{hypothesis.name}, {text}"), rough=True)
-        theta, _ = growing.grow(np.clip(problem.start, problem.lower, problem.upper), noise)
-        self.stages[hypothesis.name] = growing.stages
-        self.evaluations += growing.evaluations
-        return theta
-
-    def lost(self, hypothesis: Hypothesis) -> bool:
-        """Return whether a growing fit had to give a hypothesis up."""
-        stages = self.stages.get(hypothesis.name)
-        return stages is not None and len(stages) > 0 and stages[-1].reduced > fitting.HOPELESS
-
-    def partly(self, refit: Refit) -> LatentFit:
-        """Return a fit of the beginnings of all runs, as far as a hypothesis follows them: beyond, slopes mean nothing."""
-        stages = self.stages.get(refit.name, [])
-        good = [s for s in stages if s.reduced < FOLLOWED] or stages[:1]
-        if not good:
-            return refit.fit
-        stage, problem = (
-            good[-1],
-            refit.hypothesis.problem(self.registry, self.experiment, rough=False, trend=self.trend),
-        )
-        runs = []
-        for run in problem.runs:
-            r = run.observed - problem.predicted(run, stage.theta, slopes=False).y
-            far = ~(np.abs(r) < max(LOST * float(np.std(run.observed)), 8 * self.noise[run.name].level))
-            n = int(np.argmax(far)) if far.any() else run.t.size
-            if n >= SHORTEST:
-                runs.append(replace(run, t=run.t[:n], observed=run.observed[:n], used=run.used[:n]))
-        if not runs:
-            return refit.fit
-        self.progress(
-            f"{refit.name}: scores on {100 * sum(r.t.size for r in runs) // sum(r.t.size for r in problem.runs)} % of the samples"
-        )
-        cut = replace(problem, runs=tuple(runs), experiment=replace(problem.experiment, runs=tuple(runs)))
-        return fit_latent(cut, stage.theta, self.noise, known_noise=True)
+    def smallest(self, found: Followed) -> dict[str, Array]:
+        """Return the residuals (n,) by run, free or under a pull, whichever are smaller: they show the noise."""
+        tight = self.follower.problem(Hypothesis(), {}, PULLS[0][0])
+        out = {}
+        for run in found.problem.runs:
+            both = [
+                run.observed - problem.predicted(run, theta, slopes=False).y
+                for problem, theta in ((found.problem, found.theta), (tight, found.pulled))
+            ]
+            out[run.name] = min(both, key=lambda r: float(np.nan_to_num(np.mean(r[run.used] ** 2), nan=np.inf)))
+        return out
 
     def keep(self, hypothesis: Hypothesis, fitted: LatentFit, *, rough: bool) -> Refit:
         """Return a fit judged, and remember it."""
@@ -245,7 +238,7 @@ class Search:
         runs = fitted.problem.runs
         residuals = {r.name: r.observed - fitted.point.predictions[r.name].y for r in runs}
         adequacy = replace(
-            judge_residuals(runs, residuals, self.noise, freedom=spent(fitted)), p_tracks=evenness(fitted.point)
+            judge_residuals(runs, residuals, self.noise, freedom=freedom_spent(fitted)), p_tracks=evenness(fitted.point)
         )
         n = sum(int(r.used.sum()) for r in runs)
         cost = 0.5 * np.log(n) * (len(fitted.problem.names) - len(self.base_names())) + (4.0 if rough else 0.0)
@@ -260,7 +253,12 @@ class Search:
 
     def base_names(self) -> tuple[str, ...]:
         """Return the baseline's free parameters."""
-        return Hypothesis().problem(self.registry, self.experiment, rough=False, trend=self.trend).names
+        return self.problem(Hypothesis()).names
+
+    def problem(self, hypothesis: Hypothesis, at: Mapping[str, float] | None = None, *, rough: bool = False) -> Problem:
+        """Return the fit of a hypothesis from the values in `at`, integrated as exactly as the noise asks for."""
+        found = hypothesis.problem(self.registry, self.experiment, rough=rough, at=at, trend=self.trend)
+        return replace(found, rtol=self.rtol)
 
     def score(self, refit: Refit, candidates: Sequence[Effect]) -> list[Score]:
         """Return the scores of everything that a refit does not have yet."""
@@ -270,7 +268,7 @@ class Search:
             reported = {e.reported for e in present}
             left = [e for e in candidates if e.reported not in reported and not (e.settings and present)]
             near = refit.rough or refit.adequacy.rms_over_noise < NEAR
-            around = refit.fit if near else self.partly(refit)
+            around = refit.fit if near else self.pulled(refit)
             self.scored[key] = scores(self.registry, around.problem.experiment, around, left, present=present)
         return self.scored[key]
 
@@ -278,25 +276,39 @@ class Search:
         """Refit the hypotheses that add one effect to a refit's own, those that promise most first."""
         least = WORTH if refit.adequacy.fine else WORTH / 2
         scored = self.score(refit, candidates)
-        promising = [s for s in scored if s.gain > least][:most]
+        promising = [s for s in scored if s.gain > max(least, FAINTER * scored[0].gain)][:most]
         if not refit.adequacy.fine:  # a mass or an interface that is not there has no first order worth the name
             built = [s for s in scored if s.effect.settings]
             promising = [*built, *(s for s in promising if not s.effect.settings)]
+        if not (rough or refit.adequacy.rms_over_noise < NEAR):
+            contest(self, refit, promising)
+            return
         for score in promising:
-            if self.evaluations > MOST_EVALUATIONS:
-                self.progress("the search ends here: its budget is spent")
-                break
-            if not self.rivals(score, promising, refit):
-                continue
             hypothesis = Hypothesis((*refit.hypothesis.effects, score.effect))
-            if any(
-                set(t.hypothesis.effects) == set(hypothesis.effects) and r == rough for (_, r), t in self.tried.items()
-            ):
+            if not self.rivals(score, promising, refit) or not self.untried(hypothesis, rough=rough):
                 continue
             found = self.refit(hypothesis, refit, score.values, rough=rough)
+            if not rough and self.best() is found:
+                found = self.elsewhere(found)
             halfway = not found.adequacy.fine and found.adequacy.rms_over_noise < HALFWAY
             if not rough and halfway and self.best() is found:
                 self.refit(hypothesis, found, {}, rough=True)
+
+    def untried(self, hypothesis: Hypothesis, *, rough: bool) -> bool:
+        """Return whether a hypothesis was not fitted yet and the budget leaves room for it."""
+        if self.spent():
+            self.progress(f"{hypothesis.name} is not tried: the search's budget is spent")
+            return False
+        return not any(set(t.hypothesis.effects) == set(hypothesis.effects) and r == rough
+                       for (_, r), t in self.tried.items())  # fmt: skip
+
+    def own_values(self, hypothesis: Hypothesis, added: Mapping[str, float]) -> dict[str, float]:
+        """Return what a score expects of the last effect's parameters, by their names in the model."""
+        if not hypothesis.effects:
+            return {}
+        model = hypothesis.model(self.registry, self.experiment, rough=False)
+        own = own_parameters(hypothesis.effects[-1], model)
+        return {long: added[p.name] for long, p in own.items() if p.name in added}
 
     def rivals(self, score: Score, others: Sequence[Score], refit: Refit) -> bool:
         """Return whether an effect may do as well as the best so far: always where that leaves more than noise."""
@@ -315,27 +327,27 @@ class Search:
 
     def refit(self, hypothesis: Hypothesis, start: Refit, added: Mapping[str, float], *, rough: bool) -> Refit:
         """Fit a hypothesis from another one's parameters and from what a score expects of the added effect."""
-        problem = hypothesis.problem(self.registry, self.experiment, rough=rough, trend=self.trend)
-        at, own = dict(start.fit.values), {}
-        if hypothesis.effects and hypothesis.effects != start.hypothesis.effects:
-            for long, p in own_parameters(hypothesis.effects[-1], problem.model).items():
-                if p.name in added:
-                    own[long] = added[p.name]
-        near = rough or start.adequacy.rms_over_noise < NEAR
-        problem = hypothesis.problem(
-            self.registry, self.experiment, rough=rough, at=at | own if near else own, trend=self.trend
-        )
-        theta, squares = self.shortened(hypothesis, problem) if near else (problem.start, np.inf)
-        if not near or (not rough and squares > ASTRAY * start.fit.point.chi2):
-            file_start = hypothesis.problem(self.registry, self.experiment, rough=rough, at=own, trend=self.trend)
-            near, theta = False, self.grown(hypothesis, file_start)
+        at = dict(start.fit.values)
+        if hypothesis.effects != start.hypothesis.effects:
+            at |= self.own_values(hypothesis, added)
+        problem = self.problem(hypothesis, at, rough=rough)
+        theta, squares = self.shortened(hypothesis, problem)
+        if not rough and squares > ASTRAY * start.fit.point.chi2:
+            theta = self.follower.follow(hypothesis, at, self.noise, [LOOSE_ONLY]).theta
         tracks = start.fit.point.tracks if rough and start.rough else None if rough else Tracks((), {})
         roughness = start.fit.point.roughness if rough else None
-        steps = 2 if not near and self.lost(hypothesis) else STEPS
-        fitted = fit_latent(
-            problem, theta, self.noise, tracks=tracks, roughness=roughness, known_noise=True, steps=steps
-        )
+        fitted = fit_latent(problem, theta, self.noise, tracks=tracks, roughness=roughness, known_noise=True)
         return self.keep(hypothesis, fitted, rough=rough)
+
+    def pulled(self, refit: Refit) -> LatentFit:
+        """Return a hypothesis' fit under a loose pull: where it does not follow the recording, slopes mean something there."""
+        if refit.name not in self.pulls:
+            known = self.followed.get(refit.name)
+            values = known.problem.named(known.pulled) if known else refit.fit.values
+            self.progress(f"{refit.name}: scores with the spring drawn to the recording")
+            self.pulls[refit.name] = self.follower.around(refit.hypothesis, values, self.noise)
+            self.evaluations += self.pulls[refit.name].evaluations
+        return self.pulls[refit.name]
 
     def shortened(self, hypothesis: Hypothesis, problem: Problem) -> tuple[Array, float]:
         """Return the problem's start, the last effect's size cut where the whole of it leads astray, and chi-squared there."""
@@ -372,26 +384,3 @@ class Search:
     def best(self) -> Refit:
         """Return the refit with the best evidence."""
         return self.ranked()[0]
-
-
-def spent(fitted: LatentFit) -> dict[str, float]:
-    """Return how many parameters' worth of freedom each run's residual has lost, to the track above all."""
-    point, n = fitted.point, fitted.point.theta.size
-    out = {r.name: n / max(len(fitted.problem.runs), 1) for r in fitted.problem.runs}
-    if not point.tracks.splines or not point.roughness.amplitude:
-        return out
-    L = point.tracks.root(point.roughness)
-    M = L.T @ point.N[n:, n:] @ L
-    share = np.diag(np.linalg.solve(M + np.eye(M.shape[0]), M))
-    at = 0
-    weights = []
-    for spline in point.tracks.splines:
-        weights.append(float(share[at : at + spline.numbers.size].sum()))
-        at += spline.numbers.size
-    users: dict[int, list[str]] = {}
-    for name, i in point.tracks.of.items():
-        users.setdefault(i, []).append(name)
-    for i, names in users.items():
-        for name in names:
-            out[name] += weights[i] / len(names)
-    return out

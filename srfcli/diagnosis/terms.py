@@ -19,13 +19,15 @@ import sympy as sp
 import srfcli
 from srfcli.diagnosis.candidates import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.closedform import ClosedForm, FittedTerm
+from srfcli.diagnosis.contest import contest
 from srfcli.diagnosis.force import missing_force
+from srfcli.diagnosis.refits import Refit
 from srfcli.diagnosis.score import Score, scores
-from srfcli.diagnosis.search import NEAR, WORTH, Refit, Search
+from srfcli.diagnosis.search import NEAR, WORTH, Search
 from srfcli.diagnosis.verdict import Diagnosis, judge_held
 from srfcli.errors import SrfError
 from srfcli.expression import symbol
-from srfcli.inference.latent import STEPS, LatentFit, fit_latent
+from srfcli.inference.latent import LatentFit
 from srfcli.lawfile import read_header
 from srfcli.laws import Effect
 from srfcli.registry import Entry, Registry
@@ -36,7 +38,6 @@ ORIGIN = "terms"
 MOST_TERMS = 3
 TRIED = 4  # refitted at each step, those that promise most
 TWINS, ALIKE = 3, 0.98  # of so many signals that are so alike
-BEGUN, WHOLE = 8, 2  # tried at each step on the beginnings of runs, and of these in full, where a fit is far off
 PAYS = 3.0  # gain in log evidence below which a further term is not worth its words
 MOST_EVALUATIONS = 700  # of the recordings by a model with slopes
 
@@ -86,7 +87,7 @@ def _with_own_terms(search: Search) -> Search:
     """Return a search that knows the terms, and all that the one before has fitted."""
     return replace(
         search, registry=with_terms(search.registry), effects=None, tried=dict(search.tried), scored={}, excluded=[],
-        stages=dict(search.stages), noise=dict(search.noise), evaluations=0,
+        followed=dict(search.followed), pulls=dict(search.pulls), noise=dict(search.noise), evaluations=0,
     )  # fmt: skip
 
 
@@ -116,55 +117,17 @@ class _Selection:
 
     def step(self, start: Refit) -> Refit | None:
         """Return the best refit with one term more than `start`; None where none has evidence enough."""
-        near = start.rough or start.adequacy.rms_over_noise < NEAR
-        found = self.near(start) if near else self.far(start)
+        search = self.search
+        if start.rough or start.adequacy.rms_over_noise < NEAR:
+            found = []
+            for score in _foremost(self.scored(start, start.fit)):
+                hypothesis = Hypothesis((*start.hypothesis.effects, score.effect))
+                if self.new(hypothesis):
+                    found.append(search.refit(hypothesis, start, score.values, rough=start.rough))
+        else:
+            found = contest(search, start, _foremost(self.scored(start, search.pulled(start))))
         best = max(found, key=lambda r: r.evidence, default=None)
         return best if best is not None and best.evidence > start.evidence + PAYS else None
-
-    def near(self, start: Refit) -> list[Refit]:
-        """Return refits with one term more, from where a fit that is nearly right stands."""
-        found = []
-        for score in _foremost(self.scored(start, start.fit)):
-            hypothesis = Hypothesis((*start.hypothesis.effects, score.effect))
-            if self.new(hypothesis):
-                found.append(self.search.refit(hypothesis, start, score.values, rough=start.rough))
-        return found
-
-    def far(self, start: Refit) -> list[Refit]:
-        """Return refits with one term more where a fit is far off: tried on the beginnings first, the best of these in full."""
-        search, around = self.search, self.search.partly(start)
-        begun = []
-        for score in self.scored(start, around)[:BEGUN]:
-            hypothesis = Hypothesis((*start.hypothesis.effects, score.effect))
-            if self.new(hypothesis):
-                part = self.begun(hypothesis, score, around)
-                begun.append((part.log_likelihood - self.cost(part), hypothesis, part))
-        found: list[Refit] = []
-        for _, hypothesis, part in sorted(begun, key=lambda b: -b[0])[:WHOLE]:
-            problem = hypothesis.problem(
-                search.registry, search.experiment, rough=False, at=part.values, trend=search.trend
-            )
-            theta = search.grown(hypothesis, problem)
-            steps = 2 if search.lost(hypothesis) else STEPS
-            fitted = fit_latent(problem, theta, search.noise, known_noise=True, steps=steps)
-            found.append(search.keep(hypothesis, fitted, rough=False))
-            if found[-1].adequacy.fine or search.evaluations > MOST_EVALUATIONS:
-                break
-        return found
-
-    def begun(self, hypothesis: Hypothesis, score: Score, around: LatentFit) -> LatentFit:
-        """Return a fit of a hypothesis to the beginnings of the runs that `around` is of."""
-        search, runs, added = self.search, around.problem.runs, dict(score.values)
-        problem = hypothesis.problem(
-            search.registry, search.experiment, rough=False, at=around.values, trend=search.trend
-        )
-        own = {long: p.name for long, p in own_parameters(score.effect, problem.model).items() if p.name in added}
-        start = [added[own[n]] if n in own else x for n, x in zip(problem.names, problem.start.tolist(), strict=True)]
-        start = np.clip(np.array(start), problem.lower, problem.upper)
-        cut = replace(problem, start=start, runs=runs, experiment=replace(problem.experiment, runs=runs))
-        fitted = fit_latent(cut, search.shortened(hypothesis, cut)[0], search.noise, known_noise=True)
-        search.progress(f"{hypothesis.name}: log likelihood {fitted.log_likelihood:.1f} of the beginnings")
-        return fitted
 
     def new(self, hypothesis: Hypothesis) -> bool:
         """Return whether a hypothesis was not tried before and there is something left to try it with."""
@@ -176,10 +139,6 @@ class _Selection:
             return False
         self.done.add(key)
         return True
-
-    def cost(self, fitted: LatentFit) -> float:
-        """Return what a fit's parameters cost in evidence."""
-        return 0.5 * float(np.log(sum(int(r.used.sum()) for r in fitted.problem.runs))) * len(fitted.problem.names)
 
     def scored(self, start: Refit, around: LatentFit) -> list[Score]:
         """Return the scores of all terms that a refit lacks and can be joined with, largest gain first, by slopes `around`."""

@@ -9,8 +9,9 @@ import numpy as np
 
 from srfcli.diagnosis.adequacy import Adequacy, judge_residuals
 from srfcli.diagnosis.candidates import Excluded, Hypothesis
+from srfcli.diagnosis.refits import Refit, freedom_spent
 from srfcli.diagnosis.score import Score
-from srfcli.diagnosis.search import CLOSE, Refit, Search, spent
+from srfcli.diagnosis.search import CLOSE, Search
 from srfcli.inference.latent import fit_latent, tracks_for
 from srfcli.inference.noise import Noise
 from srfcli.numerics.collocation import Array
@@ -195,7 +196,10 @@ def _predicted(search: Search, refit: Refit, experiment: Experiment, run: Run) -
     tracks = tracks_for([as_fitted], shared=False) if rough else None
     fitted = fit_latent(small, small.start, noise, tracks=tracks, known_noise=True)
     adequacy: Adequacy = judge_residuals(
-        [as_fitted], {run.name: run.observed - fitted.point.predictions[run.name].y}, noise, freedom=spent(fitted)
+        [as_fitted],
+        {run.name: run.observed - fitted.point.predictions[run.name].y},
+        noise,
+        freedom=freedom_spent(fitted),
     )
     return fitted.point.predictions[run.name].y, fitted.log_likelihood, adequacy.rms_over_noise
 

@@ -16,7 +16,7 @@ from srfcli.errors import SrfError, did_you_mean
 from srfcli.inference.linear import inverse, root
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
 from srfcli.inference.nuisance import own_names, own_start
-from srfcli.inference.prediction import Prediction, predict, run_parameters
+from srfcli.inference.prediction import RTOL, Prediction, Pull, predict, run_parameters
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment, Run
@@ -107,6 +107,8 @@ class Problem:
     upper: Array
     trend: str | None = None
     held: Mapping[str, float] = field(default_factory=dict)
+    pull: Pull | None = None
+    rtol: float = RTOL
 
     def named(self, theta: Array) -> dict[str, float]:
         """Return parameters by name, those that are held among them."""
@@ -123,6 +125,8 @@ class Problem:
             by=by,
             until=until,
             trend=None if run.holdout else self.trend,
+            pull=self.pull,
+            rtol=self.rtol,
         )
 
 
@@ -290,14 +294,15 @@ class Search:
         A rough search stops early where the model does not follow the data, and only there.
         """
         if self.rough:
-            theta, status = self._minimise(theta, noise, horizons, tolerance=1e-4, most=12)
+            theta, status = self.descend(theta, noise, horizons, tolerance=1e-4, most=12)
             if self.reduced > FOLLOWS:
                 return theta, status
-        return self._minimise(theta, noise, horizons, tolerance=1e-9, most=60)
+        return self.descend(theta, noise, horizons, tolerance=1e-9, most=60)
 
-    def _minimise(
+    def descend(
         self, theta: Array, noise: Mapping[str, Noise], horizons: Mapping[str, float], *, tolerance: float, most: int
     ) -> tuple[Array, Status]:
+        """Return where at most so many evaluations lead, and how the minimiser ended."""
         from scipy.optimize import least_squares
 
         problem = self.problem

@@ -126,7 +126,7 @@ class Latent:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self.rough = bool(problem.model.namespace.get("TABLES"))
+        self.rough = any(slot == "mu" for slot, _ in problem.model.namespace.get("TABLES", ()))
         self.scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
         self.evaluations = 0
 
@@ -136,7 +136,8 @@ class Latent:
         return predict(
             problem.model, problem.experiment, run, problem.named(theta), by=problem.names if slopes else (),
             trend=None if run.holdout else problem.trend, tables=(tracks.spline(run),) if self.rough else (),
-            by_tables=(0,) if slopes and self.rough and run.name in tracks.of else (),
+            by_tables=(0,) if slopes and self.rough and run.name in tracks.of else (), pull=problem.pull,
+            rtol=problem.rtol,
         )  # fmt: skip
 
     def at(self, theta: Array, tracks: Tracks, noise: Mapping[str, Noise], roughness: Roughness) -> Point:

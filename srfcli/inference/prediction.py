@@ -22,6 +22,18 @@ RTOL = 1e-6  # errors of some 1e-5 um after minutes of stick-slip, a thousandth 
 
 
 @dataclass(frozen=True)
+class Pull:
+    """The spring drawn to what was recorded: by run a rate (1/s) and the recording as a spline over time (um, or N).
+
+    `table` is what a model has for it behind its other tables: V gains pull (recorded - u).
+    """
+
+    table: tuple[str, str]
+    rates: Mapping[str, float]
+    records: Mapping[str, Spline]
+
+
+@dataclass(frozen=True)
 class Prediction:
     """The observable `y` (n,) of a run in um, N or 1, and `J` (n, k), its derivatives by the names asked for; x (n, states)."""
 
@@ -113,14 +125,18 @@ def predict(
     trend: str | None = None,
     tables: Sequence[Spline] = (),
     by_tables: Sequence[int] = (),
+    pull: Pull | None = None,
 ) -> Prediction:
     """Return the observable of `run` at its sample times up to `until` s, with derivatives by the parameters `by`.
 
     Of a model with tables, J goes on with a column for each number of the tables in `by_tables`.
 
     It starts in steady sliding, or where `values` say (see `nuisance`). A trend is added to the observable: values["RUN.trend"]
-    times displacement or time. Values are in um, s, N.
+    times displacement or time. With a `pull`, whose table the model has last, the spring is drawn to the recording. Values are
+    in um, s, N.
     """
+    if pull is not None:
+        tables, values = (*tables, pull.records[run.name]), {**values, "pull": pull.rates[run.name]}
     p = run_parameters(model, experiment, run, values)
     if tables:
         p = appended(p, tables)

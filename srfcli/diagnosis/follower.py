@@ -1,0 +1,103 @@
+"""Hypotheses fitted with the spring drawn to the recording first, then free: where they start from hardly matters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from srfcli.diagnosis.candidates import Hypothesis
+from srfcli.inference import fit as fitting
+from srfcli.inference.fit import Problem
+from srfcli.inference.follow import pull_towards, slip_length, weaker
+from srfcli.inference.latent import LatentFit, Tracks, fit_latent
+from srfcli.inference.noise import Noise
+from srfcli.numerics.collocation import Array
+from srfcli.recording.values import Experiment
+from srfcli.registry import Registry
+
+LOOSE = 5.0  # slip lengths over which a pull acts that leaves most of a misfit to be seen
+PULLS = ((2.5, LOOSE), (1.25, LOOSE))  # the same, ever weaker; the second way is tried where the first leads nowhere
+LOOSE_ONLY = (LOOSE,)  # the one pull that a refit starts under
+COARSE, FEW = 1e-2, 12  # tolerance of chi-squared under a pull, and evaluations
+ROUND, FAIR = 1e-4, 1e-5  # relative tolerances of the integrator, pulled and free, on the way
+FOLLOWED = 4.0  # chi-squared per degree of freedom of a model that follows the recording without a pull
+HOPELESS = 30.0  # the same of one that does not: its minimum need not be known exactly
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Parameters (k,) with their `reduced` chi-squared when the spring is free, and those under the last pull."""
+
+    problem: Problem
+    theta: Array
+    reduced: float
+    pulled: Array
+
+    @property
+    def lost(self) -> bool:
+        """Return whether the model does not follow the recording at all."""
+        return not self.reduced < HOPELESS
+
+
+class Follower:
+    """Fits hypotheses to one experiment under pulls that grow weaker."""
+
+    def __init__(self, registry: Registry, experiment: Experiment, trend: str | None) -> None:
+        self.registry, self.experiment, self.trend = registry, experiment, trend
+        problem = self.problem(Hypothesis(), {})
+        self.unit = slip_length(problem.model, experiment)
+        self.strong = pull_towards(experiment, problem.runs, self.unit)
+        self.evaluations = 0
+
+    def problem(self, hypothesis: Hypothesis, at: Mapping[str, float], length: float | None = None) -> Problem:
+        """Return the fit of a hypothesis under a pull over so many slip lengths, or free."""
+        pull = weaker(self.strong, self.experiment.runs, length * self.unit) if length is not None else None
+        return hypothesis.problem(self.registry, self.experiment, rough=False, at=dict(at), trend=self.trend, pull=pull)
+
+    def follow(
+        self, hypothesis: Hypothesis, at: Mapping[str, float], noise: Mapping[str, Noise],
+        ways: Sequence[Sequence[float]] = PULLS,
+    ) -> Followed:  # fmt: skip
+        """Return the best free fit that any of the ways of weakening the pull leads to, from the values in `at`."""
+        best: Followed | None = None
+        for way in ways:
+            found = self.released(hypothesis, self.led(hypothesis, at, noise, way)[0], noise)
+            if best is None or found.reduced < best.reduced:
+                best = found
+            if best.reduced < FOLLOWED:
+                break
+        assert best is not None
+        return best
+
+    def led(
+        self, hypothesis: Hypothesis, at: Mapping[str, float], noise: Mapping[str, Noise], way: Sequence[float]
+    ) -> tuple[Array, float]:
+        """Return the parameters that a pull over ever more slip lengths leads to, and chi-squared per degree of freedom."""
+        theta, reduced = self.problem(hypothesis, at).start, np.inf
+        for length in way:
+            theta, reduced = self.descend(self.problem(hypothesis, at, length), theta, noise, COARSE)
+        return theta, reduced
+
+    def released(self, hypothesis: Hypothesis, pulled: Array, noise: Mapping[str, Noise]) -> Followed:
+        """Return the free fit from parameters under a pull."""
+        free = self.problem(hypothesis, {})
+        theta, reduced = self.descend(free, pulled, noise, 1e-4)
+        return Followed(free, theta, reduced, pulled)
+
+    def descend(
+        self, problem: Problem, theta: Array, noise: Mapping[str, Noise], tolerance: float
+    ) -> tuple[Array, float]:
+        """Return where some steps downhill lead, and chi-squared per degree of freedom there."""
+        search = fitting.Search(problem, lambda text: None)
+        theta, _ = search.descend(
+            np.clip(theta, problem.lower, problem.upper), noise, {}, tolerance=tolerance, most=FEW
+        )
+        self.evaluations += search.evaluations
+        return theta, search.reduced
+
+    def around(self, hypothesis: Hypothesis, values: Mapping[str, float], noise: Mapping[str, Noise]) -> LatentFit:
+        """Return the fit of a hypothesis under a loose pull, around which everything is nearly linear."""
+        problem = self.problem(hypothesis, values, LOOSE)
+        return fit_latent(problem, problem.start, noise, tracks=Tracks((), {}), known_noise=True, steps=FEW)

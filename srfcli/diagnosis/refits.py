@@ -1,0 +1,62 @@
+"""A hypothesis, fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from srfcli.diagnosis.adequacy import Adequacy
+from srfcli.diagnosis.candidates import Hypothesis
+from srfcli.inference.latent import LatentFit
+from srfcli.numerics.collocation import Array
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A hypothesis, fitted: its evidence is the log likelihood, tracks integrated out, less what its parameters cost."""
+
+    hypothesis: Hypothesis
+    fit: LatentFit
+    adequacy: Adequacy
+    evidence: float
+    rough: bool
+
+    @property
+    def name(self) -> str:
+        """Return the hypothesis' name."""
+        return self.hypothesis.name
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A hypothesis under a pull: parameters (k,), also by name, those a score expected, chi-squared per degree of freedom."""
+
+    hypothesis: Hypothesis
+    theta: Array
+    values: dict[str, float]
+    own: dict[str, float]
+    reduced: float
+
+
+def freedom_spent(fitted: LatentFit) -> dict[str, float]:
+    """Return how many parameters' worth of freedom each run's residual has lost, to the track above all."""
+    point, n = fitted.point, fitted.point.theta.size
+    out = {r.name: n / max(len(fitted.problem.runs), 1) for r in fitted.problem.runs}
+    if not point.tracks.splines or not point.roughness.amplitude:
+        return out
+    L = point.tracks.root(point.roughness)
+    M = L.T @ point.N[n:, n:] @ L
+    share = np.diag(np.linalg.solve(M + np.eye(M.shape[0]), M))
+    at = 0
+    weights = []
+    for spline in point.tracks.splines:
+        weights.append(float(share[at : at + spline.numbers.size].sum()))
+        at += spline.numbers.size
+    users: dict[int, list[str]] = {}
+    for name, i in point.tracks.of.items():
+        users.setdefault(i, []).append(name)
+    for i, names in users.items():
+        for name in names:
+            out[name] += weights[i] / len(names)
+    return out
