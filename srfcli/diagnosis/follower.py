@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.diagnosis.candidates import Hypothesis
+from srfcli.diagnosis.candidates import Hypothesis, own_parameters
 from srfcli.inference import fit as fitting
 from srfcli.inference.fit import Problem
 from srfcli.inference.follow import pull_towards, slip_length, weaker
@@ -101,3 +101,26 @@ class Follower:
         """Return the fit of a hypothesis under a loose pull, around which everything is nearly linear."""
         problem = self.problem(hypothesis, values, LOOSE)
         return fit_latent(problem, problem.start, noise, tracks=Tracks((), {}), known_noise=True, steps=FEW)
+
+
+def shortened(hypothesis: Hypothesis, problem: Problem, noise: Mapping[str, Noise]) -> tuple[Array, float]:
+    """Return the problem's start, the last effect's size cut where the whole of it leads astray, and chi-squared there."""
+    if not hypothesis.effects or not hypothesis.effects[-1].sizes:
+        return problem.start, 0.0
+    effect = hypothesis.effects[-1]
+    neutral = dict(effect.neutral)
+    places = [(problem.names.index(long), neutral[p.name]) for long, p in own_parameters(effect, problem.model).items()
+              if p.name in neutral and long in problem.names]  # fmt: skip
+    best = (problem.start, np.inf)
+    for share in (1.0, 0.3, 0.0):
+        theta = problem.start.copy()
+        for i, value in places:
+            theta[i] = value + share * (theta[i] - value)
+        theta = np.clip(theta, problem.lower, problem.upper)
+        squares = 0.0
+        for run in problem.runs:
+            r = (run.observed - problem.predicted(run, theta, slopes=False).y)[run.used] / noise[run.name].level
+            squares += float(np.sum(np.where(np.isfinite(r), r, 1e6) ** 2))
+        if squares < best[1]:
+            best = (theta, squares)
+    return best

@@ -11,7 +11,7 @@ from srfcli.diagnosis.adequacy import gauge_noise, judge_residuals
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.contest import contest
-from srfcli.diagnosis.follower import FAIR, FOLLOWED, LOOSE_ONLY, PULLS, Followed, Follower
+from srfcli.diagnosis.follower import FAIR, FOLLOWED, LOOSE_ONLY, PULLS, Followed, Follower, shortened
 from srfcli.diagnosis.refits import Refit, freedom_spent
 from srfcli.diagnosis.score import Score, scores
 from srfcli.inference.fit import Problem, first_level
@@ -32,7 +32,8 @@ HALFWAY = 1.25  # the same within which a rough track may be what is left
 SHAKES = (2.0, 0.5)  # times its size: other starts of an effect
 ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
-MOST_EVALUATIONS = 1500  # of the recordings by a model with slopes, in all
+MOST_EVALUATIONS = 1200  # of the recordings by a model with slopes, in all
+ROUGH_COSTS = 3  # of these, one with the slopes by a track
 QUIET = 1e-3  # noise over a record's standard deviation beyond which the integration need not be exact to 1e-6
 FAINTER = 0.05  # of the first's score: an effect that promises so little less is not tried
 FIRST, SINGLES, PAIRS = 2, 8, 3  # refitted in full, at each stage
@@ -68,8 +69,24 @@ class Search:
         """Return everything that was fitted, best evidence first."""
         candidates, self.excluded = applicable(self.registry, self.experiment, self.effects)
         self.look(candidates)
+        self.doubt(candidates)
         self.rebase()
         return self.ranked()
+
+    def doubt(self, candidates: Sequence[Effect]) -> None:
+        """Fit the baseline on a rough track where that might be all there is: a wave along it is easily seen in any track."""
+        bare, best = self.tried["none", False], self.best()
+        if best.rough or not best.hypothesis.effects or ("none", True) in self.tried:
+            return
+        wandering = any(along_table(e) for e in best.hypothesis.effects)
+        if bare.adequacy.rms_over_noise < (NEAR if wandering else HALFWAY):
+            rough = self.refit(Hypothesis(), bare, {}, rough=True)
+            if rough.evidence > best.evidence:
+                self.widen(rough, candidates, PAIRS, rough=True)
+        for effect in best.hypothesis.effects if len(best.hypothesis.effects) > 1 else ():
+            alone = self.tried.get((effect.name, False))
+            if alone is not None and alone.adequacy.rms_over_noise < HALFWAY and (effect.name, True) not in self.tried:
+                self.refit(alone.hypothesis, alone, {}, rough=True)
 
     def rebase(self) -> None:
         """Fit what the best hypothesis is made of, and the baseline, from where the best one stands.
@@ -88,7 +105,13 @@ class Search:
                 return
 
     def again(self, hypothesis: Hypothesis, best: Refit) -> None:
-        """Fit a hypothesis from the parameters of a larger one."""
+        """Fit a hypothesis from the parameters of a larger one, on a rough track only where a smooth one has little left."""
+        known = self.tried.get((hypothesis.name, False))
+        if best.rough and known is not None and known.adequacy.rms_over_noise > NEAR:
+            smooth = self.problem(hypothesis, best.fit.values)
+            self.keep(hypothesis, fit_latent(smooth, smooth.start, self.noise, known_noise=True, steps=15), rough=False)
+            if self.tried[hypothesis.name, False].adequacy.rms_over_noise > NEAR:
+                return
         problem = self.problem(hypothesis, best.fit.values, rough=best.rough)
         tracks = best.fit.point.tracks if best.rough else Tracks((), {})
         fitted = fit_latent(
@@ -109,17 +132,22 @@ class Search:
             self.settled(candidates)
             or (near and self.on_a_rough_track(baseline, candidates))
             or (not near and self.shaken(candidates))
+            or self.paired(candidates)
             or self.roughened(candidates)
+            or self.shaken(candidates)
         ):
             return
-        if self.shaken(candidates):
-            return
+        self.paired(candidates)
+        self.roughened(candidates)
+
+    def paired(self, candidates: Sequence[Effect]) -> bool:
+        """Return whether one of the two best single effects leaves noise alone together with another."""
         for refit in self.ranked()[:2]:
             if len(refit.hypothesis.effects) == 1:
                 self.widen(refit, candidates, PAIRS, rough=refit.rough)
                 if self.best().adequacy.fine:
-                    break
-        self.roughened(candidates)
+                    return True
+        return False
 
     def on_a_rough_track(self, baseline: Refit, candidates: Sequence[Effect]) -> bool:
         """Return whether a rough track, alone or with an effect, accounts for what the baseline leaves."""
@@ -234,7 +262,7 @@ class Search:
 
     def keep(self, hypothesis: Hypothesis, fitted: LatentFit, *, rough: bool) -> Refit:
         """Return a fit judged, and remember it."""
-        self.evaluations += fitted.evaluations
+        self.evaluations += fitted.evaluations * (ROUGH_COSTS if rough else 1)
         runs = fitted.problem.runs
         residuals = {r.name: r.observed - fitted.point.predictions[r.name].y for r in runs}
         adequacy = replace(
@@ -331,7 +359,7 @@ class Search:
         if hypothesis.effects != start.hypothesis.effects:
             at |= self.own_values(hypothesis, added)
         problem = self.problem(hypothesis, at, rough=rough)
-        theta, squares = self.shortened(hypothesis, problem)
+        theta, squares = shortened(hypothesis, problem, self.noise)
         if not rough and squares > ASTRAY * start.fit.point.chi2:
             theta = self.follower.follow(hypothesis, at, self.noise, [LOOSE_ONLY]).theta
         tracks = start.fit.point.tracks if rough and start.rough else None if rough else Tracks((), {})
@@ -348,30 +376,6 @@ class Search:
             self.pulls[refit.name] = self.follower.around(refit.hypothesis, values, self.noise)
             self.evaluations += self.pulls[refit.name].evaluations
         return self.pulls[refit.name]
-
-    def shortened(self, hypothesis: Hypothesis, problem: Problem) -> tuple[Array, float]:
-        """Return the problem's start, the last effect's size cut where the whole of it leads astray, and chi-squared there."""
-        if not hypothesis.effects or not hypothesis.effects[-1].sizes:
-            return problem.start, 0.0
-        effect = hypothesis.effects[-1]
-        neutral = dict(effect.neutral)
-        places = [(problem.names.index(long), neutral[p.name]) for long, p in own_parameters(effect, problem.model).items()
-                  if p.name in neutral and long in problem.names]  # fmt: skip
-        best = (problem.start, np.inf)
-        for share in (1.0, 0.3, 0.0):
-            theta = problem.start.copy()
-            for i, value in places:
-                theta[i] = value + share * (theta[i] - value)
-            theta = np.clip(theta, problem.lower, problem.upper)
-            squares = 0.0
-            for run in problem.runs:
-                r = (run.observed - problem.predicted(run, theta, slopes=False).y)[run.used] / self.noise[
-                    run.name
-                ].level
-                squares += float(np.sum(np.where(np.isfinite(r), r, 1e6) ** 2))
-            if squares < best[1]:
-                best = (theta, squares)
-        return best
 
     def ranked(self) -> list[Refit]:
         """Return everything that was fitted, best evidence first; of the two forms of a hypothesis the better one."""

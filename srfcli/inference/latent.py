@@ -29,7 +29,12 @@ STEPS = 25
 SETTLED = 0.02  # gain of twice the log likelihood below which the minimum is reached
 EARLY = 2.0  # the same while roughness and noise still change
 HUGE = 1e100  # a slope that is no slope any more: its square would overflow
-FAR = 1e-6  # of chi-squared, the same where the model is nowhere near the data
+FAR = (
+    (1.5, 1e-6),
+    (4.0, 1e-4),
+    (np.inf, 1e-2),
+)  # of chi-squared, the same up to so many times the samples: no minimum there matters
+LOST = 30.0  # chi-squared per sample of a fit that is given up after one round
 
 
 @dataclass(frozen=True)
@@ -129,6 +134,7 @@ class Latent:
         self.rough = any(slot == "mu" for slot, _ in problem.model.namespace.get("TABLES", ()))
         self.scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
         self.evaluations = 0
+        self.samples = sum(int(run.used.sum()) for run in problem.runs)
 
     def predicted(self, run: Run, theta: Array, tracks: Tracks, *, slopes: bool = True) -> Prediction:
         """Return the prediction of a run, with slopes by parameters and by the numbers of its track."""
@@ -190,13 +196,18 @@ class Latent:
             if gained > 0:
                 point = trial
                 damping = 0.0 if damping < 1e-6 else damping / 8
-                if gained < max(settled, FAR * point.chi2):
+                if gained < self.worth(point, settled):
                     break
             else:
-                if gain < max(settled, FAR * point.chi2) or damping > 1e6:
+                if gain < self.worth(point, settled) or damping > 1e6:
                     break
                 damping = max(8 * damping, 1e-4)
         return point
+
+    def worth(self, point: Point, settled: float) -> float:
+        """Return the gain below which a further step is not worth it."""
+        share = point.chi2 / max(self.samples, 1)
+        return max(settled, next(far for most, far in FAR if share < most or most == np.inf) * point.chi2)
 
     def _step(self, point: Point, L: Array, free: Array, damping: float) -> tuple[Array, float]:
         """Return the step over (scaled theta, numbers), and what it should gain in minus twice the log posterior."""
@@ -362,7 +373,8 @@ def fit_latent(problem: Problem, theta: Array, noise: Mapping[str, Noise], *, tr
         if point.tracks.splines:
             found = _marginal_at(point, n, grid)
             total, smooth = found.log_likelihood, found.smooth
-        if abs(total - before) < 0.5 or (known_noise and not point.tracks.splines):
+        settled = known_noise and (not point.tracks.splines or point.chi2 > LOST * latent.samples)
+        if abs(total - before) < 0.5 or settled:
             break
         before = total
     return LatentFit(problem, point, noise, total, smooth, latent.evaluations)

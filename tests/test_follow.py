@@ -1,0 +1,147 @@
+"""Fits under a pull: what a pull does to a motion, that its slopes are true, and that it leads where a free fit gets lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from srfcli.diagnosis.candidates import Hypothesis
+from srfcli.diagnosis.follower import FOLLOWED, PULLS, Follower
+from srfcli.inference.fit import first_level
+from srfcli.inference.follow import pull_towards, slip_length, smoothed, weaker
+from srfcli.inference.noise import Noise
+from srfcli.numerics.compiled import compiler
+from srfcli.proof.draw import Gauge
+from srfcli.proof.folder import case_files
+from srfcli.proof.gauge import read_gauge
+from srfcli.proof.motion import move
+from srfcli.proof.physics import Physics
+from srfcli.proof.protocol import Plan
+from srfcli.recording.experiment import read_experiment
+from srfcli.registry import bundled_registry
+
+SHIPPED = bundled_registry()
+PLANS = (
+    Plan("steps", ((0.6, 4), (0.4, 60), (0.6, 8)), 3.0, 0.002),
+    Plan("stickslip", ((0.3, 12), (3, 8)), 9.2, 0.004),
+)
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here")
+
+
+@pytest.fixture(scope="module", params=["elastic with mass", "quasi-static"])
+def experiment(request, tmp_path_factory):
+    """A stick-slip record and velocity steps, with and without a mass in the model; the truth beside it."""
+    p = Physics(massless=request.param == "quasi-static")
+    folder = tmp_path_factory.mktemp("follow")
+    rng = np.random.default_rng(5)
+    for name, text in case_files("small", p, {q: read_gauge(move(p, q).u, Gauge(), rng) for q in PLANS}).items():
+        (folder / name).write_text(text)
+    return p, read_experiment(folder, registry=SHIPPED)
+
+
+def rms(x):
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def pulled_problem(experiment, length):
+    pull = pull_towards(experiment, experiment.runs, length)
+    return Hypothesis().problem(SHIPPED, experiment, rough=False, pull=pull)
+
+
+def test_a_strong_pull_follows_anything_and_none_is_the_free_motion(experiment):
+    """Over a hundredth of a slip length a wrong model shows the recording; over a million of them it moves freely."""
+    _, ex = experiment
+    free = Hypothesis().problem(SHIPPED, ex, rough=False)
+    theta = free.start * 1.1
+    for run in free.runs:
+        noise = first_level(run)
+        unbound = free.predicted(run, theta, slopes=False).y
+        assert rms(unbound - run.observed) > 20 * noise
+        tight = pulled_problem(ex, 0.004).predicted(run, theta, slopes=False).y
+        assert rms(tight - run.observed) < 0.1 * rms(unbound - run.observed)
+        loose = pulled_problem(ex, 1e6).predicted(run, theta, slopes=False).y
+        assert loose == pytest.approx(unbound, abs=2e-3)
+
+
+def test_slopes_under_a_pull_are_true(experiment):
+    """By every free parameter, against central differences."""
+    _, ex = experiment
+    problem = replace(pulled_problem(ex, 2.0), rtol=1e-11)
+    run = problem.runs[0]
+    J = problem.predicted(run, problem.start).J
+    for k in range(problem.start.size):
+        h = 1e-4 * problem.start[k] * np.eye(problem.start.size)[k]
+        ends = [problem.predicted(run, problem.start + s * h, slopes=False).y for s in (1, -1)]
+        difference = (ends[0] - ends[1]) / (2 * h[k])
+        assert J[:, k] == pytest.approx(difference, abs=2e-3 * np.abs(difference).max()), problem.names[k]
+
+
+def test_the_truth_needs_no_pull(experiment):
+    """At the true parameters the residual is noise under any pull."""
+    p, ex = experiment
+    values = {"mu0": p.mu0, "A": p.A, "B": p.B, "D0": p.D0, "Vsat": p.Vsat, "lambda": p.lam}
+    for length in (1.0, 4.0, 1e6):
+        problem = pulled_problem(ex, length)
+        theta = np.array([values[n] for n in problem.names])
+        for run in problem.runs:
+            rms = float(np.std(problem.predicted(run, theta, slopes=False).y - run.observed))
+            assert 0.7 * 0.02 < rms < 1.4 * 0.02, (length, run.name)
+
+
+def test_it_leads_from_afar(experiment):
+    """From parameters at which stick-slip comes at the wrong times, the way down ends where the noise is."""
+    p, ex = experiment
+    follower = Follower(SHIPPED, ex, None)
+    noise = {r.name: Noise(first_level(r)) for r in ex.runs}
+    far = {"mu0": 0.34, "A": 0.0105, "B": 0.021, "D0": 0.55, "Vsat": 400.0, "lambda": 0.9}
+    start = follower.problem(Hypothesis(), far)
+    if not p.massless:  # the other finds its way from here by itself
+        assert follower.descend(start, start.start, noise, 1e-4)[1] > 10 * FOLLOWED
+    found = follower.follow(Hypothesis(), far, noise, PULLS)
+    assert found.reduced < 1.5
+    assert dict(zip(found.problem.names, found.theta, strict=True))["D0"] == pytest.approx(p.D0, rel=0.05)
+
+
+def test_recordings_in_other_units_pull_alike(experiment):
+    """A record of the spring's force, or of friction, draws the spring as the record of its elongation does."""
+    _, ex = experiment
+    problem = pulled_problem(ex, 1.0)
+    run = problem.runs[0]
+    K, W = run.stiffness, run.load(run.t)[0]
+    as_force = replace(run, observable="force", observed=K * run.observed)
+    as_friction = replace(run, observable="friction", observed=K * run.observed / W)
+    there = problem.predicted(run, problem.start, slopes=False).y
+    for other, factor in ((as_force, K), (as_friction, K / W)):
+        experiment_of_it = replace(ex, runs=(other,))
+        pull = pull_towards(experiment_of_it, [other], 1.0)
+        assert pull.table == ("force", "time")
+        found = Hypothesis().problem(SHIPPED, experiment_of_it, rough=False, pull=pull)
+        y = found.predicted(other, problem.start, slopes=False).y
+        assert y / factor == pytest.approx(there, abs=1e-4)
+    mixed = pull_towards(ex, [run, replace(as_force, name="other")], 1.0)
+    assert mixed.table == ("elongation", "time")
+    assert mixed.records["other"].numbers == pytest.approx(mixed.records[run.name].numbers, abs=1e-9)
+
+
+def test_the_pulling_spline_bridges_what_was_not_recorded():
+    """Straight over a gap, close to the samples elsewhere."""
+    t = np.linspace(0, 1, 501)
+    y = np.sin(6 * t)
+    used = (t < 0.4) | (t > 0.5)
+    y[~used] = 1e3
+    found = smoothed(t, y, used, 0.004)(t)
+    assert found[used] == pytest.approx(np.sin(6 * t[used]), abs=2e-3)
+    assert np.abs(found[~used] - np.sin(6 * t[~used])).max() < 0.05
+
+
+def test_lengths(experiment):
+    """The pull's length is counted in slip lengths, its rate in driving."""
+    _, ex = experiment
+    problem = pulled_problem(ex, 1.0)
+    assert slip_length(problem.model, ex) == pytest.approx(0.4)
+    assert problem.pull is not None
+    for run in problem.runs:
+        speed = float(np.mean(run.drive(run.t)))
+        assert weaker(problem.pull, problem.runs, 5.0).rates[run.name] == pytest.approx(speed / 5.0)
