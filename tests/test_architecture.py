@@ -59,7 +59,7 @@ MAY: dict[str, set[str]] = {
     "paper": SYMBOLS | {"paper_forms", "units"},
     "render": SYMBOLS | {"derivation", "notation", "numpytext", "paper"},
     "settings": LAWS | {"units"},
-    "recording": LAW_FILES | {"registry", "units", "numerics", "system"},
+    "recording": LAW_FILES | {"registry", "units", "numerics", "splines", "system"},
     "numerics": BASE | {"cache", "model", "numerics", "splines"},
     "inference": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "settings", "splines", "units"},
     "diagnosis": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "inference", "splines", "units"},

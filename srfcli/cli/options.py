@@ -98,11 +98,11 @@ class SystemOptions:
 
         return build_system(self.registry(), **self._chosen())
 
-    def model(self) -> GeneratedModel:
-        """Return the numerical model of that system; sympy runs only where the cache has none."""
+    def model(self, *, tables: Sequence[tuple[str, str]] = ()) -> GeneratedModel:
+        """Return the numerical model of that system, with tables if asked for; sympy runs only where the cache has none."""
         from srfcli.model import open_model
 
-        return open_model(self.registry(), **self._chosen())
+        return open_model(self.registry(), **self._chosen(), tables=tables)
 
     def resolve(self, parameters: Sequence[Parameter], **given: str | float | None) -> Resolved:
         """Return every parameter's value and origin.

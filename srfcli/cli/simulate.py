@@ -26,6 +26,7 @@ srf simulate --V 8 --load '2:5, 0.2:5->7, 4:7' --csv
 srf simulate --drive '0.5:12, 4:8' --W0 9 --eps 0.09 --onset 2 --noise 0.02 --lag1 0.8 --quantum 0.005 --out-dir made
 srf simulate EXPERIMENT --run onset --plot onset.svg
 srf simulate EXPERIMENT --set lambda=0.5 --out-dir predicted
+srf simulate EXPERIMENT --roughness 3e-4 --roughness-length 10 --seed 1 --out-dir rough
 """
 RISE = 0.02  # s; five times the slider's bounce on its interface, at usual loads
 OWN_RECORD = {  # what describes a record of one's own: an experiment brings its own
@@ -96,6 +97,12 @@ def _options(function: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option("--lag1", type=float, default=0.0, help="Correlation of the noise from sample to sample, as 0.8."),
         click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded."),
+        click.option(
+            "--roughness", metavar="SIZE", help="Standard deviation by which mu0 wanders along the track, as 3e-4."
+        ),
+        click.option(
+            "--roughness-length", metavar="UM", help="Correlation length of the track, in um.  [default: 10 um]"
+        ),
         click.option(
             "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is random."
         ),
@@ -220,7 +227,9 @@ def _simulate_all(work: Work, rtol: float) -> tuple[list[Record], Status]:
         try:
             for job in work.jobs:
                 progress.advance(0, note=job.name)
-                trace = simulate(work.model, job.p, drive=job.drive, load=job.load, t=job.t, start=job.start, rtol=rtol)
+                trace = simulate(
+                    work.model, job.p, drive=job.drive, load=job.load, t=job.t, start=job.start, tables=job.tables, rtol=rtol
+                )  # fmt: skip
                 observed = observe(work.model, job, trace)
                 records.append(Record(job, trace, observed, measure(work.gauge, job, observed)))
                 progress.advance()

@@ -19,6 +19,7 @@ from srfcli.cli.programs import (
     start_state,
     usual_rate,
 )
+from srfcli.cli.simulate_track import TABLES, found as track_found, described as track_described, on_track, read_track
 from srfcli.cli.simulated import UNITS, Job, Record, Work, read_gauge, simulated_run
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.units import parse_quantity

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from srfcli.numerics.integrate import Trace
     from srfcli.numerics.program import Drive, Load
     from srfcli.recording.values import Experiment, Run
+    from srfcli.splines import Spline
 
     Array = NDArray
 
@@ -31,7 +32,8 @@ STICK = 0.1  # of the driving velocity: a cycle whose slowest slip is below it s
 class Job:
     """One record to simulate: the parameters `p` (n_parameters,), what is imposed, and what is compared or written.
 
-    `run` is the recording that it repeats, None for a record of one's own; `ripple` the frequency of a modulation in Hz.
+    `run` is the recording that it repeats, None for a record of one's own; `ripple` the frequency of a modulation in Hz;
+    `tables` are those of the model, if it has any: the track.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Job:
     ripple: float | None = None
     modulation: tuple[float, float, float] | None = None
     run: Run | None = None
+    tables: tuple[Spline, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -97,6 +97,18 @@ class Follower:
         self.evaluations += search.evaluations
         return theta, search.reduced
 
+    def smallest(self, found: Followed) -> dict[str, Array]:
+        """Return the residuals (n,) by run, free or under a pull, whichever are smaller: they show the noise."""
+        tight = self.problem(Hypothesis(), {}, PULLS[0][0])
+        out = {}
+        for run in found.problem.runs:
+            both = [
+                run.observed - problem.predicted(run, theta, slopes=False).y
+                for problem, theta in ((found.problem, found.theta), (tight, found.pulled))
+            ]
+            out[run.name] = min(both, key=lambda r: float(np.nan_to_num(np.mean(r[run.used] ** 2), nan=np.inf)))
+        return out
+
     def around(self, hypothesis: Hypothesis, values: Mapping[str, float], noise: Mapping[str, Noise]) -> LatentFit:
         """Return the fit of a hypothesis under a loose pull, around which everything is nearly linear."""
         problem = self.problem(hypothesis, values, LOOSE)

@@ -15,11 +15,10 @@ from srfcli.diagnosis.follower import FAIR, FOLLOWED, LOOSE_ONLY, PULLS, Followe
 from srfcli.diagnosis.refits import Refit, freedom_spent
 from srfcli.diagnosis.score import Score, scores
 from srfcli.inference.fit import Problem, first_level
-from srfcli.inference.latent import STEPS, LatentFit, Tracks, evenness, fit_latent
+from srfcli.inference.latent import STEPS, LatentFit, Tracks, evenness, fit_latent, tracks_for
 from srfcli.inference.noise import Noise
 from srfcli.inference.prediction import RTOL
 from srfcli.laws import Effect
-from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
 
@@ -54,6 +53,7 @@ class Search:
     followed: dict[str, Followed] = field(default_factory=dict)
     pulls: dict[str, LatentFit] = field(default_factory=dict)
     shook: set[str] = field(default_factory=set)
+    shared: bool | None = None  # whether all runs slid on one rough track, once that was asked
     noise: dict[str, Noise] = field(default_factory=dict)
     evaluations: int = 0
 
@@ -74,19 +74,25 @@ class Search:
         return self.ranked()
 
     def doubt(self, candidates: Sequence[Effect]) -> None:
-        """Fit the baseline on a rough track where that might be all there is: a wave along it is easily seen in any track."""
-        bare, best = self.tried["none", False], self.best()
-        if best.rough or not best.hypothesis.effects or ("none", True) in self.tried:
-            return
-        wandering = any(along_table(e) for e in best.hypothesis.effects)
-        if bare.adequacy.rms_over_noise < (NEAR if wandering else HALFWAY):
-            rough = self.refit(Hypothesis(), bare, {}, rough=True)
-            if rough.evidence > best.evidence:
-                self.widen(rough, candidates, PAIRS, rough=True)
-        for effect in best.hypothesis.effects if len(best.hypothesis.effects) > 1 else ():
-            alone = self.tried.get((effect.name, False))
-            if alone is not None and alone.adequacy.rms_over_noise < HALFWAY and (effect.name, True) not in self.tried:
-                self.refit(alone.hypothesis, alone, {}, rough=True)
+        """Fit, on a rough track, what the best hypothesis is made of: a wave or a drift is easily seen in any rough track."""
+        best, self.shared = self.best(), None
+        effects = best.hypothesis.effects
+        wandering = [e for e in effects if along_table(e) and e.changes[0][0] == "mu"]
+        within = NEAR if wandering else HALFWAY
+        simpler = [tuple(e for e in effects if e is not w) for w in (wandering or (() if best.rough else effects))]
+        for left in simpler:
+            known = self.tried.get((Hypothesis(left).name, False)) or self.fitted(Hypothesis(left), best)
+            if known.adequacy.rms_over_noise < within:
+                found = self.refit(known.hypothesis, known, {}, rough=True)
+                if found.evidence > best.evidence:
+                    self.widen(found, candidates, PAIRS, rough=True)
+
+    def fitted(self, hypothesis: Hypothesis, best: Refit) -> Refit:
+        """Fit a hypothesis on a smooth track from where a larger one stands."""
+        problem = self.problem(hypothesis, best.fit.values)
+        return self.keep(
+            hypothesis, fit_latent(problem, problem.start, self.noise, known_noise=True, steps=15), rough=False
+        )
 
     def rebase(self) -> None:
         """Fit what the best hypothesis is made of, and the baseline, from where the best one stands.
@@ -107,11 +113,9 @@ class Search:
     def again(self, hypothesis: Hypothesis, best: Refit) -> None:
         """Fit a hypothesis from the parameters of a larger one, on a rough track only where a smooth one has little left."""
         known = self.tried.get((hypothesis.name, False))
-        if best.rough and known is not None and known.adequacy.rms_over_noise > NEAR:
-            smooth = self.problem(hypothesis, best.fit.values)
-            self.keep(hypothesis, fit_latent(smooth, smooth.start, self.noise, known_noise=True, steps=15), rough=False)
-            if self.tried[hypothesis.name, False].adequacy.rms_over_noise > NEAR:
-                return
+        far = best.rough and known is not None and known.adequacy.rms_over_noise > NEAR
+        if far and self.fitted(hypothesis, best).adequacy.rms_over_noise > NEAR:
+            return
         problem = self.problem(hypothesis, best.fit.values, rough=best.rough)
         tracks = best.fit.point.tracks if best.rough else Tracks((), {})
         fitted = fit_latent(
@@ -239,7 +243,7 @@ class Search:
             found = self.follower.follow(bare, {}, self.noise or level, [way])
             if bare.name not in self.followed or found.reduced < self.followed[bare.name].reduced:
                 self.followed[bare.name] = found
-            self.noise = gauge_noise(runs, self.smallest(found))
+            self.noise = gauge_noise(runs, self.follower.smallest(found))
             if found.reduced < FOLLOWED:
                 break
         best = self.followed[bare.name]
@@ -247,18 +251,6 @@ class Search:
         return self.keep(
             bare, fit_latent(self.problem(bare), best.theta, self.noise, known_noise=True, steps=steps), rough=False
         )
-
-    def smallest(self, found: Followed) -> dict[str, Array]:
-        """Return the residuals (n,) by run, free or under a pull, whichever are smaller: they show the noise."""
-        tight = self.follower.problem(Hypothesis(), {}, PULLS[0][0])
-        out = {}
-        for run in found.problem.runs:
-            both = [
-                run.observed - problem.predicted(run, theta, slopes=False).y
-                for problem, theta in ((found.problem, found.theta), (tight, found.pulled))
-            ]
-            out[run.name] = min(both, key=lambda r: float(np.nan_to_num(np.mean(r[run.used] ** 2), nan=np.inf)))
-        return out
 
     def keep(self, hypothesis: Hypothesis, fitted: LatentFit, *, rough: bool) -> Refit:
         """Return a fit judged, and remember it."""
@@ -362,10 +354,21 @@ class Search:
         theta, squares = shortened(hypothesis, problem, self.noise)
         if not rough and squares > ASTRAY * start.fit.point.chi2:
             theta = self.follower.follow(hypothesis, at, self.noise, [LOOSE_ONLY]).theta
-        tracks = start.fit.point.tracks if rough and start.rough else None if rough else Tracks((), {})
-        roughness = start.fit.point.roughness if rough else None
-        fitted = fit_latent(problem, theta, self.noise, tracks=tracks, roughness=roughness, known_noise=True)
-        return self.keep(hypothesis, fitted, rough=rough)
+        if not rough:
+            fitted = fit_latent(problem, theta, self.noise, tracks=Tracks((), {}), known_noise=True)
+            return self.keep(hypothesis, fitted, rough=False)
+        if start.rough:
+            fitted = fit_latent(
+                problem, theta, self.noise, tracks=start.fit.point.tracks, roughness=start.fit.point.roughness,
+                known_noise=True,
+            )  # fmt: skip
+            return self.keep(hypothesis, fitted, rough=True)
+        for shared in (False, True) if self.shared is None else (self.shared,):
+            tracks = tracks_for(problem.runs, shared=shared)
+            fitted = fit_latent(problem, theta, self.noise, tracks=tracks, known_noise=True)
+            if self.keep(hypothesis, fitted, rough=True).fit is fitted:
+                self.shared = shared
+        return self.tried[hypothesis.name, True]
 
     def pulled(self, refit: Refit) -> LatentFit:
         """Return a hypothesis' fit under a loose pull: where it does not follow the recording, slopes mean something there."""

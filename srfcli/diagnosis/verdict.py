@@ -53,6 +53,7 @@ class Diagnosis:
     held: tuple[Held, ...]
     noise: dict[str, Noise]
     reasons: tuple[str, ...]
+    ungated: str = ""  # the verdict, had held-out runs no say
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -85,7 +86,7 @@ def conclude(search: Search, held_out: Experiment) -> Diagnosis:
     return Diagnosis(
         held_out, found, best, baseline, ranked, close, _confidence(ranked, found, best), tuple(listed), tuple(unseen),
         {s.effect.reported: s.detectable for s in listed}, _equivalent(listed, close),
-        held, search.noise, tuple(reasons),
+        held, search.noise, tuple(reasons), _verdict(best, baseline, close, (), search)[0],
     )  # fmt: skip
 
 

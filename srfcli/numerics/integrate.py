@@ -6,6 +6,7 @@ singularity. What is imposed is smooth from discontinuity to discontinuity, and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from srfcli.numerics.collocation import Array
 from srfcli.numerics.load import Load
 from srfcli.numerics.motion import integrate
 from srfcli.numerics.program import Drive
+from srfcli.splines import Spline, appended
 from srfcli.status import Status
 
 
@@ -54,22 +56,26 @@ def simulate(
     load: Load,
     t: Array,
     start: Array | None = None,
+    tables: Sequence[Spline] = (),
     rtol: float = 1e-8,
     atol: Array | float | None = None,
 ) -> Trace:
     """Return the motion at the rising times `t` (s) of the model with parameters `p` (n_parameters,) under `drive` and `load`.
 
     It starts at t[0] in the state `start` (n,), else in steady sliding under the load at rest. The parameters V, W0, eps and f
-    in `p` are not used: drive and load stand in their place. `atol` is per state; left out, it is rtol times 1 for logarithms
-    and lengths (um) and rtol times the largest driving velocity for velocities. Errors are local, per step. Misuse raises
-    SrfError; an integration that stops early is a status.
+    in `p` are not used: drive and load stand in their place. A model with tables takes them in order. `atol` is per state; left
+    out, it is rtol times 1 for logarithms and lengths (um) and rtol times the largest driving velocity for velocities. Errors
+    are local, per step. Misuse raises SrfError; an integration that stops early is a status.
     """
     t, q = np.asarray(t, dtype=float), _parameters(model, p, drive, load, t)
     load.check(t[0], t[-1])
     n = len(model.states)
     tolerances = _absolute(model, drive, t, rtol) if atol is None else np.broadcast_to(np.asarray(atol, float), (n,))
-    motion = integrate(model, q, drive=drive, load=load, t=t, start=_start(model, q, start), rtol=rtol, atol=tolerances)
-    return _trace(model, q, drive, load, t, motion.x, motion.status, motion.reached)
+    full = appended(q, tables)
+    motion = integrate(
+        model, q, drive=drive, load=load, t=t, start=_start(model, full, start), tables=tables, rtol=rtol, atol=tolerances
+    )  # fmt: skip
+    return _trace(model, full, drive, load, t, motion.x, motion.status, motion.reached)
 
 
 def _parameters(model: GeneratedModel, p: Array, drive: Drive, load: Load, t: Array) -> Array:

@@ -20,8 +20,8 @@ class Answer:
     """One case's answer: verdict, effects and stated confidence by hypothesis, "a+b" for two effects together.
 
     `fit` holds the fitted runs' rms over noise, `held` each held-out run's rms in um and over noise, by `baseline` and
-    `augmented`; `parameters` are those that the effects brought, in declared units; `cpu` and `wall` are in s; `code` tells
-    programs apart.
+    `augmented`; `parameters` are those that the effects brought, in declared units; `tried` has what was fitted, `ungated` the
+    verdict without a say of held-out runs; `cpu` and `wall` are in s; `code` tells programs apart.
     """
 
     case: str
@@ -33,6 +33,8 @@ class Answer:
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     fit: Mapping[str, float | None] = field(default_factory=dict)
     held: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    tried: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    ungated: str = ""
     cpu: float = 0.0
     wall: float = 0.0
     code: str = ""

@@ -23,6 +23,7 @@ from srfcli.trial.answer import FAILED, Answer
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.answer import RunView
+    from srfcli.diagnosis.refits import Refit
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.registry import Registry
 
@@ -95,7 +96,21 @@ def told(diagnosis: Diagnosis, *, case: str) -> Answer:
             "augmented": _finite(final(diagnosis).adequacy.rms_over_noise),
         },
         {view.run.name: _errors(view) for view in run_views(diagnosis) if view.holdout},
+        {"+".join(sorted(r.hypothesis.reported)) or "none": _evidence(r) for r in reversed(diagnosis.ranked)},
+        diagnosis.ungated,
     )
+
+
+def _evidence(refit: Refit) -> Mapping[str, float]:
+    """Return what ranks a refit: log likelihood, how many parameters and samples it has, evidence, and whether noise is left."""
+    problem = refit.fit.problem
+    return {
+        "log_likelihood": round(float(refit.fit.log_likelihood), 3),
+        "parameters": len(problem.names) + 2 * refit.rough,
+        "samples": sum(int(run.used.sum()) for run in problem.runs),
+        "evidence": round(float(refit.evidence), 3),
+        "fine": int(refit.adequacy.fine),
+    }
 
 
 def _errors(view: RunView) -> Mapping[str, float | None]:

@@ -43,6 +43,7 @@ class Mark:
     error: float | None
     baseline_error: float | None
     deviation: tuple[float, float] | None = None
+    accepted: Accepted = frozenset()
 
     @property
     def visible(self) -> bool:
@@ -92,6 +93,7 @@ def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
         _ratio(answer, sight, "augmented"),
         _ratio(answer, sight, "baseline"),
         deviation(truth, answer),
+        allowed,
     )
 
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 from srfcli.output.tables import Column, Table
+from srfcli.trial.ablated import ablated
 from srfcli.trial.answer import VERDICTS
 from srfcli.trial.mark import CONFIDENT, INVISIBLE, KINDS, Mark
 from srfcli.trial.rates import Bin, Rate, calibration, quantile, rate
@@ -35,6 +36,7 @@ def tables(marks: Sequence[Mark], *, digest: str, seed: int, of: int) -> tuple[T
         held(marks),
         sizes(marks),
         cost(marks),
+        ablated(marks),
     ]
     more = [t for t in more if t.rows]
     meta: dict[str, Any] = {
