@@ -94,9 +94,9 @@ def _evaluated(n: int, order: int, p: Any, i: int, x: Any) -> Any:
     low, high = (real <= first), (real >= first + spacing * (count - 3))
     share = np.where(low, 0.0, np.where(high, 1.0, share))
     total: Any = 0.0
-    numbers = np.asarray(p[int(place) : int(place) + int(count)])
+    numbers, at = (np.asarray(p) if np.ndim(x) else p), int(place) + cell  # a list at one x: a long one is never copied
     for k, w in enumerate(_WEIGHTS[order](share)):
-        total = total + w * numbers[cell + k]
+        total = total + w * numbers[at + k]
     total = total / spacing**order
     if order:
         total = np.where(low | high, 0.0, total)

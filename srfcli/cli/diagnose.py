@@ -12,6 +12,7 @@ from srfcli.cli.options import Session, SrfCommand
 from srfcli.errors import SrfError, did_you_mean
 
 if TYPE_CHECKING:
+    from srfcli.diagnosis.parting import Parting
     from srfcli.diagnosis.search import Search
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.registry import Registry
@@ -31,7 +32,13 @@ srf fit found/augmented                              the augmented model is an e
 @click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
 @plugins_option
 @click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the noise that is simulated for p-values.")
+@click.option(
+    "--seed",
+    type=int,
+    default=0,
+    show_default=True,
+    help="Of the noise that is simulated for p-values, and of runs that are tried.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one object, in full precision.")
 @click.option("--out", metavar="DIR", help="Write answer, report, predictions and augmented experiment to DIR.")
 @click.option("--force", is_flag=True, help="Replace a diagnosis that is in DIR already.")
@@ -100,7 +107,8 @@ def _diagnose(
         last = None if final(diagnosis) is diagnosis.baseline else final(diagnosis).fit
         location = locate(diagnosis.baseline.fit, diagnosis.noise, last=last, seed=options["seed"])
         missing = _explained(search, diagnosis) if status is Status.OK else {}
-    found = plain_value(answer(diagnosis, location))
+        parting = _parted(registry, diagnosis, options["seed"]) if status is Status.OK else None
+    found = plain_value(answer(diagnosis, location, parting=parting))
     if missing:
         found["missing"] = plain_value({k: v for k, v in missing.items() if k not in ("force", "toml")})
     if status is not Status.OK:
@@ -111,7 +119,7 @@ def _diagnose(
         seconds = time.perf_counter() - begun
         write_answer(
             folder, found, diagnosis, location, registry, reader=options["reader"], seed=options["seed"], seconds=seconds,
-            force=options["force"], missing=missing,
+            force=options["force"], missing=missing, parting=parting,
         )  # fmt: skip
     if options["as_json"]:
         click.echo(json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False))
@@ -125,6 +133,15 @@ def _explained(search: Search, diagnosis: Diagnosis) -> dict[str, Any]:
     from srfcli.diagnosis.terms import explain_unknown
 
     return explain_unknown(search, diagnosis) if diagnosis.verdict == "unknown" else {}
+
+
+def _parted(registry: Registry, diagnosis: Diagnosis, seed: int) -> Parting | None:
+    """Return the run that would part what is ambiguous; nothing for other verdicts."""
+    if diagnosis.verdict != "ambiguous":
+        return None
+    from srfcli.diagnosis.parting import parting_experiment
+
+    return parting_experiment(registry, diagnosis, seed=seed)
 
 
 def _searched(search: Search) -> Any:

@@ -20,6 +20,7 @@ from srfcli.output.files import write_atomic
 if TYPE_CHECKING:
     from srfcli.diagnosis.answer import RunView
     from srfcli.diagnosis.locate import Location
+    from srfcli.diagnosis.parting import Parting
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.registry import Registry
 
@@ -93,8 +94,12 @@ def write_answer(
     seconds: float,
     force: bool = False,
     missing: Mapping[str, Any] | None = None,
+    parting: Parting | None = None,
 ) -> None:
-    """Write answer, predictions, augmented experiment, report and figures; of a `missing` force its closed form, as an effect."""
+    """Write answer, predictions, augmented experiment, report and figures; of a `missing` force its closed form, as an effect.
+
+    Of a `parting` run an experiment for each hypothesis is written.
+    """
     from srfcli.diagnosis.answer import final, material, run_views
     from srfcli.diagnosis.augment import augment
     from srfcli.diagnosis.diagram import stability
@@ -133,8 +138,26 @@ def write_answer(
             made_of["force"] = missing["force"]
             if missing["toml"] is not None:
                 write_atomic(fresh / FORM, missing["toml"])
+        if parting is not None:
+            made_of["parting"] = _proposed(fresh, folder, found, diagnosis, registry, parting, reader=reader)
         _report(fresh, found, made_of)
     Session.current().say(f"Wrote {folder}")
+
+
+def _proposed(
+    fresh: Path, folder: Path, found: Mapping[str, Any], diagnosis: Diagnosis, registry: Registry, parting: Parting, *,
+    reader: str | None,
+) -> list[str]:  # fmt: skip
+    """Write what each hypothesis foretells of the run that would part them, and return what the report says of it."""
+    from srfcli.diagnosis.partingtext import parting_files
+
+    told = found["experiment"]
+    if not told["parts"]:
+        return list(told["sentences"])
+    for place, text in parting_files(registry, diagnosis, parting, folder=folder, reader=reader).items():
+        (fresh / place).parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(fresh / place, text)
+    return [*told["sentences"], told["run"]]
 
 
 def _report(folder: Path, found: dict[str, Any], made: dict[str, Any]) -> None:

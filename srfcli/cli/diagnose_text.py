@@ -105,6 +105,7 @@ def _notes(found: dict[str, Any]) -> list[str]:
     notes += [f"{a} and {b} cannot be told apart by these recordings" for a, b in found["equivalent"]]
     notes += [f"{x['effect']} is not identifiable: {x['reason']}" for x in found["not_identifiable"]]
     notes += _missing(found.get("missing") or {})
+    notes += (found.get("experiment") or {}).get("sentences", [])
     for effect, size in found.get("detectable", {}).items():
         notes.append(f"{effect} could have been seen from a size of {size:.3g} on")
     return notes

@@ -19,7 +19,7 @@ from srfcli.cli.programs import (
     start_state,
     usual_rate,
 )
-from srfcli.cli.simulate_track import TABLES, found as track_found, described as track_described, on_track, read_track
+from srfcli.cli.simulate_track import TABLES, on_track, read_track, track_parameters, track_told
 from srfcli.cli.simulated import UNITS, Job, Record, Work, read_gauge, simulated_run
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.units import parse_quantity
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from srfcli.laws import Parameter
     from srfcli.model import GeneratedModel
     from srfcli.numerics.program import Load
+    from srfcli.recording.track import RoughTrack
     from srfcli.recording.values import Experiment, FitParameter
     from srfcli.settings import Resolved
 
@@ -54,9 +55,13 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     load, modulation = _modulated(base, given["onset"], values, begin)
     load.check(float(t[0]), float(t[-1]))
     start = start_state(model, p, given["start"], drive=drive, load=load.rest(begin), begin=begin)
-    job = Job(NAME, p, drive, load, t, start, observable, f, modulation)
+    job, mover = Job(NAME, p, drive, load, t, start, observable, f, modulation), model
+    if (track := _track(system, given)) is not None:
+        mover = system.model(tables=TABLES)
+        job = on_track(model, mover, job, track, start=given["start"])
     gauge = read_gauge(given, UNITS[observable])
-    described = _described(resolved, given)
+    described = _described(resolved, given) | track_parameters(track, given)
+    noted, told = track_told(track)
     chosen = _free(model, given["free"])
     spread = parse_spread(given["start_values"])
     if given["folder"] is not None and system.loading.value != "vertical":
@@ -65,14 +70,23 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
         )
 
     def experiment(records: Sequence[Record]) -> Experiment:
-        runs = tuple(simulated_run(model, r, quantum=gauge.quantum) for r in records)
+        runs = tuple(simulated_run(mover, r, quantum=gauge.quantum) for r in records)
         fitted = fit_parameters(model, values, chosen)
         return _experiment(system, model, given["folder"], values, perturbed(fitted, spread, gauge.seed), runs)
 
     inputs = () if given["load_file"] is None else (given["load_file"],)
-    notes = (*found, *_sampling_notes(rates, f, given, pieces))
-    meta = {"rate_Hz": sorted(set(rates)), "rtol": given["rtol"], "onset": modulation and modulation[2]}
-    return Work(model, (job,), gauge, described, experiment, inputs, notes, meta)
+    notes = (*found, *noted, *_sampling_notes(rates, f, given, pieces))
+    meta = {"rate_Hz": sorted(set(rates)), "rtol": given["rtol"], "onset": modulation and modulation[2], **told}
+    return Work(mover, (job,), gauge, described, experiment, inputs, notes, meta)
+
+
+def _track(system: SystemOptions, given: Mapping[str, Any]) -> RoughTrack | None:
+    track = read_track(given)
+    if track is not None and system.loading.value != "vertical":
+        raise SrfError(
+            "a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined."
+        )
+    return track
 
 
 def _drive_pieces(given: Mapping[str, Any], V: float, span: float | None) -> tuple[Piece, ...]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from srfcli.cli.options import Session, SystemOptions
 from srfcli.cli.programs import start_state
 from srfcli.cli.simulate_own import bounds, parse_spread, perturbed
+from srfcli.cli.simulate_track import TABLES, on_track, read_track, track_parameters, track_told
 from srfcli.cli.simulated import UNITS, Job, Record, Work, read_gauge, simulated_run
 from srfcli.errors import SrfError, did_you_mean
 
@@ -39,20 +40,24 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
         )
     gauge = read_gauge(given, UNITS[runs[0].observable])
     spread = parse_spread(given["start_values"])
-    jobs = tuple(_job(model, experiment, run, flags, given["start"]) for run in runs)
+    jobs, mover = tuple(_job(model, experiment, run, flags, given["start"]) for run in runs), model
+    if (track := read_track(given)) is not None:
+        mover = _open(registry, choice, tables=TABLES)
+        jobs = tuple(on_track(model, mover, job, track, start=given["start"]) for job in jobs)
 
     def made(records: Sequence[Record]) -> Experiment:
-        again = tuple(simulated_run(model, r, quantum=gauge.quantum) for r in records)
+        again = tuple(simulated_run(mover, r, quantum=gauge.quantum) for r in records)
         return _written(
             experiment, model, choice, flags, perturb=(spread, gauge.seed), runs=again, folder=given["folder"]
         )
 
-    described = _described(model, experiment, flags)
+    described = _described(model, experiment, flags) | track_parameters(track, given)
+    noted, told = track_told(track)
     inputs = (_description_file(path), *(run.file for run in runs))
     free = [run.name for run in runs if run.initial == "free"]
     notes = (f"initial state of {', '.join(free)} not known: begun in steady sliding",) if free else ()
-    meta = {"title": experiment.title, "rtol": given["rtol"]}
-    return Work(model, jobs, gauge, described, made, inputs, notes, meta)
+    meta = {"title": experiment.title, "rtol": given["rtol"], **told}
+    return Work(mover, jobs, gauge, described, made, inputs, (*notes, *noted), meta)
 
 
 def _choice(system: SystemOptions, choice: ModelChoice) -> ModelChoice:
@@ -63,7 +68,7 @@ def _choice(system: SystemOptions, choice: ModelChoice) -> ModelChoice:
     return dataclasses.replace(choice, **{k: s.value for k, s in named.items() if s.origin == "flag"})
 
 
-def _open(registry: Registry, choice: ModelChoice) -> GeneratedModel:
+def _open(registry: Registry, choice: ModelChoice, *, tables: Sequence[tuple[str, str]] = ()) -> GeneratedModel:
     from srfcli.model import open_model
 
     return open_model(
@@ -73,6 +78,7 @@ def _open(registry: Registry, choice: ModelChoice) -> GeneratedModel:
         interface=choice.interface,
         inertia=choice.inertia,
         effects=choice.effects,
+        tables=tables,
     )
 
 
@@ -101,7 +107,7 @@ def _chosen(experiment: Experiment, names: Sequence[str]) -> tuple[Run, ...]:
 def _job(model: GeneratedModel, experiment: Experiment, run: Run, flags: Mapping[str, float], start: str) -> Job:
     begin = float(run.t[0])
     mass = {"M": experiment.mass} if experiment.mass and "M" in model.names else {}
-    values = _values(model, experiment) | {"K": run.stiffness} | mass | dict(flags)
+    values = _values(model, experiment) | {"K": run.stiffness} | mass | _asked_by_effects(model, run) | dict(flags)
     p = model.vector(values)
     try:
         state = start_state(model, p, start, drive=run.drive, load=run.load.rest(begin), begin=begin)
@@ -109,6 +115,15 @@ def _job(model: GeneratedModel, experiment: Experiment, run: Run, flags: Mapping
         raise SrfError(f"run {run.name!r}: {error.message}", error.hint) from error
     ripple = run.modulation[0] if run.modulation else None
     return Job(run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run)
+
+
+def _asked_by_effects(model: GeneratedModel, run: Run) -> dict[str, float]:
+    """Return where and when the run begins and how its load is modulated, of which effects make use."""
+    if "begin" not in model.names:
+        return {}
+    from srfcli.inference.prediction import of_run
+
+    return of_run(run)
 
 
 def _values(model: GeneratedModel, experiment: Experiment) -> dict[str, float]:

@@ -59,7 +59,7 @@ def _check_size(model: GeneratedModel, job: Job, track: RoughTrack) -> None:
     if not track.size <= LARGEST * mu0:
         raise SrfError(
             f"--roughness {track.size:g} is more than half of mu0 = {mu0:g}",
-            "It is the standard deviation of mu0 along the track; real ones wander by 1e-4 to 1e-2.",
+            "It is the standard deviation of mu0 along the track, such as 3e-4.",
         )
 
 
@@ -78,8 +78,10 @@ def _reach(model: GeneratedModel, job: Job) -> float:
     return max(float(driven.max()), 0.0) + 2 * held + drawn
 
 
-def described(track: RoughTrack, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the two options as parameters are described: value, unit and origin."""
+def track_parameters(track: RoughTrack | None, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the two options as parameters are described: value, unit and origin; nothing for a smooth track."""
+    if track is None:
+        return {}
     origin = "default" if given["roughness_length"] is None else "flag"
     return {
         "roughness": {"value": track.size, "unit": "1", "origin": "flag"},
@@ -87,7 +89,7 @@ def described(track: RoughTrack, given: Mapping[str, Any]) -> dict[str, dict[str
     }
 
 
-def found(track: RoughTrack | None) -> tuple[tuple[str, ...], dict[str, Any]]:
+def track_told(track: RoughTrack | None) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return the note on a track and its entry in a result's meta, as `srf fit` has them; nothing for a smooth one."""
     if track is None:
         return (), {}

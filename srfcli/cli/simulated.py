@@ -68,11 +68,15 @@ class Record:
 
 
 def observe(model: GeneratedModel, job: Job, trace: Trace) -> Array:
-    """Return what the apparatus would record: the spring's elongation (um), its force (N), or that over the load."""
-    K = float(job.p[model.index("K")])
+    """Return what the apparatus would record: the spring's elongation (um), its force (N), or that over the load.
+
+    The elongation is the one that a gauge shows, where an effect stands between the two.
+    """
+    K, shown = float(job.p[model.index("K")]), model.namespace.get("OBSERVED") or "u"
+    u = trace.state(shown) if shown in model.states else trace.u
     if job.observable == "elongation":
-        return trace.u
-    return K * trace.u if job.observable == "force" else K * trace.u / trace.W
+        return u
+    return K * u if job.observable == "force" else K * u / trace.W
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ noise model that is fitted to whole residuals would call a slow misfit red noise
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,37 +28,63 @@ SURE = 1.04  # residual over noise that its level's own uncertainty explains
 def gauge_noise(runs: Sequence[Run], residuals: Mapping[str, Array]) -> dict[str, Noise]:
     """Return the noise of each run: level and colour of the runs that have least, which share a gauge with the others.
 
-    Noise is white or has one correlation from sample to sample; runs sampled at other intervals are apart.
+    Noise is white or has one correlation from sample to sample; what is sampled at other intervals is apart, within a run too.
     """
-    groups: dict[tuple[float, str], list[Run]] = {}
+    groups: dict[tuple[float, str], list[tuple[Run, int, int]]] = {}
     for run in runs:
-        groups.setdefault((round(float(np.median(np.diff(run.t))), 9), run.observable), []).append(run)
-    found: dict[str, Noise] = {}
+        for step, a, b in sampled(run):
+            groups.setdefault((step, run.observable), []).append((run, a, b))
+    found: dict[str, list[tuple[int, int, Noise]]] = {run.name: [] for run in runs}
     for members in groups.values():
-        seen = []
-        for run in members:
-            r = residuals[run.name]
-            ok = run.used & np.isfinite(r)
-            modulation = of_run(run)
-            cycles = modulation["f"] * float(np.median(np.diff(run.t))) if modulation["modulated"] else None
-            about = describe_noise(np.interp(run.t, run.t[ok], r[ok]), cycles)
-            level = about.total if np.isfinite(about.total) else about.white
-            seen.append(
-                (
-                    max(level, run.quantum / np.sqrt(12), 1e-12),
-                    about.lag1 if np.isfinite(about.lag1) else 0.0,
-                    run.t.size,
-                )
-            )
-        lowest = min(s[0] for s in seen)
-        kept = [s for s in seen if s[0] <= ALIKE * lowest]
-        weights = np.array([s[2] for s in kept], dtype=float)
-        level = float(np.sqrt(np.average([s[0] ** 2 for s in kept], weights=weights)))
-        rho = float(np.average([s[1] for s in kept], weights=weights))
-        rho = 0.0 if abs(rho) < FAINT else min(max(rho, -0.9), 0.97)
-        noise = Noise(level * float(np.sqrt(1 - rho**2)), (rho,) if rho else (), level)
-        found |= {run.name: noise for run in members}
-    return found
+        noise = _shared([_seen(run, residuals[run.name], a, b) for run, a, b in members])
+        for run, a, b in members:
+            found[run.name].append((b - a, a, noise))
+    return {name: joined(pieces) for name, pieces in found.items()}
+
+
+def sampled(run: Run) -> list[tuple[float, int, int]]:
+    """Return the stretches [a, b) of a run by sampling interval (s), of two digits; short ones join their neighbours."""
+    pieces: list[list[float]] = []
+    for a, b in stretches(run.t, np.ones(run.t.size, dtype=bool)):
+        step = float(f"{float(np.median(np.diff(run.t[a:b]))) if b - a > 1 else 0.0:.2g}")
+        if pieces and (pieces[-1][0] == step or b - a < LEAST or pieces[-1][2] - pieces[-1][1] < LEAST):
+            if pieces[-1][2] - pieces[-1][1] < LEAST and b - a >= LEAST:
+                pieces[-1][0] = step
+            pieces[-1][2] = b
+        else:
+            pieces.append([step, a, b])
+    return [(step, int(a), int(b)) for step, a, b in pieces]
+
+
+def _seen(run: Run, residual: Array, a: int, b: int) -> tuple[float, float, int]:
+    """Return level, correlation from sample to sample and number of samples of the noise in a stretch."""
+    t, r, ok = run.t[a:b], residual[a:b], (run.used & np.isfinite(residual))[a:b]
+    modulation = of_run(run)
+    cycles = modulation["f"] * float(np.median(np.diff(t))) if modulation["modulated"] else None
+    if not ok.any():
+        return max(run.quantum / np.sqrt(12), 1e-12), 0.0, 0
+    about = describe_noise(np.interp(t, t[ok], r[ok]), cycles)
+    level = about.total if np.isfinite(about.total) else about.white
+    return max(level, run.quantum / np.sqrt(12), 1e-12), about.lag1 if np.isfinite(about.lag1) else 0.0, b - a
+
+
+def _shared(seen: Sequence[tuple[float, float, int]]) -> Noise:
+    """Return the noise of stretches that share a gauge: of those that have least."""
+    lowest = min(s[0] for s in seen)
+    kept = [s for s in seen if s[0] <= ALIKE * lowest]
+    weights = np.array([max(s[2], 1) for s in kept], dtype=float)
+    level = float(np.sqrt(np.average([s[0] ** 2 for s in kept], weights=weights)))
+    rho = float(np.average([s[1] for s in kept], weights=weights))
+    rho = 0.0 if abs(rho) < FAINT else min(max(rho, -0.9), 0.97)
+    return Noise(level * float(np.sqrt(1 - rho**2)), (rho,) if rho else (), level)
+
+
+def joined(pieces: Sequence[tuple[int, int, Noise]]) -> Noise:
+    """Return the noise of a run from that of its stretches, the longest of which stands for the whole."""
+    longest = max(pieces, key=lambda p: p[0])[2]
+    if len(pieces) == 1:
+        return longest
+    return replace(longest, pieces=tuple((a, noise) for _, a, noise in sorted(pieces, key=lambda p: p[1])))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from srfcli.diagnosis.locate import Location
+from srfcli.diagnosis.parting import Parting
+from srfcli.diagnosis.partingtext import described
 from srfcli.diagnosis.places import Row
 from srfcli.diagnosis.refits import Refit
 from srfcli.diagnosis.verdict import Diagnosis
@@ -92,8 +94,17 @@ def parameters_of(fitted: LatentFit) -> dict[str, dict[str, Any]]:
     return found
 
 
-def answer(diagnosis: Diagnosis, location: Location, *, model: str = "augmented/experiment.toml") -> dict[str, Any]:
-    """Return the object of the format `srf.diagnose/1`; `model` is where the augmented experiment is, relative to it."""
+def answer(
+    diagnosis: Diagnosis,
+    location: Location,
+    *,
+    model: str = "augmented/experiment.toml",
+    parting: Parting | None = None,
+) -> dict[str, Any]:
+    """Return the object of the format `srf.diagnose/1`; `model` is where the augmented experiment is, relative to it.
+
+    `parting` is the run that would part what is ambiguous.
+    """
     views, last = run_views(diagnosis), final(diagnosis)
     sides = {}
     for place, (name, refit) in enumerate((("baseline", diagnosis.baseline), ("augmented", last))):
@@ -116,6 +127,8 @@ def answer(diagnosis: Diagnosis, location: Location, *, model: str = "augmented/
     }
     if diagnosis.verdict == "inconclusive":
         found["detectable"] = dict(diagnosis.detectable)
+    if diagnosis.verdict == "ambiguous" and parting is not None:
+        found["experiment"] = described(parting, diagnosis.experiment)
     return found
 
 

@@ -312,7 +312,7 @@ class Atlas:
             p = self.pieces[i]
             full = np.zeros((p.white.size, B.shape[1]))
             full[s] = B
-            B = p.whitened(full)[s] if p.noise.order else B / p.noise.innovation
+            B = p.whitened(full)[s] if p.noise.order or p.noise.pieces else B / p.noise.innovation
             white.append((i, s, B))
             C[:, p.places] += B.T @ p.X[s]
             G += B.T @ B

@@ -19,8 +19,10 @@ FINEST = 8.0  # samples of a period: a load is not known from fewer
 VARIES = 0.01  # of the load, from where on a run is one with load steps
 MANY = 12  # velocities of a recorded drive that stand for all of them
 MOST_EPS = 0.9
+LEAD = 0.1  # of a run, in which it begins fast; the same of its way
+UNKNOWN = 1.0  # N: what stands for a load that no recording tells
 NAME = "parting"
-STEPS, HOLD, LOAD, WAVE = "velocity steps", "slide-hold-slide", "load steps", "modulated load"
+STEPS, HOLD, LOAD, WAVE = "velocity steps", "slide-hold-slide", "load steps", "modulation"
 
 
 @dataclass(frozen=True)
@@ -76,14 +78,14 @@ class Proposal:
         return sorted(found)
 
     def text(self) -> str:
-        """Return what is to be done, in words."""
+        """Return what is to be done, in words: drive; load."""
         drive = ", then ".join(f"{d:g} s at {V:g} um/s" if V else f"{d:g} s at rest" for d, V in self.drive)
         load = f"{self.W0:g} N"
         for at, jump in self.steps:
             load += f", {'up' if jump > 0 else 'down'} by {abs(jump):g} N at {at:g} s"
         if self.eps:
             load += f", from {self.onset:g} s on modulated by {100 * self.eps:g} % at {self.f:g} Hz"
-        return f"{self.kind}: {drive}; load {load}"
+        return f"{drive}; load {load}"
 
 
 @dataclass(frozen=True)
@@ -128,10 +130,10 @@ def reach_of(experiment: Experiment) -> Reach:
     return Reach(
         _velocities(experiment.runs),
         tuple(r.load.rest(float(r.t[0])) for r in experiment.runs),
-        tuple(w["eps"] for w in shown), tuple(w["f"] for w in shown), tuple(jumps),
+        tuple(_digits(w["eps"]) for w in shown), tuple(_digits(w["f"]) for w in shown), tuple(map(_digits, jumps)),
         float(np.median(late)) if late else 0.25,
-        float(np.median([w["rise0"] for w in shown])) if shown else 0.02,
-        float(np.median(rises)) if rises else 0.05,
+        _digits(float(np.median([w["rise0"] for w in shown]))) if shown else 0.02,
+        _digits(float(np.median(rises))) if rises else 0.05,
         max(float(np.sum(np.abs(r.drive(r.t[:-1])) * np.diff(r.t))) for r in experiment.runs),
         _typical(plain or modulated), _typical(modulated or plain),
     )  # fmt: skip
@@ -145,7 +147,9 @@ def _velocities(runs: Sequence[Run]) -> tuple[float, ...]:
             found |= {float(f"{V:.3g}") for V in run.drive(run.t).tolist() if V > 0}
         else:
             V = run.drive(run.t)
-            found |= {float(f"{x:.3g}") for x in np.quantile(V[V > 0], np.linspace(0.05, 0.95, MANY)).tolist()}
+            V = V[V > 0]
+            shares = np.linspace(0.05, 0.95, MANY)
+            found |= {float(f"{x:.3g}") for x in np.quantile(V, shares).tolist()} if V.size else set()
     return tuple(sorted(found))
 
 
@@ -161,6 +165,16 @@ def draw(reach: Reach, number: int, rng: np.random.Generator) -> list[Proposal]:
     return [_drawn(reach, kinds[i % len(kinds)], rng) for i in range(number)]
 
 
+def led_in(proposal: Proposal, reach: Reach) -> Proposal | None:
+    """Return the run with a fast beginning, as sliding that is not stable has to begin; None where there is no room for it."""
+    (length, V), *rest = proposal.drive
+    fastest = max(reach.V)
+    lead = _digits(LEAD * min(proposal.duration, reach.travel / fastest))
+    if fastest <= V or length <= 2 * lead:
+        return None
+    return replace(proposal, drive=((lead, fastest), (_digits(length - lead), V), *rest))
+
+
 def vary(proposal: Proposal, reach: Reach, number: int, rng: np.random.Generator) -> list[Proposal]:
     """Return so many runs near another."""
     found = []
@@ -169,7 +183,7 @@ def vary(proposal: Proposal, reach: Reach, number: int, rng: np.random.Generator
         load = float(np.exp(0.3 * rng.standard_normal()))
         factors = {V: float(np.exp(0.3 * rng.standard_normal())) for _, V in proposal.drive}
         V = [_within(V * factors[V], reach.V) if V else 0.0 for _, V in proposal.drive]
-        W0 = _within(proposal.W0 * load, reach.W0)
+        W0 = _within(proposal.W0 * load, reach.W0) if set(reach.W0) != {UNKNOWN} else UNKNOWN
         jump = float(np.exp(0.3 * rng.standard_normal())) * W0 / proposal.W0
         eps, f = proposal.eps, proposal.f
         if eps:
@@ -192,8 +206,9 @@ def _drawn(reach: Reach, kind: str, rng: np.random.Generator) -> Proposal:
         return _within(values[int(rng.integers(len(values)))] * factor, values)
 
     like = reach.modulated if kind == WAVE else reach.plain
-    interval, span = float(np.median(np.diff(like.t))), float(np.ptp(like.t))
-    V, W0, other, third = near(reach.V), near(reach.W0), near(reach.V), near(reach.V)
+    interval, span = _digits(float(np.median(np.diff(like.t))), 9), float(np.ptp(like.t))
+    V, other, third = near(reach.V), near(reach.V), near(reach.V)
+    W0 = near(reach.W0) if set(reach.W0) != {UNKNOWN} else UNKNOWN
     rise = reach.switch if kind == WAVE else reach.rise
     if kind == STEPS:
         drive = _timed([V, other, V, third], [0.25] * 4, span, reach.travel)
@@ -216,11 +231,9 @@ def _drawn(reach: Reach, kind: str, rng: np.random.Generator) -> Proposal:
     )
 
 
-def _timed(
-    V: Sequence[float], shares: Sequence[float], span: float, travel: float
-) -> tuple[tuple[float, float], ...]:
+def _timed(V: Sequence[float], shares: Sequence[float], span: float, travel: float) -> tuple[tuple[float, float], ...]:
     """Return (duration, velocity) of pieces that last `span` s together, less where the track would be too short."""
-    total = sum(shares)
+    total, travel = sum(shares), (1 - LEAD) * travel
     lengths = [span * s / total for s in shares]
     way = sum(d * v for d, v in zip(lengths, V, strict=True))
     if way > travel:  # the fast pieces are made shorter, each to its share of the way
@@ -230,8 +243,7 @@ def _timed(
 
 def _allowed(W0: float, steps: tuple[tuple[float, float], ...], reach: Reach) -> tuple[tuple[float, float], ...]:
     """Return steps that keep the load within what was shown, times two."""
-    highest = max(w * (1 + j) for w, j in zip((max(reach.W0),), (max(reach.jumps, default=0.0),), strict=True))
-    low, high = min(reach.W0) / FACTOR, FACTOR * highest
+    low, high = min(reach.W0) / FACTOR, FACTOR * max(reach.W0)
     size = max((abs(j) for _, j in steps), default=0.0)
     if not size:
         return steps
@@ -246,7 +258,7 @@ def _frequency(value: float, reach: Reach, interval: float) -> float:
 
 def _within(value: float, shown: Sequence[float]) -> float:
     """Return a value, with two digits, no further than a factor of two outside what was shown."""
-    return float(np.clip(_digits(float(value), 2), min(shown) / FACTOR, max(shown) * FACTOR))
+    return _digits(float(np.clip(_digits(float(value), 2), min(shown) / FACTOR, max(shown) * FACTOR)))
 
 
 def _digits(value: float, digits: int = 3) -> float:
@@ -262,10 +274,10 @@ def run_of(proposal: Proposal, experiment: Experiment) -> Run:
     load: Load = ConstantLoad(proposal.W0)
     if proposal.steps or proposal.eps:
         load = SampledLoad(t, proposal.loads(t))
-    share = stiffness_share(experiment, like)
-    own = proposal.W0 / like.load.rest(float(like.t[0])) if share != 1.0 else 1.0
     modulation = (proposal.f, proposal.eps, proposal.onset) if proposal.eps else None
-    return Run(
+    run = Run(
         NAME, Path(f"{NAME}.csv"), True, like.start, "steady", t, np.zeros(t.size), like.observable,
-        np.ones(t.size, dtype=bool), drive, load, like.stiffness * own, modulation, 0.0, (),
+        np.ones(t.size, dtype=bool), drive, load, like.stiffness, modulation, 0.0, (),
     )  # fmt: skip
+    share = stiffness_share(experiment, run) / stiffness_share(experiment, like)
+    return replace(run, stiffness=like.stiffness * share)

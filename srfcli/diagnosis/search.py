@@ -23,6 +23,7 @@ from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
 
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, and noise is never quite as assumed
+CHOICE, SECOND = 3.0, 6.0  # cost of an effect, as there are some twenty to choose from, and more of each further one
 CLOSE = 6.0  # hypotheses within so much of the best may be it
 RIVAL = 30.0  # short of the best score's gain: where the best leaves noise alone, less is not refitted
 RIVAL_SHARE = 0.05  # the same as a part of that gain
@@ -262,7 +263,8 @@ class Search:
         )
         n = sum(int(r.used.sum()) for r in runs)
         cost = 0.5 * np.log(n) * (len(fitted.problem.names) - len(self.base_names())) + (4.0 if rough else 0.0)
-        cost += 3.0 * len(hypothesis.effects)  # there are some twenty to choose from
+        more = len(hypothesis.effects)
+        cost += CHOICE * more + SECOND * max(more - 1, 0)
         found = Refit(hypothesis, fitted, adequacy, fitted.log_likelihood - float(cost), rough)
         known = self.tried.get((hypothesis.name, rough))
         if known is None or found.evidence > known.evidence:

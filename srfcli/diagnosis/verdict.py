@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from srfcli.diagnosis.adequacy import Adequacy, judge_residuals
+from srfcli.diagnosis.adequacy import Adequacy, joined, judge_residuals, sampled
 from srfcli.diagnosis.candidates import Excluded, Hypothesis
 from srfcli.diagnosis.refits import Refit, freedom_spent
 from srfcli.diagnosis.score import Score
@@ -192,7 +192,7 @@ def _predicted(search: Search, refit: Refit, experiment: Experiment, run: Run) -
         upper=own.upper[names],
         held=held,
     )
-    noise = {run.name: _noise_for(search.noise, run)}
+    noise = {run.name: _noise_for(search, run)}
     rough = refit.rough and refit.fit.point.roughness.amplitude > 0
     tracks = tracks_for([as_fitted], shared=False) if rough else None
     fitted = fit_latent(small, small.start, noise, tracks=tracks, known_noise=True)
@@ -205,6 +205,12 @@ def _predicted(search: Search, refit: Refit, experiment: Experiment, run: Run) -
     return fitted.point.predictions[run.name].y, fitted.log_likelihood, adequacy.rms_over_noise
 
 
-def _noise_for(noises: Mapping[str, Noise], run: Run) -> Noise:
-    """Return the noise of a run that was not fitted: the gauge's, as the fitted runs have it."""
-    return next(iter(noises.values()))
+def _noise_for(search: Search, run: Run) -> Noise:
+    """Return the noise of a run that was not fitted: that of fitted stretches sampled most nearly as often, piece by piece."""
+    known = [(step, search.noise[r.name].at(a)) for r in search.experiment.runs if r.name in search.noise
+             for step, a, _ in sampled(r)]  # fmt: skip
+
+    def nearest(step: float) -> Noise:
+        return min(known, key=lambda k: abs(np.log(max(k[0], 1e-12) / max(step, 1e-12))))[1]
+
+    return joined([(b - a, a, replace(nearest(step), pieces=())) for step, a, b in sampled(run)])

@@ -20,16 +20,24 @@ UNEVEN = 1.5  # a spacing so much longer or shorter than its neighbours' ends an
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise e_t = sum_i coefficients[i] e_(t-1-i) + innovation; `innovation` and `level` are standard deviations."""
+    """Noise e_t = sum_i coefficients[i] e_(t-1-i) + innovation; `innovation` and `level` are standard deviations.
+
+    `pieces` are the noises from given samples on, of a run that is sampled at several rates: colour goes by time, not by samples.
+    """
 
     innovation: float
     coefficients: tuple[float, ...] = ()
     level: float = 0.0
+    pieces: tuple[tuple[int, Noise], ...] = ()
 
     @property
     def order(self) -> int:
         """Return the order p; 0 is white."""
         return len(self.coefficients)
+
+    def at(self, sample: int) -> Noise:
+        """Return the noise at a sample of the run."""
+        return next((own for first, own in reversed(self.pieces) if first <= sample), self)
 
 
 def stretches(t: Array, used: Array) -> list[tuple[int, int]]:
@@ -51,9 +59,11 @@ def whiten(noise: Noise, columns: Array, parts: list[tuple[int, int]]) -> Array:
     The first samples of a stretch are whitened by the lower-order predictors of the same process (Levinson and Durbin), so
     that no sample is lost and the likelihood is exact.
     """
-    predictors = _predictors(noise)
     out = []
+    whole = noise
     for a, b in parts:
+        noise = whole.at(a)
+        predictors = _predictors(noise)
         piece = columns[a:b]
         white = np.empty_like(piece)
         for k in range(min(noise.order, b - a)):
@@ -83,11 +93,11 @@ def _predictors(noise: Noise) -> list[tuple[Array, float]]:
 
 def log_determinant(noise: Noise, parts: list[tuple[int, int]]) -> float:
     """Return the sum of the logarithms of the standard deviations that `whiten` divides by."""
-    first = [np.log(sd) for _, sd in _predictors(noise)]
     total = 0.0
     for a, b in parts:
-        n = b - a
-        total += sum(first[: min(n, noise.order)]) + max(n - noise.order, 0) * np.log(noise.innovation)
+        n, own = b - a, noise.at(a)
+        first = [np.log(sd) for _, sd in _predictors(own)]
+        total += sum(first[: min(n, own.order)]) + max(n - own.order, 0) * np.log(own.innovation)
     return float(total)
 
 

@@ -40,8 +40,8 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     atlas: {axis, run, statistic, p_value, log_p, and low, high or bin};
     ranked: {name, evidence, rms_over_noise, p_value}; scores: {effect, gain, size, stderr, surviving, detectable, unit};
     parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma}.
-    Optional: title; about {effect: a phrase}; parting, the experiment that would part what is ambiguous; commands, lines to go on
-    with; force {run: {t, force, band, v, phi, W}, "form": text, "unit": text}; diagram {V, W0_baseline, W0_augmented, note}.
+    Optional: title; about {effect: a phrase}; parting, paragraphs on a run that parts what is ambiguous; commands, lines to go
+    on with; force {run: {t, force, band, v, phi, W}, "form": text, "unit": text}; diagram {V, W0_baseline, W0_augmented, note}.
     Without matplotlib the page has all but the figures, and says so.
     """
     folder.mkdir(parents=True, exist_ok=True)

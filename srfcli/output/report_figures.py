@@ -151,14 +151,10 @@ def diagram_figure(diagram: Mapping[str, Any]) -> Figure | None:
         axis.margins(x=0.0)
         axis.set_xlabel("V  [µm/s]")
         axis.set_ylabel("critical load W$_0$  [N]")
-        axis.legend(loc="best", handlelength=2.8)
-        axis.annotate(
-            "sliding is steady below the first boundary",
-            (0.99, 0.02),
-            xycoords="axes fraction",
-            ha="right",
-            color="#555555",
+        legend = axis.legend(
+            loc="best", handlelength=2.8, title="sliding is steady below the first boundary", alignment="left"
         )
+        legend.get_title().set_color("#555555")
         _decade_ticks(axis)
         _settle(figure)
         return figure

@@ -33,7 +33,7 @@ SHADED = (
     "Shaded are the times at which the baseline parts from the recording, the darker the more; that its parameters may have been "
     "bent to follow elsewhere is allowed for, so a residual may also be large outside."
 )
-FILES = ("answer.json", "prediction-*.csv", "augmented/**/*", "figures/*.svg")
+FILES = ("answer.json", "prediction-*.csv", "augmented/**/*", "parting/**/*", "figures/*.svg")
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,8 @@ def left_out(matter: Matter) -> Markup:
     parting = matter.tables.get("parting")
     if parting:
         parts.append(tag("h3", "The experiment that would part them"))
-        parts.append(tag("p", parting) if isinstance(parting, str) else tag("ul", [tag("li", str(p)) for p in parting]))
+        told = [parting] if isinstance(parting, str) else [str(p) for p in parting]
+        parts += [commands([p.rstrip()]) if p.startswith("[[runs]]") else tag("p", p) for p in told]
     return section("left-out", "What was left out", parts)
 
 
