@@ -365,9 +365,11 @@ class Search:
                 known_noise=True,
             )  # fmt: skip
             return self.keep(hypothesis, fitted, rough=True)
+        roughness = None
         for shared in (False, True) if self.shared is None else (self.shared,):
             tracks = tracks_for(problem.runs, shared=shared)
-            fitted = fit_latent(problem, theta, self.noise, tracks=tracks, known_noise=True)
+            fitted = fit_latent(problem, theta, self.noise, tracks=tracks, roughness=roughness, known_noise=True)
+            theta, roughness = fitted.point.theta, fitted.point.roughness  # one track for all is found from where many stand
             if self.keep(hypothesis, fitted, rough=True).fit is fitted:
                 self.shared = shared
         return self.tried[hypothesis.name, True]

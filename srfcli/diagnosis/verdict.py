@@ -73,12 +73,15 @@ class Diagnosis:
 def conclude(search: Search, held_out: Experiment) -> Diagnosis:
     """Return the verdict on a finished search; `held_out` is the experiment read with its held-out runs, opened only now."""
     ranked = tuple(search.ranked())
-    best, baseline = ranked[0], next(r for r in ranked if not r.hypothesis.effects)
+    best, alone = ranked[0], next(r for r in ranked if not r.hypothesis.effects)
     close = tuple(r for r in ranked if r.adequacy.fine and best.evidence - r.evidence < CLOSE)
     if len(close) > 1:  # a hypothesis that holds a smaller one, and gains nothing by it, is not another answer
         close = tuple(
             r for r in close if not any(set(o.hypothesis.reported) < set(r.hypothesis.reported) for o in close)
         )
+        best = close[0]
+    # what an effect explains is shown against a baseline on a track like its own
+    baseline = search.tried.get((alone.name, best.rough), alone) if best.hypothesis.effects else alone
     held = judge_held(search, best, baseline, held_out)
     found, reasons = _verdict(best, baseline, close, held, search)
     listed = search.scored.get((baseline.name, baseline.rough), [])
