@@ -220,6 +220,7 @@ def main() -> None:
     parser.add_argument(
         "--kept", type=Path, help="folder of the baseline's fits and the answers: a later run goes on there"
     )
+    parser.add_argument("--note", help="what to say of the bank at the head of the results")
     given = parser.parse_args()
     warnings.simplefilter("ignore")  # PySINDy warns of every empty set
     answers = answered(given.bank, given.kept)
@@ -230,16 +231,24 @@ def main() -> None:
         "# "
         + ("visible as the trial found it" if given.known else "what is invisible was not asked: all counts as visible")
     )
+    if given.note:
+        report.say(f"# {given.note}")
     tell(report, marked(truths, answers, given.known), "sparse regression")
     tell(report, marked(truths, list(map(ungated, answers)), given.known), "sparse regression, whatever remains")
     if given.beside:
         theirs = read_answers(given.beside)
         tell(report, marked(truths, [theirs[n] for n in sorted(theirs) if n in truths], given.known), "srf diagnose")
-    report.say("\ncases")
-    report.table(("case", "concealed", "track", "said", "right", "notes"), [
-        (m.case, "+".join(m.hidden) or "nothing", "rough" if m.rough else "smooth", m.answer.said, "yes" if m.right else "no",
-         m.answer.failure) for m in marked(truths, answers, given.known)
-    ])  # fmt: skip
+    report.say("\ncases; set: what the regression kept")
+    head = ("case", "concealed", "track", "said", "set", "right", "remainder, rms over its error")
+    report.table(head, [row_of(m) for m in marked(truths, answers, given.known)])
+
+
+def row_of(m: Mark) -> tuple[str, ...]:
+    """Return what is told of one case."""
+    note, track = m.answer.failure.partition("; set")[0], "rough" if m.rough else "smooth"
+    hidden, kept = ("+".join(names) for names in (m.hidden, m.answer.parameters))
+    said, right = m.answer.said or m.answer.verdict, "yes" if m.right else "no"
+    return m.case, hidden or "nothing", track, said, kept or "-", right, note
 
 
 if __name__ == "__main__":

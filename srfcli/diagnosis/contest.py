@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis
+from srfcli.diagnosis.elsewhere import elsewhere
 from srfcli.diagnosis.follower import LOOSE_ONLY, PULLS
 from srfcli.diagnosis.refits import Entry, Refit
 from srfcli.diagnosis.score import Score
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 CLEAR = 1.5  # chi-squared per degree of freedom under a pull that is nearly noise
 STUCK = 0.8  # share of it that is left after more steps where these still help
 WORSE = 1.25  # times the free chi-squared of the best: under a pull, too much to do better freely
+HOPELESS = 4.0  # under a pull: what is missing is elsewhere, and only the best is let go, to go on from
 RELEASED = 2  # fitted freely although their fit under the pull is no good, besides the best
 
 
@@ -35,7 +37,7 @@ def contest(search: Search, refit: Refit, promising: Sequence[Score]) -> list[Re
         own = search.own_values(hypothesis, score.values)
         waiting.append(_entry(search, hypothesis, around | own, own, LOOSE_ONLY))
         if waiting[-1].reduced < CLEAR:
-            found.append(search.elsewhere(_released(search, waiting.pop())))
+            found.append(elsewhere(search, _released(search, waiting.pop())))
             if found[-1].adequacy.fine:
                 return found
     for first, entry in zip((True, *[False] * RELEASED), sorted(waiting, key=lambda e: e.reduced), strict=False):
@@ -45,9 +47,10 @@ def contest(search: Search, refit: Refit, promising: Sequence[Score]) -> list[Re
             if best.reduced < CLEAR:
                 break
             best = min(best, _entry(search, entry.hypothesis, entry.own, entry.own, way), key=lambda e: e.reduced)
-        if found and best.reduced > WORSE * min(r.adequacy.rms_over_noise for r in found) ** 2:
+        beaten = found and best.reduced > WORSE * min(r.adequacy.rms_over_noise for r in found) ** 2
+        if beaten or (best.reduced > HOPELESS and not first):
             continue
-        found.append(search.elsewhere(_released(search, best)))
+        found.append(elsewhere(search, _released(search, best)))
         if found[-1].adequacy.fine:
             break
     return found

@@ -11,6 +11,7 @@ from srfcli.diagnosis.adequacy import gauge_noise, judge_residuals
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.contest import contest
+from srfcli.diagnosis.elsewhere import elsewhere
 from srfcli.diagnosis.follower import FAIR, FOLLOWED, LOOSE_ONLY, PULLS, Followed, Follower, shortened
 from srfcli.diagnosis.refits import Refit, freedom_spent
 from srfcli.diagnosis.score import Score, scores
@@ -29,7 +30,6 @@ RIVAL = 30.0  # short of the best score's gain: where the best leaves noise alon
 RIVAL_SHARE = 0.05  # the same as a part of that gain
 NEAR = 2.5  # residual over noise within which slopes at the fit tell where a better one is
 HALFWAY = 1.25  # the same within which a rough track may be what is left
-SHAKES = (2.0, 0.5)  # times its size: other starts of an effect
 ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
 MOST_EVALUATIONS = 1200  # of the recordings by a model with slopes, in all
@@ -53,7 +53,7 @@ class Search:
     excluded: list[Excluded] = field(default_factory=list)
     followed: dict[str, Followed] = field(default_factory=dict)
     pulls: dict[str, LatentFit] = field(default_factory=dict)
-    shook: set[str] = field(default_factory=set)
+    shook: set[tuple[str, bool]] = field(default_factory=set)
     shared: bool | None = None  # whether all runs slid on one rough track, once that was asked
     noise: dict[str, Noise] = field(default_factory=dict)
     evaluations: int = 0
@@ -147,8 +147,8 @@ class Search:
 
     def paired(self, candidates: Sequence[Effect]) -> bool:
         """Return whether one of the two best single effects leaves noise alone together with another."""
-        for refit in self.ranked()[:2]:
-            if len(refit.hypothesis.effects) == 1:
+        for first, refit in zip((True, False), self.ranked(), strict=False):
+            if len(refit.hypothesis.effects) == 1 and (first or refit.adequacy.rms_over_noise < NEAR):
                 self.widen(refit, candidates, PAIRS, rough=refit.rough)
                 if self.best().adequacy.fine:
                     return True
@@ -170,40 +170,9 @@ class Search:
     def shaken(self, candidates: Sequence[Effect]) -> bool:
         """Return whether one of the best leaves noise alone once its effects start from elsewhere."""
         for refit in self.ranked()[:2]:
-            if not refit.rough and self.elsewhere(refit).adequacy.fine:
+            if elsewhere(self, refit).adequacy.fine:
                 return self.settled(candidates)
         return False
-
-    def elsewhere(self, refit: Refit) -> Refit:
-        """Return the best fit of a hypothesis from other starts: larger and smaller effects, other places and wavelengths.
-
-        Where cycles are right on average and each is a little off, a minimum is false.
-        """
-        effects = refit.hypothesis.effects
-        if refit.name in self.shook or refit.adequacy.fine or refit.adequacy.rms_over_noise > NEAR or not effects:
-            return refit
-        self.shook.add(refit.name)
-        values, model = dict(refit.fit.values), refit.fit.problem.model
-        starts: list[dict[str, float]] = []
-        for effect in effects:
-            neutral, own = dict(effect.neutral), own_parameters(effect, model)
-            if along_table(effect) and effect.scans:
-                (score,) = scores(self.registry, refit.fit.problem.experiment, refit.fit, [effect], present=effects)
-                starts.append({long: score.values[p.name] for long, p in own.items() if p.name in score.values})
-            for factor in SHAKES:
-                starts.append({long: neutral[p.name] + factor * (values[long] - neutral[p.name])
-                               for long, p in own.items() if p.name in neutral and long in values})  # fmt: skip
-        for start in starts:
-            if self.spent() or not start:
-                break
-            led = self.follower.follow(refit.hypothesis, values | start, self.noise, [LOOSE_ONLY])
-            if led.lost:
-                continue
-            fitted = fit_latent(refit.fit.problem, led.theta, self.noise, tracks=Tracks((), {}), known_noise=True)
-            refit = self.keep(refit.hypothesis, fitted, rough=False)
-            if refit.adequacy.fine:
-                break
-        return refit
 
     def spent(self) -> bool:
         """Return whether the search's budget is used up."""
@@ -311,10 +280,10 @@ class Search:
                 continue
             found = self.refit(hypothesis, refit, score.values, rough=rough)
             if not rough and self.best() is found:
-                found = self.elsewhere(found)
+                found = elsewhere(self, found)
             halfway = not found.adequacy.fine and found.adequacy.rms_over_noise < HALFWAY
             if not rough and halfway and self.best() is found:
-                self.refit(hypothesis, found, {}, rough=True)
+                elsewhere(self, self.refit(hypothesis, found, {}, rough=True))
 
     def untried(self, hypothesis: Hypothesis, *, rough: bool) -> bool:
         """Return whether a hypothesis was not fitted yet and the budget leaves room for it."""
@@ -369,7 +338,10 @@ class Search:
         for shared in (False, True) if self.shared is None else (self.shared,):
             tracks = tracks_for(problem.runs, shared=shared)
             fitted = fit_latent(problem, theta, self.noise, tracks=tracks, roughness=roughness, known_noise=True)
-            theta, roughness = fitted.point.theta, fitted.point.roughness  # one track for all is found from where many stand
+            theta, roughness = (
+                fitted.point.theta,
+                fitted.point.roughness,
+            )  # one track for all is found from where many stand
             if self.keep(hypothesis, fitted, rough=True).fit is fitted:
                 self.shared = shared
         return self.tried[hypothesis.name, True]

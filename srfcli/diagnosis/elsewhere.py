@@ -1,0 +1,84 @@
+"""Other starts of a hypothesis: where cycles are right on average and each is a little off, a minimum is false."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from srfcli.diagnosis.candidates import own_parameters
+from srfcli.diagnosis.columns import along_table
+from srfcli.diagnosis.follower import LOOSE, LOOSE_ONLY, ROUND
+from srfcli.diagnosis.refits import Refit
+from srfcli.diagnosis.score import scores
+from srfcli.inference.follow import weaker
+from srfcli.inference.latent import LatentFit, Tracks, fit_latent, tracks_for
+
+if TYPE_CHECKING:
+    from srfcli.diagnosis.search import Search
+
+NEAR = 2.5  # residual over noise beyond which another start is not what a hypothesis lacks
+SHAKES = (2.0, 0.5)  # times its size: other starts of an effect
+ROUNDS, STEPS = 2, 8  # of a fit on a rough track under a pull
+
+
+def elsewhere(search: Search, refit: Refit) -> Refit:
+    """Return the best fit of a hypothesis from other starts: larger and smaller effects, other places and wavelengths."""
+    key = (refit.name, refit.rough)
+    if (
+        key in search.shook
+        or refit.adequacy.fine
+        or refit.adequacy.rms_over_noise > NEAR
+        or not refit.hypothesis.effects
+    ):
+        return refit
+    search.shook.add(key)
+    values = dict(refit.fit.values)
+    for start in other_starts(search, refit):
+        if search.spent():
+            break
+        fitted = (
+            _on_a_rough_track(search, refit, values | start) if refit.rough else _smooth(search, refit, values | start)
+        )
+        if fitted is not None:
+            refit = search.keep(refit.hypothesis, fitted, rough=refit.rough)
+        if refit.adequacy.fine:
+            break
+    return refit
+
+
+def other_starts(search: Search, refit: Refit) -> list[dict[str, float]]:
+    """Return values of the effects' own parameters: where the residual asks for a wave or a drift, and other sizes."""
+    values, model, effects = refit.fit.values, refit.fit.problem.model, refit.hypothesis.effects
+    starts: list[dict[str, float]] = []
+    for effect in effects:
+        neutral, own = dict(effect.neutral), own_parameters(effect, model)
+        if along_table(effect) and effect.scans and not refit.rough:
+            (score,) = scores(search.registry, refit.fit.problem.experiment, refit.fit, [effect], present=effects)
+            starts.append({long: score.values[p.name] for long, p in own.items() if p.name in score.values})
+        for factor in SHAKES:
+            starts.append({long: neutral[p.name] + factor * (values[long] - neutral[p.name])
+                           for long, p in own.items() if p.name in neutral and long in values})  # fmt: skip
+    return [start for start in starts if start]
+
+
+def _smooth(search: Search, refit: Refit, at: dict[str, float]) -> LatentFit | None:
+    led = search.follower.follow(refit.hypothesis, at, search.noise, [LOOSE_ONLY])
+    if led.lost:
+        return None
+    return fit_latent(refit.fit.problem, led.theta, search.noise, tracks=Tracks((), {}), known_noise=True)
+
+
+def _on_a_rough_track(search: Search, refit: Refit, at: dict[str, float]) -> LatentFit:
+    """Return the fit with parameters and track led by a pull first."""
+    follower, runs = search.follower, refit.fit.problem.runs
+    pull = weaker(follower.strong, runs, LOOSE * follower.unit)
+    pulled = refit.hypothesis.problem(
+        search.registry, search.experiment, rough=True, at=at, trend=search.trend, pull=pull
+    )
+    tracks = tracks_for(runs, shared=len(refit.fit.point.tracks.splines) == 1 < len(runs))
+    led = fit_latent(
+        replace(pulled, rtol=ROUND), pulled.start, search.noise, tracks=tracks, roughness=refit.fit.point.roughness,
+        known_noise=True, rounds=ROUNDS, steps=STEPS,
+    ).point  # fmt: skip
+    free = search.problem(refit.hypothesis, pulled.named(led.theta), rough=True)
+    return fit_latent(free, free.start, search.noise, tracks=led.tracks, roughness=led.roughness, known_noise=True)
