@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 NEAR = 2.5  # residual over noise beyond which another start is not what a hypothesis lacks
 SHAKES = (2.0, 0.5)  # times its size: other starts of an effect
-ROUNDS, STEPS = 2, 8  # of a fit on a rough track under a pull
+ROUNDS, STEPS = 1, 8  # of a fit on a rough track under a pull
 
 
 def elsewhere(search: Search, refit: Refit) -> Refit:

@@ -139,7 +139,7 @@ class Search:
             or (not near and self.shaken(candidates))
             or self.paired(candidates)
             or self.roughened(candidates)
-            or self.shaken(candidates)
+            or self.shaken(candidates, rough=True)
         ):
             return
         self.paired(candidates)
@@ -167,10 +167,10 @@ class Search:
         self.widen(rough, candidates, PAIRS, rough=True)
         return self.settled(candidates)
 
-    def shaken(self, candidates: Sequence[Effect]) -> bool:
-        """Return whether one of the best leaves noise alone once its effects start from elsewhere."""
+    def shaken(self, candidates: Sequence[Effect], *, rough: bool = False) -> bool:
+        """Return whether one of the best leaves noise alone once its effects start from elsewhere; `rough` ones take long."""
         for refit in self.ranked()[:2]:
-            if elsewhere(self, refit).adequacy.fine:
+            if (rough or not refit.rough) and elsewhere(self, refit).adequacy.fine:
                 return self.settled(candidates)
         return False
 
@@ -283,7 +283,7 @@ class Search:
                 found = elsewhere(self, found)
             halfway = not found.adequacy.fine and found.adequacy.rms_over_noise < HALFWAY
             if not rough and halfway and self.best() is found:
-                elsewhere(self, self.refit(hypothesis, found, {}, rough=True))
+                self.refit(hypothesis, found, {}, rough=True)
 
     def untried(self, hypothesis: Hypothesis, *, rough: bool) -> bool:
         """Return whether a hypothesis was not fitted yet and the budget leaves room for it."""

@@ -144,6 +144,8 @@ def _confidence(ranked: Sequence[Refit], verdict: str, best: Refit) -> dict[str,
     for r in ranked:
         key = "+".join(sorted(r.hypothesis.reported)) or "none"
         lacking = 0.0 if r.adequacy.fine else 40.0
+        if any(o.adequacy.fine and set(o.hypothesis.reported) < set(r.hypothesis.reported) for o in ranked):
+            lacking += CLOSE  # what a further effect has to earn, in the verdict too
         weights[key] = max(weights.get(key, -np.inf), r.evidence - lacking)
     weights["unknown"] = best.evidence - (20.0 if best.adequacy.fine else 5.0)
     top = max(weights.values())
