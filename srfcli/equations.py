@@ -284,6 +284,7 @@ class _Builder:
             (self.force, parts.force),
             (self.force_dot, pushed),
             (self.W_dot, imposed),
+            (self.V, parts.V),  # again: what came before may hold u', which is a state's rate there
             (load, self.total_load()),
             (self.imposed, W),
         ]
