@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from srfcli.diagnosis.candidates import own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.follower import LOOSE, LOOSE_ONLY, ROUND
-from srfcli.diagnosis.refits import Refit
+from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.score import scores
 from srfcli.inference.follow import weaker
 from srfcli.inference.latent import LatentFit, Tracks, fit_latent, tracks_for
@@ -16,7 +16,6 @@ from srfcli.inference.latent import LatentFit, Tracks, fit_latent, tracks_for
 if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
 
-NEAR = 2.5  # residual over noise beyond which another start is not what a hypothesis lacks
 SHAKES = (2.0, 0.5)  # times its size: other starts of an effect
 ROUNDS, STEPS = 1, 8  # of a fit on a rough track under a pull
 

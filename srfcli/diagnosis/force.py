@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from srfcli.diagnosis.refits import Refit
-from srfcli.diagnosis.search import NEAR, Search
+from srfcli.diagnosis.refits import NEAR, Refit
+from srfcli.diagnosis.search import Search
 from srfcli.inference.fit import Problem
 from srfcli.inference.latent import LatentFit, Tracks, fit_latent
 from srfcli.inference.prediction import Pull

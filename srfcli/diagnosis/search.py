@@ -13,7 +13,7 @@ from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.contest import contest
 from srfcli.diagnosis.elsewhere import elsewhere
 from srfcli.diagnosis.follower import FAIR, FOLLOWED, LOOSE_ONLY, PULLS, Followed, Follower, shortened
-from srfcli.diagnosis.refits import Refit, freedom_spent
+from srfcli.diagnosis.refits import NEAR, Refit, freedom_spent
 from srfcli.diagnosis.score import Score, scores
 from srfcli.inference.fit import Problem, first_level
 from srfcli.inference.latent import STEPS, LatentFit, Tracks, evenness, fit_latent, tracks_for
@@ -28,7 +28,6 @@ CHOICE, SECOND = 3.0, 6.0  # cost of an effect, as there are some twenty to choo
 CLOSE = 6.0  # hypotheses within so much of the best may be it
 RIVAL = 30.0  # short of the best score's gain: where the best leaves noise alone, less is not refitted
 RIVAL_SHARE = 0.05  # the same as a part of that gain
-NEAR = 2.5  # residual over noise within which slopes at the fit tell where a better one is
 HALFWAY = 1.25  # the same within which a rough track may be what is left
 ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other

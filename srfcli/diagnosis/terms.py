@@ -21,9 +21,9 @@ from srfcli.diagnosis.candidates import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.closedform import ClosedForm, FittedTerm
 from srfcli.diagnosis.contest import contest
 from srfcli.diagnosis.force import missing_force
-from srfcli.diagnosis.refits import Refit
+from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.score import Score, scores
-from srfcli.diagnosis.search import NEAR, WORTH, Search
+from srfcli.diagnosis.search import WORTH, Search
 from srfcli.diagnosis.verdict import Diagnosis, judge_held
 from srfcli.errors import SrfError
 from srfcli.expression import symbol

@@ -28,8 +28,6 @@ GROWN = 3.0  # standard deviations of the last fit over which the next stage wan
 SHORTER = (1.0, 0.5, 0.25, 0.12)  # of the first horizons
 POOR = 4.0  # reduced chi-squared of a first stage that is not believed before shorter ones were tried
 CONVERGED = 0.1  # standard errors: how far the minimum may still be, by the gradient
-FOLLOWS = 4.0  # chi-squared per degree of freedom up to which a rough fit's minimum is worth reaching exactly
-HOPELESS = 30.0  # the same at which a rough fit's horizons grow no more: the model cannot follow
 BAD = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
 
 
@@ -164,15 +162,13 @@ def fit(
     noises: Mapping[str, Noise] | None = None,
     progress: Callable[[str], None] = lambda text: None,
     refinements: int = 3,
-    rough: bool = False,
 ) -> Fit:
     """Return the maximum-likelihood fit from `start` (k,), the problem's own start values if left out.
 
     First with white noise of the level that the recordings' differences show and growing horizons, then with the noise that the
-    residuals show, until the two agree. KeyboardInterrupt becomes `Interrupted`, with the best parameters so far. A `rough` fit
-    stops early: it is where a better one starts from.
+    residuals show, until the two agree. KeyboardInterrupt becomes `Interrupted`, with the best parameters so far.
     """
-    search = Search(problem, progress, rough=rough)
+    search = Search(problem, progress)
     theta = np.clip(problem.start if start is None else start, problem.lower, problem.upper)
     noise = {r.name: Noise(first_level(r)) for r in problem.runs} if noises is None else dict(noises)
     try:
@@ -194,27 +190,15 @@ def first_level(run: Run) -> float:
     return max(level, run.quantum / np.sqrt(12), 1e-9 * float(np.ptp(run.observed)), 1e-300)
 
 
-@dataclass(frozen=True)
-class Stage:
-    """Where a growing fit stood: samples up to the horizons (s, by run) fitted, chi-squared for each degree of freedom."""
-
-    theta: Array
-    horizons: Mapping[str, float]
-    reduced: float
-
-
 class Search:
     """One minimisation: counts evaluations, keeps the best, and knows the covariance of the last."""
 
-    def __init__(self, problem: Problem, progress: Callable[[str], None], *, rough: bool = False) -> None:
+    def __init__(self, problem: Problem, progress: Callable[[str], None]) -> None:
         self.problem, self.progress = problem, progress
-        self.rough = rough
-        self.hopeless = HOPELESS if rough else np.inf
         self.evaluations = 0
         self.reduced = 1.0  # chi-squared for each degree of freedom
         self.best, self.covariance = problem.start, np.zeros((problem.start.size,) * 2)
         self.trail: list[tuple[float, str]] = []
-        self.stages: list[Stage] = []
         self.scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
 
     def grow(self, theta: Array, noise: Mapping[str, Noise]) -> tuple[Array, Status]:
@@ -222,9 +206,6 @@ class Search:
         width = np.minimum((self.problem.upper - self.problem.lower) / 6, 0.15 * self.scale)
         theta, status, horizons = self.first_stage(theta, noise, np.diag(width))
         covered = self.covered(horizons)
-        self.stages.append(Stage(theta, dict(horizons), self.reduced))
-        if self.reduced > self.hopeless:
-            return theta, status
         for stage in range(2, STAGES + 1):
             if covered >= 1.0:
                 break
@@ -236,10 +217,7 @@ class Search:
                 horizons, share = {}, 1.0
             self.progress(f"stage {stage}: {100 * share:.0f} % of the samples")
             theta, status = self.minimise(theta, noise, horizons)
-            self.stages.append(Stage(theta, dict(horizons), self.reduced))
             covered = share
-            if self.reduced > self.hopeless and covered < 1.0:
-                break
         return theta, status
 
     def first_stage(
@@ -289,14 +267,7 @@ class Search:
         return limit
 
     def minimise(self, theta: Array, noise: Mapping[str, Noise], horizons: Mapping[str, float]) -> tuple[Array, Status]:
-        """Return the minimum of the whitened residuals up to the horizons, and how the minimiser ended.
-
-        A rough search stops early where the model does not follow the data, and only there.
-        """
-        if self.rough:
-            theta, status = self.descend(theta, noise, horizons, tolerance=1e-4, most=12)
-            if self.reduced > FOLLOWS:
-                return theta, status
+        """Return the minimum of the whitened residuals up to the horizons, and how the minimiser ended."""
         return self.descend(theta, noise, horizons, tolerance=1e-9, most=60)
 
     def descend(

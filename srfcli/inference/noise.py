@@ -60,21 +60,20 @@ def whiten(noise: Noise, columns: Array, parts: list[tuple[int, int]]) -> Array:
     that no sample is lost and the likelihood is exact.
     """
     out = []
-    whole = noise
     for a, b in parts:
-        noise = whole.at(a)
-        predictors = _predictors(noise)
+        own = noise.at(a)
+        predictors = _predictors(own)
         piece = columns[a:b]
         white = np.empty_like(piece)
-        for k in range(min(noise.order, b - a)):
+        for k in range(min(own.order, b - a)):
             phi, sd = predictors[k]
             past = sum((c * piece[k - 1 - i] for i, c in enumerate(phi)), np.zeros_like(piece[0]))
             white[k] = (piece[k] - past) / sd
-        if b - a > noise.order:
-            rest = piece[noise.order :].copy()
-            for i, c in enumerate(noise.coefficients):
-                rest -= c * piece[noise.order - 1 - i : b - a - 1 - i]
-            white[noise.order :] = rest / noise.innovation
+        if b - a > own.order:
+            rest = piece[own.order :].copy()
+            for i, c in enumerate(own.coefficients):
+                rest -= c * piece[own.order - 1 - i : b - a - 1 - i]
+            white[own.order :] = rest / own.innovation
         out.append(white)
     return np.concatenate(out) if out else columns[:0]
 
