@@ -21,16 +21,7 @@ from srfcli.registry import load_registry
 SHS = ("--W0", "5", "--drive", "1:10, 100:0, 3:10")
 
 
-@pytest.fixture(autouse=True)
-def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty folder to work in, without settings of the caller; only the cache of generated code is shared."""
-    for name in [n for n in os.environ if n.startswith("SRF_") and n not in ("SRF_CACHE", "SRF_SHARED")]:
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "none"))
-    folder = tmp_path / "empty"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    return folder
+pytestmark = pytest.mark.usefixtures("empty_folder")
 
 
 def simulate(*arguments: str, code: int = 0) -> Result:

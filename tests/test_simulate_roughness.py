@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-import os
 import re
 import shutil
 from pathlib import Path
@@ -32,18 +31,6 @@ from srfcli.registry import load_registry
 from srfcli.splines import Spline
 
 STEADY = ("--V", "10", "--W0", "5", "--for", "2", "--rate", "100")
-
-
-@pytest.fixture
-def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty folder to work in, without settings of the caller; only the cache of generated code is shared."""
-    for name in [n for n in os.environ if n.startswith("SRF_") and n not in ("SRF_CACHE", "SRF_SHARED")]:
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "none"))
-    folder = tmp_path / "empty"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    return folder
 
 
 def simulate(*arguments: str, code: int = 0) -> Result:
