@@ -21,7 +21,8 @@ LOOSE = 5.0  # slip lengths over which a pull acts that leaves most of a misfit 
 PULLS = ((2.5, LOOSE), (1.25, LOOSE))  # the same, ever weaker; the second way is tried where the first leads nowhere
 LOOSE_ONLY = (LOOSE,)  # the one pull that a refit starts under
 COARSE, FEW = 1e-2, 12  # tolerance of chi-squared under a pull, and evaluations
-ROUND, FAIR = 1e-4, 1e-5  # relative tolerances of the integrator, pulled and free, on the way
+ROUND = 1e-4  # relative tolerance of the integrator on a rough track under a pull
+FAIR = 1e-5  # the same of a free fit, where the noise asks for no more
 FOLLOWED = 4.0  # chi-squared per degree of freedom of a model that follows the recording without a pull
 HOPELESS = 30.0  # the same of one that does not: its minimum need not be known exactly
 
