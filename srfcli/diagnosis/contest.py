@@ -9,51 +9,69 @@ import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.elsewhere import elsewhere
-from srfcli.diagnosis.follower import LOOSE_ONLY, PULLS
+from srfcli.diagnosis.follower import LOOSE_ONLY, PULLS, same
 from srfcli.diagnosis.refits import Entry, Refit
-from srfcli.diagnosis.score import Score
 from srfcli.inference.latent import STEPS, Tracks, fit_latent
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
 
 CLEAR = 1.5  # chi-squared per degree of freedom under a pull that is nearly noise
-STUCK = 0.8  # share of it that is left after more steps where these still help
 WORSE = 1.25  # times the free chi-squared of the best: under a pull, too much to do better freely
-HOPELESS = 4.0  # under a pull: what is missing is elsewhere, and only the best is let go, to go on from
-RELEASED = 2  # fitted freely although their fit under the pull is no good, besides the best
+AGAIN = 4  # led again from other places and by stronger pulls: a minimum of one that does well already may be false
+RELEASED = 2  # fitted freely although their fit under the pull is no good
 
 
-def contest(search: Search, refit: Refit, promising: Sequence[Score]) -> list[Refit]:
-    """Return the best of the hypotheses that add one effect to one that is far off: by their fits under a pull, then free.
+def contest(search: Search, refit: Refit, entrants: Sequence[tuple[Hypothesis, dict[str, float]]]) -> list[Refit]:
+    """Return the best of hypotheses that add effects to one that is far off: by their fits under a pull, then free.
 
-    What is missing shows under the pull already: with it, little is left there.
+    With what is missing, little is left under the pull already. `entrants` come with what is expected of the added parameters.
     """
-    around, found, waiting = search.pulled(refit).values, [], []
-    for score in promising:
-        hypothesis = Hypothesis((*refit.hypothesis.effects, score.effect))
+    around, waiting, found = search.pulled(refit).values, [], []
+    for hypothesis, own in entrants:
         if not search.untried(hypothesis, rough=False):
             continue
-        own = search.own_values(hypothesis, score.values)
         waiting.append(_entry(search, hypothesis, around | own, own, LOOSE_ONLY))
         if waiting[-1].reduced < CLEAR:
             found.append(elsewhere(search, _released(search, waiting.pop())))
             if found[-1].adequacy.fine:
                 return found
-    for first, entry in zip((True, *[False] * RELEASED), sorted(waiting, key=lambda e: e.reduced), strict=False):
-        best = _entry(search, entry.hypothesis, entry.values, entry.own, LOOSE_ONLY)
-        moves = best.reduced < STUCK * entry.reduced or bool(entry.hypothesis.effects[-1].settings)
-        for way in PULLS[: 2 if moves else 1 if first else 0]:
-            if best.reduced < CLEAR:
-                break
-            best = min(best, _entry(search, entry.hypothesis, entry.own, entry.own, way), key=lambda e: e.reduced)
-        beaten = found and best.reduced > WORSE * min(r.adequacy.rms_over_noise for r in found) ** 2
-        if beaten or (best.reduced > HOPELESS and not first):
+    waiting.sort(key=lambda e: e.reduced)
+    left = []
+    for i, entry in enumerate(waiting):
+        single = len(entry.hypothesis.effects) == 1
+        best = _led_again(search, entry, around) if single and (i < AGAIN or _built(entry)) else entry
+        if best.reduced >= CLEAR:
+            left.append(best)
             continue
         found.append(elsewhere(search, _released(search, best)))
         if found[-1].adequacy.fine:
-            break
+            return found
+    for best in sorted(left, key=lambda e: e.reduced)[:RELEASED]:
+        if not found or best.reduced < WORSE * min(r.adequacy.rms_over_noise for r in found) ** 2:
+            found.append(elsewhere(search, _released(search, best)))
+            if found[-1].adequacy.fine:
+                break
     return found
+
+
+def _led_again(search: Search, entry: Entry, around: dict[str, float]) -> Entry:
+    """Return the best that other starts and stronger pulls lead a hypothesis to, until little is left or two agree."""
+    best = entry
+    for at, way in ((entry.own, PULLS[0]), (around | entry.own, PULLS[1]), (entry.own, PULLS[1])):
+        if best.reduced < CLEAR or search.spent():
+            break
+        found = _entry(search, entry.hypothesis, at, entry.own, way)
+        agreed = same(found.reduced, best.reduced) and not _built(entry)
+        best = min(best, found, key=lambda e: e.reduced)
+        if agreed:
+            break
+    return best
+
+
+def _built(entry: Entry) -> bool:
+    """Return whether the last effect is built into the model: what it does there is seen at no first order."""
+    return bool(entry.hypothesis.effects[-1].settings)
 
 
 def _entry(
@@ -69,7 +87,7 @@ def _entry(
 def _released(search: Search, entry: Entry) -> Refit:
     """Fit a hypothesis freely from parameters under a pull."""
     hypothesis = entry.hypothesis
-    led = search.follower.released(hypothesis, entry.theta, search.noise)
+    led = search.follower.released(hypothesis, entry.theta, entry.reduced, search.noise)
     search.followed[hypothesis.name] = led
     problem = search.problem(hypothesis)
     steps = 2 if led.lost else STEPS

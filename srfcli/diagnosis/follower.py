@@ -3,38 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis, own_parameters
 from srfcli.inference import fit as fitting
-from srfcli.inference.fit import Problem
+from srfcli.inference.fit import Problem, first_level
 from srfcli.inference.follow import pull_towards, slip_length, weaker
 from srfcli.inference.latent import LatentFit, Tracks, fit_latent
 from srfcli.inference.noise import Noise
+from srfcli.inference.prediction import RTOL
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
 
 LOOSE = 5.0  # slip lengths over which a pull acts that leaves most of a misfit to be seen
-PULLS = ((2.5, LOOSE), (1.25, LOOSE))  # the same, ever weaker; the second way is tried where the first leads nowhere
+PULLS = (
+    (2.5, LOOSE),
+    (0.6, 1.25, 2.5, LOOSE),
+    (0.15, 0.3, 0.6, 1.25, 2.5, LOOSE),
+)  # the same, ever weaker; the next way is tried where one leads nowhere
 LOOSE_ONLY = (LOOSE,)  # the one pull that a refit starts under
 COARSE, FEW = 1e-2, 12  # tolerance of chi-squared under a pull, and evaluations
-ROUND = 1e-4  # relative tolerance of the integrator on a rough track under a pull
+ROUND = 1e-4  # relative tolerance of the integrator under a pull
 FAIR = 1e-5  # the same of a free fit, where the noise asks for no more
+QUIET = 1e-3  # noise over a record's standard deviation beyond which it asks for no more
+SAME = 0.01  # relative difference of chi-squared within which two ways led to the same minimum
 FOLLOWED = 4.0  # chi-squared per degree of freedom of a model that follows the recording without a pull
 HOPELESS = 30.0  # the same of one that does not: its minimum need not be known exactly
 
 
 @dataclass(frozen=True)
 class Followed:
-    """Parameters (k,) with their `reduced` chi-squared when the spring is free, and those under the last pull."""
+    """Parameters (k,) with their `reduced` chi-squared when the spring is free, and those under the last pull with theirs."""
 
     problem: Problem
     theta: Array
     reduced: float
     pulled: Array
+    held: float
 
     @property
     def lost(self) -> bool:
@@ -46,16 +54,21 @@ class Follower:
     """Fits hypotheses to one experiment under pulls that grow weaker."""
 
     def __init__(self, registry: Registry, experiment: Experiment, trend: str | None) -> None:
-        self.registry, self.experiment, self.trend = registry, experiment, trend
+        self.registry, self.experiment, self.trend, self.rtol = registry, experiment, trend, RTOL
         problem = self.problem(Hypothesis(), {})
         self.unit = slip_length(problem.model, experiment)
         self.strong = pull_towards(experiment, problem.runs, self.unit)
         self.evaluations = 0
+        still = min(first_level(r) / max(float(np.std(r.observed)), 1e-300) for r in problem.runs)
+        self.rtol = FAIR if still > QUIET else RTOL
 
     def problem(self, hypothesis: Hypothesis, at: Mapping[str, float], length: float | None = None) -> Problem:
         """Return the fit of a hypothesis under a pull over so many slip lengths, or free."""
         pull = weaker(self.strong, self.experiment.runs, length * self.unit) if length is not None else None
-        return hypothesis.problem(self.registry, self.experiment, rough=False, at=dict(at), trend=self.trend, pull=pull)
+        found = hypothesis.problem(
+            self.registry, self.experiment, rough=False, at=dict(at), trend=self.trend, pull=pull
+        )
+        return replace(found, rtol=self.rtol if pull is None else ROUND)
 
     def follow(
         self, hypothesis: Hypothesis, at: Mapping[str, float], noise: Mapping[str, Noise],
@@ -64,9 +77,7 @@ class Follower:
         """Return the best free fit that any of the ways of weakening the pull leads to, from the values in `at`."""
         best: Followed | None = None
         for way in ways:
-            found = self.released(hypothesis, self.led(hypothesis, at, noise, way)[0], noise)
-            if best is None or found.reduced < best.reduced:
-                best = found
+            best = better(best, self.released(hypothesis, *self.led(hypothesis, at, noise, way), noise))
             if best.reduced < FOLLOWED:
                 break
         assert best is not None
@@ -81,11 +92,11 @@ class Follower:
             theta, reduced = self.descend(self.problem(hypothesis, at, length), theta, noise, COARSE)
         return theta, reduced
 
-    def released(self, hypothesis: Hypothesis, pulled: Array, noise: Mapping[str, Noise]) -> Followed:
-        """Return the free fit from parameters under a pull."""
+    def released(self, hypothesis: Hypothesis, pulled: Array, held: float, noise: Mapping[str, Noise]) -> Followed:
+        """Return the free fit from parameters under a pull, and their chi-squared there."""
         free = self.problem(hypothesis, {})
         theta, reduced = self.descend(free, pulled, noise, 1e-4)
-        return Followed(free, theta, reduced, pulled)
+        return Followed(free, theta, reduced, pulled, held)
 
     def descend(
         self, problem: Problem, theta: Array, noise: Mapping[str, Noise], tolerance: float
@@ -114,6 +125,19 @@ class Follower:
         """Return the fit of a hypothesis under a loose pull, around which everything is nearly linear."""
         problem = self.problem(hypothesis, values, LOOSE)
         return fit_latent(problem, problem.start, noise, tracks=Tracks((), {}), known_noise=True, steps=FEW)
+
+
+def same(one: float, other: float) -> bool:
+    """Return whether two values of chi-squared are those of one minimum."""
+    return abs(one - other) < SAME * min(one, other)
+
+
+def better(known: Followed | None, found: Followed) -> Followed:
+    """Return the better of two free fits, with the better of the two under a pull, which may be another."""
+    if known is None:
+        return found
+    best, held = min((known, found), key=lambda f: f.reduced), min((known, found), key=lambda f: f.held)
+    return replace(best, pulled=held.pulled, held=held.held)
 
 
 def shortened(hypothesis: Hypothesis, problem: Problem, noise: Mapping[str, Noise]) -> tuple[Array, float]:

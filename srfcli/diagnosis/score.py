@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from srfcli.laws import Effect
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
+
+INNER = 3  # values of an effect's inner parameters that are tried with another effect's, best alone first
 
 
 @dataclass(frozen=True)
@@ -39,67 +42,131 @@ class Score:
     direction: Array = field(repr=False, compare=False)
 
 
+@dataclass(frozen=True)
+class PairScore:
+    """What two effects could explain together: `gain` in log likelihood at first order, and the parameters expected of each."""
+
+    effects: tuple[Effect, Effect]
+    gain: float
+    values: tuple[dict[str, float], dict[str, float]]
+
+
 def scores(registry: Registry, experiment: Experiment, fitted: LatentFit, effects: Sequence[Effect], *,
            present: Sequence[Effect] = ()) -> list[Score]:  # fmt: skip
     """Return the scores of `effects`, largest gain first, around a fit whose model has the effects `present`."""
     if not effects:
         return []
     columns = columns_of(registry, experiment, fitted, effects, tuple(present))
-    return sorted(_judged(fitted, columns), key=lambda s: -s.gain)
+    return sorted(_judged(_Columns(fitted, columns)), key=lambda s: -s.gain)
 
 
-def _judged(fitted: LatentFit, columns: Sequence[Column]) -> list[Score]:
+def pair_scores(
+    registry: Registry, experiment: Experiment, fitted: LatentFit, effects: Sequence[Effect]
+) -> list[PairScore]:
+    """Return what any two of `effects` could explain together, at first order, largest gain first."""
+    if len(effects) < 2:
+        return []
+    around = _Columns(fitted, columns_of(registry, experiment, fitted, effects, ()))
+    alone: dict[str, list[tuple[float, int]]] = {}
+    for j, column in enumerate(around.columns):
+        alone.setdefault(column.effect.name, []).append((around.screened(around.own(j))[0], j))
+    foremost = [j for found in alone.values() for _, j in sorted(found, reverse=True)[:INNER]]
+    best: dict[frozenset[str], PairScore] = {}
+    for i, j in combinations(foremost, 2):
+        pair = (around.columns[i], around.columns[j])
+        names = frozenset(c.effect.reported for c in pair)
+        if len(names) < 2 or any(c.effect.settings for c in pair):
+            continue
+        own = around.own(i)
+        gain, size, _, _ = around.screened([*own, *around.own(j)])
+        if names not in best or gain > best[names].gain:
+            values = (_expected(pair[0], size[: len(own)]), _expected(pair[1], size[len(own) :]))
+            best[names] = PairScore((pair[0].effect, pair[1].effect), gain, values)
+    return sorted(best.values(), key=lambda p: -p.gain)
+
+
+class _Columns:
+    """The effects' columns beside those of parameters and tracks, whitened: normal equations around a fit."""
+
+    def __init__(self, fitted: LatentFit, columns: Sequence[Column]) -> None:
+        self.fitted, self.columns = fitted, columns
+        problem, point = fitted.problem, fitted.point
+        n = self.n = point.theta.size
+        widths = [next(iter(c.by_run.values())).shape[1] for c in columns]
+        self.edges = edges = np.cumsum([0, *widths])
+        k = self.k = point.g.size
+        self.N, self.g = np.zeros((k + edges[-1], k + edges[-1])), np.zeros(k + edges[-1])
+        self.pieces: list[tuple[Sequence[int], Array]] = []
+        scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
+        for run in problem.runs:
+            p = point.predictions[run.name]
+            places = (
+                [*range(n), *(n + i for i in point.tracks.columns(run))]
+                if run.name in point.tracks.of
+                else list(range(n))
+            )
+            X = np.column_stack([c.by_run[run.name] for c in columns])
+            difference = run.observed - p.y
+            bad = ~(np.isfinite(difference) & np.isfinite(p.J).all(axis=1) & np.isfinite(X).all(axis=1))
+            J = np.column_stack([p.J, X, difference])
+            J[bad] = 0.0
+            J[:, :n] *= scale
+            white = whiten(fitted.noise[run.name], J, stretches(run.t, run.used))
+            slopes, r = white[:, :-1], white[:, -1]
+            places = [*places, *range(k, k + edges[-1])]
+            self.N[np.ix_(places, places)] += slopes.T @ slopes
+            self.g[places] += slopes.T @ r
+            self.pieces.append((places, slopes))
+        self.screened = _screen(fitted, self.N, self.g, n, k)
+
+    def own(self, j: int) -> list[int]:
+        """Return the places of one column of an effect, sine and cosine."""
+        return list(range(self.k + self.edges[j], self.k + self.edges[j + 1]))
+
+
+def _judged(around: _Columns) -> list[Score]:
     """Return the best score of each effect over its inner values."""
-    problem, point = fitted.problem, fitted.point
-    n = point.theta.size
-    widths = [next(iter(c.by_run.values())).shape[1] for c in columns]
-    edges = np.cumsum([0, *widths])
-    k = point.g.size
-    N, g = np.zeros((k + edges[-1], k + edges[-1])), np.zeros(k + edges[-1])
-    scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
-    pieces = []
-    for run in problem.runs:
-        p = point.predictions[run.name]
-        places = (
-            [*range(n), *(n + i for i in point.tracks.columns(run))] if run.name in point.tracks.of else list(range(n))
-        )
-        X = np.column_stack([c.by_run[run.name] for c in columns])
-        difference = run.observed - p.y
-        bad = ~(np.isfinite(difference) & np.isfinite(p.J).all(axis=1) & np.isfinite(X).all(axis=1))
-        J = np.column_stack([p.J, X, difference])
-        J[bad] = 0.0
-        J[:, :n] *= scale
-        white = whiten(fitted.noise[run.name], J, stretches(run.t, run.used))
-        slopes, r = white[:, :-1], white[:, -1]
-        places = [*places, *range(k, k + edges[-1])]
-        N[np.ix_(places, places)] += slopes.T @ slopes
-        g[places] += slopes.T @ r
-        pieces.append((places, slopes))
+    fitted, N, g, n, k = around.fitted, around.N, around.g, around.n, around.k
     baseline = _marginal(fitted, N[:k, :k], g[:k], n, [])
-    screened = _screen(fitted, N, g, n, k)
     best: dict[str, tuple[float, int]] = {}
-    for j, column in enumerate(columns):
-        gain = screened(range(k + edges[j], k + edges[j + 1]))[0]
+    for j, column in enumerate(around.columns):
+        gain = around.screened(around.own(j))[0]
         if gain > best.get(column.effect.name, (-1.0, 0))[0]:
             best[column.effect.name] = (gain, j)
     out = []
     for _, j in best.values():
-        own = list(range(k + edges[j], k + edges[j + 1]))
-        _, size, covariance, surviving = screened(own)
+        own = around.own(j)
+        _, size, covariance, surviving = around.screened(own)
         gain = max(_marginal(fitted, N, g, n, own) - baseline, 0.0)
-        out.append(_score(columns[j], gain, size, covariance, surviving, _direction(fitted, pieces, N, n, k, own[0])))
+        direction = _direction(fitted, around.pieces, N, n, k, own[0])
+        out.append(_score(around.columns[j], gain, size, covariance, surviving, direction))
     return out
 
 
 def _score(column: Column, gain: float, size: Array, covariance: Array, surviving: float, direction: Array) -> Score:
-    effect, values = column.effect, dict(column.inner)
-    amplitude, stderr = float(size[0]), float(np.sqrt(covariance[0, 0]))
+    amplitude = float(np.hypot(size[0], size[1])) if column.phases == 2 else float(size[0])
+    stderr = float(np.sqrt(covariance[0, 0]))
+    return Score(
+        column.effect,
+        gain,
+        _expected(column, size),
+        amplitude,
+        stderr,
+        surviving,
+        float(stderr * np.sqrt(24.0)),
+        direction,
+    )
+
+
+def _expected(column: Column, size: Array) -> dict[str, float]:
+    """Return the effect's parameters at such sizes, where its inner ones fit best."""
+    effect, values, amplitude = column.effect, dict(column.inner), float(size[0])
     if column.phases == 2:  # sine and cosine together: amplitude and phase
         amplitude = float(np.hypot(size[0], size[1]))
         values["phase"] = float(np.arctan2(size[1], size[0]))
     if effect.sizes:
         values[effect.sizes[0]] = dict(effect.neutral)[effect.sizes[0]] + amplitude
-    return Score(effect, gain, values, amplitude, stderr, surviving, float(stderr * np.sqrt(24.0)), direction)
+    return values
 
 
 def _prior(fitted: LatentFit, k: int, n: int) -> Array:

@@ -12,13 +12,12 @@ from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_pa
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.contest import contest
 from srfcli.diagnosis.elsewhere import elsewhere
-from srfcli.diagnosis.follower import FAIR, FOLLOWED, LOOSE_ONLY, PULLS, Followed, Follower, shortened
+from srfcli.diagnosis.follower import FOLLOWED, LOOSE_ONLY, PULLS, Followed, Follower, better, same, shortened
 from srfcli.diagnosis.refits import NEAR, Refit, freedom_spent
-from srfcli.diagnosis.score import Score, scores
+from srfcli.diagnosis.score import Score, pair_scores, scores
 from srfcli.inference.fit import Problem, first_level
 from srfcli.inference.latent import STEPS, LatentFit, Tracks, evenness, fit_latent, tracks_for
 from srfcli.inference.noise import Noise
-from srfcli.inference.prediction import RTOL
 from srfcli.laws import Effect
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
@@ -29,11 +28,11 @@ CLOSE = 6.0  # hypotheses within so much of the best may be it
 RIVAL = 30.0  # short of the best score's gain: where the best leaves noise alone, less is not refitted
 RIVAL_SHARE = 0.05  # the same as a part of that gain
 HALFWAY = 1.25  # the same within which a rough track may be what is left
+HALF = 0.5  # of a misfit, that one effect takes away before two are tried ahead of a rough track
 ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
 MOST_EVALUATIONS = 1200  # of the recordings by a model with slopes, in all
 ROUGH_COSTS = 3  # of these, one with the slopes by a track
-QUIET = 1e-3  # noise over a record's standard deviation beyond which the integration need not be exact to 1e-6
 FAINTER = 0.05  # of the first's score: an effect that promises so little less is not tried
 FIRST, SINGLES, PAIRS = 2, 8, 3  # refitted in full, at each stage
 
@@ -59,11 +58,6 @@ class Search:
 
     def __post_init__(self) -> None:
         self.follower = Follower(self.registry, self.experiment, self.trend)
-        runs = self.follower.strong.records
-        still = min(
-            first_level(r) / max(float(np.std(r.observed)), 1e-300) for r in self.experiment.runs if r.name in runs
-        )
-        self.rtol = FAIR if still > QUIET else RTOL
 
     def run(self) -> list[Refit]:
         """Return everything that was fitted, best evidence first."""
@@ -134,15 +128,22 @@ class Search:
         self.widen(baseline, candidates, FIRST if near else SINGLES, rough=False)
         if (
             self.settled(candidates)
+            or (near and self.halved(baseline) and (self.paired(candidates) or self.together(baseline, candidates)))
             or (near and self.on_a_rough_track(baseline, candidates))
             or (not near and self.shaken(candidates))
             or self.paired(candidates)
+            or self.together(baseline, candidates)
             or self.roughened(candidates)
             or self.shaken(candidates, rough=True)
         ):
             return
         self.paired(candidates)
         self.roughened(candidates)
+
+    def halved(self, baseline: Refit) -> bool:
+        """Return whether the best so far leaves less than half of what the baseline leaves above noise."""
+        left, before = (r.adequacy.rms_over_noise**2 - 1 for r in (self.best(), baseline))
+        return left < HALF * before
 
     def paired(self, candidates: Sequence[Effect]) -> bool:
         """Return whether one of the two best single effects leaves noise alone together with another."""
@@ -210,12 +211,14 @@ class Search:
         level = {r.name: Noise(first_level(r)) for r in runs}
         for way in PULLS:  # noise is better known after the first
             found = self.follower.follow(bare, {}, self.noise or level, [way])
-            if bare.name not in self.followed or found.reduced < self.followed[bare.name].reduced:
-                self.followed[bare.name] = found
-            self.noise = gauge_noise(runs, self.follower.smallest(found))
-            if found.reduced < FOLLOWED:
+            known = self.followed.get(bare.name)
+            best = self.followed[bare.name] = better(known, found)
+            self.progress(
+                f"baseline: rms over noise {best.reduced**0.5:.2f}, with the spring drawn {best.held**0.5:.2f}"
+            )
+            self.noise = gauge_noise(runs, self.follower.smallest(best))
+            if best.reduced < FOLLOWED or (known is not None and same(known.held, found.held)):
                 break
-        best = self.followed[bare.name]
         steps = 2 if best.lost else STEPS
         return self.keep(
             bare, fit_latent(self.problem(bare), best.theta, self.noise, known_noise=True, steps=steps), rough=False
@@ -248,7 +251,7 @@ class Search:
     def problem(self, hypothesis: Hypothesis, at: Mapping[str, float] | None = None, *, rough: bool = False) -> Problem:
         """Return the fit of a hypothesis from the values in `at`, integrated as exactly as the noise asks for."""
         found = hypothesis.problem(self.registry, self.experiment, rough=rough, at=at, trend=self.trend)
-        return replace(found, rtol=self.rtol)
+        return replace(found, rtol=self.follower.rtol)
 
     def score(self, refit: Refit, candidates: Sequence[Effect]) -> list[Score]:
         """Return the scores of everything that a refit does not have yet."""
@@ -271,18 +274,35 @@ class Search:
             built = [s for s in scored if s.effect.settings]
             promising = [*built, *(s for s in promising if not s.effect.settings)]
         if not (rough or refit.adequacy.rms_over_noise < NEAR):
-            contest(self, refit, promising)
+            contest(self, refit, self.widened(refit, promising))
             return
-        for score in promising:
-            hypothesis = Hypothesis((*refit.hypothesis.effects, score.effect))
+        for score, (hypothesis, own) in zip(promising, self.widened(refit, promising), strict=True):
             if not self.rivals(score, promising, refit) or not self.untried(hypothesis, rough=rough):
                 continue
-            found = self.refit(hypothesis, refit, score.values, rough=rough)
+            found = self.refit(hypothesis, refit, own, rough=rough)
             if not rough and self.best() is found:
                 found = elsewhere(self, found)
             halfway = not found.adequacy.fine and found.adequacy.rms_over_noise < HALFWAY
             if not rough and halfway and self.best() is found:
                 self.refit(hypothesis, found, {}, rough=True)
+
+    def widened(self, refit: Refit, added: Sequence[Score]) -> list[tuple[Hypothesis, dict[str, float]]]:
+        """Return the hypotheses that add one effect to a refit's own, with what its score expects of its parameters."""
+        wider = [Hypothesis((*refit.hypothesis.effects, score.effect)) for score in added]
+        return [(h, self.own_values(h, score.values)) for h, score in zip(wider, added, strict=True)]
+
+    def together(self, baseline: Refit, candidates: Sequence[Effect]) -> bool:
+        """Return whether two effects leave noise alone, of those that could explain most together."""
+        near = baseline.adequacy.rms_over_noise < NEAR
+        around = baseline.fit if near else self.pulled(baseline)
+        foremost = pair_scores(self.registry, around.problem.experiment, around, candidates)[:PAIRS]
+        entrants = [(h, self.own_values(h, *p.values)) for p in foremost for h in (Hypothesis(p.effects),)]
+        if not near:
+            contest(self, baseline, entrants)
+        for hypothesis, own in entrants if near else ():
+            if self.untried(hypothesis, rough=False):
+                elsewhere(self, self.refit(hypothesis, baseline, own, rough=False))
+        return self.best().adequacy.fine
 
     def untried(self, hypothesis: Hypothesis, *, rough: bool) -> bool:
         """Return whether a hypothesis was not fitted yet and the budget leaves room for it."""
@@ -292,13 +312,18 @@ class Search:
         return not any(set(t.hypothesis.effects) == set(hypothesis.effects) and r == rough
                        for (_, r), t in self.tried.items())  # fmt: skip
 
-    def own_values(self, hypothesis: Hypothesis, added: Mapping[str, float]) -> dict[str, float]:
-        """Return what a score expects of the last effect's parameters, by their names in the model."""
+    def own_values(self, hypothesis: Hypothesis, *added: Mapping[str, float]) -> dict[str, float]:
+        """Return what scores expect of the last effects' parameters, by their names in the model."""
         if not hypothesis.effects:
             return {}
         model = hypothesis.model(self.registry, self.experiment, rough=False)
-        own = own_parameters(hypothesis.effects[-1], model)
-        return {long: added[p.name] for long, p in own.items() if p.name in added}
+        last = zip(hypothesis.effects[-len(added) :], added, strict=True)
+        return {
+            long: values[p.name]
+            for effect, values in last
+            for long, p in own_parameters(effect, model).items()
+            if p.name in values
+        }
 
     def rivals(self, score: Score, others: Sequence[Score], refit: Refit) -> bool:
         """Return whether an effect may do as well as the best so far: always where that leaves more than noise."""
@@ -315,11 +340,9 @@ class Search:
         alike = abs(float(found.direction @ score.direction))
         return alike > ALIKE and found.gain - score.gain < RIVAL + RIVAL_SHARE * found.gain
 
-    def refit(self, hypothesis: Hypothesis, start: Refit, added: Mapping[str, float], *, rough: bool) -> Refit:
-        """Fit a hypothesis from another one's parameters and from what a score expects of the added effect."""
-        at = dict(start.fit.values)
-        if hypothesis.effects != start.hypothesis.effects:
-            at |= self.own_values(hypothesis, added)
+    def refit(self, hypothesis: Hypothesis, start: Refit, own: Mapping[str, float], *, rough: bool) -> Refit:
+        """Fit a hypothesis from another one's parameters and from its own values of those that were added."""
+        at = dict(start.fit.values) | dict(own)
         problem = self.problem(hypothesis, at, rough=rough)
         theta, squares = shortened(hypothesis, problem, self.noise)
         if not rough and squares > ASTRAY * start.fit.point.chi2:

@@ -120,12 +120,11 @@ class _Selection:
         search = self.search
         if start.rough or start.adequacy.rms_over_noise < NEAR:
             found = []
-            for score in _foremost(self.scored(start, start.fit)):
-                hypothesis = Hypothesis((*start.hypothesis.effects, score.effect))
+            for hypothesis, own in search.widened(start, _foremost(self.scored(start, start.fit))):
                 if self.new(hypothesis):
-                    found.append(search.refit(hypothesis, start, score.values, rough=start.rough))
+                    found.append(search.refit(hypothesis, start, own, rough=start.rough))
         else:
-            found = contest(search, start, _foremost(self.scored(start, search.pulled(start))))
+            found = contest(search, start, search.widened(start, _foremost(self.scored(start, search.pulled(start)))))
         best = max(found, key=lambda r: r.evidence, default=None)
         return best if best is not None and best.evidence > start.evidence + PAYS else None
 

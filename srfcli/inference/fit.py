@@ -29,6 +29,7 @@ SHORTER = (1.0, 0.5, 0.25, 0.12)  # of the first horizons
 POOR = 4.0  # reduced chi-squared of a first stage that is not believed before shorter ones were tried
 CONVERGED = 0.1  # standard errors: how far the minimum may still be, by the gradient
 BAD = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
+HUGE = 1e100  # a slope that is no slope any more: its square would overflow
 
 
 @dataclass(frozen=True)
@@ -316,8 +317,9 @@ class Search:
             parts = stretches(run.t[:n], used)
             own = noise[run.name]
             difference = found.y - run.observed[:n]
-            bad = ~np.isfinite(difference)
-            difference = np.where(bad, BAD * own.innovation, difference)
+            worst = BAD * own.innovation
+            bad = ~((np.abs(difference) < worst) & (np.abs(found.J) < HUGE).all(axis=1))
+            difference = np.where(bad, worst, difference)
             J = np.where(bad[:, None], 0.0, found.J) * self.scale
             values.append(whiten(own, difference, parts))
             slopes.append(whiten(own, J, parts))

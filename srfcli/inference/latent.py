@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from srfcli.inference.fit import BAD, Problem
+from srfcli.inference.fit import BAD, HUGE, Problem
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, whiten
 from srfcli.inference.prediction import Prediction, predict
 from srfcli.numerics.collocation import Array
@@ -28,7 +28,6 @@ GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the roughness that are
 STEPS = 25
 SETTLED = 0.02  # gain of twice the log likelihood below which the minimum is reached
 EARLY = 2.0  # the same while roughness and noise still change
-HUGE = 1e100  # a slope that is no slope any more: its square would overflow
 FAR = (
     (1.5, 1e-6),
     (4.0, 1e-4),
@@ -158,7 +157,7 @@ class Latent:
             places = [*range(n), *(n + i for i in tracks.columns(run))] if run.name in tracks.of else list(range(n))
             parts, own = stretches(run.t, run.used), noise[run.name]
             difference = run.observed - p.y
-            bad = ~np.isfinite(difference) | ~(np.abs(p.J) < HUGE).all(axis=1)
+            bad = ~((np.abs(difference) < BAD * own.innovation) & (np.abs(p.J) < HUGE).all(axis=1))
             difference[bad] = BAD * own.innovation
             J = np.where(bad[:, None], 0.0, p.J)
             J[:, :n] *= self.scale
@@ -372,7 +371,9 @@ def fit_latent(problem: Problem, theta: Array, noise: Mapping[str, Noise], *, tr
         total = smooth = point.log_likelihood
         if point.tracks.splines:
             found = _marginal_at(point, n, grid)
-            total, smooth = found.log_likelihood, found.smooth
+            total, smooth = (
+                min(x, point.log_likelihood) for x in (found.log_likelihood, found.smooth)
+            )  # no prior adds any
         settled = known_noise and (not point.tracks.splines or point.chi2 > LOST * latent.samples)
         if abs(total - before) < 0.5 or settled:
             break

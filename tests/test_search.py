@@ -1,0 +1,141 @@
+"""The search's own judgement: two effects scored together, fits led by several ways, and evidence of a fit that is lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from srfcli.diagnosis.candidates import Hypothesis, applicable
+from srfcli.diagnosis.contest import contest
+from srfcli.diagnosis.follower import Followed, better, same
+from srfcli.diagnosis.score import pair_scores, scores
+from srfcli.diagnosis.search import Search
+from srfcli.inference.latent import Roughness, Tracks, fit_latent, tracks_for
+from srfcli.inference.noise import stretches, whiten
+from srfcli.numerics.compiled import compiler
+from srfcli.proof.draw import Gauge
+from srfcli.proof.folder import case_files
+from srfcli.proof.gauge import read_gauge
+from srfcli.proof.motion import move
+from srfcli.proof.physics import Physics
+from srfcli.proof.protocol import Plan
+from srfcli.recording.experiment import read_experiment
+from srfcli.registry import bundled_registry
+
+SHIPPED = bundled_registry()
+PLANS = (
+    Plan("steps", ((0.6, 4), (0.4, 60), (0.6, 8)), 3.0, 0.002),
+    Plan("stickslip", ((0.3, 12), (3, 8)), 9.2, 0.004),
+)
+PAIR = ("sensor-lag", "viscous-drag")
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here")
+
+
+@pytest.fixture(scope="module")
+def search(tmp_path_factory):
+    """A search whose baseline is fitted to a record of a slider with a little drag, read by a gauge that lags a little."""
+    folder, rng, base = tmp_path_factory.mktemp("pair"), np.random.default_rng(5), Physics()
+    real = replace(base, drag=4e-6, lag=0.002)
+    for name, text in case_files("small", base, {q: read_gauge(move(real, q).u, Gauge(), rng) for q in PLANS}).items():
+        (folder / name).write_text(text)
+    found = Search(SHIPPED, read_experiment(folder, registry=SHIPPED))
+    found.baseline()
+    return found
+
+
+def effects(*names):
+    return [SHIPPED.load(next(e for e in SHIPPED.entries("effect") if e.name == n)) for n in names]
+
+
+def gain_by_differences(search, fitted, added):
+    """Return the gain that least squares over the parameters and these effects' sizes promises, from differences."""
+    problem = Hypothesis(tuple(added)).problem(SHIPPED, search.experiment, rough=False, at=fitted.values)
+    problem = replace(problem, rtol=1e-10)
+    neutral, n = problem.start, fitted.point.theta.size
+    steps = np.where(np.arange(neutral.size) < n, 1e-6 * np.abs(neutral), 1e-6 * (problem.upper - problem.lower))
+    rows = []
+    for run in problem.runs:
+        here = problem.predicted(run, neutral, slopes=False).y
+        J = []
+        for i, step in enumerate(steps):
+            moved = neutral.copy()
+            moved[i] += step
+            J.append((problem.predicted(run, moved, slopes=False).y - here) / step)
+        own = fitted.noise[run.name]
+        rows.append(whiten(own, np.column_stack([*J, run.observed - here]), stretches(run.t, run.used)))
+    table = np.concatenate(rows)
+    table[:, :-1] /= np.linalg.norm(table[:, :-1], axis=0)
+
+    def left(columns):
+        X, r = table[:, columns], table[:, -1]
+        return float(np.sum((r - X @ np.linalg.lstsq(X, r, rcond=None)[0]) ** 2))
+
+    return 0.5 * (left(list(range(n))) - left(list(range(neutral.size))))
+
+
+def test_a_pair_s_gain_is_that_of_least_squares_over_both_sizes(search):
+    fitted, pair = search.tried["none", False].fit, effects(*PAIR)
+    (found,) = pair_scores(SHIPPED, fitted.problem.experiment, fitted, pair)
+    assert found.gain == pytest.approx(gain_by_differences(search, fitted, pair), rel=0.05)
+
+
+def test_the_two_that_were_concealed_explain_most_together(search):
+    fitted = search.tried["none", False].fit
+    candidates = [e for e in applicable(SHIPPED, search.experiment)[0] if not e.scans]
+    found = pair_scores(SHIPPED, fitted.problem.experiment, fitted, candidates)
+    alone = {s.effect.name: s.gain for s in scores(SHIPPED, fitted.problem.experiment, fitted, candidates)}
+    assert tuple(sorted(e.name for e in found[0].effects)) == PAIR
+    for pair in found:
+        assert pair.gain > 0.99 * max(alone[e.name] for e in pair.effects) - 1.0
+
+
+def test_effects_that_are_reported_as_one_are_no_pair(search):
+    fitted = search.tried["none", False].fit
+    assert (
+        pair_scores(SHIPPED, fitted.problem.experiment, fitted, effects("friction-drift", "friction-drift-slip")) == []
+    )
+    assert pair_scores(SHIPPED, fitted.problem.experiment, fitted, effects("viscous-drag")) == []
+
+
+def test_both_expectations_reach_the_model(search):
+    fitted, pair = search.tried["none", False].fit, effects(*PAIR)
+    (found,) = pair_scores(SHIPPED, fitted.problem.experiment, fitted, pair)
+    own = search.own_values(Hypothesis(found.effects), *found.values)
+    assert set(own) == {"time_constant", "c"}
+    assert own["time_constant"] == pytest.approx(0.002, rel=0.5)
+
+
+def test_a_contest_finds_both_from_under_a_pull(search):
+    """Where nothing is near, the pair is fitted under a pull and then let go."""
+    base, pair = search.tried["none", False], effects(*PAIR)
+    (found,) = pair_scores(SHIPPED, base.fit.problem.experiment, base.fit, pair)
+    hypothesis = Hypothesis(found.effects)
+    (refit,) = contest(search, base, [(hypothesis, search.own_values(hypothesis, *found.values))])
+    assert refit.adequacy.fine
+    assert set(refit.hypothesis.reported) == set(PAIR)
+    assert contest(search, base, [(hypothesis, {})]) == []  # not twice
+
+
+def test_of_two_ways_the_better_free_fit_and_the_better_under_a_pull_are_kept():
+    one = Followed(None, np.array([1.0]), 5.0, np.array([2.0]), 9.0)
+    other = Followed(None, np.array([3.0]), 7.0, np.array([4.0]), 2.0)
+    for best in (better(one, other), better(other, one)):
+        assert (best.theta[0], best.reduced, best.pulled[0], best.held) == (1.0, 5.0, 4.0, 2.0)
+    assert better(None, one) is one
+    assert same(9.0, 9.05) and not same(2.0, 9.0)
+
+
+def test_a_lost_fit_on_a_rough_track_has_no_evidence_beyond_its_likelihood(search):
+    """Far from any minimum the linearised likelihood promises what no track can keep."""
+    problem = search.problem(Hypothesis(), rough=True)
+    theta = np.clip(1.6 * problem.start, problem.lower, problem.upper)
+    lost = fit_latent(
+        problem, theta, search.noise, tracks=tracks_for(problem.runs, shared=False), roughness=Roughness(1e-3, 10.0),
+        known_noise=True, steps=0,
+    )  # fmt: skip
+    assert lost.log_likelihood <= lost.point.log_likelihood
+    smooth = search.problem(Hypothesis())
+    near = fit_latent(smooth, smooth.start, search.noise, tracks=Tracks((), {}), known_noise=True)
+    assert near.log_likelihood > lost.log_likelihood
