@@ -141,7 +141,12 @@ class Search:
         self.roughened(candidates)
 
     def halved(self, baseline: Refit) -> bool:
-        """Return whether the best so far leaves less than half of what the baseline leaves above noise."""
+        """Return whether the best so far leaves less than half of what the baseline leaves above noise, and is no wave or drift.
+
+        Those do so for any rough track.
+        """
+        if any(along_table(e) for e in self.best().hypothesis.effects):
+            return False
         left, before = (r.adequacy.rms_over_noise**2 - 1 for r in (self.best(), baseline))
         return left < HALF * before
 
