@@ -29,7 +29,6 @@ import argparse
 import json
 import time
 import warnings
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -37,6 +36,7 @@ from pathlib import Path
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
 from common import Report
+from marked import marked, tell
 from sparse_selection import Reading, choose, remainder
 from sparse_signals import Array, Baseline, Inverse, Signals, columns, guided, signals
 
@@ -45,7 +45,6 @@ from srfcli.diagnosis.follower import FOLLOWED, PULLS, Follower
 from srfcli.inference.fit import first_level
 from srfcli.inference.noise import Noise
 from srfcli.model import open_model
-from srfcli.output.tables import cell_text
 from srfcli.proof.seal import unseal
 from srfcli.recording.experiment import read_experiment
 from srfcli.recording.noise import describe_noise
@@ -53,9 +52,7 @@ from srfcli.recording.values import Run
 from srfcli.registry import Registry, load_registry
 from srfcli.trial.answer import FAILED, Answer, read_answers, write_answers
 from srfcli.trial.blind import failed
-from srfcli.trial.mark import Mark, mark
-from srfcli.trial.report import by_effect, by_outside, confusion, cost, rates
-from srfcli.trial.sight import Sight
+from srfcli.trial.mark import Mark
 
 MARGIN, CHANCE = 1.04, 3.72  # of the remainder over that of a simulated baseline; standard errors of one in 10^4
 LEAST_NOISE = 0.005  # um
@@ -71,8 +68,8 @@ def fitted_baseline(registry: Registry, folder: Path, kept: Path | None) -> tupl
         experiment = read_experiment(folder, registry=registry, holdout=False)
         follower, bare = Follower(registry, experiment, None), Hypothesis()
         noise = {r.name: Noise(first_level(r)) for r in experiment.runs if not r.holdout}
-        pulled, _ = follower.led(bare, {}, noise, PULLS[0])
-        free = follower.released(bare, pulled, noise)
+        pulled, held = follower.led(bare, {}, noise, PULLS[0])
+        free = follower.released(bare, pulled, held, noise)
         found = {"names": free.problem.names, "pulled": pulled.tolist(), "free": free.theta.tolist()}
         found |= {"reduced": free.reduced, "cpu": [time.process_time() - begun]}
         if path is not None:
@@ -187,25 +184,6 @@ def answered(bank: Path, kept: Path | None) -> list[Answer]:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_answers(path, answers.values())
     return [answers[name] for name in sorted(answers)]
-
-
-def marked(truths: dict, answers: Sequence[Answer], known: Path | None) -> list[Mark]:
-    """Return the marks; without what was visible everything that is concealed counts as visible."""
-    sights = {}
-    if known is not None:
-        for line in known.read_text(encoding="utf-8").splitlines():
-            sights[json.loads(line)["case"]] = Sight(**json.loads(line))
-    return [mark(truths[a.case], a, sights.get(a.case, Sight(a.case))) for a in answers]
-
-
-def tell(report: Report, marks: Sequence[Mark], who: str) -> None:
-    """Say the tables of `srf prove` for these marks."""
-    for table in (confusion(marks), rates(marks), by_effect(marks), by_outside(marks), cost(marks)):
-        if table.rows:
-            report.say(f"\n{who}: {table.title}")
-            formats = [c.format for c in table.columns]
-            cells = [[cell_text(v, f) for v, f in zip(row, formats, strict=True)] for row in table.rows]
-            report.table([c.name for c in table.columns], cells)
 
 
 def main() -> None:

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
-import numpy as np
-
-from srfcli.diagnosis.adequacy import gauge_noise, judge_residuals
+from srfcli.diagnosis.adequacy import gauge_noise
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.contest import contest
 from srfcli.diagnosis.elsewhere import elsewhere
-from srfcli.diagnosis.follower import FOLLOWED, LOOSE_ONLY, PULLS, Followed, Follower, better, same, shortened
-from srfcli.diagnosis.refits import NEAR, Refit, freedom_spent
+from srfcli.diagnosis.follower import FOLLOWED, LOOSE_ONLY, PULLS, Followed, better, same, shortened
+from srfcli.diagnosis.ledger import Ledger
+from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.score import Score, pair_scores, scores
-from srfcli.inference.fit import Problem, first_level
-from srfcli.inference.latent import STEPS, LatentFit, Tracks, evenness, fit_latent, tracks_for
+from srfcli.inference.fit import first_level
+from srfcli.inference.latent import STEPS, LatentFit, Tracks, fit_latent, tracks_for
 from srfcli.inference.noise import Noise
 from srfcli.laws import Effect
-from srfcli.recording.values import Experiment
-from srfcli.registry import Registry
+from srfcli.numerics.collocation import Array
+from srfcli.recording.values import Run
 
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, and noise is never quite as assumed
-CHOICE, SECOND = 3.0, 6.0  # cost of an effect, as there are some twenty to choose from, and more of each further one
 CLOSE = 6.0  # hypotheses within so much of the best may be it
 RIVAL = 30.0  # short of the best score's gain: where the best leaves noise alone, less is not refitted
 RIVAL_SHARE = 0.05  # the same as a part of that gain
@@ -31,33 +29,20 @@ HALFWAY = 1.25  # the same within which a rough track may be what is left
 HALF = 0.5  # of a misfit, that one effect takes away before two are tried ahead of a rough track
 ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
-MOST_EVALUATIONS = 1200  # of the recordings by a model with slopes, in all
-ROUGH_COSTS = 3  # of these, one with the slopes by a track
 FAINTER = 0.05  # of the first's score: an effect that promises so little less is not tried
 FIRST, SINGLES, PAIRS = 2, 8, 3  # refitted in full, at each stage
 
 
 @dataclass
-class Search:
-    """One diagnosis on its way: what was tried, and how well it did."""
+class Search(Ledger):
+    """One diagnosis on its way: what is fitted next."""
 
-    registry: Registry
-    experiment: Experiment
-    progress: Callable[[str], None] = lambda text: None
-    effects: Sequence[str] | None = None
-    trend: str | None = None
-    tried: dict[tuple[str, bool], Refit] = field(default_factory=dict)
     scored: dict[tuple[str, bool], list[Score]] = field(default_factory=dict)
     excluded: list[Excluded] = field(default_factory=list)
     followed: dict[str, Followed] = field(default_factory=dict)
     pulls: dict[str, LatentFit] = field(default_factory=dict)
     shook: set[tuple[str, bool]] = field(default_factory=set)
     shared: bool | None = None  # whether all runs slid on one rough track, once that was asked
-    noise: dict[str, Noise] = field(default_factory=dict)
-    evaluations: int = 0
-
-    def __post_init__(self) -> None:
-        self.follower = Follower(self.registry, self.experiment, self.trend)
 
     def run(self) -> list[Refit]:
         """Return everything that was fitted, best evidence first."""
@@ -179,10 +164,6 @@ class Search:
                 return self.settled(candidates)
         return False
 
-    def spent(self) -> bool:
-        """Return whether the search's budget is used up."""
-        return self.evaluations + self.follower.evaluations > MOST_EVALUATIONS
-
     def roughened(self, candidates: Sequence[Effect]) -> bool:
         """Return whether the best so far leaves noise alone once its track may be rough."""
         best = self.best()
@@ -221,7 +202,7 @@ class Search:
             self.progress(
                 f"baseline: rms over noise {best.reduced**0.5:.2f}, with the spring drawn {best.held**0.5:.2f}"
             )
-            self.noise = gauge_noise(runs, self.follower.smallest(best))
+            self.noise = self.gauged(runs, self.follower.smallest(best))
             if best.reduced < FOLLOWED or (known is not None and same(known.held, found.held)):
                 break
         steps = 2 if best.lost else STEPS
@@ -229,34 +210,13 @@ class Search:
             bare, fit_latent(self.problem(bare), best.theta, self.noise, known_noise=True, steps=steps), rough=False
         )
 
-    def keep(self, hypothesis: Hypothesis, fitted: LatentFit, *, rough: bool) -> Refit:
-        """Return a fit judged, and remember it."""
-        self.evaluations += fitted.evaluations * (ROUGH_COSTS if rough else 1)
-        runs = fitted.problem.runs
-        residuals = {r.name: r.observed - fitted.point.predictions[r.name].y for r in runs}
-        adequacy = replace(
-            judge_residuals(runs, residuals, self.noise, freedom=freedom_spent(fitted)), p_tracks=evenness(fitted.point)
-        )
-        n = sum(int(r.used.sum()) for r in runs)
-        cost = 0.5 * np.log(n) * (len(fitted.problem.names) - len(self.base_names())) + (4.0 if rough else 0.0)
-        more = len(hypothesis.effects)
-        cost += CHOICE * more + SECOND * max(more - 1, 0)
-        found = Refit(hypothesis, fitted, adequacy, fitted.log_likelihood - float(cost), rough)
-        known = self.tried.get((hypothesis.name, rough))
-        if known is None or found.evidence > known.evidence:
-            self.tried[hypothesis.name, rough] = found
-        self.progress(f"{hypothesis.name}{' on a rough track' if rough else ''}: log evidence {found.evidence:.1f}, "
-                      f"rms over noise {adequacy.rms_over_noise:.3f}")  # fmt: skip
-        return self.tried[hypothesis.name, rough]
+    def gauged(self, runs: Sequence[Run], residuals: Mapping[str, Array]) -> dict[str, Noise]:
+        """Return the noise of each run, from residuals (n,) by run."""
+        return gauge_noise(runs, residuals)
 
-    def base_names(self) -> tuple[str, ...]:
-        """Return the baseline's free parameters."""
-        return self.problem(Hypothesis()).names
-
-    def problem(self, hypothesis: Hypothesis, at: Mapping[str, float] | None = None, *, rough: bool = False) -> Problem:
-        """Return the fit of a hypothesis from the values in `at`, integrated as exactly as the noise asks for."""
-        found = hypothesis.problem(self.registry, self.experiment, rough=rough, at=at, trend=self.trend)
-        return replace(found, rtol=self.follower.rtol)
+    def tangent(self, fitted: LatentFit) -> LatentFit:
+        """Return the fit around which scores are of first order, its parameters' slopes among it."""
+        return fitted
 
     def score(self, refit: Refit, candidates: Sequence[Effect]) -> list[Score]:
         """Return the scores of everything that a refit does not have yet."""
@@ -266,7 +226,7 @@ class Search:
             reported = {e.reported for e in present}
             left = [e for e in candidates if e.reported not in reported and not (e.settings and present)]
             near = refit.rough or refit.adequacy.rms_over_noise < NEAR
-            around = refit.fit if near else self.pulled(refit)
+            around = self.tangent(refit.fit if near else self.pulled(refit))
             self.scored[key] = scores(self.registry, around.problem.experiment, around, left, present=present)
         return self.scored[key]
 
@@ -299,7 +259,7 @@ class Search:
     def together(self, baseline: Refit, candidates: Sequence[Effect]) -> bool:
         """Return whether two effects leave noise alone, of those that could explain most together."""
         near = baseline.adequacy.rms_over_noise < NEAR
-        around = baseline.fit if near else self.pulled(baseline)
+        around = self.tangent(baseline.fit if near else self.pulled(baseline))
         foremost = pair_scores(self.registry, around.problem.experiment, around, candidates)[:PAIRS]
         entrants = [(h, self.own_values(h, *p.values)) for p in foremost for h in (Hypothesis(p.effects),)]
         if not near:
@@ -308,14 +268,6 @@ class Search:
             if self.untried(hypothesis, rough=False):
                 elsewhere(self, self.refit(hypothesis, baseline, own, rough=False))
         return self.best().adequacy.fine
-
-    def untried(self, hypothesis: Hypothesis, *, rough: bool) -> bool:
-        """Return whether a hypothesis was not fitted yet and the budget leaves room for it."""
-        if self.spent():
-            self.progress(f"{hypothesis.name} is not tried: the search's budget is spent")
-            return False
-        return not any(set(t.hypothesis.effects) == set(hypothesis.effects) and r == rough
-                       for (_, r), t in self.tried.items())  # fmt: skip
 
     def own_values(self, hypothesis: Hypothesis, *added: Mapping[str, float]) -> dict[str, float]:
         """Return what scores expect of the last effects' parameters, by their names in the model."""
@@ -382,15 +334,3 @@ class Search:
             self.pulls[refit.name] = self.follower.around(refit.hypothesis, values, self.noise)
             self.evaluations += self.pulls[refit.name].evaluations
         return self.pulls[refit.name]
-
-    def ranked(self) -> list[Refit]:
-        """Return everything that was fitted, best evidence first; of the two forms of a hypothesis the better one."""
-        best: dict[str, Refit] = {}
-        for refit in self.tried.values():
-            if refit.name not in best or refit.evidence > best[refit.name].evidence:
-                best[refit.name] = refit
-        return sorted(best.values(), key=lambda r: -r.evidence)
-
-    def best(self) -> Refit:
-        """Return the refit with the best evidence."""
-        return self.ranked()[0]

@@ -24,6 +24,7 @@ from srfcli.trial.answer import FAILED, Answer
 if TYPE_CHECKING:
     from srfcli.diagnosis.answer import RunView
     from srfcli.diagnosis.refits import Refit
+    from srfcli.diagnosis.search import Search
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.registry import Registry
 
@@ -65,14 +66,17 @@ def failed(case: str, why: str) -> Answer:
     return Answer(case, FAILED, failure=" ".join(why.split()))
 
 
-def diagnose_case(folder: Path, plugins: tuple[Path, ...]) -> Answer:
-    """Return what the tool's own diagnosis says of the experiment in `folder`: held-out runs are read when it is done."""
+def diagnose_case(folder: Path, plugins: tuple[Path, ...], *, by: type[Search] | None = None) -> Answer:
+    """Return what the tool's own diagnosis, or one `by` another search, says of the experiment in `folder`.
+
+    Held-out runs are read when it is done.
+    """
     from srfcli.diagnosis.search import Search
     from srfcli.diagnosis.verdict import conclude
     from srfcli.recording.experiment import read_experiment
 
     registry = _registry(plugins)
-    search = Search(registry, read_experiment(folder, registry=registry, holdout=False))
+    search = (by or Search)(registry, read_experiment(folder, registry=registry, holdout=False))
     search.run()
     return told(conclude(search, read_experiment(folder, registry=registry)), case=folder.name)
 

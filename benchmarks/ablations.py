@@ -1,0 +1,123 @@
+"""What parts of the diagnosis are worth: the cases of a sealed bank once more, with a part left out.
+
+    python benchmarks/ablations.py BANK TRUTHS --beside answers.jsonl [--known known.jsonl] [--without PART]
+        [--cases N] [--workers N] [--kept FOLDER]
+
+BANK is a folder of cases as `srf prove` makes, TRUTHS their truths, answers.jsonl and known.jsonl those of the trial: what the
+whole diagnosis said of the same cases, and what was visible. The first N cases are taken, all of them if left out.
+
+colour      noise is taken for white, of the level it has: nothing is whitened, neither in fits nor in scores nor in the
+            question whether noise is left
+projection  effects are scored by what they explain of the misfit alone: what the baseline's parameters or a rough track
+            could explain as well is not taken off
+
+What the held-out runs are worth, and what the Bayesian information criterion alone would choose, needs no second diagnosis:
+those tables are in the trial's own report.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import common  # noqa: F401  before NumPy: it fixes the number of threads
+import numpy as np
+from common import Report
+from marked import marked, tell
+
+from srfcli.diagnosis.search import Search
+from srfcli.inference.latent import LatentFit
+from srfcli.inference.noise import Noise
+from srfcli.numerics.collocation import Array
+from srfcli.parallel.pool import run_processes
+from srfcli.proof.seal import unseal
+from srfcli.recording.values import Run
+from srfcli.trial.answer import Answer, read_answers, write_answers
+from srfcli.trial.blind import Task, answer_case, diagnose_case, failed
+from srfcli.trial.rates import rate
+
+LIMIT = 1800.0  # s of CPU
+
+
+class WithoutColour(Search):
+    """The search with white noise."""
+
+    def gauged(self, runs: Sequence[Run], residuals: Mapping[str, Array]) -> dict[str, Noise]:
+        """Return noise of the right level and no colour."""
+        return {name: Noise(noise.level) for name, noise in super().gauged(runs, residuals).items()}
+
+
+class WithoutProjection(Search):
+    """The search whose scores take nothing off."""
+
+    def tangent(self, fitted: LatentFit) -> LatentFit:
+        """Return the fit as if no parameter and no track changed the prediction."""
+        flat = {n: replace(p, J=np.zeros_like(p.J)) for n, p in fitted.point.predictions.items()}
+        return replace(fitted, point=replace(fitted.point, predictions=flat))
+
+
+PARTS: dict[str, type[Search]] = {"colour": WithoutColour, "projection": WithoutProjection}
+
+
+def answered(bank: Path, part: str, names: Sequence[str], workers: int, kept: Path | None) -> Iterator[Answer]:
+    """Yield the answers to these cases without a part; those in the folder `kept` are not sought again."""
+    path = kept / f"without-{part}-{bank.name}.jsonl" if kept else None
+    known = read_answers(path) if path else {}
+    waiting = [name for name in names if name not in known]
+    tasks = [Task(bank / name, (), functools.partial(diagnose_case, by=PARTS[part]), LIMIT) for name in waiting]
+    found = dict(known)
+    for _, answer in run_processes(
+        answer_case, tasks, workers=workers, lost=lambda i: failed(waiting[i], "its process was killed")
+    ):
+        found[answer.case] = answer
+        print(part, answer.case, answer.said or answer.verdict, f"{answer.cpu:.0f} s", answer.failure, flush=True)
+        if path:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_answers(path, found.values())
+    yield from (found[name] for name in names)
+
+
+def main() -> None:
+    """Answer the cases without each part, mark the answers beside the whole diagnosis's, print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("bank", type=Path)
+    parser.add_argument("truths", type=Path)
+    parser.add_argument("--beside", type=Path, required=True, help="answers.jsonl of the trial, marked beside")
+    parser.add_argument("--known", type=Path, help="known.jsonl of the trial: what was visible")
+    parser.add_argument("--without", action="append", choices=sorted(PARTS), help="part to leave out; default: each")
+    parser.add_argument("--cases", type=int, help="how many cases to take, from the first on")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--kept", type=Path, help="folder of the answers: a later run goes on there")
+    given = parser.parse_args()
+    whole = read_answers(given.beside)
+    names = sorted(whole)[: given.cases]
+    parts = given.without or sorted(PARTS)
+    found = {part: list(answered(given.bank, part, names, given.workers, given.kept)) for part in parts}
+    truths = unseal(given.bank, given.truths)  # only now
+    report = Report("ablations", __doc__ or "")
+    report.say(f"# bank {given.bank.name}, {len(names)} cases")
+    report.say(
+        "# "
+        + ("visible as the trial found it" if given.known else "what is invisible was not asked: all counts as visible")
+    )
+    answers = {"whole": [whole[name] for name in names]} | {f"without {part}": found[part] for part in parts}
+    marks = {who: marked(truths, listed, given.known) for who, listed in answers.items()}
+    rows = []
+    for who, listed in marks.items():
+        right = rate(m.right for m in listed)
+        low, high = right.interval
+        turned = sum(a.right and not b.right for a, b in zip(marks["whole"], listed, strict=True))
+        mended = sum(b.right and not a.right for a, b in zip(marks["whole"], listed, strict=True))
+        span = f"{low:.2f} to {high:.2f}" if low is not None and high is not None else "-"
+        rows.append((who, f"{right.hits} of {right.count}", span, str(turned), str(mended)))
+    report.say("\nright, its interval (Wilson, 95 %); cases that the whole has right and this wrong, and the reverse")
+    report.table(("diagnosis", "right", "interval", "lost", "won"), rows)
+    for who, listed in marks.items():
+        tell(report, listed, who)
+
+
+if __name__ == "__main__":
+    main()

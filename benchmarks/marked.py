@@ -1,0 +1,35 @@
+"""Marks and tables of `srf prove`, for benchmarks that answer the cases of its banks in other ways."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from common import Report
+
+from srfcli.output.tables import cell_text
+from srfcli.trial.answer import Answer
+from srfcli.trial.mark import Mark, mark
+from srfcli.trial.report import by_effect, by_outside, confusion, cost, rates
+from srfcli.trial.sight import Sight
+
+
+def marked(truths: dict[str, Any], answers: Sequence[Answer], known: Path | None) -> list[Mark]:
+    """Return the marks; without what was visible everything that is concealed counts as visible."""
+    sights = {}
+    if known is not None:
+        for line in known.read_text(encoding="utf-8").splitlines():
+            sights[json.loads(line)["case"]] = Sight(**json.loads(line))
+    return [mark(truths[a.case], a, sights.get(a.case, Sight(a.case))) for a in answers]
+
+
+def tell(report: Report, marks: Sequence[Mark], who: str) -> None:
+    """Say the tables of `srf prove` for these marks."""
+    for table in (confusion(marks), rates(marks), by_effect(marks), by_outside(marks), cost(marks)):
+        if table.rows:
+            report.say(f"\n{who}: {table.title}")
+            formats = [c.format for c in table.columns]
+            cells = [[cell_text(v, f) for v, f in zip(row, formats, strict=True)] for row in table.rows]
+            report.table([c.name for c in table.columns], cells)
