@@ -22,10 +22,13 @@ AGAIN = 4  # led again from other places and by stronger pulls: a minimum of one
 RELEASED = 2  # fitted freely although their fit under the pull is no good
 
 
-def contest(search: Search, refit: Refit, entrants: Sequence[tuple[Hypothesis, dict[str, float]]]) -> list[Refit]:
+def contest(
+    search: Search, refit: Refit, entrants: Sequence[tuple[Hypothesis, dict[str, float]]], *, again: int = AGAIN
+) -> list[Refit]:
     """Return the best of hypotheses that add effects to one that is far off: by their fits under a pull, then free.
 
-    With what is missing, little is left under the pull already. `entrants` come with what is expected of the added parameters.
+    With what is missing, little is left under the pull already. `entrants` come with what is expected of the added parameters; the
+    foremost `again` are led again.
     """
     around, waiting, found = search.pulled(refit).values, [], []
     for hypothesis, own in entrants:
@@ -40,7 +43,7 @@ def contest(search: Search, refit: Refit, entrants: Sequence[tuple[Hypothesis, d
     left = []
     for i, entry in enumerate(waiting):
         single = len(entry.hypothesis.effects) == 1
-        best = _led_again(search, entry, around) if single and (i < AGAIN or _built(entry)) else entry
+        best = _led_again(search, entry, around) if single and (i < again or _built(entry)) else entry
         if best.reduced >= CLEAR:
             left.append(best)
             continue

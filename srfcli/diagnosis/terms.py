@@ -124,7 +124,8 @@ class _Selection:
                 if self.new(hypothesis):
                     found.append(search.refit(hypothesis, start, own, rough=start.rough))
         else:
-            found = contest(search, start, search.widened(start, _foremost(self.scored(start, search.pulled(start)))))
+            candidates = _foremost(self.scored(start, search.pulled(start)))
+            found = contest(search, start, search.widened(start, candidates), again=1)
         best = max(found, key=lambda r: r.evidence, default=None)
         return best if best is not None and best.evidence > start.evidence + PAYS else None
 
