@@ -27,8 +27,8 @@ def contest(
 ) -> list[Refit]:
     """Return the best of hypotheses that add effects to one that is far off: by their fits under a pull, then free.
 
-    With what is missing, little is left under the pull already. `entrants` come with what is expected of the added parameters; the
-    foremost `again` are led again.
+    With what is missing, little is left under the pull already. `entrants` come with what is expected of the added parameters;
+    the foremost `again` are led again.
     """
     around, waiting, found = search.pulled(refit).values, [], []
     for hypothesis, own in entrants:
