@@ -26,7 +26,7 @@ from pathlib import Path
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
 from common import Report
-from marked import marked, tell
+from marked import heading, marked, tell
 
 from srfcli.diagnosis.search import Search
 from srfcli.inference.latent import LatentFit
@@ -98,11 +98,7 @@ def main() -> None:
     found = {part: list(answered(given.bank, part, names, given.workers, given.kept)) for part in parts}
     truths = unseal(given.bank, given.truths)  # only now
     report = Report("ablations", __doc__ or "")
-    report.say(f"# bank {given.bank.name}, {len(names)} cases")
-    report.say(
-        "# "
-        + ("visible as the trial found it" if given.known else "what is invisible was not asked: all counts as visible")
-    )
+    heading(report, f"bank {given.bank.name}", len(names), given.known)
     answers = {"whole": [whole[name] for name in names]} | {f"without {part}": found[part] for part in parts}
     marks = {who: marked(truths, listed, given.known) for who, listed in answers.items()}
     rows = []

@@ -25,6 +25,13 @@ def marked(truths: dict[str, Any], answers: Sequence[Answer], known: Path | None
     return [mark(truths[a.case], a, sights.get(a.case, Sight(a.case))) for a in answers]
 
 
+def heading(report: Report, bank: str, cases: int, known: Path | None) -> None:
+    """Say which cases were marked, and what counts as visible in them."""
+    report.say(f"# {bank}, {cases} cases")
+    asked = "visible as the trial found it" if known else "what is invisible was not asked: all counts as visible"
+    report.say(f"# {asked}")
+
+
 def tell(report: Report, marks: Sequence[Mark], who: str) -> None:
     """Say the tables of `srf prove` for these marks."""
     for table in (confusion(marks), rates(marks), by_effect(marks), by_outside(marks), cost(marks)):

@@ -36,7 +36,7 @@ from pathlib import Path
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
 from common import Report
-from marked import marked, tell
+from marked import heading, marked, tell
 from sparse_selection import Reading, choose, remainder
 from sparse_signals import Array, Baseline, Inverse, Signals, columns, guided, signals
 
@@ -204,11 +204,7 @@ def main() -> None:
     answers = answered(given.bank, given.kept)
     truths = unseal(given.bank, given.truths)  # only now
     report = Report("sparse_regression", __doc__ or "")
-    report.say(f"# pysindy {version('pysindy')}; bank {given.bank.name}, {len(answers)} cases")
-    report.say(
-        "# "
-        + ("visible as the trial found it" if given.known else "what is invisible was not asked: all counts as visible")
-    )
+    heading(report, f"pysindy {version('pysindy')}; bank {given.bank.name}", len(answers), given.known)
     if given.note:
         report.say(f"# {given.note}")
     tell(report, marked(truths, answers, given.known), "sparse regression")

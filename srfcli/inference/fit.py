@@ -191,6 +191,11 @@ def first_level(run: Run) -> float:
     return max(level, run.quantum / np.sqrt(12), 1e-9 * float(np.ptp(run.observed)), 1e-300)
 
 
+def unreached(difference: Array, J: Array, noise: Noise) -> Array:
+    """Return which samples (n,) have no residual or no slopes (n, k) to speak of: the integration did not reach them."""
+    return ~((np.abs(difference) < BAD * noise.innovation) & (np.abs(J) < HUGE).all(axis=1))
+
+
 class Search:
     """One minimisation: counts evaluations, keeps the best, and knows the covariance of the last."""
 
@@ -317,9 +322,8 @@ class Search:
             parts = stretches(run.t[:n], used)
             own = noise[run.name]
             difference = found.y - run.observed[:n]
-            worst = BAD * own.innovation
-            bad = ~((np.abs(difference) < worst) & (np.abs(found.J) < HUGE).all(axis=1))
-            difference = np.where(bad, worst, difference)
+            bad = unreached(difference, found.J, own)
+            difference = np.where(bad, BAD * own.innovation, difference)
             J = np.where(bad[:, None], 0.0, found.J) * self.scale
             values.append(whiten(own, difference, parts))
             slopes.append(whiten(own, J, parts))

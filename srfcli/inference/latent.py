@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from srfcli.inference.fit import BAD, HUGE, Problem
+from srfcli.inference.fit import BAD, Problem, unreached
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, whiten
 from srfcli.inference.prediction import Prediction, predict
 from srfcli.numerics.collocation import Array
@@ -157,7 +157,7 @@ class Latent:
             places = [*range(n), *(n + i for i in tracks.columns(run))] if run.name in tracks.of else list(range(n))
             parts, own = stretches(run.t, run.used), noise[run.name]
             difference = run.observed - p.y
-            bad = ~((np.abs(difference) < BAD * own.innovation) & (np.abs(p.J) < HUGE).all(axis=1))
+            bad = unreached(difference, p.J, own)
             difference[bad] = BAD * own.innovation
             J = np.where(bad[:, None], 0.0, p.J)
             J[:, :n] *= self.scale
