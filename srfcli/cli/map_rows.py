@@ -178,12 +178,15 @@ def _coordinates(model: GeneratedModel, grid: Any, p: Array) -> list[float]:
 
 def _curve(
     model: GeneratedModel, grid: Any, branch: Branch, cubic: Array
-) -> tuple[list[float], list[float], list[bool]]:
-    """Return a branch's coordinates and where it is subcritical; a closed one ends where it begins."""
+) -> tuple[list[float], list[float], list[str]]:
+    """Return a branch's coordinates and what it is at each; a closed one ends where it begins."""
     from srfcli.status import Status
 
     points = [_coordinates(model, grid, pt.p) for pt in branch.points]
     if branch.end is Status.CLOSED:
         points.append(points[0])
-    below = [bool(d > 0) for d in cubic]
-    return [q[0] for q in points], [q[1] for q in points], below + below[: len(points) - len(below)]
+    looks = [
+        "fold" if pt.kind == "fold" else "subcritical" if d > 0 else ""
+        for pt, d in zip(branch.points, cubic, strict=True)
+    ]
+    return [q[0] for q in points], [q[1] for q in points], looks + looks[: len(points) - len(looks)]

@@ -6,14 +6,14 @@ branch that passes through it, or by a new branch that starts there. What closes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array, Discretisation
-from srfcli.numerics.continuation import Curve, CurvePoint, StepSettings, correct, trace
+from srfcli.numerics.continuation import Curve, CurvePoint, StepSettings, correct, metric, trace
 from srfcli.numerics.critical import INTERVALS, locate_crossings
 from srfcli.numerics.plane import Plane
 from srfcli.numerics.polish import BoundaryPoint, Direction, polish
@@ -191,18 +191,11 @@ def _starting_point(
 def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: AtlasSettings) -> list[Branch]:
     """Return the stability boundary along a traced curve, polished; parts where another multiplier is unstable are left out.
 
-    Each point moves along the curve's normal, so that folds are as good as any other point; end points on the window's
-    edge move along the edge.
+    Each point moves across the curve's tangent in parameters and state together, so that folds and cusps are as good as any
+    other point; end points on the window's edge move along the edge.
     """
     pts = curve.points
-    normals = np.array([np.array([-t[1], t[0]]) / np.linalg.norm(t) for t in (pt.tangent_q for pt in pts)])
-    for k in (0, -1):
-        for axis in (0, 1):
-            if min(abs(pts[k].q[axis]), abs(pts[k].q[axis] - 1)) < 1e-9:
-                normals[k] = np.eye(2)[1 - axis]
-    vectors = normals * np.array([plane.x.span, plane.y.span])
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)  # distances in ln(parameter)
-    direction = Direction(plane.names, vectors, (plane.x.log, plane.y.log))
+    direction = _across(model, plane, pts)
     polished: list[BoundaryPoint | None] = [None] * len(pts)
     meshes = np.array([len(pt.orbit.edges) for pt in pts])
     for edges in np.unique(meshes):
@@ -244,6 +237,24 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
     ]
 
 
+def _across(model: GeneratedModel, plane: Plane, points: Sequence[CurvePoint]) -> Direction:
+    """Return the hyperplanes across a curve's tangents at its points, along the edge for those on the window's edge."""
+    axes = (plane.x, plane.y)
+    length = np.array(
+        [1.0 if a.log else a.span for a in axes]
+    )  # of a unit distance: in ln(parameter), or of the window
+    unit = np.array([1 / a.span if a.log else 1.0 for a in axes])
+    rows = []
+    for point in points:
+        along_x, along_q = metric(model, point.p, point.orbit.x[0], point.tangent_orbit.x[0]), point.tangent_q
+        edge = np.nonzero(np.minimum(np.abs(point.q), np.abs(point.q - 1)) < 1e-9)[0]
+        if edge.size:
+            along_x, along_q = np.zeros_like(along_x), np.eye(2)[edge[0]]
+        rows.append(np.concatenate([along_x, along_q * unit]))
+    vectors = np.broadcast_to(np.diag(length), (len(points), 2, 2))
+    return Direction(plane.names, vectors, (plane.x.log, plane.y.log), np.array(rows)[:, None, :])
+
+
 def _notes(atlas: Atlas, settings: AtlasSettings, missed: int) -> list[str]:
     plane = atlas.plane
     lost = sum(len(s.lost) for s in atlas.scans)
@@ -266,7 +277,8 @@ def crossing_numbers(model: GeneratedModel, atlas: Atlas) -> list[list[int | Non
     """Return, for every point of every branch, its number among the crossings at its x, counted from low y.
 
     Odd numbers are those where stability is lost as y rises (the paper's footnote). Counted on the polylines of all branches
-    and corrected to the parity that the point's own slope shows; None where the slope vanishes, at a fold.
+    and corrected to the parity that the point's own slope shows; None where there is no such slope: where the curve turns round,
+    and where a multiplier is +1.
     """
     plane = atlas.plane
     lines = [plane.coordinates(model, np.stack([pt.p for pt in b.points], axis=1)) for b in atlas.branches]
@@ -281,7 +293,8 @@ def crossing_numbers(model: GeneratedModel, atlas: Atlas) -> list[list[int | Non
             losing = point.slope > 0
             if (number % 2 == 1) != losing:
                 number += 1 if _nearest_from_below(lines, b, i) else -1
-            row.append(max(number, 1) if np.isfinite(point.slope) and point.slope != 0 else None)
+            told = np.isfinite(point.slope) and point.slope != 0 and point.kind != "fold"
+            row.append(max(number, 1) if told else None)
         numbers.append(row)
     return numbers
 

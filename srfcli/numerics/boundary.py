@@ -64,13 +64,27 @@ def linearise_boundary(
     rho = np.take_along_axis(values, chosen[..., None], -1)[..., 0]
     if growth is None:
         r = np.take_along_axis(right_vectors, chosen[..., None, None], -1)[..., 0]
-        left_vectors = np.linalg.inv(right_vectors)  # rows l with l . r = 1
-        l = np.take_along_axis(left_vectors, chosen[..., None, None], -2)[..., 0, :]
-        growth = _growth_row(model, p, orbit, condensed, names, rho, r, l)
+        growth = _growth_row(model, p, orbit, condensed, names, rho, r, _left_vector(M, rho, r))
     end = condensed.prefix[..., -1, :n, :].copy()
     index = np.arange(n)
     end[..., index, index] -= 1
     return BoundaryLinear(condensed, end, growth, rho, np.log(np.abs(rho)), values)
+
+
+def _left_vector(M: Array, rho: Array, r: Array) -> ComplexArray:
+    """Return the left eigenvector l (..., n) of M (..., n, n) for its simple eigenvalue rho with right eigenvector r; l . r = 1.
+
+    The bordered system needs nothing of the other eigenvectors, which may coincide where multipliers underflow.
+    """
+    n = r.shape[-1]
+    matrix = np.zeros((*r.shape[:-1], n + 1, n + 1), dtype=complex)
+    matrix[..., :n, :n] = np.swapaxes(M, -1, -2)
+    index = np.arange(n)
+    matrix[..., index, index] -= rho[..., None]
+    matrix[..., :n, n], matrix[..., n, :n] = r.conj(), r
+    right = np.zeros((*r.shape[:-1], n + 1, 1), dtype=complex)
+    right[..., n, 0] = 1.0
+    return np.linalg.solve(matrix, right)[..., :n, 0]
 
 
 def _growth_row(

@@ -167,14 +167,19 @@ def _matrix(
     return matrix
 
 
-def orbit_size(model: GeneratedModel, point: CurvePoint) -> Array:
-    """Return the scale of the state at tau = 0 in the arclength, (n,)."""
-    return np.maximum(scales(model, point.p), np.where(np.array(model.logarithmic), 1.0, np.abs(point.orbit.x[0])))
+def state_size(model: GeneratedModel, p: Array, x: Array) -> Array:
+    """Return the scale of the state at tau = 0, `x` (n,), in the arclength at parameters `p`, (n,)."""
+    return np.maximum(scales(model, p), np.where(np.array(model.logarithmic), 1.0, np.abs(x)))
+
+
+def metric(model: GeneratedModel, p: Array, x: Array, change: Array) -> Array:
+    """Return the row (n,) whose product with changes of the state `x` (n,) at tau = 0 is their arclength along `change`."""
+    return change * (ORBIT_WEIGHT / state_size(model, p, x)) ** 2
 
 
 def _normalised(model: GeneratedModel, point: CurvePoint, orientation: CurvePoint | None) -> CurvePoint:
     """Return `point` with a tangent of unit length that continues that of `orientation`."""
-    size = orbit_size(model, point)
+    size = state_size(model, point.p, point.orbit.x[0])
     along_x = point.tangent_orbit.x[0] / size * ORBIT_WEIGHT
     length = float(np.sqrt(point.tangent_q @ point.tangent_q + along_x @ along_x))
     if orientation is not None:
@@ -207,8 +212,6 @@ def follow(
     ds, first = settings.first, current
     for count in range(settings.max_steps):
         q, orbit = predict(current, before, ds)
-        size = orbit_size(model, current)
-        normal_x = current.tangent_orbit.x[0] / size**2 * ORBIT_WEIGHT**2
         point = correct(
             model,
             plane,
@@ -216,12 +219,12 @@ def follow(
             orbit,
             current.rho,
             current.tangent_q,
-            normal_x,
+            metric(model, current.p, current.orbit.x[0], current.tangent_orbit.x[0]),
             orientation=current,
             tol=settings.tol,
             reach=ds,
         )
-        turned = np.inf if point is None else _angle(current, point)
+        turned = np.inf if point is None else _angle(model, current, point)
         if point is None or turned > 2 * settings.turn or abs(np.angle(point.rho / current.rho)) > 0.5:
             ds *= 0.4
             if ds < settings.smallest:
@@ -262,16 +265,18 @@ def refined(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: St
         return None
     edges = uniform_mesh(int(mesh))
     seen = replace(point, tangent_orbit=interpolate(point.tangent_orbit, edges))
-    normal_x = np.zeros(point.orbit.x.shape[-1])
+    normal_x = metric(model, point.p, point.orbit.x[0], point.tangent_orbit.x[0])
     start = interpolate(point.orbit, edges)
     return correct(
         model, plane, point.q, start, point.rho, point.tangent_q, normal_x, orientation=seen, reach=point.step
     )
 
 
-def _angle(a: CurvePoint, b: CurvePoint) -> float:
-    cosine = a.tangent_q @ b.tangent_q / (np.linalg.norm(a.tangent_q) * np.linalg.norm(b.tangent_q))
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+def _angle(model: GeneratedModel, a: CurvePoint, b: CurvePoint) -> float:
+    """Return the angle between the tangents of two points in parameters and state together: small where a cusp is passed."""
+    size = state_size(model, a.p, a.orbit.x[0])
+    u, v = (np.append(pt.tangent_q, ORBIT_WEIGHT * pt.tangent_orbit.x[0] / size) for pt in (a, b))
+    return float(np.arccos(np.clip(u @ v / (np.linalg.norm(u) * np.linalg.norm(v)), -1.0, 1.0)))
 
 
 def _edge_crossed(a: Array, b: Array) -> tuple[int, float] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,19 @@ class Seed:
 
 
 @dataclass
+class Brink:
+    """A stable point, `ends[0]` in unit coordinates of the plane, whose state may end on the way to its neighbour `ends[1]`.
+
+    At the neighbour no orbit was found, or quite another.
+    """
+
+    ends: Array
+    axis: int
+    rho: complex
+    orbit: Discretisation
+
+
+@dataclass
 class StabilityMap:
     """A map: `leading` (nx, ny), the leading multiplier, NaN where no orbit was found; `mesh` (nx, ny) intervals.
 
@@ -52,6 +65,7 @@ class StabilityMap:
     extra_leading: ComplexArray
     suspect: Array
     seeds: list[Seed]
+    brinks: list[Brink] = field(default_factory=list)
     finished: bool = True
 
     @property
@@ -145,10 +159,12 @@ def join_tiles(
     leading, mesh = np.full(shape, np.nan, dtype=complex), np.zeros(shape, dtype=int)
     covered = 0
     seeds: list[Seed] = []
+    brinks: list[Brink] = []
     for task, tile in tiles:
         place = (slice(task.columns[0], task.columns[1] + 1), slice(task.rows[0], task.rows[1] + 1))
         leading[place], mesh[place] = tile["leading"], int(tile["mesh"])
         seeds += _seeds(model, grid, tile)
+        brinks += _brinks(model, grid, tile)
         covered += (task.columns[1] - task.columns[0]) * (task.rows[1] - task.rows[0])
     extra_at = np.concatenate([t["extra_at"] for _, t in tiles])
     _, first = np.unique(extra_at, axis=0, return_index=True)  # tiles that meet refine their common side alike
@@ -161,8 +177,32 @@ def join_tiles(
         np.concatenate([t["extra_leading"] for _, t in tiles])[first],
         np.concatenate([t["suspect"] for _, t in tiles]),
         seeds,
+        brinks,
         covered == (shape[0] - 1) * (shape[1] - 1),
     )
+
+
+def _brinks(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Brink]:
+    """Return the brinks of a tile, in the plane's unit coordinates."""
+    ends = tile["brink_ends"]
+    if not len(ends):
+        return []
+    unit = grid.plane(model).coordinates(model, grid.points(model, *_quantities(grid, ends)))
+    edges = np.linspace(0.0, 1.0, int(tile["mesh"]) + 1)
+    return [
+        Brink(
+            unit[k],
+            int(axis),
+            complex(tile["brink_rho"][k]),
+            Discretisation(tile["brink_x"][k], tile["brink_stages"][k], edges),
+        )
+        for k, axis in enumerate(tile["brink_axis"])
+    ]
+
+
+def _quantities(grid: MapGrid, places: Array) -> tuple[Array, Array]:
+    """Return the quantities along x and y at places (..., 2) in grid steps."""
+    return grid.x.between(places[..., 0]), grid.y.between(places[..., 1])
 
 
 def _seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
@@ -170,8 +210,7 @@ def _seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
     plane, ends = grid.plane(model), tile["seed_ends"]
     if not len(ends):
         return []
-    xs, ys = grid.x.between(ends[..., 0]), grid.y.between(ends[..., 1])
-    unit = plane.coordinates(model, grid.points(model, xs, ys))  # (E, 2, 2)
+    unit = plane.coordinates(model, grid.points(model, *_quantities(grid, ends)))  # (E, 2, 2)
     edges = np.linspace(0.0, 1.0, int(tile["mesh"]) + 1)
     seeds = []
     for k, axis in enumerate(tile["seed_axis"].tolist()):

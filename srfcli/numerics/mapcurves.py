@@ -1,4 +1,7 @@
-"""The boundary components of a map: every sign change accounted for by a curve that passes through it, or that starts there."""
+"""The boundary components of a map: every sign change accounted for by a curve that passes through it, or that starts there.
+
+So is every stable state that ends beside a point without one: by a curve of folds.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,10 @@ from srfcli.numerics.atlas import Atlas, AtlasSettings, polish_curve
 from srfcli.numerics.collocation import Array, Discretisation
 from srfcli.numerics.continuation import Curve, CurvePoint, correct, trace
 from srfcli.numerics.critical import locate_crossings
-from srfcli.numerics.map import Seed, StabilityMap
+from srfcli.numerics.map import Brink, Seed, StabilityMap
+from srfcli.numerics.mapfolds import fold_at, leads_on
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.numerics.polish import BoundaryPoint, along, polish
+from srfcli.numerics.polish import BoundaryPoint, along, bifurcation_kind, polish
 from srfcli.numerics.scan import scan_line
 from srfcli.numerics.special import crossings_at
 from srfcli.status import Status
@@ -23,6 +27,7 @@ DENSE = 12  # points of the cubic between two points of a curve, on which seeds 
 REACH = 1e-3  # of the window: seeds and curves are compared to this
 RETRIES = 3  # of a curve that jumped from one side of a tongue to the other
 UPRIGHT = 0.05  # of the tangent: where less points along x the slope at fixed x is not to be relied on
+PATIENCE = 24  # stable points in a row beside one without an orbit at which no fold is met: orbits were missed
 MARGIN = 0.5  # of a seed's length by which its boundary point may lie outside
 
 Progress = Callable[[str], None]
@@ -30,11 +35,15 @@ Progress = Callable[[str], None]
 
 @dataclass
 class _Traced:
-    """A curve and its dense polyline (D, 2) in unit coordinates, with normals (D, 2) to its unstable side."""
+    """A curve and its dense polyline (D, 2) in unit coordinates, with normals (D, 2) to its unstable side.
+
+    `fold` (D,) marks where states end: there neither side is the unstable one.
+    """
 
     curve: Curve
     line: Array
     unstable: Array
+    fold: Array
 
 
 def find_boundaries(
@@ -51,16 +60,24 @@ def find_boundaries(
     settings = settings or AtlasSettings()
     atlas = Atlas(found.grid.plane(model), [], [], [])
     waiting = sorted(found.seeds, key=lambda s: (float(np.ptp(s.ends, axis=0).max()), -s.axis))[::-1]
+    brinks = list(found.brinks)
     traced: list[_Traced] = []
-    missed = 0
+    missed: list[Seed] = []
+    endless = 0
     try:
-        while waiting:
-            seed = waiting.pop(0)
-            start = starting_point(model, atlas.plane, seed, settings)
-            if start is None:
-                missed += 1
-                continue
-            if any(_same_place(t, start) for t in traced):
+        while waiting or brinks:
+            if waiting:
+                seed = waiting.pop(0)
+                start = starting_point(model, atlas.plane, seed, settings)
+                missed += [seed] if start is None else []
+            else:
+                end = leads_on(model, atlas.plane, brinks.pop(len(brinks) // 2))
+                if end is None:
+                    continue
+                start = fold_at(model, atlas.plane, end)
+                endless = 0 if start is not None else endless + 1
+                brinks = brinks if endless < PATIENCE else []
+            if start is None or any(_same_place(t, start) for t in traced):
                 continue  # met again from a seed that the map's mesh misplaced
             progress(f"boundary {len(traced) + 1}")
             curve = follow_curve(model, atlas.plane, start, settings, progress)
@@ -68,12 +85,13 @@ def find_boundaries(
                 traced.append(_dense(curve))
                 atlas.branches.extend(polish_curve(model, atlas.plane, curve, settings))
                 waiting = [s for s in waiting if not passes(traced[-1], s)]
+                brinks = [b for b in brinks if not ends_state(traced[-1], b)]
             if curve.end is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             yield atlas
     except KeyboardInterrupt:
         atlas.status = Status.INTERRUPTED
-    _conclude(atlas, found, missed)
+    _conclude(atlas, found, sum(not any(passes(t, seed) for t in traced) for seed in missed))
     yield atlas
 
 
@@ -82,6 +100,11 @@ def _conclude(atlas: Atlas, found: StabilityMap, missed: int) -> None:
     atlas.notes = map_notes(found)
     if missed:
         atlas.notes.append(f"{missed} sign changes of the map could not be polished to a point of a boundary")
+    if any(pt.kind == "fold" for b in atlas.branches for pt in b.points):
+        atlas.notes.append(
+            "at a boundary of type fold the state that slides steadily without modulation ends: beyond it is another motion, "
+            "larger or irregular, which the map does not look for"
+        )
     if atlas.status is Status.OK and (missed or not all(pt.status.ok for b in atlas.branches for pt in b.points)):
         atlas.status = Status.NO_CONVERGENCE
     ends = {end for b in atlas.branches for end in (b.start, b.end)}
@@ -116,7 +139,7 @@ def starting_point(model: GeneratedModel, plane: Plane, seed: Seed, settings: At
     tol = settings.steps.mesh_error
     direction = replace(along(axis.name, 1), log=(axis.log,))
     if not axis.log:
-        direction = replace(direction, vectors=np.full((1, 1), axis.span))
+        direction = replace(direction, vectors=np.full((1, 1, 1), axis.span))
     points = polish(
         model, seed.p[:, None], seed.orbit, np.array([seed.rho]), direction, tol=tol, max_mesh=settings.max_mesh
     )
@@ -191,14 +214,20 @@ def unstable_side(curve: Curve) -> Array:
     """Return, as a sign, on which side of its tangent sliding is unstable, for the points that tell.
 
     Those are where the curve is not upright and no other multiplier is unstable: beyond a strong resonance the side changes.
+    Where a multiplier is +1 there is no such side: the state ends.
     """
     t = np.array([pt.tangent_q for pt in curve.points])
     slope = np.array([pt.slope_y for pt in curve.points])
     others = np.array([pt.others for pt in curve.points])
-    clear = (np.abs(t[:, 0]) > UPRIGHT * np.linalg.norm(t, axis=1)) & np.isfinite(slope) & (others < 1)
+    clear = (np.abs(t[:, 0]) > UPRIGHT * np.linalg.norm(t, axis=1)) & np.isfinite(slope) & (others < 1) & ~_fold(curve)
     forward = np.sign((t[:-1] * np.diff(curve.q, axis=0)).sum(axis=1))
     forward = np.concatenate([forward, forward[-1:]]) if len(forward) else np.ones(1)
     return np.asarray(np.sign(slope * t[:, 0] * forward)[clear])
+
+
+def _fold(curve: Curve) -> Array:
+    """Return which points of a curve have a multiplier +1."""
+    return np.array([bifurcation_kind(pt.rho) == "fold" for pt in curve.points])
 
 
 def _dense(curve: Curve) -> _Traced:
@@ -221,25 +250,37 @@ def _dense(curve: Curve) -> _Traced:
     along_line = np.gradient(line, axis=0)
     left = np.stack([-along_line[:, 1], along_line[:, 0]], axis=1)
     side = unstable_side(curve)  # the same all along
-    return _Traced(curve, line, left * (np.sign(side.sum()) if side.size else 1.0))
+    fold = np.append(np.repeat(_fold(curve)[:-1], DENSE), _fold(curve)[-1:])
+    return _Traced(curve, line, left * (np.sign(side.sum()) if side.size else 1.0), fold)
 
 
 def passes(traced: _Traced, seed: Seed) -> bool:
-    """Return whether a curve passes through a seed in the seed's direction."""
-    k, other = seed.axis, 1 - seed.axis
+    """Return whether a curve passes through a seed in the seed's direction; folds through one with a multiplier beyond +1."""
+    index, near = _met(traced, seed.ends, seed.axis)
+    rising = traced.unstable[index, seed.axis] > 0
+    alike = np.where(traced.fold[index], bifurcation_kind(seed.rho) == "fold", rising == seed.rising)
+    return bool((near & alike).any())
+
+
+def ends_state(traced: _Traced, brink: Brink) -> bool:
+    """Return whether a curve of folds passes between a brink's ends."""
+    index, near = _met(traced, brink.ends, brink.axis)
+    return bool((near & traced.fold[index]).any())
+
+
+def _met(traced: _Traced, ends: Array, k: int) -> tuple[Array, Array]:
+    """Return the parts of a curve that meet the line along axis `k` through `ends`, and whether they do between these."""
+    other = 1 - k
     a, b = traced.line[:-1], traced.line[1:]
-    at = seed.ends[0, other]
+    at = ends[0, other]
+    low, high = ends[:, k].min(), ends[:, k].max()
     near = (np.minimum(a[:, other], b[:, other]) - 1e-9 <= at) & (at <= np.maximum(a[:, other], b[:, other]) + 1e-9)
     index = np.nonzero(near)[0]
-    if not index.size:
-        return False
     run = b[index, other] - a[index, other]
     share = np.clip((at - a[index, other]) / np.where(run == 0, 1.0, run), 0.0, 1.0)
     height = a[index, k] + share * (b[index, k] - a[index, k])
-    low, high = seed.ends[:, k]
     reach = 0.25 * (high - low) + REACH
-    rising = traced.unstable[index, k] > 0
-    return bool(((height >= low - reach) & (height <= high + reach) & (rising == seed.rising)).any())
+    return index, (height >= low - reach) & (height <= high + reach)
 
 
 def _same_place(traced: _Traced, point: CurvePoint) -> bool:
@@ -249,6 +290,8 @@ def _same_place(traced: _Traced, point: CurvePoint) -> bool:
     share = np.clip((away * d).sum(axis=1) / np.maximum((d * d).sum(axis=1), 1e-300), 0, 1)
     distance = np.linalg.norm(away - share[:, None] * d, axis=1)
     k = int(np.argmin(distance))
+    if traced.fold[k]:
+        return bool(distance[k] < 0.3 * REACH and bifurcation_kind(point.rho) == "fold")
     t = point.tangent_q
     normal = np.array([-t[1], t[0]]) * np.sign(point.slope_y * t[0])
     reach = 0.3 if normal @ traced.unstable[k] > 0 else 0.03  # beside a fold in x the slope's sign is rounding
@@ -258,14 +301,15 @@ def _same_place(traced: _Traced, point: CurvePoint) -> bool:
 def unexplained(model: GeneratedModel, found: StabilityMap, atlas: Atlas) -> Array:
     """Return the grid points (count, 2) whose stability is not what the number of boundaries below them says.
 
-    Points beside a boundary, within 2 REACH of the window, are not judged. None left over: the curves account for the map.
+    Points beside a boundary, within 2 REACH of the window, are not judged. Folds do not count: a state ends there, and is stable
+    on both sides of where two exist. None left over: the curves account for the map.
     """
     p = found.points(model)
     unit = atlas.plane.coordinates(model, p)  # (nx, ny, 2)
     flipped = bool(unit[0, -1, 1] < unit[0, 0, 1])
     values = p[model.index(atlas.plane.x.name), :, 0]
     left = []
-    for i, heights in enumerate(crossings_at(model, atlas.plane, atlas.branches, values)):
+    for i, heights in enumerate(crossings_at(model, atlas.plane, atlas.branches, values, folds=False)):
         edges = np.asarray(atlas.plane.y.unit(np.array(heights))).reshape(-1)
         order = np.arange(unit.shape[1])[:: -1 if flipped else 1]
         y, g = unit[i, order, 1], found.growth[i, order]

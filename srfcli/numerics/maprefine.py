@@ -6,6 +6,7 @@ taken from second differences of the grid, and in a cell that was halved from ho
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,11 +14,12 @@ import numpy as np
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array, Discretisation, join
 from srfcli.numerics.mapgrid import TileTask
-from srfcli.numerics.maptile import Samples, guided_orbits, solve_block, tile_points
+from srfcli.numerics.maptile import Samples, regular_orbits, solve_block, tile_points
 
 SAFETY = 1.5  # on an interpolation error, which is itself an estimate
 SHRINKS = 0.5  # of a cell's error that its quarters keep: 0.25 where g is smooth, more where multipliers meet
 CROSSED = 0.5  # a cell that a boundary crosses is halved, too, where its error exceeds this share of the largest |g|
+JUMP = 0.5  # of a state between neighbours, in ln or um: it may be another state then
 
 # in units of half a cell: its middle and the middles of its sides, and the corners whose mean foretells each
 MIDDLES = np.array([(1, 0), (1, 2), (0, 1), (2, 1), (1, 1)])
@@ -73,7 +75,15 @@ class _Points:
         p = task.grid.points(model, xs, ys)
         x = np.stack([old.orbit.x[k].mean(axis=0) for k in fresh.values()])
         stages = np.stack([old.orbit.stages[k].mean(axis=0) for k in fresh.values()])
-        batch = guided_orbits(model, p, Discretisation(x, stages, old.orbit.edges), task.settings.tol)
+        batch = regular_orbits(model, p, Discretisation(x, stages, old.orbit.edges), task.settings.tol)
+        for k in range(4):  # where the mean leads nowhere, each of the parents
+            lost = np.nonzero(~batch.converged)[0]
+            if not lost.size:
+                break
+            near = old.orbit.part(np.array([above[k % len(above)] for above in fresh.values()])[lost])
+            again = regular_orbits(model, p[:, lost], near, task.settings.tol)
+            batch.orbit.x[lost], batch.orbit.stages[lost] = again.orbit.x, again.orbit.stages
+            batch.monodromy[lost], batch.converged[lost] = again.monodromy, again.converged
         for key in fresh:
             self.place[key] = len(self.place)
         self.samples = Samples(
@@ -164,7 +174,9 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
     `leading` (columns, rows) is the leading multiplier, NaN where no orbit was found; `mesh` the intervals; `extra_p` and
     `extra_leading` the points added; `suspect` (S, 3) cells in which a boundary may still hide (column, row, size in grid
     steps). Every pair of neighbours of different sign is a seed: `seed_ends` (E, 2, 2) in grid steps, `seed_axis` (E,),
-    `seed_g` (E, 2), and between them `seed_p` (n_parameters, E), `seed_rho`, `seed_x`, `seed_stages`.
+    `seed_g` (E, 2), and between them `seed_p` (n_parameters, E), `seed_rho`, `seed_x`, `seed_stages`. Every stable point beside
+    one without an orbit, or with quite another, is a brink: `brink_ends` (K, 2, 2), it and that neighbour, `brink_axis` (K,), and
+    at it `brink_rho`, `brink_x`, `brink_stages`.
     """
     done = refine(task, solve_block(task))
     samples = done.samples
@@ -180,6 +192,7 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
         "extra_leading": leading[count:],
         "suspect": suspect,
         **_seeds(task, done, corner),
+        **_brinks(done, 2**task.settings.depth, corner),
     }
 
 
@@ -190,20 +203,14 @@ def _upper(rho: Array) -> Array:
 
 def _seeds(task: TileTask, done: Refined, corner: Array) -> dict[str, Array]:
     """Return the sign changes between neighbouring points, with an orbit and a multiplier between the two."""
-    samples, unit = done.samples, 2**task.settings.depth
-    points = _Points(samples, unit)
-    g, edges = samples.g, {}
-    for cells in done.leaves:
-        corners = points.index(cells.corners())
-        for a, b, axis in SIDES:
-            i, j = corners[:, a], corners[:, b]
-            middle = cells.corners()[:, a] + np.eye(2, dtype=int)[axis] * (cells.size // 2)
-            for k in np.nonzero(np.isfinite(g[i]) & np.isfinite(g[j]) & ((g[i] > 0) != (g[j] > 0)))[0]:
-                split = cells.size > 1 and (int(middle[k, 0]), int(middle[k, 1])) in points.place
-                if not split:  # a finer cell next to it has the two halves
-                    edges[int(i[k]), int(j[k])] = axis
-    pairs = np.array(sorted(edges), dtype=int).reshape(-1, 2)
-    i, j = pairs.T
+    samples = done.samples
+    g = samples.g
+
+    def crossed(i: Array, j: Array) -> Array:
+        """Return whether one of the ends is stable and the other is not."""
+        return np.asarray(np.isfinite(g[i]) & np.isfinite(g[j]) & ((g[i] > 0) != (g[j] > 0)))
+
+    i, j, axis = _sides(done, 2**task.settings.depth, crossed).T
     share = g[i] / np.where(g[i] == g[j], 1.0, g[i] - g[j])
     nearer = np.where(share < 0.5, i, j)
     blend, orbit = share[:, None, None], samples.orbit
@@ -211,10 +218,52 @@ def _seeds(task: TileTask, done: Refined, corner: Array) -> dict[str, Array]:
     model = tile_points(task)[0]
     return {
         "seed_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
-        "seed_axis": np.array([edges[int(a), int(b)] for a, b in pairs], dtype=int),
+        "seed_axis": axis,
         "seed_g": np.stack([g[i], g[j]], axis=1),
         "seed_p": task.grid.points(model, *_quantities(task, at)),
         "seed_rho": _upper(samples.multipliers[nearer, 0]),
         "seed_x": (1 - blend) * orbit.x[i] + blend * orbit.x[j],
         "seed_stages": (1 - blend[..., None]) * orbit.stages[i] + blend[..., None] * orbit.stages[j],
     }
+
+
+def _brinks(done: Refined, unit: int, corner: Array) -> dict[str, Array]:
+    """Return the stable points whose state may end before their neighbour, with that neighbour."""
+    samples = done.samples
+    g, x = samples.g, samples.orbit.x
+
+    saddle = (g > 0) & (np.abs(np.angle(samples.multipliers[:, 0])) < 1e-7)
+
+    def apart(i: Array, j: Array) -> Array:
+        """Return whether the state of one end, which is stable, may not be that of the other."""
+        far = np.abs(x[i, 0] - x[j, 0]).max(axis=-1) > JUMP
+        stable = (g[i] < 0) & (g[j] < 0)
+        one = np.fmin(g[i], g[j]) < 0
+        return np.asarray((stable & far) | (one & (np.isnan(g[i]) | np.isnan(g[j]) | saddle[i] | saddle[j])))
+
+    i, j, axis = _sides(done, unit, apart).T
+    i, j, axis = np.concatenate([i, j]), np.concatenate([j, i]), np.concatenate([axis, axis])  # from either end
+    i, j, axis = i[g[i] < 0], j[g[i] < 0], axis[g[i] < 0]
+    return {
+        "brink_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
+        "brink_axis": axis,
+        "brink_rho": _upper(samples.multipliers[i, 0]),
+        "brink_x": x[i],
+        "brink_stages": samples.orbit.stages[i],
+    }
+
+
+def _sides(done: Refined, unit: int, wanted: Callable[[Array, Array], Array]) -> Array:
+    """Return the `wanted` sides of leaf cells, (E, 3) in order: the samples at their two ends, and the axis they lie along."""
+    points = _Points(done.samples, unit)
+    sides: dict[tuple[int, int], int] = {}
+    for cells in done.leaves:
+        corners = points.index(cells.corners())
+        for a, b, axis in SIDES:
+            i, j = corners[:, a], corners[:, b]
+            middle = cells.corners()[:, a] + np.eye(2, dtype=int)[axis] * (cells.size // 2)
+            for k in np.nonzero(wanted(i, j))[0]:
+                split = cells.size > 1 and (int(middle[k, 0]), int(middle[k, 1])) in points.place
+                if not split:  # a finer cell next to it has the two halves
+                    sides[int(i[k]), int(j[k])] = axis
+    return np.array([(i, j, axis) for (i, j), axis in sorted(sides.items())], dtype=int).reshape(-1, 3)

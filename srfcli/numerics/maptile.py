@@ -13,13 +13,21 @@ import numpy as np
 
 from srfcli.model import GeneratedModel, load_source
 from srfcli.numerics.collocation import STAGES, Array, ComplexArray, Discretisation, mesh_error
+from srfcli.numerics.integrate import simulate
+from srfcli.numerics.load import Modulation
 from srfcli.numerics.mapgrid import TileTask
 from srfcli.numerics.orbit import OrbitBatch, interpolate, ordered_eigenvalues, solve_orbits, uniform_mesh
+from srfcli.numerics.program import Drive
 from srfcli.numerics.scan import robust_orbits
 
 STRIDE = 8  # orbits solved without neighbours are this many rows and columns apart
 NEIGHBOURS = 6  # through which a first guess is interpolated
 GRAIN = 4  # meshes are multiples of this many intervals
+STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # to the points beside a point, in columns and rows
+SETTLING = 200  # periods of a simulation
+SETTLINGS = 32  # simulations at most in a tile,
+IN_VAIN = 3  # and in a row without a periodic state
+GOLDEN = 0.6180339887  # a share by whose multiples a list is sampled evenly
 PATIENCE = 8  # Newton steps from a neighbour's guess before an orbit is looked for anew
 
 
@@ -68,6 +76,7 @@ def solve_block(task: TileTask) -> Samples:
     for level in range(1, len(columns)):
         known, new = np.concatenate(columns[:level]), columns[level]
         block.fill(new, every, block.along_columns(known, new), settings.tol)
+    block.spread(settings.tol)
     at = np.stack(np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij"), axis=-1).reshape(-1, 2)
     flat = Discretisation(
         block.x.reshape(-1, *block.x.shape[2:]), block.stages.reshape(-1, *block.stages.shape[2:]), block.edges
@@ -148,7 +157,9 @@ class _Block:
         self.x[place] = batch.orbit.x.reshape(*shape, *self.x.shape[2:])
         self.stages[place] = batch.orbit.stages.reshape(*shape, *self.stages.shape[2:])
         self.monodromy[place] = batch.monodromy.reshape(*shape, *self.monodromy.shape[2:])
-        self.converged[place] = batch.converged.reshape(shape)
+        found = batch.converged.copy()
+        found[found] = _before_fold(batch.monodromy[found])
+        self.converged[place] = found.reshape(shape)
 
     def along_rows(self, columns: Array, known: Array, new: Array) -> Discretisation:
         """Return guesses at rows `new` of `columns` from the rows `known`."""
@@ -167,18 +178,115 @@ class _Block:
     def fill(self, columns: Array, rows: Array, guess: Discretisation, tol: float) -> None:
         """Solve the orbits at the crossings of `columns` and `rows` from `guess`, and store them."""
         p = self.p[:, columns[:, None], rows[None]].reshape(len(self.p), -1)
-        self.put(columns, rows, guided_orbits(self.model, p, guess, tol))
+        self.put(columns, rows, solve_orbits(self.model, p, guess, tol=tol, max_iterations=PATIENCE))
+
+    def spread(self, tol: float) -> None:
+        """Solve the orbits that were not found from those beside them, again and again until none is added.
+
+        Steps from point to point lead round a cusp to a state that grows out of nothing else nearby. Where they lead nowhere,
+        orbits are looked for anew, and the motion is simulated at a few points until it may have settled.
+        """
+        self._spread(self.converged.copy(), tol)
+        if not self.converged.all():
+            self._spread(self._robust(tol), tol)
+        in_vain = 0
+        for attempt in range(SETTLINGS):
+            if self.converged.all() or in_vain == IN_VAIN:
+                return
+            fresh = self._settled(attempt * GOLDEN % 1, tol)
+            in_vain = 0 if fresh.any() else in_vain + 1
+            self._spread(fresh, tol)
+
+    def _robust(self, tol: float) -> Array:
+        """Look for the missing orbits without a guess, and mark those that are found."""
+        found = ~self.converged
+        c, r = np.nonzero(found)
+        self._keep(c, r, robust_orbits(self.model, self.p[:, c, r], None, self.edges, tol=tol))
+        return found & self.converged
+
+    def _settled(self, share: float, tol: float) -> Array:
+        """Mark the point, if any, at which a simulation ends in a periodic state; it begins with the state of one beside it.
+
+        Of all such points that is tried which lies a share of the way through their list.
+        """
+        found = np.zeros_like(self.converged)
+        brinks = [
+            (c, r, c - dc, r - dr)
+            for dc, dr in STEPS
+            for c, r in np.argwhere(_moved(self.converged, dc, dr) & ~self.converged).tolist()
+        ]
+        if brinks:
+            c, r, from_c, from_r = brinks[int(share * len(brinks))]
+            guess = settle(self.model, self.p[:, c, r], self.x[from_c, from_r, 0], self.edges)
+            if guess is not None:
+                self._solve(np.array([c]), np.array([r]), guess, tol)
+                found[c, r] = self.converged[c, r]
+        return found
+
+    def _spread(self, fresh: Array, tol: float) -> None:
+        """Solve the points beside `fresh` ones from these, and so on."""
+        while fresh.any() and not self.converged.all():
+            added = np.zeros_like(fresh)
+            for dc, dr in STEPS:
+                to_c, to_r = np.nonzero(_moved(fresh, dc, dr) & ~self.converged)
+                if not to_c.size:
+                    continue
+                from_c, from_r = to_c - dc, to_r - dr
+                guess = Discretisation(self.x[from_c, from_r], self.stages[from_c, from_r], self.edges)
+                self._solve(to_c, to_r, guess, tol)
+                added[to_c, to_r] = self.converged[to_c, to_r]
+            fresh = added
+
+    def _solve(self, c: Array, r: Array, guess: Discretisation, tol: float) -> None:
+        """Solve the orbits at columns `c`, rows `r` from `guess`, and keep those that are found."""
+        self._keep(c, r, solve_orbits(self.model, self.p[:, c, r], guess, tol=tol, max_iterations=PATIENCE))
+
+    def _keep(self, c: Array, r: Array, batch: OrbitBatch) -> None:
+        """Store those of a batch that were found, at columns `c`, rows `r`."""
+        good = np.nonzero(batch.converged)[0]
+        good = good[_before_fold(batch.monodromy[good])]
+        place = c[good], r[good]
+        self.x[place], self.stages[place] = batch.orbit.x[good], batch.orbit.stages[good]
+        self.monodromy[place], self.converged[place] = batch.monodromy[good], True
 
 
-def guided_orbits(model: GeneratedModel, p: Array, guess: Discretisation, tol: float) -> OrbitBatch:
-    """Return the orbits at `p` from `guess`, those that it does not lead to looked for without it."""
+def settle(model: GeneratedModel, p: Array, start: Array, edges: Array) -> Discretisation | None:
+    """Return the last of SETTLING periods of the motion that begins in the state `start` (n,), or None where it stops early."""
+    V, W0, eps, f = (float(p[model.index(name)]) for name in ("V", "W0", "eps", "f"))
+    blank = np.zeros((len(edges) - 1, STAGES, len(start)))
+    last = Discretisation(blank[:, 0], blank, edges)
+    tau = np.concatenate([edges[:-1, None], last.phases], axis=1)
+    t = np.concatenate([[0.0], (SETTLING + tau.reshape(-1)) / f])
+    trace = simulate(model, p, drive=Drive.constant(V), load=Modulation(W0, eps, f), t=t, start=start, rtol=1e-6)
+    if not trace.status.ok:
+        return None
+    x = trace.x[1:].reshape(len(edges) - 1, STAGES + 1, -1)
+    return Discretisation(x[None, :, 0], x[None, :, 1:], edges)
+
+
+def _moved(marks: Array, dc: int, dr: int) -> Array:
+    """Return the marks (columns, rows) moved by dc columns and dr rows, those beyond the edge dropped."""
+    moved = np.zeros_like(marks)
+    c, r = marks.shape
+    moved[max(dc, 0) : c + min(dc, 0), max(dr, 0) : r + min(dr, 0)] = marks[
+        max(-dc, 0) : c + min(-dc, 0), max(-dr, 0) : r + min(-dr, 0)
+    ]
+    return moved
+
+
+def regular_orbits(model: GeneratedModel, p: Array, guess: Discretisation, tol: float) -> OrbitBatch:
+    """Return the orbits at `p` from `guess`; those beyond a fold count as not found.
+
+    An odd number of multipliers beyond +1, det(1 - M) < 0, is that of a state that meets the sliding state in a fold.
+    """
     batch = solve_orbits(model, p, guess, tol=tol, max_iterations=PATIENCE)
-    lost = np.nonzero(~batch.converged)[0]
-    if lost.size:
-        again = robust_orbits(model, p[:, lost], None, guess.edges, tol=tol)
-        batch.orbit.x[lost], batch.orbit.stages[lost] = again.orbit.x, again.orbit.stages
-        batch.monodromy[lost], batch.converged[lost] = again.monodromy, again.converged
+    batch.converged[batch.converged] = _before_fold(batch.monodromy[batch.converged])
     return batch
+
+
+def _before_fold(monodromy: Array) -> Array:
+    """Return which monodromy matrices (..., n, n) have an even number of multipliers beyond +1."""
+    return np.asarray(np.linalg.det(np.eye(monodromy.shape[-1]) - monodromy) > 0)
 
 
 def neighbours(known: Array, new: Array) -> tuple[Array, Array]:

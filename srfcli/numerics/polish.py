@@ -17,28 +17,41 @@ CHUNK = 48
 LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
 FINE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
 SHALLOW = 0.02  # slopes in ln|rho| per ln(parameter) below this are computed anew
+REGULAR = (
+    0.1  # from +1: where the critical multiplier is closer, an orbit at fixed parameters is not improved by itself
+)
 CHORD_GAIN = 0.02  # a chord step is taken to leave this share of the correction, until a second one shows its own
 
 
 @dataclass(frozen=True)
 class Direction:
-    """Lines in parameter space: `vectors` (B, k) over the parameters `names`, in the logarithm of those marked `log`."""
+    """How points may move over the parameters `names`: `vectors` (B, k, d), in the logarithm of those marked `log`.
+
+    With d > 1 the rows `across` (B, d - 1, n + d) close the system: their products with the changes of the state at tau = 0
+    and of the d distances are zero.
+    """
 
     names: tuple[str, ...]
     vectors: Array
     log: tuple[bool, ...]
+    across: Array | None = None
+
+    @property
+    def distances(self) -> int:
+        """Return d, the number of distances that a point has."""
+        return int(self.vectors.shape[-1])
 
     def part(self, index: slice | Array) -> Direction:
         """Return the directions of a part of the batch."""
-        return Direction(self.names, self.vectors[index], self.log)
+        return Direction(self.names, self.vectors[index], self.log, None if self.across is None else self.across[index])
 
     def rates(self, values: Array) -> Array:
-        """Return dp/d(distance) (B, k) at parameter `values` (k, B)."""
-        return self.vectors * np.where(np.array(self.log)[:, None], values, 1.0).T
+        """Return dp/d(distances) (B, k, d) at parameter `values` (k, B)."""
+        return self.vectors * np.where(np.array(self.log)[:, None], values, 1.0).T[..., None]
 
-    def moved(self, values: Array, distance: Array) -> Array:
-        """Return `values` (k, B) moved by `distance` (B,)."""
-        shift = self.vectors.T * distance
+    def moved(self, values: Array, distances: Array) -> Array:
+        """Return `values` (k, B) moved by `distances` (B, d)."""
+        shift = np.einsum("bkd,bd->kb", self.vectors, distances)
         return np.where(
             np.array(self.log)[:, None],
             values * np.exp(np.where(np.array(self.log)[:, None], shift, 0)),
@@ -48,7 +61,7 @@ class Direction:
 
 def along(name: str, count: int) -> Direction:
     """Return the direction of ln(name) for `count` points."""
-    return Direction((name,), np.ones((count, 1)), (True,))
+    return Direction((name,), np.ones((count, 1, 1)), (True,))
 
 
 @dataclass(frozen=True)
@@ -223,9 +236,10 @@ def _newton_chunk(
         np.full(B, np.nan),
         np.zeros(B, bool),
     )
-    before, chord = np.full(B, np.inf), np.full(B, growth is not None)
-    if growth is not None:
-        _orbits_only(model, r)
+    before, chord = np.full(B, np.inf), np.full(B, False)
+    if growth is not None:  # not where rho = 1: at fixed parameters the orbit is singular there
+        chord = np.abs(target - 1) > REGULAR
+        _orbits_only(model, r, np.nonzero(chord)[0])
     active = np.arange(B)
     for _ in range(max_iterations):
         going = []
@@ -239,13 +253,16 @@ def _newton_chunk(
     return r
 
 
-def _orbits_only(model: GeneratedModel, r: _Polished) -> None:
-    """Make one Newton step of the orbits at fixed parameters: a gradient from elsewhere does not know what that does to g."""
+def _orbits_only(model: GeneratedModel, r: _Polished, index: Array) -> None:
+    """Make one Newton step of the orbits `index` at fixed parameters: a gradient from elsewhere knows nothing of it."""
+    if not index.size:
+        return
     with np.errstate(all="ignore"):
-        _, dx, dstages, finite = newton_step(model, r.p, r.orbit)
+        _, dx, dstages, finite = newton_step(model, r.p[:, index], r.orbit.part(index))
         limit = step_limit(model, dx, dstages)
-    r.orbit.x[finite] += limit[finite, None, None] * dx[finite]
-    r.orbit.stages[finite] += limit[finite, None, None, None] * dstages[finite]
+    good = index[finite]
+    r.orbit.x[good] += limit[finite, None, None] * dx[finite]
+    r.orbit.stages[good] += limit[finite, None, None, None] * dstages[finite]
 
 
 def _step(
@@ -261,30 +278,31 @@ def _step(
 ) -> Array:
     """Make one Newton or chord step of the points `index` of `r`, in place, and return those that are not finished."""
     n, part, q = r.orbit.x.shape[-1], r.orbit.part(index), r.p[:, index]
-    unit = direction.rates(q[rows])  # dp/d(distance), (B, k)
+    unit = direction.rates(q[rows])  # dp/d(distances), (B, k, d)
     with np.errstate(all="ignore"):
         try:
             known = r.growth[index] if by_chord else None
             linear = linearise_boundary(model, q, part, direction.names, r.rho[index], known)
         except np.linalg.LinAlgError:
             return index[:0]  # they stay marked as not converged
-        matrix, right = _bordered(linear, unit, n, by_chord)
+        matrix, right = _bordered(linear, unit, direction.across, by_chord)
         finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
-        matrix[~finite] = np.eye(n + 1)
+        matrix[~finite] = np.eye(matrix.shape[-1])
         step = np.linalg.solve(matrix, np.where(finite[:, None], right, 0.0)[..., None])[..., 0]
-        dq = np.clip(step[:, n], -LARGEST_STEP, LARGEST_STEP)
-        dx, dstages = expand(linear.condensed, step[:, :n], dq[:, None] * unit)
+        dq = step[:, n:]
+        dq = dq * np.minimum(1.0, LARGEST_STEP / np.maximum(np.abs(dq).max(axis=1), 1e-300))[:, None]
+        dx, dstages = expand(linear.condensed, step[:, :n], np.einsum("bkd,bd->bk", unit, dq))
         limit = step_limit(model, dx, dstages)
         change = np.abs(dx / scales(model, q)[:, None, :]).max(axis=(-1, -2))
     usable: Any = finite & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
     limit = np.where(usable, limit, 0.0)
-    dq = np.where(usable, limit * dq, 0.0)
+    dq = np.where(usable[:, None], limit[:, None] * dq, 0.0)
     r.rho[index], r.growth[index] = linear.rho, linear.growth
     r.others[index] = _largest_other(linear.multipliers, linear.rho)
     r.p[np.asarray(rows)[:, None], index] = direction.moved(q[rows], dq)
     r.orbit.x[index] += np.where(usable[:, None, None], limit[:, None, None] * dx, 0.0)
     r.orbit.stages[index] += np.where(usable[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
-    size = np.maximum(0.1 * change, np.abs(dq))
+    size = np.maximum(0.1 * change, np.abs(dq).max(axis=1))
     gain = np.where(np.isfinite(before[index]), size / before[index], CHORD_GAIN)
     left = size * np.clip(gain, size, 1.0) if by_chord else size * size  # what the step just made leaves behind
     enough = np.maximum(0.1 * tol, 0.1 * mesh_error(model, part))  # a tenth of the mesh's own error
@@ -313,17 +331,19 @@ def _renew_gradients(model: GeneratedModel, r: _Polished, direction: Direction, 
         r.slope[here] = slope_in_last(linear) * q[model.index(direction.names[-1])]
 
 
-def _bordered(linear: BoundaryLinear, unit: Array, n: int, chord: bool) -> tuple[Array, Array]:
-    """Return Newton's matrix (B, n+1, n+1) and right side for dx_0 and the distance along `unit` (B, k)."""
-    B = unit.shape[0]
-    matrix = np.empty((B, n + 1, n + 1))
+def _bordered(linear: BoundaryLinear, unit: Array, across: Array | None, chord: bool) -> tuple[Array, Array]:
+    """Return Newton's matrix (B, n+d, n+d) and right side for dx_0 and the distances along `unit` (B, k, d)."""
+    B, _, d = unit.shape
+    n = linear.periodic.shape[-2]
+    matrix, right = np.empty((B, n + d, n + d)), np.zeros((B, n + d))
     matrix[:, :n, :n] = linear.periodic[..., :n]
-    matrix[:, :n, n] = np.einsum("bik,bk->bi", linear.periodic[..., n + 1 :], unit)
+    matrix[:, :n, n:] = linear.periodic[..., n + 1 :] @ unit
     matrix[:, n, :n] = linear.growth[..., :n]
-    matrix[:, n, n] = np.einsum("bk,bk->b", linear.growth[..., n + 1 :], unit)
-    right = -np.concatenate(
-        [linear.periodic[..., n], (linear.g + (0 if chord else linear.growth[..., n]))[:, None]], axis=-1
-    )
+    matrix[:, n, n:] = (linear.growth[..., None, n + 1 :] @ unit)[..., 0, :]
+    if across is not None:
+        matrix[:, n + 1 :] = across
+    right[:, :n] = -linear.periodic[..., n]
+    right[:, n] = -(linear.g + (0 if chord else linear.growth[..., n]))
     return matrix, right
 
 

@@ -1,7 +1,7 @@
-"""Points of a stability boundary where something changes: folds of the curve, resonances, zeros of a caller's test function.
+"""Points of a stability boundary where something changes: folds and cusps of the curve, resonances, zeros of a caller's function.
 
 Between two neighbouring points of a polished branch a test function of opposite signs is brought to zero by the Illinois method,
-each trial corrected onto the boundary on the line across the chord.
+each trial corrected onto the boundary on the hyperplane across the chord, which joins the points in parameters and state.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from srfcli.model import GeneratedModel
 from srfcli.numerics.atlas import Branch
 from srfcli.numerics.collocation import Array, Discretisation, mesh_error
-from srfcli.numerics.continuation import CurvePoint, correct
+from srfcli.numerics.continuation import CurvePoint, correct, metric
 from srfcli.numerics.orbit import interpolate
 from srfcli.numerics.plane import Plane
 from srfcli.numerics.polish import BoundaryPoint, bifurcation_kind
@@ -23,6 +23,7 @@ from srfcli.status import Status
 
 CLOSE = 1e-8  # of the chord: where the search for a zero ends
 MEETING = 0.05  # of Re(rho) from +1 or -1: a Neimark-Sacker boundary that ends so near ends in a strong resonance
+CUSPED = 1e-3  # of the tangent in the plane beside a cusp: what is left of it at the cusp
 INSIDE = 1 - 1e-9  # of the window: its far edge as seen from within
 RESONANCES = {"1:3": 2 * np.pi / 3, "1:4": np.pi / 2}
 STRONG = {"fold": "1:1", "pd": "1:2"}  # where a pair of multipliers meets on the real axis
@@ -32,7 +33,7 @@ Test = Callable[[CurvePoint], float]
 
 @dataclass(frozen=True)
 class SpecialPoint:
-    """A located point: `what` is `fold` (with `axis`, the parameter that turns round), `1:1` to `1:4`, or the caller's word.
+    """A located point: `what` is `fold` (with `axis`, the parameter that turns round), `cusp`, `1:1` to `1:4`, or the caller's.
 
     `place` counts along the branch, 3.5 between its points 3 and 4; `error` is the estimated relative error of the parameters.
     """
@@ -52,19 +53,27 @@ class SpecialPoint:
 
 
 def special_points(model: GeneratedModel, plane: Plane, branch: Branch) -> list[SpecialPoint]:
-    """Return the folds in either parameter and the resonances 1:1 to 1:4 of a branch, in their order along it.
+    """Return the folds in either parameter, the cusps and the resonances 1:1 to 1:4 of a branch, in their order along it.
 
     1:1 and 1:2 are where a Neimark-Sacker boundary goes over into one of multipliers at +1 or -1, or ends; the error of an end
-    is the distance over which the multiplier was extrapolated. A cusp is not looked for: a curve that meets one ends there.
+    is the distance over which the multiplier was extrapolated. Cusps are looked for where a multiplier is +1: the folds of two
+    pairs of periodic states meet in them, and the other boundaries have none in general.
     """
-    found = [*_folds(model, plane, branch), *_resonances(model, plane, branch), *_strong(model, plane, branch)]
+    found = [*_turns(model, plane, branch), *_resonances(model, plane, branch), *_strong(model, plane, branch)]
     found += _strong_ends(model, branch)
     return sorted(found, key=lambda s: s.place)
 
 
-def crossings_at(model: GeneratedModel, plane: Plane, branches: Sequence[Branch], values: Array) -> list[list[float]]:
-    """Return for each value of the plane's x parameter the values of y, rising, at which a boundary is crossed there."""
+def crossings_at(
+    model: GeneratedModel, plane: Plane, branches: Sequence[Branch], values: Array, *, folds: bool = True
+) -> list[list[float]]:
+    """Return for each value of the plane's x parameter the values of y, rising, at which a boundary is crossed there.
+
+    Without `folds` those where a multiplier is +1 are left out.
+    """
     lines = [plane.coordinates(model, np.stack([pt.p for pt in b.points], axis=1)) for b in branches]
+    for line, branch in zip(lines, branches, strict=True):
+        line[[not folds and pt.kind == "fold" for pt in branch.points]] = np.nan
     heights = polyline_heights(lines, np.asarray(plane.x.unit(values)))
     return [np.asarray(plane.y.value(np.array(h))).reshape(-1).tolist() for h in heights]
 
@@ -83,17 +92,39 @@ def polyline_heights(lines: Sequence[Array], at: Array) -> list[list[float]]:
     return out
 
 
-def _folds(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[SpecialPoint]:
-    """Yield the points at which one of the two parameters turns round."""
+def _turns(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[SpecialPoint]:
+    """Yield the cusps, and the points at which one of the two parameters turns round."""
     q = plane.coordinates(model, np.stack([pt.p for pt in branch.points], axis=1))
-    for axis, name in enumerate(plane.names):
-        step = np.diff(q[:, axis])
-        for k in np.nonzero(step[:-1] * step[1:] < 0)[0]:
+    steps = np.diff(q, axis=0)
+    back = steps[:-1] * steps[1:] < 0  # (steps - 1, 2)
+    for k in np.nonzero(back.any(axis=1))[0]:
+        between = int(k), int(k) + 2
+        turned = (steps[k] * steps[k + 1]).sum() < 0 and branch.points[k + 1].kind == "fold"
+        cusp = _cusp(model, plane, branch, between, steps[k] / np.linalg.norm(steps[k])) if turned else None
+        if cusp is not None:
+            yield cusp
+            continue
+        for axis in np.nonzero(back[k])[0]:
 
-            def turning(point: CurvePoint, axis: int = axis) -> float:
+            def turning(point: CurvePoint, axis: int = int(axis)) -> float:
                 return float(point.tangent_q[axis] / np.linalg.norm(point.tangent_q))
 
-            yield locate(model, plane, branch, (int(k), int(k) + 2), turning, what="fold", axis=name)
+            yield locate(model, plane, branch, between, turning, what="fold", axis=plane.names[axis])
+
+
+def _cusp(
+    model: GeneratedModel, plane: Plane, branch: Branch, between: tuple[int, int], forward: Array
+) -> SpecialPoint | None:
+    """Return the cusp between two points of a branch, where the tangent has no part in the plane, or None."""
+    left: dict[float, float] = {}  # of the tangent's length in the plane, by its part along `forward`
+
+    def along(point: CurvePoint) -> float:
+        part = float(point.tangent_q @ forward)
+        left[part] = float(np.linalg.norm(point.tangent_q))
+        return part
+
+    found = locate(model, plane, branch, between, along, what="cusp")
+    return found if left and left[min(left, key=abs)] < CUSPED * max(left.values()) else None
 
 
 def _resonances(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[SpecialPoint]:
@@ -206,23 +237,22 @@ def _special(
 def _on_chord(
     model: GeneratedModel, plane: Plane, ends: tuple[BoundaryPoint, BoundaryPoint], s: float
 ) -> CurvePoint | None:
-    """Return the boundary point on the line across the chord between two points, a share `s` along it, or None."""
+    """Return the boundary point on the hyperplane across the chord between two points, a share `s` along it, or None."""
     a, b = ends
     q = [plane.coordinates(model, e.p) for e in ends]
-    chord = q[1] - q[0]
     edges = max((e.orbit.edges for e in ends), key=len)
     orbits = [interpolate(_single(e.orbit), edges) for e in ends]
     blend = Discretisation(
         (1 - s) * orbits[0].x + s * orbits[1].x, (1 - s) * orbits[0].stages + s * orbits[1].stages, edges
     )
     rho = a.rho if s < 0.5 else b.rho
-    normal = chord / np.linalg.norm(chord)
-    across = np.zeros(blend.x.shape[-1])
-    point = correct(model, plane, q[0] + s * chord, blend, rho, normal, across, tol=1e-6)
+    chord = q[1] - q[0]
+    across = metric(model, a.p, blend.x[0], orbits[1].x[0] - orbits[0].x[0])
+    point = correct(model, plane, q[0] + s * chord, blend, rho, chord, across, tol=1e-6)
     if point is not None:  # again from there: the tangent is that of the place a correction starts at
-        point = correct(model, plane, point.q, point.orbit, point.rho, normal, across, tol=1e-6)
-    if point is not None and point.tangent_q @ chord < 0:  # so that a test function of the tangent is continuous
-        point.tangent_q = -point.tangent_q
+        point = correct(model, plane, point.q, point.orbit, point.rho, chord, across, tol=1e-6)
+    if point is not None and point.tangent_q @ chord + point.tangent_orbit.x[0] @ across < 0:
+        point.tangent_q = -point.tangent_q  # so that a test function of the tangent is continuous
     return point
 
 

@@ -12,9 +12,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SHADES = "PuOr_r"  # purple and orange: told apart in all common forms of colour blindness, and in grey by the curves
-MARKS = {"fold": ("^", "fold"), "1:1": ("o", "1:1"), "1:2": ("D", "1:2"), "1:3": ("v", "1:3"), "1:4": ("s", "1:4")}
+MARKS = {
+    "fold": ("^", "fold"),
+    "cusp": ("*", "cusp"),
+    "1:1": ("o", "1:1"),
+    "1:2": ("D", "1:2"),
+    "1:3": ("v", "1:3"),
+    "1:4": ("s", "1:4"),
+}
 HATCH = "#5A4A7A"
-SUBCRITICAL = "subcritical"
+LOOKS: dict[str, dict[str, Any]] = {
+    "": {"label": "boundary", "color": "black", "linewidth": 1.6},
+    "subcritical": {"label": "subcritical", "color": "white", "linewidth": 0.9, "linestyle": (0, (2, 1.5))},
+    "fold": {"label": "state ends (fold)", "color": "black", "linewidth": 1.6, "linestyle": (0, (4, 1.5))},
+}
 CRITICALITY = ("P", "criticality changes")
 
 
@@ -23,7 +34,7 @@ def stability_map(
     y: Values,
     growth: Any,
     *,
-    branches: Sequence[tuple[Values, Values, Sequence[bool]]] = (),
+    branches: Sequence[tuple[Values, Values, Sequence[str]]] = (),
     special: Sequence[Mapping[str, Any]] = (),
     unresolved: tuple[Values, Values] = ((), ()),
     xlabel: str,
@@ -35,7 +46,7 @@ def stability_map(
 ) -> Figure:
     """Return a map of `growth` (nx, ny), negative where stable, over axes `x` (nx,) and `y` (ny,), both rising.
 
-    `branches` are curves (x, y, whether subcritical); `special` points
+    `branches` are curves (x, y, at each point `subcritical`, `fold` or nothing); `special` points
     {what, x, y}; `unresolved` the places of points without an orbit. The stable side is hatched as well as shaded, so that it
     is told apart in print without colour.
     """
@@ -88,8 +99,8 @@ def _legend(figure: Figure, ax: Axes) -> None:
     stable = Patch(facecolor="#B2ABD2", edgecolor=HATCH, hatch="....", linewidth=0.0, label="stable")
     drawn, names = ax.get_legend_handles_labels()
     handles: list[Any] = [stable, *drawn]
-    if SUBCRITICAL in names:  # white on black in the figure, and so in the legend
-        handles[1 + names.index(SUBCRITICAL)] = (drawn[names.index("boundary")], drawn[names.index(SUBCRITICAL)])
+    if "subcritical" in names:  # white on black in the figure, and so in the legend
+        handles[1 + names.index("subcritical")] = (drawn[names.index("boundary")], drawn[names.index("subcritical")])
     figure.legend(
         handles,
         ["stable", *names],
@@ -118,17 +129,17 @@ def _hatch_stable(ax: Axes, x: Values, y: Values, growth: Any) -> None:
         drawn.set_linewidth(0.0)
 
 
-def _draw_boundaries(ax: Axes, branches: Sequence[tuple[Values, Values, Sequence[bool]]]) -> None:
-    """Draw the curves, solid and, where the bifurcation is subcritical, white on black, each kind named once."""
-    named: set[bool] = set()
-    for x, y, subcritical in branches:
-        ax.plot(list(x), list(y), color="black", linewidth=1.6, label=None if False in named else "boundary")
-        named.add(False)
-        if any(subcritical):
-            gaps = [float(v) if s else float("nan") for v, s in zip(y, subcritical, strict=True)]
-            look: dict[str, Any] = {"color": "white", "linewidth": 0.9, "linestyle": (0, (2, 1.5))}
-            ax.plot(list(x), gaps, label=None if True in named else SUBCRITICAL, **look)
-            named.add(True)
+def _draw_boundaries(ax: Axes, branches: Sequence[tuple[Values, Values, Sequence[str]]]) -> None:
+    """Draw the curves, solid, white on black where the bifurcation is subcritical, dashed where states end in a fold."""
+    named: set[str] = set()
+    for x, y, looks in branches:
+        for look, style in LOOKS.items():
+            mine = [s == look or (look == "" and s == "subcritical") for s in looks]
+            if not any(mine):
+                continue
+            gaps = [float(v) if m else float("nan") for v, m in zip(y, mine, strict=True)]
+            ax.plot(list(x), gaps, **{**style, "label": None if look in named else style["label"]})
+            named.add(look)
 
 
 def _draw_marks(ax: Axes, special: Sequence[Mapping[str, Any]]) -> None:
