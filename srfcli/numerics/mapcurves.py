@@ -123,9 +123,8 @@ def map_notes(found: StabilityMap) -> list[str]:
         f"not show them"
     ]
     if found.lost:
-        notes.append(
-            f"no forced periodic state was found at {found.lost} points; boundaries beside them may be missing"
-        )
+        places = "1 point" if found.lost == 1 else f"{found.lost} points"
+        notes.append(f"no forced periodic state was found at {places}; boundaries beside them may be missing")
     if len(found.suspect):
         notes.append(
             f"in {len(found.suspect)} cells a boundary could still hide below the finest spacing: unresolved there"
