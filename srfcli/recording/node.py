@@ -131,6 +131,11 @@ def open_node(path: Path) -> Node:
     except RecursionError:
         raise SrfError(f"{path}: nested too deeply", "An experiment needs a few levels.") from None
     except ValueError as error:  # TOMLDecodeError is one, and numbers of thousands of digits raise another
+        if path.suffix.lower() != ".toml":
+            raise SrfError(
+                f"{path}: a data file, not the description of an experiment",
+                f'Name the folder or the experiment.toml whose [[run]] says file = "{path.name}".',
+            ) from None
         raise SrfError(f"{path}: not TOML: {error}", 'Text goes in quotes: law = "srf-vsat".') from None
     return Node(path, table, (), key_lines(text))
 
