@@ -105,7 +105,8 @@ def _evaluated(n: int, order: int, p: Any, i: int, x: Any) -> Any:
 
 def _cells(first: float, spacing: float, count: int, x: Any) -> tuple[Any, Any]:
     r = np.clip((x - first) / spacing, 0.0, count - 3.0)
-    cell = np.minimum(r.astype(int) if np.ndim(r) else int(r), count - 4)
+    known = np.where(np.isnan(r), 0.0, r)  # a motion that was lost: its value is NaN, its cell is any
+    cell = np.minimum(known.astype(int) if np.ndim(r) else int(known), count - 4)
     return cell, r - cell
 
 

@@ -66,6 +66,16 @@ def test_beyond_its_knots_a_table_is_constant():
     assert (lut1(p, 0, beyond) == 0).all() and (lut2(p, 0, beyond) == 0).all()
 
 
+def test_at_no_number_a_table_is_none_and_its_neighbours_are_unharmed():
+    s = some()
+    p = appended(np.array([1.0, 2.0]), [s])
+    for order, value in enumerate(tables_after(2)):
+        one, other = value(p, 0, np.array([np.nan, 2.5]))
+        assert np.isnan(one) and np.isnan(value(p, 0, np.nan))
+        assert other == pytest.approx(scipy_spline(s).derivative(order)(2.5) if order else scipy_spline(s)(2.5))
+    assert np.isnan(s(np.array([np.nan]))).all()
+
+
 def test_complex_steps_see_argument_and_numbers():
     s = some(5)
     p, step = appended(np.array([1.0]), (s,)), 1e-30

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from srfcli.diagnosis.candidates import own_parameters
 from srfcli.diagnosis.columns import along_table
-from srfcli.diagnosis.follower import LOOSE, LOOSE_ONLY, ROUND
+from srfcli.diagnosis.follower import LOOSE, LOOSE_ONLY, PULLS, ROUND
 from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.score import scores
 from srfcli.inference.follow import weaker
@@ -21,7 +22,10 @@ ROUNDS, STEPS = 1, 8  # of a fit on a rough track under a pull
 
 
 def elsewhere(search: Search, refit: Refit) -> Refit:
-    """Return the best fit of a hypothesis from other starts: larger and smaller effects, other places and wavelengths."""
+    """Return the best fit of a hypothesis from other starts: the file's own, larger and smaller effects, other wavelengths.
+
+    The file's own come first: without the effect the baseline may have been bent, and its parameters do not find back.
+    """
     key = (refit.name, refit.rough)
     if (
         key in search.shook
@@ -32,12 +36,14 @@ def elsewhere(search: Search, refit: Refit) -> Refit:
         return refit
     search.shook.add(key)
     values = dict(refit.fit.values)
-    for start in other_starts(search, refit):
+    tries = [(values | start, LOOSE_ONLY) for start in other_starts(search, refit)]
+    if not refit.rough:
+        own = [long for e in refit.hypothesis.effects for long in own_parameters(e, refit.fit.problem.model)]
+        tries.insert(0, ({long: values[long] for long in own if long in values}, PULLS[1]))
+    for at, way in tries:
         if search.spent():
             break
-        fitted = (
-            _on_a_rough_track(search, refit, values | start) if refit.rough else _smooth(search, refit, values | start)
-        )
+        fitted = _on_a_rough_track(search, refit, at) if refit.rough else _smooth(search, refit, at, way)
         if fitted is not None:
             refit = search.keep(refit.hypothesis, fitted, rough=refit.rough)
         if refit.adequacy.fine:
@@ -60,8 +66,8 @@ def other_starts(search: Search, refit: Refit) -> list[dict[str, float]]:
     return [start for start in starts if start]
 
 
-def _smooth(search: Search, refit: Refit, at: dict[str, float]) -> LatentFit | None:
-    led = search.follower.follow(refit.hypothesis, at, search.noise, [LOOSE_ONLY])
+def _smooth(search: Search, refit: Refit, at: dict[str, float], way: Sequence[float]) -> LatentFit | None:
+    led = search.follower.follow(refit.hypothesis, at, search.noise, [way])
     if led.lost:
         return None
     return fit_latent(refit.fit.problem, led.theta, search.noise, tracks=Tracks((), {}), known_noise=True)

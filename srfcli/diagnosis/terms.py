@@ -125,7 +125,8 @@ class _Selection:
                     found.append(search.refit(hypothesis, start, own, rough=start.rough))
         else:
             candidates = _foremost(self.scored(start, search.pulled(start)))
-            found = contest(search, start, search.widened(start, candidates), again=1)
+            entrants = [(h, own) for h, own in search.widened(start, candidates) if self.new(h)]
+            found = contest(search, start, entrants, again=1)
         best = max(found, key=lambda r: r.evidence, default=None)
         return best if best is not None and best.evidence > start.evidence + PAYS else None
 
