@@ -115,6 +115,7 @@ def test_the_concealed_effect_is_named_with_its_size(found: dict[str, Any]) -> N
     alpha = found["augmented"]["parameters"]["alpha"]
     assert abs(alpha["value"] - ALPHA) < 4 * alpha["stderr"] < 0.3 * ALPHA
     assert found["confidence"]["linker-dieterich"] > 0.9
+    assert 0.01 < found["confidence"]["unknown"] < 0.1  # something that is not registered may look like it
     assert sum(found["confidence"].values()) == pytest.approx(1.0)
 
 

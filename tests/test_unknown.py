@@ -212,6 +212,9 @@ def test_the_command_says_it(tmp_path):
     assert result.exit_code == 0, result.output
     found = json.loads((out / "answer.json").read_text())
     assert found["verdict"] == "unknown"
+    assert max(found["confidence"], key=found["confidence"].get) == "unknown"
+    assert 0.4 < found["confidence"]["unknown"] < 0.9  # a search may have missed what is registered
+    assert sum(found["confidence"].values()) == pytest.approx(1.0)
     assert [t["name"] for t in found["missing"]["terms"]] == ["age-power"]
     assert set(found["missing"]) >= {"form", "gain", "held_gain", "latent", "leaves_noise_alone"}
     assert read_law(out / "closed-form.toml").sizes == ("age_power",)

@@ -36,7 +36,9 @@ def elsewhere(search: Search, refit: Refit) -> Refit:
         return refit
     search.shook.add(key)
     values = dict(refit.fit.values)
-    tries = [(values | start, LOOSE_ONLY) for start in other_starts(search, refit)]
+    tries: list[tuple[dict[str, float], Sequence[float]]] = [
+        (values | start, LOOSE_ONLY) for start in other_starts(search, refit)
+    ]
     if not refit.rough:
         own = [long for e in refit.hypothesis.effects for long in own_parameters(e, refit.fit.problem.model)]
         tries.insert(0, ({long: values[long] for long in own if long in values}, PULLS[1]))
