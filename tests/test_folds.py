@@ -112,7 +112,7 @@ def test_at_the_cusp_two_extrema_of_eps_along_the_response_meet(model, atlas, cu
     counts = []
     for factor in (0.997, 1.0, 1.003):
         start = brute_states(model, point)
-        a = start[2] + np.linspace(-0.25, 0.25, 13)
+        a = start[2] + (0.15 if factor == 1.0 else 0.25) * np.linspace(-1, 1, 13)
         fit = np.polynomial.Polynomial.fit(a, response(factor * f, a, start, eps), 8)
         slope, inside = fit.deriv(), np.linspace(a[0], a[-1], 401)
         steepest = np.abs(slope(inside)).max()

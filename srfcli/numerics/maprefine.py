@@ -6,7 +6,7 @@ taken from second differences of the grid, and in a cell that was halved from ho
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,13 +19,15 @@ from srfcli.numerics.maptile import Samples, regular_orbits, solve_block, tile_p
 SAFETY = 1.5  # on an interpolation error, which is itself an estimate
 SHRINKS = 0.5  # of a cell's error that its quarters keep: 0.25 where g is smooth, more where multipliers meet
 CROSSED = 0.5  # a cell that a boundary crosses is halved, too, where its error exceeds this share of the largest |g|
-JUMP = 0.5  # of a state between neighbours, in ln or um: it may be another state then
+JUMP = 0.5  # of a state's logarithms between neighbours: it may be another state then
 
 # in units of half a cell: its middle and the middles of its sides, and the corners whose mean foretells each
 MIDDLES = np.array([(1, 0), (1, 2), (0, 1), (2, 1), (1, 1)])
 PARENTS = ((0, 1), (2, 3), (0, 2), (1, 3), (0, 1, 2, 3))
 CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # the order of a cell's corners, and of its quarters
 SIDES = ((0, 1, 0), (2, 3, 0), (0, 2, 1), (1, 3, 1))  # two corners and the axis they lie along
+
+Between = Callable[[Array, Array], Array]  # what holds between samples i (E,) and j (E,)
 
 
 @dataclass
@@ -183,6 +185,8 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
     nc, nr = task.columns[1] - task.columns[0] + 1, task.rows[1] - task.rows[0] + 1
     count, corner = nc * nr, np.array([task.columns[0], task.rows[0]])
     leading = _upper(samples.multipliers[:, 0])
+    crossed, apart = _crossed(samples), _apart(samples, tile_points(task)[0].logarithmic)
+    sides = _sides(done, 2**task.settings.depth, lambda i, j: crossed(i, j) | apart(i, j))
     suspect = done.suspect.copy()
     suspect[:, :2] += corner
     return {
@@ -191,9 +195,28 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
         "extra_at": samples.at[count:] + corner,
         "extra_leading": leading[count:],
         "suspect": suspect,
-        **_seeds(task, done, corner),
-        **_brinks(done, 2**task.settings.depth, corner),
+        **_seeds(task, samples, sides[crossed(sides[:, 0], sides[:, 1])], corner),
+        **_brinks(samples, sides[apart(sides[:, 0], sides[:, 1])], corner),
     }
+
+
+def _crossed(samples: Samples) -> Between:
+    """Return the test whether, of two samples, one is stable and the other is not."""
+    g = samples.g
+    return lambda i, j: np.asarray(np.isfinite(g[i]) & np.isfinite(g[j]) & ((g[i] > 0) != (g[j] > 0)))
+
+
+def _apart(samples: Samples, logarithmic: Sequence[bool]) -> Between:
+    """Return the test whether, of two samples, one is stable and the state of the other may not be the same."""
+    g, start = samples.g, samples.orbit.x[:, 0][:, np.array(logarithmic)]
+    saddle = (g > 0) & (np.abs(np.angle(samples.multipliers[:, 0])) < 1e-7)
+
+    def apart(i: Array, j: Array) -> Array:
+        far = np.abs(start[i] - start[j]).max(axis=-1) > JUMP
+        stable, one = (g[i] < 0) & (g[j] < 0), np.fmin(g[i], g[j]) < 0
+        return np.asarray((stable & far) | (one & (np.isnan(g[i]) | np.isnan(g[j]) | saddle[i] | saddle[j])))
+
+    return apart
 
 
 def _upper(rho: Array) -> Array:
@@ -201,16 +224,9 @@ def _upper(rho: Array) -> Array:
     return rho.real + 1j * np.abs(rho.imag)
 
 
-def _seeds(task: TileTask, done: Refined, corner: Array) -> dict[str, Array]:
-    """Return the sign changes between neighbouring points, with an orbit and a multiplier between the two."""
-    samples = done.samples
-    g = samples.g
-
-    def crossed(i: Array, j: Array) -> Array:
-        """Return whether one of the ends is stable and the other is not."""
-        return np.asarray(np.isfinite(g[i]) & np.isfinite(g[j]) & ((g[i] > 0) != (g[j] > 0)))
-
-    i, j, axis = _sides(done, 2**task.settings.depth, crossed).T
+def _seeds(task: TileTask, samples: Samples, sides: Array, corner: Array) -> dict[str, Array]:
+    """Return the sign changes on `sides` (E, 3), with an orbit and a multiplier between the two ends of each."""
+    g, (i, j, axis) = samples.g, sides.T
     share = g[i] / np.where(g[i] == g[j], 1.0, g[i] - g[j])
     nearer = np.where(share < 0.5, i, j)
     blend, orbit = share[:, None, None], samples.orbit
@@ -227,33 +243,20 @@ def _seeds(task: TileTask, done: Refined, corner: Array) -> dict[str, Array]:
     }
 
 
-def _brinks(done: Refined, unit: int, corner: Array) -> dict[str, Array]:
-    """Return the stable points whose state may end before their neighbour, with that neighbour."""
-    samples = done.samples
-    g, x = samples.g, samples.orbit.x
-
-    saddle = (g > 0) & (np.abs(np.angle(samples.multipliers[:, 0])) < 1e-7)
-
-    def apart(i: Array, j: Array) -> Array:
-        """Return whether the state of one end, which is stable, may not be that of the other."""
-        far = np.abs(x[i, 0] - x[j, 0]).max(axis=-1) > JUMP
-        stable = (g[i] < 0) & (g[j] < 0)
-        one = np.fmin(g[i], g[j]) < 0
-        return np.asarray((stable & far) | (one & (np.isnan(g[i]) | np.isnan(g[j]) | saddle[i] | saddle[j])))
-
-    i, j, axis = _sides(done, unit, apart).T
-    i, j, axis = np.concatenate([i, j]), np.concatenate([j, i]), np.concatenate([axis, axis])  # from either end
-    i, j, axis = i[g[i] < 0], j[g[i] < 0], axis[g[i] < 0]
+def _brinks(samples: Samples, sides: Array, corner: Array) -> dict[str, Array]:
+    """Return the stable ends of `sides` (E, 3), whose state may end before it reaches the other end, with that end."""
+    both = np.concatenate([sides, sides[:, [1, 0, 2]]])
+    i, j, axis = both[samples.g[both[:, 0]] < 0].T
     return {
         "brink_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
         "brink_axis": axis,
         "brink_rho": _upper(samples.multipliers[i, 0]),
-        "brink_x": x[i],
+        "brink_x": samples.orbit.x[i],
         "brink_stages": samples.orbit.stages[i],
     }
 
 
-def _sides(done: Refined, unit: int, wanted: Callable[[Array, Array], Array]) -> Array:
+def _sides(done: Refined, unit: int, wanted: Between) -> Array:
     """Return the `wanted` sides of leaf cells, (E, 3) in order: the samples at their two ends, and the axis they lie along."""
     points = _Points(done.samples, unit)
     sides: dict[tuple[int, int], int] = {}
