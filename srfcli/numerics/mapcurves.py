@@ -102,8 +102,7 @@ def _conclude(atlas: Atlas, found: StabilityMap, missed: int) -> None:
         atlas.notes.append(f"{missed} sign changes of the map could not be polished to a point of a boundary")
     if any(pt.kind == "fold" for b in atlas.branches for pt in b.points):
         atlas.notes.append(
-            "at a boundary of type fold the state that slides steadily without modulation ends: beyond it is another motion, "
-            "larger or irregular, which the map does not look for"
+            "at a boundary of type fold a forced state ends: beyond it the map shows another one, where it finds any"
         )
     if atlas.status is Status.OK and (missed or not all(pt.status.ok for b in atlas.branches for pt in b.points)):
         atlas.status = Status.NO_CONVERGENCE
@@ -249,8 +248,9 @@ def _dense(curve: Curve) -> _Traced:
     along_line = np.gradient(line, axis=0)
     left = np.stack([-along_line[:, 1], along_line[:, 0]], axis=1)
     side = unstable_side(curve)  # the same all along
-    fold = np.append(np.repeat(_fold(curve)[:-1], DENSE), _fold(curve)[-1:])
-    return _Traced(curve, line, left * (np.sign(side.sum()) if side.size else 1.0), fold)
+    fold = _fold(curve)
+    dense = np.append(np.repeat(fold[:-1], DENSE), fold[-1:])
+    return _Traced(curve, line, left * (np.sign(side.sum()) if side.size else 1.0), dense)
 
 
 def passes(traced: _Traced, seed: Seed) -> bool:

@@ -78,14 +78,12 @@ class _Points:
         x = np.stack([old.orbit.x[k].mean(axis=0) for k in fresh.values()])
         stages = np.stack([old.orbit.stages[k].mean(axis=0) for k in fresh.values()])
         batch = regular_orbits(model, p, Discretisation(x, stages, old.orbit.edges), task.settings.tol)
+        sources = list(fresh.values())
         for k in range(4):  # where the mean leads nowhere, each of the parents
-            lost = np.nonzero(~batch.converged)[0]
-            if not lost.size:
-                break
-            near = old.orbit.part(np.array([above[k % len(above)] for above in fresh.values()])[lost])
-            again = regular_orbits(model, p[:, lost], near, task.settings.tol)
-            batch.orbit.x[lost], batch.orbit.stages[lost] = again.orbit.x, again.orbit.stages
-            batch.monodromy[lost], batch.converged[lost] = again.monodromy, again.converged
+            lost = np.array([b for b in np.nonzero(~batch.converged)[0] if k < len(sources[b])], dtype=int)
+            if lost.size:
+                near = old.orbit.part(np.array([sources[b][k] for b in lost]))
+                batch.replace(lost, regular_orbits(model, p[:, lost], near, task.settings.tol))
         for key in fresh:
             self.place[key] = len(self.place)
         self.samples = Samples(

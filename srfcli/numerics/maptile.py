@@ -68,7 +68,7 @@ def solve_block(task: TileTask) -> Samples:
     first = np.ix_(columns[0], rows[0])
     start = _coarse(model, p[:, first[0], first[1]].reshape(len(p), -1), task)
     block = _Block.empty(model, p, start.orbit.edges)
-    block.put(columns[0], rows[0], start)
+    block.put(columns[0], rows[0], regular(start))
     for level in range(1, len(rows)):
         known, new = np.concatenate(rows[:level]), rows[level]
         block.fill(columns[0], new, block.along_rows(columns[0], known, new), settings.tol)
@@ -157,9 +157,7 @@ class _Block:
         self.x[place] = batch.orbit.x.reshape(*shape, *self.x.shape[2:])
         self.stages[place] = batch.orbit.stages.reshape(*shape, *self.stages.shape[2:])
         self.monodromy[place] = batch.monodromy.reshape(*shape, *self.monodromy.shape[2:])
-        found = batch.converged.copy()
-        found[found] = _before_fold(batch.monodromy[found])
-        self.converged[place] = found.reshape(shape)
+        self.converged[place] = batch.converged.reshape(shape)
 
     def along_rows(self, columns: Array, known: Array, new: Array) -> Discretisation:
         """Return guesses at rows `new` of `columns` from the rows `known`."""
@@ -178,7 +176,7 @@ class _Block:
     def fill(self, columns: Array, rows: Array, guess: Discretisation, tol: float) -> None:
         """Solve the orbits at the crossings of `columns` and `rows` from `guess`, and store them."""
         p = self.p[:, columns[:, None], rows[None]].reshape(len(self.p), -1)
-        self.put(columns, rows, solve_orbits(self.model, p, guess, tol=tol, max_iterations=PATIENCE))
+        self.put(columns, rows, regular_orbits(self.model, p, guess, tol))
 
     def spread(self, tol: float) -> None:
         """Solve the orbits that were not found from those beside them, again and again until none is added.
@@ -201,7 +199,7 @@ class _Block:
         """Look for the missing orbits without a guess, and mark those that are found."""
         found = ~self.converged
         c, r = np.nonzero(found)
-        self._keep(c, r, robust_orbits(self.model, self.p[:, c, r], None, self.edges, tol=tol))
+        self._keep(c, r, regular(robust_orbits(self.model, self.p[:, c, r], None, self.edges, tol=tol)))
         return found & self.converged
 
     def _settled(self, share: float, tol: float) -> Array:
@@ -239,12 +237,11 @@ class _Block:
 
     def _solve(self, c: Array, r: Array, guess: Discretisation, tol: float) -> None:
         """Solve the orbits at columns `c`, rows `r` from `guess`, and keep those that are found."""
-        self._keep(c, r, solve_orbits(self.model, self.p[:, c, r], guess, tol=tol, max_iterations=PATIENCE))
+        self._keep(c, r, regular_orbits(self.model, self.p[:, c, r], guess, tol))
 
     def _keep(self, c: Array, r: Array, batch: OrbitBatch) -> None:
         """Store those of a batch that were found, at columns `c`, rows `r`."""
         good = np.nonzero(batch.converged)[0]
-        good = good[_before_fold(batch.monodromy[good])]
         place = c[good], r[good]
         self.x[place], self.stages[place] = batch.orbit.x[good], batch.orbit.stages[good]
         self.monodromy[place], self.converged[place] = batch.monodromy[good], True
@@ -275,18 +272,18 @@ def _moved(marks: Array, dc: int, dr: int) -> Array:
 
 
 def regular_orbits(model: GeneratedModel, p: Array, guess: Discretisation, tol: float) -> OrbitBatch:
-    """Return the orbits at `p` from `guess`; those beyond a fold count as not found.
+    """Return the orbits at `p` from `guess`, those beyond a fold marked as not found."""
+    return regular(solve_orbits(model, p, guess, tol=tol, max_iterations=PATIENCE))
+
+
+def regular(batch: OrbitBatch) -> OrbitBatch:
+    """Return `batch` with the orbits beyond a fold marked as not found.
 
     An odd number of multipliers beyond +1, det(1 - M) < 0, is that of a state that meets the sliding state in a fold.
     """
-    batch = solve_orbits(model, p, guess, tol=tol, max_iterations=PATIENCE)
-    batch.converged[batch.converged] = _before_fold(batch.monodromy[batch.converged])
+    M = batch.monodromy[batch.converged]
+    batch.converged[batch.converged] = np.linalg.det(np.eye(M.shape[-1]) - M) > 0
     return batch
-
-
-def _before_fold(monodromy: Array) -> Array:
-    """Return which monodromy matrices (..., n, n) have an even number of multipliers beyond +1."""
-    return np.asarray(np.linalg.det(np.eye(monodromy.shape[-1]) - monodromy) > 0)
 
 
 def neighbours(known: Array, new: Array) -> tuple[Array, Array]:

@@ -41,6 +41,11 @@ class OrbitBatch:
         """Return the Floquet multipliers (..., n), largest modulus first; NaN where the orbit did not converge."""
         return ordered_eigenvalues(self.monodromy, self.converged)
 
+    def replace(self, index: Array, other: OrbitBatch) -> None:
+        """Put the orbits of `other` in the place of those at `index`, whatever became of them."""
+        self.orbit.x[index], self.orbit.stages[index] = other.orbit.x, other.orbit.stages
+        self.monodromy[index], self.converged[index] = other.monodromy, other.converged
+
 
 def ordered_eigenvalues(matrix: Array, valid: Array) -> ComplexArray:
     """Return eigenvalues of (..., n, n), largest modulus first, NaN where not `valid`."""

@@ -79,9 +79,7 @@ def _scatter(whole: Discretisation, part: Discretisation, index: Array) -> Discr
 def _retry(model: GeneratedModel, batch: OrbitBatch, guess: Discretisation, tol: float) -> None:
     """Solve again, in place, the members of `batch` that have not converged."""
     bad = np.nonzero(~batch.converged)[0]
-    again = solve_orbits(model, batch.p[:, bad], guess.part(bad), tol=tol)
-    batch.orbit.x[bad], batch.orbit.stages[bad] = again.orbit.x, again.orbit.stages
-    batch.monodromy[bad], batch.converged[bad] = again.monodromy, again.converged
+    batch.replace(bad, solve_orbits(model, batch.p[:, bad], guess.part(bad), tol=tol))
 
 
 def scan_line(
