@@ -9,7 +9,16 @@ import sympy as sp
 from srfcli.errors import SrfError
 from srfcli.expression import symbol
 from srfcli.laws import ExtraState
-from srfcli.system import FOLLOWED, Equations, System, lut, solve_linear, state_rate, steady_states, tidy
+from srfcli.system import (
+    FOLLOWED,
+    Equations,
+    System,
+    lut,
+    solve_linear,
+    state_rate,
+    steady_states,
+    tidy,
+)
 
 AUXILIARY = {"slip": "v", "stage": "V", "time": "1"}  # unknowns that an effect may name, um, um, s, and their rates
 
@@ -47,10 +56,19 @@ def parts_of(system: System) -> Parts:
     for number, (slot, argument) in enumerate(system.tables):
         value = lut(sp.Integer(number), symbol(argument))
         if slot in FOLLOWED:
-            found["V"] += symbol("pull") * (value / FOLLOWED[slot] - symbol("u"))
+            found["force"] -= symbol("hold") * behind_the_gauge(system, value / FOLLOWED[slot])
             continue
         found[slot] = found[slot] * (1 + value) if slot == "V" else found[slot] + value
     return Parts(**{slot: _modulated(f) for slot, f in found.items()}, **({} if "kappa" in found else {"kappa": None}))
+
+
+def behind_the_gauge(system: System, shown: sp.Expr) -> sp.Expr:
+    """Return the elongation at which the gauge shows `shown`, a function of time; `shown` itself where that has no one answer."""
+    gauge = next((e for effect in system.effects for e in effect.states if e.name == effect.observed), None)
+    if gauge is None:
+        return shown
+    rate = sp.diff(shown, symbol("time")) - gauge.rate.subs(symbol(gauge.name), shown)
+    return sp.solve(rate, symbol("u"))[0] if sp.Poly(rate, symbol("u")).degree() == 1 else shown
 
 
 def check_slots(system: System, parts: Parts) -> None:
@@ -114,13 +132,17 @@ class _Builder:
         }:
             self.slip_t = sp.Symbol("S_t_")
         self.force, self.force_dot, self.W_dot = sp.symbols("F_ F_dot_ We_dot_")
+        held = any(slot in FOLLOWED for slot, _ in system.tables)
+        self.K = symbol("K") + (
+            symbol("hold") if held else 0
+        )  # of the springs to the stage and to where it was recorded
         self.tangent = sp.tan(symbol("angle")) if system.loading == "inclined" else sp.S.Zero
 
     def equations(self) -> Equations:
         system, s, aux = self.system, symbol, self.aux
         solution, u_rate = self.solved()
         meaning = self.meaning()
-        mu_ss, K, V = self.mu_ss(), s("K"), s("V")
+        mu_ss, K, V = self.mu_ss(), self.K, s("V")
         z_rate = (K * s("u") - self.load * self.mu + self.force) / s("M")
         names, unknowns, rates = list(system.states), [s("v"), *self.phis], []
         if system.inertia:
@@ -225,7 +247,7 @@ class _Builder:
     def solved(self) -> tuple[dict[sp.Symbol, sp.Expr], sp.Expr]:
         """Return the unknown derivatives, and u', in stand-ins."""
         system, s = self.system, symbol
-        v, K, M, u, z = s("v"), s("K"), s("M"), s("u"), s("z")
+        v, M, u, z = s("v"), s("M"), s("u"), s("z")
         self.d_ln_v, mu_dot, W_rate, x_rate = sp.symbols("d_ln_v mu_dot_ W_rate_ x_rate_")
         self.d_ln_phi = sp.symbols(f"d_ln_phi0:{len(self.phis)}")
         mu, load, V = self.mu, self.load, self.V
@@ -233,7 +255,7 @@ class _Builder:
         ages = sum(a * b for a, b in zip(self.m_phi, self.d_ln_phi, strict=True))
         balance = [
             mu_dot - self.m_v * self.d_ln_v - ages - self.m_W * W_rate - self.m_t,
-            W_rate - self.W_dot - self.tangent * K * u_rate,
+            W_rate - self.W_dot - self.tangent * s("K") * u_rate,
         ]
         stand_ins = {
             s("mu"): mu,
@@ -249,9 +271,9 @@ class _Builder:
             stretched = self.slip * mu_dot + mu * self.slip_W * W_rate + mu * self.slip_t
             balance.append(stretched - ((z if system.inertia else x_rate) - v))
         if system.inertia and not system.elastic:
-            balance.append(M * v * self.d_ln_v - (K * u - load * mu + self.force))
+            balance.append(M * v * self.d_ln_v - (self.K * u - load * mu + self.force))
         if not system.inertia:
-            balance.append(K * u_rate - load * mu_dot - mu * W_rate + self.force_dot)
+            balance.append(self.K * u_rate - load * mu_dot - mu * W_rate + self.force_dot)
             if system.elastic:
                 wanted.append(x_rate)
         return solve_linear(balance, wanted, system), u_rate
@@ -270,7 +292,7 @@ class _Builder:
         imposed += sp.diff(parts.W, W) * s("W_dot")
         pushed += sp.diff(parts.force, W) * s("W_dot")
         v = s("v")
-        spring = s("u") if self.system.inertia else (load * self.mu - self.force) / s("K")
+        spring = s("u") if self.system.inertia else (load * self.mu - self.force) / self.K
         return [
             (self.V, parts.V.subs(s("u"), spring)),
             *([(self.slip_t, on_load(stretched))] if self.slip_t else []),

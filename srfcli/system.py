@@ -40,7 +40,7 @@ RUN = (  # of one run: what an effect may ask of the recording
     Parameter("rise0", 0.02, "s", about="time scale of the switch-on of the modulation"),
     Parameter("onset0", -1e6, "s", about="when half of the load modulation was switched on"),
 )
-PULL = Parameter("pull", 0.0, "1/s", 0.0, 1e9, "how fast the spring is drawn to what was recorded")
+HOLD = Parameter("hold", 0.0, "N/um", 0.0, 1e9, "stiffness of a second spring, to where the slider was recorded")
 FOLLOWED = {"elongation": 1, "force": symbol("K")}  # what a table of a recording holds, over the spring's elongation
 EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "kappa", "force", "rate", "V")
 LOADINGS = ("vertical", "inclined")
@@ -83,7 +83,7 @@ class System:
         if self.effects or self.tables:
             own += RUN
         if any(slot in FOLLOWED for slot, _ in self.tables):
-            own.append(PULL)
+            own.append(HOLD)
         seen = {p.name for p in own}
         for law in self.laws:
             for parameter in law.parameters:
@@ -286,9 +286,13 @@ class lut1(sp.Function):
 
 
 class lut2(sp.Function):
-    """The second derivative of a table; nothing needs its slope."""
+    """The second derivative of a table."""
 
     nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return no slope: it is asked for in the Jacobian's column of time alone, which meets a sensitivity that is none."""
+        return sp.S.Zero
 
 
 @lru_cache(maxsize=32)

@@ -1,4 +1,4 @@
-"""Fits under a pull: what a pull does to a motion, that its slopes are true, and that it leads where a free fit gets lost."""
+"""Fits while held: what a second spring does to a motion, true slopes, and that it leads where a free fit gets lost."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.follower import FOLLOWED, PULLS, Follower
 from srfcli.inference.fit import first_level
-from srfcli.inference.follow import pull_towards, slip_length, smoothed, weaker
+from srfcli.inference.follow import FIRM, between_slips, calmed, pull_towards, slip_length, smoothed, weaker
 from srfcli.inference.noise import Noise
 from srfcli.numerics.compiled import compiler
 from srfcli.proof.draw import Gauge
@@ -45,12 +45,12 @@ def rms(x):
     return float(np.sqrt(np.mean(x**2)))
 
 
-def pulled_problem(experiment, length):
+def held_problem(experiment, length):
     pull = pull_towards(experiment, experiment.runs, length)
     return Hypothesis().problem(SHIPPED, experiment, rough=False, pull=pull)
 
 
-def test_a_strong_pull_follows_anything_and_none_is_the_free_motion(experiment):
+def test_a_stiff_hold_follows_anything_and_none_is_the_free_motion(experiment):
     """Over a hundredth of a slip length a wrong model shows the recording; over a million of them it moves freely."""
     _, ex = experiment
     free = Hypothesis().problem(SHIPPED, ex, rough=False)
@@ -59,34 +59,35 @@ def test_a_strong_pull_follows_anything_and_none_is_the_free_motion(experiment):
         noise = first_level(run)
         unbound = free.predicted(run, theta, slopes=False).y
         assert rms(unbound - run.observed) > 20 * noise
-        tight = pulled_problem(ex, 0.004).predicted(run, theta, slopes=False).y
+        tight = held_problem(ex, 0.004).predicted(run, theta, slopes=False).y
         assert rms(tight - run.observed) < 0.1 * rms(unbound - run.observed)
-        loose = pulled_problem(ex, 1e6).predicted(run, theta, slopes=False).y
+        loose = held_problem(ex, 1e6).predicted(run, theta, slopes=False).y
         assert loose == pytest.approx(unbound, abs=2e-3)
 
 
-def test_slopes_under_a_pull_are_true(experiment):
+def test_slopes_while_held_are_true(experiment):
     """By every free parameter, against central differences."""
     _, ex = experiment
-    problem = replace(pulled_problem(ex, 2.0), rtol=1e-11)
+    problem = replace(held_problem(ex, 2.0), rtol=1e-11)
     run = problem.runs[0]
     J = problem.predicted(run, problem.start).J
     for k in range(problem.start.size):
         h = 1e-4 * problem.start[k] * np.eye(problem.start.size)[k]
         ends = [problem.predicted(run, problem.start + s * h, slopes=False).y for s in (1, -1)]
         difference = (ends[0] - ends[1]) / (2 * h[k])
-        assert J[:, k] == pytest.approx(difference, abs=2e-3 * np.abs(difference).max()), problem.names[k]
+        assert J[:, k] == pytest.approx(difference, abs=5e-3 * np.abs(difference).max()), problem.names[k]
 
 
-def test_the_truth_needs_no_pull(experiment):
-    """At the true parameters the residual is noise under any pull."""
+def test_the_truth_needs_no_hold(experiment):
+    """At the true parameters the residual between slips is noise under any hold that stick-slip does not survive, and free."""
     p, ex = experiment
     values = {"mu0": p.mu0, "A": p.A, "B": p.B, "D0": p.D0, "Vsat": p.Vsat, "lambda": p.lam}
-    for length in (1.0, 4.0, 1e6):
-        problem = pulled_problem(ex, length)
+    for length in (0.2, 0.4, 0.8, 1e6):
+        problem = held_problem(ex, length)
         theta = np.array([values[n] for n in problem.names])
         for run in problem.runs:
-            rms = float(np.std(problem.predicted(run, theta, slopes=False).y - run.observed))
+            rest = problem.predicted(run, theta, slopes=False).y - run.observed
+            rms = float(np.std(rest[between_slips(run).used]))
             assert 0.7 * 0.02 < rms < 1.4 * 0.02, (length, run.name)
 
 
@@ -104,10 +105,10 @@ def test_it_leads_from_afar(experiment):
     assert dict(zip(found.problem.names, found.theta, strict=True))["D0"] == pytest.approx(p.D0, rel=0.05)
 
 
-def test_recordings_in_other_units_pull_alike(experiment):
-    """A record of the spring's force, or of friction, draws the spring as the record of its elongation does."""
+def test_recordings_in_other_units_hold_alike(experiment):
+    """A record of the spring's force, or of friction, holds the slider as the record of its elongation does."""
     _, ex = experiment
-    problem = pulled_problem(ex, 1.0)
+    problem = held_problem(ex, 1.0)
     run = problem.runs[0]
     K, W = run.stiffness, run.load(run.t)[0]
     as_force = replace(run, observable="force", observed=K * run.observed)
@@ -119,13 +120,13 @@ def test_recordings_in_other_units_pull_alike(experiment):
         assert pull.table == ("force", "time")
         found = Hypothesis().problem(SHIPPED, experiment_of_it, rough=False, pull=pull)
         y = found.predicted(other, problem.start, slopes=False).y
-        assert y / factor == pytest.approx(there, abs=1e-4)
+        assert y / factor == pytest.approx(there, abs=1e-3)
     mixed = pull_towards(ex, [run, replace(as_force, name="other")], 1.0)
     assert mixed.table == ("elongation", "time")
     assert mixed.records["other"].numbers == pytest.approx(mixed.records[run.name].numbers, abs=1e-9)
 
 
-def test_the_pulling_spline_bridges_what_was_not_recorded():
+def test_the_spline_that_holds_bridges_what_was_not_recorded():
     """Straight over a gap, close to the samples elsewhere."""
     t = np.linspace(0, 1, 501)
     y = np.sin(6 * t)
@@ -137,11 +138,42 @@ def test_the_pulling_spline_bridges_what_was_not_recorded():
 
 
 def test_lengths(experiment):
-    """The pull's length is counted in slip lengths, its rate in driving."""
+    """Over its length the second spring takes a share of the load."""
     _, ex = experiment
-    problem = pulled_problem(ex, 1.0)
+    problem = held_problem(ex, 1.0)
     assert slip_length(problem.model, ex) == pytest.approx(0.4)
     assert problem.pull is not None
     for run in problem.runs:
-        speed = float(np.mean(run.drive(run.t)))
-        assert weaker(problem.pull, problem.runs, 5.0).rates[run.name] == pytest.approx(speed / 5.0)
+        load = float(np.mean(run.load(run.t)[0]))
+        assert weaker(problem.pull, problem.runs, 5.0).stiffness[run.name] == pytest.approx(FIRM * load / 5.0)
+
+
+def test_a_record_is_calmed_but_for_its_slips(experiment):
+    """Noise is less than half of what it was between slips, where nothing is bent; a slip stays where it was."""
+    _, ex = experiment
+    for run in ex.runs:
+        used = run.used & np.isfinite(run.observed)
+        quiet = calmed(run, run.observed, used)
+        assert quiet.shape == run.observed.shape
+        moved = np.abs(np.diff(run.observed, prepend=run.observed[0]))
+        assert np.abs(quiet - run.observed).max() < 6 * 0.02
+        if moved.max() > 0.5:  # stick-slip: the largest slip is as large as before
+            k = int(np.argmax(moved))
+            assert quiet[k] - quiet[k - 1] == pytest.approx(run.observed[k] - run.observed[k - 1], abs=0.12)
+    t = np.arange(2000) * 0.004
+    rng = np.random.default_rng(0)
+    smooth = 5 + np.sin(2 * t)
+    run = replace(ex.runs[0], t=t, observed=smooth + 0.02 * rng.standard_normal(t.size), used=np.ones(t.size, dtype=bool),
+                  modulation=None)  # fmt: skip
+    assert rms(calmed(run, run.observed, run.used) - smooth) < 0.5 * 0.02
+
+
+def test_nothing_is_told_by_the_slips(experiment):
+    """Samples beside a jump of many times the noise are left out, others are not."""
+    _, ex = experiment
+    t = np.arange(1000) * 0.004
+    y = 10 * t + 0.02 * np.random.default_rng(2).standard_normal(t.size)
+    y[500:] -= 8.0
+    run = replace(ex.runs[0], t=t, observed=y, used=np.ones(t.size, dtype=bool), modulation=None)
+    left = np.flatnonzero(~between_slips(run).used)
+    assert left.size < 40 and {499, 500, 501} <= set(left.tolist())

@@ -20,8 +20,11 @@ from srfcli.recording.values import Run
 WINDOWS, LEAST = 8, 64  # of each run, and samples of a window
 SLOW = 6  # cosines over a window: what is slower than a window's sixth
 FAINT = 0.08  # a correlation from sample to sample that is taken for none
-ALIKE = 1.08  # noise levels of runs, over the lowest, that are the gauge's
+ALIKE = 1.08  # noise levels of runs, over the lowest, that are the gauge's; beside what chance makes of them
+CHANCE = 2.5  # standard deviations by which chance parts two levels
+LOSS = 1.5  # times its spread that a level has for the trend that was taken out of every stretch
 DOUBT = 1e-4  # p-value below which noise is not all that is left
+STEADY = 0.003  # relative change of an innovation, and change of a correlation, that leave noise as it was
 SURE = 1.04  # residual over noise that its level's own uncertainty explains
 
 
@@ -56,27 +59,54 @@ def sampled(run: Run) -> list[tuple[float, int, int]]:
     return [(step, int(a), int(b)) for step, a, b in pieces]
 
 
-def _seen(run: Run, residual: Array, a: int, b: int) -> tuple[float, float, int]:
-    """Return level, correlation from sample to sample and number of samples of the noise in a stretch."""
+@dataclass(frozen=True)
+class _Seen:
+    """Level, correlation from sample to sample, and number of samples of the noise in a stretch; `used` of them are calm."""
+
+    level: float
+    rho: float
+    samples: int
+    used: int
+
+    @property
+    def spread(self) -> float:
+        """Return the relative standard deviation of the level."""
+        return LOSS * float(np.sqrt((1 + self.rho**2) / (1 - self.rho**2) / 2 / max(self.used, 1)))
+
+
+def _seen(run: Run, residual: Array, a: int, b: int) -> _Seen:
+    """Return the noise in a stretch."""
     t, r, ok = run.t[a:b], residual[a:b], (run.used & np.isfinite(residual))[a:b]
     modulation = of_run(run)
     cycles = modulation["f"] * float(np.median(np.diff(t))) if modulation["modulated"] else None
     if not ok.any():
-        return max(run.quantum / np.sqrt(12), 1e-12), 0.0, 0
+        return _Seen(max(run.quantum / np.sqrt(12), 1e-12), 0.0, 0, 0)
     about = describe_noise(np.interp(t, t[ok], r[ok]), cycles)
     level = about.total if np.isfinite(about.total) else about.white
-    return max(level, run.quantum / np.sqrt(12), 1e-12), about.lag1 if np.isfinite(about.lag1) else 0.0, b - a
+    rho = min(max(about.lag1, -0.9), 0.97) if np.isfinite(about.lag1) else 0.0
+    return _Seen(max(level, run.quantum / np.sqrt(12), 1e-12), rho, b - a, about.samples)
 
 
-def _shared(seen: Sequence[tuple[float, float, int]]) -> Noise:
+def quietest(run: Run, residual: Array) -> float:
+    """Return the lowest level of noise in a stretch of a residual (n,), infinite for one that is not finite."""
+    if not np.isfinite(residual[run.used]).all():
+        return np.inf
+    return min(_seen(run, residual, a, b).level for _, a, b in sampled(run))
+
+
+def _shared(seen: Sequence[_Seen]) -> Noise:
     """Return the noise of stretches that share a gauge: of those that have least."""
-    lowest = min(s[0] for s in seen)
-    kept = [s for s in seen if s[0] <= ALIKE * lowest]
-    weights = np.array([max(s[2], 1) for s in kept], dtype=float)
-    level = float(np.sqrt(np.average([s[0] ** 2 for s in kept], weights=weights)))
-    rho = float(np.average([s[1] for s in kept], weights=weights))
-    rho = 0.0 if abs(rho) < FAINT else min(max(rho, -0.9), 0.97)
-    return Noise(level * float(np.sqrt(1 - rho**2)), (rho,) if rho else (), level)
+    least = min(seen, key=lambda s: s.level)
+    kept = [
+        s for s in seen if s.level <= least.level * max(ALIKE, 1 + CHANCE * float(np.hypot(s.spread, least.spread)))
+    ]
+    weights = np.array([max(s.samples, 1) for s in kept], dtype=float)
+    level = float(np.sqrt(np.average([s.level**2 for s in kept], weights=weights)))
+    rho = float(np.average([s.rho for s in kept], weights=weights))
+    rho = 0.0 if abs(rho) < FAINT else rho
+    used = max(sum(s.used for s in kept), 1)
+    slack = 2 * LOSS * float(np.sqrt((1 + rho) / (1 - rho) / used)) if rho else 0.0
+    return Noise(level * float(np.sqrt(1 - rho**2)), (rho,) if rho else (), level, slack=slack)
 
 
 def joined(pieces: Sequence[tuple[int, int, Noise]]) -> Noise:
@@ -85,6 +115,19 @@ def joined(pieces: Sequence[tuple[int, int, Noise]]) -> Noise:
     if len(pieces) == 1:
         return longest
     return replace(longest, pieces=tuple((a, noise) for _, a, noise in sorted(pieces, key=lambda p: p[1])))
+
+
+def alike(a: Noise, b: Noise) -> bool:
+    """Return whether two noises of a run are, but for less than anything rests on, the same."""
+    pieces = zip(_pieces(a), _pieces(b), strict=False)
+    return len(a.pieces) == len(b.pieces) and all(
+        abs(x.innovation / y.innovation - 1) < STEADY and abs(sum(x.coefficients) - sum(y.coefficients)) < STEADY
+        for x, y in pieces
+    )
+
+
+def _pieces(noise: Noise) -> list[Noise]:
+    return [own for _, own in noise.pieces] or [noise]
 
 
 @dataclass(frozen=True)
@@ -112,9 +155,9 @@ def judge_residuals(runs: Sequence[Run], residuals: Mapping[str, Array], noise: 
                     freedom: Mapping[str, float] | None = None) -> Adequacy:  # fmt: skip
     """Return the adequacy of residuals (n,) by run; `freedom` is how many parameters' worth a fit has taken from each run."""
     from scipy.fft import dct
-    from scipy.stats import chi2
 
     slow, degrees, squares, count = 0.0, 0.0, 0.0, 0
+    slack: dict[Noise, float] = {}
     windows, excess, p_values = [], {}, {}
     for run in runs:
         r = residuals[run.name]
@@ -141,7 +184,8 @@ def judge_residuals(runs: Sequence[Run], residuals: Mapping[str, Array], noise: 
             own += float(low @ low) / level
         free = max(SLOW * len(pieces) - 0.5 * spent, 0.25 * SLOW * len(pieces))
         slow, degrees = slow + own, degrees + free
-        p_values[run.name] = float(chi2.sf(own, free))
+        slack[noise[run.name]] = slack.get(noise[run.name], 0.0) + free * noise[run.name].slack
+        p_values[run.name] = _tail(own, free, noise[run.name].slack)
         squares, count = squares + float(white @ white) * n / max(n - spent, 1.0), count + n
         excess[run.name] = max(float(white @ white) - (n - spent), 0.0)
     whole = sum(excess.values())
@@ -149,7 +193,15 @@ def judge_residuals(runs: Sequence[Run], residuals: Mapping[str, Array], noise: 
     far = sorted(
         (w for w in windows if w[4] > 4 * np.sqrt(2 * SLOW) or w[3] > 6 * np.sqrt(2 * LEAST)), key=lambda w: -w[3]
     )
+    loose = float(np.hypot.reduce(list(slack.values()))) / max(degrees, 1.0)
     return Adequacy(
-        float(chi2.sf(slow, max(degrees, 1.0))), float(np.sqrt(squares / max(count, 1))), shares,
+        _tail(slow, max(degrees, 1.0), loose), float(np.sqrt(squares / max(count, 1))), shares,
         tuple(w[:4] for w in far), p_values,
     )  # fmt: skip
+
+
+def _tail(squares: float, degrees: float, slack: float) -> float:
+    """Return the p-value of a sum of squares over noise whose power has been estimated: of Fisher's F, or of chi-squared."""
+    from scipy.stats import chi2, f
+
+    return float(f.sf(squares / degrees, degrees, 2 / slack**2) if slack else chi2.sf(squares, degrees))

@@ -1,4 +1,4 @@
-"""Where a fit is far off: which effect, added to it, brings it back to the recording."""
+"""Where a fit is far off: which effects, added to it, bring it back to the recording."""
 
 from __future__ import annotations
 
@@ -8,87 +8,110 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis
-from srfcli.diagnosis.elsewhere import elsewhere
-from srfcli.diagnosis.follower import LOOSE_ONLY, PULLS, same
+from srfcli.diagnosis.follower import CLEAR, LOOSE_ONLY, PULLS, same
 from srfcli.diagnosis.refits import Entry, Refit
+from srfcli.diagnosis.score import scores
 from srfcli.inference.latent import STEPS, Tracks, fit_latent
+from srfcli.laws import Effect
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
 
-CLEAR = 1.5  # chi-squared per degree of freedom under a pull that is nearly noise
-WORSE = 1.25  # times the free chi-squared of the best: under a pull, too much to do better freely
-AGAIN = 4  # led again from other places and by stronger pulls: a minimum of one that does well already may be false
-RELEASED = 2  # fitted freely although their fit under the pull is no good
+RELEASED = 3  # fitted freely, those that leave least while they are held first
+PARTNERS, LEADERS = 4, 2  # effects that are tried beside one that leads, and how many lead
+HOPELESS = 4.0  # times what the baseline leaves: other starts would not help
+DEARER = 0.004  # of chi-squared per degree of freedom, what a further effect has to take away
 
 
 def contest(
-    search: Search, refit: Refit, entrants: Sequence[tuple[Hypothesis, dict[str, float]]], *, again: int = AGAIN
+    search: Search,
+    refit: Refit,
+    entrants: Sequence[tuple[Hypothesis, dict[str, float]]],
+    candidates: Sequence[Effect] = (),
 ) -> list[Refit]:
-    """Return the best of hypotheses that add effects to one that is far off: by their fits under a pull, then free.
+    """Return the best of hypotheses that add effects to one that is far off: by their fits while held, then free.
 
-    With what is missing, little is left under the pull already. `entrants` come with what is expected of the added parameters;
-    the foremost `again` are led again.
+    With what is missing, little is left under the hold already. `entrants` come with what is expected of the added parameters;
+    the foremost are tried with a second effect of the `candidates`, too.
     """
     around, waiting, found = search.pulled(refit).values, [], []
     for hypothesis, own in entrants:
         if not search.untried(hypothesis, rough=False):
             continue
-        waiting.append(_entry(search, hypothesis, around | own, own, LOOSE_ONLY))
+        if _unseen(hypothesis.effects[-1]):
+            own = {}
+        waiting.append(_led(search, _entry(search, hypothesis, around | own, own, LOOSE_ONLY), around))
         if waiting[-1].reduced < CLEAR:
-            found.append(elsewhere(search, _released(search, waiting.pop())))
+            found.append(_released(search, waiting.pop()))
             if found[-1].adequacy.fine:
                 return found
-    waiting.sort(key=lambda e: e.reduced)
-    left = []
-    for i, entry in enumerate(waiting):
-        single = len(entry.hypothesis.effects) == 1
-        best = _led_again(search, entry, around) if single and (i < again or _built(entry)) else entry
-        if best.reduced >= CLEAR:
-            left.append(best)
-            continue
-        found.append(elsewhere(search, _released(search, best)))
+    singles = [e for e in waiting if len(e.hypothesis.effects) == 1]
+    for leader in sorted(singles, key=lambda e: e.reduced)[: LEADERS if candidates else 0]:
+        waiting += _partnered(search, leader, candidates)
+    waiting.sort(key=lambda e: e.reduced + DEARER * len(e.hypothesis.effects))
+    for entry in waiting[:RELEASED]:
+        found.append(_released(search, entry))
         if found[-1].adequacy.fine:
-            return found
-    for best in sorted(left, key=lambda e: e.reduced)[:RELEASED]:
-        if not found or best.reduced < WORSE * min(r.adequacy.rms_over_noise for r in found) ** 2:
-            found.append(elsewhere(search, _released(search, best)))
-            if found[-1].adequacy.fine:
-                break
+            break
     return found
 
 
-def _led_again(search: Search, entry: Entry, around: dict[str, float]) -> Entry:
-    """Return the best that other starts and stronger pulls lead a hypothesis to, until little is left or two agree."""
-    best = entry
-    for at, way in ((entry.own, PULLS[0]), (around | entry.own, PULLS[1]), (entry.own, PULLS[1])):
+def _partnered(search: Search, leader: Entry, candidates: Sequence[Effect]) -> list[Entry]:
+    """Return the fits, while held, of a hypothesis with each of the effects that promise most beside its own."""
+    effects = leader.hypothesis.effects
+    reported = {e.reported for e in effects}
+    left = [e for e in candidates if e.reported not in reported and not e.settings]
+    around = search.follower.around(leader.hypothesis, leader.values, search.noise)
+    scored = scores(search.registry, around.problem.experiment, around, left, present=effects)
+    promising = [*scored[:PARTNERS], *(s for s in scored[PARTNERS:] if _unseen(s.effect))]
+    found = []
+    for score in promising:
+        hypothesis = Hypothesis((*effects, score.effect))
+        if search.untried(hypothesis, rough=False):
+            own = {} if _unseen(score.effect) else search.own_values(hypothesis, score.values)
+            found.append(_entry(search, hypothesis, around.values | own, own, LOOSE_ONLY))
+    return found
+
+
+def _unseen(effect: Effect) -> bool:
+    """Return whether nothing is expected of an effect by its score while held: it is built in, or in the gauge that holds."""
+    return bool(effect.settings or effect.observed)
+
+
+def _led(search: Search, entry: Entry, around: dict[str, float]) -> Entry:
+    """Return the best that other starts lead a hypothesis to whose last effect is built in: it is seen at no first order."""
+    if not entry.hypothesis.effects[-1].settings:
+        return entry
+    best, known = entry, search.followed.get(Hypothesis().name)
+    if known is not None and entry.reduced > HOPELESS * known.held:
+        return entry
+    for at, way in ((entry.own, PULLS[0]), (around | entry.own, PULLS[1])):
         if best.reduced < CLEAR or search.spent():
             break
         found = _entry(search, entry.hypothesis, at, entry.own, way)
-        agreed = same(found.reduced, best.reduced) and not _built(entry)
+        agreed = same(found.reduced, best.reduced)
         best = min(best, found, key=lambda e: e.reduced)
         if agreed:
             break
     return best
 
 
-def _built(entry: Entry) -> bool:
-    """Return whether the last effect is built into the model: what it does there is seen at no first order."""
-    return bool(entry.hypothesis.effects[-1].settings)
-
-
 def _entry(
     search: Search, hypothesis: Hypothesis, at: Mapping[str, float], own: Mapping[str, float], way: Sequence[float]
 ) -> Entry:
-    """Return a hypothesis fitted under a pull, from the values in `at`."""
+    """Return a hypothesis fitted while held, from the values in `at`."""
     theta, reduced = search.follower.led(hypothesis, at, search.noise, way)
     problem = search.follower.problem(hypothesis, {})
-    search.progress(f"{hypothesis.name}: rms over noise {np.sqrt(reduced):.2f} with the spring drawn")
-    return Entry(hypothesis, theta, problem.named(theta), dict(own), reduced)
+    search.progress(f"{hypothesis.name}: rms over noise {np.sqrt(reduced):.3f}, held to the recording")
+    found = Entry(hypothesis, theta, problem.named(theta), dict(own), reduced)
+    known = search.held.get(hypothesis.name)
+    if known is None or reduced < known.reduced:
+        search.held[hypothesis.name] = found
+    return found
 
 
 def _released(search: Search, entry: Entry) -> Refit:
-    """Fit a hypothesis freely from parameters under a pull."""
+    """Fit a hypothesis freely from parameters while held."""
     hypothesis = entry.hypothesis
     led = search.follower.released(hypothesis, entry.theta, entry.reduced, search.noise)
     search.followed[hypothesis.name] = led

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from srfcli.diagnosis.candidates import own_parameters
+from srfcli.diagnosis.candidates import Hypothesis, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.follower import LOOSE, LOOSE_ONLY, PULLS, ROUND
 from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.score import scores
-from srfcli.inference.follow import weaker
-from srfcli.inference.latent import LatentFit, Tracks, fit_latent, tracks_for
+from srfcli.inference.latent import LatentFit, Roughness, Tracks, fit_latent, tracks_for
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
@@ -45,7 +44,14 @@ def elsewhere(search: Search, refit: Refit) -> Refit:
     for at, way in tries:
         if search.spent():
             break
-        fitted = _on_a_rough_track(search, refit, at) if refit.rough else _smooth(search, refit, at, way)
+        if refit.rough:
+            point = refit.fit.point
+            shared = len(point.tracks.splines) == 1 < len(point.tracks.of)
+            fitted: LatentFit | None = on_a_rough_track(
+                search, refit.hypothesis, at, shared=shared, roughness=point.roughness
+            )
+        else:
+            fitted = _smooth(search, refit, at, way)
         if fitted is not None:
             refit = search.keep(refit.hypothesis, fitted, rough=refit.rough)
         if refit.adequacy.fine:
@@ -75,17 +81,19 @@ def _smooth(search: Search, refit: Refit, at: dict[str, float], way: Sequence[fl
     return fit_latent(refit.fit.problem, led.theta, search.noise, tracks=Tracks((), {}), known_noise=True)
 
 
-def _on_a_rough_track(search: Search, refit: Refit, at: dict[str, float]) -> LatentFit:
-    """Return the fit with parameters and track led by a pull first."""
-    follower, runs = search.follower, refit.fit.problem.runs
-    pull = weaker(follower.strong, runs, LOOSE * follower.unit)
-    pulled = refit.hypothesis.problem(
-        search.registry, search.experiment, rough=True, at=at, trend=search.trend, pull=pull
-    )
-    tracks = tracks_for(runs, shared=len(refit.fit.point.tracks.splines) == 1 < len(runs))
+def on_a_rough_track(
+    search: Search, hypothesis: Hypothesis, at: Mapping[str, float], *, shared: bool, roughness: Roughness | None = None
+) -> LatentFit:
+    """Return the fit from the values in `at`, parameters and track found while held first."""
+    follower = search.follower
+    held = replace(
+        hypothesis.problem(search.registry, search.experiment, rough=True, at=at, trend=search.trend,
+                           pull=follower.hold(LOOSE)),
+        rtol=ROUND, runs=follower.between,
+    )  # fmt: skip
+    tracks = tracks_for(held.runs, shared=shared)
     led = fit_latent(
-        replace(pulled, rtol=ROUND), pulled.start, search.noise, tracks=tracks, roughness=refit.fit.point.roughness,
-        known_noise=True, rounds=ROUNDS, steps=STEPS,
+        held, held.start, search.noise, tracks=tracks, roughness=roughness, known_noise=True, rounds=ROUNDS, steps=STEPS,
     ).point  # fmt: skip
-    free = search.problem(refit.hypothesis, pulled.named(led.theta), rough=True)
+    free = search.problem(hypothesis, held.named(led.theta), rough=True)
     return fit_latent(free, free.start, search.noise, tracks=led.tracks, roughness=led.roughness, known_noise=True)

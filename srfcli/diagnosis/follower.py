@@ -1,4 +1,4 @@
-"""Hypotheses fitted with the spring drawn to the recording first, then free: where they start from hardly matters."""
+"""Hypotheses fitted while the slider is held to the recording first, then free: where they start from hardly matters."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from srfcli.diagnosis.adequacy import quietest
 from srfcli.diagnosis.candidates import Hypothesis, own_parameters
 from srfcli.inference import fit as fitting
 from srfcli.inference.fit import Problem, first_level
-from srfcli.inference.follow import pull_towards, slip_length, weaker
+from srfcli.inference.follow import between_slips, pull_towards, slip_length, weaker
 from srfcli.inference.latent import LatentFit, Tracks, fit_latent
 from srfcli.inference.noise import Noise
-from srfcli.inference.prediction import RTOL
+from srfcli.inference.prediction import RTOL, Pull
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
 
-LOOSE = 5.0  # slip lengths over which a pull acts that leaves most of a misfit to be seen
+LOOSE = 2.0  # slip lengths over which a second spring holds that leaves most of a misfit to be seen
 PULLS = (
-    (2.5, LOOSE),
-    (0.6, 1.25, 2.5, LOOSE),
-    (0.15, 0.3, 0.6, 1.25, 2.5, LOOSE),
-)  # the same, ever weaker; the next way is tried where one leads nowhere
-LOOSE_ONLY = (LOOSE,)  # the one pull that a refit starts under
+    (1.0, LOOSE),
+    (0.5, 1.0, LOOSE),
+)  # the same, ever softer; the next way is tried where one leads nowhere
+CLEAR = 1.05  # chi-squared per degree of freedom under a hold that is noise
+LOOSE_ONLY = (LOOSE,)  # the one that a refit starts under
+SPREAD = 0.02  # relative uncertainty of parameters from which a fit is set free
 COARSE, FEW = 1e-2, 12  # tolerance of chi-squared under a pull, and evaluations
 ROUND = 1e-4  # relative tolerance of the integrator under a pull
 FAIR = 1e-5  # the same of a free fit, where the noise asks for no more
@@ -51,7 +53,7 @@ class Followed:
 
 
 class Follower:
-    """Fits hypotheses to one experiment under pulls that grow weaker."""
+    """Fits hypotheses to one experiment under a hold that grows softer."""
 
     def __init__(self, registry: Registry, experiment: Experiment, trend: str | None) -> None:
         self.registry, self.experiment, self.trend, self.rtol = registry, experiment, trend, RTOL
@@ -59,29 +61,37 @@ class Follower:
         self.unit = slip_length(problem.model, experiment)
         self.strong = pull_towards(experiment, problem.runs, self.unit)
         self.evaluations = 0
+        self.between = tuple(between_slips(run) for run in problem.runs)
         still = min(first_level(r) / max(float(np.std(r.observed)), 1e-300) for r in problem.runs)
         self.rtol = FAIR if still > QUIET else RTOL
 
     def problem(self, hypothesis: Hypothesis, at: Mapping[str, float], length: float | None = None) -> Problem:
         """Return the fit of a hypothesis under a pull over so many slip lengths, or free."""
-        pull = weaker(self.strong, self.experiment.runs, length * self.unit) if length is not None else None
+        pull = self.hold(length) if length is not None else None
         found = hypothesis.problem(
             self.registry, self.experiment, rough=False, at=dict(at), trend=self.trend, pull=pull
         )
-        return replace(found, rtol=self.rtol if pull is None else ROUND)
+        return replace(found, rtol=self.rtol) if pull is None else replace(found, rtol=ROUND, runs=self.between)
+
+    def hold(self, length: float) -> Pull:
+        """Return the second spring over so many slip lengths."""
+        return weaker(self.strong, self.experiment.runs, length * self.unit)
 
     def follow(
         self, hypothesis: Hypothesis, at: Mapping[str, float], noise: Mapping[str, Noise],
         ways: Sequence[Sequence[float]] = PULLS,
     ) -> Followed:  # fmt: skip
-        """Return the best free fit that any of the ways of weakening the pull leads to, from the values in `at`."""
-        best: Followed | None = None
-        for way in ways:
-            best = better(best, self.released(hypothesis, *self.led(hypothesis, at, noise, way), noise))
-            if best.reduced < FOLLOWED:
+        """Return the free fit from where the best of the ways of softening the hold leads, from the values in `at`."""
+        theta, reduced = self.led(hypothesis, at, noise, ways[0])
+        for way in ways[1:]:
+            if reduced < CLEAR:
                 break
-        assert best is not None
-        return best
+            found = self.led(hypothesis, at, noise, way)
+            agreed = same(found[1], reduced)
+            theta, reduced = min((theta, reduced), found, key=lambda f: f[1])
+            if agreed:
+                break
+        return self.released(hypothesis, theta, reduced, noise)
 
     def led(
         self, hypothesis: Hypothesis, at: Mapping[str, float], noise: Mapping[str, Noise], way: Sequence[float]
@@ -96,6 +106,13 @@ class Follower:
         """Return the free fit from parameters under a pull, and their chi-squared there."""
         free = self.problem(hypothesis, {})
         theta, reduced = self.descend(free, pulled, noise, 1e-4)
+        if not reduced < FOLLOWED:
+            grown = fitting.Search(free, lambda text: None)
+            grown.covariance = np.diag((SPREAD * grown.scale) ** 2)
+            place, _ = grown.grow(np.clip(pulled, free.lower, free.upper), noise)
+            self.evaluations += grown.evaluations
+            if grown.reduced < reduced:
+                theta, reduced = place, grown.reduced
         return Followed(free, theta, reduced, pulled, held)
 
     def descend(
@@ -110,15 +127,11 @@ class Follower:
         return theta, search.reduced
 
     def smallest(self, found: Followed) -> dict[str, Array]:
-        """Return the residuals (n,) by run, free or under a pull, whichever are smaller: they show the noise."""
-        tight = self.problem(Hypothesis(), {}, PULLS[0][0])
+        """Return what a free fit leaves (n,) by run, or the recording itself, whichever has less noise about a slow trend."""
         out = {}
         for run in found.problem.runs:
-            both = [
-                run.observed - problem.predicted(run, theta, slopes=False).y
-                for problem, theta in ((found.problem, found.theta), (tight, found.pulled))
-            ]
-            out[run.name] = min(both, key=lambda r: float(np.nan_to_num(np.mean(r[run.used] ** 2), nan=np.inf)))
+            residual = run.observed - found.problem.predicted(run, found.theta, slopes=False).y
+            out[run.name] = min(residual, run.observed, key=lambda r: quietest(run, r))
         return out
 
     def around(self, hypothesis: Hypothesis, values: Mapping[str, float], noise: Mapping[str, Noise]) -> LatentFit:
@@ -130,14 +143,6 @@ class Follower:
 def same(one: float, other: float) -> bool:
     """Return whether two values of chi-squared are those of one minimum."""
     return abs(one - other) < SAME * min(one, other)
-
-
-def better(known: Followed | None, found: Followed) -> Followed:
-    """Return the better of two free fits, with the better of the two under a pull, which may be another."""
-    if known is None:
-        return found
-    best, held = min((known, found), key=lambda f: f.reduced), min((known, found), key=lambda f: f.held)
-    return replace(best, pulled=held.pulled, held=held.held)
 
 
 def shortened(hypothesis: Hypothesis, problem: Problem, noise: Mapping[str, Noise]) -> tuple[Array, float]:

@@ -7,20 +7,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from srfcli.diagnosis.adequacy import judge_residuals
+from srfcli.diagnosis.adequacy import alike, gauge_noise, judge_residuals
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.follower import Follower
 from srfcli.diagnosis.refits import Refit, freedom_spent
 from srfcli.inference.fit import Problem
-from srfcli.inference.latent import LatentFit, evenness
+from srfcli.inference.latent import LatentFit, evenness, fit_latent
 from srfcli.inference.noise import Noise
-from srfcli.recording.values import Experiment
+from srfcli.numerics.collocation import Array
+from srfcli.recording.values import Experiment, Run
 from srfcli.registry import Registry
 
 CHOICE, SECOND = 3.0, 6.0  # cost of an effect, as there are some twenty to choose from, and more of each further one
 ROUGH = 4.0  # cost of a rough track
-MOST_EVALUATIONS = 1200  # of the recordings by a model with slopes, in all
+MOST_EVALUATIONS = 1800  # of the recordings by a model with slopes, in all
 ROUGH_COSTS = 3  # of these, one with the slopes by a track
+LITTLE, LOWER = 1.1, 0.01  # residual over noise from which noise is taken anew, and by how much lower than before
+AGAIN = 2  # steps of a fit whose noise has changed
 
 
 @dataclass
@@ -35,6 +38,7 @@ class Ledger:
     tried: dict[tuple[str, bool], Refit] = field(default_factory=dict)
     noise: dict[str, Noise] = field(default_factory=dict)
     evaluations: int = 0
+    gauged_at: float = np.inf  # residual over noise of the fit that the noise was taken from
 
     def __post_init__(self) -> None:
         self.follower = Follower(self.registry, self.experiment, self.trend)
@@ -49,24 +53,52 @@ class Ledger:
         return self.problem(Hypothesis()).names
 
     def keep(self, hypothesis: Hypothesis, fitted: LatentFit, *, rough: bool) -> Refit:
-        """Return a fit judged, and remember it."""
+        """Return a fit judged, and remember it; where it leaves little, noise is known better than before."""
         self.evaluations += fitted.evaluations * (ROUGH_COSTS if rough else 1)
+        found = self.judged(hypothesis, fitted, rough=rough)
+        known = self.tried.get((hypothesis.name, rough))
+        if known is None or found.evidence > known.evidence:
+            self.tried[hypothesis.name, rough] = found
+        self.progress(f"{hypothesis.name}{' on a rough track' if rough else ''}: log evidence {found.evidence:.1f}, "
+                      f"rms over noise {found.adequacy.rms_over_noise:.3f}")  # fmt: skip
+        left = found.adequacy.rms_over_noise
+        if self.best() is found and left < LITTLE and left < self.gauged_at - LOWER:
+            self.gauged_at = left
+            self.regauge(found)
+        return self.tried[hypothesis.name, rough]
+
+    def judged(self, hypothesis: Hypothesis, fitted: LatentFit, *, rough: bool) -> Refit:
+        """Return a fit with what it leaves, judged against the noise, and with its evidence."""
         runs = fitted.problem.runs
-        residuals = {r.name: r.observed - fitted.point.predictions[r.name].y for r in runs}
         adequacy = replace(
-            judge_residuals(runs, residuals, self.noise, freedom=freedom_spent(fitted)), p_tracks=evenness(fitted.point)
+            judge_residuals(runs, _residuals(fitted), self.noise, freedom=freedom_spent(fitted)),
+            p_tracks=evenness(fitted.point),
         )
         n = sum(int(r.used.sum()) for r in runs)
         cost = 0.5 * np.log(n) * (len(fitted.problem.names) - len(self.base_names())) + (ROUGH if rough else 0.0)
         more = len(hypothesis.effects)
         cost += CHOICE * more + SECOND * max(more - 1, 0)
-        found = Refit(hypothesis, fitted, adequacy, fitted.log_likelihood - float(cost), rough)
-        known = self.tried.get((hypothesis.name, rough))
-        if known is None or found.evidence > known.evidence:
-            self.tried[hypothesis.name, rough] = found
-        self.progress(f"{hypothesis.name}{' on a rough track' if rough else ''}: log evidence {found.evidence:.1f}, "
-                      f"rms over noise {adequacy.rms_over_noise:.3f}")  # fmt: skip
-        return self.tried[hypothesis.name, rough]
+        return Refit(hypothesis, fitted, adequacy, fitted.log_likelihood - float(cost), rough)
+
+    def gauged(self, runs: Sequence[Run], residuals: Mapping[str, Array]) -> dict[str, Noise]:
+        """Return the noise of each run, from residuals (n,) by run."""
+        return gauge_noise(runs, residuals)
+
+    def regauge(self, found: Refit) -> None:
+        """Take the noise from what a fit leaves, and judge everything anew that was judged by a worse one's."""
+        noise = self.gauged(found.fit.problem.runs, _residuals(found.fit))
+        if all(alike(noise[name], known) for name, known in self.noise.items()):
+            return
+        self.noise = noise
+        self.progress(f"noise as {found.name} leaves it")
+        for key, refit in list(self.tried.items()):
+            point = refit.fit.point
+            again = fit_latent(
+                refit.fit.problem, point.theta, noise, tracks=point.tracks, roughness=point.roughness, known_noise=True,
+                steps=AGAIN,
+            )  # fmt: skip
+            self.evaluations += again.evaluations * (ROUGH_COSTS if refit.rough else 1)
+            self.tried[key] = self.judged(refit.hypothesis, again, rough=refit.rough)
 
     def untried(self, hypothesis: Hypothesis, *, rough: bool) -> bool:
         """Return whether a hypothesis was not fitted yet and the budget leaves room for it."""
@@ -91,3 +123,8 @@ class Ledger:
     def best(self) -> Refit:
         """Return the refit with the best evidence."""
         return self.ranked()[0]
+
+
+def _residuals(fitted: LatentFit) -> dict[str, Array]:
+    """Return what a fit leaves of each run."""
+    return {r.name: r.observed - fitted.point.predictions[r.name].y for r in fitted.problem.runs}

@@ -11,7 +11,7 @@ from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.inference.latent import LatentFit
 from srfcli.numerics.collocation import Array
 
-NEAR = 2.5  # residual over noise within which slopes at the fit tell where a better one is
+NEAR = 3.5  # residual over noise within which slopes at the fit tell where a better one is
 
 
 @dataclass(frozen=True)

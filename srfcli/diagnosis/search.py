@@ -5,21 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from srfcli.diagnosis.adequacy import gauge_noise
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.columns import along_table
-from srfcli.diagnosis.contest import contest
-from srfcli.diagnosis.elsewhere import elsewhere
-from srfcli.diagnosis.follower import FOLLOWED, LOOSE_ONLY, PULLS, Followed, better, same, shortened
+from srfcli.diagnosis.contest import DEARER, contest
+from srfcli.diagnosis.elsewhere import elsewhere, on_a_rough_track
+from srfcli.diagnosis.follower import LOOSE_ONLY, Followed, shortened
 from srfcli.diagnosis.ledger import Ledger
-from srfcli.diagnosis.refits import NEAR, Refit
+from srfcli.diagnosis.refits import NEAR, Entry, Refit
 from srfcli.diagnosis.score import Score, pair_scores, scores
-from srfcli.inference.fit import first_level
 from srfcli.inference.latent import STEPS, LatentFit, Tracks, fit_latent, tracks_for
-from srfcli.inference.noise import Noise
 from srfcli.laws import Effect
-from srfcli.numerics.collocation import Array
-from srfcli.recording.values import Run
 
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, and noise is never quite as assumed
 CLOSE = 6.0  # hypotheses within so much of the best may be it
@@ -30,6 +25,7 @@ HALF = 0.5  # of a misfit, that one effect takes away before two are tried ahead
 ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
 FAINTER = 0.05  # of the first's score: an effect that promises so little less is not tried
+ROUGHENED = 2  # of those that leave least while held, how many are fitted on rough tracks
 FIRST, SINGLES, PAIRS = 2, 8, 3  # refitted in full, at each stage
 
 
@@ -38,8 +34,10 @@ class Search(Ledger):
     """One diagnosis on its way: what is fitted next."""
 
     scored: dict[tuple[str, bool], list[Score]] = field(default_factory=dict)
+    stale: set[tuple[str, bool]] = field(default_factory=set)  # scored under a noise that is known better now
     excluded: list[Excluded] = field(default_factory=list)
     followed: dict[str, Followed] = field(default_factory=dict)
+    held: dict[str, Entry] = field(default_factory=dict)  # the best fit of each hypothesis while held to the recording
     pulls: dict[str, LatentFit] = field(default_factory=dict)
     shook: set[tuple[str, bool]] = field(default_factory=set)
     shared: bool | None = None  # whether all runs slid on one rough track, once that was asked
@@ -50,6 +48,8 @@ class Search(Ledger):
         self.look(candidates)
         self.doubt(candidates)
         self.rebase()
+        for key in [k for k in self.stale if k[0] == Hypothesis().name]:
+            self.score(self.tried[key], candidates)
         return self.ranked()
 
     def doubt(self, candidates: Sequence[Effect]) -> None:
@@ -69,9 +69,15 @@ class Search(Ledger):
     def fitted(self, hypothesis: Hypothesis, best: Refit) -> Refit:
         """Fit a hypothesis on a smooth track from where a larger one stands."""
         problem = self.problem(hypothesis, best.fit.values)
-        return self.keep(
-            hypothesis, fit_latent(problem, problem.start, self.noise, known_noise=True, steps=15), rough=False
-        )
+        found = fit_latent(problem, problem.start, self.noise, known_noise=True, steps=15)
+        if found.point.chi2 > ASTRAY * best.fit.point.chi2:  # what was left out kept the cycles in step
+            led = self.follower.follow(hypothesis, best.fit.values, self.noise, [LOOSE_ONLY])
+            found = max(
+                found,
+                fit_latent(problem, led.theta, self.noise, known_noise=True, steps=15),
+                key=lambda f: f.log_likelihood,
+            )
+        return self.keep(hypothesis, found, rough=False)
 
     def rebase(self) -> None:
         """Fit what the best hypothesis is made of, and the baseline, from where the best one stands.
@@ -95,13 +101,15 @@ class Search(Ledger):
         far = best.rough and known is not None and known.adequacy.rms_over_noise > NEAR
         if far and self.fitted(hypothesis, best).adequacy.rms_over_noise > NEAR:
             return
-        problem = self.problem(hypothesis, best.fit.values, rough=best.rough)
-        tracks = best.fit.point.tracks if best.rough else Tracks((), {})
+        if not best.rough:
+            self.fitted(hypothesis, best)
+            return
+        problem = self.problem(hypothesis, best.fit.values, rough=True)
         fitted = fit_latent(
-            problem, problem.start, self.noise, tracks=tracks, roughness=best.fit.point.roughness if best.rough else None,
+            problem, problem.start, self.noise, tracks=best.fit.point.tracks, roughness=best.fit.point.roughness,
             known_noise=True, steps=15,
         )  # fmt: skip
-        self.keep(hypothesis, fitted, rough=best.rough)
+        self.keep(hypothesis, fitted, rough=True)
 
     def look(self, candidates: Sequence[Effect]) -> None:
         """Fit hypotheses until one leaves noise alone, or what is worth trying has been tried."""
@@ -115,7 +123,7 @@ class Search(Ledger):
             self.settled(candidates)
             or (near and self.halved(baseline) and (self.paired(candidates) or self.together(baseline, candidates)))
             or (near and self.on_a_rough_track(baseline, candidates))
-            or (not near and self.shaken(candidates))
+            or (not near and self.held_on_rough_tracks(candidates))
             or self.paired(candidates)
             or self.together(baseline, candidates)
             or self.roughened(candidates)
@@ -157,6 +165,35 @@ class Search(Ledger):
         self.widen(rough, candidates, PAIRS, rough=True)
         return self.settled(candidates)
 
+    def held_on_rough_tracks(self, candidates: Sequence[Effect]) -> bool:
+        """Return whether one of those that leave least while held leaves noise alone on a rough track."""
+        if self.best().adequacy.rms_over_noise < NEAR:
+            return self.shaken(candidates)
+        foremost = sorted(self.held.values(), key=lambda e: e.reduced + DEARER * len(e.hypothesis.effects))
+        for entry in [e for e in foremost if len(e.hypothesis.effects) == 1][:ROUGHENED]:
+            if not self.untried(entry.hypothesis, rough=True):
+                continue
+            found = self.keep(
+                entry.hypothesis,
+                on_a_rough_track(self, entry.hypothesis, entry.values, shared=False), rough=True,
+            )  # fmt: skip
+            if found.adequacy.rms_over_noise < NEAR and self.shared is None:
+                found = self.on_one_track(found)
+            if found.adequacy.fine:
+                break
+        return self.settled(candidates)
+
+    def on_one_track(self, refit: Refit) -> Refit:
+        """Return a hypothesis on one rough track for all runs, where that does better than one for each."""
+        tracks = tracks_for(refit.fit.problem.runs, shared=True)
+        fitted = fit_latent(
+            refit.fit.problem, refit.fit.point.theta, self.noise, tracks=tracks, roughness=refit.fit.point.roughness,
+            known_noise=True,
+        )  # fmt: skip
+        found = self.keep(refit.hypothesis, fitted, rough=True)
+        self.shared = found.fit is fitted
+        return found
+
     def shaken(self, candidates: Sequence[Effect], *, rough: bool = False) -> bool:
         """Return whether one of the best leaves noise alone once its effects start from elsewhere; `rough` ones take long."""
         for refit in self.ranked()[:2]:
@@ -194,25 +231,21 @@ class Search(Ledger):
         """Return the baseline's fit, from the file's own start values."""
         self.progress("baseline")
         bare, runs = Hypothesis(), [r for r in self.experiment.runs if not r.holdout]
-        level = {r.name: Noise(first_level(r)) for r in runs}
-        for way in PULLS:  # noise is better known after the first
-            found = self.follower.follow(bare, {}, self.noise or level, [way])
-            known = self.followed.get(bare.name)
-            best = self.followed[bare.name] = better(known, found)
-            self.progress(
-                f"baseline: rms over noise {best.reduced**0.5:.2f}, with the spring drawn {best.held**0.5:.2f}"
-            )
-            self.noise = self.gauged(runs, self.follower.smallest(best))
-            if best.reduced < FOLLOWED or (known is not None and same(known.held, found.held)):
-                break
+        self.noise = self.gauged(runs, {r.name: r.observed for r in runs})
+        best = self.followed[bare.name] = self.follower.follow(bare, {}, self.noise)
+        self.progress(f"baseline: rms over noise {best.reduced**0.5:.2f}, held to the recording {best.held**0.5:.2f}")
+        self.noise = self.gauged(runs, self.follower.smallest(best))
         steps = 2 if best.lost else STEPS
         return self.keep(
             bare, fit_latent(self.problem(bare), best.theta, self.noise, known_noise=True, steps=steps), rough=False
         )
 
-    def gauged(self, runs: Sequence[Run], residuals: Mapping[str, Array]) -> dict[str, Noise]:
-        """Return the noise of each run, from residuals (n,) by run."""
-        return gauge_noise(runs, residuals)
+    def regauge(self, found: Refit) -> None:
+        """Take the noise from what a fit leaves; what was scored by another is scored anew when it is asked for."""
+        before = self.noise
+        super().regauge(found)
+        if self.noise is not before:
+            self.stale.update(self.scored)
 
     def tangent(self, fitted: LatentFit) -> LatentFit:
         """Return the fit around which scores are of first order, its parameters' slopes among it."""
@@ -221,12 +254,14 @@ class Search(Ledger):
     def score(self, refit: Refit, candidates: Sequence[Effect]) -> list[Score]:
         """Return the scores of everything that a refit does not have yet."""
         key = (refit.name, refit.rough)
-        if key not in self.scored:
+        if key not in self.scored or key in self.stale:
+            refit = self.tried[key]
             present = refit.hypothesis.effects
             reported = {e.reported for e in present}
             left = [e for e in candidates if e.reported not in reported and not (e.settings and present)]
             near = refit.rough or refit.adequacy.rms_over_noise < NEAR
             around = self.tangent(refit.fit if near else self.pulled(refit))
+            self.stale.discard(key)
             self.scored[key] = scores(self.registry, around.problem.experiment, around, left, present=present)
         return self.scored[key]
 
@@ -235,16 +270,19 @@ class Search(Ledger):
         least = WORTH if refit.adequacy.fine else WORTH / 2
         scored = self.score(refit, candidates)
         promising = [s for s in scored if s.gain > max(least, FAINTER * scored[0].gain)][:most]
+        far = not (rough or refit.adequacy.rms_over_noise < NEAR)
         if not refit.adequacy.fine:  # a mass or an interface that is not there has no first order worth the name
-            built = [s for s in scored if s.effect.settings]
-            promising = [*built, *(s for s in promising if not s.effect.settings)]
-        if not (rough or refit.adequacy.rms_over_noise < NEAR):
-            contest(self, refit, self.widened(refit, promising))
+            built = [s for s in scored if s.effect.settings or (far and s.effect.observed)]
+            promising = [*built, *(s for s in promising if s not in built)]
+        if far:
+            contest(self, refit, self.widened(refit, promising), candidates)
             return
         for score, (hypothesis, own) in zip(promising, self.widened(refit, promising), strict=True):
             if not self.rivals(score, promising, refit) or not self.untried(hypothesis, rough=rough):
                 continue
             found = self.refit(hypothesis, refit, own, rough=rough)
+            if score.effect.settings:  # tried first; whether it leads is known when others were tried
+                continue
             if not rough and self.best() is found:
                 found = elsewhere(self, found)
             halfway = not found.adequacy.fine and found.adequacy.rms_over_noise < HALFWAY
@@ -263,7 +301,7 @@ class Search(Ledger):
         foremost = pair_scores(self.registry, around.problem.experiment, around, candidates)[:PAIRS]
         entrants = [(h, self.own_values(h, *p.values)) for p in foremost for h in (Hypothesis(p.effects),)]
         if not near:
-            contest(self, baseline, entrants)
+            contest(self, baseline, entrants, candidates)
         for hypothesis, own in entrants if near else ():
             if self.untried(hypothesis, rough=False):
                 elsewhere(self, self.refit(hypothesis, baseline, own, rough=False))
@@ -330,7 +368,7 @@ class Search(Ledger):
         if refit.name not in self.pulls:
             known = self.followed.get(refit.name)
             values = known.problem.named(known.pulled) if known else refit.fit.values
-            self.progress(f"{refit.name}: scores with the spring drawn to the recording")
+            self.progress(f"{refit.name}: scores while held to the recording")
             self.pulls[refit.name] = self.follower.around(refit.hypothesis, values, self.noise)
             self.evaluations += self.pulls[refit.name].evaluations
         return self.pulls[refit.name]

@@ -126,7 +126,7 @@ class _Selection:
         else:
             candidates = _foremost(self.scored(start, search.pulled(start)))
             entrants = [(h, own) for h, own in search.widened(start, candidates) if self.new(h)]
-            found = contest(search, start, entrants, again=1)
+            found = contest(search, start, entrants)
         best = max(found, key=lambda r: r.evidence, default=None)
         return best if best is not None and best.evidence > start.evidence + PAYS else None
 

@@ -1,40 +1,59 @@
-"""Fits that cannot lose their way: the spring is drawn to what was recorded, ever more weakly, until it is free.
+"""Fits that cannot lose their way: a second spring holds the slider to where it was recorded, ever more softly, until it is free.
 
-Stick-slip makes a least-squares surface full of false minima: a cycle too early fits as well as any. A model whose elongation is
-pulled towards the recording keeps its cycles in step whatever its parameters are, so that its residual is nearly linear in them;
-a right model needs no pull, and its minimum stays where it is while the pull is taken away.
-Abarbanel, Creveling, Farsian and Kostuk, SIAM J. Appl. Dyn. Syst. 8, 1341 (2009).
+Stick-slip makes a least-squares surface full of false minima: a cycle too early fits as well as any. A slider that a second
+spring holds, too stiff together with the first for stick-slip, keeps its cycles in step whatever the parameters are, and what
+its friction lacks shows as an elongation in proportion. A right model needs no second spring, and its minimum stays where it is
+while that is taken away. To draw the stage instead takes stiffness away: at a force that is imposed, weakening friction does not
+slide steadily at all.
+Abarbanel, Creveling, Farsian and Kostuk, SIAM J. Appl. Dyn. Syst. 8, 1341 (2009); Rice and Ruina, J. Appl. Mech. 50, 343 (1983).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from srfcli.inference.prediction import Pull, stiffness_share
+from srfcli.inference.noise import stretches
+from srfcli.inference.prediction import Pull, of_run, stiffness_share
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array
+from srfcli.recording.noise import describe_noise
 from srfcli.recording.values import Experiment, Run
 from srfcli.splines import Spline
 from srfcli.units import split_quantity, to_base
 
-DENSE = 2.0  # samples from knot to knot: noise is halved, slips are kept
+DENSE = 1.0  # samples from knot to knot: a slip between two samples leaves its mark for the whole of the next cycle
+FIRM = 0.03  # of the load: the force of the second spring over one length
+WIDEST, AGREE = 33, 2.0  # samples of the longest parabola, and standard deviations within which two of them agree
+FAST, BESIDE = (
+    8.0,
+    4,
+)  # noise levels from one sample to the next that are a slip, and samples beside it that tell nothing
 STIFF = 1e-4  # weight of second differences, against a sample's 1: they bridge what was not recorded
 
 
 def pull_towards(experiment: Experiment, runs: Sequence[Run], length: float) -> Pull:
-    """Return what draws these runs' springs to their recordings over `length` um of driving."""
+    """Return the spring that holds the slider of these runs to the recording, by 3 % of the load over `length` um."""
     forces = all(run.observable != "elongation" for run in runs)
     records = {run.name: _record(experiment, run, forces) for run in runs}
-    return Pull(
-        ("force" if forces else "elongation", "time"), {run.name: _speed(run) / length for run in runs}, records
-    )
+    return weaker(Pull(("force" if forces else "elongation", "time"), {}, records), runs, length)
 
 
 def weaker(pull: Pull, runs: Sequence[Run], length: float) -> Pull:
-    """Return the same pull over another length."""
-    return Pull(pull.table, {run.name: _speed(run) / length for run in runs}, pull.records)
+    """Return the same spring over another length."""
+    return Pull(pull.table, {run.name: FIRM * _load(run) / length for run in runs}, pull.records)
+
+
+def between_slips(run: Run) -> Run:
+    """Return a run without its slips, as nothing tells when between two samples the held slider was to slip."""
+    from scipy.ndimage import binary_dilation
+
+    level = describe_noise(run.observed[run.used & np.isfinite(run.observed)]).total
+    moved = np.abs(np.diff(run.observed, prepend=run.observed[0]))
+    slips = binary_dilation(moved > FAST * level, iterations=BESIDE)
+    return replace(run, used=run.used & ~slips) if slips.mean() < 0.5 else run
 
 
 def slip_length(model: GeneratedModel, experiment: Experiment) -> float:
@@ -44,8 +63,8 @@ def slip_length(model: GeneratedModel, experiment: Experiment) -> float:
     return lengths.get("D0") or min((v for v in lengths.values() if v > 0), default=1.0)
 
 
-def _speed(run: Run) -> float:
-    return float(np.mean(np.abs(run.drive(run.t))))
+def _load(run: Run) -> float:
+    return float(np.mean(run.load(run.t)[0]))
 
 
 def _record(experiment: Experiment, run: Run, forces: bool) -> Spline:
@@ -55,7 +74,36 @@ def _record(experiment: Experiment, run: Run, forces: bool) -> Spline:
         size, unit = split_quantity(experiment.stiffness_text, name="stiffness")
         y = y / (to_base(size, unit) * stiffness_share(experiment, run))
     step = float(np.median(np.diff(run.t)))
-    return smoothed(run.t, y, run.used & np.isfinite(y), DENSE * step)
+    used = run.used & np.isfinite(y)
+    return smoothed(run.t, calmed(run, y, used), used, DENSE * step)
+
+
+def calmed(run: Run, y: Array, used: Array) -> Array:
+    """Return a record y (n,) without its noise, by parabolas over the longest stretches that agree with all shorter ones.
+
+    Noise that a second spring carries into the motion would make every spring look softer than it is.
+    Goldenshluger and Nemirovski, Math. Methods Stat. 6, 135 (1997).
+    """
+    from scipy.signal import savgol_coeffs, savgol_filter
+
+    out, modulation = y.copy(), of_run(run)
+    for a, b in stretches(run.t, used):
+        if b - a < 2 * WIDEST:
+            continue
+        cycles = modulation["f"] * float(np.median(np.diff(run.t[a:b]))) if modulation["modulated"] else None
+        about = describe_noise(y[a:b], cycles)
+        level, rho = (x if np.isfinite(x) else 0.0 for x in (about.total, about.lag1))
+        low, high = y[a:b] - 1.5 * AGREE * level, y[a:b] + 1.5 * AGREE * level
+        agree = np.ones(b - a, dtype=bool)
+        for size in (5, 9, 17, WIDEST):
+            weights = savgol_coeffs(size, 2)
+            apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+            error = AGREE * level * float(np.sqrt(weights @ np.clip(rho, 0.0, 0.9) ** apart @ weights))
+            found = savgol_filter(y[a:b], size, 2)
+            low, high = np.maximum(low, found - error), np.minimum(high, found + error)
+            agree &= low <= high
+            out[a:b] = np.where(agree, found, out[a:b])
+    return out
 
 
 def smoothed(t: Array, y: Array, used: Array, spacing: float) -> Spline:

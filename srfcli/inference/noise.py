@@ -23,12 +23,14 @@ class Noise:
     """Noise e_t = sum_i coefficients[i] e_(t-1-i) + innovation; `innovation` and `level` are standard deviations.
 
     `pieces` are the noises from given samples on, of a run that is sampled at several rates: colour goes by time, not by samples.
+    `slack` is the relative standard deviation of the power at low frequencies, as the colour is estimated; 0 where it is known.
     """
 
     innovation: float
     coefficients: tuple[float, ...] = ()
     level: float = 0.0
     pieces: tuple[tuple[int, Noise], ...] = ()
+    slack: float = 0.0
 
     @property
     def order(self) -> int:

@@ -23,13 +23,13 @@ RTOL = 1e-6  # errors of some 1e-5 um after minutes of stick-slip, a thousandth 
 
 @dataclass(frozen=True)
 class Pull:
-    """The spring drawn to what was recorded: by run a rate (1/s) and the recording as a spline over time (um, or N).
+    """A second spring, to where the slider was: by run its stiffness (N/um), the recording as a spline over time (um, N).
 
-    `table` is what a model has for it behind its other tables: V gains pull (recorded - u).
+    `table` is what a model has for it behind its other tables: the force on the slider gains hold (u - recorded).
     """
 
     table: tuple[str, str]
-    rates: Mapping[str, float]
+    stiffness: Mapping[str, float]
     records: Mapping[str, Spline]
 
 
@@ -136,7 +136,7 @@ def predict(
     in um, s, N.
     """
     if pull is not None:
-        tables, values = (*tables, pull.records[run.name]), {**values, "pull": pull.rates[run.name]}
+        tables, values = (*tables, pull.records[run.name]), {**values, "hold": pull.stiffness[run.name]}
     p = run_parameters(model, experiment, run, values)
     if tables:
         p = appended(p, tables)
