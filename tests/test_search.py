@@ -118,6 +118,27 @@ def test_a_contest_finds_both_while_held(search):
     assert contest(search, base, [(hypothesis, {})]) == []  # not twice
 
 
+@pytest.mark.parametrize("length", [0.5, 1.0, 2.0])
+def test_a_gauge_that_lags_is_undone_while_held(search, length):
+    """At the true parameters, lag and drag among them, the residual between slips is noise however stiff the hold."""
+    p = Physics()
+    true = {
+        "mu0": p.mu0,
+        "A": p.A,
+        "B": p.B,
+        "D0": p.D0,
+        "Vsat": p.Vsat,
+        "lambda": p.lam,
+        "time_constant": 0.002,
+        "c": 4e-6,
+    }
+    problem = search.follower.problem(Hypothesis(tuple(effects(*PAIR))), {}, length)
+    theta = np.array([true[n] for n in problem.names])
+    for run in problem.runs:
+        rest = (problem.predicted(run, theta, slopes=False).y - run.observed)[run.used]
+        assert 0.7 * 0.02 < float(np.std(rest)) < 1.4 * 0.02, run.name
+
+
 def test_a_lost_fit_on_a_rough_track_has_no_evidence_beyond_its_likelihood(search):
     """Far from any minimum the linearised likelihood promises what no track can keep."""
     problem = search.problem(Hypothesis(), rough=True)

@@ -36,7 +36,7 @@ def contest(
     """
     around, waiting, found = search.pulled(refit).values, [], []
     for hypothesis, own in entrants:
-        if not search.untried(hypothesis, rough=False):
+        if hypothesis.name in search.held or search.spent():
             continue
         if _unseen(hypothesis.effects[-1]):
             own = {}
@@ -67,9 +67,13 @@ def _partnered(search: Search, leader: Entry, candidates: Sequence[Effect]) -> l
     found = []
     for score in promising:
         hypothesis = Hypothesis((*effects, score.effect))
-        if search.untried(hypothesis, rough=False):
+        if hypothesis.name not in search.held and not search.spent():
             own = {} if _unseen(score.effect) else search.own_values(hypothesis, score.values)
             found.append(_entry(search, hypothesis, around.values | own, own, LOOSE_ONLY))
+    for built in (e for e in candidates if e.settings and e.reported not in reported):
+        hypothesis = Hypothesis((built, *effects))
+        if hypothesis.name not in search.held and not search.spent():
+            found.append(_entry(search, hypothesis, around.values, {}, LOOSE_ONLY))
     return found
 
 

@@ -122,6 +122,7 @@ class Search(Ledger):
         if (
             self.settled(candidates)
             or (near and self.halved(baseline) and (self.paired(candidates) or self.together(baseline, candidates)))
+            or (near and self.contested(baseline, candidates))
             or (near and self.on_a_rough_track(baseline, candidates))
             or (not near and self.held_on_rough_tracks(candidates))
             or self.paired(candidates)
@@ -164,6 +165,17 @@ class Search(Ledger):
             return True
         self.widen(rough, candidates, PAIRS, rough=True)
         return self.settled(candidates)
+
+    def contested(self, baseline: Refit, candidates: Sequence[Effect]) -> bool:
+        """Return whether effects that are chosen while held leave noise alone: a free fit that is near may be false."""
+        if baseline.adequacy.rms_over_noise < HALFWAY or self.best().rough:
+            return False
+        around = self.tangent(self.pulled(baseline))
+        scored = scores(self.registry, around.problem.experiment, around, candidates)
+        first = scored[:SINGLES]
+        unseen = [s for s in scored[SINGLES:] if s.effect.settings or s.effect.observed]
+        contest(self, baseline, self.widened(baseline, [*unseen, *first]), candidates)
+        return self.roughened(candidates)
 
     def held_on_rough_tracks(self, candidates: Sequence[Effect]) -> bool:
         """Return whether one of those that leave least while held leaves noise alone on a rough track."""

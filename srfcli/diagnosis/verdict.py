@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from srfcli.diagnosis.adequacy import Adequacy, joined, judge_residuals, sampled
+from srfcli.diagnosis.adequacy import DOUBT, Adequacy, joined, judge_residuals, sampled
 from srfcli.diagnosis.candidates import Excluded, Hypothesis
 from srfcli.diagnosis.refits import Refit, freedom_spent
 from srfcli.diagnosis.score import Score
 from srfcli.diagnosis.search import CLOSE, Search
+from srfcli.inference.bumps import likeliest_bump
 from srfcli.inference.latent import fit_latent, tracks_for
 from srfcli.inference.noise import Noise
 from srfcli.numerics.collocation import Array
@@ -87,6 +88,13 @@ def conclude(search: Search, held_out: Experiment) -> Diagnosis:
     baseline = search.tried.get((alone.name, best.rough), alone) if best.hypothesis.effects else alone
     held = judge_held(search, best, baseline, held_out)
     found, reasons = _verdict(best, baseline, close, held, search)
+    bump = likeliest_bump(best.fit.point) if best.rough else None
+    if bump is not None and bump.p_value < DOUBT:
+        found = "unknown" if found == "none" else found
+        reasons.append(
+            f"the track has a bump at {bump.place:.1f} um, {bump.width:g} um wide and {bump.height:+.2g} high: no roughness "
+            f"explains it (p = {bump.p_value:.1g})"
+        )
     listed = search.scored.get((baseline.name, baseline.rough), [])
     unseen = [*search.excluded, *_unidentifiable(listed)]
     return Diagnosis(
