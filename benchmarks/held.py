@@ -21,7 +21,7 @@ from srfcli.diagnosis.candidates import Hypothesis, applicable
 from srfcli.diagnosis.follower import COARSE, LOOSE, Follower
 from srfcli.inference import follow
 from srfcli.inference.noise import Noise
-from srfcli.inference.prediction import Pull
+from srfcli.inference.prediction import Hold
 from srfcli.proof.case import make_case
 from srfcli.recording.experiment import read_experiment
 from srfcli.recording.values import Experiment, Run
@@ -66,9 +66,9 @@ def main() -> None:
         ):
             for length in LENGTHS if said == "as it is" else LENGTHS[1:4]:
                 held = follower.problem(hypothesis, {}, length)
-                if length is not None and held.pull is not None:
+                if length is not None and held.hold is not None:
                     records = {r.name: record(experiment, r, spacing, calm=calm) for r in experiment.runs}
-                    held = replace(held, pull=Pull(held.pull.table, held.pull.stiffness, records))
+                    held = replace(held, hold=Hold(held.hold.table, held.hold.stiffness, records))
                 rows.append(
                     [
                         said,

@@ -6,7 +6,7 @@
 BANK is a folder of cases as `srf prove` makes, TRUTHS their truths; known.jsonl and answers.jsonl are those of the trial:
 what was visible, and what the diagnosis said, which is then marked beside it. TRUTHS is opened when every case is answered.
 
-Given are the baseline as this project fits it under a pull, its simulated motion, the noise's level and colour, and the
+Given are the baseline as this project fits it while held, its simulated motion, the noise's level and colour, and the
 true form of every registered effect. Recordings are smoothed by local cubics, under a modulation with its harmonics, in the
 widest window that agrees with all narrower ones; where the baseline's motion is near, the distance from it is smoothed.
 Slip velocity, age and friction follow by reading the equations backwards (sparse_signals.py). The friction left over,
@@ -59,7 +59,7 @@ LEAST_NOISE = 0.005  # um
 
 
 def fitted_baseline(registry: Registry, folder: Path, kept: Path | None) -> tuple[dict[str, float], float]:
-    """Return the baseline's parameters as the diagnosis begins, under a pull, then free if the model follows; and CPU s."""
+    """Return the baseline's parameters as the diagnosis begins, while held, then free if the model follows; and CPU s."""
     path = kept / f"{folder.parent.name}-{folder.name}.json" if kept else None
     if path is not None and path.exists():
         found = json.loads(path.read_text(encoding="utf-8"))
@@ -68,14 +68,14 @@ def fitted_baseline(registry: Registry, folder: Path, kept: Path | None) -> tupl
         experiment = read_experiment(folder, registry=registry, holdout=False)
         follower, bare = Follower(registry, experiment, None), Hypothesis()
         noise = {r.name: Noise(first_level(r)) for r in experiment.runs if not r.holdout}
-        pulled, held = follower.led(bare, {}, noise, PULLS[0])
-        free = follower.released(bare, pulled, held, noise)
-        found = {"names": free.problem.names, "pulled": pulled.tolist(), "free": free.theta.tolist()}
+        place, held = follower.led(bare, {}, noise, PULLS[0])
+        free = follower.released(bare, place, held, noise)
+        found = {"names": free.problem.names, "place": place.tolist(), "free": free.theta.tolist()}
         found |= {"reduced": free.reduced, "cpu": [time.process_time() - begun]}
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps(found), encoding="utf-8")
-    best = found["free" if found["reduced"] < FOLLOWED else "pulled"]
+    best = found["free" if found["reduced"] < FOLLOWED else "place"]
     return dict(zip(found["names"], best, strict=True)), sum(found["cpu"])
 
 

@@ -10,7 +10,7 @@ import pytest
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.follower import FOLLOWED, PULLS, Follower
 from srfcli.inference.fit import first_level
-from srfcli.inference.follow import FIRM, between_slips, calmed, pull_towards, slip_length, smoothed, weaker
+from srfcli.inference.follow import FIRM, between_slips, calmed, hold_to, slip_length, smoothed, weaker
 from srfcli.inference.noise import Noise
 from srfcli.numerics.compiled import compiler
 from srfcli.proof.draw import Gauge
@@ -46,8 +46,8 @@ def rms(x):
 
 
 def held_problem(experiment, length):
-    pull = pull_towards(experiment, experiment.runs, length)
-    return Hypothesis().problem(SHIPPED, experiment, rough=False, pull=pull)
+    hold = hold_to(experiment, experiment.runs, length)
+    return Hypothesis().problem(SHIPPED, experiment, rough=False, hold=hold)
 
 
 def test_a_stiff_hold_follows_anything_and_none_is_the_free_motion(experiment):
@@ -116,12 +116,12 @@ def test_recordings_in_other_units_hold_alike(experiment):
     there = problem.predicted(run, problem.start, slopes=False).y
     for other, factor in ((as_force, K), (as_friction, K / W)):
         experiment_of_it = replace(ex, runs=(other,))
-        pull = pull_towards(experiment_of_it, [other], 1.0)
-        assert pull.table == ("force", "time")
-        found = Hypothesis().problem(SHIPPED, experiment_of_it, rough=False, pull=pull)
+        hold = hold_to(experiment_of_it, [other], 1.0)
+        assert hold.table == ("force", "time")
+        found = Hypothesis().problem(SHIPPED, experiment_of_it, rough=False, hold=hold)
         y = found.predicted(other, problem.start, slopes=False).y
         assert y / factor == pytest.approx(there, abs=1e-3)
-    mixed = pull_towards(ex, [run, replace(as_force, name="other")], 1.0)
+    mixed = hold_to(ex, [run, replace(as_force, name="other")], 1.0)
     assert mixed.table == ("elongation", "time")
     assert mixed.records["other"].numbers == pytest.approx(mixed.records[run.name].numbers, abs=1e-9)
 
@@ -142,10 +142,10 @@ def test_lengths(experiment):
     _, ex = experiment
     problem = held_problem(ex, 1.0)
     assert slip_length(problem.model, ex) == pytest.approx(0.4)
-    assert problem.pull is not None
+    assert problem.hold is not None
     for run in problem.runs:
         load = float(np.mean(run.load(run.t)[0]))
-        assert weaker(problem.pull, problem.runs, 5.0).stiffness[run.name] == pytest.approx(FIRM * load / 5.0)
+        assert weaker(problem.hold, problem.runs, 5.0).stiffness[run.name] == pytest.approx(FIRM * load / 5.0)
 
 
 def test_a_record_is_calmed_but_for_its_slips(experiment):

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from srfcli.inference.fit import Problem, fit_problem
-from srfcli.inference.prediction import Pull
+from srfcli.inference.prediction import Hold
 from srfcli.laws import Effect, Parameter
 from srfcli.model import GeneratedModel, open_model
 from srfcli.recording.values import Experiment, FitParameter
@@ -86,18 +86,18 @@ class Hypothesis:
         return tuple(e.reported for e in self.effects)
 
     def model(
-        self, registry: Registry, experiment: Experiment, *, rough: bool, pull: Pull | None = None
+        self, registry: Registry, experiment: Experiment, *, rough: bool, hold: Hold | None = None
     ) -> GeneratedModel:
-        """Return the model, with a table along the track if it is rough, and one for the recording if that pulls."""
+        """Return the model, with a table along the track if it is rough, and one for the recording if that holds."""
         return open_model(
             registry, **asdict(experiment.choice.plus(_key(registry, e) for e in self.effects)),
-            tables=((TRACK,) if rough else ()) + ((pull.table,) if pull else ()),
+            tables=((TRACK,) if rough else ()) + ((hold.table,) if hold else ()),
         )  # fmt: skip
 
     def problem(self, registry: Registry, experiment: Experiment, *, rough: bool, at: Mapping[str, float] | None = None,
-                trend: str | None = None, pull: Pull | None = None) -> Problem:  # fmt: skip
+                trend: str | None = None, hold: Hold | None = None) -> Problem:  # fmt: skip
         """Return the fit of baseline and effects together, from the values in `at` where there are some."""
-        model = self.model(registry, experiment, rough=rough, pull=pull)
+        model = self.model(registry, experiment, rough=rough, hold=hold)
         added = [q for e in self.effects for q in fit_parameters(e, model, experiment)]
         at = at or {}
         names = {q.name for q in added}
@@ -107,7 +107,7 @@ class Hypothesis:
         )
         problem = fit_problem(model, replace(experiment, parameters=listed), trend=trend)
         start = [at.get(n, s) for n, s in zip(problem.names, problem.start, strict=True)]
-        return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper), pull=pull)
+        return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper), hold=hold)
 
 
 def _key(registry: Registry, effect: Effect) -> str:

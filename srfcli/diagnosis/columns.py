@@ -47,11 +47,11 @@ def columns_of(registry: Registry, experiment: Experiment, fitted: LatentFit, ef
     ]
     plain = [e for e in regular if not e.scans]
     names = tuple(e.name for e in (*present, *plain))
-    model = open_model(registry, **asdict(choice.plus(names)), tables=(*TABLES, *_pulled(fitted)))
+    model = open_model(registry, **asdict(choice.plus(names)), tables=(*TABLES, *_held(fitted)))
     found += _union(model, experiment, fitted, present, plain, [e for e in effects if e.name in tabled], tabled)
     for effect in (e for e in regular if e.scans):
         own = open_model(
-            registry, **asdict(choice.plus((*(e.name for e in present), effect.name))), tables=(TRACK, *_pulled(fitted))
+            registry, **asdict(choice.plus((*(e.name for e in present), effect.name))), tables=(TRACK, *_held(fitted))
         )
         found += _scanned(own, experiment, fitted, present, effect)
     for effect in (e for e in effects if e.settings or e.observed):
@@ -112,13 +112,13 @@ def _union(model: GeneratedModel, experiment: Experiment, fitted: LatentFit, pre
 
 
 def _as_fitted(fitted: LatentFit) -> dict[str, Any]:
-    """Return how a fit's own predictions were made: its pull and its tolerance."""
-    return {"pull": fitted.problem.pull, "rtol": fitted.problem.rtol}
+    """Return how a fit's own predictions were made: its hold and its tolerance."""
+    return {"hold": fitted.problem.hold, "rtol": fitted.problem.rtol}
 
 
-def _pulled(fitted: LatentFit) -> tuple[tuple[str, str], ...]:
-    """Return the table of the recording that pulls, if one does."""
-    return (fitted.problem.pull.table,) if fitted.problem.pull else ()
+def _held(fitted: LatentFit) -> tuple[tuple[str, str], ...]:
+    """Return the table of the recording that holds, if one does."""
+    return (fitted.problem.hold.table,) if fitted.problem.hold else ()
 
 
 def _track(fitted: LatentFit, run: Run) -> Spline:
@@ -241,7 +241,7 @@ def _probed(
 ) -> Column:
     """Return the column of an effect whose model has other unknowns than the baseline: a difference over a small size."""
     names = (*(e.name for e in present), effect.name)
-    model = open_model(registry, **asdict(experiment.choice.plus(names)), tables=(TRACK, *_pulled(fitted)))
+    model = open_model(registry, **asdict(experiment.choice.plus(names)), tables=(TRACK, *_held(fitted)))
     values = _values(model, experiment, fitted, present, [effect])
     (parameter,) = [q for q in fit_parameters(effect, model, experiment)]
     size = (
@@ -270,7 +270,7 @@ def _freed(
     registry: Registry, experiment: Experiment, fitted: LatentFit, present: Sequence[Effect], effect: Effect
 ) -> Column:
     model = open_model(
-        registry, **asdict(experiment.choice.plus(e.name for e in present)), tables=(TRACK, *_pulled(fitted))
+        registry, **asdict(experiment.choice.plus(e.name for e in present)), tables=(TRACK, *_held(fitted))
     )
     values = _values(model, experiment, fitted, present, [])
     added = fit_parameters(effect, model, experiment)

@@ -34,7 +34,7 @@ def contest(
     With what is missing, little is left under the hold already. `entrants` come with what is expected of the added parameters;
     the foremost are tried with a second effect of the `candidates`, too.
     """
-    around, waiting, found = search.pulled(refit).values, [], []
+    around, waiting, found = search.loosely(refit).values, [], []
     for hypothesis, own in entrants:
         if hypothesis.name in search.held or search.spent():
             continue

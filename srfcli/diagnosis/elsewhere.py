@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
 
 SHAKES = (2.0, 0.5)  # times its size: other starts of an effect
-ROUNDS, STEPS = 1, 8  # of a fit on a rough track under a pull
+ROUNDS, STEPS = 1, 8  # of a fit on a rough track while held
 
 
 def elsewhere(search: Search, refit: Refit) -> Refit:
@@ -88,7 +88,7 @@ def on_a_rough_track(
     follower = search.follower
     held = replace(
         hypothesis.problem(search.registry, search.experiment, rough=True, at=at, trend=search.trend,
-                           pull=follower.hold(LOOSE)),
+                           hold=follower.hold(LOOSE)),
         rtol=ROUND, runs=follower.between,
     )  # fmt: skip
     tracks = tracks_for(held.runs, shared=shared)

@@ -11,10 +11,10 @@ from srfcli.diagnosis.adequacy import quietest
 from srfcli.diagnosis.candidates import Hypothesis, own_parameters
 from srfcli.inference import fit as fitting
 from srfcli.inference.fit import Problem, first_level
-from srfcli.inference.follow import between_slips, pull_towards, slip_length, weaker
+from srfcli.inference.follow import between_slips, hold_to, slip_length, weaker
 from srfcli.inference.latent import LatentFit, Tracks, fit_latent
 from srfcli.inference.noise import Noise
-from srfcli.inference.prediction import RTOL, Pull
+from srfcli.inference.prediction import RTOL, Hold
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
@@ -25,25 +25,26 @@ PULLS = (
     (0.5, 1.0, LOOSE),
 )  # the same, ever softer; the next way is tried where one leads nowhere
 CLEAR = 1.05  # chi-squared per degree of freedom under a hold that is noise
+NEARLY = 1.3  # the same of a model that may be right: what is lost when it is set free is worth finding
 LOOSE_ONLY = (LOOSE,)  # the one that a refit starts under
 SPREAD = 0.02  # relative uncertainty of parameters from which a fit is set free
-COARSE, FEW = 1e-2, 12  # tolerance of chi-squared under a pull, and evaluations
-ROUND = 1e-4  # relative tolerance of the integrator under a pull
+COARSE, FEW = 1e-2, 12  # tolerance of chi-squared while held, and evaluations
+ROUND = 1e-4  # relative tolerance of the integrator while held
 FAIR = 1e-5  # the same of a free fit, where the noise asks for no more
 QUIET = 1e-3  # noise over a record's standard deviation beyond which it asks for no more
 SAME = 0.01  # relative difference of chi-squared within which two ways led to the same minimum
-FOLLOWED = 4.0  # chi-squared per degree of freedom of a model that follows the recording without a pull
+FOLLOWED = 4.0  # chi-squared per degree of freedom of a model that follows the recording when free
 HOPELESS = 30.0  # the same of one that does not: its minimum need not be known exactly
 
 
 @dataclass(frozen=True)
 class Followed:
-    """Parameters (k,) with their `reduced` chi-squared when the spring is free, and those under the last pull with theirs."""
+    """Parameters (k,) with their `reduced` chi-squared when the spring is free, and those under the last hold with theirs."""
 
     problem: Problem
     theta: Array
     reduced: float
-    pulled: Array
+    place: Array
     held: float
 
     @property
@@ -59,21 +60,21 @@ class Follower:
         self.registry, self.experiment, self.trend, self.rtol = registry, experiment, trend, RTOL
         problem = self.problem(Hypothesis(), {})
         self.unit = slip_length(problem.model, experiment)
-        self.strong = pull_towards(experiment, problem.runs, self.unit)
+        self.strong = hold_to(experiment, problem.runs, self.unit)
         self.evaluations = 0
         self.between = tuple(between_slips(run) for run in problem.runs)
         still = min(first_level(r) / max(float(np.std(r.observed)), 1e-300) for r in problem.runs)
         self.rtol = FAIR if still > QUIET else RTOL
 
     def problem(self, hypothesis: Hypothesis, at: Mapping[str, float], length: float | None = None) -> Problem:
-        """Return the fit of a hypothesis under a pull over so many slip lengths, or free."""
-        pull = self.hold(length) if length is not None else None
+        """Return the fit of a hypothesis held over so many slip lengths, or free."""
+        held = self.hold(length) if length is not None else None
         found = hypothesis.problem(
-            self.registry, self.experiment, rough=False, at=dict(at), trend=self.trend, pull=pull
+            self.registry, self.experiment, rough=False, at=dict(at), trend=self.trend, hold=held
         )
-        return replace(found, rtol=self.rtol) if pull is None else replace(found, rtol=ROUND, runs=self.between)
+        return replace(found, rtol=self.rtol) if held is None else replace(found, rtol=ROUND, runs=self.between)
 
-    def hold(self, length: float) -> Pull:
+    def hold(self, length: float) -> Hold:
         """Return the second spring over so many slip lengths."""
         return weaker(self.strong, self.experiment.runs, length * self.unit)
 
@@ -96,24 +97,24 @@ class Follower:
     def led(
         self, hypothesis: Hypothesis, at: Mapping[str, float], noise: Mapping[str, Noise], way: Sequence[float]
     ) -> tuple[Array, float]:
-        """Return the parameters that a pull over ever more slip lengths leads to, and chi-squared per degree of freedom."""
+        """Return the parameters that a hold over ever more slip lengths leads to, and chi-squared per degree of freedom."""
         theta, reduced = self.problem(hypothesis, at).start, np.inf
         for length in way:
             theta, reduced = self.descend(self.problem(hypothesis, at, length), theta, noise, COARSE)
         return theta, reduced
 
-    def released(self, hypothesis: Hypothesis, pulled: Array, held: float, noise: Mapping[str, Noise]) -> Followed:
-        """Return the free fit from parameters under a pull, and their chi-squared there."""
+    def released(self, hypothesis: Hypothesis, place: Array, held: float, noise: Mapping[str, Noise]) -> Followed:
+        """Return the free fit from parameters while held, and their chi-squared there."""
         free = self.problem(hypothesis, {})
-        theta, reduced = self.descend(free, pulled, noise, 1e-4)
-        if not reduced < FOLLOWED:
+        theta, reduced = self.descend(free, place, noise, 1e-4)
+        if not reduced < FOLLOWED and held < NEARLY:
             grown = fitting.Search(free, lambda text: None)
             grown.covariance = np.diag((SPREAD * grown.scale) ** 2)
-            place, _ = grown.grow(np.clip(pulled, free.lower, free.upper), noise)
+            grew, _ = grown.grow(np.clip(place, free.lower, free.upper), noise)
             self.evaluations += grown.evaluations
             if grown.reduced < reduced:
-                theta, reduced = place, grown.reduced
-        return Followed(free, theta, reduced, pulled, held)
+                theta, reduced = grew, grown.reduced
+        return Followed(free, theta, reduced, place, held)
 
     def descend(
         self, problem: Problem, theta: Array, noise: Mapping[str, Noise], tolerance: float
@@ -135,7 +136,7 @@ class Follower:
         return out
 
     def around(self, hypothesis: Hypothesis, values: Mapping[str, float], noise: Mapping[str, Noise]) -> LatentFit:
-        """Return the fit of a hypothesis under a loose pull, around which everything is nearly linear."""
+        """Return the fit of a hypothesis under a loose hold, around which everything is nearly linear."""
         problem = self.problem(hypothesis, values, LOOSE)
         return fit_latent(problem, problem.start, noise, tracks=Tracks((), {}), known_noise=True, steps=FEW)
 

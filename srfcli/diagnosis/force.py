@@ -18,7 +18,7 @@ from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.search import Search
 from srfcli.inference.fit import Problem
 from srfcli.inference.latent import LatentFit, Tracks, fit_latent
-from srfcli.inference.prediction import Pull
+from srfcli.inference.prediction import Hold
 from srfcli.model import open_model
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Run
@@ -90,14 +90,14 @@ def tracks_over_time(runs: Sequence[Run], *, knots: int = KNOTS) -> Tracks:
 def missing_force(search: Search, refit: Refit, *, knots: int = KNOTS) -> Force:
     """Return the friction that a fitted hypothesis lacks, along the runs that it was fitted to.
 
-    Where the hypothesis is far off, the force is found with the spring drawn to the recording first, then without.
+    Where the hypothesis is far off, the force is found while the slider is held to the recording first, then without.
     """
     near = refit.adequacy.rms_over_noise < NEAR
-    around = refit.fit if near else search.pulled(refit)
+    around = refit.fit if near else search.loosely(refit)
     tracks, roughness = tracks_over_time(around.problem.runs, knots=knots), None
     search.progress(f"{refit.name}: the force that is missing")
-    for pull in [None] if near else [around.problem.pull, None]:
-        problem = _problem(search, refit, around, pull)
+    for hold in [None] if near else [around.problem.hold, None]:
+        problem = _problem(search, refit, around, hold)
         fitted = fit_latent(
             problem, problem.start, search.noise, tracks=tracks, roughness=roughness, known_noise=True, rounds=ROUNDS,
             steps=STEPS, grid=(TIMES, AMPLITUDES),
@@ -108,12 +108,12 @@ def missing_force(search: Search, refit: Refit, *, knots: int = KNOTS) -> Force:
     return _force(refit, smooth.fit if smooth is not None else refit.fit, fitted)
 
 
-def _problem(search: Search, refit: Refit, around: LatentFit, pull: Pull | None) -> Problem:
+def _problem(search: Search, refit: Refit, around: LatentFit, hold: Hold | None) -> Problem:
     """Return the problem of a refit, from where `around` stands, whose model has the force instead of a track."""
     choice = search.experiment.choice.plus(e.name for e in refit.hypothesis.effects)
-    model = open_model(search.registry, **asdict(choice), tables=(TABLE, pull.table) if pull else (TABLE,))
+    model = open_model(search.registry, **asdict(choice), tables=(TABLE, hold.table) if hold else (TABLE,))
     problem = around.problem
-    return replace(problem, model=model, start=np.clip(around.point.theta, problem.lower, problem.upper), pull=pull)
+    return replace(problem, model=model, start=np.clip(around.point.theta, problem.lower, problem.upper), hold=hold)
 
 
 def _force(refit: Refit, bare: LatentFit, fitted: LatentFit) -> Force:

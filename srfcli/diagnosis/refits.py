@@ -32,7 +32,7 @@ class Refit:
 
 @dataclass(frozen=True)
 class Entry:
-    """A hypothesis under a pull: parameters (k,), also by name, those a score expected, chi-squared per degree of freedom."""
+    """A hypothesis while held: parameters (k,), also by name, those a score expected, chi-squared per degree of freedom."""
 
     hypothesis: Hypothesis
     theta: Array

@@ -38,7 +38,7 @@ class Search(Ledger):
     excluded: list[Excluded] = field(default_factory=list)
     followed: dict[str, Followed] = field(default_factory=dict)
     held: dict[str, Entry] = field(default_factory=dict)  # the best fit of each hypothesis while held to the recording
-    pulls: dict[str, LatentFit] = field(default_factory=dict)
+    loose: dict[str, LatentFit] = field(default_factory=dict)
     shook: set[tuple[str, bool]] = field(default_factory=set)
     shared: bool | None = None  # whether all runs slid on one rough track, once that was asked
 
@@ -170,7 +170,7 @@ class Search(Ledger):
         """Return whether effects that are chosen while held leave noise alone: a free fit that is near may be false."""
         if baseline.adequacy.rms_over_noise < HALFWAY or self.best().rough:
             return False
-        around = self.tangent(self.pulled(baseline))
+        around = self.tangent(self.loosely(baseline))
         scored = scores(self.registry, around.problem.experiment, around, candidates)
         first = scored[:SINGLES]
         unseen = [s for s in scored[SINGLES:] if s.effect.settings or s.effect.observed]
@@ -272,7 +272,7 @@ class Search(Ledger):
             reported = {e.reported for e in present}
             left = [e for e in candidates if e.reported not in reported and not (e.settings and present)]
             near = refit.rough or refit.adequacy.rms_over_noise < NEAR
-            around = self.tangent(refit.fit if near else self.pulled(refit))
+            around = self.tangent(refit.fit if near else self.loosely(refit))
             self.stale.discard(key)
             self.scored[key] = scores(self.registry, around.problem.experiment, around, left, present=present)
         return self.scored[key]
@@ -309,7 +309,7 @@ class Search(Ledger):
     def together(self, baseline: Refit, candidates: Sequence[Effect]) -> bool:
         """Return whether two effects leave noise alone, of those that could explain most together."""
         near = baseline.adequacy.rms_over_noise < NEAR
-        around = self.tangent(baseline.fit if near else self.pulled(baseline))
+        around = self.tangent(baseline.fit if near else self.loosely(baseline))
         foremost = pair_scores(self.registry, around.problem.experiment, around, candidates)[:PAIRS]
         entrants = [(h, self.own_values(h, *p.values)) for p in foremost for h in (Hypothesis(p.effects),)]
         if not near:
@@ -375,12 +375,12 @@ class Search(Ledger):
                 self.shared = shared
         return self.tried[hypothesis.name, True]
 
-    def pulled(self, refit: Refit) -> LatentFit:
-        """Return a hypothesis' fit under a loose pull: where it does not follow the recording, slopes mean something there."""
-        if refit.name not in self.pulls:
+    def loosely(self, refit: Refit) -> LatentFit:
+        """Return a hypothesis' fit under a loose hold: where it does not follow the recording, slopes mean something there."""
+        if refit.name not in self.loose:
             known = self.followed.get(refit.name)
-            values = known.problem.named(known.pulled) if known else refit.fit.values
+            values = known.problem.named(known.place) if known else refit.fit.values
             self.progress(f"{refit.name}: scores while held to the recording")
-            self.pulls[refit.name] = self.follower.around(refit.hypothesis, values, self.noise)
-            self.evaluations += self.pulls[refit.name].evaluations
-        return self.pulls[refit.name]
+            self.loose[refit.name] = self.follower.around(refit.hypothesis, values, self.noise)
+            self.evaluations += self.loose[refit.name].evaluations
+        return self.loose[refit.name]

@@ -87,7 +87,7 @@ def _with_own_terms(search: Search) -> Search:
     """Return a search that knows the terms, and all that the one before has fitted."""
     return replace(
         search, registry=with_terms(search.registry), effects=None, tried=dict(search.tried), scored={}, excluded=[],
-        followed=dict(search.followed), pulls=dict(search.pulls), noise=dict(search.noise), evaluations=0,
+        followed=dict(search.followed), loose=dict(search.loose), noise=dict(search.noise), evaluations=0,
     )  # fmt: skip
 
 
@@ -124,7 +124,7 @@ class _Selection:
                 if self.new(hypothesis):
                     found.append(search.refit(hypothesis, start, own, rough=start.rough))
         else:
-            candidates = _foremost(self.scored(start, search.pulled(start)))
+            candidates = _foremost(self.scored(start, search.loosely(start)))
             entrants = [(h, own) for h, own in search.widened(start, candidates) if self.new(h)]
             found = contest(search, start, entrants)
         best = max(found, key=lambda r: r.evidence, default=None)

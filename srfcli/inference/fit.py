@@ -16,7 +16,7 @@ from srfcli.errors import SrfError, did_you_mean
 from srfcli.inference.linear import inverse, root
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
 from srfcli.inference.nuisance import own_names, own_start
-from srfcli.inference.prediction import RTOL, Prediction, Pull, predict, run_parameters
+from srfcli.inference.prediction import RTOL, Hold, Prediction, predict, run_parameters
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment, Run
@@ -106,7 +106,7 @@ class Problem:
     upper: Array
     trend: str | None = None
     held: Mapping[str, float] = field(default_factory=dict)
-    pull: Pull | None = None
+    hold: Hold | None = None
     rtol: float = RTOL
 
     def named(self, theta: Array) -> dict[str, float]:
@@ -124,7 +124,7 @@ class Problem:
             by=by,
             until=until,
             trend=None if run.holdout else self.trend,
-            pull=self.pull,
+            hold=self.hold,
             rtol=self.rtol,
         )
 

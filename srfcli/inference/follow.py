@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from srfcli.inference.noise import stretches
-from srfcli.inference.prediction import Pull, of_run, stiffness_share
+from srfcli.inference.prediction import Hold, of_run, stiffness_share
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array
 from srfcli.recording.noise import describe_noise
@@ -34,16 +34,16 @@ FAST, BESIDE = (
 STIFF = 1e-4  # weight of second differences, against a sample's 1: they bridge what was not recorded
 
 
-def pull_towards(experiment: Experiment, runs: Sequence[Run], length: float) -> Pull:
+def hold_to(experiment: Experiment, runs: Sequence[Run], length: float) -> Hold:
     """Return the spring that holds the slider of these runs to the recording, by 3 % of the load over `length` um."""
     forces = all(run.observable != "elongation" for run in runs)
     records = {run.name: _record(experiment, run, forces) for run in runs}
-    return weaker(Pull(("force" if forces else "elongation", "time"), {}, records), runs, length)
+    return weaker(Hold(("force" if forces else "elongation", "time"), {}, records), runs, length)
 
 
-def weaker(pull: Pull, runs: Sequence[Run], length: float) -> Pull:
+def weaker(hold: Hold, runs: Sequence[Run], length: float) -> Hold:
     """Return the same spring over another length."""
-    return Pull(pull.table, {run.name: FIRM * _load(run) / length for run in runs}, pull.records)
+    return Hold(hold.table, {run.name: FIRM * _load(run) / length for run in runs}, hold.records)
 
 
 def between_slips(run: Run) -> Run:

@@ -22,7 +22,7 @@ RTOL = 1e-6  # errors of some 1e-5 um after minutes of stick-slip, a thousandth 
 
 
 @dataclass(frozen=True)
-class Pull:
+class Hold:
     """A second spring, to where the slider was: by run its stiffness (N/um), the recording as a spline over time (um, N).
 
     `table` is what a model has for it behind its other tables: the force on the slider gains hold (u - recorded).
@@ -125,18 +125,18 @@ def predict(
     trend: str | None = None,
     tables: Sequence[Spline] = (),
     by_tables: Sequence[int] = (),
-    pull: Pull | None = None,
+    hold: Hold | None = None,
 ) -> Prediction:
     """Return the observable of `run` at its sample times up to `until` s, with derivatives by the parameters `by`.
 
     Of a model with tables, J goes on with a column for each number of the tables in `by_tables`.
 
     It starts in steady sliding, or where `values` say (see `nuisance`). A trend is added to the observable: values["RUN.trend"]
-    times displacement or time. With a `pull`, whose table the model has last, the spring is drawn to the recording. Values are
+    times displacement or time. With a `hold`, whose table the model has last, the slider is held to the recording. Values are
     in um, s, N.
     """
-    if pull is not None:
-        tables, values = (*tables, pull.records[run.name]), {**values, "hold": pull.stiffness[run.name]}
+    if hold is not None:
+        tables, values = (*tables, hold.records[run.name]), {**values, "hold": hold.stiffness[run.name]}
     p = run_parameters(model, experiment, run, values)
     if tables:
         p = appended(p, tables)
