@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis
-from srfcli.diagnosis.follower import CLEAR, LOOSE_ONLY, PULLS, same
+from srfcli.diagnosis.follower import CLEAR, LOOSE_ONLY
 from srfcli.diagnosis.refits import Entry, Refit
 from srfcli.diagnosis.score import scores
 from srfcli.inference.latent import STEPS, Tracks, fit_latent
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 RELEASED = 3  # fitted freely, those that leave least while they are held first
 PARTNERS, LEADERS = 4, 2  # effects that are tried beside one that leads, and how many lead
+SIZES = (0.5, 0.6, 0.7, 0.35)  # of a built-in effect's parameters, between their bounds on a scale of logarithms
 HOPELESS = 4.0  # times what the baseline leaves: other starts would not help
 DEARER = 0.004  # of chi-squared per degree of freedom, what a further effect has to take away
 
@@ -40,7 +41,7 @@ def contest(
             continue
         if _unseen(hypothesis.effects[-1]):
             own = {}
-        waiting.append(_led(search, _entry(search, hypothesis, around | own, own, LOOSE_ONLY), around))
+        waiting.append(_led(search, _entry(search, hypothesis, around | own, own, LOOSE_ONLY)))
         if waiting[-1].reduced < CLEAR:
             found.append(_released(search, waiting.pop()))
             if found[-1].adequacy.fine:
@@ -49,7 +50,8 @@ def contest(
     for leader in sorted(singles, key=lambda e: e.reduced)[: LEADERS if candidates else 0]:
         waiting += _partnered(search, leader, candidates)
     waiting.sort(key=lambda e: e.reduced + DEARER * len(e.hypothesis.effects))
-    for entry in waiting[:RELEASED]:
+    first = next((e for e in waiting if len(e.hypothesis.effects) == 1), None)  # one effect is asked before two
+    for entry in [*([first] if first else []), *(e for e in waiting if e is not first)][:RELEASED]:
         found.append(_released(search, entry))
         if found[-1].adequacy.fine:
             break
@@ -82,21 +84,22 @@ def _unseen(effect: Effect) -> bool:
     return bool(effect.settings or effect.observed)
 
 
-def _led(search: Search, entry: Entry, around: dict[str, float]) -> Entry:
-    """Return the best that other starts lead a hypothesis to whose last effect is built in: it is seen at no first order."""
-    if not entry.hypothesis.effects[-1].settings:
-        return entry
+def _led(search: Search, entry: Entry) -> Entry:
+    """Return the best that other starts lead a hypothesis to whose last effect is built in: it is seen at no first order.
+
+    They are the file's own values, the effect's parameters at some sizes: the baseline has been bent, and has no such parameter.
+    """
     best, known = entry, search.followed.get(Hypothesis().name)
-    if known is not None and entry.reduced > HOPELESS * known.held:
+    if not entry.hypothesis.effects[-1].settings or (known is not None and entry.reduced > HOPELESS * known.held):
         return entry
-    for at, way in ((entry.own, PULLS[0]), (around | entry.own, PULLS[1])):
+    problem = search.follower.problem(entry.hypothesis, {})
+    bare = search.base_names()
+    bounds = [(n, a, b) for n, a, b in zip(problem.names, problem.lower, problem.upper, strict=True) if n not in bare]
+    for share in SIZES:
         if best.reduced < CLEAR or search.spent():
             break
-        found = _entry(search, entry.hypothesis, at, entry.own, way)
-        agreed = same(found.reduced, best.reduced)
-        best = min(best, found, key=lambda e: e.reduced)
-        if agreed:
-            break
+        at = {name: float(a * (b / a) ** share if a > 0 else a + share * (b - a)) for name, a, b in bounds}
+        best = min(best, _entry(search, entry.hypothesis, at, entry.own, LOOSE_ONLY), key=lambda e: e.reduced)
     return best
 
 

@@ -25,7 +25,7 @@ PULLS = (
     (0.5, 1.0, LOOSE),
 )  # the same, ever softer; the next way is tried where one leads nowhere
 CLEAR = 1.05  # chi-squared per degree of freedom under a hold that is noise
-NEARLY = 1.3  # the same of a model that may be right: what is lost when it is set free is worth finding
+NEARLY = 1.6  # the same of a model that may be right: what is lost when it is set free is worth finding
 LOOSE_ONLY = (LOOSE,)  # the one that a refit starts under
 SPREAD = 0.02  # relative uncertainty of parameters from which a fit is set free
 COARSE, FEW = 1e-2, 12  # tolerance of chi-squared while held, and evaluations
