@@ -35,27 +35,35 @@ def contest(
     With what is missing, little is left under the hold already. `entrants` come with what is expected of the added parameters;
     the foremost are tried with a second effect of the `candidates`, too.
     """
-    around, waiting, found = search.loosely(refit).values, [], []
+    around, held, found = search.loosely(refit).values, list[Entry](), dict[str, Refit]()
+
+    def free(entry: Entry) -> bool:
+        found[entry.hypothesis.name] = _released(search, entry)
+        return found[entry.hypothesis.name].adequacy.fine
+
     for hypothesis, own in entrants:
         if hypothesis.name in search.held or search.spent():
             continue
         if _unseen(hypothesis.effects[-1]):
             own = {}
-        waiting.append(_led(search, _entry(search, hypothesis, around | own, own, LOOSE_ONLY)))
-        if waiting[-1].reduced < CLEAR:
-            found.append(_released(search, waiting.pop()))
-            if found[-1].adequacy.fine:
-                return found
-    singles = [e for e in waiting if len(e.hypothesis.effects) == 1]
-    for leader in sorted(singles, key=lambda e: e.reduced)[: LEADERS if candidates else 0]:
-        waiting += _partnered(search, leader, candidates)
-    waiting.sort(key=lambda e: e.reduced + DEARER * len(e.hypothesis.effects))
-    first = next((e for e in waiting if len(e.hypothesis.effects) == 1), None)  # one effect is asked before two
-    for entry in [*([first] if first else []), *(e for e in waiting if e is not first)][:RELEASED]:
-        found.append(_released(search, entry))
-        if found[-1].adequacy.fine:
+        held.append(_led(search, _entry(search, hypothesis, around | own, own, LOOSE_ONLY)))
+        if held[-1].reduced < CLEAR and free(held[-1]):
+            return list(found.values())
+    singles = sorted((e for e in held if len(e.hypothesis.effects) == 1), key=_ranked)
+    if singles and singles[0].hypothesis.name not in found and free(singles[0]):  # one effect is asked before two
+        return list(found.values())
+    for leader in singles[: LEADERS if candidates else 0]:
+        held += _partnered(search, leader, candidates)
+    waiting = [e for e in sorted(held, key=_ranked) if e.hypothesis.name not in found]
+    for entry in waiting[: RELEASED - len(singles[:1])]:
+        if free(entry):
             break
-    return found
+    return list(found.values())
+
+
+def _ranked(entry: Entry) -> float:
+    """Return what a hypothesis leaves while held, and what its effects cost."""
+    return entry.reduced + DEARER * len(entry.hypothesis.effects)
 
 
 def _partnered(search: Search, leader: Entry, candidates: Sequence[Effect]) -> list[Entry]:
