@@ -9,16 +9,7 @@ import sympy as sp
 from srfcli.errors import SrfError
 from srfcli.expression import symbol
 from srfcli.laws import ExtraState
-from srfcli.system import (
-    FOLLOWED,
-    Equations,
-    System,
-    lut,
-    solve_linear,
-    state_rate,
-    steady_states,
-    tidy,
-)
+from srfcli.system import FOLLOWED, Equations, System, lut, solve_linear, state_rate, steady_states, tidy
 
 AUXILIARY = {"slip": "v", "stage": "V", "time": "1"}  # unknowns that an effect may name, um, um, s, and their rates
 
@@ -133,9 +124,8 @@ class _Builder:
             self.slip_t = sp.Symbol("S_t_")
         self.force, self.force_dot, self.W_dot = sp.symbols("F_ F_dot_ We_dot_")
         held = any(slot in FOLLOWED for slot, _ in system.tables)
-        self.K = symbol("K") + (
-            symbol("hold") if held else 0
-        )  # of the springs to the stage and to where it was recorded
+        # stiffness of the spring to the stage, and of the one to where the slider was recorded
+        self.K = symbol("K") + symbol("hold") if held else symbol("K")
         self.tangent = sp.tan(symbol("angle")) if system.loading == "inclined" else sp.S.Zero
 
     def equations(self) -> Equations:
@@ -292,9 +282,7 @@ class _Builder:
         imposed += sp.diff(parts.W, W) * s("W_dot")
         pushed += sp.diff(parts.force, W) * s("W_dot")
         v = s("v")
-        spring = s("u") if self.system.inertia else (load * self.mu - self.force) / self.K
         return [
-            (self.V, parts.V.subs(s("u"), spring)),
             *([(self.slip_t, on_load(stretched))] if self.slip_t else []),
             (self.slip, on_load(S)),
             (self.slip_W, on_load(sp.diff(S, W))),
@@ -306,7 +294,7 @@ class _Builder:
             (self.force, parts.force),
             (self.force_dot, pushed),
             (self.W_dot, imposed),
-            (self.V, parts.V),  # again: what came before may hold u', which is a state's rate there
+            (self.V, parts.V),
             (load, self.total_load()),
             (self.imposed, W),
         ]

@@ -21,7 +21,6 @@ RELEASED = 3  # fitted freely, those that leave least while they are held first
 PARTNERS, LEADERS = 4, 2  # effects that are tried beside one that leads, and how many lead
 SIZES = (0.5, 0.6, 0.7, 0.35)  # of a built-in effect's parameters, between their bounds on a scale of logarithms
 HOPELESS = 4.0  # times what the baseline leaves: other starts would not help
-DEARER = 0.004  # of chi-squared per degree of freedom, what a further effect has to take away
 
 
 def contest(
@@ -44,26 +43,19 @@ def contest(
     for hypothesis, own in entrants:
         if hypothesis.name in search.held or search.spent():
             continue
-        if _unseen(hypothesis.effects[-1]):
-            own = {}
-        held.append(_led(search, _entry(search, hypothesis, around | own, own, LOOSE_ONLY)))
+        held.append(_led(search, _entry(search, hypothesis, around | _expected(hypothesis, own))))
         if held[-1].reduced < CLEAR and free(held[-1]):
             return list(found.values())
-    singles = sorted((e for e in held if len(e.hypothesis.effects) == 1), key=_ranked)
+    singles = sorted((e for e in held if e.single), key=lambda e: e.rank)
     if singles and singles[0].hypothesis.name not in found and free(singles[0]):  # one effect is asked before two
         return list(found.values())
     for leader in singles[: LEADERS if candidates else 0]:
         held += _partnered(search, leader, candidates)
-    waiting = [e for e in sorted(held, key=_ranked) if e.hypothesis.name not in found]
+    waiting = [e for e in sorted(held, key=lambda e: e.rank) if e.hypothesis.name not in found]
     for entry in waiting[: RELEASED - len(singles[:1])]:
         if free(entry):
             break
     return list(found.values())
-
-
-def _ranked(entry: Entry) -> float:
-    """Return what a hypothesis leaves while held, and what its effects cost."""
-    return entry.reduced + DEARER * len(entry.hypothesis.effects)
 
 
 def _partnered(search: Search, leader: Entry, candidates: Sequence[Effect]) -> list[Entry]:
@@ -73,23 +65,24 @@ def _partnered(search: Search, leader: Entry, candidates: Sequence[Effect]) -> l
     left = [e for e in candidates if e.reported not in reported and not e.settings]
     around = search.follower.around(leader.hypothesis, leader.values, search.noise)
     scored = scores(search.registry, around.problem.experiment, around, left, present=effects)
-    promising = [*scored[:PARTNERS], *(s for s in scored[PARTNERS:] if _unseen(s.effect))]
+    promising = [*scored[:PARTNERS], *(s for s in scored[PARTNERS:] if unseen(s.effect))]
+    wider = [(h, search.own_values(h, s.values)) for s in promising for h in (Hypothesis((*effects, s.effect)),)]
+    built = [e for e in candidates if e.settings and e.reported not in reported]
     found = []
-    for score in promising:
-        hypothesis = Hypothesis((*effects, score.effect))
+    for hypothesis, own in [*wider, *((Hypothesis((e, *effects)), {}) for e in built)]:
         if hypothesis.name not in search.held and not search.spent():
-            own = {} if _unseen(score.effect) else search.own_values(hypothesis, score.values)
-            found.append(_entry(search, hypothesis, around.values | own, own, LOOSE_ONLY))
-    for built in (e for e in candidates if e.settings and e.reported not in reported):
-        hypothesis = Hypothesis((built, *effects))
-        if hypothesis.name not in search.held and not search.spent():
-            found.append(_entry(search, hypothesis, around.values, {}, LOOSE_ONLY))
+            found.append(_entry(search, hypothesis, around.values | _expected(hypothesis, own)))
     return found
 
 
-def _unseen(effect: Effect) -> bool:
+def unseen(effect: Effect) -> bool:
     """Return whether nothing is expected of an effect by its score while held: it is built in, or in the gauge that holds."""
     return bool(effect.settings or effect.observed)
+
+
+def _expected(hypothesis: Hypothesis, own: Mapping[str, float]) -> dict[str, float]:
+    """Return what a score expects of the last effect's parameters, nothing where it sees none."""
+    return {} if unseen(hypothesis.effects[-1]) else dict(own)
 
 
 def _led(search: Search, entry: Entry) -> Entry:
@@ -107,18 +100,16 @@ def _led(search: Search, entry: Entry) -> Entry:
         if best.reduced < CLEAR or search.spent():
             break
         at = {name: float(a * (b / a) ** share if a > 0 else a + share * (b - a)) for name, a, b in bounds}
-        best = min(best, _entry(search, entry.hypothesis, at, entry.own, LOOSE_ONLY), key=lambda e: e.reduced)
+        best = min(best, _entry(search, entry.hypothesis, at), key=lambda e: e.reduced)
     return best
 
 
-def _entry(
-    search: Search, hypothesis: Hypothesis, at: Mapping[str, float], own: Mapping[str, float], way: Sequence[float]
-) -> Entry:
+def _entry(search: Search, hypothesis: Hypothesis, at: Mapping[str, float]) -> Entry:
     """Return a hypothesis fitted while held, from the values in `at`."""
-    theta, reduced = search.follower.led(hypothesis, at, search.noise, way)
+    theta, reduced = search.follower.led(hypothesis, at, search.noise, LOOSE_ONLY)
     problem = search.follower.problem(hypothesis, {})
     search.progress(f"{hypothesis.name}: rms over noise {np.sqrt(reduced):.3f}, held to the recording")
-    found = Entry(hypothesis, theta, problem.named(theta), dict(own), reduced)
+    found = Entry(hypothesis, theta, problem.named(theta), reduced)
     known = search.held.get(hypothesis.name)
     if known is None or reduced < known.reduced:
         search.held[hypothesis.name] = found

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from srfcli.diagnosis.candidates import Hypothesis, own_parameters
 from srfcli.diagnosis.columns import along_table
-from srfcli.diagnosis.follower import LOOSE, LOOSE_ONLY, PULLS, ROUND
+from srfcli.diagnosis.follower import LOOSE, LOOSE_ONLY, PULLS, ROUND, same
 from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.score import scores
 from srfcli.inference.latent import LatentFit, Roughness, Tracks, fit_latent, tracks_for
@@ -41,17 +41,17 @@ def elsewhere(search: Search, refit: Refit) -> Refit:
     if not refit.rough:
         own = [long for e in refit.hypothesis.effects for long in own_parameters(e, refit.fit.problem.model)]
         tries.insert(0, ({long: values[long] for long in own if long in values}, PULLS[1]))
+    seen: list[float] = []
     for at, way in tries:
         if search.spent():
             break
         if refit.rough:
             point = refit.fit.point
-            shared = len(point.tracks.splines) == 1 < len(point.tracks.of)
             fitted: LatentFit | None = on_a_rough_track(
-                search, refit.hypothesis, at, shared=shared, roughness=point.roughness
+                search, refit.hypothesis, at, shared=point.tracks.shared, roughness=point.roughness
             )
         else:
-            fitted = _smooth(search, refit, at, way)
+            fitted = _smooth(search, refit, at, way, seen)
         if fitted is not None:
             refit = search.keep(refit.hypothesis, fitted, rough=refit.rough)
         if refit.adequacy.fine:
@@ -74,8 +74,15 @@ def other_starts(search: Search, refit: Refit) -> list[dict[str, float]]:
     return [start for start in starts if start]
 
 
-def _smooth(search: Search, refit: Refit, at: dict[str, float], way: Sequence[float]) -> LatentFit | None:
-    led = search.follower.follow(refit.hypothesis, at, search.noise, [way])
+def _smooth(
+    search: Search, refit: Refit, at: dict[str, float], way: Sequence[float], seen: list[float]
+) -> LatentFit | None:
+    """Return the fit from where a hold leads, None where it is lost or leads to a place that was `seen`."""
+    theta, reduced = search.follower.led(refit.hypothesis, at, search.noise, way)
+    if any(same(reduced, known) for known in seen):
+        return None
+    seen.append(reduced)
+    led = search.follower.released(refit.hypothesis, theta, reduced, search.noise)
     if led.lost:
         return None
     return fit_latent(refit.fit.problem, led.theta, search.noise, tracks=Tracks((), {}), known_noise=True)

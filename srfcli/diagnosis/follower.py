@@ -163,7 +163,7 @@ def shortened(hypothesis: Hypothesis, problem: Problem, noise: Mapping[str, Nois
         squares = 0.0
         for run in problem.runs:
             r = (run.observed - problem.predicted(run, theta, slopes=False).y)[run.used] / noise[run.name].level
-            squares += float(np.sum(np.where(np.isfinite(r), r, 1e6) ** 2))
+            squares += float(np.sum(np.clip(np.nan_to_num(r, nan=1e6), -1e6, 1e6) ** 2))
         if squares < best[1]:
             best = (theta, squares)
     return best

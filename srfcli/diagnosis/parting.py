@@ -99,7 +99,7 @@ class Side:
         inverse = np.linalg.inv(point.tracks.root(point.roughness))
         whole = point.N.copy()
         whole[n:, n:] += inverse.T @ inverse
-        if len(point.tracks.splines) == 1 and len(problem.runs) > 1:
+        if point.tracks.shared:
             return cls(refit, latent, whole, True)
         own = whole[:n, :n] - whole[:n, n:] @ np.linalg.solve(whole[n:, n:], whole[n:, :n])
         return cls(refit, latent, own, False)

@@ -11,7 +11,8 @@ from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.inference.latent import LatentFit
 from srfcli.numerics.collocation import Array
 
-NEAR = 3.5  # residual over noise within which slopes at the fit tell where a better one is
+DEARER = 0.004  # of chi-squared per degree of freedom while held, what a further effect has to take away
+NEAR = 2.5  # residual over noise within which slopes at the fit tell where a better one is
 
 
 @dataclass(frozen=True)
@@ -32,13 +33,22 @@ class Refit:
 
 @dataclass(frozen=True)
 class Entry:
-    """A hypothesis while held: parameters (k,), also by name, those a score expected, chi-squared per degree of freedom."""
+    """A hypothesis while held: parameters (k,), also by name, chi-squared per degree of freedom."""
 
     hypothesis: Hypothesis
     theta: Array
     values: dict[str, float]
-    own: dict[str, float]
     reduced: float
+
+    @property
+    def single(self) -> bool:
+        """Return whether it adds one effect."""
+        return len(self.hypothesis.effects) == 1
+
+    @property
+    def rank(self) -> float:
+        """Return what it leaves, and what its effects cost."""
+        return self.reduced + DEARER * len(self.hypothesis.effects)
 
 
 def freedom_spent(fitted: LatentFit) -> dict[str, float]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.columns import along_table
-from srfcli.diagnosis.contest import DEARER, contest
+from srfcli.diagnosis.contest import contest, unseen
 from srfcli.diagnosis.elsewhere import elsewhere, on_a_rough_track
 from srfcli.diagnosis.follower import LOOSE_ONLY, Followed, shortened
 from srfcli.diagnosis.ledger import Ledger
@@ -118,11 +118,12 @@ class Search(Ledger):
         if baseline.adequacy.fine and not (first and first[0].gain > WORTH):
             return
         near = baseline.adequacy.rms_over_noise < NEAR
+        if near and self.contested(baseline, candidates):
+            return
         self.widen(baseline, candidates, FIRST if near else SINGLES, rough=False)
         if (
             self.settled(candidates)
             or (near and self.halved(baseline) and (self.paired(candidates) or self.together(baseline, candidates)))
-            or (near and self.contested(baseline, candidates))
             or (near and self.on_a_rough_track(baseline, candidates))
             or (not near and self.held_on_rough_tracks(candidates))
             or self.paired(candidates)
@@ -168,21 +169,19 @@ class Search(Ledger):
 
     def contested(self, baseline: Refit, candidates: Sequence[Effect]) -> bool:
         """Return whether effects that are chosen while held leave noise alone: a free fit that is near may be false."""
-        if baseline.adequacy.rms_over_noise < HALFWAY or self.best().rough:
+        if baseline.adequacy.rms_over_noise < HALFWAY:
             return False
         around = self.tangent(self.loosely(baseline))
         scored = scores(self.registry, around.problem.experiment, around, candidates)
-        first = scored[:SINGLES]
-        unseen = [s for s in scored[SINGLES:] if s.effect.settings or s.effect.observed]
-        contest(self, baseline, self.widened(baseline, [*unseen, *first]), candidates)
-        return self.roughened(candidates)
+        entrants = [*(s for s in scored[SINGLES:] if unseen(s.effect)), *scored[:SINGLES]]
+        contest(self, baseline, self.widened(baseline, entrants), candidates)
+        return self.roughened(candidates) if self.best().adequacy.rms_over_noise < HALFWAY else False
 
     def held_on_rough_tracks(self, candidates: Sequence[Effect]) -> bool:
         """Return whether one of those that leave least while held leaves noise alone on a rough track."""
         if self.best().adequacy.rms_over_noise < NEAR:
             return self.shaken(candidates)
-        foremost = sorted(self.held.values(), key=lambda e: e.reduced + DEARER * len(e.hypothesis.effects))
-        for entry in [e for e in foremost if len(e.hypothesis.effects) == 1][:ROUGHENED]:
+        for entry in sorted((e for e in self.held.values() if e.single), key=lambda e: e.rank)[:ROUGHENED]:
             if not self.untried(entry.hypothesis, rough=True):
                 continue
             found = self.keep(
@@ -190,20 +189,19 @@ class Search(Ledger):
                 on_a_rough_track(self, entry.hypothesis, entry.values, shared=False), rough=True,
             )  # fmt: skip
             if found.adequacy.rms_over_noise < NEAR and self.shared is None:
-                found = self.on_one_track(found)
+                found = self.on_one_track(entry.hypothesis, found.fit)
             if found.adequacy.fine:
                 break
         return self.settled(candidates)
 
-    def on_one_track(self, refit: Refit) -> Refit:
-        """Return a hypothesis on one rough track for all runs, where that does better than one for each."""
-        tracks = tracks_for(refit.fit.problem.runs, shared=True)
+    def on_one_track(self, hypothesis: Hypothesis, many: LatentFit) -> Refit:
+        """Return a hypothesis on one rough track for all runs, found from where many stand, or on many if that is better."""
+        tracks = tracks_for(many.problem.runs, shared=True)
         fitted = fit_latent(
-            refit.fit.problem, refit.fit.point.theta, self.noise, tracks=tracks, roughness=refit.fit.point.roughness,
-            known_noise=True,
-        )  # fmt: skip
-        found = self.keep(refit.hypothesis, fitted, rough=True)
-        self.shared = found.fit is fitted
+            many.problem, many.point.theta, self.noise, tracks=tracks, roughness=many.point.roughness, known_noise=True
+        )
+        found = self.keep(hypothesis, fitted, rough=True)
+        self.shared = found.fit.point.tracks.shared
         return found
 
     def shaken(self, candidates: Sequence[Effect], *, rough: bool = False) -> bool:
@@ -284,7 +282,7 @@ class Search(Ledger):
         promising = [s for s in scored if s.gain > max(least, FAINTER * scored[0].gain)][:most]
         far = not (rough or refit.adequacy.rms_over_noise < NEAR)
         if not refit.adequacy.fine:  # a mass or an interface that is not there has no first order worth the name
-            built = [s for s in scored if s.effect.settings or (far and s.effect.observed)]
+            built = [s for s in scored if (unseen(s.effect) if far else s.effect.settings)]
             promising = [*built, *(s for s in promising if s not in built)]
         if far:
             contest(self, refit, self.widened(refit, promising), candidates)
@@ -363,17 +361,10 @@ class Search(Ledger):
                 known_noise=True,
             )  # fmt: skip
             return self.keep(hypothesis, fitted, rough=True)
-        roughness = None
-        for shared in (False, True) if self.shared is None else (self.shared,):
-            tracks = tracks_for(problem.runs, shared=shared)
-            fitted = fit_latent(problem, theta, self.noise, tracks=tracks, roughness=roughness, known_noise=True)
-            theta, roughness = (
-                fitted.point.theta,
-                fitted.point.roughness,
-            )  # one track for all is found from where many stand
-            if self.keep(hypothesis, fitted, rough=True).fit is fitted:
-                self.shared = shared
-        return self.tried[hypothesis.name, True]
+        tracks = tracks_for(problem.runs, shared=bool(self.shared))
+        fitted = fit_latent(problem, theta, self.noise, tracks=tracks, known_noise=True)
+        found = self.keep(hypothesis, fitted, rough=True)
+        return found if self.shared is not None else self.on_one_track(hypothesis, fitted)
 
     def loosely(self, refit: Refit) -> LatentFit:
         """Return a hypothesis' fit under a loose hold: where it does not follow the recording, slopes mean something there."""

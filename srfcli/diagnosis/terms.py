@@ -87,7 +87,8 @@ def _with_own_terms(search: Search) -> Search:
     """Return a search that knows the terms, and all that the one before has fitted."""
     return replace(
         search, registry=with_terms(search.registry), effects=None, tried=dict(search.tried), scored={}, excluded=[],
-        followed=dict(search.followed), loose=dict(search.loose), noise=dict(search.noise), evaluations=0,
+        followed=dict(search.followed), held=dict(search.held), loose=dict(search.loose), noise=dict(search.noise),
+        stale=set(), evaluations=0,
     )  # fmt: skip
 
 

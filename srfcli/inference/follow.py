@@ -27,10 +27,7 @@ from srfcli.units import split_quantity, to_base
 DENSE = 1.0  # samples from knot to knot: a slip between two samples leaves its mark for the whole of the next cycle
 FIRM = 0.03  # of the load: the force of the second spring over one length
 WIDEST, AGREE = 33, 2.0  # samples of the longest parabola, and standard deviations within which two of them agree
-FAST, BESIDE = (
-    8.0,
-    4,
-)  # noise levels from one sample to the next that are a slip, and samples beside it that tell nothing
+FAST, BESIDE = 8.0, 4  # noise levels from one sample to the next that are a slip, samples beside it that tell nothing
 STIFF = 1e-4  # weight of second differences, against a sample's 1: they bridge what was not recorded
 
 

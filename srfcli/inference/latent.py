@@ -70,6 +70,11 @@ class Tracks:
             self.of,
         )
 
+    @property
+    def shared(self) -> bool:
+        """Return whether several runs slid on one track."""
+        return len(self.splines) == 1 < len(self.of)
+
     def columns(self, run: Run) -> range:
         """Return the places of a run's numbers among all."""
         before = sum(s.numbers.size for s in self.splines[: self.of[run.name]])
