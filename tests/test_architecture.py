@@ -66,7 +66,7 @@ MAY: dict[str, set[str]] = {
     "output": LAWS | {"output"},
     "parallel": BASE | {"output"},
     "trial": BASE | {"registry", "recording", "diagnosis", "model", "output", "parallel", "proof"},
-    "proof": {"errors", "output"},  # shares no equation and no integrator with what it is to prove
+    "proof": {"errors", "output", "parallel"},  # shares no equation and no integrator with what it is to prove
 }
 HEAVY = {"sympy", "scipy", "numpy", "matplotlib", "pint", "numba"}
 FORBIDDEN = {

@@ -89,6 +89,46 @@ def test_no_worker_is_left_behind():
     assert multiprocessing.active_children() == []
 
 
+def endless(folder):
+    """Leave the process's number in the folder, then compute until killed."""
+    Path(folder, str(os.getpid())).touch()
+    while True:
+        pass
+
+
+def running(number):
+    """Return whether a process computes still; one that only waits to be fetched does not."""
+    state = Path(f"/proc/{number}/stat")
+    return state.exists() and state.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc to see processes in")
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    code = f"import test_parallel as t; list(t.run_processes(t.endless, [{str(tmp_path)!r}] * 2, workers=2))"
+    parent = subprocess.Popen([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"})
+    try:
+        assert eventually(lambda: len(list(tmp_path.iterdir())) == 2)
+    finally:
+        parent.kill()
+        parent.wait()
+    numbers = [path.name for path in tmp_path.iterdir()]
+    try:
+        assert eventually(lambda: not any(map(running, numbers)))
+    finally:
+        for number in filter(running, numbers):
+            os.kill(int(number), signal.SIGKILL)
+
+
+def eventually(condition, patience=60.0):
+    """Return whether the condition comes true before patience, in s, is out."""
+    end = time.monotonic() + patience
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.05)
+    return False
+
+
 def test_a_store_gives_back_what_it_kept(tmp_path):
     calls = []
 

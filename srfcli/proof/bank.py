@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import cycle, islice
 from pathlib import Path
@@ -13,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from srfcli.errors import SrfError, did_you_mean
+from srfcli.parallel.pool import run_here, run_processes
 from srfcli.proof.case import Truth, make_case
 from srfcli.proof.draw import KINDS, SHARES
 from srfcli.proof.effects import NAMES, OUTSIDE_NAMES
@@ -58,7 +56,7 @@ def make_bank(
         for i, names in enumerate(plan_bank(n, seed, kinds=kinds))
     ]
     truths: dict[str, Truth] = {}
-    for name, truth in _made(tasks, workers):
+    for _, (name, truth) in run_here(_make, tasks) if workers <= 1 else run_processes(_make, tasks, workers=workers):
         truths[name] = truth
         if told:
             told(len(truths), n)
@@ -98,22 +96,3 @@ Task = tuple[Path, tuple[int, int], tuple[str, ...], bool]
 def _make(task: Task) -> tuple[str, Truth]:
     folder, seed, names, strengths = task
     return folder.name, make_case(folder, seed, effects=names, strengths=strengths)
-
-
-def _made(tasks: list[Task], workers: int) -> Iterator[tuple[str, Truth]]:
-    """Yield name and truth of every case, as it is done."""
-    if workers <= 1:
-        yield from map(_make, tasks)
-        return
-    context, deaf = (
-        multiprocessing.get_context("spawn"),
-        (signal.SIGINT, signal.SIG_IGN),
-    )  # the parent decides what Ctrl-C means
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=signal.signal, initargs=deaf) as pool:
-        waiting = [pool.submit(_make, task) for task in tasks]
-        try:
-            for done in as_completed(waiting):
-                yield done.result()
-        finally:
-            for task in waiting:
-                task.cancel()
