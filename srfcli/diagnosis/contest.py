@@ -9,7 +9,7 @@ import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.follower import CLEAR, LOOSE_ONLY
-from srfcli.diagnosis.refits import Entry, Refit
+from srfcli.diagnosis.refits import HALFWAY, Entry, Refit
 from srfcli.diagnosis.score import scores
 from srfcli.inference.latent import STEPS, Tracks, fit_latent
 from srfcli.laws import Effect
@@ -37,8 +37,11 @@ def contest(
     around, held, found = search.loosely(refit).values, list[Entry](), dict[str, Refit]()
 
     def free(entry: Entry) -> bool:
-        found[entry.hypothesis.name] = _released(search, entry)
-        return found[entry.hypothesis.name].adequacy.fine
+        refit = found[entry.hypothesis.name] = _released(search, entry)
+        halfway = not refit.adequacy.fine and refit.adequacy.rms_over_noise < HALFWAY
+        if halfway and search.best() is refit and search.untried(entry.hypothesis, rough=True):
+            refit = search.refit(entry.hypothesis, refit, {}, rough=True)
+        return refit.adequacy.fine
 
     for hypothesis, own in entrants:
         if hypothesis.name in search.held or search.spent():

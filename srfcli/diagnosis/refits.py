@@ -12,6 +12,7 @@ from srfcli.inference.latent import LatentFit
 from srfcli.numerics.collocation import Array
 
 DEARER = 0.004  # of chi-squared per degree of freedom while held, what a further effect has to take away
+HALFWAY = 1.25  # residual over noise within which a rough track may be what is left
 NEAR = 2.5  # residual over noise within which slopes at the fit tell where a better one is
 
 

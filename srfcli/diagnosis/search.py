@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.contest import contest, unseen
 from srfcli.diagnosis.elsewhere import elsewhere, on_a_rough_track
 from srfcli.diagnosis.follower import LOOSE_ONLY, Followed, shortened
 from srfcli.diagnosis.ledger import Ledger
-from srfcli.diagnosis.refits import NEAR, Entry, Refit
+from srfcli.diagnosis.refits import HALFWAY, NEAR, Entry, Refit
 from srfcli.diagnosis.score import Score, pair_scores, scores
 from srfcli.inference.latent import STEPS, LatentFit, Tracks, fit_latent, tracks_for
 from srfcli.laws import Effect
@@ -20,7 +22,6 @@ WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns ar
 CLOSE = 6.0  # hypotheses within so much of the best may be it
 RIVAL = 30.0  # short of the best score's gain: where the best leaves noise alone, less is not refitted
 RIVAL_SHARE = 0.05  # the same as a part of that gain
-HALFWAY = 1.25  # the same within which a rough track may be what is left
 HALF = 0.5  # of a misfit, that one effect takes away before two are tried ahead of a rough track
 ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
@@ -46,6 +47,7 @@ class Search(Ledger):
         """Return everything that was fitted, best evidence first."""
         candidates, self.excluded = applicable(self.registry, self.experiment, self.effects)
         self.look(candidates)
+        self.alike_on_rough_tracks(candidates)
         self.doubt(candidates)
         self.rebase()
         for key in [k for k in self.stale if k[0] == Hypothesis().name]:
@@ -64,6 +66,21 @@ class Search(Ledger):
             if known.adequacy.rms_over_noise < within:
                 found = self.refit(known.hypothesis, known, {}, rough=True)
                 if found.evidence > best.evidence:
+                    self.widen(found, candidates, PAIRS, rough=True)
+
+    def alike_on_rough_tracks(self, candidates: Sequence[Effect]) -> None:
+        """Fit on rough tracks, where the best is on one, those too that it led on a smooth one by less than it gained."""
+        best = self.best()
+        if not best.rough or not best.hypothesis.effects:
+            return
+        smooth = self.tried.get((best.name, False))
+        worst = smooth.evidence - (best.evidence - smooth.evidence) if smooth else -np.inf
+        others = [r for r in self.ranked() if not r.rough and r.hypothesis.effects and r.evidence > worst]
+        for other in [r for r in others if r.adequacy.rms_over_noise < HALFWAY][:ROUGHENED]:
+            if self.untried(other.hypothesis, rough=True):
+                self.shared = None  # another model asks that anew
+                found = self.refit(other.hypothesis, other, {}, rough=True)
+                if self.best() is found:
                     self.widen(found, candidates, PAIRS, rough=True)
 
     def fitted(self, hypothesis: Hypothesis, best: Refit) -> Refit:
