@@ -151,3 +151,48 @@ def test_a_lost_fit_on_a_rough_track_has_no_evidence_beyond_its_likelihood(searc
     smooth = search.problem(Hypothesis())
     near = fit_latent(smooth, smooth.start, search.noise, tracks=Tracks((), {}), known_noise=True)
     assert near.log_likelihood > lost.log_likelihood
+
+
+@pytest.mark.parametrize(
+    ("rival", "left", "asked"),
+    [(880.0, 1.05, True), (790.0, 1.05, False), (880.0, 1.5, False)],
+    ids=["led by less than the track gained", "led by more", "left too much"],
+)
+def test_what_a_rough_track_gives_one_it_may_give_its_rival(search, monkeypatch, rival, left, asked):
+    """Of two effects alike on a smooth track one is not named because it alone was tried on a rough one."""
+    base, (one, other) = search.tried["none", False], [Hypothesis((e,)) for e in effects(*PAIR)]
+    faint = replace(base.adequacy, rms_over_noise=left, p_value=0.0)
+    smooth = {
+        h.name: replace(base, hypothesis=h, evidence=value, adequacy=faint)
+        for h, value in ((one, 900.0), (other, rival))
+    }
+    rough = replace(smooth[one.name], evidence=1000.0, rough=True)
+    trial = Search(SHIPPED, search.experiment)
+    trial.tried = {(name, False): r for name, r in smooth.items()} | {(one.name, True): rough}
+    fitted = []
+
+    def refit(hypothesis, start, own, *, rough):
+        fitted.append((hypothesis.name, start, rough, trial.shared))
+        return replace(start, evidence=start.evidence + 50, rough=True)
+
+    trial.shared = True
+    monkeypatch.setattr(trial, "refit", refit)
+    trial.alike_on_rough_tracks([])
+    assert fitted == ([(other.name, smooth[other.name], True, None)] if asked else [])
+
+
+def test_a_leader_that_is_nearly_there_is_tried_on_a_rough_track_at_once(search, monkeypatch):
+    """What a smooth track leaves of the right effect is not given to a second one before a rough track was asked."""
+    from srfcli.diagnosis import contest as module
+
+    base, (one, _) = search.tried["none", False], [Hypothesis((e,)) for e in effects(*PAIR)]
+    near = replace(base, hypothesis=one, evidence=base.evidence + 1e6,
+                   adequacy=replace(base.adequacy, rms_over_noise=1.1, p_value=0.0))  # fmt: skip
+    fine = replace(near, rough=True, adequacy=replace(near.adequacy, rms_over_noise=1.0, p_value=0.5))
+    trial = Search(SHIPPED, search.experiment)
+    trial.tried, trial.noise, trial.loose = {(one.name, False): near}, search.noise, {base.name: base.fit}
+    monkeypatch.setattr(module, "_released", lambda *_: near)
+    monkeypatch.setattr(module, "_entry", lambda s, h, at: module.Entry(h, base.fit.point.theta, {}, 1.2))
+    monkeypatch.setattr(module, "_partnered", lambda *_: pytest.fail("a partner was tried first"))
+    monkeypatch.setattr(trial, "refit", lambda *_, **how: fine if how == {"rough": True} else near)
+    assert contest(trial, base, [(one, {})], effects(*PAIR)) == [near]
