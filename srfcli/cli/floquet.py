@@ -90,6 +90,11 @@ def _table(model: GeneratedModel, r: FloquetResult, parameters: dict[str, Any]) 
         modulus = abs(m)
         growth = float(np.log(modulus) * f) if modulus > 0 else None
         rows.append((i + 1, m.real, m.imag, modulus, float(np.angle(m)), growth, r.error))
+    intervals = len(r.orbit.edges) - 1
+    if not r.found:
+        notes: tuple[str, ...] = (f"no forced periodic state was found, on up to {intervals} intervals",)
+        meta: dict[str, Any] = {"stable": None, "intervals": intervals}
+        return Table("srf.floquet/1", columns, rows, model.title, notes, parameters, meta, r.status.value)
     meta = {
         "stable": r.stable,
         "mean_friction": r.mean_friction,
@@ -100,11 +105,11 @@ def _table(model: GeneratedModel, r: FloquetResult, parameters: dict[str, Any]) 
         "mu_harmonics": [
             {"k": k, "amplitude": abs(c), "phase": float(np.angle(c))} for k, c in enumerate(r.mu_harmonics)
         ],
-        "intervals": len(r.orbit.edges) - 1,
+        "intervals": intervals,
         "liouville": r.liouville,
     }
     notes = (
-        f"{'stable' if r.stable else 'unstable'}; error of the multipliers {r.error:.1g} on {meta['intervals']} intervals, "
+        f"{'stable' if r.stable else 'unstable'}; error of the multipliers {r.error:.1g} on {intervals} intervals, "
         f"product of the multipliers against exp(integrated trace) {_checked(r.liouville)}",
         f"mean friction {r.mean_friction:.8f}, shift from eps = 0 {r.friction_shift:+.8f}",
         "harmonics of u [um]: " + ", ".join(f"{k}: {abs(c):.4g}" for k, c in enumerate(r.u_harmonics)),
@@ -127,5 +132,6 @@ def _figure(model: GeneratedModel, r: FloquetResult) -> Figure:
     column = {name: waves.x[:, i] for i, name in enumerate(model.states)}
     ages = {name[3:]: np.exp(values) for name, values in column.items() if name.startswith("ln_") and name != "ln_v"}
     value = {n: r.p[model.index(n)] for n in ("V", "W0", "eps")}
-    title = f"V = {value['V']:g} µm/s, W$_0$ = {value['W0']:g} N, ε = {value['eps']:g}: {'stable' if r.stable else 'unstable'}"
+    verdict = ("stable" if r.stable else "unstable") if r.found else "not converged"
+    title = f"V = {value['V']:g} µm/s, W$_0$ = {value['W0']:g} N, ε = {value['eps']:g}: {verdict}"
     return plots.orbit(waves.tau, u=waves.u, v=np.exp(column["ln_v"]), states=ages, mu=waves.mu, W=waves.W, title=title)

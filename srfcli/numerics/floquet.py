@@ -22,6 +22,7 @@ from srfcli.numerics.scan import robust_orbits
 from srfcli.status import Status
 
 FIRST_MESH = 16
+PATIENT = 256  # intervals up to which a state that was not found is looked for on a finer mesh
 STIFF = 3.0
 RELIED_ON = 31.0  # an interval halved gains 2^8 in theory, 2^5 is relied on
 
@@ -45,6 +46,11 @@ class FloquetResult:
     u_harmonics: ComplexArray
     mu_harmonics: ComplexArray
     status: Status
+
+    @property
+    def found(self) -> bool:
+        """Return whether there is a state at all: Newton's method converged."""
+        return self.status is not Status.NO_CONVERGENCE
 
     @property
     def stable(self) -> bool:
@@ -72,6 +78,9 @@ def solve_floquet(
     """
     column = p[:, None]
     batch = robust_orbits(model, column, None, uniform_mesh(FIRST_MESH), tol=1e-10)
+    while not batch.converged[0] and 2 * (len(batch.orbit.edges) - 1) <= min(max_mesh, PATIENT):
+        edges = uniform_mesh(2 * (len(batch.orbit.edges) - 1))
+        batch = robust_orbits(model, column, None, edges, tol=1e-10)
     error = np.inf
     while batch.converged[0] and error > tol and 2 * (len(batch.orbit.edges) - 1) <= max_mesh:
         finer = interpolate(batch.orbit, uniform_mesh(2 * (len(batch.orbit.edges) - 1)))

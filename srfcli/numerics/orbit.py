@@ -41,6 +41,12 @@ class OrbitBatch:
         """Return the Floquet multipliers (..., n), largest modulus first; NaN where the orbit did not converge."""
         return ordered_eigenvalues(self.monodromy, self.converged)
 
+    def part(self, index: Array) -> OrbitBatch:
+        """Return the orbits that `index` selects."""
+        return OrbitBatch(
+            self.p[:, index], self.orbit.part(index), self.monodromy[index], self.converged[index], self.iterations
+        )
+
     def replace(self, index: Array, other: OrbitBatch) -> None:
         """Put the orbits of `other` in the place of those at `index`, whatever became of them."""
         self.orbit.x[index], self.orbit.stages[index] = other.orbit.x, other.orbit.stages

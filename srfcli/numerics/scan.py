@@ -16,6 +16,9 @@ from srfcli.numerics.orbit import OrbitBatch, forced_guess, interpolate, solve_o
 
 MESH_ERROR = 1e-5  # a hump of g lower than this cannot be told from none
 FINEST = 64
+FIRST_CLIMB, SMALLEST_CLIMB = 0.25, 2e-3  # steps in which eps is raised to its value, as shares of it
+CLIMBING = 12  # Newton steps at each
+ALMOST = 1 - 1e-12  # of eps
 
 
 @dataclass
@@ -60,13 +63,39 @@ def robust_orbits(
         _retry(model, batch, _scatter(batch.orbit, forced_guess(model, p[:, bad], edges), bad), tol)
     if not batch.converged.all():
         bad = np.nonzero(~batch.converged)[0]
-        i = model.index("eps")
-        ladder = steady_guess(model, p[:, bad], edges)
-        for fraction in (0.25, 0.5, 0.75, 1.0):
-            q = p[:, bad].copy()
-            q[i] *= fraction
-            ladder = solve_orbits(model, q, ladder, tol=tol).orbit
-        _retry(model, batch, _scatter(batch.orbit, ladder, bad), tol)
+        batch.replace(bad, climbed(model, p[:, bad], edges, tol=tol))
+    return batch
+
+
+def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7) -> OrbitBatch:
+    """Return orbits at `p` (n_parameters, B) by raising eps from 0, each in steps of its own that are halved where one fails."""
+    eps, B = model.index("eps"), p.shape[1]
+    calm = p.copy()
+    calm[eps] = 0.0
+    batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=tol)
+    slope_x, slope_stages = np.zeros_like(batch.orbit.x), np.zeros_like(batch.orbit.stages)
+    reached, step = np.zeros(B), np.full(B, FIRST_CLIMB)
+    going = batch.converged.copy()
+    while going.any():
+        at = np.nonzero(going)[0]
+        step[at] = np.minimum(step[at], 1.0 - reached[at])
+        q, ahead = p[:, at].copy(), step[at][:, None, None]
+        q[eps] *= reached[at] + step[at]
+        before = batch.orbit.part(at)
+        guess = Discretisation(
+            before.x + ahead * slope_x[at], before.stages + ahead[..., None] * slope_stages[at], edges
+        )
+        found = solve_orbits(model, q, guess, tol=tol, max_iterations=CLIMBING)
+        new, got, lost = np.nonzero(found.converged)[0], at[found.converged], at[~found.converged]
+        slope_x[got] = (found.orbit.x[new] - before.x[new]) / ahead[new]
+        slope_stages[got] = (found.orbit.stages[new] - before.stages[new]) / ahead[new][..., None]
+        batch.replace(got, found.part(new))
+        reached[got] += step[got]
+        step[got] *= 1.5
+        step[lost] /= 2
+        going = batch.converged & (reached < ALMOST) & (step > SMALLEST_CLIMB)
+    batch.p[:] = p
+    batch.converged &= reached >= ALMOST
     return batch
 
 
