@@ -1,4 +1,4 @@
-"""What the discovered physics does to the stability diagram: critical loads of both models under constant load."""
+"""What the discovered physics does to the stability diagram: critical loads of both models, under constant and modulated load."""
 
 from __future__ import annotations
 
@@ -9,47 +9,116 @@ from typing import Any
 import numpy as np
 
 from srfcli.errors import SrfError
-from srfcli.model import open_model
+from srfcli.expression import symbol
+from srfcli.laws import Effect
+from srfcli.model import GeneratedModel, open_model
+from srfcli.numerics.atlas import AtlasSettings, find_components
 from srfcli.numerics.collocation import Array
 from srfcli.numerics.hopf import critical_point
+from srfcli.numerics.plane import Axis, Plane
+from srfcli.numerics.windows import load_window
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
 
 VELOCITIES = 61
+CORNERS = 5  # velocities at which the loads without modulation say where boundaries are looked for
 BEYOND = 3.0  # times the slowest and fastest drive of the recordings: how far the diagram goes
+DRAWN = AtlasSettings(tol=1e-4, max_mesh=256)  # as good as a line in a figure
 
 
 def stability(
     registry: Registry, baseline: Experiment, at: Mapping[str, float], augmented: Experiment
 ) -> dict[str, Any]:
-    """Return V (um/s) and the critical loads (N, NaN where sliding is steady at any) of both models, and a note.
+    """Return V (um/s), the critical loads (N) of both models under constant load and under the strongest modulation, and a note.
 
-    `at` are the baseline's fitted parameters; the augmented experiment has its own. Effects of the apparatus change no critical
-    load under constant load but through the parameters that they had bent.
+    `at` are the baseline's fitted parameters; the augmented experiment has its own. Loads are NaN where sliding is steady at any;
+    boundaries under modulation have velocities of their own, NaN between components. Effects of the apparatus change diagrams by
+    the parameters that they had bent, and by how much of the modulation they let through.
     """
     driven = np.concatenate([np.abs(r.drive.velocities) for r in baseline.runs])
     driven = driven[driven > 0]
     if not driven.size:
         return {}
     V = np.geomspace(driven.min() / BEYOND, driven.max() * BEYOND, VELOCITIES)
+    after = {q.name: q.value for q in augmented.parameters}
+    strongest = max((r.modulation for r in baseline.runs if r.modulation), key=lambda m: m[1], default=None)
+    notes = ["Dotted: under constant load."] if strongest else ["Under constant load."]
+    found: dict[str, Any] = {"V": V}
     try:
-        before = _loads(registry, baseline, at, V)
-        after = _loads(registry, augmented, {q.name: q.value for q in augmented.parameters}, V)
+        for side, experiment, values in (("baseline", baseline, at), ("augmented", augmented, after)):
+            model, base = _model(registry, experiment, values)
+            found[f"W0_hopf_{side}"] = _loads(model, base, V)
+            if strongest:
+                share = _let_through(registry, experiment, values)
+                found |= _boundary(model, base, V, strongest[0], share * strongest[1], side, notes)
     except SrfError as error:
         return {"note": f"no stability diagram: {error.message}"}
-    left = augmented.choice.effects
-    note = "Under constant load. `srf critical` and `srf continue --eps` follow the boundary under modulation."
-    if left:
-        note += f" {', '.join(left)}: of the apparatus, not in the laws."
-    return {"V": V, "W0_hopf_baseline": before, "W0_hopf_augmented": after, "note": note}
+    if strongest:
+        notes.insert(
+            1,
+            f"Drawn through: under a load modulated by {strongest[1]:.3g} at {strongest[0]:g} Hz, the strongest here.",
+        )
+    notes.append("`srf continue --eps` and `srf map` follow the boundary at any other.")
+    if left := augmented.choice.effects:
+        notes.append(f"{', '.join(left)}: of the apparatus, not in the laws.")
+    return found | {"note": " ".join(notes)}
 
 
-def _loads(registry: Registry, experiment: Experiment, values: Mapping[str, float], V: Array) -> Array:
-    """Return the critical load at each velocity, NaN for none."""
+def _model(registry: Registry, experiment: Experiment, values: Mapping[str, float]) -> tuple[GeneratedModel, Array]:
+    """Return the laws' model without effects of the apparatus, and its parameters."""
     model = open_model(registry, **asdict(replace(experiment.choice, effects=())))
     own = {n: v for n, v in values.items() if n in model.names and n not in ("V", "W0", "K")}
     own["K"] = experiment.runs[0].stiffness
     if experiment.mass is not None and "M" in model.names:
         own["M"] = experiment.mass
-    found = [critical_point(model, model.vector({**own, "V": v, "W0": 1.0}))[0] for v in V.tolist()]
+    return model, model.vector({**own, "W0": 1.0, "eps": 0.0})
+
+
+def _loads(model: GeneratedModel, base: Array, V: Array) -> Array:
+    """Return the critical load under constant load at each velocity, NaN for none."""
+    found = [critical_point(model, _at(model, base, V=v))[0] for v in V.tolist()]
     return np.array([np.nan if point is None else point.W0 for point in found])
+
+
+def _at(model: GeneratedModel, base: Array, **values: float) -> Array:
+    p = base.copy()
+    for name, value in values.items():
+        p[model.index(name)] = value
+    return p
+
+
+def _let_through(registry: Registry, experiment: Experiment, values: Mapping[str, float]) -> float:
+    """Return the share of a modulation that effects of the apparatus let through, of first order."""
+    share = 1.0
+    for name in experiment.choice.effects:
+        effect = registry.get("effect", name)
+        assert isinstance(effect, Effect)
+        for slot, formula in effect.changes:
+            if slot == "W":
+                slope = formula.diff(symbol("W")).subs(symbol("modulated"), 1)
+                numbers = {symbol(q.name): values.get(q.name, q.default) for q in effect.parameters}
+                passed = slope.subs(numbers)
+                share *= float(passed) if passed.is_number else 1.0
+    return share
+
+
+def _boundary(
+    model: GeneratedModel, base: Array, V: Array, f: float, eps: float, side: str, notes: list[str]
+) -> dict[str, Array]:
+    """Return velocities and loads of the boundary under modulation, its components one after another, NaN between them."""
+    corners = [_at(model, base, V=v) for v in np.geomspace(V[0], V[-1], CORNERS)]
+    low, high = load_window(model, corners)
+    forced = _at(model, base, f=f, eps=eps, V=float(V[0]))
+    plane = Plane(forced, Axis("V", float(V[0]), float(V[-1])), Axis("W0", low, high))
+    *_, atlas = find_components(model, plane, DRAWN)
+    if not atlas.branches:
+        notes.append(f"No boundary of the {side} was found under modulation.")
+        return {}
+    lost = sum(scan.lost.size for scan in atlas.scans)
+    if lost:
+        notes.append(f"At {lost} points no forced state of the {side} was found: boundaries there may be missing.")
+    x, y = [], []
+    for branch in atlas.branches:
+        x += [*(q.value(model, "V") for q in branch.points), np.nan]
+        y += [*(q.value(model, "W0") for q in branch.points), np.nan]
+    return {f"V_{side}": np.array(x), f"W0_{side}": np.array(y)}

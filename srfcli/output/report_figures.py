@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 PIECES = 40  # in which a force is averaged along a quantity of state
 STATES = (("v", "slip velocity v  [µm/s]", True), ("phi", "age φ  [s]", True), ("W", "load W  [N]", False))
-WIDE = 10.0  # ratio from which a quantity of state has a logarithmic axis
+WIDE = 10.0  # ratio from which a quantity has a logarithmic axis
 
 
 def parameters_figure(parameters: Sequence[Mapping[str, Any]]) -> Figure | None:
@@ -149,6 +149,9 @@ def diagram_figure(diagram: Mapping[str, Any]) -> Figure | None:
             axis.plot(_gaps(V), _gaps(diagram[key]), color=colour, linestyle=dash, label=label)
         axis.set_xscale("log")
         axis.margins(x=0.0)
+        heights = np.concatenate([_gaps(diagram[c[0]]) for c in drawn])
+        if np.nanmax(heights) > WIDE * np.nanmin(heights) > 0:
+            axis.set_yscale("log")
         axis.set_xlabel("V  [µm/s]")
         axis.set_ylabel("critical load W$_0$  [N]")
         legend = axis.legend(

@@ -1,0 +1,82 @@
+"""The diagram at the end of a report: critical loads of both models, under constant load and under the recordings' modulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from srfcli.diagnosis.diagram import stability
+from srfcli.numerics.critical import critical_line
+from srfcli.output.report_figures import diagram_figure
+from srfcli.proof.folder import case_files
+from srfcli.proof.physics import Physics
+from srfcli.proof.protocol import Plan
+from srfcli.recording.experiment import read_experiment
+from srfcli.recording.values import FitParameter
+from srfcli.registry import bundled_registry
+
+SHIPPED = bundled_registry()
+PLANS = (
+    Plan("calm", ((1, 20), (1, 60)), 5.0, 0.01),
+    Plan("weak", ((2, 30),), 5.0, 0.002, eps=0.05, f=80.0),
+    Plan("strong", ((2, 40),), 5.0, 0.002, eps=0.2, f=110.0, holdout=True),
+)
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("diagram")
+    records = {p: np.full(p.times().size, 15.0) for p in PLANS}  # what was recorded does not matter here
+    for name, text in case_files("small", Physics(), records).items():
+        (folder / name).write_text(text)
+    return read_experiment(folder, registry=SHIPPED)
+
+
+@pytest.fixture(scope="module")
+def found(experiment):
+    """The diagram where half of the modulation is said to reach the asperities."""
+    rho = FitParameter("rho", 0.5, 0.0, 2.0, fixed=False, unit="1")
+    augmented = replace(
+        experiment,
+        choice=replace(experiment.choice, effects=("load-transmission",)),
+        parameters=(*experiment.parameters, rho),
+    )
+    return stability(SHIPPED, experiment, {q.name: q.value for q in experiment.parameters}, augmented)
+
+
+def crossings(found, side, V):
+    """Return the loads, rising, at which a side's boundary crosses a velocity."""
+    x, y = np.log(found[f"V_{side}"]), np.log(found[f"W0_{side}"])
+    across = (x[:-1] - np.log(V)) * (x[1:] - np.log(V)) <= 0
+    share = ((np.log(V) - x[:-1]) / (x[1:] - x[:-1]))[across]
+    return np.sort(np.exp(y[:-1][across] + share * (y[1:] - y[:-1])[across]))
+
+
+@pytest.mark.parametrize(("side", "eps"), [("baseline", 0.2), ("augmented", 0.1)])
+def test_the_boundary_is_that_at_the_modulation_that_reaches_the_asperities(experiment, make_model, found, side, eps):
+    model, V = make_model(), 37.0
+    values = {q.name: q.value for q in experiment.parameters if q.name in model.names}
+    K = experiment.runs[0].stiffness
+    line = critical_line(model, model.vector(values | {"V": V, "eps": eps, "f": 110.0, "K": K}), lo=2.0, hi=400.0)
+    loads = [q.value(model, "W0") for q in line.points]
+    assert loads and crossings(found, side, V) == pytest.approx(loads, rel=5e-3)
+
+
+def test_constant_load_is_beside_it_and_the_note_says_what_is_shown(found):
+    assert np.array_equal(found["W0_hopf_baseline"], found["W0_hopf_augmented"])  # same laws, same numbers
+    for word in ("0.2 at 110 Hz", "constant load", "load-transmission"):
+        assert word in found["note"]
+
+
+def test_without_a_modulated_run_it_is_under_constant_load(experiment):
+    calm = replace(experiment, runs=tuple(r for r in experiment.runs if r.modulation is None))
+    alone = stability(SHIPPED, calm, {q.name: q.value for q in calm.parameters}, calm)
+    assert "W0_baseline" not in alone and np.isfinite(alone["W0_hopf_baseline"]).all()
+    assert alone["note"].startswith("Under constant load.")
+
+
+def test_the_figure_shows_four_curves(found):
+    (axis,) = diagram_figure(found).axes
+    assert len(axis.lines) == 4 and axis.get_ylabel() == "critical load W$_0$  [N]"
