@@ -59,7 +59,7 @@ class Writer:
         lines += [f"    {line}" for line in self._unpack(used - set(tail), vectors, state)]
         lines += [f"    {s} = {self.text(e)}" for s, e in shared]
         like = [*head, *(["x[..., 0]"] if state else []), *tail, *(f"_{w}[..., 0]" for w in vectors)]
-        like += [] if state else ["*p"]
+        like += [] if state else ["*p[: len(PARAMETERS)]"]
         if len(outputs) == 1 and outputs[0][0] == "":
             value = self.printer.parenthesize(renamed(reduced[0]), 40)
             lines.append(f"    return _empty(({', '.join(like)},), ()) + {value}")

@@ -67,6 +67,7 @@ def _partnered(search: Search, leader: Entry, candidates: Sequence[Effect]) -> l
     reported = {e.reported for e in effects}
     left = [e for e in candidates if e.reported not in reported and not e.settings]
     around = search.follower.around(leader.hypothesis, leader.values, search.noise)
+    search.evaluations += around.evaluations
     scored = scores(search.registry, around.problem.experiment, around, left, present=effects)
     promising = [*scored[:PARTNERS], *(s for s in scored[PARTNERS:] if unseen(s.effect))]
     wider = [(h, search.own_values(h, s.values)) for s in promising for h in (Hypothesis((*effects, s.effect)),)]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from srfcli.diagnosis.candidates import Hypothesis, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.follower import LOOSE, LOOSE_ONLY, PULLS, ROUND, same
+from srfcli.diagnosis.ledger import ROUGH_COSTS
 from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.score import scores
 from srfcli.inference.latent import LatentFit, Roughness, Tracks, fit_latent, tracks_for
@@ -101,6 +102,8 @@ def on_a_rough_track(
     tracks = tracks_for(held.runs, shared=shared)
     led = fit_latent(
         held, held.start, search.noise, tracks=tracks, roughness=roughness, known_noise=True, rounds=ROUNDS, steps=STEPS,
-    ).point  # fmt: skip
-    free = search.problem(hypothesis, held.named(led.theta), rough=True)
-    return fit_latent(free, free.start, search.noise, tracks=led.tracks, roughness=led.roughness, known_noise=True)
+    )  # fmt: skip
+    search.evaluations += led.evaluations * ROUGH_COSTS
+    point = led.point
+    free = search.problem(hypothesis, held.named(point.theta), rough=True)
+    return fit_latent(free, free.start, search.noise, tracks=point.tracks, roughness=point.roughness, known_noise=True)
