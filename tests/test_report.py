@@ -389,6 +389,8 @@ def test_the_atlas_is_read_in_both_forms() -> None:
     assert [s.sure for s in found] == [True, False, True, False]
     assert [s.axis for s in foremost(found, each=1)] == ["v", "frequency"]
     assert [s.height for s in spots([{"axis": "a", "bin": "b", "statistic": -4.0}])] == [4.0]
+    (edge,) = spots([{"axis": "dlnW/dt", "low": -4.5e-15, "high": 35.8, "statistic": 1.0}])
+    assert edge.place.startswith("0 to 35.8")  # an end that rounding alone keeps from zero
 
 
 def test_command_lines_are_quoted_and_name_the_laws_that_there_are() -> None:

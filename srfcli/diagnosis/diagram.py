@@ -58,7 +58,7 @@ def stability(
             1,
             f"Drawn through: under a load modulated by {strongest[1]:.3g} at {strongest[0]:g} Hz, the strongest here.",
         )
-    notes.append("`srf continue --eps` and `srf map` follow the boundary at any other.")
+    notes.append("srf continue --eps and srf map follow the boundary at any other.")
     if left := augmented.choice.effects:
         notes.append(f"{', '.join(left)}: of the apparatus, not in the laws.")
     return found | {"note": " ".join(notes)}

@@ -40,6 +40,7 @@ AXES: dict[str, tuple[str, str]] = {
     "position": ("place on the track", "µm"),
     "slip": ("slip", "µm"),
 }
+ROUNDING = 1e-9  # of an interval's other end: an end below is zero
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,9 @@ class Spot:
         tail = f"{NARROW}{unit}" if unit else ""
         if self.axis == "frequency" or self.low == self.high:
             return f"{number(0.5 * (self.low + self.high))}{tail}"
-        return f"{number(self.low)} to {number(self.high)}{tail}"
+        least = ROUNDING * max(abs(self.low), abs(self.high))
+        low, high = (0.0 if abs(end) < least else end for end in (self.low, self.high))
+        return f"{number(low)} to {number(high)}{tail}"
 
 
 def spots(rows: Sequence[Mapping[str, Any]]) -> list[Spot]:
