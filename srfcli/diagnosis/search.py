@@ -50,6 +50,7 @@ class Search(Ledger):
         self.alike_on_rough_tracks(candidates)
         self.doubt(candidates)
         self.rebase()
+        self.paired_on_smooth_tracks(candidates)
         for key in [k for k in self.stale if k[0] == Hypothesis().name]:
             self.score(self.tried[key], candidates)
         return self.ranked()
@@ -82,6 +83,16 @@ class Search(Ledger):
                 found = self.refit(other.hypothesis, other, {}, rough=True)
                 if self.best() is found:
                     self.widen(found, candidates, PAIRS, rough=True)
+
+    def paired_on_smooth_tracks(self, candidates: Sequence[Effect]) -> None:
+        """Fit, where the best is one effect on a rough track, that one with others on a smooth one: a track hides them."""
+        best = self.best()
+        if best.rough and len(best.hypothesis.effects) == 1:
+            smooth = self.tried.get((best.name, False)) or self.fitted(best.hypothesis, best)
+            if smooth.adequacy.rms_over_noise < NEAR:
+                self.widen(smooth, candidates, PAIRS, rough=False)
+        if self.best() is not best:
+            self.rebase()
 
     def fitted(self, hypothesis: Hypothesis, best: Refit) -> Refit:
         """Fit a hypothesis on a smooth track from where a larger one stands."""
@@ -201,10 +212,8 @@ class Search(Ledger):
         for entry in sorted((e for e in self.held.values() if e.single), key=lambda e: e.rank)[:ROUGHENED]:
             if not self.untried(entry.hypothesis, rough=True):
                 continue
-            found = self.keep(
-                entry.hypothesis,
-                on_a_rough_track(self, entry.hypothesis, entry.values, shared=False), rough=True,
-            )  # fmt: skip
+            fitted = on_a_rough_track(self, entry.hypothesis, entry.values, shared=False)
+            found = self.keep(entry.hypothesis, fitted, rough=True)
             if found.adequacy.rms_over_noise < NEAR and self.shared is None:
                 found = self.on_one_track(entry.hypothesis, found.fit)
             if found.adequacy.fine:
@@ -231,12 +240,8 @@ class Search(Ledger):
     def roughened(self, candidates: Sequence[Effect]) -> bool:
         """Return whether the best so far leaves noise alone once its track may be rough."""
         best = self.best()
-        if (
-            not best.adequacy.fine
-            and not best.rough
-            and best.hypothesis.effects
-            and best.adequacy.rms_over_noise < NEAR
-        ):
+        asked = best.hypothesis.effects and not best.rough and not best.adequacy.fine
+        if asked and best.adequacy.rms_over_noise < NEAR:
             self.refit(best.hypothesis, best, {}, rough=True)
         return self.settled(candidates)
 
