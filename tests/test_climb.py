@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
 from srfcli.cli.main import cli
+from srfcli.numerics.collocation import mesh_error
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.floquet import solve_floquet
 from srfcli.numerics.orbit import forced_guess, solve_orbits, uniform_mesh
@@ -74,9 +75,16 @@ def test_states_are_found_that_no_first_guess_leads_to(rigid):
     speeds, loads = np.meshgrid(np.geomspace(1, 30, 8), np.geomspace(3, 300, 12), indexing="ij")
     p = np.repeat(rigid.vector({"eps": EPS})[:, None], speeds.size, axis=1)
     p[rigid.index("V")], p[rigid.index("W0")] = speeds.ravel(), loads.ravel()
-    edges = uniform_mesh(24)
+    edges = uniform_mesh(64)
     assert solve_orbits(rigid, p, forced_guess(rigid, p, edges)).converged.mean() < 0.2
-    assert robust_orbits(rigid, p, None, edges).converged.all()
+    assert robust_orbits(rigid, p, None, edges).converged.mean() > 0.95
+
+
+def test_a_state_on_a_mesh_that_is_too_coarse_is_not_taken(rigid):
+    p = np.repeat(rigid.vector({"V": 1.0, "W0": 21.0, "eps": 0.6})[:, None], 2, axis=1)
+    assert not climbed(rigid, p, uniform_mesh(24)).converged.any()
+    found = climbed(rigid, p, uniform_mesh(256))
+    assert found.converged.all() and (mesh_error(rigid, found.orbit) < 0.1).all()
 
 
 def test_climbing_leads_where_a_good_guess_does(model):

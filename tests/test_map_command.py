@@ -78,7 +78,7 @@ def test_equal_runs_give_equal_figures(tmp_path):
 
 def test_points_without_an_orbit_end_with_exit_code_3():
     code, out, err = run(
-        *("map", "--interface", "rigid", "--eps", "0.6", "--over", "V=1:2:2", "--over", "K/W0=0.01:0.011:2"), "--csv"
+        *("map", "--interface", "rigid", "--eps", "0.9", "--over", "V=1:2:2", "--over", "K/W0=0.01:0.011:2"), "--csv"
     )
     assert code == 3
     assert "unresolved" in out and "no forced periodic state was found" in err

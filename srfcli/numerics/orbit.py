@@ -215,8 +215,8 @@ def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: fl
             limit = step_limit(model, dx, dstages)
             change = (np.abs(dx) / size[active][:, None, :]).max(axis=(-1, -2))
         limit = np.where(finite, limit, 0.0)
-        x[active] += np.where(finite[:, None, None], limit[:, None, None] * dx, 0.0)
-        stages[active] += np.where(finite[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
+        x[active] += limit[:, None, None] * np.where(finite[:, None, None], dx, 0.0)
+        stages[active] += limit[:, None, None, None] * np.where(finite[:, None, None, None], dstages, 0.0)
         monodromy[active] = linear.monodromy
         done = finite & (change < tol)
         converged[active[done]] = True

@@ -19,6 +19,7 @@ FINEST = 64
 FIRST_CLIMB, SMALLEST_CLIMB = 0.25, 2e-3  # steps in which eps is raised to its value, as shares of it
 CLIMBING = 12  # Newton steps at each
 ALMOST = 1 - 1e-12  # of eps
+ROUGHEST = 0.1  # estimated error of a climbed state's multipliers on its mesh; the true one is a hundredth of that
 
 
 @dataclass
@@ -68,7 +69,10 @@ def robust_orbits(
 
 
 def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7) -> OrbitBatch:
-    """Return orbits at `p` (n_parameters, B) by raising eps from 0, each in steps of its own that are halved where one fails."""
+    """Return orbits at `p` (n_parameters, B) by raising eps from 0, each in steps of its own that are halved where one fails.
+
+    One that the mesh is too coarse for has not converged: a finer one may be climbed to.
+    """
     eps, B = model.index("eps"), p.shape[1]
     calm = p.copy()
     calm[eps] = 0.0
@@ -96,6 +100,7 @@ def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7)
         going = batch.converged & (reached < ALMOST) & (step > SMALLEST_CLIMB)
     batch.p[:] = p
     batch.converged &= reached >= ALMOST
+    batch.converged[batch.converged] = mesh_error(model, batch.orbit)[batch.converged] < ROUGHEST
     return batch
 
 
