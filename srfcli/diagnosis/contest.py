@@ -9,7 +9,7 @@ import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.follower import CLEAR, LOOSE_ONLY
-from srfcli.diagnosis.refits import HALFWAY, Entry, Refit
+from srfcli.diagnosis.refits import Entry, Refit
 from srfcli.diagnosis.score import scores
 from srfcli.inference.latent import STEPS, Tracks, fit_latent
 from srfcli.laws import Effect
@@ -38,8 +38,7 @@ def contest(
 
     def free(entry: Entry) -> bool:
         refit = found[entry.hypothesis.name] = _released(search, entry)
-        halfway = not refit.adequacy.fine and refit.adequacy.rms_over_noise < HALFWAY
-        if halfway and search.best() is refit and search.untried(entry.hypothesis, rough=True):
+        if refit.halfway and search.best() is refit and search.untried(entry.hypothesis, rough=True):
             refit = search.refit(entry.hypothesis, refit, {}, rough=True)
         return refit.adequacy.fine
 

@@ -31,6 +31,11 @@ class Refit:
         """Return the hypothesis' name."""
         return self.hypothesis.name
 
+    @property
+    def halfway(self) -> bool:
+        """Return whether it leaves more than noise, and no more than a rough track may be."""
+        return not self.adequacy.fine and self.adequacy.rms_over_noise < HALFWAY
+
 
 @dataclass(frozen=True)
 class Entry:

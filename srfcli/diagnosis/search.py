@@ -317,8 +317,7 @@ class Search(Ledger):
                 continue
             if not rough and self.best() is found:
                 found = elsewhere(self, found)
-            halfway = not found.adequacy.fine and found.adequacy.rms_over_noise < HALFWAY
-            if not rough and halfway and self.best() is found:
+            if not rough and found.halfway and self.best() is found:
                 self.refit(hypothesis, found, {}, rough=True)
 
     def widened(self, refit: Refit, added: Sequence[Score]) -> list[tuple[Hypothesis, dict[str, float]]]:

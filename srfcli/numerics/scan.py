@@ -61,7 +61,7 @@ def robust_orbits(
     batch = solve_orbits(model, p, guess or forced_guess(model, p, edges), tol=tol, max_iterations=14 if guess else 40)
     if guess is not None and not batch.converged.all():
         bad = np.nonzero(~batch.converged)[0]
-        _retry(model, batch, _scatter(batch.orbit, forced_guess(model, p[:, bad], edges), bad), tol)
+        batch.replace(bad, solve_orbits(model, p[:, bad], forced_guess(model, p[:, bad], edges), tol=tol))
     if not batch.converged.all():
         bad = np.nonzero(~batch.converged)[0]
         batch.replace(bad, climbed(model, p[:, bad], edges, tol=tol))
@@ -102,18 +102,6 @@ def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7)
     batch.converged &= reached >= ALMOST
     batch.converged[batch.converged] = mesh_error(model, batch.orbit)[batch.converged] < ROUGHEST
     return batch
-
-
-def _scatter(whole: Discretisation, part: Discretisation, index: Array) -> Discretisation:
-    x, stages = whole.x.copy(), whole.stages.copy()
-    x[index], stages[index] = part.x, part.stages
-    return Discretisation(x, stages, whole.edges)
-
-
-def _retry(model: GeneratedModel, batch: OrbitBatch, guess: Discretisation, tol: float) -> None:
-    """Solve again, in place, the members of `batch` that have not converged."""
-    bad = np.nonzero(~batch.converged)[0]
-    batch.replace(bad, solve_orbits(model, batch.p[:, bad], guess.part(bad), tol=tol))
 
 
 def scan_line(
