@@ -9,6 +9,7 @@ import pytest
 
 from srfcli.diagnosis.candidates import Hypothesis, applicable
 from srfcli.diagnosis.contest import contest
+from srfcli.diagnosis.doubts import alike_on_rough_tracks
 from srfcli.diagnosis.score import pair_scores, scores
 from srfcli.diagnosis.search import WORTH, Search
 from srfcli.inference.latent import Roughness, Tracks, fit_latent, tracks_for
@@ -177,7 +178,7 @@ def test_what_a_rough_track_gives_one_it_may_give_its_rival(search, monkeypatch,
 
     trial.shared = True
     monkeypatch.setattr(trial, "refit", refit)
-    trial.alike_on_rough_tracks([])
+    alike_on_rough_tracks(trial, [])
     assert fitted == ([(other.name, smooth[other.name], True, None)] if asked else [])
 
 

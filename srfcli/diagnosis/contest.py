@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis
+from srfcli.diagnosis.doubts import doubt, wandering
+from srfcli.diagnosis.elsewhere import resized
 from srfcli.diagnosis.follower import CLEAR, LOOSE_ONLY
 from srfcli.diagnosis.refits import Entry, Refit
 from srfcli.diagnosis.score import scores
@@ -37,9 +39,12 @@ def contest(
     around, held, found = search.loosely(refit).values, list[Entry](), dict[str, Refit]()
 
     def free(entry: Entry) -> bool:
-        refit = found[entry.hypothesis.name] = _released(search, entry)
+        refit = found[entry.hypothesis.name] = resized(search, _released(search, entry))
         if refit.halfway and search.best() is refit and search.untried(entry.hypothesis, rough=True):
             refit = search.refit(entry.hypothesis, refit, {}, rough=True)
+            if not refit.adequacy.fine and wandering(entry.hypothesis):  # it stood in for a part of the track
+                doubt(search, candidates)
+                return search.best().adequacy.fine
         return refit.adequacy.fine
 
     for hypothesis, own in entrants:
@@ -74,7 +79,7 @@ def _partnered(search: Search, leader: Entry, candidates: Sequence[Effect]) -> l
     found = []
     for hypothesis, own in [*wider, *((Hypothesis((e, *effects)), {}) for e in built)]:
         if hypothesis.name not in search.held and not search.spent():
-            found.append(_entry(search, hypothesis, around.values | _expected(hypothesis, own)))
+            found.append(_led(search, _entry(search, hypothesis, around.values | _expected(hypothesis, own))))
     return found
 
 
@@ -94,7 +99,9 @@ def _led(search: Search, entry: Entry) -> Entry:
     They are the file's own values, the effect's parameters at some sizes: the baseline has been bent, and has no such parameter.
     """
     best, known = entry, search.followed.get(Hypothesis().name)
-    if not entry.hypothesis.effects[-1].settings or (known is not None and entry.reduced > HOPELESS * known.held):
+    if not any(e.settings for e in entry.hypothesis.effects) or (
+        known is not None and entry.reduced > HOPELESS * known.held
+    ):
         return entry
     problem = search.follower.problem(entry.hypothesis, {})
     bare = search.base_names()

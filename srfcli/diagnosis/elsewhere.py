@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
 
 SHAKES = (2.0, 0.5)  # times its size: other starts of an effect
+RUNGS = (1.5, 0.65, 1.2, 0.8, 2.2, 0.45)  # times a mass: its minima lie a third apart, where oscillation is a cycle off
+BETTER = 1.0  # in log likelihood, from where on a place is another one
+CLIMBS, BRIEF = 12, 8  # fits of a mass from other sizes, and their steps
 ROUNDS, STEPS = 1, 8  # of a fit on a rough track while held
 
 
@@ -41,7 +44,7 @@ def elsewhere(search: Search, refit: Refit) -> Refit:
     ]
     if not refit.rough:
         own = [long for e in refit.hypothesis.effects for long in own_parameters(e, refit.fit.problem.model)]
-        tries.insert(0, ({long: values[long] for long in own if long in values}, PULLS[1]))
+        tries.insert(0, ({long: values[long] for long in own if long in values}, PULLS[-1]))
     seen: list[float] = []
     for at, way in tries:
         if search.spent():
@@ -57,6 +60,36 @@ def elsewhere(search: Search, refit: Refit) -> Refit:
             refit = search.keep(refit.hypothesis, fitted, rough=refit.rough)
         if refit.adequacy.fine:
             break
+    return refit
+
+
+def resized(search: Search, refit: Refit) -> Refit:
+    """Return the best fit of a hypothesis with an effect that is built in from other sizes of it, each rung from the best so far.
+
+    With a mass the slider oscillates: a minimum is false where it is a cycle off, and a hold damps that and does not show it.
+    """
+    built = [e for e in refit.hypothesis.effects if e.settings]
+    key = (refit.name, "sizes")
+    if key in search.shook or refit.rough or not built:
+        return refit
+    search.shook.add(key)
+    names = [
+        n
+        for e in built
+        for n in (*own_parameters(e, refit.fit.problem.model), *e.frees)
+        if refit.fit.values.get(n, 0) > 0
+    ]
+    rungs = [(name, factor) for name in names for factor in RUNGS]
+    at = 0
+    for _ in range(CLIMBS):
+        if refit.adequacy.fine or refit.adequacy.rms_over_noise > NEAR or at == len(rungs) or search.spent():
+            break
+        name, factor = rungs[at]
+        values = dict(refit.fit.values)
+        problem = search.problem(refit.hypothesis, values | {name: factor * values[name]})
+        fitted = fit_latent(problem, problem.start, search.noise, known_noise=True, steps=BRIEF)
+        before, refit = refit, search.keep(refit.hypothesis, fitted, rough=False)
+        at = 0 if refit.evidence > before.evidence + BETTER else at + 1
     return refit
 
 

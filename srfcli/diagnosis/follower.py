@@ -21,9 +21,10 @@ from srfcli.registry import Registry
 
 LOOSE = 2.0  # slip lengths over which a second spring holds that leaves most of a misfit to be seen
 PULLS = (
+    (LOOSE,),
     (1.0, LOOSE),
     (0.5, 1.0, LOOSE),
-)  # the same, ever softer; the next way is tried where one leads nowhere
+)  # the same, and ever softer ones; the next way is tried where one leads nowhere
 CLEAR = 1.05  # chi-squared per degree of freedom under a hold that is noise
 NEARLY = 1.6  # the same of a model that may be right: what is lost when it is set free is worth finding
 LOOSE_ONLY = (LOOSE,)  # the one that a refit starts under

@@ -14,6 +14,7 @@ from srfcli.diagnosis.refits import Refit, freedom_spent
 from srfcli.inference.fit import Problem
 from srfcli.inference.latent import LatentFit, evenness, fit_latent
 from srfcli.inference.noise import Noise
+from srfcli.laws import Effect
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment, Run
 from srfcli.registry import Registry
@@ -100,12 +101,12 @@ class Ledger:
             self.evaluations += again.evaluations * (ROUGH_COSTS if refit.rough else 1)
             self.tried[key] = self.judged(refit.hypothesis, again, rough=refit.rough)
 
-    def untried(self, hypothesis: Hypothesis, *, rough: bool) -> bool:
-        """Return whether a hypothesis was not fitted yet and the budget leaves room for it."""
+    def untried(self, hypothesis: Hypothesis, *, rough: bool, above: float = -np.inf) -> bool:
+        """Return whether a hypothesis was not fitted yet, to a log likelihood `above` one, and the budget leaves room for it."""
         if self.spent():
             self.progress(f"{hypothesis.name} is not tried: the search's budget is spent")
             return False
-        return not any(set(t.hypothesis.effects) == set(hypothesis.effects) and r == rough
+        return not any(set(t.hypothesis.effects) == set(hypothesis.effects) and r == rough and t.fit.log_likelihood > above
                        for (_, r), t in self.tried.items())  # fmt: skip
 
     def spent(self) -> bool:
@@ -114,10 +115,11 @@ class Ledger:
 
     def ranked(self) -> list[Refit]:
         """Return everything that was fitted, best evidence first; of the two forms of a hypothesis the better one."""
-        best: dict[str, Refit] = {}
+        best: dict[frozenset[Effect], Refit] = {}
         for refit in self.tried.values():
-            if refit.name not in best or refit.evidence > best[refit.name].evidence:
-                best[refit.name] = refit
+            effects = frozenset(refit.hypothesis.effects)
+            if effects not in best or refit.evidence > best[effects].evidence:
+                best[effects] = refit
         return sorted(best.values(), key=lambda r: -r.evidence)
 
     def best(self) -> Refit:

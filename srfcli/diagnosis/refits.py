@@ -13,6 +13,8 @@ from srfcli.numerics.collocation import Array
 
 DEARER = 0.004  # of chi-squared per degree of freedom while held, what a further effect has to take away
 HALFWAY = 1.25  # residual over noise within which a rough track may be what is left
+ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
+PAIRS, ROUGHENED = 3, 2  # how many are fitted with a second effect, at each stage, and on rough tracks
 NEAR = 2.5  # residual over noise within which slopes at the fit tell where a better one is
 
 

@@ -10,10 +10,11 @@ import numpy as np
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.contest import contest, unseen
-from srfcli.diagnosis.elsewhere import elsewhere, on_a_rough_track
+from srfcli.diagnosis.doubts import second_thoughts
+from srfcli.diagnosis.elsewhere import elsewhere, on_a_rough_track, resized
 from srfcli.diagnosis.follower import LOOSE_ONLY, Followed, shortened
 from srfcli.diagnosis.ledger import Ledger
-from srfcli.diagnosis.refits import HALFWAY, NEAR, Entry, Refit
+from srfcli.diagnosis.refits import ASTRAY, HALFWAY, NEAR, PAIRS, ROUGHENED, Entry, Refit
 from srfcli.diagnosis.score import Score, pair_scores, scores
 from srfcli.inference.latent import STEPS, LatentFit, Tracks, fit_latent, tracks_for
 from srfcli.laws import Effect
@@ -23,11 +24,9 @@ CLOSE = 6.0  # hypotheses within so much of the best may be it
 RIVAL = 30.0  # short of the best score's gain: where the best leaves noise alone, less is not refitted
 RIVAL_SHARE = 0.05  # the same as a part of that gain
 HALF = 0.5  # of a misfit, that one effect takes away before two are tried ahead of a rough track
-ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
 ALIKE = 0.9  # likeness of two signals below which one does not stand in for the other
 FAINTER = 0.05  # of the first's score: an effect that promises so little less is not tried
-ROUGHENED = 2  # of those that leave least while held, how many are fitted on rough tracks
-FIRST, SINGLES, PAIRS = 2, 8, 3  # refitted in full, at each stage
+FIRST, SINGLES = 2, 8  # refitted in full, at each stage
 
 
 @dataclass
@@ -40,104 +39,17 @@ class Search(Ledger):
     followed: dict[str, Followed] = field(default_factory=dict)
     held: dict[str, Entry] = field(default_factory=dict)  # the best fit of each hypothesis while held to the recording
     loose: dict[str, LatentFit] = field(default_factory=dict)
-    shook: set[tuple[str, bool]] = field(default_factory=set)
+    shook: set[tuple[str, bool | str]] = field(default_factory=set)
     shared: bool | None = None  # whether all runs slid on one rough track, once that was asked
 
     def run(self) -> list[Refit]:
         """Return everything that was fitted, best evidence first."""
         candidates, self.excluded = applicable(self.registry, self.experiment, self.effects)
         self.look(candidates)
-        self.alike_on_rough_tracks(candidates)
-        self.doubt(candidates)
-        self.rebase()
-        self.paired_on_smooth_tracks(candidates)
+        second_thoughts(self, candidates)
         for key in [k for k in self.stale if k[0] == Hypothesis().name]:
             self.score(self.tried[key], candidates)
         return self.ranked()
-
-    def doubt(self, candidates: Sequence[Effect]) -> None:
-        """Fit, on a rough track, what the best hypothesis is made of: a wave or a drift is easily seen in any rough track."""
-        best, self.shared = self.best(), None
-        effects = best.hypothesis.effects
-        wandering = [e for e in effects if along_table(e) and e.changes[0][0] == "mu"]
-        within = NEAR if wandering else HALFWAY
-        simpler = [tuple(e for e in effects if e is not w) for w in (wandering or (() if best.rough else effects))]
-        for left in simpler:
-            known = self.tried.get((Hypothesis(left).name, False)) or self.fitted(Hypothesis(left), best)
-            if known.adequacy.rms_over_noise < within:
-                found = self.refit(known.hypothesis, known, {}, rough=True)
-                if found.evidence > best.evidence:
-                    self.widen(found, candidates, PAIRS, rough=True)
-
-    def alike_on_rough_tracks(self, candidates: Sequence[Effect]) -> None:
-        """Fit on rough tracks, where the best is on one, those too that it led on a smooth one by less than it gained."""
-        best = self.best()
-        if not best.rough or not best.hypothesis.effects:
-            return
-        smooth = self.tried.get((best.name, False))
-        worst = smooth.evidence - (best.evidence - smooth.evidence) if smooth else -np.inf
-        others = [r for r in self.ranked() if not r.rough and r.hypothesis.effects and r.evidence > worst]
-        for other in [r for r in others if r.adequacy.rms_over_noise < HALFWAY][:ROUGHENED]:
-            if self.untried(other.hypothesis, rough=True):
-                self.shared = None  # another model asks that anew
-                found = self.refit(other.hypothesis, other, {}, rough=True)
-                if self.best() is found:
-                    self.widen(found, candidates, PAIRS, rough=True)
-
-    def paired_on_smooth_tracks(self, candidates: Sequence[Effect]) -> None:
-        """Fit, where the best is one effect on a rough track, that one with others on a smooth one: a track hides them."""
-        best = self.best()
-        if best.rough and len(best.hypothesis.effects) == 1:
-            smooth = self.tried.get((best.name, False)) or self.fitted(best.hypothesis, best)
-            if smooth.adequacy.rms_over_noise < NEAR:
-                self.widen(smooth, candidates, PAIRS, rough=False)
-        if self.best() is not best:
-            self.rebase()
-
-    def fitted(self, hypothesis: Hypothesis, best: Refit) -> Refit:
-        """Fit a hypothesis on a smooth track from where a larger one stands."""
-        problem = self.problem(hypothesis, best.fit.values)
-        found = fit_latent(problem, problem.start, self.noise, known_noise=True, steps=15)
-        if found.point.chi2 > ASTRAY * best.fit.point.chi2:  # what was left out kept the cycles in step
-            led = self.follower.follow(hypothesis, best.fit.values, self.noise, [LOOSE_ONLY])
-            found = max(
-                found,
-                fit_latent(problem, led.theta, self.noise, known_noise=True, steps=15),
-                key=lambda f: f.log_likelihood,
-            )
-        return self.keep(hypothesis, found, rough=False)
-
-    def rebase(self) -> None:
-        """Fit what the best hypothesis is made of, and the baseline, from where the best one stands.
-
-        A simpler hypothesis that had lost its way in a false minimum is to be judged at its own best.
-        """
-        for _ in range(3):
-            best = self.best()
-            if not best.hypothesis.effects:
-                return
-            effects = best.hypothesis.effects
-            simpler = [Hypothesis(tuple(e for e in effects if e is not left)) for left in effects]
-            for hypothesis in {h.name: h for h in (*simpler, Hypothesis())}.values():
-                self.again(hypothesis, best)
-            if self.best() is best:
-                return
-
-    def again(self, hypothesis: Hypothesis, best: Refit) -> None:
-        """Fit a hypothesis from the parameters of a larger one, on a rough track only where a smooth one has little left."""
-        known = self.tried.get((hypothesis.name, False))
-        far = best.rough and known is not None and known.adequacy.rms_over_noise > NEAR
-        if far and self.fitted(hypothesis, best).adequacy.rms_over_noise > NEAR:
-            return
-        if not best.rough:
-            self.fitted(hypothesis, best)
-            return
-        problem = self.problem(hypothesis, best.fit.values, rough=True)
-        fitted = fit_latent(
-            problem, problem.start, self.noise, tracks=best.fit.point.tracks, roughness=best.fit.point.roughness,
-            known_noise=True, steps=15,
-        )  # fmt: skip
-        self.keep(hypothesis, fitted, rough=True)
 
     def look(self, candidates: Sequence[Effect]) -> None:
         """Fit hypotheses until one leaves noise alone, or what is worth trying has been tried."""
@@ -310,10 +222,14 @@ class Search(Ledger):
             contest(self, refit, self.widened(refit, promising), candidates)
             return
         for score, (hypothesis, own) in zip(promising, self.widened(refit, promising), strict=True):
-            if not self.rivals(score, promising, refit) or not self.untried(hypothesis, rough=rough):
+            above = (
+                refit.fit.log_likelihood if refit.rough == rough else -np.inf
+            )  # one that adds to it and is below it lost its way
+            if not self.rivals(score, promising, refit) or not self.untried(hypothesis, rough=rough, above=above):
                 continue
             found = self.refit(hypothesis, refit, own, rough=rough)
             if score.effect.settings:  # tried first; whether it leads is known when others were tried
+                resized(self, found)
                 continue
             if not rough and self.best() is found:
                 found = elsewhere(self, found)
