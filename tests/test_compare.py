@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from srfcli.cli.compare_rows import highest_fold
 from srfcli.cli.main import cli
 from srfcli.errors import SrfError
+from srfcli.numerics import compare
 from srfcli.numerics.compare import LawStudy, LawTask, Window, changed_areas, contrast, read_study, study_law, turns
 from srfcli.numerics.comparematch import check_adjusted, match, observe
 from srfcli.numerics.critical import critical_line
@@ -109,10 +110,41 @@ def test_a_study_without_re_entrance_says_so(model):
     assert np.isnan(found.onset).all() and found.folds == (0, 0)
 
 
+@pytest.mark.parametrize(
+    ("several", "there", "onset", "end"),
+    [
+        ((False, False), lambda eps: 0.033 < eps < 0.058, 0.033, 0.058),
+        ((False, True), lambda eps: 0.033 < eps < 0.058 or eps > 0.1, 0.033, 0.058),
+        ((False, True), lambda eps: eps > 0.071, 0.071, None),
+        ((True, False), lambda eps: eps < 0.02, 0.0, 0.02),
+        ((False, False), lambda eps: False, None, None),
+    ],
+)
+def test_re_entrance_that_comes_and_goes_between_two_amplitudes_is_seen(model, monkeypatch, several, there, onset, end):
+    """`several` is what the maps at 0 and 0.13 say; between them each amplitude is asked for, and brackets hold the edges."""
+    fold, plain = np.array([[5.0, 10], [9, 12], [7, 15]]), np.array([[5.0, 10], [9, 12]])
+    monkeypatch.setattr(compare, "_followed", lambda m, t, eps: [fold if there(eps) else plain])
+    task = LawTask(model.source, model.key, model.vector(), (0.0, 0.13), WINDOW, onset=1e-3)
+    for (low, high), edge in zip(compare._reentrance(model, task, several), (onset, end), strict=True):
+        if edge is None:
+            assert np.isnan([low, high]).all()
+        else:
+            assert low <= edge <= high
+            assert high - low <= 1e-3
+
+
 def made(*crossings):
     """Return a study with the given crossings and nothing else."""
     count = len(crossings)
-    return LawStudy(tuple(crossings), ((),) * count, (0,) * count, (0,) * count, (np.nan, np.nan), (Status.OK,) * count)
+    return LawStudy(
+        tuple(crossings),
+        ((),) * count,
+        (0,) * count,
+        (0,) * count,
+        (np.nan, np.nan),
+        (np.nan, np.nan),
+        (Status.OK,) * count,
+    )
 
 
 def test_areas_of_rectangles():
@@ -145,7 +177,7 @@ def test_turns(values, count):
 
 def test_highest_fold():
     curve = np.array([[1.0, 5], [3, 5], [2, 5], [2.5, 5], [2.2, 5], [4, 5]])
-    found = LawStudy((), ((curve,),), (3,), (0,), (0.0, 0.0), (Status.OK,))
+    found = LawStudy((), ((curve,),), (3,), (0,), (0.0, 0.0), (np.nan, np.nan), (Status.OK,))
     assert highest_fold(found, 0) == 3.0
     assert highest_fold(LawStudy((), ((curve[:2],),), (0,), (0,), (0.0, 0.0), (Status.OK,)), 0) is None
 

@@ -129,6 +129,20 @@ def test_a_second_method_finds_the_same_components(model, eps, count):
         assert special_folds(model, atlas) == pytest.approx(special_folds(model, second), rel=1e-5)
 
 
+@pytest.mark.parametrize("law", ["log-log", "bowden-tabor"])
+def test_the_second_method_agrees_for_other_laws(make_model, law):
+    """The same, folds among it, for laws whose parameters are as shipped, around the low loads where they fold."""
+    model = make_model(law=law)
+    grid = window(model, 0.18, 30, 40, ratio=(0.21 / 200, 0.21 / 8))
+    atlas = finished(model, compute_map(model, grid, MapSettings(depth=2)))
+    other = AtlasSettings(lines=9, samples=100, tol=1e-5, steps=StepSettings(largest=0.025, mesh_error=5e-5))
+    *_, second = find_components(model, Plane(grid.base, Axis("V", 1.0, 100.0), Axis("W0", 8.0, 200.0)), other)
+    assert len(atlas.branches) == len(second.branches) > 0
+    assert extents(model, atlas)[:, :2] == pytest.approx(extents(model, second)[:, :2], rel=1e-3)
+    folds = special_folds(model, atlas)
+    assert folds and folds == pytest.approx(special_folds(model, second), rel=1e-5)
+
+
 def special_folds(model, atlas):
     """Return the velocities at which boundaries turn round, rising."""
     return sorted(float(s.p[0]) for b in atlas.branches for s in special_points(model, atlas.plane, b) if s.axis == "V")

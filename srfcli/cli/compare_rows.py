@@ -20,6 +20,7 @@ COLUMNS = (
     Column("law", "", "friction law, ageing law, or both"),
     Column("eps", "1", "modulation amplitude"),
     Column("reentrance_eps", "1", "smallest amplitude at which a line of constant V meets more than one boundary"),
+    Column("reentrance_end", "1", "amplitude from which none does any more, nothing if that is beyond the largest"),
     Column(
         "destabilised",
         "1",
@@ -49,16 +50,16 @@ def law_rows(
     statuses = []
     for k, name in enumerate(names):
         if k not in studies:
-            rows.append((name, None, *(None,) * 6, matches[k].miss, matches[k].status.value))
+            rows.append((name, None, *(None,) * 7, matches[k].miss, matches[k].status.value))
             statuses.append(matches[k].status)
             continue
         study, miss = studies[k], matches[k].miss
-        onset = study.onset[1] if math.isfinite(study.onset[1]) else None
+        begins, ends = (b[1] if math.isfinite(b[1]) else None for b in (study.onset, study.end))
         for eps in wanted:
             i = amplitudes.index(eps)
             shape = (study.folds[i], len(study.curves[i]), highest_fold(study, i))
             areas = changed_areas(study.crossings[: i + 1], window)
-            rows.append((name, eps, onset, *areas, *shape, miss, study.status[i].value))
+            rows.append((name, eps, begins, ends, *areas, *shape, miss, study.status[i].value))
             statuses.append(study.status[i])
     return rows, next((s for s in statuses if not s.ok), Status.OK)
 

@@ -6,6 +6,7 @@ V; and the smallest amplitude at which a line meets more than one boundary (re-e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -49,7 +50,10 @@ class LawTask:
     amplitudes: tuple[float, ...]
     window: Window
     tol: float = 1e-5
-    onset: float = 2e-3  # how closely the amplitude at which re-entrance begins is bracketed
+    onset: float = 2e-3  # how closely the amplitudes at which re-entrance begins and ends are bracketed
+    stride: float = (
+        0.01  # between amplitudes at which is looked for re-entrance: what comes and goes in less may be missed
+    )
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,8 @@ class LawStudy:
 
     `curves` are its components as (points, 2) arrays of V and W0, `folds` how often V turns round on them all, `unexplained` the
     number of map points that the curves do not account for. `onset` brackets the amplitude at which re-entrance begins:
-    (nan, nan) where it does not up to the largest amplitude, (0, 0) where it is there without modulation.
+    (nan, nan) where it does not up to the largest amplitude, (0, 0) where it is there without modulation; `end` that at which it
+    is gone again, (nan, nan) where it stays up to the largest.
     """
 
     crossings: tuple[Array, ...]
@@ -66,6 +71,7 @@ class LawStudy:
     folds: tuple[int, ...]
     unexplained: tuple[int, ...]
     onset: tuple[float, float]
+    end: tuple[float, float]
     status: tuple[Status, ...]
 
 
@@ -82,7 +88,7 @@ def study_law(task: LawTask) -> dict[str, Array]:
         out[f"status_{k}"] = np.array(list(Status).index(status))
         out[f"sizes_{k}"] = np.array([len(c) for c in curves], dtype=int)
         out[f"curves_{k}"] = np.concatenate([np.zeros((0, 2)), *curves])
-    out["onset"] = np.array(_onset(model, task, several))
+    out["reentrance"] = np.array(_reentrance(model, task, several))
     return out
 
 
@@ -94,13 +100,14 @@ def read_study(arrays: dict[str, Array]) -> LawStudy:
         cuts = np.cumsum(arrays[f"sizes_{k}"])[:-1]
         parts = np.split(arrays[f"curves_{k}"], cuts) if arrays[f"sizes_{k}"].size else []
         curves.append(tuple(parts))
-    low, high = arrays["onset"].tolist()
+    onset, end = (tuple(bracket) for bracket in arrays["reentrance"].tolist())
     return LawStudy(
         tuple(arrays[f"crossings_{k}"] for k in count),
         tuple(curves),
         tuple(int(arrays[f"folds_{k}"]) for k in count),
         tuple(int(arrays[f"odd_{k}"]) for k in count),
-        (low, high),
+        onset,
+        end,
         tuple(list(Status)[int(arrays[f"status_{k}"])] for k in count),
     )
 
@@ -167,21 +174,30 @@ def _reentrant(curves: Sequence[Array], window: Window) -> bool:
     return any(turns(c[:, 0]) for c in curves) or any(len(h) > 1 for h in _heights(curves, window))
 
 
-def _onset(model: GeneratedModel, task: LawTask, several: Sequence[bool]) -> tuple[float, float]:
-    """Return the bracket of the smallest amplitude with re-entrance, by halving; see LawStudy."""
-    first = next((k for k, r in enumerate(several) if r), None)
-    if first is None:
-        return np.nan, np.nan
-    low, high = (task.amplitudes[first - 1] if first else 0.0), task.amplitudes[first]
-    if first == 0 and (high == 0 or _reentrant(_without(model, task)[0], task.window)):
-        return 0.0, 0.0
-    while high - low > task.onset:
-        middle = 0.5 * (low + high)
-        if _reentrant(_followed(model, task, middle), task.window):
-            high = middle
-        else:
-            low = middle
-    return low, high
+def _reentrance(model: GeneratedModel, task: LawTask, several: Sequence[bool]) -> tuple[tuple[float, float], ...]:
+    """Return the brackets of the amplitudes at which re-entrance begins, and is gone again; see LawStudy."""
+
+    def there(eps: float) -> bool:
+        return _reentrant(_followed(model, task, eps) if eps > 0 else _without(model, task)[0], task.window)
+
+    def halved(low: float, high: float) -> tuple[float, float]:
+        after = known[high]
+        while high - low > task.onset:
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if there(middle) == after else (middle, high)
+        return low, high
+
+    known = dict(zip(task.amplitudes, several, strict=True))
+    largest = max(task.amplitudes)
+    for eps in np.linspace(0, largest, max(1, math.ceil(largest / task.stride)) + 1).tolist():
+        if min(abs(eps - k) for k in known) > 0.4 * task.stride:
+            known[eps] = there(eps)
+    brackets: list[tuple[float, float]] = []
+    rising = sorted(known)
+    for before, eps in zip([0.0, *rising], rising, strict=False):
+        if len(brackets) < 2 and known[eps] == (not brackets):
+            brackets.append(halved(before, eps))
+    return (*brackets, *((np.nan, np.nan),) * (2 - len(brackets)))
 
 
 def _followed(model: GeneratedModel, task: LawTask, eps: float) -> list[Array]:
