@@ -9,6 +9,7 @@ import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.columns import along_table
+from srfcli.diagnosis.elsewhere import elsewhere, resized
 from srfcli.diagnosis.follower import LOOSE_ONLY
 from srfcli.diagnosis.refits import ASTRAY, HALFWAY, NEAR, PAIRS, ROUGHENED, Refit
 from srfcli.inference.latent import fit_latent
@@ -20,10 +21,22 @@ if TYPE_CHECKING:
 
 def second_thoughts(search: Search, candidates: Sequence[Effect]) -> None:
     """Fit what else may be it, now that something is best."""
+    thoroughly(search)
     alike_on_rough_tracks(search, candidates)
     doubt(search, candidates)
     rebase(search)
     paired_on_smooth_tracks(search, candidates)
+    thoroughly(search)
+
+
+def thoroughly(search: Search) -> None:
+    """Fit the best, on a smooth track, from other starts: within some errors of its minimum, too, noise alone may be left.
+
+    What was missed there is a track that is not rough, and sizes that are off.
+    """
+    smooth = search.tried.get((search.best().name, False))
+    if smooth is not None and smooth.adequacy.rms_over_noise < HALFWAY:
+        elsewhere(search, resized(search, smooth, thorough=True), thorough=True)
 
 
 def wandering(hypothesis: Hypothesis) -> list[Effect]:

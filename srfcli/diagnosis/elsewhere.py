@@ -24,15 +24,16 @@ CLIMBS, BRIEF = 12, 8  # fits of a mass from other sizes, and their steps
 ROUNDS, STEPS = 1, 8  # of a fit on a rough track while held
 
 
-def elsewhere(search: Search, refit: Refit) -> Refit:
+def elsewhere(search: Search, refit: Refit, *, thorough: bool = False) -> Refit:
     """Return the best fit of a hypothesis from other starts: the file's own, larger and smaller effects, other wavelengths.
 
-    The file's own come first: without the effect the baseline may have been bent, and its parameters do not find back.
+    The file's own come first: without the effect the baseline may have been bent, and its parameters do not find back. One that
+    leaves noise alone is left as it is, unless all starts are to be tried: beside a minimum that is fine there may be a better.
     """
     key = (refit.name, refit.rough)
     if (
         key in search.shook
-        or refit.adequacy.fine
+        or (refit.adequacy.fine and not thorough)
         or refit.adequacy.rms_over_noise > NEAR
         or not refit.hypothesis.effects
     ):
@@ -58,12 +59,12 @@ def elsewhere(search: Search, refit: Refit) -> Refit:
             fitted = _smooth(search, refit, at, way, seen)
         if fitted is not None:
             refit = search.keep(refit.hypothesis, fitted, rough=refit.rough)
-        if refit.adequacy.fine:
+        if refit.adequacy.fine and not thorough:
             break
     return refit
 
 
-def resized(search: Search, refit: Refit) -> Refit:
+def resized(search: Search, refit: Refit, *, thorough: bool = False) -> Refit:
     """Return the best fit of a hypothesis with an effect that is built in from other sizes of it, each rung from the best so far.
 
     With a mass the slider oscillates: a minimum is false where it is a cycle off, and a hold damps that and does not show it.
@@ -82,7 +83,8 @@ def resized(search: Search, refit: Refit) -> Refit:
     rungs = [(name, factor) for name in names for factor in RUNGS]
     at = 0
     for _ in range(CLIMBS):
-        if refit.adequacy.fine or refit.adequacy.rms_over_noise > NEAR or at == len(rungs) or search.spent():
+        done = refit.adequacy.fine and not thorough
+        if done or refit.adequacy.rms_over_noise > NEAR or at == len(rungs) or search.spent():
             break
         name, factor = rungs[at]
         values = dict(refit.fit.values)
