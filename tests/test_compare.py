@@ -179,7 +179,9 @@ def test_highest_fold():
     curve = np.array([[1.0, 5], [3, 5], [2, 5], [2.5, 5], [2.2, 5], [4, 5]])
     found = LawStudy((), ((curve,),), (3,), (0,), (0.0, 0.0), (np.nan, np.nan), (Status.OK,))
     assert highest_fold(found, 0) == 3.0
-    assert highest_fold(LawStudy((), ((curve[:2],),), (0,), (0,), (0.0, 0.0), (Status.OK,)), 0) is None
+    assert (
+        highest_fold(LawStudy((), ((curve[:2],),), (0,), (0,), (0.0, 0.0), (np.nan, np.nan), (Status.OK,)), 0) is None
+    )
 
 
 def run(*arguments):
