@@ -19,8 +19,12 @@ if TYPE_CHECKING:
 COLUMNS = (
     Column("law", "", "friction law, ageing law, or both"),
     Column("eps", "1", "modulation amplitude"),
-    Column("reentrance_eps", "1", "smallest amplitude at which a line of constant V meets more than one boundary"),
-    Column("reentrance_end", "1", "amplitude from which none does any more, nothing if that is beyond the largest"),
+    Column(
+        "reentrance_eps", "1", "smallest amplitude at which a line of constant V meets more than one boundary", ".4g"
+    ),
+    Column(
+        "reentrance_end", "1", "amplitude from which none does any more, nothing if that is beyond the largest", ".4g"
+    ),
     Column(
         "destabilised",
         "1",
