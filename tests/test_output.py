@@ -203,6 +203,23 @@ def test_the_curves_of_one_amplitude_are_shaded_where_sliding_is_stable() -> Non
     assert not shaded(alone, HOPF["V"][middle], HOPF["K_over_W0"][middle] * 0.9)
 
 
+@pytest.mark.parametrize("count", [5, 6, 9])
+def test_many_names_stand_below_the_axes_and_cover_nothing(count: int) -> None:
+    pytest.importorskip("matplotlib")
+    curves = [
+        {"eps": k, "label": f"law-{k}/dieterich", "V": [1, 10], "K_over_W0": [0.01 + k / 1e3] * 2} for k in range(count)
+    ]
+    figure = plots.stability_diagram(curves)
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    inside, below = axes.get_legend(), figure.legends
+    assert (inside is None, len(below)) == ((True, 1) if count > 5 else (False, 0))
+    assert [t.get_text() for t in (below[0] if below else inside).get_texts()] == [c["label"] for c in curves]
+    if below:
+        assert below[0].get_window_extent().y1 < axes.get_window_extent().y0
+        assert below[0].get_window_extent().x1 <= figure.bbox.x1
+
+
 def test_several_amplitudes_are_told_apart_without_colour() -> None:
     pytest.importorskip("matplotlib")
     axes = plots.stability_diagram(BRANCHES).axes[0]

@@ -26,6 +26,8 @@ SUFFIXES = (".png", ".svg", ".pdf")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (9, 2)), (0, (3, 1, 1, 1, 1, 1)), (0, (2, 2)))
 DOTTED = (0, (1, 1.2))  # kept for the constant load
+FEW_NAMES = 5  # of curves that a legend holds within the axes; more are named below them
+NAME_COLUMNS, NAME_ROW = 2, 0.2  # there, and the height of a row in inches
 
 STYLE: dict[str, Any] = {
     "figure.figsize": (6.0, 4.2),
@@ -301,8 +303,16 @@ def _finish_axes(ax: Axes, *, xlabel: str, ylabel: str, title: str, legend: bool
     ax.set_ylabel(ylabel)
     if title:
         ax.set_title(title)
-    if legend:
+    if not legend:
+        return
+    drawn, names = ax.get_legend_handles_labels()
+    if len(names) <= FEW_NAMES:
         ax.legend(loc="best", handlelength=2.8)
+        return
+    figure = ax.get_figure(root=True)  # below the axes, which stay as high as they are
+    assert figure is not None
+    figure.set_figheight(figure.get_figheight() + NAME_ROW * -(-len(names) // NAME_COLUMNS))
+    figure.legend(drawn, names, loc="outside lower center", ncols=NAME_COLUMNS, handlelength=2.8, fontsize=9)
 
 
 def _decade_ticks(ax: Axes) -> None:
