@@ -11,6 +11,7 @@ import pytest
 
 from srfcli import units
 from srfcli.errors import SrfError
+from srfcli.registry import bundled_registry
 from srfcli.units import convert, find_unit, from_base, parse_quantity, to_base
 
 
@@ -113,3 +114,11 @@ def test_without_pint_the_table_works_and_the_rest_says_how(monkeypatch: pytest.
     with pytest.raises(SrfError) as caught:
         parse_quantity("210 N/mm", "N/um", name="K")
     assert 'pip install "srfcli[units]"' in str(caught.value.hint)
+
+
+def test_every_shipped_law_and_effect_is_read_without_pint() -> None:
+    registry = bundled_registry()
+    shipped = [registry.load(e) for kind in ("friction", "ageing", "effect") for e in registry.entries(kind)]
+    asked = {p.unit for law in shipped for p in law.parameters}
+    assert len(asked) > 5
+    assert asked <= set(units._TABLE), "this unit would ask for pint"
