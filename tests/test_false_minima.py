@@ -62,13 +62,26 @@ def test_a_mass_that_is_a_cycle_off_is_found_from_other_sizes(ringing, factor):
     true = {"mu0": p.mu0, "A": p.A, "B": p.B, "D0": p.D0, "Vsat": p.Vsat, "lambda": p.lam, "M": factor * MASS}
     problem = ringing.problem(hypothesis, true)
     ringing.tried.pop((hypothesis.name, False), None)
-    ringing.shook.clear()
+    ringing.sized.clear()
     false = ringing.keep(hypothesis, fit_latent(problem, problem.start, ringing.noise, known_noise=True), rough=False)
     assert abs(false.fit.values["M"] / MASS - 1) > 0.03, "this start leads to the truth: the test asks nothing"
     found = resized(ringing, false)
     assert found.adequacy.rms_over_noise < 1.03
     assert found.fit.values["M"] == pytest.approx(MASS, rel=0.02)
     assert found.fit.values["lambda"] == pytest.approx(p.lam, rel=0.02)
+
+
+def test_one_that_leaves_noise_alone_at_once_is_tried_at_other_sizes_only_when_all_are_asked(ringing):
+    hypothesis, p = masses(ringing), Physics()
+    true = {"mu0": p.mu0, "A": p.A, "B": p.B, "D0": p.D0, "Vsat": p.Vsat, "lambda": p.lam, "M": MASS}
+    problem = ringing.problem(hypothesis, true)
+    ringing.sized.clear()
+    fine = ringing.keep(hypothesis, fit_latent(problem, problem.start, ringing.noise, known_noise=True), rough=False)
+    assert fine.adequacy.fine
+    before = ringing.evaluations
+    assert resized(ringing, fine) is fine and ringing.evaluations == before
+    assert resized(ringing, fine, thorough=True).evidence >= fine.evidence
+    assert ringing.evaluations > before
 
 
 def test_what_has_no_mass_is_not_tried_at_other_sizes(ringing):

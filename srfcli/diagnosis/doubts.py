@@ -89,7 +89,10 @@ def paired_on_smooth_tracks(search: Search, candidates: Sequence[Effect]) -> Non
 
 
 def fitted(search: Search, hypothesis: Hypothesis, best: Refit) -> Refit:
-    """Fit a hypothesis on a smooth track from where a larger one stands."""
+    """Fit a hypothesis on a smooth track from where a larger one stands, once from each."""
+    if search.stood.get(hypothesis.name) is best:
+        return search.tried[hypothesis.name, False]
+    search.stood[hypothesis.name] = best
     problem = search.problem(hypothesis, best.fit.values)
     found = fit_latent(problem, problem.start, search.noise, known_noise=True, steps=15)
     if found.point.chi2 > ASTRAY * best.fit.point.chi2:  # what was left out kept the cycles in step

@@ -70,10 +70,10 @@ def resized(search: Search, refit: Refit, *, thorough: bool = False) -> Refit:
     With a mass the slider oscillates: a minimum is false where it is a cycle off, and a hold damps that and does not show it.
     """
     built = [e for e in refit.hypothesis.effects if e.settings]
-    key = (refit.name, "sizes")
-    if key in search.shook or refit.rough or not built:
+    left = refit.adequacy.fine and not thorough
+    if left or refit.name in search.sized or refit.rough or not built:
         return refit
-    search.shook.add(key)
+    search.sized.add(refit.name)
     names = [
         n
         for e in built

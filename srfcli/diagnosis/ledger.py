@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from srfcli.diagnosis.adequacy import alike, gauge_noise, judge_residuals
+from srfcli.diagnosis.adequacy import alike, gauge_noise
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.follower import Follower
-from srfcli.diagnosis.refits import Refit, freedom_spent
+from srfcli.diagnosis.refits import Refit, judge_fit, residuals_of
 from srfcli.inference.fit import Problem
 from srfcli.inference.latent import LatentFit, evenness, fit_latent
 from srfcli.inference.noise import Noise
@@ -71,10 +71,7 @@ class Ledger:
     def judged(self, hypothesis: Hypothesis, fitted: LatentFit, *, rough: bool) -> Refit:
         """Return a fit with what it leaves, judged against the noise, and with its evidence."""
         runs = fitted.problem.runs
-        adequacy = replace(
-            judge_residuals(runs, _residuals(fitted), self.noise, freedom=freedom_spent(fitted)),
-            p_tracks=evenness(fitted.point),
-        )
+        adequacy = replace(judge_fit(fitted, self.noise), p_tracks=evenness(fitted.point))
         n = sum(int(r.used.sum()) for r in runs)
         cost = 0.5 * np.log(n) * (len(fitted.problem.names) - len(self.base_names())) + (ROUGH if rough else 0.0)
         more = len(hypothesis.effects)
@@ -87,7 +84,7 @@ class Ledger:
 
     def regauge(self, found: Refit) -> None:
         """Take the noise from what a fit leaves, and judge everything anew that was judged by a worse one's."""
-        noise = self.gauged(found.fit.problem.runs, _residuals(found.fit))
+        noise = self.gauged(found.fit.problem.runs, residuals_of(found.fit))
         if all(alike(noise[name], known) for name, known in self.noise.items()):
             return
         self.noise = noise
@@ -125,8 +122,3 @@ class Ledger:
     def best(self) -> Refit:
         """Return the refit with the best evidence."""
         return self.ranked()[0]
-
-
-def _residuals(fitted: LatentFit) -> dict[str, Array]:
-    """Return what a fit leaves of each run."""
-    return {r.name: r.observed - fitted.point.predictions[r.name].y for r in fitted.problem.runs}

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.diagnosis.adequacy import Adequacy
+from srfcli.diagnosis.adequacy import Adequacy, judge_residuals
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.inference.latent import LatentFit
+from srfcli.inference.noise import Noise
 from srfcli.numerics.collocation import Array
+from srfcli.recording.values import Run
 
 DEARER = 0.004  # of chi-squared per degree of freedom while held, what a further effect has to take away
 HALFWAY = 1.25  # residual over noise within which a rough track may be what is left
@@ -57,6 +60,17 @@ class Entry:
     def rank(self) -> float:
         """Return what it leaves, and what its effects cost."""
         return self.reduced + DEARER * len(self.hypothesis.effects)
+
+
+def residuals_of(fitted: LatentFit) -> dict[str, Array]:
+    """Return what a fit leaves (n,) of each run."""
+    return {r.name: r.observed - fitted.point.predictions[r.name].y for r in fitted.problem.runs}
+
+
+def judge_fit(fitted: LatentFit, noise: Mapping[str, Noise], runs: Sequence[Run] | None = None) -> Adequacy:
+    """Return whether noise is all that a fit leaves, of all its runs or of some."""
+    every = fitted.problem.runs if runs is None else runs
+    return judge_residuals(every, residuals_of(fitted), noise, freedom=freedom_spent(fitted))
 
 
 def freedom_spent(fitted: LatentFit) -> dict[str, float]:

@@ -39,7 +39,9 @@ class Search(Ledger):
     followed: dict[str, Followed] = field(default_factory=dict)
     held: dict[str, Entry] = field(default_factory=dict)  # the best fit of each hypothesis while held to the recording
     loose: dict[str, LatentFit] = field(default_factory=dict)
-    shook: set[tuple[str, bool | str]] = field(default_factory=set)
+    shook: set[tuple[str, bool]] = field(default_factory=set)
+    sized: set[str] = field(default_factory=set)  # tried at other sizes of what is built in
+    stood: dict[str, Refit] = field(default_factory=dict)  # where the best was when each was last fitted from there
     shared: bool | None = None  # whether all runs slid on one rough track, once that was asked
 
     def run(self) -> list[Refit]:
@@ -222,9 +224,8 @@ class Search(Ledger):
             contest(self, refit, self.widened(refit, promising), candidates)
             return
         for score, (hypothesis, own) in zip(promising, self.widened(refit, promising), strict=True):
-            above = (
-                refit.fit.log_likelihood if refit.rough == rough else -np.inf
-            )  # one that adds to it and is below it lost its way
+            # what adds to it and is below it lost its way
+            above = refit.fit.log_likelihood if refit.rough == rough else -np.inf
             if not self.rivals(score, promising, refit) or not self.untried(hypothesis, rough=rough, above=above):
                 continue
             found = self.refit(hypothesis, refit, own, rough=rough)

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from srfcli.diagnosis.adequacy import DOUBT, SURE, Adequacy, joined, judge_residuals, sampled
+from srfcli.diagnosis.adequacy import DOUBT, SURE, Adequacy, joined, sampled
 from srfcli.diagnosis.candidates import Excluded, Hypothesis
 from srfcli.diagnosis.follower import LOOSE, Follower
-from srfcli.diagnosis.refits import HALFWAY, NEAR, Refit, freedom_spent
+from srfcli.diagnosis.refits import HALFWAY, NEAR, Refit, judge_fit
 from srfcli.diagnosis.score import Score
 from srfcli.diagnosis.search import CLOSE, Search
 from srfcli.inference.bumps import likeliest_bump
@@ -42,7 +42,7 @@ class Held:
     gain: float
     rms_baseline: float
     rms_augmented: float
-    noise_alone: bool = True
+    noise_alone: bool
 
 
 @dataclass(frozen=True)
@@ -225,8 +225,7 @@ def _refused(search: Search, best: Refit, experiment: Experiment, held: Sequence
         roughness = point.roughness if tracks else None
         fitted = fit_latent(problem, problem.start, noise, tracks=tracks, roughness=roughness, known_noise=True)
         runs = [r for r in fitted.problem.runs if r.name in names]
-        residuals = {r.name: r.observed - fitted.point.predictions[r.name].y for r in runs}
-        adequacy = judge_residuals(runs, residuals, noise, freedom=freedom_spent(fitted))
+        adequacy = judge_fit(fitted, noise, runs)
         return adequacy, _alone(adequacy, runs)
 
     values = best.fit.values
@@ -265,13 +264,7 @@ def _predicted(search: Search, refit: Refit, experiment: Experiment, run: Run) -
     rough = refit.rough and refit.fit.point.roughness.amplitude > 0
     tracks = tracks_for([as_fitted], shared=False) if rough else None
     fitted = fit_latent(small, small.start, noise, tracks=tracks, known_noise=True)
-    adequacy: Adequacy = judge_residuals(
-        [as_fitted],
-        {run.name: run.observed - fitted.point.predictions[run.name].y},
-        noise,
-        freedom=freedom_spent(fitted),
-    )
-    return fitted.point.predictions[run.name].y, fitted.log_likelihood, adequacy
+    return fitted.point.predictions[run.name].y, fitted.log_likelihood, judge_fit(fitted, noise)
 
 
 def _noise_for(search: Search, run: Run) -> Noise:

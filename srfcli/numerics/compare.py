@@ -51,9 +51,7 @@ class LawTask:
     window: Window
     tol: float = 1e-5
     onset: float = 2e-3  # how closely the amplitudes at which re-entrance begins and ends are bracketed
-    stride: float = (
-        0.01  # between amplitudes at which is looked for re-entrance: what comes and goes in less may be missed
-    )
+    stride: float = 0.01  # between amplitudes that are looked at: re-entrance that comes and goes in less may be missed
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import itertools
 import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from srfcli.errors import SrfError
 from srfcli.output.files import check_target, write_atomic
@@ -309,8 +309,7 @@ def _finish_axes(ax: Axes, *, xlabel: str, ylabel: str, title: str, legend: bool
     if len(names) <= FEW_NAMES:
         ax.legend(loc="best", handlelength=2.8)
         return
-    figure = ax.get_figure(root=True)  # below the axes, which stay as high as they are
-    assert figure is not None
+    figure = cast("Figure", ax.figure)  # below the axes, which stay as high as they are
     figure.set_figheight(figure.get_figheight() + NAME_ROW * -(-len(names) // NAME_COLUMNS))
     figure.legend(drawn, names, loc="outside lower center", ncols=NAME_COLUMNS, handlelength=2.8, fontsize=9)
 
