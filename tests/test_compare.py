@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from srfcli.cli.compare_rows import highest_fold
+from srfcli.cli.compare_rows import compare_figure, highest_fold
 from srfcli.cli.main import cli
 from srfcli.errors import SrfError
 from srfcli.numerics import compare
@@ -182,6 +182,20 @@ def test_highest_fold():
     assert (
         highest_fold(LawStudy((), ((curve[:2],),), (0,), (0,), (0.0, 0.0), (np.nan, np.nan), (Status.OK,)), 0) is None
     )
+
+
+@pytest.mark.parametrize(
+    ("matched", "title"), [(True, "matched at low velocity, ε = 0.1"), (False, "as given, ε = 0.1")]
+)
+def test_a_figure_says_whether_its_laws_were_matched(matched, title):
+    pytest.importorskip("matplotlib")
+    lines = np.full((WINDOW.velocities().size, 1), 9.0)
+    curve = np.array([[5.0, 10], [9, 12]])
+    study = LawStudy(
+        (lines, lines), ((), (curve,)), (0, 0), (0, 0), (np.nan, np.nan), (np.nan, np.nan), (Status.OK,) * 2
+    )
+    figure = compare_figure(["a", "b"], {0: study, 1: study}, (0.0, 0.1), WINDOW, 0.21, matched)
+    assert figure.axes[0].get_title(loc="left") == title
 
 
 def run(*arguments):

@@ -125,7 +125,7 @@ def command(
     meta = law_meta(names, models, matches, goal, pairs)
     table = Table("srf.compare/1", COLUMNS, rows, f"{len(names)} laws", notes, described, meta, worst.value)
     figure = functools.partial(
-        compare_figure, names, studies, amplitudes, window, float(matches[0].p[models[0].index("K")])
+        compare_figure, names, studies, amplitudes, window, float(matches[0].p[models[0].index("K")]), matched
     )
     every = tuple(law for model in models for law in model.laws)
     emit(table, output, laws=dict.fromkeys(every), timings={"all": time.perf_counter() - begun}, figure=figure)

@@ -160,7 +160,12 @@ def sentences(
 
 
 def compare_figure(
-    names: list[str], studies: dict[int, LawStudy], amplitudes: tuple[float, ...], window: Window, K: float
+    names: list[str],
+    studies: dict[int, LawStudy],
+    amplitudes: tuple[float, ...],
+    window: Window,
+    K: float,
+    matched: bool,
 ) -> Figure:
     """Return the laws' boundaries at the largest amplitude over each other."""
     from srfcli.output import plots
@@ -172,5 +177,5 @@ def compare_figure(
     ]
     first = studies[min(studies)].crossings[0][:, 0]
     hopf = {"V": window.velocities().tolist(), "K_over_W0": (K / first).tolist()}
-    title = f"matched at low velocity, ε = {amplitudes[-1]:g}"
+    title = f"{'matched at low velocity' if matched else 'as given'}, ε = {amplitudes[-1]:g}"
     return plots.stability_diagram(branches, hopf=hopf, title=title)
