@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from srfcli.inference.bumps import likeliest_bump
-from srfcli.inference.latent import Point, Roughness, Tracks
+from srfcli.inference.latent import Point
+from srfcli.inference.tracks import Roughness, Tracks
 from srfcli.splines import Spline
 
 LENGTH, NOISE = 40.0, 2e-4  # um, and what mu0 is known to by each of three samples per um

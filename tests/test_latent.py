@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from srfcli.inference.fit import fit, fit_problem
-from srfcli.inference.latent import AMPLITUDES, LENGTHS, Point, Roughness, Tracks, evenness, marginal
+from srfcli.inference.latent import AMPLITUDES, LENGTHS, Point, evenness, marginal
 from srfcli.inference.rough import fit_rough
+from srfcli.inference.tracks import Roughness, Tracks
 from srfcli.model import open_model
 from srfcli.recording.experiment import read_experiment
 from srfcli.registry import load_registry
@@ -38,26 +39,34 @@ def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.nda
     return J @ [1.0, -2.0] + C @ c + rng.normal(size=n), J, C, tracks
 
 
+def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, tracks: Tracks, roughness: Roughness) -> float:
+    """The log likelihood with parameters and track integrated out, from the covariance of all samples."""
+    L = tracks.root(roughness) if roughness.amplitude else np.zeros((tracks.numbers.size, 1))
+    S = np.eye(r.size) + C @ L @ L.T @ C.T
+    W = np.linalg.solve(S, np.column_stack([J, r]))
+    rest = r - J @ np.linalg.solve(J.T @ W[:, :2], J.T @ W[:, 2])
+    flat = 0.5 * np.linalg.slogdet(J.T @ J)[1] - 0.5 * np.linalg.slogdet(J.T @ W[:, :2])[1]  # integrated out, too
+    return flat - 0.5 * float(rest @ np.linalg.solve(S, rest)) - 0.5 * np.linalg.slogdet(S)[1]
+
+
 def test_marginal_likelihood_is_that_of_the_whole_covariance() -> None:
     r, J, C, tracks = _linear(1e-4, 1)
     A = np.column_stack([J, C])
     base = -0.5 * float(r @ r)
     found = marginal(A.T @ A, A.T @ r, [0, 1], range(2, A.shape[1]), tracks, base)
-    best = -np.inf
-    for length in LENGTHS:
-        for amplitude in AMPLITUDES:
-            L = tracks.root(Roughness(amplitude, length)) if amplitude else np.zeros((tracks.numbers.size, 1))
-            S = np.eye(r.size) + C @ L @ L.T @ C.T
-            W = np.linalg.solve(S, np.column_stack([J, r]))
-            theta = np.linalg.solve(J.T @ W[:, :2], J.T @ W[:, 2])
-            rest = r - J @ theta
-            flat = (
-                0.5 * np.linalg.slogdet(J.T @ J)[1] - 0.5 * np.linalg.slogdet(J.T @ W[:, :2])[1]
-            )  # integrated out, too
-            value = flat - 0.5 * float(rest @ np.linalg.solve(S, rest)) - 0.5 * np.linalg.slogdet(S)[1]
-            best = max(best, value)
+    best = max(_whole(r, J, C, tracks, Roughness(a, length)) for length in LENGTHS for a in AMPLITUDES)
     assert found.log_likelihood == pytest.approx(best, abs=1e-5)
     assert 0.3e-4 < found.roughness.amplitude < 3e-4
+
+
+@pytest.mark.parametrize("own", [Roughness(5e-4, 6.0), Roughness(2e-5, 0.5)], ids=["coarse", "finer than its knots"])
+def test_marginal_likelihood_of_one_roughness_is_its_own_and_not_a_better_one_s(own: Roughness) -> None:
+    r, J, C, tracks = _linear(1e-4, 1)
+    A = np.column_stack([J, C])
+    grid = np.array([own.length]), np.array([own.amplitude])
+    found = marginal(A.T @ A, A.T @ r, [0, 1], range(2, A.shape[1]), tracks, -0.5 * float(r @ r), grid=grid)
+    assert found.log_likelihood == pytest.approx(_whole(r, J, C, tracks, own), abs=1e-5)
+    assert found.roughness == own
 
 
 def test_no_roughness_is_found_where_there_is_none() -> None:

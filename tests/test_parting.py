@@ -20,8 +20,9 @@ from srfcli.diagnosis.partingtext import described, sentences
 from srfcli.diagnosis.proposals import FACTOR, Proposal, draw, led_in, reach_of, run_of, vary
 from srfcli.diagnosis.search import Search
 from srfcli.diagnosis.verdict import Diagnosis, conclude
-from srfcli.inference.latent import Latent, LatentFit, Roughness, Tracks, fit_latent, tracks_for
+from srfcli.inference.latent import Latent, LatentFit, fit_latent
 from srfcli.inference.prediction import run_parameters
+from srfcli.inference.tracks import Roughness, Tracks, tracks_for
 from srfcli.numerics.motion import integrate
 from srfcli.numerics.program import ConstantLoad, Drive
 from srfcli.output import report

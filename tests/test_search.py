@@ -12,8 +12,9 @@ from srfcli.diagnosis.contest import contest
 from srfcli.diagnosis.doubts import alike_on_rough_tracks
 from srfcli.diagnosis.score import pair_scores, scores
 from srfcli.diagnosis.search import WORTH, Search
-from srfcli.inference.latent import Roughness, Tracks, fit_latent, tracks_for
+from srfcli.inference.latent import fit_latent
 from srfcli.inference.noise import stretches, whiten
+from srfcli.inference.tracks import Roughness, Tracks, tracks_for
 from srfcli.numerics.compiled import compiler
 from srfcli.proof.draw import Gauge
 from srfcli.proof.folder import case_files

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from srfcli.inference.fit import Fit, Problem
-    from srfcli.inference.latent import Roughness
     from srfcli.inference.profile import Interval
+    from srfcli.inference.tracks import Roughness
     from srfcli.output.tables import Table
     from srfcli.recording.values import Experiment
     from srfcli.registry import Registry

@@ -110,6 +110,14 @@ class Hypothesis:
         return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper), hold=hold)
 
 
+def built_beside(hypothesis: Hypothesis, candidates: Sequence[Effect]) -> list[Hypothesis]:
+    """Return a hypothesis with each effect that is built in, a mass or an interface: beside others it has no score."""
+    present = hypothesis.effects
+    reported = {e.reported for e in present}
+    built = [e for e in candidates if e.settings and e.reported not in reported]
+    return [Hypothesis((e, *present)) for e in built] if present else []
+
+
 def _key(registry: Registry, effect: Effect) -> str:
     """Return what `open_model` knows an effect by."""
     return effect.name

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from srfcli.diagnosis.candidates import Hypothesis
+from srfcli.diagnosis.candidates import Hypothesis, built_beside
 from srfcli.diagnosis.doubts import doubt, wandering
 from srfcli.diagnosis.elsewhere import resized
 from srfcli.diagnosis.follower import CLEAR, LOOSE_ONLY
 from srfcli.diagnosis.refits import Entry, Refit
 from srfcli.diagnosis.score import scores
-from srfcli.inference.latent import STEPS, Tracks, fit_latent
+from srfcli.inference.latent import STEPS, fit_latent
+from srfcli.inference.tracks import Tracks
 from srfcli.laws import Effect
 
 if TYPE_CHECKING:
@@ -56,6 +57,8 @@ def contest(
     singles = sorted((e for e in held if e.single), key=lambda e: e.rank)
     if singles and singles[0].hypothesis.name not in found and free(singles[0]):  # one effect is asked before two
         return list(found.values())
+    if candidates and not refit.hypothesis.effects and search.bared(refit, candidates):
+        return list(found.values())
     for leader in singles[: LEADERS if candidates else 0]:
         held += _partnered(search, leader, candidates)
     waiting = [e for e in sorted(held, key=lambda e: e.rank) if e.hypothesis.name not in found]
@@ -75,9 +78,8 @@ def _partnered(search: Search, leader: Entry, candidates: Sequence[Effect]) -> l
     scored = scores(search.registry, around.problem.experiment, around, left, present=effects)
     promising = [*scored[:PARTNERS], *(s for s in scored[PARTNERS:] if unseen(s.effect))]
     wider = [(h, search.own_values(h, s.values)) for s in promising for h in (Hypothesis((*effects, s.effect)),)]
-    built = [e for e in candidates if e.settings and e.reported not in reported]
     found = []
-    for hypothesis, own in [*wider, *((Hypothesis((e, *effects)), {}) for e in built)]:
+    for hypothesis, own in [*wider, *((h, {}) for h in built_beside(leader.hypothesis, candidates))]:
         if hypothesis.name not in search.held and not search.spent():
             found.append(_led(search, _entry(search, hypothesis, around.values | _expected(hypothesis, own))))
     return found

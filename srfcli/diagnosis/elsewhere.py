@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from srfcli.diagnosis.candidates import Hypothesis, own_parameters
+from srfcli.diagnosis.candidates import own_parameters
 from srfcli.diagnosis.columns import along_table
-from srfcli.diagnosis.follower import LOOSE, LOOSE_ONLY, PULLS, ROUND, same
-from srfcli.diagnosis.ledger import ROUGH_COSTS
+from srfcli.diagnosis.follower import LOOSE_ONLY, PULLS, same
+from srfcli.diagnosis.horizons import on_a_rough_track
 from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.score import scores
-from srfcli.inference.latent import LatentFit, Roughness, Tracks, fit_latent, tracks_for
+from srfcli.inference.latent import LatentFit, fit_latent
+from srfcli.inference.tracks import Tracks
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
@@ -21,7 +21,6 @@ SHAKES = (2.0, 0.5)  # times its size: other starts of an effect
 RUNGS = (1.5, 0.65, 1.2, 0.8, 2.2, 0.45)  # times a mass: its minima lie a third apart, where oscillation is a cycle off
 BETTER = 1.0  # in log likelihood, from where on a place is another one
 CLIMBS, BRIEF = 12, 8  # fits of a mass from other sizes, and their steps
-ROUNDS, STEPS = 1, 8  # of a fit on a rough track while held
 
 
 def elsewhere(search: Search, refit: Refit, *, thorough: bool = False) -> Refit:
@@ -51,10 +50,7 @@ def elsewhere(search: Search, refit: Refit, *, thorough: bool = False) -> Refit:
         if search.spent():
             break
         if refit.rough:
-            point = refit.fit.point
-            fitted: LatentFit | None = on_a_rough_track(
-                search, refit.hypothesis, at, shared=point.tracks.shared, roughness=point.roughness
-            )
+            fitted = on_a_rough_track(search, refit.hypothesis, at, shared=refit.fit.point.tracks.shared)
         else:
             fitted = _smooth(search, refit, at, way, seen)
         if fitted is not None:
@@ -122,23 +118,3 @@ def _smooth(
     if led.lost:
         return None
     return fit_latent(refit.fit.problem, led.theta, search.noise, tracks=Tracks((), {}), known_noise=True)
-
-
-def on_a_rough_track(
-    search: Search, hypothesis: Hypothesis, at: Mapping[str, float], *, shared: bool, roughness: Roughness | None = None
-) -> LatentFit:
-    """Return the fit from the values in `at`, parameters and track found while held first."""
-    follower = search.follower
-    held = replace(
-        hypothesis.problem(search.registry, search.experiment, rough=True, at=at, trend=search.trend,
-                           hold=follower.hold(LOOSE)),
-        rtol=ROUND, runs=follower.between,
-    )  # fmt: skip
-    tracks = tracks_for(held.runs, shared=shared)
-    led = fit_latent(
-        held, held.start, search.noise, tracks=tracks, roughness=roughness, known_noise=True, rounds=ROUNDS, steps=STEPS,
-    )  # fmt: skip
-    search.evaluations += led.evaluations * ROUGH_COSTS
-    point = led.point
-    free = search.problem(hypothesis, held.named(point.theta), rough=True)
-    return fit_latent(free, free.start, search.noise, tracks=point.tracks, roughness=point.roughness, known_noise=True)

@@ -12,9 +12,10 @@ from srfcli.diagnosis.candidates import Hypothesis, own_parameters
 from srfcli.inference import fit as fitting
 from srfcli.inference.fit import Problem, first_level
 from srfcli.inference.follow import between_slips, hold_to, slip_length, weaker
-from srfcli.inference.latent import LatentFit, Tracks, fit_latent
+from srfcli.inference.latent import LatentFit, fit_latent
 from srfcli.inference.noise import Noise
 from srfcli.inference.prediction import RTOL, Hold
+from srfcli.inference.tracks import Tracks
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry

@@ -17,8 +17,9 @@ from scipy.stats import rankdata
 from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.search import Search
 from srfcli.inference.fit import Problem
-from srfcli.inference.latent import LatentFit, Tracks, fit_latent
+from srfcli.inference.latent import LatentFit, fit_latent
 from srfcli.inference.prediction import Hold
+from srfcli.inference.tracks import Tracks
 from srfcli.model import open_model
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Run

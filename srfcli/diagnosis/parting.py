@@ -22,10 +22,11 @@ from scipy.linalg import block_diag
 from srfcli.diagnosis.proposals import Proposal, Reach, draw, led_in, reach_of, run_of, vary
 from srfcli.diagnosis.refits import Refit
 from srfcli.diagnosis.verdict import Diagnosis
-from srfcli.inference.latent import Latent, Tracks, solve_scaled, tracks_for
+from srfcli.inference.latent import Latent, solve_scaled
 from srfcli.inference.noise import Noise, stretches, whiten
 from srfcli.inference.nuisance import basis
 from srfcli.inference.prediction import run_parameters
+from srfcli.inference.tracks import Tracks, tracks_for
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment, Run
 from srfcli.registry import Registry

@@ -7,16 +7,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, own_parameters
+from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, built_beside, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.contest import contest, unseen
 from srfcli.diagnosis.doubts import second_thoughts
-from srfcli.diagnosis.elsewhere import elsewhere, on_a_rough_track, resized
+from srfcli.diagnosis.elsewhere import elsewhere, resized
 from srfcli.diagnosis.follower import LOOSE_ONLY, Followed, shortened
+from srfcli.diagnosis.horizons import by_horizons
 from srfcli.diagnosis.ledger import Ledger
-from srfcli.diagnosis.refits import ASTRAY, HALFWAY, NEAR, PAIRS, ROUGHENED, Entry, Refit
+from srfcli.diagnosis.refits import ASTRAY, HALFWAY, NEAR, PAIRS, Entry, Refit
 from srfcli.diagnosis.score import Score, pair_scores, scores
-from srfcli.inference.latent import STEPS, LatentFit, Tracks, fit_latent, tracks_for
+from srfcli.inference.latent import STEPS, LatentFit, fit_latent
+from srfcli.inference.tracks import Tracks, tracks_for
 from srfcli.laws import Effect
 
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, and noise is never quite as assumed
@@ -42,6 +44,7 @@ class Search(Ledger):
     shook: set[tuple[str, bool]] = field(default_factory=set)
     sized: set[str] = field(default_factory=set)  # tried at other sizes of what is built in
     stood: dict[str, Refit] = field(default_factory=dict)  # where the best was when each was last fitted from there
+    begun: dict[tuple[frozenset[Effect], bool], set[tuple[float, ...]]] = field(default_factory=dict)
     shared: bool | None = None  # whether all runs slid on one rough track, once that was asked
 
     def run(self) -> list[Refit]:
@@ -67,7 +70,7 @@ class Search(Ledger):
             self.settled(candidates)
             or (near and self.halved(baseline) and (self.paired(candidates) or self.together(baseline, candidates)))
             or (near and self.on_a_rough_track(baseline, candidates))
-            or (not near and self.held_on_rough_tracks(candidates))
+            or (not near and self.shaken(candidates))
             or self.paired(candidates)
             or self.together(baseline, candidates)
             or self.roughened(candidates)
@@ -119,20 +122,16 @@ class Search(Ledger):
         contest(self, baseline, self.widened(baseline, entrants), candidates)
         return self.roughened(candidates) if self.best().adequacy.rms_over_noise < HALFWAY else False
 
-    def held_on_rough_tracks(self, candidates: Sequence[Effect]) -> bool:
-        """Return whether one of those that leave least while held leaves noise alone on a rough track."""
-        if self.best().adequacy.rms_over_noise < NEAR:
-            return self.shaken(candidates)
-        for entry in sorted((e for e in self.held.values() if e.single), key=lambda e: e.rank)[:ROUGHENED]:
-            if not self.untried(entry.hypothesis, rough=True):
-                continue
-            fitted = on_a_rough_track(self, entry.hypothesis, entry.values, shared=False)
-            found = self.keep(entry.hypothesis, fitted, rough=True)
-            if found.adequacy.rms_over_noise < NEAR and self.shared is None:
-                found = self.on_one_track(entry.hypothesis, found.fit)
-            if found.adequacy.fine:
-                break
-        return self.settled(candidates)
+    def bared(self, baseline: Refit, candidates: Sequence[Effect]) -> bool:
+        """Return whether a baseline that is far off leaves noise alone on a rough track, or effects beside it do.
+
+        While held, a wave or a drift stands in for a rough track, and where nothing leads, the track may be why.
+        """
+        best = self.best()
+        led = best.adequacy.rms_over_noise < NEAR and not any(along_table(e) for e in best.hypothesis.effects)
+        if led or (Hypothesis().name, True) in self.tried:
+            return False
+        return by_horizons(self, baseline, candidates)
 
     def on_one_track(self, hypothesis: Hypothesis, many: LatentFit) -> Refit:
         """Return a hypothesis on one rough track for all runs, found from where many stand, or on many if that is better."""
@@ -217,7 +216,9 @@ class Search(Ledger):
         scored = self.score(refit, candidates)
         promising = [s for s in scored if s.gain > max(least, FAINTER * scored[0].gain)][:most]
         far = not (rough or refit.adequacy.rms_over_noise < NEAR)
-        if not refit.adequacy.fine:  # a mass or an interface that is not there has no first order worth the name
+        if (
+            promising or not refit.adequacy.fine
+        ):  # a mass or an interface that is not there has no first order worth the name
             built = [s for s in scored if (unseen(s.effect) if far else s.effect.settings)]
             promising = [*built, *(s for s in promising if s not in built)]
         if far:
@@ -228,6 +229,8 @@ class Search(Ledger):
             above = refit.fit.log_likelihood if refit.rough == rough else -np.inf
             if not self.rivals(score, promising, refit) or not self.untried(hypothesis, rough=rough, above=above):
                 continue
+            if not self.anew(hypothesis, refit, rough=rough):
+                continue
             found = self.refit(hypothesis, refit, own, rough=rough)
             if score.effect.settings:  # tried first; whether it leads is known when others were tried
                 resized(self, found)
@@ -236,6 +239,18 @@ class Search(Ledger):
                 found = elsewhere(self, found)
             if not rough and found.halfway and self.best() is found:
                 self.refit(hypothesis, found, {}, rough=True)
+
+        for hypothesis in built_beside(refit.hypothesis, candidates) if promising else ():
+            if self.untried(hypothesis, rough=rough):
+                resized(self, self.refit(hypothesis, refit, {}, rough=rough))
+
+    def anew(self, hypothesis: Hypothesis, start: Refit, *, rough: bool) -> bool:
+        """Return whether a hypothesis was not fitted yet from where a smaller one stands, and remember that it is."""
+        key, place = (frozenset(hypothesis.effects), rough), tuple(start.fit.values.values())
+        seen = self.begun.setdefault(key, set())
+        new = place not in seen
+        seen.add(place)
+        return new
 
     def widened(self, refit: Refit, added: Sequence[Score]) -> list[tuple[Hypothesis, dict[str, float]]]:
         """Return the hypotheses that add one effect to a refit's own, with what its score expects of its parameters."""

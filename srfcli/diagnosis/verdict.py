@@ -15,8 +15,9 @@ from srfcli.diagnosis.score import Score
 from srfcli.diagnosis.search import CLOSE, Search
 from srfcli.inference.bumps import likeliest_bump
 from srfcli.inference.fit import Problem
-from srfcli.inference.latent import fit_latent, tracks_for
+from srfcli.inference.latent import fit_latent
 from srfcli.inference.noise import Noise
+from srfcli.inference.tracks import tracks_for
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment, Run
 

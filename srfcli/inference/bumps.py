@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.inference.latent import Point, Roughness
+from srfcli.inference.latent import Point
+from srfcli.inference.tracks import Roughness
 from srfcli.numerics.collocation import Array
 
 WIDTHS = (0.7, 1.4, 2.8)  # um, of a Gaussian bump
@@ -49,7 +50,8 @@ def likeliest_bump(point: Point) -> Bump | None:
             whole, own = float(shape @ seen), turned @ seen
             score = float(shape @ h) - np.sum(s2 * own * along / (1 + s2 * values), axis=1)
             weight = whole - np.sum(s2 * own**2 / (1 + s2 * values), axis=1)
-            total = even + np.where(weight > 1e-9 * whole, 0.5 * score**2 / np.maximum(weight, 1e-300), 0.0)
+            seen_at = weight > 1e-9 * whole
+            total = even + np.divide(0.5 * score**2, weight, out=np.zeros_like(weight), where=seen_at)
             k = int(np.argmax(total))
             gain = 2 * float(total[k] - even.max())
             if gain > best:

@@ -11,20 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from srfcli.inference.fit import BAD, Problem, unreached
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, whiten
 from srfcli.inference.prediction import Prediction, predict
+from srfcli.inference.tracks import USUAL, Roughness, Tracks, tracks_for
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Run
-from srfcli.splines import Spline
 
-SPACING = 0.8  # um between knots: contacts are renewed over half of it, and a finer track fits no better
-MOST = 300  # numbers of a track: a longer one has wider knots
 AMPLITUDES = np.array([0.0, *np.geomspace(2e-5, 3e-3, 12)])
 LENGTHS = np.geomspace(1.0, 30.0, 6)
-GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the roughness that are tried, amplitude 0 first
+GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the roughness that are tried
 STEPS = 25
 SETTLED = 0.02  # gain of twice the log likelihood below which the minimum is reached
 EARLY = 2.0  # the same while roughness and noise still change
@@ -34,74 +31,7 @@ FAR = (
     (np.inf, 1e-2),
 )  # of chi-squared, the same up to so many times the samples: no minimum there matters
 LOST = 30.0  # chi-squared per sample of a fit that is given up after one round
-
-
-@dataclass(frozen=True)
-class Roughness:
-    """Standard deviation of mu0 along the track and its correlation length (um); amplitude 0 is a smooth track."""
-
-    amplitude: float = 0.0
-    length: float = 5.0
-
-    def root(self, nodes: Array) -> Array:
-        """Return L with L L' the covariance of a track's numbers."""
-        d = np.abs(nodes[:, None] - nodes[None, :]) * np.sqrt(3) / self.length
-        K = (1 + d) * np.exp(-d) + 1e-8 * np.eye(nodes.size)
-        return self.amplitude * np.linalg.cholesky(K)
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """The splines of all runs: `of` tells, for each run's name, which of `splines` it slid on."""
-
-    splines: tuple[Spline, ...]
-    of: Mapping[str, int]
-
-    @property
-    def numbers(self) -> Array:
-        """Return the numbers of all splines, one after another."""
-        return np.concatenate([s.numbers for s in self.splines]) if self.splines else np.zeros(0)
-
-    def with_numbers(self, numbers: Array) -> Tracks:
-        """Return the same knots with other numbers."""
-        edges = np.cumsum([0, *(s.numbers.size for s in self.splines)])
-        return Tracks(
-            tuple(s.with_numbers(numbers[a:b]) for s, a, b in zip(self.splines, edges, edges[1:], strict=False)),
-            self.of,
-        )
-
-    @property
-    def shared(self) -> bool:
-        """Return whether several runs slid on one track."""
-        return len(self.splines) == 1 < len(self.of)
-
-    def columns(self, run: Run) -> range:
-        """Return the places of a run's numbers among all."""
-        before = sum(s.numbers.size for s in self.splines[: self.of[run.name]])
-        return range(before, before + self.spline(run).numbers.size)
-
-    def spline(self, run: Run) -> Spline:
-        """Return the track of a run; a smooth one where none is known."""
-        return self.splines[self.of[run.name]] if run.name in self.of else Spline.over(-1.0, 1.0, 1.0)
-
-    def root(self, roughness: Roughness) -> Array:
-        """Return L with L L' the prior covariance of all numbers."""
-        return block_diag(*(roughness.root(s.nodes) for s in self.splines)) if self.splines else np.zeros((0, 0))
-
-
-def tracks_for(runs: Sequence[Run], *, shared: bool) -> Tracks:
-    """Return smooth tracks that cover the slip of these runs: one for all, or one for each."""
-    ends = {}
-    for run in runs:
-        V = run.drive(run.t)
-        ends[run.name] = run.start + float(np.sum(0.5 * (V[1:] + V[:-1]) * np.diff(run.t)))
-    if shared:
-        return Tracks((_cover(min(r.start for r in runs), max(ends.values())),), {r.name: 0 for r in runs})
-    return Tracks(tuple(_cover(r.start, ends[r.name]) for r in runs), {r.name: i for i, r in enumerate(runs)})
-
-
-def _cover(low: float, high: float) -> Spline:
-    return Spline.over(low - 1.0, high + 2.0, max(SPACING, (high - low) / (MOST - 3)))
+ROUGHLY = 6.0  # the same within which roughness is estimated: farther off it would take up what is not its own
 
 
 @dataclass(frozen=True)
@@ -213,6 +143,12 @@ class Latent:
         share = point.chi2 / max(self.samples, 1)
         return max(settled, next(far for most, far in FAR if share < most or most == np.inf) * point.chi2)
 
+    def roughness(self, point: Point, grid: tuple[Array, Array]) -> Roughness:
+        """Return the roughness at which the marginal likelihood is largest, the one so far where that means nothing."""
+        if point.chi2 > ROUGHLY * self.samples:
+            return point.roughness if point.roughness.amplitude else USUAL
+        return _marginal_at(point, point.theta.size, grid).roughness
+
     def _step(self, point: Point, L: Array, free: Array, damping: float) -> tuple[Array, float]:
         """Return the step over (scaled theta, numbers), and what it should gain in minus twice the log posterior."""
         n = free.size
@@ -264,15 +200,15 @@ def marginal(
     now = tracks.numbers
     b = h + G @ now
     smooth = base - float(h @ now) - 0.5 * float(now @ G @ now)
-    best = (smooth, Roughness())
-    for length in grid[0]:
-        if length < 1.2 * max(s.spacing for s in tracks.splines):
-            continue
+    lengths, amplitudes = grid
+    best = (smooth if 0.0 in amplitudes else -np.inf, Roughness())
+    wide = lengths[lengths >= 1.2 * max(s.spacing for s in tracks.splines)]
+    for length in wide if wide.size else lengths[-1:]:
         unit = tracks.root(Roughness(1.0, float(length)))
         core, forced = unit.T @ G @ unit, unit.T @ b
         values, vectors = np.linalg.eigh(core)
         values, along = np.maximum(values, 0.0), vectors.T @ forced
-        for amplitude in grid[1][1:]:
+        for amplitude in amplitudes[amplitudes > 0]:
             s2 = amplitude**2
             found = smooth + 0.5 * float(np.sum(s2 * along**2 / (1 + s2 * values)) - np.sum(np.log1p(s2 * values)))
             if found > best[0]:
@@ -318,7 +254,6 @@ class LatentFit:
     point: Point
     noise: dict[str, Noise]
     log_likelihood: float
-    smooth: float
     evaluations: int
 
     @property
@@ -359,31 +294,37 @@ def fit_latent(problem: Problem, theta: Array, noise: Mapping[str, Noise], *, tr
         tracks = Tracks((), {})
     elif tracks is None:
         tracks = tracks_for(problem.runs, shared=False)
-    noise, n = dict(noise), theta.size
+    noise = dict(noise)
     point = latent.at(theta, tracks, noise, roughness or Roughness())
     before = -np.inf
     for number in range(rounds):
+        last = point
         if point.tracks.splines:
-            found = _marginal_at(point, n, grid)
-            point = replace(point, roughness=found.roughness)
-            if not found.roughness.amplitude:
+            point = replace(point, roughness=latent.roughness(point, grid))
+            if not point.roughness.amplitude:
                 point = replace(point, tracks=point.tracks.with_numbers(np.zeros(point.tracks.numbers.size)))
         early = bool(point.tracks.splines) and number + 1 < rounds
         point = latent.minimise(point, noise, steps=steps, settled=EARLY if early else SETTLED)
         if not known_noise:
             noise = latent.noise(point)
             point = latent.at(point.theta, point.tracks, noise, point.roughness)
-        total = smooth = point.log_likelihood
-        if point.tracks.splines:
-            found = _marginal_at(point, n, grid)
-            total, smooth = (
-                min(x, point.log_likelihood) for x in (found.log_likelihood, found.smooth)
-            )  # no prior adds any
+        total = attained(point)
+        if known_noise and total < before:  # the likelihood is not as linear as it took to promise more
+            point, total = last, before
+            break
         settled = known_noise and (not point.tracks.splines or point.chi2 > LOST * latent.samples)
         if abs(total - before) < 0.5 or settled:
             break
         before = total
-    return LatentFit(problem, point, noise, total, smooth, latent.evaluations)
+    return LatentFit(problem, point, noise, total, latent.evaluations)
+
+
+def attained(point: Point) -> float:
+    """Return the log likelihood with the track integrated out, at the roughness under which it was found."""
+    if not point.tracks.splines:
+        return point.log_likelihood
+    own = np.array([point.roughness.length]), np.array([point.roughness.amplitude])
+    return min(_marginal_at(point, point.theta.size, own).log_likelihood, point.log_likelihood)  # no prior adds any
 
 
 def _marginal_at(point: Point, n: int, grid: tuple[Array, Array]) -> Marginal:

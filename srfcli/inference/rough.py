@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from srfcli.inference.fit import Fit, Problem, RunFit
-from srfcli.inference.latent import Latent, LatentFit, Roughness, fit_latent, tracks_for
+from srfcli.inference.latent import Latent, LatentFit, fit_latent
 from srfcli.inference.noise import estimate_noise, stretches, white_level
+from srfcli.inference.tracks import Roughness, tracks_for
 from srfcli.status import Status
 
 

@@ -1,0 +1,135 @@
+"""Where a baseline is far off, and nothing leads while held: hypotheses on a rough track, by horizons that grow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from srfcli.diagnosis.candidates import Hypothesis
+from srfcli.diagnosis.columns import along_table
+from srfcli.diagnosis.ledger import ROUGH_COSTS
+from srfcli.diagnosis.refits import NEAR, PAIRS, Refit
+from srfcli.diagnosis.score import scores
+from srfcli.inference.fit import Problem
+from srfcli.inference.grow import FOLLOWED, SHARES, Grown, grow, whole
+from srfcli.inference.latent import LatentFit
+from srfcli.inference.tracks import tracks_for
+from srfcli.laws import Effect
+
+if TYPE_CHECKING:
+    from srfcli.diagnosis.search import Search
+
+BRIEF = 0.2  # share of the recordings below which one track for all runs is not followed: each has its own
+FOREMOST, FAINT = (
+    4,
+    0.2,
+)  # effects that are grown beside a hypothesis, and of the first one's score what another promises
+STRICT = 1.44  # chi-squared per sample within which they grow: with what is missing noise alone is left
+CLEARLY = 60.0  # twice the log posterior by which one leads, so that the next is not asked
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A hypothesis on its way: its fit over the longest horizon that it follows."""
+
+    hypothesis: Hypothesis
+    problem: Problem
+    grown: Grown
+
+    @property
+    def follows(self) -> bool:
+        """Return whether it follows the recordings nearly to their end."""
+        return self.grown.share == SHARES[-1]
+
+
+def by_horizons(search: Search, baseline: Refit, candidates: Sequence[Effect]) -> bool:
+    """Return whether the baseline on a rough track, or effects beside it, leave noise alone.
+
+    What is missing stops a horizon from growing, or leaves more there, and is scored where slopes still mean something.
+    """
+    bare, values = Hypothesis(), search.loosely(baseline).values
+    shared = True
+    alone = entrant(search, bare, values, shared=shared)
+    if alone.grown.share < BRIEF:
+        shared = False
+        alone = entrant(search, bare, values, shared=shared)
+    around = alone.grown.fit
+    if alone.follows:
+        found = search.keep(bare, whole(alone.problem, alone.grown, search.noise), rough=True)
+        if found.adequacy.fine:
+            search.shared = shared
+            search.widen(found, candidates, PAIRS, rough=True)
+            return search.settled(candidates)
+        if found.adequacy.rms_over_noise < NEAR:
+            around = found.fit
+    singles = _beside(search, bare, around, candidates, values, shared=shared)
+    if _released(search, singles, shared=shared) or not singles:
+        return search.settled(candidates)
+    leader = singles[0]
+    at = values | leader.grown.fit.values
+    _released(
+        search, _beside(search, leader.hypothesis, leader.grown.fit, candidates, at, shared=shared), shared=shared
+    )
+    return search.settled(candidates)
+
+
+def entrant(
+    search: Search, hypothesis: Hypothesis, at: Mapping[str, float], *, shared: bool, followed: float = FOLLOWED
+) -> Entrant:
+    """Return a hypothesis grown from the values in `at`, on one track for all runs or on one for each."""
+    problem = search.problem(hypothesis, at, rough=True)
+    grown = grow(
+        problem, tracks_for(problem.runs, shared=shared), search.noise, tied=search.base_names(), followed=followed
+    )
+    search.evaluations += grown.evaluations * ROUGH_COSTS
+    search.progress(
+        f"{hypothesis.name} on a rough track: follows {100 * grown.share:.0f} % of the recordings, "
+        f"rms over noise {grown.left:.3f}"
+    )
+    return Entrant(hypothesis, problem, grown)
+
+
+def on_a_rough_track(
+    search: Search, hypothesis: Hypothesis, at: Mapping[str, float], *, shared: bool
+) -> LatentFit | None:
+    """Return the fit of all of the recordings from the values in `at`, None where horizons do not grow to their end."""
+    found = entrant(search, hypothesis, at, shared=shared)
+    return whole(found.problem, found.grown, search.noise) if found.follows else None
+
+
+def _beside(
+    search: Search, hypothesis: Hypothesis, around: LatentFit, candidates: Sequence[Effect],
+    values: Mapping[str, float], *, shared: bool,
+) -> list[Entrant]:  # fmt: skip
+    """Return the hypotheses that add one effect, grown, the best first: those that promise most, and those that are built in."""
+    present = hypothesis.effects
+    reported = {e.reported for e in present}
+    left = [e for e in candidates if e.reported not in reported and not (e.settings and present)]
+    scored = scores(search.registry, around.problem.experiment, around, left, present=present)
+    least = FAINT * scored[0].gain if scored else 0.0
+    promising = [s for i, s in enumerate(scored) if (i < FOREMOST and s.gain >= least) or s.effect.settings]
+    found = []
+    for score in promising:
+        wider = Hypothesis((*present, score.effect))
+        own = search.own_values(wider, score.values) if along_table(score.effect) else {}
+        if search.untried(wider, rough=True):
+            found.append(entrant(search, wider, {**values, **own}, shared=shared, followed=STRICT))
+    return sorted(found, key=lambda e: e.grown.rank)
+
+
+def _released(search: Search, entrants: Sequence[Entrant], *, shared: bool) -> bool:
+    """Return whether one of those that follow the recordings leaves noise alone, set free: the best, and what is close to it."""
+    following = [e for e in entrants if e.follows]
+    for e in following[:2]:
+        samples = sum(int(r.used.sum()) for r in e.grown.fit.problem.runs)
+        if (
+            e is not following[0]
+            and (e.grown.rank - following[0].grown.rank) * samples > CLEARLY
+            and search.best().adequacy.fine
+        ):
+            break
+        found = search.keep(e.hypothesis, whole(e.problem, e.grown, search.noise), rough=True)
+        if found.adequacy.rms_over_noise < NEAR:
+            search.shared = shared
+    return search.best().adequacy.fine
