@@ -191,7 +191,7 @@ def roughened(refit: object, noise: dict, tracks: Tracks) -> Side:
     """Return a hypothesis with the same parameters, on tracks of a known roughness."""
     problem = refit.hypothesis.problem(SHIPPED, refit.fit.problem.experiment, rough=True, at=refit.fit.values)
     point = Latent(problem).at(refit.fit.point.theta, tracks, noise, Roughness(1e-3, 3.0))
-    fit = LatentFit(problem, point, noise, point.log_likelihood, point.log_likelihood, 1)
+    fit = LatentFit(problem, point, noise, point.log_likelihood, 1)
     return Side.of(replace(refit, fit=fit, rough=True))
 
 
