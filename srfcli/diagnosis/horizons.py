@@ -20,7 +20,7 @@ from srfcli.laws import Effect
 if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
 
-BRIEF = 0.2  # share of the recordings below which one track for all runs is not followed: each has its own
+BRIEF = 0.2  # share of the recordings below which one track for all runs is not followed: none is there, or each has its own
 FOREMOST, FAINT = (
     4,
     0.2,
@@ -46,31 +46,28 @@ class Entrant:
 def by_horizons(search: Search, baseline: Refit, candidates: Sequence[Effect]) -> bool:
     """Return whether the baseline on a rough track, or effects beside it, leave noise alone.
 
-    What is missing stops a horizon from growing, or leaves more there, and is scored where slopes still mean something.
+    What is missing stops a horizon from growing, or leaves more there, and is scored where slopes still mean something. The track
+    is the same for all runs: one for each takes up what is missing as well as roughness.
     """
     bare, values = Hypothesis(), search.loosely(baseline).values
-    shared = True
-    alone = entrant(search, bare, values, shared=shared)
+    alone = entrant(search, bare, values, shared=True)
     if alone.grown.share < BRIEF:
-        shared = False
-        alone = entrant(search, bare, values, shared=shared)
+        return False
     around = alone.grown.fit
     if alone.follows:
         found = search.keep(bare, whole(alone.problem, alone.grown, search.noise), rough=True)
         if found.adequacy.fine:
-            search.shared = shared
+            search.shared = True
             search.widen(found, candidates, PAIRS, rough=True)
             return search.settled(candidates)
         if found.adequacy.rms_over_noise < NEAR:
             around = found.fit
-    singles = _beside(search, bare, around, candidates, values, shared=shared)
-    if _released(search, singles, shared=shared) or not singles:
+    singles = _beside(search, bare, around, candidates, values)
+    if _released(search, singles) or not singles:
         return search.settled(candidates)
     leader = singles[0]
     at = values | leader.grown.fit.values
-    _released(
-        search, _beside(search, leader.hypothesis, leader.grown.fit, candidates, at, shared=shared), shared=shared
-    )
+    _released(search, _beside(search, leader.hypothesis, leader.grown.fit, candidates, at))
     return search.settled(candidates)
 
 
@@ -99,9 +96,8 @@ def on_a_rough_track(
 
 
 def _beside(
-    search: Search, hypothesis: Hypothesis, around: LatentFit, candidates: Sequence[Effect],
-    values: Mapping[str, float], *, shared: bool,
-) -> list[Entrant]:  # fmt: skip
+    search: Search, hypothesis: Hypothesis, around: LatentFit, candidates: Sequence[Effect], values: Mapping[str, float]
+) -> list[Entrant]:
     """Return the hypotheses that add one effect, grown, the best first: those that promise most, and those that are built in."""
     present = hypothesis.effects
     reported = {e.reported for e in present}
@@ -114,11 +110,11 @@ def _beside(
         wider = Hypothesis((*present, score.effect))
         own = search.own_values(wider, score.values) if along_table(score.effect) else {}
         if search.untried(wider, rough=True):
-            found.append(entrant(search, wider, {**values, **own}, shared=shared, followed=STRICT))
+            found.append(entrant(search, wider, {**values, **own}, shared=True, followed=STRICT))
     return sorted(found, key=lambda e: e.grown.rank)
 
 
-def _released(search: Search, entrants: Sequence[Entrant], *, shared: bool) -> bool:
+def _released(search: Search, entrants: Sequence[Entrant]) -> bool:
     """Return whether one of those that follow the recordings leaves noise alone, set free: the best, and what is close to it."""
     following = [e for e in entrants if e.follows]
     for e in following[:2]:
@@ -131,5 +127,5 @@ def _released(search: Search, entrants: Sequence[Entrant], *, shared: bool) -> b
             break
         found = search.keep(e.hypothesis, whole(e.problem, e.grown, search.noise), rough=True)
         if found.adequacy.rms_over_noise < NEAR:
-            search.shared = shared
+            search.shared = True
     return search.best().adequacy.fine
