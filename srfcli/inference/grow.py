@@ -65,18 +65,17 @@ def grow(
     followed, by `whole`.
     """
     theta, evaluations, rank = problem.start, 0, np.inf
-    cut, point, reached = problem, None, 0.0
+    cut, reached = problem, 0.0
     for share in SHARES:
         shorter = replace(problem, runs=tuple(_until(run, share) for run in problem.runs))
         latent = Tied(shorter, problem.start, tied)
         trial = latent.minimise(latent.at(theta, tracks, noise, USUAL), noise, steps=STEPS, settled=SETTLED)
         evaluations += max(round(share * latent.evaluations), 1)
-        if point is not None and trial.chi2 > followed * latent.samples:
-            break
-        cut, point, reached = shorter, trial, share
-        rank = trial.penalised / latent.samples + 100 * (1 - share)
-        theta, tracks = trial.theta, trial.tracks
-        if trial.chi2 > followed * latent.samples:
+        beyond = trial.chi2 > followed * latent.samples
+        if not beyond or not reached:  # the first horizon is the least that there is
+            cut, theta, tracks, reached = shorter, trial.theta, trial.tracks, share
+            rank = trial.penalised / latent.samples + 100 * (1 - share)
+        if beyond:
             break
     plain = Latent(cut)
     place = plain.at(theta, tracks, noise, USUAL)
