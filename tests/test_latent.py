@@ -97,8 +97,9 @@ def test_parameters_survive_a_rough_track(shared: Path) -> None:
     choice = asdict(experiment.choice)
     plain = fit(fit_problem(open_model(registry, **choice), experiment))
     problem = fit_problem(open_model(registry, **choice, tables=(("mu", "slip"),)), experiment)
-    found, roughness = fit_rough(problem, plain)
-    assert 2e-4 < roughness.amplitude < 5e-4
+    rough = fit_rough(problem, plain)
+    found = rough.fit
+    assert 2e-4 < rough.roughness.amplitude < 5e-4 and not rough.shared
     assert found.rms_over_noise() == pytest.approx(1.0, abs=0.03)
     for name, value in found.values.items():
         assert abs(value - truth[{"lambda": "lam"}.get(name, name)]) < 4 * found.stderr[name]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from srfcli.inference.fit import Fit, Problem
     from srfcli.inference.profile import Interval
-    from srfcli.inference.tracks import Roughness
+    from srfcli.inference.rough import RoughFit
     from srfcli.output.tables import Table
     from srfcli.recording.values import Experiment
     from srfcli.registry import Registry
@@ -80,6 +80,8 @@ def command(source: Path, system: SystemOptions, output: OutputOptions, **option
     for name in ("law", "ageing", "interface", "loading", "inertia"):
         if getattr(system, name).origin == "flag":
             raise SrfError(f"--{name} is given, and an experiment names its own", "Change [model] in experiment.toml.")
+    for name in system.flags:
+        raise SrfError(f"{name} is set, and an experiment has its own values", "Change it in experiment.toml.")
     _fit_recordings(
         source, system, output, **{k: v for k, v in options.items() if k not in ("bounds", "method", "tol")}
     )
@@ -120,7 +122,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     begun, status = time.perf_counter(), Status.OK
     starts: list[tuple[float, bool]] = []
     intervals: list[Interval] = []
-    draws, roughness = None, None
+    draws, rough = None, None
     with Progress("fit") as progress:
 
         def report(text: str) -> None:
@@ -130,7 +132,8 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
             fit, starts = fit_from_several(problem, count=options["starts"], seed=options["seed"], progress=report)
             status = fit.status
             if options["track"] == "rough":
-                fit, roughness = fit_rough(_on_tracks(registry, experiment, problem), fit, progress=report)
+                rough = fit_rough(_on_tracks(registry, experiment, problem), fit, progress=report)
+                fit = rough.fit
             if options["profile"]:
                 for name in problem.names:
                     intervals.append(profile(problem, fit, name, progress=report))
@@ -147,8 +150,8 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
             Session.current().detail(f"{run.name}: {notice}")
     runs = run_table(fit)
     table = parameter_table(problem, fit, intervals, starts, draws, runs, status)
-    if roughness is not None:
-        table = _with_roughness(table, roughness)
+    if rough is not None:
+        table = _with_tracks(table, rough)
     emit(
         table, output, more=[runs], laws=model.laws, inputs=[experiment.path, *(r.file for r in experiment.runs)],
         seed=options["seed"], timings={"fit": time.perf_counter() - begun}, figure=_figure(problem, fit),
@@ -165,13 +168,15 @@ def _on_tracks(registry: Registry, experiment: Experiment, problem: Problem) -> 
     return replace(problem, model=open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),)))
 
 
-def _with_roughness(table: Table, roughness: Roughness) -> Table:
+def _with_tracks(table: Table, rough: RoughFit) -> Table:
     """Return the table with what was found of the tracks."""
     from dataclasses import replace
 
-    text = f"tracks: mu0 wanders by {roughness.amplitude:.2g} (standard deviation) over {roughness.length:.2g} um"
-    text = text if roughness.amplitude else "tracks: smooth; none was found to be rough"
-    found = {"amplitude": roughness.amplitude, "length_um": roughness.length}
+    roughness, text = rough.roughness, "tracks: smooth; none was found to be rough"
+    if roughness.amplitude:
+        whose = "one for all runs" if rough.shared else "each run has its own"
+        text = f"tracks: mu0 wanders by {roughness.amplitude:.2g} (standard deviation) over {roughness.length:.2g} um; {whose}"
+    found = {"amplitude": roughness.amplitude, "length_um": roughness.length, "shared": rough.shared}
     return replace(table, notes=(*table.notes, text), meta={**table.meta, "track": found})
 
 
