@@ -209,16 +209,17 @@ def test_the_size_of_every_effect_is_known_on_both_sides(name):
 
 
 def test_deviations_by_hand():
-    def off(name, value, unit="1", *, named=None, **physics):
+    def off(name, value, unit="1", *, named=None, changed=None, **physics):
         (size,) = [s for s in SIZES[name] if s.unit == unit]
         truth = truth_of(name, physics=physics)
-        truth["truth"] = physics
+        truth["truth"] = changed if changed is not None else physics
         found = {size.parameter: {"value": value, "stderr": 0.5, "unit": unit}}
         return deviation(truth, Answer("c", "identified", (named or name,), parameters=found))
 
     assert off(ALPHA, 3.0, alpha=2.0) == (2.0, 0.5)
     assert off("age-saturation", 0.25, "s/um", Vsat=8.0) == (0.25, 1.0)
     assert off("inertia", 1.0, "kg", M=2e-6) == (-2.0, 0.5)
+    assert off("inertia", 1.0, "kg", M=2e-6, changed={"massless": False}) == (-2.0, 0.5)  # the baseline lacks it all
     assert off("drive-ripple", -3.0, ripple=2.0) == (2.0, 0.5)
     assert off("friction-drift", 3.0, "1/um", drift_x=2.0) == (2.0, 0.5)
     assert off("friction-drift", 3.0, "1/um", drift_t=2.0) is None  # drift in time, found as one along the track

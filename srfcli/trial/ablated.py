@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from math import log
 
+from srfcli.diagnosis.search import CLOSE
 from srfcli.output.tables import Column, Table
 from srfcli.trial.answer import Answer
 from srfcli.trial.mark import Mark
@@ -21,23 +22,29 @@ def ungated(answer: Answer) -> tuple[str, frozenset[str]]:
     """Return what would have been said had held-out runs no say."""
     if answer.ungated in ("", answer.verdict):
         return as_it_is(answer)
-    return answer.ungated, _effects(_best(answer, "evidence")) if answer.ungated == "identified" else frozenset()
+    return answer.ungated, _effects(_named(answer)) if answer.ungated == "identified" else frozenset()
 
 
 def information_criterion(answer: Answer) -> tuple[str, frozenset[str]]:
     """Return what the smallest Bayesian information criterion says: always a model, whatever it leaves over."""
     if not answer.tried:
         return as_it_is(answer)
-    effects = _effects(_best(answer, "criterion"))
+    tried = answer.tried
+    effects = _effects(
+        max(
+            sorted(tried),
+            key=lambda n: tried[n]["log_likelihood"] - 0.5 * tried[n]["parameters"] * log(tried[n]["samples"]),
+        )
+    )
     return ("identified" if effects else "none"), effects
 
 
-def _best(answer: Answer, by: str) -> str:
-    def value(name: str) -> float:
-        t = answer.tried[name]
-        return t["evidence"] if by == "evidence" else t["log_likelihood"] - 0.5 * t["parameters"] * log(t["samples"])
-
-    return max(sorted(answer.tried), key=value)
+def _named(answer: Answer) -> str:
+    """Return the hypothesis that is named where no run is held out: the best that leaves noise alone and holds no smaller one."""
+    evidence = {name: t["evidence"] for name, t in answer.tried.items()}
+    close = [n for n in sorted(evidence) if answer.tried[n]["fine"] and max(evidence.values()) - evidence[n] < CLOSE]
+    smallest = [n for n in close if not any(_effects(other) < _effects(n) for other in close)]
+    return max(smallest or sorted(evidence), key=evidence.__getitem__)
 
 
 def _effects(name: str) -> frozenset[str]:

@@ -53,9 +53,11 @@ def deviation(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] |
     """
     if len(truth["effects"]) != 1 or answer.effects != tuple(truth["effects"]):
         return None
-    for size in SIZES.get(truth["effects"][0], ()):
+    sizes = SIZES.get(truth["effects"][0], ())
+    for size in sizes:
         found = answer.parameters.get(size.parameter)
-        if found is None or found["unit"] != size.unit or size.field not in truth["truth"]:
+        other_form = len(sizes) > 1 and size.field not in truth["truth"]
+        if found is None or found["unit"] != size.unit or other_form:
             continue
         true, value, error = truth["physics"][size.field] * size.factor, found["value"], found["stderr"]
         true = 1 / true if size.inverse else true
