@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,29 @@ def test_a_noisier_run_is_no_gauge_of_the_others():
     rng, runs = np.random.default_rng(1), runs_of(SIZES)
     residuals = {r.name: red(rng, r.t.size, 0.3) * (2 if r.name == "r1" else 1) for r in runs}
     assert gauge_noise(runs, residuals)["r0"].level == pytest.approx(0.02, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("size", "unused"),
+    [
+        (400, [(100, 230)]),  # one stretch, over two of the pieces in which noise is looked for
+        (2125, [(0, 700), (1500, 1900)]),
+        (2125, [(k, k + 1) for k in range(20, 2125, 50)]),  # hardly a piece without one
+        (2125, [(k, k + 5) for k in range(20, 2125, 50)]),
+    ],
+)
+def test_what_is_not_used_is_no_calm_stretch(size, unused):
+    """A line across a gap has no noise at all: that is no gauge of the rest."""
+    rng, (whole, other) = np.random.default_rng(8), runs_of((size, 3000))
+    residuals = {r.name: red(rng, r.t.size, 0.0) for r in (whole, other)}
+    used = whole.used.copy()
+    for a, b in unused:
+        used[a:b] = False
+        residuals["r0"][a:b] = np.nan
+    found = gauge_noise([replace(whole, used=used), other], residuals)
+    assert found["r1"].level == pytest.approx(0.02, rel=0.05)
+    alone = gauge_noise([replace(whole, used=used)], residuals)
+    assert alone["r0"].level == pytest.approx(0.02, rel=0.12)
 
 
 def test_noises_are_alike_within_what_matters():

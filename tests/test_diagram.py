@@ -70,6 +70,18 @@ def test_constant_load_is_beside_it_and_the_note_says_what_is_shown(found):
         assert word in found["note"]
 
 
+def test_a_fitted_stiffness_is_the_diagram_s(experiment):
+    calm = replace(experiment, runs=tuple(r for r in experiment.runs if r.modulation is None))
+    values = {q.name: q.value for q in calm.parameters}
+    stiffer = 1.3 * calm.runs[0].stiffness
+    told = replace(calm, runs=tuple(replace(r, stiffness=stiffer) for r in calm.runs))
+    found = stability(SHIPPED, calm, values | {"K": stiffer}, told)
+    assert found["W0_hopf_baseline"] == pytest.approx(found["W0_hopf_augmented"])
+    slow = slice(0, 20)  # where inertia does not count the critical load goes with the stiffness
+    stated = stability(SHIPPED, calm, values, calm)["W0_hopf_baseline"][slow]
+    assert found["W0_hopf_baseline"][slow] == pytest.approx(1.3 * stated, rel=0.01)
+
+
 def test_without_a_modulated_run_it_is_under_constant_load(experiment):
     calm = replace(experiment, runs=tuple(r for r in experiment.runs if r.modulation is None))
     alone = stability(SHIPPED, calm, {q.name: q.value for q in calm.parameters}, calm)

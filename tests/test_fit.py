@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from srfcli.errors import SrfError
 from srfcli.inference.fit import Interrupted, fit, fit_problem, held_fit
 from srfcli.inference.noise import Noise, estimate_noise, lag_one, log_determinant, stretches, white_level, whiten
-from srfcli.inference.nuisance import own_names
+from srfcli.inference.nuisance import basis, own_names, own_start
 from srfcli.inference.prediction import predict
 from srfcli.inference.profile import profile
 from srfcli.inference.starts import fit_from_several
@@ -175,6 +175,24 @@ def test_trend_and_free_start_are_fitted(rock_model):
     found = fit(fit_problem(rock_model, experiment, trend="slip"))
     assert abs(found.values["r0.mu"] - 0.61) < 4 * found.stderr["r0.mu"]
     assert found.values["r0.trend"] > 0 and found.rms_over_noise() == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_trend_may_be_as_steep_by_time_as_by_slip(rock_model):
+    (run,) = rock(rock_model, runs=1).runs
+    p = np.zeros(len(rock_model.names))
+    for trend in ("slip", "time"):
+        start, lower, upper = own_start(rock_model, run, p, "r0.trend", trend)
+        assert start == 0.0 and lower == -upper
+        assert upper * np.ptp(basis(run, trend)) == pytest.approx(10 * np.ptp(run.observed))
+
+
+@pytest.mark.parametrize("first", [0.0, -5e-4, 1e-4])
+def test_a_run_may_begin_without_any_friction(rock_model, first):
+    (run,) = rock(rock_model, runs=1).runs
+    unloaded = replace(run, observed=run.observed - run.observed[0] + first, initial="free")
+    unloaded.observed[:5] = first
+    mu, lower, upper = own_start(rock_model, unloaded, np.zeros(len(rock_model.names)), "r0.mu")
+    assert mu == first and lower < mu - 0.09 and upper > mu + 0.09
 
 
 def test_stick_slip_from_afar(make_model):

@@ -16,7 +16,7 @@ from srfcli.diagnosis.search import Search
 from srfcli.inference import latent
 from srfcli.inference.grow import SHARES, grow, whole
 from srfcli.inference.latent import GRID, ROUGHLY, Latent, Point, fit_latent
-from srfcli.inference.tracks import USUAL, Roughness, tracks_for
+from srfcli.inference.tracks import USUAL, Roughness, Tracks, tracks_for
 from srfcli.numerics.compiled import compiler
 from srfcli.proof.draw import Gauge
 from srfcli.proof.folder import case_files
@@ -67,6 +67,15 @@ def test_roughness_is_not_estimated_far_off_where_what_is_left_is_not_the_track_
     tracks = tracks_for(problem.runs, shared=True)
     point = Point(problem.start, tracks, given, {}, np.eye(1), np.zeros(1), 2 * ROUGHLY * likelihood.samples, 0.0)
     assert likelihood.roughness(point, GRID) == expected
+
+
+def test_a_fit_whose_every_parameter_stands_at_a_bound_stays_there(search):
+    values = dict(search.tried["none", False].fit.values)
+    problem, bound = search.problem(Hypothesis(), values), np.array([1.02 * values.pop("mu0")])
+    pinned = replace(problem, names=("mu0",), start=bound, lower=bound, upper=1.1 * bound, held=values)
+    likelihood = Latent(pinned)
+    point = likelihood.at(bound, Tracks((), {}), search.noise, Roughness())
+    assert likelihood.minimise(point, search.noise).theta == bound
 
 
 def test_evidence_on_a_rough_track_is_of_a_roughness_that_was_fitted(search, monkeypatch):

@@ -14,11 +14,12 @@ import numpy as np
 from srfcli.inference.noise import Noise, stretches, whiten
 from srfcli.inference.prediction import of_run
 from srfcli.numerics.collocation import Array
-from srfcli.recording.noise import describe_noise
+from srfcli.recording.noise import TREND, describe_noise
 from srfcli.recording.values import Run
 
 WINDOWS, LEAST = 8, 64  # of each run, and samples of a window
 SLOW = 6  # cosines over a window: what is slower than a window's sixth
+WHOLE = 0.97  # share of a piece's samples that are used, from which its noise is that of the gauge
 FAINT = 0.08  # a correlation from sample to sample that is taken for none
 ALIKE = 1.08  # noise levels of runs, over the lowest, that are the gauge's; beside what chance makes of them
 CHANCE = 2.5  # standard deviations by which chance parts two levels
@@ -81,10 +82,19 @@ def _seen(run: Run, residual: Array, a: int, b: int) -> _Seen:
     cycles = modulation["f"] * float(np.median(np.diff(t))) if modulation["modulated"] else None
     if not ok.any():
         return _Seen(max(run.quantum / np.sqrt(12), 1e-12), 0.0, 0, 0)
-    about = describe_noise(np.interp(t, t[ok], r[ok]), cycles)
+    about = describe_noise(_used_pieces(np.interp(t, t[ok], r[ok]), ok), cycles)
     level = about.total if np.isfinite(about.total) else about.white
     rho = min(max(about.lag1, -0.9), 0.97) if np.isfinite(about.lag1) else 0.0
-    return _Seen(max(level, run.quantum / np.sqrt(12), 1e-12), rho, b - a, about.samples)
+    return _Seen(max(level, run.quantum / np.sqrt(12), 1e-12), rho, int(ok.sum()), about.samples)
+
+
+def _used_pieces(x: Array, ok: Array) -> Array:
+    """Return those pieces of x (n,) in which nearly every sample is used: a line across a gap is calmer than any noise."""
+    count = x.size // TREND
+    if ok.all() or count < 2:
+        return x
+    share = ok[: count * TREND].reshape(count, TREND).mean(axis=1)
+    return np.asarray(x[: count * TREND].reshape(count, TREND)[share >= min(WHOLE, share.max())].ravel())
 
 
 def quietest(run: Run, residual: Array) -> float:

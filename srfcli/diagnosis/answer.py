@@ -12,7 +12,7 @@ from srfcli.diagnosis.parting import Parting
 from srfcli.diagnosis.partingtext import described
 from srfcli.diagnosis.places import Row
 from srfcli.diagnosis.refits import Refit
-from srfcli.diagnosis.verdict import Diagnosis
+from srfcli.diagnosis.verdict import NOTHING, Diagnosis
 from srfcli.inference.latent import LatentFit
 from srfcli.inference.noise import stretches, whiten
 from srfcli.inference.prediction import of_run
@@ -21,7 +21,6 @@ from srfcli.recording.values import Run
 from srfcli.units import find_unit, from_base, split_quantity
 
 SCHEMA = "srf.diagnose/1"
-NOTHING_ADDED = ("none", "inconclusive")  # verdicts whose final model is the baseline
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class RunView:
 
 def final(diagnosis: Diagnosis) -> Refit:
     """Return the model that the answer calls augmented: the baseline itself where nothing is to be added."""
-    return diagnosis.baseline if diagnosis.verdict in NOTHING_ADDED else diagnosis.best
+    return diagnosis.baseline if diagnosis.verdict in NOTHING else diagnosis.best
 
 
 def run_views(diagnosis: Diagnosis) -> tuple[RunView, ...]:
@@ -56,12 +55,11 @@ def run_views(diagnosis: Diagnosis) -> tuple[RunView, ...]:
         parts = stretches(run.t, run.used)
         rms = [float(np.sqrt(np.mean(whiten(noise, run.observed - y, parts) ** 2))) for y in (y0, y1)]
         found.append(RunView(run, False, y0, y1, (rms[0], rms[1]), noise.level, slip_of(run, y0)))
-    level = next(iter(diagnosis.noise.values())).level
     for held in diagnosis.held:
         run = replace(held.run, holdout=True)
         y1, rms1 = (held.baseline, held.rms_baseline) if same else (held.augmented, held.rms_augmented)
         found.append(
-            RunView(run, True, held.baseline, y1, (held.rms_baseline, rms1), level, slip_of(run, held.baseline))
+            RunView(run, True, held.baseline, y1, (held.rms_baseline, rms1), held.level, slip_of(run, held.baseline))
         )
     return tuple(found)
 

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from srfcli.inference.fit import Problem, fit_problem
-from srfcli.inference.prediction import Hold
+from srfcli.inference.prediction import Hold, of_run
 from srfcli.laws import Effect, Parameter
 from srfcli.model import GeneratedModel, open_model
 from srfcli.recording.values import Experiment, FitParameter
@@ -17,6 +17,7 @@ from srfcli.registry import Registry
 from srfcli.units import split_quantity, to_base
 
 TRACK = ("mu", "slip")
+MODULATED = {"modulated", "eps", "envelope"}  # an effect of these is none where no load is modulated
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ def applicable(
     base = open_model(registry, **asdict(experiment.choice))
     found, excluded = [], []
     free = {p.name for p in experiment.parameters if not p.fixed}
+    had = {p.name: name for name in experiment.choice.effects for p in registry.get("effect", name).parameters}
     for entry in registry.entries("effect"):
         effect = registry.load(entry)
         assert isinstance(effect, Effect)
@@ -41,8 +43,12 @@ def applicable(
             continue
         if any(n not in base.names for n in effect.needs) or any(n in base.names for n in effect.lacks):
             continue
-        if any(p.name in base.names for p in effect.parameters) and not effect.settings:
-            continue  # the law has a parameter of that name already
+        taken = [p.name for p in effect.parameters if p.name in base.names] if not effect.settings else []
+        if taken:  # of the law, or of another effect that the baseline has
+            if taken[0] in had and effect.name not in had.values():
+                reason = f"its parameter {taken[0]} has the name of one of {had[taken[0]]}"
+                excluded.append(Excluded(effect.reported, reason))
+            continue
         if set(effect.frees) & free:
             continue
         reason = _unseen(effect, experiment)
@@ -64,7 +70,7 @@ def _unseen(effect: Effect, experiment: Experiment) -> str:
         return f"the load varies by {100 * spread:.2g} %" if spread > 0 else "the load is constant"
     if {"kappa", "W"} & (used | set(formulas)) and "W" in used and max(spread, between) < 1e-3:
         return f"the loads of all runs lie within {100 * max(spread, between):.2g} %"
-    if "eps" in used and all(run.modulation is None for run in experiment.runs) and spread < 1e-3:
+    if MODULATED & used and not any(of_run(run)["modulated"] for run in experiment.runs):
         return "no run has a modulated load"
     return ""
 
@@ -132,12 +138,18 @@ def own_parameters(effect: Effect, model: GeneratedModel) -> dict[str, Parameter
     return found
 
 
+def neutral_values(effect: Effect) -> dict[str, float]:
+    """Return the values at which an effect's sizes change nothing, in um, s, N."""
+    units = {p.name: p.unit for p in effect.parameters}
+    return {name: to_base(value, units[name]) for name, value in effect.neutral}
+
+
 def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment) -> list[FitParameter]:
     """Return start values and bounds of an effect's parameters in um, s, N: sizes at their neutral values, or just inside."""
-    neutral, found = dict(effect.neutral), []
+    neutral, found = neutral_values(effect), []
     for name, p in own_parameters(effect, model).items():
         low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
-        value = float(np.clip(to_base(neutral.get(p.name, p.default), p.unit), low, high))
+        value = float(np.clip(neutral.get(p.name, to_base(p.default, p.unit)), low, high))
         found.append(FitParameter(name, value, low, high, False, p.unit))
     for name in effect.frees:
         if name == "K":

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from srfcli.diagnosis.candidates import TRACK, fit_parameters, inner_grid, own_parameters
+from srfcli.diagnosis.candidates import TRACK, fit_parameters, inner_grid, neutral_values, own_parameters
 from srfcli.inference.latent import LatentFit
 from srfcli.inference.prediction import predict
 from srfcli.laws import Effect
@@ -72,9 +72,9 @@ def _values(
                 if short in fitted.values:
                     values[long] = fitted.values[short]
     for effect in added:
-        neutral = dict(effect.neutral)
+        neutral = neutral_values(effect)
         for long, p in own_parameters(effect, model).items():
-            values[long] = to_base(neutral.get(p.name, p.default), p.unit)
+            values[long] = neutral.get(p.name, to_base(p.default, p.unit))
     return values
 
 

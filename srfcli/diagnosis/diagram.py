@@ -10,6 +10,7 @@ import numpy as np
 
 from srfcli.errors import SrfError
 from srfcli.expression import symbol
+from srfcli.inference.prediction import stiffness_share
 from srfcli.laws import Effect
 from srfcli.model import GeneratedModel, open_model
 from srfcli.numerics.atlas import AtlasSettings, find_components
@@ -68,9 +69,10 @@ def _model(registry: Registry, experiment: Experiment, values: Mapping[str, floa
     """Return the laws' model without effects of the apparatus, and its parameters."""
     model = open_model(registry, **asdict(replace(experiment.choice, effects=())))
     own = {n: v for n, v in values.items() if n in model.names and n not in ("V", "W0", "K")}
-    own["K"] = experiment.runs[0].stiffness
-    if experiment.mass is not None and "M" in model.names:
-        own["M"] = experiment.mass
+    run = experiment.runs[0]
+    own["K"] = values["K"] * stiffness_share(experiment, run) if "K" in values else run.stiffness
+    if "M" in model.names and experiment.mass is not None:
+        own.setdefault("M", experiment.mass)
     return model, model.vector({**own, "W0": 1.0, "eps": 0.0})
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from srfcli.diagnosis.candidates import own_parameters
+from srfcli.diagnosis.candidates import neutral_values, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.follower import LOOSE_ONLY, PULLS, same
 from srfcli.diagnosis.horizons import on_a_rough_track
@@ -96,7 +96,7 @@ def other_starts(search: Search, refit: Refit) -> list[dict[str, float]]:
     values, model, effects = refit.fit.values, refit.fit.problem.model, refit.hypothesis.effects
     starts: list[dict[str, float]] = []
     for effect in effects:
-        neutral, own = dict(effect.neutral), own_parameters(effect, model)
+        neutral, own = neutral_values(effect), own_parameters(effect, model)
         if along_table(effect) and effect.scans and not refit.rough:
             (score,) = scores(search.registry, refit.fit.problem.experiment, refit.fit, [effect], present=effects)
             starts.append({long: score.values[p.name] for long, p in own.items() if p.name in score.values})

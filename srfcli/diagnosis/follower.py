@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from srfcli.diagnosis.adequacy import quietest
-from srfcli.diagnosis.candidates import Hypothesis, own_parameters
+from srfcli.diagnosis.candidates import Hypothesis, neutral_values, own_parameters
 from srfcli.inference import fit as fitting
 from srfcli.inference.fit import Problem, first_level
 from srfcli.inference.follow import between_slips, hold_to, slip_length, weaker
@@ -29,7 +29,6 @@ PULLS = (
 CLEAR = 1.05  # chi-squared per degree of freedom under a hold that is noise
 NEARLY = 1.6  # the same of a model that may be right: what is lost when it is set free is worth finding
 LOOSE_ONLY = (LOOSE,)  # the one that a refit starts under
-SPREAD = 0.02  # relative uncertainty of parameters from which a fit is set free
 COARSE, FEW = 1e-2, 12  # tolerance of chi-squared while held, and evaluations
 ROUND = 1e-4  # relative tolerance of the integrator while held
 FAIR = 1e-5  # the same of a free fit, where the noise asks for no more
@@ -111,7 +110,6 @@ class Follower:
         theta, reduced = self.descend(free, place, noise, 1e-4)
         if not reduced < FOLLOWED and held < NEARLY:
             grown = fitting.Search(free, lambda text: None)
-            grown.covariance = np.diag((SPREAD * grown.scale) ** 2)
             grew, _ = grown.grow(np.clip(place, free.lower, free.upper), noise)
             self.evaluations += grown.evaluations
             if grown.reduced < reduced:
@@ -153,7 +151,7 @@ def shortened(hypothesis: Hypothesis, problem: Problem, noise: Mapping[str, Nois
     if not hypothesis.effects or not hypothesis.effects[-1].sizes:
         return problem.start, 0.0
     effect = hypothesis.effects[-1]
-    neutral = dict(effect.neutral)
+    neutral = neutral_values(effect)
     places = [(problem.names.index(long), neutral[p.name]) for long, p in own_parameters(effect, problem.model).items()
               if p.name in neutral and long in problem.names]  # fmt: skip
     best = (problem.start, np.inf)

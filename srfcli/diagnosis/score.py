@@ -13,6 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
+from srfcli.diagnosis.candidates import neutral_values
 from srfcli.diagnosis.columns import Column, columns_of
 from srfcli.inference.latent import LatentFit, marginal, solve_scaled
 from srfcli.inference.noise import stretches, whiten
@@ -165,7 +166,7 @@ def _expected(column: Column, size: Array) -> dict[str, float]:
         amplitude = float(np.hypot(size[0], size[1]))
         values["phase"] = float(np.arctan2(size[1], size[0]))
     if effect.sizes:
-        values[effect.sizes[0]] = dict(effect.neutral)[effect.sizes[0]] + amplitude
+        values[effect.sizes[0]] = neutral_values(effect)[effect.sizes[0]] + amplitude
     return values
 
 

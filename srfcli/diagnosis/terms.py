@@ -71,8 +71,13 @@ def best_form(search: Search, diagnosis: Diagnosis) -> ClosedForm | None:
     held = judge_held(own, best, diagnosis.baseline, diagnosis.experiment)
     fitted = tuple(_fitted(e, best) for e in terms)
     beside = tuple(e for e in best.hypothesis.effects if e.name not in names)
-    gain = best.fit.log_likelihood - diagnosis.baseline.fit.log_likelihood
+    gain = best.fit.log_likelihood - _as_judged(own, diagnosis.baseline).fit.log_likelihood
     return ClosedForm(fitted, beside, best, gain, held)
+
+
+def _as_judged(search: Search, refit: Refit) -> Refit:
+    """Return a refit under the noise as it is known now: better fits that came later may have told it better."""
+    return search.tried.get((refit.name, refit.rough), refit)
 
 
 def _smoothed(search: Search, best: Refit | None) -> Refit | None:
@@ -80,7 +85,7 @@ def _smoothed(search: Search, best: Refit | None) -> Refit | None:
     if best is None or not best.rough:
         return best
     smooth = search.refit(best.hypothesis, best, {}, rough=False)
-    return max((best, smooth), key=lambda r: r.evidence)
+    return max((_as_judged(search, best), smooth), key=lambda r: r.evidence)
 
 
 def _with_own_terms(search: Search) -> Search:
@@ -106,7 +111,8 @@ class _Selection:
         best = self.step(start)
         if diagnosis.best.hypothesis.effects and not (best is not None and best.adequacy.fine):
             other = self.step(diagnosis.best)
-            best = max((r for r in (best, other) if r is not None), key=lambda r: r.evidence, default=None)
+            found = [_as_judged(self.search, r) for r in (best, other) if r is not None]
+            best = max(found, key=lambda r: r.evidence, default=None)
         for _ in range(MOST_TERMS - 1):
             if best is None or best.adequacy.fine:
                 break
@@ -128,8 +134,8 @@ class _Selection:
             candidates = _foremost(self.scored(start, search.loosely(start)))
             entrants = [(h, own) for h, own in search.widened(start, candidates) if self.new(h)]
             found = contest(search, start, entrants)
-        best = max(found, key=lambda r: r.evidence, default=None)
-        return best if best is not None and best.evidence > start.evidence + PAYS else None
+        best = max((_as_judged(search, r) for r in found), key=lambda r: r.evidence, default=None)
+        return best if best is not None and best.evidence > _as_judged(search, start).evidence + PAYS else None
 
     def new(self, hypothesis: Hypothesis) -> bool:
         """Return whether a hypothesis was not tried before and there is something left to try it with."""

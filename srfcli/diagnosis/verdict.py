@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from srfcli.diagnosis.adequacy import DOUBT, SURE, Adequacy, joined, sampled
-from srfcli.diagnosis.candidates import Excluded, Hypothesis
+from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, neutral_values
 from srfcli.diagnosis.follower import LOOSE, Follower
 from srfcli.diagnosis.refits import HALFWAY, NEAR, Refit, judge_fit
 from srfcli.diagnosis.score import Score
@@ -20,8 +20,10 @@ from srfcli.inference.noise import Noise
 from srfcli.inference.tracks import tracks_for
 from srfcli.numerics.collocation import Array
 from srfcli.recording.values import Experiment, Run
+from srfcli.units import to_base
 
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
+NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
 SAME = 0.97  # likeness of two effects' projected columns beyond which they are one class
 FEW = 4.0  # standard deviations by which the level of a short run's noise may be off
 TEMPER = 3.0  # by which evidence is divided before it becomes a stated confidence: found on a bank of its own
@@ -34,7 +36,8 @@ OUTSIDE, MISSED, UNKNOWN = 0.05, 0.06, 0.77
 class Held:
     """One held-out run under the baseline and under the final model: predictions (n,) and gain in log likelihood.
 
-    `noise_alone` is whether the final model leaves noise alone, its parameters as they were fitted to other runs.
+    `noise_alone` is whether the final model leaves noise alone, its parameters as they were fitted to other runs; `level` is the
+    gauge's noise there.
     """
 
     run: Run
@@ -44,6 +47,7 @@ class Held:
     rms_baseline: float
     rms_augmented: float
     noise_alone: bool
+    level: float
 
 
 @dataclass(frozen=True)
@@ -86,43 +90,57 @@ def conclude(search: Search, held_out: Experiment) -> Diagnosis:
     ranked = tuple(search.ranked())
     best, alone = ranked[0], next(r for r in ranked if not r.hypothesis.effects)
     close = tuple(r for r in ranked if r.adequacy.fine and best.evidence - r.evidence < CLOSE)
-    if len(close) > 1:  # a hypothesis that holds a smaller one, and gains nothing by it, is not another answer
+    if close:  # a hypothesis that holds a smaller one, and gains nothing by it, is not another answer
         close = tuple(
             r for r in close if not any(set(o.hypothesis.reported) < set(r.hypothesis.reported) for o in close)
         )
         best = close[0]
     # what an effect explains is shown against a baseline on a track like its own
     baseline = search.tried.get((alone.name, best.rough), alone) if best.hypothesis.effects else alone
+    listed = _scored(search, baseline)
+    ungated, reasons = _verdict(best, close, (), listed)
+    bumped = _bumped(best)
+    ungated = "unknown" if bumped and ungated in NOTHING else ungated
     held = judge_held(search, best, baseline, held_out)
-    found, reasons = _verdict(best, baseline, close, held, search)
+    found, reasons = _verdict(best, close, held, listed)
     refused = _refused(search, best, held_out, held) if found != "unknown" else ""
-    if refused:
+    if refused or (bumped and found in NOTHING):
         found = "unknown"
-        reasons.append(refused)
-    bump = likeliest_bump(best.fit.point) if best.rough else None
-    if bump is not None and bump.p_value < DOUBT:
-        found = "unknown" if found == "none" else found
-        reasons.append(
-            f"the track has a bump at {bump.place:.1f} um, {bump.width:g} um wide and {bump.height:+.2g} high: no roughness "
-            f"explains it (p = {bump.p_value:.1g})"
-        )
-    listed = search.scored.get((baseline.name, baseline.rough), [])
+    reasons += [reason for reason in (refused, bumped) if reason]
     unseen = [*search.excluded, *_unidentifiable(listed)]
     return Diagnosis(
         held_out, found, best, baseline, ranked, close, _confidence(ranked, found), tuple(listed), tuple(unseen),
         {s.effect.reported: s.detectable for s in listed}, _equivalent(listed, close),
-        held, search.noise, tuple(reasons), _verdict(best, baseline, close, (), search)[0],
+        held, search.noise, tuple(reasons), ungated,
     )  # fmt: skip
 
 
+def _scored(search: Search, baseline: Refit) -> list[Score]:
+    """Return the scores around the baseline; around it on a track of the other kind where slopes mean nothing at this one."""
+    key, other = (baseline.name, baseline.rough), (baseline.name, not baseline.rough)
+    if key not in search.scored and (baseline.adequacy.rms_over_noise < NEAR or other not in search.scored):
+        return search.score(baseline, applicable(search.registry, search.experiment, search.effects)[0])
+    return search.scored[key] if key in search.scored else search.scored[other]
+
+
+def _bumped(best: Refit) -> str:
+    """Return what to say of a bump on the track, nothing where there is none."""
+    bump = likeliest_bump(best.fit.point) if best.rough else None
+    if bump is None or bump.p_value >= DOUBT:
+        return ""
+    return (
+        f"the track has a bump at {bump.place:.1f} um, {bump.width:g} um wide and {bump.height:+.2g} high: no roughness "
+        f"explains it (p = {bump.p_value:.1g})"
+    )
+
+
 def _verdict(
-    best: Refit, baseline: Refit, close: Sequence[Refit], held: Sequence[Held], search: Search
+    best: Refit, close: Sequence[Refit], held: Sequence[Held], looked: Sequence[Score]
 ) -> tuple[str, list[str]]:
     reasons = [f"{best.name}: rms over noise {best.adequacy.rms_over_noise:.3f}, p = {best.adequacy.p_value:.2g}"]
     if not best.adequacy.fine:
         return "unknown", [*reasons, "no registered effect, nor two of them, brings the residuals down to noise"]
     if any(not r.hypothesis.effects for r in close):
-        looked = search.scored.get((baseline.name, baseline.rough), [])
         seen = [s for s in looked if s.detectable < interesting(s)]
         if 2 * len(seen) >= len(looked):
             return "none", [*reasons, "the baseline leaves noise alone"]
@@ -142,11 +160,11 @@ def _verdict(
 
 
 def interesting(score: Score) -> float:
-    """Return the size of an effect that matters: what its plugin gives as default, from its neutral value."""
+    """Return the size of an effect that matters, in um, s, N: what its plugin gives as default, from its neutral value."""
     if not score.effect.sizes:
         return 0.1
-    parameter = next(p for p in score.effect.parameters if p.name == score.effect.sizes[0])
-    return abs(parameter.default - dict(score.effect.neutral)[parameter.name])
+    p = next(p for p in score.effect.parameters if p.name == score.effect.sizes[0])
+    return abs(to_base(p.default, p.unit) - neutral_values(score.effect)[p.name])
 
 
 def _unidentifiable(scores: Sequence[Score]) -> list[Excluded]:
@@ -199,7 +217,8 @@ def judge_held(search: Search, best: Refit, baseline: Refit, experiment: Experim
     for run in (r for r in experiment.runs if r.holdout):
         answers = [_predicted(search, refit, experiment, run) for refit in (baseline, best)]
         (y0, l0, a0), (y1, l1, a1) = answers
-        found.append(Held(run, y0, y1, l1 - l0, a0.rms_over_noise, a1.rms_over_noise, _alone(a1, [run])))
+        level = _noise_for(search, run).level
+        found.append(Held(run, y0, y1, l1 - l0, a0.rms_over_noise, a1.rms_over_noise, _alone(a1, [run]), level))
     return tuple(found)
 
 
@@ -251,8 +270,10 @@ def _predicted(search: Search, refit: Refit, experiment: Experiment, run: Run) -
     fixed = tuple(replace(q, value=refit.fit.values.get(q.name, q.value)) for q in problem.experiment.parameters)
     alone = replace(experiment, runs=(as_fitted,), parameters=fixed)
     held = {n: v for n, v in refit.fit.values.items() if "." not in n}
-    own = Hypothesis(refit.hypothesis.effects).problem(search.registry, alone, rough=refit.rough, at=held)
-    names = [i for i, n in enumerate(own.names) if "." in n]  # only a free start is estimated
+    own = Hypothesis(refit.hypothesis.effects).problem(
+        search.registry, alone, rough=refit.rough, at=held, trend=search.trend
+    )
+    names = [i for i, n in enumerate(own.names) if "." in n]  # only a free start and a trend are estimated
     small = replace(
         own,
         names=tuple(own.names[i] for i in names),
@@ -270,8 +291,9 @@ def _predicted(search: Search, refit: Refit, experiment: Experiment, run: Run) -
 
 def _noise_for(search: Search, run: Run) -> Noise:
     """Return the noise of a run that was not fitted: that of fitted stretches sampled most nearly as often, piece by piece."""
-    known = [(step, search.noise[r.name].at(a)) for r in search.experiment.runs if r.name in search.noise
-             for step, a, _ in sampled(r)]  # fmt: skip
+    fitted = [r for r in search.experiment.runs if r.name in search.noise]
+    like = [r for r in fitted if r.observable == run.observable]
+    known = [(step, search.noise[r.name].at(a)) for r in like or fitted for step, a, _ in sampled(r)]
 
     def nearest(step: float) -> Noise:
         return min(known, key=lambda k: abs(np.log(max(k[0], 1e-12) / max(step, 1e-12))))[1]

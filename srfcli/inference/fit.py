@@ -147,7 +147,7 @@ def fit_problem(
     for run in runs:
         own = own_names(model, run, trend)
         p = run_parameters(model, experiment, run, {})
-        rows += [own_start(model, run, p, name) for name in own]
+        rows += [own_start(model, run, p, name, trend) for name in own]
         names += own
     start, lower, upper = np.array(rows, dtype=float).T
     for name, low, high in zip(names, lower, upper, strict=True):

@@ -160,6 +160,8 @@ class Latent:
             z = np.linalg.solve(L, point.tracks.numbers)
             A[free.sum() :, free.sum() :] += np.eye(L.shape[1])
             b[free.sum() :] -= z
+        if not A.size:  # every parameter stands at a bound, and there is no track
+            return np.zeros(point.g.size), 0.0
         A[np.diag_indices_from(A)] *= 1 + damping
         A[np.diag_indices_from(A)] += 1e-12 * np.diag(A).max()
         x = np.linalg.solve(A, b)

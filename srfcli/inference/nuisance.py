@@ -15,6 +15,7 @@ from srfcli.recording.values import Run
 
 TINY = 1e-30  # imaginary step: exact to rounding, as nothing is subtracted
 TRENDS = ("slip", "time")
+UNLOADED = 0.1  # least distance of the bounds of a free start's friction: a run may begin without any
 
 
 def own_names(model: GeneratedModel, run: Run, trend: str | None) -> list[str]:
@@ -23,17 +24,20 @@ def own_names(model: GeneratedModel, run: Run, trend: str | None) -> list[str]:
     return initial + ([f"{run.name}.trend"] if trend else [])
 
 
-def own_start(model: GeneratedModel, run: Run, p: Array, name: str) -> tuple[float, float, float]:
-    """Return a start value and bounds for one of `own_names`."""
+def own_start(
+    model: GeneratedModel, run: Run, p: Array, name: str, trend: str | None = None
+) -> tuple[float, float, float]:
+    """Return a start value and bounds for one of `own_names`; `trend` is what a trend is proportional to, slip if left out."""
     kind = name.rpartition(".")[2]
     if kind == "trend":
-        steepest = 10 * float(np.ptp(run.observed)) / max(float(np.ptp(basis(run, "slip"))), 1e-9)
+        steepest = 10 * float(np.ptp(run.observed)) / max(float(np.ptp(basis(run, trend or "slip"))), 1e-9)
         return 0.0, -max(steepest, 1e-9), max(steepest, 1e-9)
     if kind == "mu":
         first = float(np.median(run.observed[run.used][:5]))
         W = run.load.rest(float(run.t[0]))
         mu = {"elongation": first * run.stiffness / W, "force": first / W, "friction": first}[run.observable]
-        return mu, 0.5 * mu, 1.5 * mu
+        wide = max(0.5 * abs(mu), UNLOADED)
+        return mu, mu - wide, mu + wide
     steady = float(np.asarray(model.steady(p))[model.states.index(kind)])
     return steady, steady - 15.0, steady + 15.0
 

@@ -1,0 +1,74 @@
+"""Which effects a search may find in an experiment, and why others cannot be seen in it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from srfcli.diagnosis.candidates import applicable
+from srfcli.diagnosis.search import Search
+from srfcli.diagnosis.verdict import judge_held
+from srfcli.numerics.compiled import compiler
+from srfcli.proof.draw import Gauge
+from srfcli.proof.folder import case_files
+from srfcli.proof.gauge import read_gauge
+from srfcli.proof.motion import move
+from srfcli.proof.physics import Physics
+from srfcli.proof.protocol import Plan
+from srfcli.recording.experiment import read_experiment
+from srfcli.registry import bundled_registry
+
+SHIPPED = bundled_registry()
+OF_THE_MODULATION = {"load-transmission", "load-distortion"}
+
+
+def experiment_of(folder, *plans, readings=None):
+    readings = readings or {p: np.full(p.times().size, 15.0) for p in plans}  # what was recorded need not matter
+    for name, text in case_files("small", Physics(), readings).items():
+        (folder / name).write_text(text)
+    return read_experiment(folder, registry=SHIPPED)
+
+
+@pytest.mark.parametrize(
+    ("plan", "reason"),
+    [
+        (Plan("held", ((1, 20), (1, 60)), 5.0, 0.002), "the load is constant"),
+        (Plan("steps", ((2, 20),), 5.0, 0.002, steps=((0.7, 1.0),)), "no run has a modulated load"),
+        (Plan("strong", ((2, 20),), 5.0, 0.002, eps=0.1, f=80.0), None),
+    ],
+    ids=lambda x: x.name if isinstance(x, Plan) else "",
+)
+def test_effects_of_the_modulation_need_one(plan, reason, tmp_path):
+    found, excluded = applicable(SHIPPED, experiment_of(tmp_path, plan))
+    said = {e.effect: e.reason for e in excluded}
+    for name in OF_THE_MODULATION:
+        assert said.get(name) == reason
+        assert (name in {e.name for e in found}) is (reason is None)
+
+
+def test_an_effect_whose_parameter_has_the_name_of_another_s_is_not_dropped_without_a_word(tmp_path):
+    experiment = experiment_of(tmp_path, Plan("strong", ((2, 20),), 5.0, 0.002, eps=0.1, f=80.0))
+    choice = replace(experiment.choice, effects=("load-distortion",))
+    found, excluded = applicable(SHIPPED, replace(experiment, choice=choice))
+    said = {e.effect: e.reason for e in excluded}
+    for name in ("track-topography", "drive-ripple"):
+        assert said[name] == "its parameter amplitude has the name of one of load-distortion"
+    assert "load-distortion" not in said and "load-distortion" not in {e.name for e in found}
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here")
+def test_a_held_out_run_has_a_trend_of_its_own(tmp_path):
+    """Where drifts are fitted, that of a held-out run is: it says nothing against a model."""
+    rng, drift = np.random.default_rng(3), 0.08  # um/s: four times the noise each second
+    plans = (
+        Plan("up", ((0.6, 10), (0.6, 40)), 3.0, 0.002),
+        Plan("down", ((0.6, 40), (0.8, 15)), 3.0, 0.002, holdout=True),
+    )
+    readings = {p: read_gauge(move(Physics(), p).u + drift * p.times(), Gauge(), rng) for p in plans}
+    whole = experiment_of(tmp_path, *plans, readings=readings)
+    search = Search(SHIPPED, replace(whole, runs=tuple(r for r in whole.runs if not r.holdout)), trend="time")
+    baseline = search.baseline()
+    (held,) = judge_held(search, baseline, baseline, whole)
+    assert held.rms_augmented < 1.1 and held.noise_alone
