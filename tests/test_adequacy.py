@@ -81,6 +81,10 @@ def test_a_noisier_run_is_no_gauge_of_the_others():
         (2125, [(0, 700), (1500, 1900)]),
         (2125, [(k, k + 1) for k in range(20, 2125, 50)]),  # hardly a piece without one
         (2125, [(k, k + 5) for k in range(20, 2125, 50)]),
+        (2125, [(k, k + 1) for k in np.flatnonzero(np.random.default_rng(1).random(2125) < 0.1).tolist()]),
+        (2125, [(k, k + 1) for k in range(0, 2125, 2)]),  # a slower channel
+        (130, [(0, 100)]),
+        (2125, [(0, 2125)]),  # nothing of it is used
     ],
 )
 def test_what_is_not_used_is_no_calm_stretch(size, unused):
@@ -93,8 +97,9 @@ def test_what_is_not_used_is_no_calm_stretch(size, unused):
         residuals["r0"][a:b] = np.nan
     found = gauge_noise([replace(whole, used=used), other], residuals)
     assert found["r1"].level == pytest.approx(0.02, rel=0.05)
-    alone = gauge_noise([replace(whole, used=used)], residuals)
-    assert alone["r0"].level == pytest.approx(0.02, rel=0.12)
+    if used.sum() > 200:
+        alone = gauge_noise([replace(whole, used=used)], residuals)
+        assert alone["r0"].level == pytest.approx(0.02, rel=0.1)
 
 
 def test_noises_are_alike_within_what_matters():

@@ -18,7 +18,7 @@ from srfcli.proof.motion import move
 from srfcli.proof.physics import Physics
 from srfcli.proof.protocol import Plan
 from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry
+from srfcli.registry import bundled_registry, load_registry
 
 SHIPPED = bundled_registry()
 OF_THE_MODULATION = {"load-transmission", "load-distortion"}
@@ -56,6 +56,29 @@ def test_an_effect_whose_parameter_has_the_name_of_another_s_is_not_dropped_with
     for name in ("track-topography", "drive-ripple"):
         assert said[name] == "its parameter amplitude has the name of one of load-distortion"
     assert "load-distortion" not in said and "load-distortion" not in {e.name for e in found}
+
+
+OWN = """format = "srf-law/1"
+kind = "effect"
+name = "felt"
+about = "A share of the load's change is felt twice, and another of its modulation"
+W = "W + a*(W - W0)*{of}"
+constitutive = false
+
+[parameters]
+a = {{ default = 0.1, neutral = 0.0, unit = "1", bounds = [-1.0, 1.0], about = "share" }}
+"""
+
+
+@pytest.mark.parametrize(("of", "seen"), [("(1 + modulated)", True), ("(1 - eps)", True), ("modulated", False)])
+def test_an_effect_that_a_modulation_only_adds_to_is_seen_without_one(of, seen, tmp_path):
+    experiment = experiment_of(tmp_path, Plan("steps", ((2, 20),), 5.0, 0.002, steps=((0.7, 1.0),)))
+    (tmp_path / "felt.toml").write_text(OWN.format(of=of))
+    registry = load_registry((tmp_path,), user=False, entry_points=False)
+    found, _ = applicable(registry, experiment, ["felt"])
+    assert bool(found) is seen
+    choice = replace(experiment.choice, effects=(str(tmp_path / "felt.toml"),))
+    assert applicable(registry, replace(experiment, choice=choice), ["felt"]) == ([], [])  # the baseline has it
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here")

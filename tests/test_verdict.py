@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from srfcli.diagnosis import verdict as module
+from srfcli.diagnosis.candidates import neutral_values
 from srfcli.diagnosis.score import Score
 from srfcli.diagnosis.verdict import _noise_for, conclude, interesting
 from srfcli.inference.noise import Noise
@@ -130,9 +131,17 @@ def test_the_noise_of_a_held_out_run_is_that_of_the_same_observable(observable, 
     assert _noise_for(found, run("c", observable)).level == level
 
 
+def test_the_scores_of_what_was_found_are_not_asked_for_anew():
+    found = search(refit("viscous-drag", evidence=100.0, rough=True), refit(evidence=0.0, fine=False), scored=SEEN)
+    found.tried["none", True] = refit(evidence=-5.0, fine=False, rough=True)
+    answer = concluded(found)
+    assert (found.asked, answer.verdict, answer.scores) == ([], "identified", tuple(SEEN["none", False]))
+
+
 def test_an_interesting_size_is_in_base_units():
-    """A user's lag of 2 ms by default is interesting from 0.002 s on, as sizes that can be seen are in s."""
+    """A user's lag, 3 ms by default and nothing at 1 ms, is interesting from 0.002 s on: sizes that can be seen are in s."""
     own = effect("sensor-lag")
     (name,) = own.sizes
-    in_ms = replace(own, parameters=(Parameter(name, 2.0, "ms", 0.0, 100.0),), neutral=((name, 0.0),))
+    in_ms = replace(own, parameters=(Parameter(name, 3.0, "ms", 0.0, 100.0),), neutral=((name, 1.0),))
     assert interesting(replace(score("sensor-lag", 1.0), effect=in_ms)) == pytest.approx(0.002)
+    assert neutral_values(in_ms) == {name: pytest.approx(0.001)}

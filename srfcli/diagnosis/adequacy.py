@@ -19,7 +19,6 @@ from srfcli.recording.values import Run
 
 WINDOWS, LEAST = 8, 64  # of each run, and samples of a window
 SLOW = 6  # cosines over a window: what is slower than a window's sixth
-WHOLE = 0.97  # share of a piece's samples that are used, from which its noise is that of the gauge
 FAINT = 0.08  # a correlation from sample to sample that is taken for none
 ALIKE = 1.08  # noise levels of runs, over the lowest, that are the gauge's; beside what chance makes of them
 CHANCE = 2.5  # standard deviations by which chance parts two levels
@@ -81,31 +80,40 @@ def _seen(run: Run, residual: Array, a: int, b: int) -> _Seen:
     modulation = of_run(run)
     cycles = modulation["f"] * float(np.median(np.diff(t))) if modulation["modulated"] else None
     if not ok.any():
-        return _Seen(max(run.quantum / np.sqrt(12), 1e-12), 0.0, 0, 0)
-    about = describe_noise(_used_pieces(np.interp(t, t[ok], r[ok]), ok), cycles)
+        return _Seen(1.0, 0.0, 0, 0)
+    about = describe_noise(_only_used(r, ok), cycles)
     level = about.total if np.isfinite(about.total) else about.white
     rho = min(max(about.lag1, -0.9), 0.97) if np.isfinite(about.lag1) else 0.0
     return _Seen(max(level, run.quantum / np.sqrt(12), 1e-12), rho, int(ok.sum()), about.samples)
 
 
-def _used_pieces(x: Array, ok: Array) -> Array:
-    """Return those pieces of x (n,) in which nearly every sample is used: a line across a gap is calmer than any noise."""
-    count = x.size // TREND
-    if ok.all() or count < 2:
+def _only_used(x: Array, ok: Array) -> Array:
+    """Return the pieces of x (n,) that are used throughout, or where they are few what is used of it, closed up.
+
+    A line across a gap would be calmer than any noise; a place where it was closed is one of the wilder.
+    """
+    if ok.all():
         return x
-    share = ok[: count * TREND].reshape(count, TREND).mean(axis=1)
-    return np.asarray(x[: count * TREND].reshape(count, TREND)[share >= min(WHOLE, share.max())].ravel())
+    count = x.size // TREND
+    pieces, whole = x[: count * TREND].reshape(count, TREND), ok[: count * TREND].reshape(count, TREND).all(axis=1)
+    return np.asarray(pieces[whole].ravel() if 4 * whole.sum() >= max(count, 4) else x[ok])
+
+
+def _telling(seen: Sequence[_Seen]) -> Sequence[_Seen]:
+    """Return those stretches that are long enough to tell a level, all where none is."""
+    return [s for s in seen if s.samples >= LEAST // 2] or seen
 
 
 def quietest(run: Run, residual: Array) -> float:
     """Return the lowest level of noise in a stretch of a residual (n,), infinite for one that is not finite."""
     if not np.isfinite(residual[run.used]).all():
         return np.inf
-    return min(_seen(run, residual, a, b).level for _, a, b in sampled(run))
+    return min(s.level for s in _telling([_seen(run, residual, a, b) for _, a, b in sampled(run)]))
 
 
 def _shared(seen: Sequence[_Seen]) -> Noise:
     """Return the noise of stretches that share a gauge: of those that have least."""
+    seen = _telling(seen)
     least = min(seen, key=lambda s: s.level)
     kept = [
         s for s in seen if s.level <= least.level * max(ALIKE, 1 + CHANCE * float(np.hypot(s.spread, least.spread)))

@@ -8,6 +8,7 @@ from itertools import product
 
 import numpy as np
 
+from srfcli.expression import symbol
 from srfcli.inference.fit import Problem, fit_problem
 from srfcli.inference.prediction import Hold, of_run
 from srfcli.laws import Effect, Parameter
@@ -17,7 +18,7 @@ from srfcli.registry import Registry
 from srfcli.units import split_quantity, to_base
 
 TRACK = ("mu", "slip")
-MODULATED = {"modulated", "eps", "envelope"}  # an effect of these is none where no load is modulated
+UNMODULATED = {symbol(name): 0 for name in ("modulated", "eps", "envelope")}
 
 
 @dataclass(frozen=True)
@@ -35,17 +36,20 @@ def applicable(
     base = open_model(registry, **asdict(experiment.choice))
     found, excluded = [], []
     free = {p.name for p in experiment.parameters if not p.fixed}
-    had = {p.name: name for name in experiment.choice.effects for p in registry.get("effect", name).parameters}
+    present = [registry.get("effect", name) for name in experiment.choice.effects]
+    had = {p.name: e.name for e in present for p in e.parameters}
     for entry in registry.entries("effect"):
         effect = registry.load(entry)
         assert isinstance(effect, Effect)
         if effects is not None and effect.reported not in effects and effect.name not in effects:
             continue
+        if effect.name in {e.name for e in present}:
+            continue
         if any(n not in base.names for n in effect.needs) or any(n in base.names for n in effect.lacks):
             continue
         taken = [p.name for p in effect.parameters if p.name in base.names] if not effect.settings else []
         if taken:  # of the law, or of another effect that the baseline has
-            if taken[0] in had and effect.name not in had.values():
+            if taken[0] in had:
                 reason = f"its parameter {taken[0]} has the name of one of {had[taken[0]]}"
                 excluded.append(Excluded(effect.reported, reason))
             continue
@@ -70,7 +74,8 @@ def _unseen(effect: Effect, experiment: Experiment) -> str:
         return f"the load varies by {100 * spread:.2g} %" if spread > 0 else "the load is constant"
     if {"kappa", "W"} & (used | set(formulas)) and "W" in used and max(spread, between) < 1e-3:
         return f"the loads of all runs lie within {100 * max(spread, between):.2g} %"
-    if MODULATED & used and not any(of_run(run)["modulated"] for run in experiment.runs):
+    calm = not any(of_run(run)["modulated"] for run in experiment.runs)
+    if calm and formulas and all(f.subs(UNMODULATED) == symbol(slot) for slot, f in formulas.items()):
         return "no run has a modulated load"
     return ""
 

@@ -164,7 +164,7 @@ def along_table(effect: Effect) -> Shape | None:
     (slot, formula), size = effect.changes[0], effect.sizes[0]
     if slot not in ("mu", "V"):
         return None
-    slope = sp.diff(formula, symbol(size)).subs(symbol(size), sp.nsimplify(dict(effect.neutral)[size]))
+    slope = sp.diff(formula, symbol(size)).subs(symbol(size), sp.nsimplify(neutral_values(effect)[size]))
     if slot == "V":
         slope = sp.simplify(slope / symbol("V"))
     inner = [p.name for p in effect.parameters if p.name != size]

@@ -41,12 +41,12 @@ def stability(
     if not driven.size:
         return {}
     V = np.geomspace(driven.min() / BEYOND, driven.max() * BEYOND, VELOCITIES)
-    after = {q.name: q.value for q in augmented.parameters}
+    before, after = ({q.name: q.value for q in e.parameters} for e in (baseline, augmented))
     strongest = max((r.modulation for r in baseline.runs if r.modulation), key=lambda m: m[1], default=None)
     notes = ["Dotted: under constant load."] if strongest else ["Under constant load."]
     found: dict[str, Any] = {"V": V}
     try:
-        for side, experiment, values in (("baseline", baseline, at), ("augmented", augmented, after)):
+        for side, experiment, values in (("baseline", baseline, before | dict(at)), ("augmented", augmented, after)):
             model, base = _model(registry, experiment, values)
             found[f"W0_hopf_{side}"] = _loads(model, base, V)
             if strongest:

@@ -65,6 +65,7 @@ def best_form(search: Search, diagnosis: Diagnosis) -> ClosedForm | None:
     best = _Selection(own, candidates).run(diagnosis)
     best = _smoothed(own, best)
     search.evaluations += own.evaluations
+    best = _as_judged(own, best) if best is not None else None
     terms = [e for e in best.hypothesis.effects if e.name in names] if best is not None else []
     if best is None or not terms:
         return None
@@ -117,9 +118,9 @@ class _Selection:
             if best is None or best.adequacy.fine:
                 break
             longer = self.step(best)
+            best = _as_judged(self.search, longer or best)
             if longer is None:
                 break
-            best = longer
         return best
 
     def step(self, start: Refit) -> Refit | None:

@@ -97,7 +97,7 @@ def conclude(search: Search, held_out: Experiment) -> Diagnosis:
         best = close[0]
     # what an effect explains is shown against a baseline on a track like its own
     baseline = search.tried.get((alone.name, best.rough), alone) if best.hypothesis.effects else alone
-    listed = _scored(search, baseline)
+    listed = _scored(search, baseline, asked=any(not r.hypothesis.effects for r in close))
     ungated, reasons = _verdict(best, close, (), listed)
     bumped = _bumped(best)
     ungated = "unknown" if bumped and ungated in NOTHING else ungated
@@ -115,12 +115,12 @@ def conclude(search: Search, held_out: Experiment) -> Diagnosis:
     )  # fmt: skip
 
 
-def _scored(search: Search, baseline: Refit) -> list[Score]:
-    """Return the scores around the baseline; around it on a track of the other kind where slopes mean nothing at this one."""
+def _scored(search: Search, baseline: Refit, *, asked: bool) -> list[Score]:
+    """Return the scores around the baseline, found only now if a verdict asks for them; else those on the other kind of track."""
     key, other = (baseline.name, baseline.rough), (baseline.name, not baseline.rough)
-    if key not in search.scored and (baseline.adequacy.rms_over_noise < NEAR or other not in search.scored):
+    if asked and key not in search.scored:
         return search.score(baseline, applicable(search.registry, search.experiment, search.effects)[0])
-    return search.scored[key] if key in search.scored else search.scored[other]
+    return search.scored.get(key) or search.scored.get(other, [])
 
 
 def _bumped(best: Refit) -> str:

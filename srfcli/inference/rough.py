@@ -11,6 +11,8 @@ from srfcli.inference.noise import estimate_noise, stretches, white_level
 from srfcli.inference.tracks import Roughness, tracks_for
 from srfcli.status import Status
 
+SURELY = 2.0  # in log likelihood, by which one track for all runs has to be likelier than one for each
+
 
 @dataclass(frozen=True)
 class RoughFit:
@@ -39,13 +41,15 @@ def fit_rough(problem: Problem, plain: Fit, *, progress: Callable[[str], None] =
         tracks = tracks_for(problem.runs, shared=True)
         one = fit_latent(problem, found.point.theta, found.noise, tracks=tracks, roughness=found.point.roughness)
         evaluations += one.evaluations
-        found = max(found, one, key=lambda f: f.log_likelihood)
+        if one.log_likelihood > found.log_likelihood + SURELY:
+            found = one
     runs = tuple(_judged(problem, found, name) for name in (r.name for r in plain.runs))
     fitted = replace(
         plain, values=problem.named(found.point.theta), covariance=found.covariance, runs=runs,
         log_likelihood=found.log_likelihood, status=Status.OK, evaluations=evaluations,
     )  # fmt: skip
-    return RoughFit(fitted, found.point.roughness, found.point.tracks.shared)
+    roughness = found.point.roughness
+    return RoughFit(fitted, roughness, bool(roughness.amplitude) and found.point.tracks.shared)
 
 
 def _judged(problem: Problem, found: LatentFit, name: str) -> RunFit:
