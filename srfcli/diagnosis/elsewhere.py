@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from srfcli.diagnosis.candidates import neutral_values, own_parameters
 from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.follower import LOOSE_ONLY, PULLS, same
-from srfcli.diagnosis.horizons import on_a_rough_track
+from srfcli.diagnosis.horizons import fit_by_horizons
 from srfcli.diagnosis.refits import NEAR, Refit
 from srfcli.diagnosis.score import scores
 from srfcli.inference.latent import LatentFit, fit_latent
@@ -50,7 +50,7 @@ def elsewhere(search: Search, refit: Refit, *, thorough: bool = False) -> Refit:
         if search.spent():
             break
         if refit.rough:
-            fitted = on_a_rough_track(search, refit.hypothesis, at, shared=refit.fit.point.tracks.shared)
+            fitted = fit_by_horizons(search, refit.hypothesis, at, shared=refit.fit.point.tracks.shared)
         else:
             fitted = _smooth(search, refit, at, way, seen)
         if fitted is not None:

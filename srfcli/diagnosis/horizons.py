@@ -87,7 +87,7 @@ def entrant(
     return Entrant(hypothesis, problem, grown)
 
 
-def on_a_rough_track(
+def fit_by_horizons(
     search: Search, hypothesis: Hypothesis, at: Mapping[str, float], *, shared: bool
 ) -> LatentFit | None:
     """Return the fit of all of the recordings from the values in `at`, None where horizons do not grow to their end."""
