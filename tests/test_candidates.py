@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from srfcli.diagnosis.candidates import applicable
+from srfcli.diagnosis.candidates import Hypothesis, applicable
 from srfcli.diagnosis.search import Search
 from srfcli.diagnosis.verdict import judge_held
 from srfcli.numerics.compiled import compiler
@@ -24,9 +24,9 @@ SHIPPED = bundled_registry()
 OF_THE_MODULATION = {"load-transmission", "load-distortion"}
 
 
-def experiment_of(folder, *plans, readings=None):
+def experiment_of(folder, *plans, readings=None, base=None):
     readings = readings or {p: np.full(p.times().size, 15.0) for p in plans}  # what was recorded need not matter
-    for name, text in case_files("small", Physics(), readings).items():
+    for name, text in case_files("small", base or Physics(), readings).items():
         (folder / name).write_text(text)
     return read_experiment(folder, registry=SHIPPED)
 
@@ -79,6 +79,24 @@ def test_an_effect_that_a_modulation_only_adds_to_is_seen_without_one(of, seen, 
     assert bool(found) is seen
     choice = replace(experiment.choice, effects=(str(tmp_path / "felt.toml"),))
     assert applicable(registry, replace(experiment, choice=choice), ["felt"]) == ([], [])  # the baseline has it
+
+
+@pytest.mark.parametrize("rigid", [True, False])
+def test_what_one_effect_brings_another_may_need(rigid, tmp_path):
+    """An interface may stiffen otherwise than with the load where it is elastic, or where that is what is missing."""
+    plan = Plan("strong", ((2, 20),), 5.0, 0.002, eps=0.1, f=80.0)
+    search = Search(SHIPPED, experiment_of(tmp_path, plan, base=Physics(rigid=rigid)))
+    candidates, _ = applicable(SHIPPED, search.experiment)
+    known = {e.name: e for e in candidates}
+    assert "stiffness-exponent" in known and ("interface-compliance" in known) is rigid
+    alone = {e.name for e in search.joining(candidates)}
+    assert ("stiffness-exponent" in alone) is not rigid
+    if rigid:
+        compliance, exponent = known["interface-compliance"], known["stiffness-exponent"]
+        assert exponent in search.joining(candidates, [compliance])
+        assert search.stands((compliance, exponent)) and search.stands((compliance,)) and not search.stands((exponent,))
+        names = Hypothesis((compliance, exponent)).model(SHIPPED, search.experiment, rough=False).names
+        assert {"lambda", "n"} <= set(names)
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here")

@@ -32,9 +32,12 @@ class Excluded:
 def applicable(
     registry: Registry, experiment: Experiment, effects: Sequence[str] | None = None
 ) -> tuple[list[Effect], list[Excluded]]:
-    """Return the effects that the baseline lacks and could have, and those that these recordings cannot show."""
+    """Return the effects that the baseline lacks and could have, and those that these recordings cannot show.
+
+    Among the former are those that could join it only beside another one that brings what they need.
+    """
     base = open_model(registry, **asdict(experiment.choice))
-    found, excluded = [], []
+    found, excluded, waiting = [], [], []
     free = {p.name for p in experiment.parameters if not p.fixed}
     present = [registry.get("effect", name) for name in experiment.choice.effects]
     had = {p.name: e.name for e in present for p in e.parameters}
@@ -45,7 +48,7 @@ def applicable(
             continue
         if effect.name in {e.name for e in present}:
             continue
-        if any(n not in base.names for n in effect.needs) or any(n in base.names for n in effect.lacks):
+        if any(n in base.names for n in effect.lacks):
             continue
         taken = [p.name for p in effect.parameters if p.name in base.names] if not effect.settings else []
         if taken:  # of the law, or of another effect that the baseline has
@@ -56,11 +59,14 @@ def applicable(
         if set(effect.frees) & free:
             continue
         reason = _unseen(effect, experiment)
-        if reason:
+        if any(n not in base.names for n in effect.needs):
+            waiting += [effect] if not reason else []
+        elif reason:
             excluded.append(Excluded(effect.reported, reason))
         else:
             found.append(effect)
-    return found, excluded
+    brought = {*base.names, *(p.name for e in found if e.settings for p in e.parameters)}
+    return [*found, *(e for e in waiting if brought.issuperset(e.needs))], excluded
 
 
 def _unseen(effect: Effect, experiment: Experiment) -> str:

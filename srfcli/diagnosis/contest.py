@@ -71,8 +71,7 @@ def contest(
 def _partnered(search: Search, leader: Entry, candidates: Sequence[Effect]) -> list[Entry]:
     """Return the fits, while held, of a hypothesis with each of the effects that promise most beside its own."""
     effects = leader.hypothesis.effects
-    reported = {e.reported for e in effects}
-    left = [e for e in candidates if e.reported not in reported and not e.settings]
+    left = search.joining(candidates, effects)
     around = search.follower.around(leader.hypothesis, leader.values, search.noise)
     search.evaluations += around.evaluations
     scored = scores(search.registry, around.problem.experiment, around, left, present=effects)

@@ -51,7 +51,7 @@ def doubt(search: Search, candidates: Sequence[Effect]) -> None:
     doubtful = wandering(best.hypothesis)
     within = NEAR if doubtful else HALFWAY
     simpler = [tuple(e for e in effects if e is not w) for w in (doubtful or (() if best.rough else effects))]
-    for left in simpler:
+    for left in filter(search.stands, simpler):
         known = search.tried.get((Hypothesis(left).name, False))
         if known is None or known.adequacy.rms_over_noise > within:
             known = fitted(search, Hypothesis(left), best)
@@ -115,8 +115,8 @@ def rebase(search: Search) -> None:
         if not best.hypothesis.effects:
             return
         effects = best.hypothesis.effects
-        simpler = [Hypothesis(tuple(e for e in effects if e is not left)) for left in effects]
-        for hypothesis in {h.name: h for h in (*simpler, Hypothesis())}.values():
+        simpler = [rest for left in effects if search.stands(rest := tuple(e for e in effects if e is not left))]
+        for hypothesis in {h.name: h for h in (*map(Hypothesis, simpler), Hypothesis())}.values():
             again(search, hypothesis, best)
         if search.best() is best:
             return

@@ -100,8 +100,7 @@ def _beside(
 ) -> list[Entrant]:
     """Return the hypotheses that add one effect, grown, the best first: those that promise most, and those that are built in."""
     present = hypothesis.effects
-    reported = {e.reported for e in present}
-    left = [e for e in candidates if e.reported not in reported and not (e.settings and present)]
+    left = search.joining(candidates, present)
     scored = scores(search.registry, around.problem.experiment, around, left, present=present)
     least = FAINT * scored[0].gain if scored else 0.0
     promising = [s for i, s in enumerate(scored) if (i < FOREMOST and s.gain >= least) or s.effect.settings]

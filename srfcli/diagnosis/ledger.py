@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -52,6 +53,24 @@ class Ledger:
     def base_names(self) -> tuple[str, ...]:
         """Return the baseline's free parameters."""
         return self.problem(Hypothesis()).names
+
+    @cached_property
+    def _had(self) -> frozenset[str]:
+        return frozenset(Hypothesis().model(self.registry, self.experiment, rough=False).names)
+
+    def stands(self, effects: Sequence[Effect]) -> bool:
+        """Return whether each of some effects finds what it needs in the baseline, or brought by another of them."""
+        there = self._had.union(p.name for e in effects for p in e.parameters)
+        return all(there.issuperset(e.needs) for e in effects)
+
+    def joining(self, candidates: Sequence[Effect], present: Sequence[Effect] = ()) -> list[Effect]:
+        """Return the effects that can be added to those present: of no variant of one of them, built in alone, standing."""
+        reported = {e.reported for e in present}
+        return [
+            e
+            for e in candidates
+            if e.reported not in reported and not (e.settings and present) and self.stands((*present, e))
+        ]
 
     def keep(self, hypothesis: Hypothesis, fitted: LatentFit, *, rough: bool) -> Refit:
         """Return a fit judged, and remember it; where it leaves little, noise is known better than before."""

@@ -117,7 +117,7 @@ class Search(Ledger):
         if baseline.adequacy.rms_over_noise < HALFWAY:
             return False
         around = self.tangent(self.loosely(baseline))
-        scored = scores(self.registry, around.problem.experiment, around, candidates)
+        scored = scores(self.registry, around.problem.experiment, around, self.joining(candidates))
         entrants = [*(s for s in scored[SINGLES:] if unseen(s.effect)), *scored[:SINGLES]]
         contest(self, baseline, self.widened(baseline, entrants), candidates)
         return self.roughened(candidates) if self.best().adequacy.rms_over_noise < HALFWAY else False
@@ -202,8 +202,7 @@ class Search(Ledger):
         if key not in self.scored or key in self.stale:
             refit = self.tried[key]
             present = refit.hypothesis.effects
-            reported = {e.reported for e in present}
-            left = [e for e in candidates if e.reported not in reported and not (e.settings and present)]
+            left = self.joining(candidates, present)
             near = refit.rough or refit.adequacy.rms_over_noise < NEAR
             around = self.tangent(refit.fit if near else self.loosely(refit))
             self.stale.discard(key)
@@ -261,7 +260,7 @@ class Search(Ledger):
         """Return whether two effects leave noise alone, of those that could explain most together."""
         near = baseline.adequacy.rms_over_noise < NEAR
         around = self.tangent(baseline.fit if near else self.loosely(baseline))
-        foremost = pair_scores(self.registry, around.problem.experiment, around, candidates)[:PAIRS]
+        foremost = pair_scores(self.registry, around.problem.experiment, around, self.joining(candidates))[:PAIRS]
         entrants = [(h, self.own_values(h, *p.values)) for p in foremost for h in (Hypothesis(p.effects),)]
         if not near:
             contest(self, baseline, entrants, candidates)

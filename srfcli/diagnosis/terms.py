@@ -152,7 +152,7 @@ class _Selection:
     def scored(self, start: Refit, around: LatentFit) -> list[Score]:
         """Return the scores of all terms that a refit lacks and can be joined with, largest gain first, by slopes `around`."""
         search, present = self.search, start.hypothesis.effects
-        left = [e for e in self.candidates if e not in present]
+        left = search.joining(self.candidates, present)
         found: list[Score] = []
         for group in _groups(left, present):
             search.progress(f"{start.name}: {len(group)} terms scored")
