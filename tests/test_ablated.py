@@ -22,10 +22,8 @@ def tried(evidence: float, *, fine: bool = True, parameters: int = 7, log_likeli
         ({f"{ALPHA}+{DRAG}": tried(103.0), ALPHA: tried(100.0), "none": tried(0.0, fine=False)}, {ALPHA}),
         ({f"{ALPHA}+{DRAG}": tried(107.0), ALPHA: tried(100.0), "none": tried(0.0, fine=False)}, {ALPHA, DRAG}),
         ({DRAG: tried(102.0, fine=False), ALPHA: tried(100.0), "none": tried(0.0, fine=False)}, {ALPHA}),
-        (
-            {ALPHA: tried(100.0, fine=False), "none": tried(0.0, fine=False)},
-            {ALPHA},
-        ),  # fine in a fit that is not listed
+        # fine in a fit that is not listed
+        ({ALPHA: tried(100.0, fine=False), "none": tried(0.0, fine=False)}, {ALPHA}),
     ],
 )
 def test_without_held_out_runs_that_is_named_which_the_verdict_would_have_named(fits, named):

@@ -53,7 +53,7 @@ def search(tmp_path_factory):
 
 
 def effect(name):
-    return SHIPPED.load(next(e for e in SHIPPED.entries("effect") if e.name == name))
+    return SHIPPED.get("effect", name)
 
 
 def effects(*names):

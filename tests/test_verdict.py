@@ -24,7 +24,7 @@ SHIPPED = bundled_registry()
 
 
 def effect(name):
-    return SHIPPED.load(next(e for e in SHIPPED.entries("effect") if e.name == name))
+    return SHIPPED.get("effect", name)
 
 
 def refit(*names, evidence, fine=True, rough=False):
@@ -65,28 +65,19 @@ SEEN = {("none", False): [score("viscous-drag", 1e-9)]}
 HIDDEN = [score("viscous-drag", 1e9), score("linker-dieterich", 1e9)]
 
 
-def test_one_hypothesis_that_is_fine_is_taken_where_one_that_is_not_is_hardly_ahead_of_it():
+@pytest.mark.parametrize(
+    ("evidence", "said"), [(98.0, ("identified", ("viscous-drag",))), (90.0, ("unknown", ()))], ids=["hardly", "far"]
+)
+def test_one_hypothesis_that_is_fine_is_taken_where_one_that_is_not_is_hardly_ahead_of_it(evidence, said):
     found = concluded(
         search(
             refit("slip-evolution", evidence=100.0, fine=False),
-            refit("viscous-drag", evidence=98.0),
+            refit("viscous-drag", evidence=evidence),
             refit(evidence=0.0, fine=False),
             scored=SEEN,
         )
     )
-    assert (found.verdict, found.effects) == ("identified", ("viscous-drag",))
-
-
-def test_it_is_unknown_where_the_one_that_is_not_fine_is_far_ahead():
-    found = concluded(
-        search(
-            refit("slip-evolution", evidence=100.0, fine=False),
-            refit("viscous-drag", evidence=90.0),
-            refit(evidence=0.0, fine=False),
-            scored=SEEN,
-        )
-    )
-    assert (found.verdict, found.effects) == ("unknown", ())
+    assert (found.verdict, found.effects) == said
 
 
 def test_a_further_effect_that_gains_little_is_not_named():

@@ -80,7 +80,8 @@ def command(source: Path, system: SystemOptions, output: OutputOptions, **option
     for name in ("law", "ageing", "interface", "loading", "inertia"):
         if getattr(system, name).origin == "flag":
             raise SrfError(f"--{name} is given, and an experiment names its own", "Change [model] in experiment.toml.")
-    for name in system.flags:
+    if system.flags:
+        name = next(iter(system.flags))
         raise SrfError(f"{name} is set, and an experiment has its own values", "Change it in experiment.toml.")
     _fit_recordings(
         source, system, output, **{k: v for k, v in options.items() if k not in ("bounds", "method", "tol")}

@@ -40,15 +40,14 @@ def applicable(
     found, excluded, waiting = [], [], []
     free = {p.name for p in experiment.parameters if not p.fixed}
     present = [registry.get("effect", name) for name in experiment.choice.effects]
+    names = {e.name for e in present}
     had = {p.name: e.name for e in present for p in e.parameters}
     for entry in registry.entries("effect"):
         effect = registry.load(entry)
         assert isinstance(effect, Effect)
         if effects is not None and effect.reported not in effects and effect.name not in effects:
             continue
-        if effect.name in {e.name for e in present}:
-            continue
-        if any(n in base.names for n in effect.lacks):
+        if effect.name in names or any(n in base.names for n in effect.lacks):
             continue
         taken = [p.name for p in effect.parameters if p.name in base.names] if not effect.settings else []
         if taken:  # of the law, or of another effect that the baseline has

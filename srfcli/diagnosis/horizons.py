@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
 
 BRIEF = 0.2  # share of the recordings below which one track for all runs is not followed: none is there, or each has its own
-FOREMOST, FAINT = (
-    4,
-    0.2,
-)  # effects that are grown beside a hypothesis, and of the first one's score what another promises
+FOREMOST = 4  # effects that are grown beside a hypothesis
+FAINT = 0.2  # of the first one's score, what another has to promise
 STRICT = 1.44  # chi-squared per sample within which they grow: with what is missing noise alone is left
 CLEARLY = 60.0  # twice the log posterior by which one leads, so that the next is not asked
 

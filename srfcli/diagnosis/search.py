@@ -215,9 +215,8 @@ class Search(Ledger):
         scored = self.score(refit, candidates)
         promising = [s for s in scored if s.gain > max(least, FAINTER * scored[0].gain)][:most]
         far = not (rough or refit.adequacy.rms_over_noise < NEAR)
-        if (
-            promising or not refit.adequacy.fine
-        ):  # a mass or an interface that is not there has no first order worth the name
+        # a mass or an interface that is not there has no first order worth the name
+        if promising or not refit.adequacy.fine:
             built = [s for s in scored if (unseen(s.effect) if far else s.effect.settings)]
             promising = [*built, *(s for s in promising if s not in built)]
         if far:

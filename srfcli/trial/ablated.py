@@ -29,20 +29,20 @@ def information_criterion(answer: Answer) -> tuple[str, frozenset[str]]:
     """Return what the smallest Bayesian information criterion says: always a model, whatever it leaves over."""
     if not answer.tried:
         return as_it_is(answer)
-    tried = answer.tried
-    effects = _effects(
-        max(
-            sorted(tried),
-            key=lambda n: tried[n]["log_likelihood"] - 0.5 * tried[n]["parameters"] * log(tried[n]["samples"]),
-        )
-    )
+
+    def criterion(name: str) -> float:
+        t = answer.tried[name]
+        return t["log_likelihood"] - 0.5 * t["parameters"] * log(t["samples"])
+
+    effects = _effects(max(sorted(answer.tried), key=criterion))
     return ("identified" if effects else "none"), effects
 
 
 def _named(answer: Answer) -> str:
     """Return the hypothesis that is named where no run is held out: the best that leaves noise alone and holds no smaller one."""
     evidence = {name: t["evidence"] for name, t in answer.tried.items()}
-    close = [n for n in sorted(evidence) if answer.tried[n]["fine"] and max(evidence.values()) - evidence[n] < CLOSE]
+    top = max(evidence.values())
+    close = [n for n in sorted(evidence) if answer.tried[n]["fine"] and top - evidence[n] < CLOSE]
     smallest = [n for n in close if not any(_effects(other) < _effects(n) for other in close)]
     return max(smallest or sorted(evidence), key=evidence.__getitem__)
 
