@@ -17,7 +17,7 @@ from click.testing import CliRunner, Result
 from srfcli.cli.diagnose_out import prediction_names
 from srfcli.cli.main import cli
 from srfcli.diagnosis.search import Search
-from srfcli.diagnosis.verdict import MISSED, OUTSIDE
+from srfcli.diagnosis.verdict import NAMED
 
 ALPHA = 0.03
 TOML = """format = "srf-experiment/1"
@@ -116,9 +116,9 @@ def test_the_concealed_effect_is_named_with_its_size(found: dict[str, Any]) -> N
     alpha = found["augmented"]["parameters"]["alpha"]
     assert abs(alpha["value"] - ALPHA) < 4 * alpha["stderr"] < 0.3 * ALPHA
     # what was wrong for another reason in sealed cases is kept back
-    assert found["confidence"]["linker-dieterich"] == pytest.approx(1 - OUTSIDE - MISSED, abs=0.01)
-    assert found["confidence"]["unknown"] == OUTSIDE  # something that is not registered may look like it
-    assert sum(found["confidence"].values()) == pytest.approx(1 - MISSED)
+    assert found["confidence"]["linker-dieterich"] == pytest.approx(1 - sum(NAMED), abs=0.01)
+    assert found["confidence"]["unknown"] == NAMED[0]  # something that is not registered may look like it
+    assert sum(found["confidence"].values()) == pytest.approx(1 - NAMED[1])
 
 
 def test_the_answer_has_the_form_of_the_format(found: dict[str, Any]) -> None:

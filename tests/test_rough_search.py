@@ -165,7 +165,7 @@ def test_a_baseline_that_is_far_off_is_put_on_a_rough_track_where_nothing_leads(
 
 def standing(hypothesis, share, rank):
     fit = SimpleNamespace(
-        problem=SimpleNamespace(runs=(SimpleNamespace(used=np.ones(1000, dtype=bool)),), experiment=None)
+        problem=SimpleNamespace(runs=(SimpleNamespace(used=np.ones(1000, dtype=bool)),), experiment=None), values={}
     )
     return Entrant(hypothesis, None, SimpleNamespace(fit=fit, share=share, rank=rank))
 
@@ -181,7 +181,7 @@ def standing(hypothesis, share, rank):
 )
 def test_what_follows_best_is_set_free(search, monkeypatch, ranks, shares, freed):
     """Of hypotheses that were grown the best is fitted to all of the recordings, another one only where it is close."""
-    trial, base, kept = Search(SHIPPED, search.experiment), search.tried["none", False], []
+    trial, base, kept, smooth = Search(SHIPPED, search.experiment), search.tried["none", False], [], []
     trial.tried, trial.noise, trial.loose = {("none", False): base}, search.noise, {"none": base.fit}
     added = dict(zip("ab", effects("viscous-drag", "adhesion-offset"), strict=True))
     names = {e.name: k for k, e in added.items()}
@@ -191,21 +191,44 @@ def test_what_follows_best_is_set_free(search, monkeypatch, ranks, shares, freed
         return grown[names[hypothesis.effects[0].name]] if hypothesis.effects else standing(hypothesis, 0.4, 61.0)
 
     def keep(hypothesis, fitted, *, rough):
-        kept.append(names[hypothesis.effects[0].name])
+        (kept if rough else smooth).append(names[hypothesis.effects[0].name])
         fine = replace(base.adequacy, rms_over_noise=1.0, p_value=0.5)
-        found = replace(base, hypothesis=hypothesis, rough=True, adequacy=fine, evidence=base.evidence + 1e6)
-        trial.tried[found.name, True] = found
+        found = replace(base, hypothesis=hypothesis, rough=rough, adequacy=fine, evidence=base.evidence + 1e6 + rough)
+        trial.tried[found.name, rough] = found
         return found
 
     scored = [SimpleNamespace(effect=e, values={}, gain=9.0) for e in added.values()]
     monkeypatch.setattr(horizons, "entrant", entrant)
     monkeypatch.setattr(horizons, "scores", lambda *_, **__: scored)
     monkeypatch.setattr(horizons, "whole", lambda *_: None)
+    monkeypatch.setattr(horizons, "fit_latent", lambda *_, **__: None)
+    monkeypatch.setattr(trial, "problem", lambda *_, **__: SimpleNamespace(start=None))
     monkeypatch.setattr(trial, "keep", keep)
     monkeypatch.setattr(trial, "settled", lambda _: True)
     assert horizons.by_horizons(trial, base, list(added.values()))
-    assert kept == freed
+    assert kept == smooth == freed  # the track may not be rough after all
     assert trial.shared is True
+    assert horizons.by_horizons(trial, base, list(added.values())) is False  # asked once
+
+
+@pytest.mark.parametrize(("follows", "asked"), [("a", "a"), ("c", "abc")], ids=["the first follows", "the last does"])
+def test_where_none_that_promises_follows_the_others_are_asked(search, monkeypatch, follows, asked):
+    """Over a short horizon scores tell little: of three effects two promise, and the third is what lets horizons grow."""
+    trial, base, grown = Search(SHIPPED, search.experiment), search.tried["none", False], []
+    trial.tried = {("none", False): base}
+    added = dict(zip("abc", effects("viscous-drag", "adhesion-offset", "linker-dieterich"), strict=True))
+    names = {e.name: k for k, e in added.items()}
+
+    def entrant(_, hypothesis, at, *, shared, followed=None):
+        grown.append(names[hypothesis.effects[0].name])
+        return standing(hypothesis, 0.85 if grown[-1] == follows else 0.1, 16.0 if grown[-1] == follows else 91.0)
+
+    scored = [SimpleNamespace(effect=e, values={}, gain=9.0 if k == "a" else 0.1) for k, e in added.items()]
+    monkeypatch.setattr(horizons, "entrant", entrant)
+    monkeypatch.setattr(horizons, "scores", lambda *_, **__: scored)
+    found = horizons._beside(trial, Hypothesis(), base.fit, list(added.values()), {})
+    assert "".join(grown) == asked
+    assert names[found[0].hypothesis.effects[0].name] == follows
 
 
 def test_nothing_is_fitted_twice_from_one_place(search):

@@ -184,7 +184,10 @@ def test_what_a_rough_track_gives_one_it_may_give_its_rival(search, monkeypatch,
 
 
 def test_a_leader_that_is_nearly_there_is_tried_on_a_rough_track_at_once(search, monkeypatch):
-    """What a smooth track leaves of the right effect is not given to a second one before a rough track was asked."""
+    """What a smooth track leaves of the right effect is not given to a second one before a rough track was asked.
+
+    Nor to a rough track before other starts were: a false minimum leaves as much.
+    """
     from srfcli.diagnosis import contest as module
 
     base, (one, _) = search.tried["none", False], [Hypothesis((e,)) for e in effects(*PAIR)]
@@ -196,5 +199,8 @@ def test_a_leader_that_is_nearly_there_is_tried_on_a_rough_track_at_once(search,
     monkeypatch.setattr(module, "_released", lambda *_: near)
     monkeypatch.setattr(module, "_entry", lambda s, h, at: module.Entry(h, base.fit.point.theta, {}, 1.2))
     monkeypatch.setattr(module, "_partnered", lambda *_: pytest.fail("a partner was tried first"))
-    monkeypatch.setattr(trial, "refit", lambda *_, **how: fine if how == {"rough": True} else near)
+    asked = []
+    monkeypatch.setattr(module, "elsewhere", lambda _, refit: asked.append("elsewhere") or refit)
+    monkeypatch.setattr(trial, "refit", lambda *_, **how: asked.append(how) or fine)
     assert contest(trial, base, [(one, {})], effects(*PAIR)) == [near]
+    assert asked == ["elsewhere", {"rough": True}]

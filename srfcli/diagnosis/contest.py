@@ -9,7 +9,7 @@ import numpy as np
 
 from srfcli.diagnosis.candidates import Hypothesis, built_beside
 from srfcli.diagnosis.doubts import doubt, wandering
-from srfcli.diagnosis.elsewhere import resized
+from srfcli.diagnosis.elsewhere import elsewhere, resized
 from srfcli.diagnosis.follower import CLEAR, LOOSE_ONLY
 from srfcli.diagnosis.refits import Entry, Refit
 from srfcli.diagnosis.score import scores
@@ -41,6 +41,8 @@ def contest(
 
     def free(entry: Entry) -> bool:
         refit = found[entry.hypothesis.name] = resized(search, _released(search, entry))
+        if refit.halfway and search.best() is refit:  # beside a false minimum a rough track takes up what is left
+            refit = found[entry.hypothesis.name] = elsewhere(search, refit)
         if refit.halfway and search.best() is refit and search.untried(entry.hypothesis, rough=True):
             refit = search.refit(entry.hypothesis, refit, {}, rough=True)
             if not refit.adequacy.fine and wandering(entry.hypothesis):  # it stood in for a part of the track

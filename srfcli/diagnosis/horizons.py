@@ -11,17 +11,17 @@ from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.ledger import ROUGH_COSTS
 from srfcli.diagnosis.refits import NEAR, PAIRS, Refit
 from srfcli.diagnosis.score import scores
+from srfcli.inference import fit as fitting
 from srfcli.inference.fit import Problem
 from srfcli.inference.grow import FOLLOWED, SHARES, Grown, grow, whole
-from srfcli.inference.latent import LatentFit
+from srfcli.inference.latent import LatentFit, fit_latent
 from srfcli.inference.tracks import tracks_for
 from srfcli.laws import Effect
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.search import Search
 
-BRIEF = 0.2  # share of the recordings below which one track for all runs is not followed: none is there, or each has its own
-FOREMOST = 4  # effects that are grown beside a hypothesis
+FOREMOST = 5  # effects that are grown beside a hypothesis
 FAINT = 0.2  # of the first one's score, what another has to promise
 STRICT = 1.44  # chi-squared per sample within which they grow: with what is missing noise alone is left
 CLEARLY = 60.0  # twice the log posterior by which one leads, so that the next is not asked
@@ -42,20 +42,23 @@ class Entrant:
 
 
 def by_horizons(search: Search, baseline: Refit, candidates: Sequence[Effect]) -> bool:
-    """Return whether the baseline on a rough track, or effects beside it, leave noise alone.
+    """Return whether the baseline on a rough track, or effects beside it, leave noise alone; asked once.
 
-    What is missing stops a horizon from growing, or leaves more there, and is scored where slopes still mean something. The track
-    is the same for all runs: one for each takes up what is missing as well as roughness.
+    What is missing stops a horizon from growing, or leaves more there, and is scored where slopes still mean something; where
+    none of those that promise most follows, the others are asked. It starts from the file's own values or from where the baseline
+    stands while held, whichever follows further. The track is the same for all runs: one for each takes up what is missing as
+    well as roughness.
     """
-    bare, values = Hypothesis(), search.loosely(baseline).values
-    alone = entrant(search, bare, values, shared=True)
-    if alone.grown.share < BRIEF:
+    if search.raced:
         return False
+    search.raced, bare = True, Hypothesis()
+    starts: tuple[Mapping[str, float], ...] = ({}, search.loosely(baseline).values)
+    tries = [(entrant(search, bare, at, shared=True), at) for at in starts]
+    alone, values = min(tries, key=lambda found: found[0].grown.rank)
     around = alone.grown.fit
     if alone.follows:
-        found = search.keep(bare, whole(alone.problem, alone.grown, search.noise), rough=True)
+        found = _freed(search, alone)
         if found.adequacy.fine:
-            search.shared = True
             search.widen(found, candidates, PAIRS, rough=True)
             return search.settled(candidates)
         if found.adequacy.rms_over_noise < NEAR:
@@ -64,7 +67,7 @@ def by_horizons(search: Search, baseline: Refit, candidates: Sequence[Effect]) -
     if _released(search, singles) or not singles:
         return search.settled(candidates)
     leader = singles[0]
-    at = values | leader.grown.fit.values
+    at = {**values, **leader.grown.fit.values}
     _released(search, _beside(search, leader.hypothesis, leader.grown.fit, candidates, at))
     return search.settled(candidates)
 
@@ -100,10 +103,12 @@ def _beside(
     present = hypothesis.effects
     left = search.joining(candidates, present)
     scored = scores(search.registry, around.problem.experiment, around, left, present=present)
-    least = FAINT * scored[0].gain if scored else 0.0
+    least = FAINT * scored[0].gain if scored and not present else 0.0  # beside a leader scores tell less
     promising = [s for i, s in enumerate(scored) if (i < FOREMOST and s.gain >= least) or s.effect.settings]
-    found = []
-    for score in promising:
+    found = list[Entrant]()
+    for score in [*promising, *(s for s in scored if s not in promising and not along_table(s.effect))]:
+        if score not in promising and (present or any(e.follows for e in found)):
+            break
         wider = Hypothesis((*present, score.effect))
         own = search.own_values(wider, score.values) if along_table(score.effect) else {}
         if search.untried(wider, rough=True):
@@ -122,7 +127,20 @@ def _released(search: Search, entrants: Sequence[Entrant]) -> bool:
             and search.best().adequacy.fine
         ):
             break
-        found = search.keep(e.hypothesis, whole(e.problem, e.grown, search.noise), rough=True)
-        if found.adequacy.rms_over_noise < NEAR:
-            search.shared = True
+        _freed(search, e)
     return search.best().adequacy.fine
+
+
+def _freed(search: Search, found: Entrant) -> Refit:
+    """Fit the whole of the recordings from a hypothesis that follows them, and without a track, too: it may not be rough."""
+    refit = search.keep(found.hypothesis, whole(found.problem, found.grown, search.noise), rough=True)
+    if refit.adequacy.rms_over_noise < NEAR:
+        search.shared = True
+    smooth = search.problem(found.hypothesis, found.grown.fit.values)
+    theta = smooth.start
+    if not refit.adequacy.fine:
+        alone = fitting.Search(smooth, lambda text: None)
+        theta, _ = alone.grow(theta, search.noise)
+        search.evaluations += alone.evaluations
+    search.keep(found.hypothesis, fit_latent(smooth, theta, search.noise, known_noise=True), rough=False)
+    return refit

@@ -45,6 +45,7 @@ class Search(Ledger):
     sized: set[str] = field(default_factory=set)  # tried at other sizes of what is built in
     stood: dict[str, Refit] = field(default_factory=dict)  # where the best was when each was last fitted from there
     begun: dict[tuple[frozenset[Effect], bool], set[tuple[float, ...]]] = field(default_factory=dict)
+    raced: bool = False  # whether hypotheses were grown side by side
     shared: bool | None = None  # whether all runs slid on one rough track, once that was asked
 
     def run(self) -> list[Refit]:

@@ -42,7 +42,7 @@ def likeliest_bump(point: Point) -> Bump | None:
     turned = vectors.T @ unit.T
     values, along, s2 = np.maximum(values, 0.0), turned @ h, AMPLITUDES[:, None] ** 2
     even = 0.5 * np.sum(s2 * along**2 / (1 + s2 * values) - np.log1p(s2 * values), axis=1)
-    best, found = 0.0, None
+    best, found, most = 0.0, None, float(np.diag(G).max())
     for place in np.arange(nodes[0], nodes[-1], APART):
         for width in WIDTHS:
             shape = np.exp(-0.5 * ((nodes - place) / width) ** 2)
@@ -50,7 +50,7 @@ def likeliest_bump(point: Point) -> Bump | None:
             whole, own = float(shape @ seen), turned @ seen
             score = float(shape @ h) - np.sum(s2 * own * along / (1 + s2 * values), axis=1)
             weight = whole - np.sum(s2 * own**2 / (1 + s2 * values), axis=1)
-            seen_at = weight > 1e-9 * whole
+            seen_at = weight > 1e-9 * max(whole, most)  # nothing is known where nothing slid
             total = even + np.divide(0.5 * score**2, weight, out=np.zeros_like(weight), where=seen_at)
             k = int(np.argmax(total))
             gain = 2 * float(total[k] - even.max())
