@@ -10,9 +10,10 @@ from typing import Any
 from common import Report
 
 from srfcli.output.tables import cell_text
+from srfcli.trial.ablated import ablated
 from srfcli.trial.answer import Answer
 from srfcli.trial.mark import Mark, mark
-from srfcli.trial.report import by_effect, by_outside, confusion, cost, rates
+from srfcli.trial.report import by_effect, by_outside, by_strength, calibrated, confusion, cost, held, rates, sizes
 from srfcli.trial.sight import Sight
 
 
@@ -34,9 +35,12 @@ def heading(report: Report, bank: str, cases: int, known: Path | None) -> None:
 
 def tell(report: Report, marks: Sequence[Mark], who: str) -> None:
     """Say the tables of `srf prove` for these marks."""
-    for table in (confusion(marks), rates(marks), by_effect(marks), by_outside(marks), cost(marks)):
+    made = (confusion, rates, by_effect, by_outside, by_strength, calibrated, held, sizes, cost, ablated)
+    for table in (make(marks) for make in made):
         if table.rows:
             report.say(f"\n{who}: {table.title}")
             formats = [c.format for c in table.columns]
             cells = [[cell_text(v, f) for v, f in zip(row, formats, strict=True)] for row in table.rows]
             report.table([c.name for c in table.columns], cells)
+            for note in table.notes:
+                report.say(f"# {note}")

@@ -13,7 +13,9 @@ import tempfile
 from dataclasses import asdict
 from pathlib import Path
 
-from srfcli.inference.fit import Fit, fit, fit_problem
+import numpy as np
+
+from srfcli.inference.fit import Problem, fit, fit_problem
 from srfcli.model import open_model
 from srfcli.recording.experiment import read_experiment
 from srfcli.registry import load_registry
@@ -69,24 +71,50 @@ CASES = [
 ]
 
 
-def fitted(data: Path, case: dict[str, object], ageing: str, stiffness: str, K: str, D0: float) -> Fit:
-    """Return the fit of one recording with a slip trend; K is "free" or empty."""
+BEYOND = [(BASALT, "ruina", "5.4e-3", 10.0, (11685.0, 11700.0))]  # fitted up to so many seconds, predicted to the end
+
+
+def problem_of(
+    data: Path, case: dict[str, object], ageing: str, stiffness: str, K: str, D0: float, until: float | None = None
+) -> Problem:
+    """Return the fit of one recording with a slip trend, up to a time if one is given; K is "free" or empty."""
+    window = str(case["window"])
+    values = {
+        **case,
+        "file": (data / str(case["file"])).resolve(),
+        "window": window if until is None else f"{window.split(',')[0]}, {until}]",
+        "ageing": ageing,
+        "stiffness": stiffness,
+        "D0": D0,
+    }
+    text = EXPERIMENT.format(**values, K=FREE_K.format(stiffness).replace("{{", "{").replace("}}", "}") if K else "")
     with tempfile.TemporaryDirectory() as folder:
-        values = {
-            **case,
-            "file": (data / str(case["file"])).resolve(),
-            "ageing": ageing,
-            "stiffness": stiffness,
-            "D0": D0,
-        }
-        text = EXPERIMENT.format(
-            **values, K=FREE_K.format(stiffness).replace("{{", "{").replace("}}", "}") if K else ""
-        )
         path = Path(folder) / "experiment.toml"
         path.write_text(text, encoding="utf-8")
         registry = load_registry()
         experiment = read_experiment(path, registry=registry)
-        return fit(fit_problem(open_model(registry, **asdict(experiment.choice)), experiment, trend="slip"))
+    return fit_problem(open_model(registry, **asdict(experiment.choice)), experiment, trend="slip")
+
+
+def beyond(data: Path, case: dict[str, object], ageing: str, stiffness: str, D0: float, until: float) -> str:
+    """Return how what comes after a time is predicted by a fit of what came before: scatter, and how far it is off on average.
+
+    The standard error of that is of the fit's parameters, its slip trend above all, and of noise with its colour.
+    """
+    found, whole = (
+        fit(problem_of(data, case, ageing, stiffness, "", D0, until)),
+        problem_of(data, case, ageing, stiffness, "", D0),
+    )
+    run, noise = whole.runs[0], found.runs[0].noise
+    predicted = whole.predicted(run, np.array([found.values[n] for n in whole.names]))
+    late = run.used & (run.t > until)
+    left, slope = (run.observed - predicted.y)[late], predicted.J[late].mean(axis=0)
+    slow = noise.innovation / (1 - sum(noise.coefficients)) / np.sqrt(left.size)
+    error = float(np.sqrt(slope @ found.covariance @ slope + slow**2))
+    return (
+        f"to {until:g} s, then {left.size} samples: scatter {left.std() / found.runs[0].rms:.2f} times what the fit leaves, "
+        f"{left.mean():+.1e}({error:.1e}) off"
+    )
 
 
 def main() -> None:
@@ -94,7 +122,7 @@ def main() -> None:
     if len(sys.argv) != 2:
         raise SystemExit("usage: python examples/real_steps.py DATA")
     for case, ageing, stiffness, K, D0, published in CASES:
-        found = fitted(Path(sys.argv[1]), case, ageing, stiffness, K, D0)
+        found = fit(problem_of(Path(sys.argv[1]), case, ageing, stiffness, K, D0))
         cells = [
             f"{n} {found.values[n]:.5g} ({found.stderr[n]:.2g})" for n in found.names if n in ("A", "B", "D0", "K")
         ]
@@ -104,6 +132,12 @@ def main() -> None:
             f"    published {published}; rms {run.rms:.2e}, noise of order {run.noise.order}, {found.status.value}",
             flush=True,
         )
+    for case, ageing, stiffness, D0, ends in BEYOND:
+        for until in ends:
+            print(
+                f"{case['title']}, {ageing}, {beyond(Path(sys.argv[1]), case, ageing, stiffness, D0, until)}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

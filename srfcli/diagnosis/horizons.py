@@ -99,15 +99,20 @@ def fit_by_horizons(
 def _beside(
     search: Search, hypothesis: Hypothesis, around: LatentFit, candidates: Sequence[Effect], values: Mapping[str, float]
 ) -> list[Entrant]:
-    """Return the hypotheses that add one effect, grown, the best first: those that promise most, and those that are built in."""
+    """Return the hypotheses that add one effect, grown, the best first: those that promise most, and those that are built in.
+
+    Beside the bare baseline every other one is asked, too, where none of these follows, but for waves and drifts.
+    """
     present = hypothesis.effects
     left = search.joining(candidates, present)
     scored = scores(search.registry, around.problem.experiment, around, left, present=present)
     least = FAINT * scored[0].gain if scored and not present else 0.0  # beside a leader scores tell less
     promising = [s for i, s in enumerate(scored) if (i < FOREMOST and s.gain >= least) or s.effect.settings]
+    names = {s.effect.name for s in promising}
+    others = [s for s in scored if s.effect.name not in names and not along_table(s.effect)]
     found = list[Entrant]()
-    for score in [*promising, *(s for s in scored if s not in promising and not along_table(s.effect))]:
-        if score not in promising and (present or any(e.follows for e in found)):
+    for score in [*promising, *(() if present else others)]:
+        if score.effect.name not in names and any(e.follows for e in found):
             break
         wider = Hypothesis((*present, score.effect))
         own = search.own_values(wider, score.values) if along_table(score.effect) else {}
