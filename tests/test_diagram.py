@@ -92,3 +92,12 @@ def test_without_a_modulated_run_it_is_under_constant_load(experiment):
 def test_the_figure_shows_four_curves(found):
     (axis,) = diagram_figure(found).axes
     assert len(axis.lines) == 4 and axis.get_ylabel() == "critical load W$_0$  [N]"
+
+
+def test_where_nothing_is_ever_unstable_there_is_no_figure(found):
+    """A step on a rock that strengthens with velocity has no critical load, of either model."""
+    nowhere = {
+        key: [None] * len(value) if key.startswith("W0") and value is not None else value
+        for key, value in found.items()
+    }
+    assert diagram_figure(nowhere) is None

@@ -12,7 +12,7 @@ import pytest
 from srfcli.diagnosis import verdict as module
 from srfcli.diagnosis.candidates import neutral_values
 from srfcli.diagnosis.score import Score
-from srfcli.diagnosis.verdict import _noise_for, conclude, interesting
+from srfcli.diagnosis.verdict import _noise_for, conclude, interesting, undetermined
 from srfcli.inference.noise import Noise
 from srfcli.laws import Parameter
 from srfcli.numerics.load import ConstantLoad
@@ -136,3 +136,17 @@ def test_an_interesting_size_is_in_base_units():
     in_ms = replace(own, parameters=(Parameter(name, 3.0, "ms", 0.0, 100.0),), neutral=((name, 1.0),))
     assert interesting(replace(score("sensor-lag", 1.0), effect=in_ms)) == pytest.approx(0.002)
     assert neutral_values(in_ms) == {name: pytest.approx(0.001)}
+
+
+@pytest.mark.parametrize(("error", "nothing"), [(1e-9, False), (3e-7, True)])
+@pytest.mark.parametrize(("name", "size"), [("inertia", "M"), ("interface-compliance", "lambda")])
+def test_what_is_built_in_has_to_stand_out_from_nothing(name, size, error, nothing):
+    """A mass of 4 kg with an error of 1200 was named beside a stiffness: it came with another roughness of the track."""
+    found = refit(name, "viscous-drag", evidence=0.0)
+    names = ("A", size, "c")
+    found.fit = SimpleNamespace(
+        problem=SimpleNamespace(names=names, model=SimpleNamespace(names=names)), covariance=np.diag([1.0, error**2, 1.0]),
+        values={"A": 0.01, size: 4e-7, "c": 1e-5},
+    )  # fmt: skip
+    assert undetermined(found) is nothing
+    assert undetermined(refit("viscous-drag", evidence=0.0)) is False  # a drag's error says nothing here

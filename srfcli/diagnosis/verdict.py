@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from srfcli.diagnosis.adequacy import DOUBT, SURE, Adequacy, joined, sampled
-from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, neutral_values
+from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, neutral_values, own_parameters
 from srfcli.diagnosis.follower import LOOSE, Follower
 from srfcli.diagnosis.refits import HALFWAY, NEAR, Refit, judge_fit
 from srfcli.diagnosis.score import Score
@@ -25,6 +25,7 @@ from srfcli.units import to_base
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
 NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
 SAME = 0.97  # likeness of two effects' projected columns beyond which they are one class
+DETERMINED = 2.0  # standard errors from nothing, of a mass or an interface that is built in
 FEW = 4.0  # standard deviations by which the level of a short run's noise may be off
 TEMPER = 3.0  # by which evidence is divided before it becomes a stated confidence: found on a bank of its own
 # shares of the sealed cases of seeds 227 and 817 (docs/proof.md) by verdict: what was concealed is not registered; the best
@@ -88,7 +89,7 @@ class Diagnosis:
 
 def conclude(search: Search, held_out: Experiment) -> Diagnosis:
     """Return the verdict on a finished search; `held_out` is the experiment read with its held-out runs, opened only now."""
-    ranked = tuple(search.ranked())
+    ranked = tuple(r for r in search.ranked() if not undetermined(r))
     best, alone = ranked[0], next(r for r in ranked if not r.hypothesis.effects)
     close = tuple(r for r in ranked if r.adequacy.fine and best.evidence - r.evidence < CLOSE)
     if close:  # a hypothesis that holds a smaller one, and gains nothing by it, is not another answer
@@ -114,6 +115,21 @@ def conclude(search: Search, held_out: Experiment) -> Diagnosis:
         {s.effect.reported: s.detectable for s in listed}, _equivalent(listed, close),
         held, search.noise, tuple(reasons), ungated,
     )  # fmt: skip
+
+
+def undetermined(refit: Refit) -> bool:
+    """Return whether a mass or an interface that a hypothesis builds in is nothing by its own error: such a one is not there.
+
+    Where slopes tell that nothing depends on it, more evidence is that of another minimum, or of another roughness.
+    """
+    built = [e for e in refit.hypothesis.effects if e.settings]
+    if not built:
+        return False
+    fitted = refit.fit
+    errors = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
+    known = dict(zip(fitted.problem.names, errors.tolist(), strict=True))
+    sizes = [n for e in built for n in (*own_parameters(e, fitted.problem.model), *e.frees) if n in known]
+    return any(fitted.values[n] < DETERMINED * known[n] for n in sizes)
 
 
 def _scored(search: Search, baseline: Refit, *, asked: bool) -> list[Score]:

@@ -138,7 +138,7 @@ def diagram_figure(diagram: Mapping[str, Any]) -> Figure | None:
     curves = [("W0_baseline", "baseline", BEFORE, "-"), ("W0_augmented", "augmented model", AFTER, (0, (5, 1.5)))]
     curves += [("W0_hopf_baseline", "baseline, constant load", BEFORE, DOTTED)]
     curves += [("W0_hopf_augmented", "augmented model, constant load", AFTER, DOTTED)]
-    drawn = [c for c in curves if diagram.get(c[0]) is not None and len(diagram[c[0]])]
+    drawn = [c for c in curves if diagram.get(c[0]) is not None and np.isfinite(_gaps(diagram[c[0]])).any()]
     if not drawn or diagram.get("V") is None:
         return None
     with house_style():
