@@ -54,7 +54,11 @@ def stability(
                 found |= _boundary(model, base, V, strongest[0], share * strongest[1], side, notes)
     except SrfError as error:
         return {"note": f"no stability diagram: {error.message}"}
-    if strongest:
+    if not any(np.isfinite(loads).any() for key, loads in found.items() if key.startswith("W0")):
+        notes = [
+            f"Sliding is steady at any load from {V[0]:.3g} to {V[-1]:.3g} um/s, of both models: there is no boundary."
+        ]
+    elif strongest:
         notes.insert(
             1,
             f"Drawn through: under a load modulated by {strongest[1]:.3g} at {strongest[0]:g} Hz, the strongest here.",

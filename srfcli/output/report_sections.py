@@ -354,12 +354,11 @@ def missing_force(matter: Matter) -> Markup:
 
 def diagram(matter: Matter) -> Markup:
     """Return what the model does to the stability diagram; nothing where that was not computed."""
-    if "diagram" not in matter.pictures:
+    note, drawn = (matter.tables.get("diagram") or {}).get("note"), "diagram" in matter.pictures
+    if not (note or drawn):
         return Markup("")
-    note = (matter.tables.get("diagram") or {}).get("note")
-    figure = matter.figure(
-        "diagram", "Critical load against driving velocity, baseline and augmented model.", small=True
-    )
+    caption = "Critical load against driving velocity, baseline and augmented model."
+    figure = matter.figure("diagram", caption, small=True) if drawn else ""
     return section("diagram", "What it does to the stability diagram", tag("p", str(note)) if note else "", figure)
 
 
