@@ -58,12 +58,11 @@ def stability(
         notes = [
             f"Sliding is steady at any load from {V[0]:.3g} to {V[-1]:.3g} um/s, of both models: there is no boundary."
         ]
-    elif strongest:
-        notes.insert(
-            1,
-            f"Drawn through: under a load modulated by {strongest[1]:.3g} at {strongest[0]:g} Hz, the strongest here.",
-        )
-    notes.append("srf continue --eps and srf map follow the boundary at any other.")
+    else:
+        if strongest:
+            drawn = f"under a load modulated by {strongest[1]:.3g} at {strongest[0]:g} Hz, the strongest here."
+            notes.insert(1, f"Drawn through: {drawn}")
+        notes.append("srf continue --eps and srf map follow the boundary at any other.")
     if left := augmented.choice.effects:
         notes.append(f"{', '.join(left)}: of the apparatus, not in the laws.")
     return found | {"note": " ".join(notes)}
