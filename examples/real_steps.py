@@ -87,7 +87,7 @@ def problem_of(
         "stiffness": stiffness,
         "D0": D0,
     }
-    text = EXPERIMENT.format(**values, K=FREE_K.format(stiffness).replace("{{", "{").replace("}}", "}") if K else "")
+    text = EXPERIMENT.format(**values, K=FREE_K.format(stiffness) if K else "")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "experiment.toml"
         path.write_text(text, encoding="utf-8")
@@ -101,10 +101,8 @@ def beyond(data: Path, case: dict[str, object], ageing: str, stiffness: str, D0:
 
     The standard error of that is of the fit's parameters, its slip trend above all, and of noise with its colour.
     """
-    found, whole = (
-        fit(problem_of(data, case, ageing, stiffness, "", D0, until)),
-        problem_of(data, case, ageing, stiffness, "", D0),
-    )
+    found = fit(problem_of(data, case, ageing, stiffness, "", D0, until))
+    whole = problem_of(data, case, ageing, stiffness, "", D0)
     run, noise = whole.runs[0], found.runs[0].noise
     predicted = whole.predicted(run, np.array([found.values[n] for n in whole.names]))
     late = run.used & (run.t > until)

@@ -109,11 +109,7 @@ class Follower:
         free = self.problem(hypothesis, {})
         theta, reduced = self.descend(free, place, noise, 1e-4)
         if not reduced < FOLLOWED and held < NEARLY:
-            grown = fitting.Search(free, lambda text: None)
-            grew, _ = grown.grow(np.clip(place, free.lower, free.upper), noise)
-            self.evaluations += grown.evaluations
-            if grown.reduced < reduced:
-                theta, reduced = grew, grown.reduced
+            theta, reduced = min((theta, reduced), self.grow(free, place, noise), key=lambda f: f[1])
         return Followed(free, theta, reduced, place, held)
 
     def descend(
@@ -124,6 +120,13 @@ class Follower:
         theta, _ = search.descend(
             np.clip(theta, problem.lower, problem.upper), noise, {}, tolerance=tolerance, most=FEW
         )
+        self.evaluations += search.evaluations
+        return theta, search.reduced
+
+    def grow(self, problem: Problem, theta: Array, noise: Mapping[str, Noise]) -> tuple[Array, float]:
+        """Return where horizons that grow lead, and chi-squared per degree of freedom there."""
+        search = fitting.Search(problem, lambda text: None)
+        theta, _ = search.grow(np.clip(theta, problem.lower, problem.upper), noise)
         self.evaluations += search.evaluations
         return theta, search.reduced
 

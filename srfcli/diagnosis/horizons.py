@@ -11,7 +11,6 @@ from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.ledger import ROUGH_COSTS
 from srfcli.diagnosis.refits import NEAR, PAIRS, Refit
 from srfcli.diagnosis.score import scores
-from srfcli.inference import fit as fitting
 from srfcli.inference.fit import Problem
 from srfcli.inference.grow import FOLLOWED, SHARES, Grown, grow, whole
 from srfcli.inference.latent import LatentFit, fit_latent
@@ -144,8 +143,6 @@ def _freed(search: Search, found: Entrant) -> Refit:
     smooth = search.problem(found.hypothesis, found.grown.fit.values)
     theta = smooth.start
     if not refit.adequacy.fine:
-        alone = fitting.Search(smooth, lambda text: None)
-        theta, _ = alone.grow(theta, search.noise)
-        search.evaluations += alone.evaluations
+        theta, _ = search.follower.grow(smooth, theta, search.noise)
     search.keep(found.hypothesis, fit_latent(smooth, theta, search.noise, known_noise=True), rough=False)
     return refit
