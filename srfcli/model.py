@@ -99,15 +99,16 @@ def open_model(
     inertia: bool = True,
     effects: Sequence[str] = (),
     tables: Sequence[tuple[str, str]] = (),
+    random_field: bool = False,
 ) -> GeneratedModel:
     """Return the model of the system that these names describe, from the cache where it was built before.
 
-    With effects or tables it holds what motion in time needs, and nothing of stability.
+    With effects, tables or a random friction field it holds what motion in time needs, and nothing of stability.
     """
     base, *modifiers = ageing.split("+")
     wanted = [("friction", law), ("ageing", base), *(("modifier", m) for m in modifiers), ("interface", interface)]
     wanted += [("effect", name) for name in effects]
-    parts, laws = [__version__, str(FORMAT), loading, str(inertia), repr(tuple(tables))], []
+    parts, laws = [__version__, str(FORMAT), loading, str(inertia), repr(tuple(tables)), str(random_field)], []
     for kind, name in wanted:
         found, fingerprint = _source(registry, kind, name.strip())
         parts += [kind, name, fingerprint]
@@ -121,9 +122,9 @@ def open_model(
 
         system = build_system(
             registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia, effects=effects,
-            tables=tables,
+            tables=tables, random_field=random_field,
         )  # fmt: skip
-        return generate_motion(system) if effects or tables else generate(system)
+        return generate_motion(system) if effects or tables or random_field else generate(system)
 
     return load_source(cached_source(key, build), key=key, laws=tuple(laws))
 

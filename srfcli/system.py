@@ -41,6 +41,29 @@ RUN = (  # of one run: what an effect may ask of the recording
     Parameter("onset0", -1e6, "s", about="when half of the load modulation was switched on"),
 )
 HOLD = Parameter("hold", 0.0, "N/um", 0.0, 1e9, "stiffness of a second spring, to where the slider was recorded")
+_ALONG = sp.sqrt(3) * symbol("v") / symbol("field_length")  # slip rate in the units of a Matern covariance
+RANDOM_FIELD = Effect(  # correlation (1 + r) exp(-r), r = sqrt(3) d/length (Matern 3/2): two states, driven by white noise
+    "random-field",
+    about="friction that no law explains: a stationary Gaussian process along slip",
+    cites=("J. Hartikainen and S. Sarkka, IEEE MLSP 2010",),
+    parameters=(
+        Parameter("field_amplitude", 1e-3, "1", 0.0, 1.0, "standard deviation of the random friction field"),
+        Parameter("field_length", 5.0, "um", 1e-6, 1e6, "correlation length of the random friction field"),
+        Parameter("field_noise", 0.0, "1", about="the white noise that drives the field, over its standard deviation"),
+        Parameter("field_start", 0.0, "1", about="the field where the run begins, over its amplitude"),
+        Parameter("field_slope_start", 0.0, "1", about="its slope there times length/sqrt(3), over its amplitude"),
+    ),
+    changes=(("mu", symbol("mu") + symbol("field")),),
+    states=(
+        ExtraState("field", symbol("field_slope") * _ALONG,
+                   symbol("field_amplitude") * symbol("field_start")),
+        ExtraState("field_slope",
+                   -(symbol("field") + 2 * symbol("field_slope")) * _ALONG
+                   + 2 * symbol("field_amplitude") * symbol("field_noise") * sp.sqrt(_ALONG),
+                   symbol("field_amplitude") * symbol("field_slope_start")),
+    ),
+    neutral=(("field_amplitude", 0.0),),
+)  # fmt: skip
 FOLLOWED = {"elongation": 1, "force": symbol("K")}  # what a table of a recording holds, over the spring's elongation
 EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "kappa", "force", "rate", "V")
 LOADINGS = ("vertical", "inclined")
@@ -153,9 +176,15 @@ def build_system(
     inertia: bool = True,
     effects: Sequence[str] = (),
     tables: Sequence[tuple[str, str]] = (),
+    random_field: bool = False,
 ) -> System:
-    """Return the system that these registered names describe; `ageing` may carry modifiers, `dieterich+linker-dieterich`."""
+    """Return the system that these registered names describe; `ageing` may carry modifiers, `dieterich+linker-dieterich`.
+
+    With `random_field` a random friction field along slip adds to mu, as RANDOM_FIELD says.
+    """
     added = apart([_of(Effect, registry.get("effect", name)) for name in effects])
+    if random_field:
+        added = (*added, RANDOM_FIELD)
     for effect in added:
         chosen = dict(effect.settings)
         interface, inertia = str(chosen.get("interface", interface)), bool(chosen.get("inertia", inertia))

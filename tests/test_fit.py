@@ -222,9 +222,21 @@ def test_stick_slip_from_afar(make_model):
 
 def test_several_starts_agree_and_are_seeded(rock_model):
     problem = fit_problem(rock_model, rock(rock_model, runs=1))
-    best, starts = fit_from_several(problem, count=3, seed=4)
-    assert len(starts) == 3 and all(same for _, same in starts)
-    assert fit_from_several(problem, count=3, seed=4)[0].values == best.values
+    found = fit_from_several(problem, count=3, seed=4)
+    assert len(found.rows) == 3 and all(same for _, same in found.rows) and not found.interrupted
+    assert fit_from_several(problem, count=3, seed=4).best.values == found.best.values
+
+
+def test_starts_that_were_not_done_are_not_passed_over(rock_model):
+    problem, calls = fit_problem(rock_model, rock(rock_model, runs=1)), []
+
+    def stop(text):
+        calls.append(text)
+        if text.startswith("start 2 of 3"):
+            raise KeyboardInterrupt
+
+    found = fit_from_several(problem, count=3, seed=4, progress=stop)
+    assert found.interrupted and len(found.rows) == 1
 
 
 def test_interruption_keeps_the_best(rock_model):

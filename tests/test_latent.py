@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from srfcli.inference.fit import fit, fit_problem
 from srfcli.inference.latent import AMPLITUDES, LENGTHS, Point, evenness, marginal
-from srfcli.inference.rough import fit_rough
+from srfcli.inference.recordings import fit_recordings
 from srfcli.inference.tracks import Roughness, Tracks
-from srfcli.model import open_model
 from srfcli.recording.experiment import read_experiment
 from srfcli.registry import load_registry
 from srfcli.splines import Spline
@@ -94,12 +91,9 @@ def test_parameters_survive_a_rough_track(shared: Path) -> None:
     registry = load_registry()
     experiment = read_experiment(shared / "cases" / "open-07", registry=registry)
     truth = json.loads((shared / "cases" / "truth.json").read_text())["open-07"]["parameters"]
-    choice = asdict(experiment.choice)
-    plain = fit(fit_problem(open_model(registry, **choice), experiment))
-    problem = fit_problem(open_model(registry, **choice, tables=(("mu", "slip"),)), experiment)
-    rough = fit_rough(problem, plain)
-    found = rough.fit
-    assert 2e-4 < rough.roughness.amplitude < 5e-4 and not rough.shared
+    fitted = fit_recordings(registry, experiment)
+    found = fitted.fit
+    assert fitted.track is not None and 2e-4 < fitted.track.amplitude < 5e-4 and not fitted.track.shared
     assert found.rms_over_noise() == pytest.approx(1.0, abs=0.03)
     for name, value in found.values.items():
         assert abs(value - truth[{"lambda": "lam"}.get(name, name)]) < 4 * found.stderr[name]

@@ -15,16 +15,12 @@ if TYPE_CHECKING:
 
     from srfcli.inference.fit import Fit, Problem
     from srfcli.inference.profile import Interval
-    from srfcli.inference.rough import RoughFit
-    from srfcli.output.tables import Table
-    from srfcli.recording.values import Experiment
-    from srfcli.registry import Registry
 
 EXAMPLES = """
 srf fit EXPERIMENT                                  a folder with experiment.toml, or that file
 srf fit EXPERIMENT --profile --starts 5 --json
 srf fit EXPERIMENT --trend slip --free A,B,D0
-srf fit EXPERIMENT --track rough                    stick-slip whose phase wanders with the track
+srf fit EXPERIMENT --track smooth                   no random friction field, whatever the recording says
 srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c, sigma
 """
 
@@ -41,10 +37,8 @@ srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c,
 @click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
 @click.option(
     "--track",
-    type=click.Choice(["smooth", "rough"]),
-    default="smooth",
-    show_default=True,
-    help="Rough: mu0 wanders along each run's track.",
+    type=click.Choice(["smooth", "rough", "shared"]),
+    help="Random friction field along slip: none, one for each run, one for all; else the recording decides.",
 )
 @click.option(
     "--sample", type=click.IntRange(100, 1_000_000), metavar="N", help="Draw N points of the posterior (emcee)."
@@ -64,8 +58,9 @@ srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c,
 def command(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
     """Fit the model of an experiment to its recordings, all runs together, by maximum likelihood.
 
-    The noise of each run, its level and colour, is estimated with the parameters and counts in their errors. A CSV file is taken
-    for a table of critical loads, which the paper's procedure fits: the laws are then those of the options below.
+    The gauge's noise, its level and colour, and a random friction field along slip are estimated with the parameters and count
+    in their errors. A CSV file is taken for a table of critical loads, which the paper's procedure fits: the laws are then those
+    of the options below.
     """
     if source.suffix.lower() == ".csv":
         from srfcli.cli.fit_thresholds import fit_thresholds
@@ -99,86 +94,63 @@ def _refuse(options: dict[str, Any], names: tuple[str, ...], purpose: str) -> No
 
 def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
     import time
-    from dataclasses import asdict
+    from dataclasses import asdict, replace
 
     from srfcli.cli.emit import Progress, emit, finish
     from srfcli.cli.fit_tables import parameter_table, run_table
-    from srfcli.inference.fit import Interrupted, fit_problem, held_fit
     from srfcli.inference.profile import profile
-    from srfcli.inference.rough import fit_rough
-    from srfcli.inference.starts import fit_from_several
-    from srfcli.model import open_model
+    from srfcli.inference.recordings import fit_recordings
     from srfcli.recording.experiment import read_experiment
     from srfcli.status import Status
 
     registry = system.registry()
     experiment = read_experiment(source, registry=registry, format=options["reader"])
-    model = open_model(registry, **asdict(experiment.choice))
     free = [n.strip() for text in options["free"] for n in text.split(",") if n.strip()] or None
-    problem = fit_problem(model, experiment, free=free, trend=options["trend"])
-    if options["track"] == "rough" and (options["profile"] or options["sample"]):
-        raise SrfError(
-            "--track rough does not go with --profile or --sample", "Its standard errors allow for the tracks."
-        )
-    begun, status = time.perf_counter(), Status.OK
-    starts: list[tuple[float, bool]] = []
+    asked = options["profile"] or options["sample"]
+    if options["track"] == "shared" and asked:
+        raise SrfError("--track shared does not go with --profile or --sample", "Leave it out, or name --track rough.")
+    begun = time.perf_counter()
     intervals: list[Interval] = []
-    draws, rough = None, None
+    draws = None
     with Progress("fit") as progress:
 
         def report(text: str) -> None:
             progress.advance(note=text)
 
+        found = fit_recordings(
+            registry, experiment, free=free, trend=options["trend"], track=options["track"], ask_shared=not asked,
+            starts=options["starts"], seed=options["seed"], progress=report,
+        )  # fmt: skip
+        problem, fit, status = found.problem, found.fit, found.status
         try:
-            fit, starts = fit_from_several(problem, count=options["starts"], seed=options["seed"], progress=report)
-            status = fit.status
-            if options["track"] == "rough":
-                rough = fit_rough(_on_tracks(registry, experiment, problem), fit, progress=report)
-                fit = rough.fit
-            if options["profile"]:
+            if options["profile"] and status is not Status.INTERRUPTED:
                 for name in problem.names:
-                    intervals.append(profile(problem, fit, name, progress=report))
-            if options["sample"]:
+                    intervals.append(profile(problem, fit, name, rough=found.state_space, progress=report))
+            if options["sample"] and status is not Status.INTERRUPTED:
                 from srfcli.inference.sample import sample
 
-                draws = sample(problem, fit, options["sample"], seed=options["seed"], progress=report)
-        except Interrupted as stopped:
-            fit, status = held_fit(problem, stopped.values), Status.INTERRUPTED
+                draws = sample(
+                    problem, fit, options["sample"], rough=found.state_space, seed=options["seed"], progress=report
+                )
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
     for run in experiment.runs:
         for notice in run.notices:
             Session.current().detail(f"{run.name}: {notice}")
     runs = run_table(fit)
-    table = parameter_table(problem, fit, intervals, starts, draws, runs, status)
-    if rough is not None:
-        table = _with_tracks(table, rough)
+    table = parameter_table(problem, fit, intervals, found.starts, draws, runs, status)
+    if found.track is not None:
+        table = replace(
+            table, notes=(*table.notes, str(found.track)), meta={**table.meta, "track": asdict(found.track)}
+        )
+    if status is Status.INTERRUPTED and options["starts"] > 1:
+        note = f"interrupted: {len(found.starts)} of {options['starts']} starts were done"
+        table = replace(table, notes=(*table.notes, note))
     emit(
-        table, output, more=[runs], laws=model.laws, inputs=[experiment.path, *(r.file for r in experiment.runs)],
+        table, output, more=[runs], laws=problem.model.laws, inputs=[experiment.path, *(r.file for r in experiment.runs)],
         seed=options["seed"], timings={"fit": time.perf_counter() - begun}, figure=_figure(problem, fit),
     )  # fmt: skip
     finish(status)
-
-
-def _on_tracks(registry: Registry, experiment: Experiment, problem: Problem) -> Problem:
-    """Return the same problem with a model whose mu0 is a function of the slip along each run's track besides."""
-    from dataclasses import asdict, replace
-
-    from srfcli.model import open_model
-
-    return replace(problem, model=open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),)))
-
-
-def _with_tracks(table: Table, rough: RoughFit) -> Table:
-    """Return the table with what was found of the tracks."""
-    from dataclasses import replace
-
-    roughness, text = rough.roughness, "tracks: smooth; none was found to be rough"
-    if roughness.amplitude:
-        whose = "one for all runs" if rough.shared else "each run has its own"
-        text = f"tracks: mu0 wanders by {roughness.amplitude:.2g} (standard deviation) over {roughness.length:.2g} um; {whose}"
-    found = {"amplitude": roughness.amplitude, "length_um": roughness.length, "shared": rough.shared}
-    return replace(table, notes=(*table.notes, text), meta={**table.meta, "track": found})
 
 
 def _figure(problem: Problem, fit: Fit) -> Callable[[], Any]:

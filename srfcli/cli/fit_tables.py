@@ -30,10 +30,10 @@ RUNS = (
     Column("role", "", "fit, or held out"),
     Column("samples", "", "compared"),
     Column("rms", "", "of the residual, in the observable's unit"),
-    Column("noise", "", "standard deviation of white noise, from differences of the residual"),
+    Column("noise", "", "standard deviation of the gauge's white noise"),
     Column("rms_over_noise", "", "1 where the model explains all but the noise", ".4g"),
     Column("lag1", "", "correlation of neighbouring residuals", ".3g"),
-    Column("order", "", "of the autoregressive noise"),
+    Column("order", "", "how many times of correlation the gauge's noise has"),
 )
 CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
 
@@ -65,7 +65,10 @@ def parameter_table(
         "log_likelihood": fit.log_likelihood,
         "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
         "evaluations": fit.evaluations,
-        "noise": {f.name: {"innovation": f.noise.innovation, "coefficients": f.noise.coefficients} for f in fit.runs},
+        "noise": {
+            f.name: {"innovation": f.noise.innovation, "coefficients": f.noise.coefficients, "colours": f.colours}
+            for f in fit.runs
+        },
         "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in starts],
         "posterior": None if draws is None else {"names": fit.names, "draws": draws},
     }
@@ -81,7 +84,7 @@ def run_table(fit: Fit) -> Table:
         size = sum(b - a for a, b in f.parts)
         rows.append(
             (f.name, "held out" if f.holdout else "fit", size, f.rms, f.white, f.rms / f.white if f.white else None,
-             lag_one(f.residual, f.parts), f.noise.order)
+             lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
         )  # fmt: skip
     return Table("srf.fit.runs/1", RUNS, rows, "runs")
 
@@ -117,6 +120,10 @@ def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float
     )
     if len(starts) > 1:
         notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
+    for time, size in fit.runs[0].colours:
+        notes.append(
+            f"gauge noise: {size:.3g} correlated over {time:.3g} s besides white noise, or physics that is missing"
+        )
     coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
     if coloured:
         notes.append(

@@ -34,7 +34,10 @@ HUGE = 1e100  # a slope that is no slope any more: its square would overflow
 
 @dataclass(frozen=True)
 class RunFit:
-    """How one run is fitted: residual (n,), its noise model, the part of its samples that took part."""
+    """How one run is fitted: residual (n,), its noise model, the part of its samples that took part.
+
+    `colours` are correlation time (s) and standard deviation of the gauge's coloured noise, of a state-space fit.
+    """
 
     name: str
     holdout: bool
@@ -43,6 +46,7 @@ class RunFit:
     parts: list[tuple[int, int]]
     noise: Noise
     white: float  # standard deviation of white noise, from differences of the residual
+    colours: tuple[tuple[float, float], ...] = ()
 
     @property
     def rms(self) -> float:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from srfcli.inference.fit import Fit, Problem, Search
-from srfcli.inference.noise import Noise
+from srfcli.inference.statespace import CLOSER, StateSpaceFit, maximise
 from srfcli.numerics.collocation import Array
 
 LEVEL = 3.841458820694124  # of chi-squared with one degree of freedom, 95 %
 FARTHEST = 8.0  # standard errors: an interval that has not ended there is open
+
+Held = Callable[[int, float, Array], tuple[Array, float, int]]
 
 
 @dataclass(frozen=True)
@@ -25,28 +27,53 @@ class Interval:
     evaluations: int
 
 
-def profile(problem: Problem, fit: Fit, name: str, *, progress: Callable[[str], None] = lambda text: None) -> Interval:
-    """Return the profile-likelihood interval of one parameter, the noise held at what the fit found."""
+@dataclass(frozen=True)
+class _Valley:
+    """Where a likelihood is largest: `best` (k,), its covariance and bounds, and what it costs to hold one coordinate.
+
+    `held(k, value, start)` returns the others' best values, minus twice the log likelihood there, and how often it was asked.
+    """
+
+    best: Array
+    base: float
+    covariance: Array
+    lower: Array
+    upper: Array
+    held: Held
+
+
+def profile(
+    problem: Problem,
+    fit: Fit,
+    name: str,
+    *,
+    rough: StateSpaceFit | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Interval:
+    """Return the profile-likelihood interval of one parameter.
+
+    Of the state-space likelihood `rough`, field and gauge noise refitted too; without it the noise is held at what the fit
+    found.
+    """
     k = problem.names.index(name)
-    noise = {r.name: r.noise for r in fit.runs}
-    best = np.array([fit.values[n] for n in problem.names])
-    base = _cost(problem, best, noise)
+    valley = _of_residuals(problem, fit) if rough is None else _of_state_space(rough)
     ends, count = [], 0
     for side in (-1.0, 1.0):
-        end, used = _end(problem, fit, k, side, best, base, noise)
+        end, used = _end(valley, k, side)
         progress(f"{name}: {'upper' if side > 0 else 'lower'} end")
         ends.append(end)
         count += used
     return Interval(name, ends[0], ends[1], count)
 
 
-def _end(
-    problem: Problem, fit: Fit, k: int, side: float, best: Array, base: float, noise: Mapping[str, Noise]
-) -> tuple[float | None, int]:
+def _end(valley: _Valley, k: int, side: float) -> tuple[float | None, int]:
     """Return where the profile crosses LEVEL on one side, by secant on its root, which is nearly linear in the parameter."""
-    error = fit.stderr[problem.names[k]]
-    along = fit.covariance[:, k] / fit.covariance[k, k]
-    limit = problem.upper[k] if side > 0 else problem.lower[k]
+    best, covariance = valley.best, valley.covariance
+    error = float(np.sqrt(covariance[k, k]))
+    if not error > 0:
+        return None, 0
+    along = covariance[:, k] / covariance[k, k]
+    limit = valley.upper[k] if side > 0 else valley.lower[k]
     used, theta = 0, best
     points = [(0.0, -np.sqrt(LEVEL))]
     step = np.sqrt(LEVEL) * error
@@ -54,10 +81,11 @@ def _end(
         value = best[k] + side * step
         if (value - limit) * side > 0 or step > FARTHEST * error * np.sqrt(LEVEL):
             return None, used
-        start = np.clip(theta + along * (value - theta[k]), problem.lower, problem.upper)
-        theta, cost, n = _held(problem, k, value, start, noise)
+        start = np.clip(theta + along * (value - theta[k]), valley.lower, valley.upper)
+        start[k] = value
+        theta, cost, n = valley.held(k, value, start)
         used += n
-        height = np.sign(cost - base) * np.sqrt(abs(cost - base)) - np.sqrt(LEVEL)
+        height = np.sign(cost - valley.base) * np.sqrt(abs(cost - valley.base)) - np.sqrt(LEVEL)
         points.append((step, height))
         if abs(height) < 0.01:
             return float(value), used
@@ -66,25 +94,42 @@ def _end(
     return float(best[k] + side * step), used
 
 
-def _held(problem: Problem, k: int, value: float, start: Array, noise: Mapping[str, Noise]) -> tuple[Array, float, int]:
-    """Return the others' best values with parameter k held, the cost there, and the evaluations it took."""
-    others = [i for i in range(len(problem.names)) if i != k]
-    if not others:
-        theta = np.array([value])
-        return theta, _cost(problem, theta, noise), 1
-    held = replace(
-        problem,
-        names=tuple(problem.names[i] for i in others),
-        start=start[others],
-        lower=problem.lower[others],
-        upper=problem.upper[others],
-        held={**problem.held, problem.names[k]: value},
+def _of_state_space(found: StateSpaceFit) -> _Valley:
+    likelihood, maximum = found.likelihood, found.maximum
+
+    def held(k: int, value: float, start: Array) -> tuple[Array, float, int]:
+        before = likelihood.evaluations
+        others = maximise(likelihood, start, held=(likelihood.names[k],), close=CLOSER)
+        return others.point.x, -2 * others.point.log_likelihood, likelihood.evaluations - before
+
+    return _Valley(
+        maximum.point.x, -2 * found.log_likelihood, maximum.covariance, likelihood.lower, likelihood.upper, held
     )
-    search = Search(held, lambda text: None)
-    found, _ = search.minimise(start[others], noise, {})
-    return np.insert(found, k, value), search.trail[-1][0], search.evaluations
 
 
-def _cost(problem: Problem, theta: Array, noise: Mapping[str, Noise]) -> float:
-    residual, _ = Search(problem, lambda text: None).residuals(theta, noise, {})
-    return float(residual @ residual)
+def _of_residuals(problem: Problem, fit: Fit) -> _Valley:
+    noise = {r.name: r.noise for r in fit.runs}
+
+    def cost(theta: Array) -> float:
+        residual, _ = Search(problem, lambda text: None).residuals(theta, noise, {})
+        return float(residual @ residual)
+
+    def held(k: int, value: float, start: Array) -> tuple[Array, float, int]:
+        others = [i for i in range(len(problem.names)) if i != k]
+        if not others:
+            theta = np.array([value])
+            return theta, cost(theta), 1
+        fewer = replace(
+            problem,
+            names=tuple(problem.names[i] for i in others),
+            start=start[others],
+            lower=problem.lower[others],
+            upper=problem.upper[others],
+            held={**problem.held, problem.names[k]: value},
+        )
+        search = Search(fewer, lambda text: None)
+        found, _ = search.minimise(start[others], noise, {})
+        return np.insert(found, k, value), search.trail[-1][0], search.evaluations
+
+    best = np.array([fit.values[n] for n in problem.names])
+    return _Valley(best, cost(best), fit.covariance, problem.lower, problem.upper, held)

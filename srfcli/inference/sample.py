@@ -9,15 +9,25 @@ import numpy as np
 from srfcli.errors import SrfError
 from srfcli.inference.fit import Fit, Problem
 from srfcli.inference.noise import whiten
+from srfcli.inference.statespace import StateSpaceFit
 from srfcli.numerics.collocation import Array
 
 BURN = 20  # autocorrelation takes some ten steps where the ensemble starts from the fit's own covariance
 
 
 def sample(
-    problem: Problem, fit: Fit, count: int, *, seed: int = 0, progress: Callable[[str], None] = lambda text: None
+    problem: Problem,
+    fit: Fit,
+    count: int,
+    *,
+    rough: StateSpaceFit | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda text: None,
 ) -> Array:
-    """Return `count` draws (count, k) in the order of problem.names, um, s, N; the noise is held at what the fit found."""
+    """Return `count` draws (count, k) in the order of problem.names, um, s, N.
+
+    Field and gauge noise are held at what the fit found: those of the state-space likelihood `rough`, without it the residuals'.
+    """
     try:
         import emcee
     except ImportError as error:
@@ -32,6 +42,10 @@ def sample(
     def log_posterior(theta: Array) -> float:
         if (theta <= problem.lower).any() or (theta >= problem.upper).any():
             return -np.inf
+        if rough is not None:
+            x = rough.maximum.point.x.copy()
+            x[: theta.size] = theta
+            return rough.likelihood.at(x, slopes=False).log_likelihood
         total = 0.0
         for run in problem.runs:
             difference = problem.predicted(run, theta, slopes=False).y - run.observed

@@ -24,15 +24,23 @@ from pathlib import Path
 from srfcli.cache import cache_folder, content_key
 from srfcli.errors import SrfError
 from srfcli.model import GeneratedModel
-from srfcli.numerics.ctext import LAMBERTW, TABLES, c_function
+from srfcli.numerics.ctext import LAMBERTW, TABLES, c_function, dual_arithmetic
 
-FLAGS = ("-O3", "-std=c99", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math")
+FLAGS = (  # no contraction: the digits are the same whatever the processor
+    "-O3", "-std=c99", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off", "-Wno-psabi",
+)  # fmt: skip
+VECTORS = ("avx512f", "avx2")  # instruction sets that carry derivatives several at a time, the widest first
 FUNCTIONS = {"rates": "srf_rates", "rates_jacobian": "srf_jacobian", "rates_parameters": "srf_parameters"}
+DUAL_FUNCTIONS = {
+    "rates": "srf_d_rates", "rates_jacobian": "srf_d_jacobian", "field_gain": "srf_d_gain", "elongation": "srf_d_reading",
+    "elongation_gradient": "srf_d_gradient",
+}  # fmt: skip
+LANES = 8  # derivatives that the filter carries along at a time
 TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
 
 
 def c_source(model: GeneratedModel) -> str:
-    """Return the C text of the integrator for this model."""
+    """Return the C text of the integrator for this model, and of the filter where it has a random friction field."""
     head = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n"
     tables, functions = model.namespace.get("TABLES", ()), FUNCTIONS
     if tables:
@@ -40,7 +48,26 @@ def c_source(model: GeneratedModel) -> str:
         functions = FUNCTIONS | TABLE_FUNCTIONS
     needs = (LAMBERTW if "lambertw(" in model.source else "") + (TABLES if tables else "")
     body = "\n".join(c_function(model.source, name, label=label) for name, label in functions.items())
-    return head + needs + body + (files("srfcli") / "data" / "radau.c").read_text(encoding="utf-8")
+    own = (files("srfcli") / "data" / "radau.c").read_text(encoding="utf-8")
+    return head + needs + body + own + (_filter_source(model) if "field_gain" in model.namespace else "")
+
+
+def _filter_source(model: GeneratedModel) -> str:
+    """Return the C text of the filter, which follows that of the integrator."""
+    gauge = model.namespace.get("OBSERVED")
+    text = f"#define LANES {LANES}\n" + dual_arithmetic(model.source)
+    text += c_function(model.source, "field_gain", label="srf_gain")
+    for name, label in DUAL_FUNCTIONS.items():
+        if gauge and name.startswith("elongation"):
+            place = model.states.index(gauge)
+            shown = f"out[{place}] = srf_plain(1.0)" if name.endswith("gradient") else f"out[0] = x[{place}]"
+            arguments = "const dual *x, double V, double W, double W_dot, const dual *p, dual *out"
+            text += (
+                f"static void {label}({arguments}) {{ (void)x; (void)V; (void)W; (void)W_dot; (void)p; {shown}; }}\n"
+            )
+        else:
+            text += c_function(model.source, name, label=label, dual=True)
+    return text + (files("srfcli") / "data" / "filter.c").read_text(encoding="utf-8")
 
 
 @cache
@@ -59,13 +86,24 @@ def compiler() -> tuple[str, ...] | None:
 
 
 @cache
+def flags() -> tuple[str, ...]:
+    """Return the compiler's options: FLAGS, and the widest vectors that this processor says it has."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:
+        return FLAGS
+    known = next((line.split() for line in lines if line.startswith("flags")), [])
+    return (*FLAGS, *[f"-m{name}" for name in VECTORS if name in known][:1])
+
+
+@cache
 def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
     """Return the compiled integrator of this model, or None where there is no compiler; SrfError where it fails on the text."""
     command = compiler()
     if command is None:
         return None
     source = c_source(model)
-    key = content_key([source, " ".join(command), " ".join(FLAGS), platform.platform(), platform.machine()])
+    key = content_key([source, " ".join(command), " ".join(flags()), platform.platform(), platform.machine()])
     folder = cache_folder()
     if folder is None:
         return _load(_build(command, source, Path(tempfile.mkdtemp(prefix="srf-")) / f"{key}.so"))
@@ -87,7 +125,7 @@ def _build(command: tuple[str, ...], source: str, path: Path) -> Path:
         text.write_text(source, encoding="utf-8")
         end = [] if sys.platform == "win32" else ["-lm"]
         done = subprocess.run(
-            [*command, *FLAGS, "-o", str(library), str(text), *end], capture_output=True, text=True, check=False
+            [*command, *flags(), "-o", str(library), str(text), *end], capture_output=True, text=True, check=False
         )
         if done.returncode:
             first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
@@ -109,4 +147,6 @@ def _intact(path: Path) -> bool:
 def _load(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))
     library.srf_integrate.restype = ctypes.c_int
+    if hasattr(library, "srf_filter"):
+        library.srf_filter.restype = ctypes.c_int
     return library

@@ -1,6 +1,8 @@
 """Generated array functions as C: `x[..., i]` becomes `x[i]`, `out[..., i, j] = e` one assignment to a flat array.
 
-The text of the generated module is the only source, as it is for `scalar`; no formula is derived or printed twice.
+The text of the generated module is the only source, as it is for `scalar`; no formula is derived or printed twice. In dual
+numbers a function carries its derivatives in several directions along (forward automatic differentiation; Griewank and Walther,
+Evaluating Derivatives, 2008).
 """
 
 from __future__ import annotations
@@ -64,33 +66,134 @@ static double srf_lambertw(double x) { /* principal branch, x > -1/e */
 }
 """
 
+DUAL = """
+typedef double lanes __attribute__((vector_size(8 * LANES), may_alias));
+typedef struct { double v; lanes d; } dual; /* a number and its derivatives in LANES directions */
+static inline dual srf_scaled(double v, double s, dual a) { dual r = {v, s * a.d}; return r; }
+static inline dual srf_plain(double v) { dual r = {v, (lanes){0.0}}; return r; }
+static inline dual srf_add(dual a, dual b) { dual r = {a.v + b.v, a.d + b.d}; return r; }
+static inline dual srf_sub(dual a, dual b) { dual r = {a.v - b.v, a.d - b.d}; return r; }
+static inline dual srf_mul(dual a, dual b) { dual r = {a.v * b.v, a.v * b.d + b.v * a.d}; return r; }
+static inline dual srf_div(dual a, dual b) { double i = 1.0 / b.v, q = a.v * i; dual r = {q, i * (a.d - q * b.d)}; return r; }
+static inline dual srf_add_c(dual a, double b) { a.v += b; return a; }
+static inline dual srf_mul_c(dual a, double b) { return srf_scaled(a.v * b, b, a); }
+static inline dual srf_c_div(double a, dual b) { double q = a / b.v; return srf_scaled(q, -q / b.v, b); }
+static inline dual srf_pow_c(dual a, double b) {
+    if (b == 2.0) return srf_scaled(a.v * a.v, 2.0 * a.v, a);
+    double q = pow(a.v, b - 1.0);
+    return srf_scaled(q * a.v, b * q, a);
+}
+static inline dual srf_pow(dual a, dual b) {
+    double q = pow(a.v, b.v);
+    dual r = {q, q * (b.v / a.v * a.d + log(a.v) * b.d)};
+    return r;
+}
+static inline dual srf_c_pow(double a, dual b) { double q = pow(a, b.v); return srf_scaled(q, q * log(a), b); }
+"""
+_DUAL_OPERATORS = {
+    ast.Add: "srf_add", ast.Sub: "srf_sub", ast.Mult: "srf_mul", ast.Div: "srf_div", ast.Pow: "srf_pow",
+}  # fmt: skip
+_SLOPES = {  # of f at x where f(x) = v
+    "cos": "-sin(a.v)", "cosh": "sinh(a.v)", "exp": "v", "expm1": "v + 1.0", "log": "1.0 / a.v",
+    "log1p": "1.0 / (1.0 + a.v)", "sin": "cos(a.v)", "sinh": "cosh(a.v)", "sqrt": "0.5 / v", "tan": "1.0 + v * v",
+    "tanh": "1.0 - v * v", "atan": "1.0 / (1.0 + a.v * a.v)", "asinh": "1.0 / sqrt(1.0 + a.v * a.v)",
+    "srf_lambertw": "1.0 / (exp(v) * (1.0 + v))",
+}  # fmt: skip
 
-def c_function(source: str, name: str, *, label: str) -> str:
+
+def dual_arithmetic(source: str) -> str:
+    """Return the C text of dual numbers, with the functions that a generated module calls."""
+    text = DUAL
+    for name, known in _FUNCTIONS.items():
+        if known in _SLOPES and f"{name}(" in source:
+            body = f"double v = {known}(a.v); return srf_scaled(v, {_SLOPES[known]}, a);"
+            text += f"static inline dual d_{known}(dual a) {{ {body} }}\n"
+    return text
+
+
+def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str:
     """Return function `name` of the generated module `source` as `static void label(x, V, W, W_dot, p, out)`.
 
-    Entries of `out` that the formulas leave at zero are not written: the caller clears it. Raises SrfError for no such function.
+    In dual numbers x, p and out are such. Entries of `out` that the formulas leave at zero are not written: the caller clears it.
+    Raises SrfError for no such function.
     """
     function = next((d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef) and d.name == name), None)
     if function is None:
         raise SrfError(f"generated module has no function '{name}'")
+    arguments = [a.arg for a in function.args.args]
+    duals = {a for a in arguments if a in ("x", "p")} if dual else None
     lines, shape = [], (1,)
     for statement in function.body[1:]:  # the first is the docstring
         if isinstance(statement, ast.Return):
+            if isinstance(statement.value, ast.BinOp):  # of one number: _empty(...) + it
+                lines.append(f"out[0] = {_value(statement.value.right, duals)};")
             continue
         assert isinstance(statement, ast.Assign)
         target, value = statement.targets[0], statement.value
         if isinstance(target, ast.Subscript):
-            lines.append(f"out[{_flat(target, shape)}] = {_text(value)};")
+            lines.append(f"out[{_flat(target, shape)}] = {_value(value, duals)};")
         elif isinstance(target, ast.Name) and target.id == "out":
             assert isinstance(value, ast.Call)
             shape = ast.literal_eval(value.args[1])
         elif isinstance(target, ast.Name):
-            lines.append(f"const double {_safe(target.id)} = {_text(value)};")
-    arguments = [a.arg for a in function.args.args]
+            if duals is not None and _Dual(duals).moves(value):
+                duals.add(target.id)
+                lines.append(f"const dual {_safe(target.id)} = {_Dual(duals).text(value)};")
+            else:
+                lines.append(f"const double {_safe(target.id)} = {_text(value)};")
     unused = "".join(f" (void){_safe(a)};" for a in arguments)
-    declared = ", ".join(f"const double {'*' if a in ('x', 'p') else ''}{_safe(a)}" for a in arguments)
+    kinds = {a: "const dual *" if dual else "const double *" for a in ("x", "p")}
+    declared = ", ".join(f"{kinds.get(a, 'const double ')}{_safe(a)}" for a in arguments)
     body = "\n".join(f"    {line}" for line in lines)
-    return f"static void {label}({declared}, double *out) {{\n   {unused}\n{body}\n}}\n"
+    return f"static void {label}({declared}, {'dual' if dual else 'double'} *out) {{\n   {unused}\n{body}\n}}\n"
+
+
+def _value(node: ast.AST, duals: set[str] | None) -> str:
+    if duals is None:
+        return _text(node)
+    own = _Dual(duals)
+    return own.text(node) if own.moves(node) else f"srf_plain({_text(node)})"
+
+
+class _Dual:
+    """Text of expressions in dual numbers; what depends on none of the `names` stays a plain number."""
+
+    def __init__(self, names: set[str]) -> None:
+        self.names = names
+
+    def moves(self, node: ast.AST) -> bool:
+        """Return whether an expression has derivatives."""
+        return any(isinstance(n, ast.Name) and n.id in self.names for n in ast.walk(node))
+
+    def text(self, node: ast.AST) -> str:
+        """Return an expression that moves, as C."""
+        if isinstance(node, ast.UnaryOp):
+            inner = self.text(node.operand)
+            return f"srf_mul_c({inner}, -1.0)" if isinstance(node.op, ast.USub) else inner
+        if isinstance(node, ast.BinOp):
+            return self._binary(node)
+        if isinstance(node, ast.Call):
+            assert isinstance(node.func, ast.Name)
+            if _FUNCTIONS.get(node.func.id) not in _SLOPES:
+                raise SrfError(f"function {node.func.id} of a generated module has no derivative in C")
+            return f"d_{_FUNCTIONS[node.func.id]}({self.text(node.args[0])})"
+        return _text(node)
+
+    def _binary(self, node: ast.BinOp) -> str:
+        moving = self.moves(node.left), self.moves(node.right)
+        left, right = (self.text(n) if m else _text(n) for n, m in zip((node.left, node.right), moving, strict=True))
+        kind = type(node.op)
+        if all(moving):
+            return f"{_DUAL_OPERATORS[kind]}({left}, {right})"
+        if kind is ast.Pow:
+            return f"srf_pow_c({left}, {right})" if moving[0] else f"srf_c_pow({left}, {right})"
+        if moving[0]:
+            forms = {ast.Add: "srf_add_c({}, {})", ast.Sub: "srf_add_c({}, -({}))", ast.Mult: "srf_mul_c({}, {})"}
+            return forms.get(kind, "srf_mul_c({}, 1.0 / ({}))").format(left, right)
+        if kind is ast.Sub:
+            return f"srf_add_c(srf_mul_c({right}, -1.0), {left})"
+        forms = {ast.Add: "srf_add_c({1}, {0})", ast.Mult: "srf_mul_c({1}, {0})", ast.Div: "srf_c_div({0}, {1})"}
+        return forms[kind].format(left, right)
 
 
 def _flat(target: ast.Subscript, shape: tuple[int, ...]) -> int:

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +98,24 @@ def _integrate_compiled(
     rtol: float,
     atol: Array,
 ) -> Motion:
+    n, k = start.size, S0.shape[1]
+    x, S = np.full((t.size, n), np.nan), np.full((t.size, n, k), np.nan)
+    stats, stop = np.zeros(4), ctypes.c_int(0)
+    arguments = (
+        *imposed_arguments(t, drive, load), doubles(np.asarray(p, dtype=float)), doubles(np.asarray(start, dtype=float)), k,
+        len(by), integers(columns), integers(np.array(by or [-1], dtype=np.intc)), doubles(sensitivity_scale(p, by)), doubles(S0),
+        ctypes.c_double(rtol_of_estimate(rtol)),
+        doubles(np.asarray(atol) * rtol_of_estimate(rtol) / rtol),
+        ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(MAX_STEPS),
+        t.size, doubles(np.asarray(t, dtype=float)), doubles(x), doubles(S), doubles(stats), ctypes.byref(stop),
+    )  # fmt: skip
+    filled = interruptible(lambda: library.srf_integrate(*arguments), stop)
+    status = Status.OK if filled == t.size else Status.INTEGRATION
+    return Motion(x, S, status, float(stats[3]), int(stats[0]))
+
+
+def imposed_arguments(t: Array, drive: Drive, load: Load) -> tuple[Any, ...]:
+    """Return what compiled code is told of drive and load between the first and the last of the times `t`."""
     segments = list(pieces(t, drive, load))
     edges = np.array([segments[0][0], *(b for _, b in segments)])
     knots, coefficients = load.polynomials(float(edges[0]), float(edges[-1]))
@@ -106,25 +125,21 @@ def _integrate_compiled(
         np.searchsorted(knots, edges[1:] - 1e-12 * np.abs(edges).max(), side="left"), low + 1, len(knots) - 1
     )
     ranges = np.column_stack([low, high]).astype(np.intc)
-    middle = [drive.piece(0.5 * (a + b)) for a, b in segments]
-    n, k = start.size, S0.shape[1]
-    x, S = np.full((t.size, n), np.nan), np.full((t.size, n, k), np.nan)
-    stats, stop = np.zeros(4), ctypes.c_int(0)
-    arguments = (
-        len(segments), _d(edges), _d(np.array(middle, dtype=float)), _i(ranges), len(knots), coefficients.shape[1] - 1,
-        _d(knots), _d(coefficients), _d(np.asarray(p, dtype=float)), _d(np.asarray(start, dtype=float)), k,
-        len(by), _i(columns), _i(np.array(by or [-1], dtype=np.intc)), _d(sensitivity_scale(p, by)), _d(S0),
-        ctypes.c_double(rtol_of_estimate(rtol)),
-        _d(np.asarray(atol) * rtol_of_estimate(rtol) / rtol),
-        ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(MAX_STEPS),
-        t.size, _d(np.asarray(t, dtype=float)), _d(x), _d(S), _d(stats), ctypes.byref(stop),
-    )  # fmt: skip
-    filled = _interruptible(lambda: library.srf_integrate(*arguments), stop)
-    status = Status.OK if filled == t.size else Status.INTEGRATION
-    return Motion(x, S, status, float(stats[3]), int(stats[0]))
+    middle = np.array([drive.piece(0.5 * (a + b)) for a, b in segments], dtype=float)
+    count, degree = len(knots), coefficients.shape[1] - 1
+    return (
+        len(segments),
+        doubles(edges),
+        doubles(middle),
+        integers(ranges),
+        count,
+        degree,
+        doubles(knots),
+        doubles(coefficients),
+    )
 
 
-def _interruptible(call: Callable[[], int], stop: ctypes.c_int) -> int:
+def interruptible(call: Callable[[], int], stop: ctypes.c_int) -> int:
     """Return call(), which ends early once `stop` is set: by whatever a signal's handler raises, Ctrl-C as a rule.
 
     Python's handlers run in the main thread alone, and only between its own instructions: compiled code there would hold them up.
@@ -154,7 +169,7 @@ def rtol_of_estimate(rtol: float) -> float:
     return 0.1 * rtol ** (2 / 3)
 
 
-def _d(array: Array) -> ctypes.c_void_p:
+def doubles(array: Array) -> ctypes.c_void_p:
     array = (
         array if array.flags.c_contiguous and array.dtype == np.float64 else np.ascontiguousarray(array, dtype=float)
     )
@@ -163,7 +178,7 @@ def _d(array: Array) -> ctypes.c_void_p:
     return pointer
 
 
-def _i(array: Array) -> ctypes.c_void_p:
+def integers(array: Array) -> ctypes.c_void_p:
     array = np.ascontiguousarray(array, dtype=np.intc)
     pointer = ctypes.c_void_p(array.ctypes.data)
     pointer.array = array  # type: ignore[attr-defined]

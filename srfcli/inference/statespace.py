@@ -1,0 +1,595 @@
+"""Maximum likelihood for recordings under a model with a random friction field along slip and coloured gauge noise.
+
+Friction is m(s) more than the laws say: a stationary Gaussian process along slip s, Matern 3/2, of amplitude a and correlation
+length l. A Kalman filter follows slider and field together, so that the likelihood of all readings is the product of what each is
+expected to be given those before it. With a = 0 that is the likelihood of the free-running model.
+
+The field's amplitude is a homotopy: with a wide field the filter stays with the recording whatever the parameters are, and the
+likelihood has one maximum where that of the free-running model, whose cycles fall out of step, has many. So the fit begins with
+a wide field, and then estimates it with everything else, by Fisher scoring on exact derivatives.
+Kristensen, Madsen and Jorgensen, Automatica 40 (2004); Hartikainen and Sarkka 2010; Durbin and Koopman 2012.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.signal import lfilter
+
+from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level
+from srfcli.inference.linear import inverse
+from srfcli.inference.noise import Noise, stretches
+from srfcli.inference.nuisance import TINY, basis, start_state
+from srfcli.inference.prediction import Prediction, run_parameters, stiffness_share
+from srfcli.model import GeneratedModel
+from srfcli.numerics.collocation import Array
+from srfcli.numerics.filter import GAUGE_PROCESSES, Dual, Innovations, Smoothed, kalman_filter, smooth
+from srfcli.recording.values import Experiment, Run
+from srfcli.status import Status
+
+RTOL = 1e-5  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
+FIELD = ("field_amplitude", "field_length")
+WIDE = (
+    0.003,
+    0.03,
+    0.3,
+)  # amplitudes of the field, over the friction of the recordings, of which a fit begins with the likeliest
+SHORT = (1.0, 0.25, 0.06)  # the same for its correlation length, over that of PIECES
+SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
+FAINT = 3e-4  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
+HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters, when one is not worth a fit
+PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
+STEPS = 40  # of Fisher scoring
+CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
+COLOUR = 3.5  # standard deviations of a correlation between innovations beyond which coloured gauge noise is fitted
+DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """One run filtered: what the innovations say of the parameters `names`.
+
+    `nu`, `S` (m,) are innovations and their variances at the samples used, `nu_d`, `S_d` (m, k) their derivatives.
+    """
+
+    run: Run
+    names: tuple[str, ...]
+    found: Innovations = field(repr=False)
+
+    @property
+    def whole(self) -> bool:
+        """Return whether the motion was followed to the last sample."""
+        return self.found.reached == self.run.t.size and bool(np.isfinite(self.found.nu).all())
+
+    @property
+    def white(self) -> Array:
+        """Return the innovations over their standard deviations (m,): white noise of variance 1 under the right model."""
+        used = self.run.used
+        return np.asarray(self.found.nu[used] / np.sqrt(self.found.S[used]))
+
+    @property
+    def log_likelihood(self) -> float:
+        """Return the log likelihood of the readings used; minus infinity where the motion could not be followed."""
+        if not self.whole:
+            return -np.inf
+        S, white = self.found.S[self.run.used], self.white
+        return -0.5 * float(np.sum(white**2) + np.sum(np.log(2 * np.pi * S)))
+
+    @property
+    def score(self) -> Array:
+        """Return the gradient of the log likelihood (k,), exact."""
+        used, f = self.run.used, self.found
+        nu, S, nu_d, S_d = f.nu[used], f.S[used], f.nu_d[used], f.S_d[used]
+        return np.asarray(-(nu / S) @ nu_d + 0.5 * ((nu**2 / S - 1) / S) @ S_d)
+
+    @property
+    def information(self) -> Array:
+        """Return Fisher's information (k, k), from the derivatives of innovations and variances."""
+        used, f = self.run.used, self.found
+        S = f.S[used]
+        a, b = f.nu_d[used] / np.sqrt(S)[:, None], f.S_d[used] / S[:, None]
+        return np.asarray(a.T @ a + 0.5 * b.T @ b)
+
+    def smoothed(self) -> Smoothed:
+        """Return states and field given all readings of the run; it was filtered with `keep`."""
+        return smooth(self.found, self.run.used)
+
+
+def filter_run(
+    model: GeneratedModel,
+    experiment: Experiment,
+    run: Run,
+    values: Mapping[str, float],
+    *,
+    by: Sequence[str] = (),
+    trend: str | None = None,
+    rtol: float = RTOL,
+    keep: bool = False,
+) -> Filtered:
+    """Return `run` filtered under `values` (um, s, N), with derivatives by the parameters `by`.
+
+    `values` hold those of the model, field_amplitude and field_length among them, `gauge_white`, the standard deviation of white
+    gauge noise in the observable's unit, `gauge_colour1` and `gauge_time1` (s) of an exponentially correlated part, and so on up
+    to 3 of these, and what belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend.
+    """
+    k, n = len(by), run.t.size
+    p = run_parameters(model, experiment, run, values)
+    d = np.zeros((p.size, k))
+    share = stiffness_share(experiment, run)
+    for j, name in enumerate(by):
+        if name in model.names:
+            d[model.index(name), j] = share if name == "K" else 1.0
+    start, P0 = _belief(model, run, p, values, by, share)
+    K, W = Dual(p[[model.index("K")]], d[[model.index("K")]]), run.load(run.t)[0]
+    over = np.ones(n) if run.observable == "force" else 1 / W
+    factor = Dual.plain(np.ones(n), k) if run.observable == "elongation" else Dual(over * K.v, over[:, None] * K.d)
+    offset = Dual.plain(np.zeros(n), k)
+    if trend:
+        along, name = basis(run, trend), f"{run.name}.trend"
+        offset = Dual(values.get(name, 0.0) * along, np.outer(along, [float(b == name) for b in by]))
+    sd = values["gauge_white"]
+    R = Dual(np.full(n, sd**2 + run.quantum**2 / 12), np.outer(np.ones(n), [2 * sd * (b == "gauge_white") for b in by]))
+    own = [gauge_process(j) for j in range(1, GAUGE_PROCESSES + 1) if gauge_process(j)[0] in values]
+    gauge = Dual(
+        np.array([[values[name] for name in pair] for pair in own]).reshape(len(own), 2),
+        np.array([[[float(b == name) for b in by] for name in pair] for pair in own]).reshape(len(own), 2, k),
+    )
+    size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
+    fine = np.array([max(values["field_amplitude"], 1e-3) if s.startswith("field") else 1.0 for s in model.states])
+    found = kalman_filter(
+        model, Dual(p, d), drive=run.drive, load=run.load, t=run.t, observed=run.observed, used=run.used, start=start,
+        covariance=P0, gauge=gauge, factor=factor, offset=offset, R=R, rtol=rtol, atol=rtol * size * fine, keep=keep,
+    )  # fmt: skip
+    return Filtered(run, tuple(by), found)
+
+
+def gauge_process(number: int) -> tuple[str, str]:
+    """Return the names of correlation time (s) and standard deviation of a process of coloured gauge noise; the first is 1."""
+    return f"gauge_time{number}", f"gauge_colour{number}"
+
+
+def _belief(
+    model: GeneratedModel, run: Run, p: Array, values: Mapping[str, float], by: Sequence[str], share: float
+) -> tuple[Dual, Dual]:
+    """Return mean (n,) and covariance (n, n) of the state at the first sample, where the field is what it is anywhere."""
+    names = [b for b in by if b in model.names or b.startswith(f"{run.name}.")]
+    x0, S0 = start_state(model, run, p, values, names)
+    columns = _field_columns(model, run, p, x0)
+    d, P_d = np.zeros((x0.size, len(by))), np.zeros((x0.size, x0.size, len(by)))
+    for j, name in enumerate(names):
+        unit = share if name == "K" else 1.0
+        at, column = by.index(name), S0[:, j] * unit
+        d[:, at] = column
+        step = DIFFERENCE * max(
+            abs(values.get(name, 0.0)), abs(float(p[model.index(name)])) if name in model.names else 1e-3, 1e-12
+        )
+        sides = []
+        for sign in (1, -1):
+            q, own = p.copy(), dict(values)
+            if name in model.names:
+                q[model.index(name)] += sign * step
+            else:
+                own[name] = own[name] + sign * step
+            sides.append(_field_columns(model, run, q, start_state(model, run, q, own, [])[0]))
+        C_d = (sides[0] - sides[1]) / (2 * step) * unit
+        P_d[:, :, at] = C_d @ columns.T + columns @ C_d.T
+    return Dual(x0, d), Dual(columns @ columns.T, P_d)
+
+
+def _field_columns(model: GeneratedModel, run: Run, p: Array, x0: Array) -> Array:
+    """Return how the start (n,) answers to the field's two standard normal values there, (n, 2)."""
+    states, out = list(model.states), np.zeros((x0.size, 2))
+    for j, name in enumerate(("field_start", "field_slope_start")):
+        if run.initial != "free":
+            q = p.astype(complex)
+            q[model.index(name)] += 1j * TINY
+            out[:, j] = np.asarray(model.steady(q)).imag / TINY
+            continue
+        place = states.index(name.removesuffix("_start"))
+        out[place, j] = p[model.index("field_amplitude")]
+        t0 = float(run.t[0])
+        V, W = float(run.drive(run.t[:1])[0]), run.load.rest(t0)
+        moved = []
+        for i in (place, states.index("ln_v")):
+            x = x0.astype(complex)
+            x[i] += 1j * TINY
+            moved.append(float(np.asarray(model.friction(x, V, W, 0.0, p)).imag) / TINY)
+        out[states.index("ln_v"), j] = -out[place, j] * moved[0] / moved[1]  # friction there is what the start says
+        if "z" in states:
+            out[states.index("z"), j] = np.exp(x0[states.index("ln_v")]) * out[states.index("ln_v"), j]
+    return out
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where a likelihood was evaluated: `x` (k,) in its own coordinates, values by name, derivatives by x, runs filtered."""
+
+    x: Array
+    values: dict[str, float] = field(repr=False)
+    log_likelihood: float
+    score: Array = field(repr=False)
+    information: Array = field(repr=False)
+    runs: tuple[Filtered, ...] = field(repr=False)
+
+    @property
+    def rms(self) -> float:
+        """Return the root mean square of all standardised innovations: 1 under the right model."""
+        white = np.concatenate([f.white for f in self.runs])
+        return float(np.sqrt(np.mean(white**2)))
+
+
+class Likelihood:
+    """The log likelihood of a problem's runs; its model has a random friction field.
+
+    Coordinates x are the problem's parameters, then the logarithms of field_amplitude and field_length unless the track is
+    `smooth`, of gauge_white, and of correlation time and standard deviation of each of the gauge's coloured `processes`.
+    """
+
+    def __init__(
+        self, problem: Problem, *, smooth: bool = False, processes: int = 0, rtol: float = RTOL, threads: int = 1
+    ) -> None:
+        self.problem, self.smooth, self.processes = problem, smooth, processes
+        self.rtol, self.threads, self.evaluations = rtol, threads, 0
+        self.best: Point | None = None  # the likeliest with slopes so far
+        scales = _scales(problem.runs)
+        wanted = [
+            *(() if smooth else FIELD),
+            "gauge_white",
+            *(n for j in range(processes) for n in gauge_process(j + 1)),
+        ]
+        own = [(n, *scales[n.rstrip("123")]) for n in wanted]
+        self.names = (*problem.names, *(row[0] for row in own))
+        start, low, high = np.log(np.array([row[1:] for row in own])).T
+        self.start = np.concatenate([problem.start, start])
+        self.lower, self.upper = np.concatenate([problem.lower, low]), np.concatenate([problem.upper, high])
+        self.logarithmic = np.array([n in wanted for n in self.names])
+
+    @property
+    def samples(self) -> int:
+        """Return the number of readings used."""
+        return sum(int(run.used.sum()) for run in self.problem.runs)
+
+    def values(self, x: Array) -> dict[str, float]:
+        """Return parameters by name in um, s, N."""
+        plain = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x)
+        found = self.problem.named(plain[: len(self.problem.names)]) | dict(
+            zip(self.names, plain.tolist(), strict=True)
+        )
+        return found | ({"field_amplitude": 0.0, "field_length": 1.0} if self.smooth else {})
+
+    def coordinates(self, values: Mapping[str, float]) -> Array:
+        """Return x for values by name; those left out are the start's. Within the bounds."""
+        x = self.start.copy()
+        for i, name in enumerate(self.names):
+            if name in values:
+                x[i] = np.log(max(values[name], 1e-300)) if self.logarithmic[i] else values[name]
+        return np.clip(x, self.lower, self.upper)
+
+    def at(self, x: Array, *, slopes: bool = True, keep: bool = False) -> Point:
+        """Return log likelihood, score and information at x (k,)."""
+        values, k = self.values(x), len(self.names)
+        problem, self.evaluations = self.problem, self.evaluations + 1
+        shared = [n for n in self.names if "." not in n]
+
+        def one(run: Run) -> Filtered:
+            by = [*shared, *(n for n in self.names if n.startswith(f"{run.name}."))] if slopes else ()
+            return filter_run(
+                problem.model, problem.experiment, run, values, by=by, trend=problem.trend, rtol=self.rtol, keep=keep
+            )
+
+        if self.threads > 1 and len(problem.runs) > 1:
+            with ThreadPoolExecutor(self.threads) as pool:
+                runs = tuple(pool.map(one, problem.runs))
+        else:
+            runs = tuple(map(one, problem.runs))
+        total = float(sum(f.log_likelihood for f in runs))
+        score, information = np.zeros(k), np.zeros((k, k))
+        if slopes and np.isfinite(total):
+            unit = np.array([values[n] if log else 1.0 for n, log in zip(self.names, self.logarithmic, strict=True)])
+            for f in runs:
+                at = [self.names.index(n) for n in f.names]
+                score[at] += f.score * unit[at]
+                information[np.ix_(at, at)] += f.information * np.outer(unit[at], unit[at])
+        point = Point(x, values, total, score, information, runs)
+        if slopes and (self.best is None or total > self.best.log_likelihood):
+            self.best = point
+        return point
+
+
+def _scales(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
+    """Return start value and bounds of the parameters of field and gauge, from the recordings."""
+    friction = max(float(np.median([_friction(r) for r in runs])), 1e-6)
+    slid = max(float(np.sum(np.abs(r.drive(r.t[1:])) * np.diff(r.t))) for r in runs)
+    level = float(np.median([first_level(r) for r in runs]))
+    spacing = float(np.median([np.median(np.diff(r.t)) for r in runs]))
+    longest = max(float(r.t[-1] - r.t[0]) for r in runs)
+    length = max(slid, 1e-6) / PIECES
+    return {
+        "field_amplitude": (WIDE[0] * friction, SMALL * friction, 0.3 * friction),
+        "field_length": (length, length / 100, 10 * length),
+        "gauge_white": (level, level / 30, 100 * level),
+        "gauge_colour": (level, level / 100, 100 * level),
+        "gauge_time": (10 * spacing, spacing, longest),
+    }
+
+
+def _friction(run: Run) -> float:
+    """Return the typical friction coefficient of a recording."""
+    observed, W = run.observed[run.used], run.load(run.t)[0][run.used]
+    over = W if run.observable == "friction" else run.stiffness if run.observable == "elongation" else 1.0
+    return float(np.median(np.abs(observed * over / W)))
+
+
+@dataclass(frozen=True)
+class Maximum:
+    """Where Fisher scoring ended: the point, how far the maximum may still be in standard errors, and the status."""
+
+    point: Point
+    away: float
+    status: Status
+    covariance: Array = field(repr=False)
+
+
+def maximise(
+    likelihood: Likelihood,
+    x: Array,
+    *,
+    held: Sequence[str] = (),
+    steps: int = STEPS,
+    close: float = CONVERGED,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Maximum:
+    """Return the maximum from x (k,), by Fisher scoring with Levenberg's damping; parameters `held` stay where they are.
+
+    It ends within `close` standard errors of the maximum, by the score. Parameters that a step would push out stay at their
+    bounds. A likelihood that cannot be evaluated at x is a status.
+    """
+    free = np.array([n not in held for n in likelihood.names])
+    point, damping = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper)), 1e-3
+    if not np.isfinite(point.log_likelihood):
+        return Maximum(point, np.inf, Status.INTEGRATION, np.full((x.size, x.size), np.nan))
+    away = np.inf
+    for _ in range(steps):
+        low, high = point.x <= likelihood.lower, point.x >= likelihood.upper
+        moving = np.nonzero(free & ~(low & (point.score < 0)) & ~(high & (point.score > 0)))[0]
+        g, I = point.score[moving], point.information[np.ix_(moving, moving)]
+        d = np.sqrt(np.maximum(np.diag(I), 1e-300))
+        scaled = I / np.outer(d, d)
+        away = np.sqrt(max(float(g @ inverse(I) @ g), 0.0)) if moving.size else 0.0
+        progress(f"log likelihood {point.log_likelihood:.1f}, {away:.2g} standard errors from the maximum")
+        if away < close:
+            break
+        while damping < 1e8:
+            x = point.x.copy()
+            move = np.linalg.solve(scaled + damping * np.eye(moving.size), g / d) / d
+            x[moving] += np.where(likelihood.logarithmic[moving], np.clip(move, -1.5, 1.5), move)
+            trial = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper))
+            if trial.log_likelihood > point.log_likelihood:
+                point, damping = trial, max(damping / 10, 1e-9)
+                break
+            damping = max(10 * damping, 1e-3)
+        else:
+            break
+    at_bound = ((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0))
+    covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound)[0]
+    covariance[np.ix_(inner, inner)] = inverse(point.information[np.ix_(inner, inner)])
+    return Maximum(point, away, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE, covariance)
+
+
+@dataclass(frozen=True)
+class StateSpaceFit:
+    """A fit of all runs together: its likelihood, the maximum there, and how many times all runs were filtered."""
+
+    likelihood: Likelihood
+    maximum: Maximum
+    evaluations: int
+
+    @property
+    def smooth(self) -> bool:
+        """Return whether no random friction field is needed."""
+        return self.likelihood.smooth
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Return all parameters by name, those of field and gauge too, in um, s, N."""
+        return self.maximum.point.values
+
+    @property
+    def log_likelihood(self) -> float:
+        """Return the log likelihood at the maximum."""
+        return self.maximum.point.log_likelihood
+
+    @property
+    def criterion(self) -> float:
+        """Return the log likelihood less half of ln n for each parameter (Schwarz 1978)."""
+        return self.log_likelihood - 0.5 * np.log(self.likelihood.samples) * len(self.likelihood.names)
+
+
+def fit_state_space(
+    problem: Problem,
+    *,
+    start: Mapping[str, float] | None = None,
+    smooth: bool | None = None,
+    processes: int | None = None,
+    threads: int = 1,
+    rtol: float = RTOL,
+    progress: Callable[[str], None] = lambda text: None,
+) -> StateSpaceFit:
+    """Return the maximum-likelihood fit of parameters, random friction field and gauge noise.
+
+    From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
+    `smooth` says whether there is no field, `processes` how many of coloured noise the gauge has; left out, Schwarz's criterion
+    decides. The status is that of the last maximisation.
+    """
+    tried: list[Likelihood] = []
+
+    def likelihood(smooth: bool, processes: int) -> Likelihood:
+        tried.append(Likelihood(problem, smooth=smooth, processes=processes, rtol=rtol, threads=threads))
+        return tried[-1]
+
+    try:
+        return _fitted(likelihood, start or {}, smooth, processes, progress)
+    except KeyboardInterrupt as error:
+        last = next((own.best for own in reversed(tried) if own.best is not None), None)
+        raise Interrupted(last.values if last else problem.named(problem.start)) from error
+
+
+def stopped(problem: Problem, values: Mapping[str, float], *, threads: int = 1) -> StateSpaceFit:
+    """Return the state of a fit that was stopped: its parameters, with errors as if they were the maximum."""
+    smooth, processes = not values.get("field_amplitude"), sum(gauge_process(j)[1] in values for j in (1, 2, 3))
+    likelihood = Likelihood(problem, smooth=smooth, processes=processes, threads=threads)
+    point = likelihood.at(likelihood.coordinates(values))
+    return StateSpaceFit(likelihood, Maximum(point, np.inf, Status.INTERRUPTED, inverse(point.information)), 1)
+
+
+def _fitted(
+    likelihood: Callable[[bool, int], Likelihood],
+    start: Mapping[str, float],
+    smooth: bool | None,
+    processes: int | None,
+    progress: Callable[[str], None],
+) -> StateSpaceFit:
+    count = processes or 0
+    rough = likelihood(False, count)
+    x = _widest(rough, start or {}, progress)
+    found = maximise(
+        rough, x, held=FIELD if start is None or FIELD[0] not in start else (), steps=8, close=1.0, progress=progress
+    )
+    best = StateSpaceFit(rough, found, rough.evaluations)
+    if found.status is Status.INTEGRATION:
+        return best
+    best = _with_or_without(best, smooth, likelihood, progress)
+    while processes is None and count < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
+        count += 1
+        wider = _coloured(best, likelihood(best.smooth, count), progress)
+        if wider.criterion < best.criterion:
+            return _counted(best, wider.evaluations)
+        best = _with_or_without(wider, smooth, likelihood, progress)
+    return best
+
+
+def correlated(point: Point) -> float:
+    """Return how far the innovations are correlated with exponential means of those before, in standard deviations, at most.
+
+    That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of a run.
+    """
+    worst, longest = 0.0, max(f.white.size for f in point.runs)
+    for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
+        product, square = 0.0, 0.0
+        for f in point.runs:
+            white = np.clip(f.white, -5.0, 5.0)
+            before = lfilter([0.0, 1.0], [1.0, -np.exp(-1.0 / span)], white)
+            product, square = product + float(white @ before), square + float(before @ before)
+        worst = max(worst, abs(product) / np.sqrt(square) if square else 0.0)
+    return worst
+
+
+def _with_or_without(
+    begun: StateSpaceFit,
+    smooth: bool | None,
+    likelihood: Callable[[bool, int], Likelihood],
+    progress: Callable[[str], None],
+) -> StateSpaceFit:
+    """Return the fit from where one begun stands, with a field or without, as `smooth` says or Schwarz's criterion."""
+    rough, plain = begun.likelihood, likelihood(True, begun.likelihood.processes)
+    before, x = begun.evaluations, begun.maximum.point.x
+    if begun.smooth:
+        return StateSpaceFit(rough, maximise(rough, x, progress=progress), rough.evaluations)
+    at = rough.names.index("field_amplitude")
+    faint = rough.lower[at] + np.log(FAINT / SMALL)
+    while True:
+        found = maximise(rough, x, steps=4, progress=progress)
+        ended = found.away < CONVERGED or np.array_equal(found.point.x, x) or rough.evaluations - before > STEPS
+        x = found.point.x
+        if ended or (x[at] < faint and smooth is None):
+            break
+    best = StateSpaceFit(rough, found, rough.evaluations)
+    if smooth is False:
+        return best
+    values = plain.coordinates(found.point.values)
+    if smooth is None and plain.at(values, slopes=False).log_likelihood < found.point.log_likelihood - HOPELESS:
+        return _counted(best, plain.evaluations)
+    progress("without a field")
+    bare = StateSpaceFit(plain, maximise(plain, values, progress=progress), plain.evaluations)
+    if smooth or bare.criterion > best.criterion:
+        return _counted(bare, rough.evaluations)
+    if not ended:  # the field is faint, and yet there
+        best = StateSpaceFit(rough, maximise(rough, x, progress=progress), rough.evaluations)
+    return _counted(best, plain.evaluations)
+
+
+def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str], None]) -> StateSpaceFit:
+    """Return the fit with one more process of gauge noise, from the likeliest of a few correlation times."""
+    time, size = (wider.names.index(n) for n in gauge_process(wider.processes))
+    base = wider.coordinates(fitted.values)
+    base[size] = np.log(0.7 * fitted.values["gauge_white"])
+    base[wider.names.index("gauge_white")] += np.log(0.7)
+    trials = []
+    for tau in np.linspace(wider.lower[time] + np.log(2.0), wider.upper[time] - np.log(10.0), 4):
+        x = base.copy()
+        x[time] = tau
+        trials.append((wider.at(np.clip(x, wider.lower, wider.upper), slopes=False).log_likelihood, x))
+    progress(f"coloured gauge noise: {wider.processes}")
+    return StateSpaceFit(
+        wider, maximise(wider, max(trials, key=lambda t: t[0])[1], progress=progress), wider.evaluations
+    )
+
+
+def _counted(fitted: StateSpaceFit, more: int) -> StateSpaceFit:
+    return StateSpaceFit(fitted.likelihood, fitted.maximum, fitted.evaluations + more)
+
+
+def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Array:
+    """Return x at `start` under the likeliest of a few wide fields: there the filter stays with the recording."""
+    x = rough.coordinates(start)
+    if "field_amplitude" in start:
+        return x
+    amplitude, length = (rough.names.index(n) for n in FIELD)
+    best = (-np.inf, x)
+    for wide in WIDE:
+        for short in SHORT:
+            trial = x.copy()
+            trial[amplitude] = rough.lower[amplitude] + np.log(wide / SMALL)
+            trial[length] = rough.start[length] + np.log(short)
+            found = rough.at(trial, slopes=False).log_likelihood
+            progress(
+                f"field of {np.exp(trial[amplitude]):.2g} over {np.exp(trial[length]):.2g} um: log likelihood {found:.1f}"
+            )
+            if found > best[0]:
+                best = found, trial
+    return best[1]
+
+
+def as_fit(found: StateSpaceFit, *, status: Status | None = None) -> Fit:
+    """Return a state-space fit as other fits are: predictions are those of each reading from the ones before it.
+
+    Residuals are innovations over their own standard deviation, in units of the gauge's white noise. Runs held out are filtered
+    with what was found.
+    """
+    likelihood, maximum = found.likelihood, found.maximum
+    problem, values, k = likelihood.problem, found.values, len(likelihood.problem.names)
+    held = [
+        filter_run(problem.model, problem.experiment, run, values, rtol=likelihood.rtol)
+        for run in problem.experiment.runs
+        if run.holdout
+    ]
+    pairs = [gauge_process(j + 1) for j in range(likelihood.processes)]
+    colours = tuple((values[time], values[size]) for time, size in pairs)
+    runs = []
+    for f in (*maximum.point.runs, *held):
+        level = float(np.hypot(values["gauge_white"], f.run.quantum / np.sqrt(12)))
+        with np.errstate(invalid="ignore"):
+            residual = f.found.nu / np.sqrt(f.found.S) * level
+        y = f.run.observed - f.found.nu
+        parts = stretches(f.run.t, f.run.used & np.isfinite(residual))
+        prediction = Prediction(y, np.zeros((y.size, 0)), np.zeros((y.size, 0)), Status.OK, float(f.run.t[-1]))
+        runs.append(
+            RunFit(f.run.name, f.run.holdout, prediction, residual, parts, Noise(level, (), level), level, colours)
+        )
+    return Fit(
+        problem.names, problem.named(maximum.point.x[:k]), maximum.covariance[:k, :k], problem.lower, problem.upper,
+        tuple(runs), found.log_likelihood, status or maximum.status, found.evaluations,
+    )  # fmt: skip

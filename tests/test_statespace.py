@@ -1,0 +1,381 @@
+"""The state-space likelihood: the free-running limit, derivatives, a linear model against statsmodels, particles, recovery."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from srfcli.errors import SrfError
+from srfcli.inference.fit import Interrupted, fit_problem
+from srfcli.inference.prediction import predict
+from srfcli.inference.statespace import Likelihood, as_fit, filter_run, fit_state_space, stopped
+from srfcli.numerics.compiled import compiler
+from srfcli.numerics.load import ConstantLoad, Modulation
+from srfcli.numerics.program import Drive
+from srfcli.recording.values import Experiment, FitParameter, ModelChoice, Run
+from srfcli.status import Status
+
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
+
+FIELD = {"field_amplitude": 2e-3, "field_length": 4.0}
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A model, one run under it, true values and what is asked of derivatives."""
+
+    choice: dict[str, Any]
+    values: dict[str, float]
+    run: Run
+    stiffness: str
+    mass: float | None = None
+    trend: str | None = None
+
+    @property
+    def experiment(self) -> Experiment:
+        listed = tuple(FitParameter(n, v, v / 2, v * 2, False, "1") for n, v in self.values.items() if "." not in n)
+        choice = ModelChoice(
+            self.choice["law"], self.choice["ageing"], self.choice["interface"], self.choice["inertia"],
+            tuple(self.choice.get("effects", ())),
+        )  # fmt: skip
+        return Experiment(Path(), "rig", choice, self.mass, self.stiffness, listed, (self.run,), ())
+
+
+def recording(t, observable, drive, load, **change):
+    run = Run("r", Path("x"), False, 0.0, "steady", t, np.zeros(t.size), observable, np.ones(t.size, bool), drive, load, 0.21,
+              None, 0.0, ())  # fmt: skip
+    return replace(run, **change)
+
+
+PMMA = {"law": "srf-vsat", "ageing": "dieterich", "interface": "elastic", "inertia": True}
+PMMA_VALUES = {"mu0": 0.33, "A": 0.0126, "B": 0.0246, "D0": 0.395, "Vsat": 240.0, "lambda": 0.54}
+ROCK = {"law": "dieterich-ruina", "ageing": "ruina", "interface": "rigid", "inertia": False}
+ROCK_VALUES = {"mu0": 0.6, "A": 0.008, "B": 0.010, "D0": 10.0}
+STEPS = Drive.steps([(0.0, 5.0), (0.4, 20.0)])
+RIGS = {
+    "paper": Rig(PMMA, PMMA_VALUES, recording(np.linspace(0, 0.8, 161), "elongation", STEPS, ConstantLoad(5.0)),
+                 "0.21 N/um", 2.37e-6),
+    "stick-slip, modulated": Rig(
+        PMMA, PMMA_VALUES,
+        recording(np.linspace(0, 1.0, 401), "elongation", Drive.steps([(0.0, 12.0), (0.2, 8.0)]),
+                  Modulation(9.0, 0.09, 60.0, 0.5)),
+        "0.21 N/um", 2.37e-6,
+    ),
+    "rock, free start and trend": Rig(
+        ROCK, ROCK_VALUES | {"r.mu": 0.605, "r.ln_phi": 0.8, "r.trend": 1e-5},
+        recording(np.linspace(0, 20, 101), "friction", Drive.steps([(0.0, 3.0), (8.0, 30.0)]), ConstantLoad(20.0),
+                  initial="free", stiffness=0.2),
+        "0.2 N/um", trend="slip",
+    ),
+    "rock by load, uneven": Rig(
+        ROCK, ROCK_VALUES,
+        recording(np.cumsum(np.r_[0.0, np.tile([0.05, 0.4, 0.15], 40)]), "friction", Drive.steps([(0.0, 3.0), (8.0, 30.0)]),
+                  Modulation(20.0, 0.05, 0.3), stiffness=20 * 0.01),
+        "0.01 1/um",
+    ),
+    "hold, force": Rig(
+        ROCK | {"ageing": "dieterich", "law": "dieterich-cutoff"}, ROCK_VALUES | {"D0": 2.0},
+        recording(np.linspace(0, 30, 151), "force", Drive.steps([(0.0, 10.0), (5.0, 1e-3), (20.0, 10.0)]), ConstantLoad(4.0)),
+        "0.21 N/um",
+    ),
+    "two states, nagata, power": Rig(
+        {"law": "two-state", "ageing": "nagata", "interface": "power", "inertia": True}, {},
+        recording(np.linspace(0, 0.8, 121), "elongation", STEPS, ConstantLoad(5.0)), "0.21 N/um", 2.37e-6,
+    ),
+    "lag of the gauge": Rig(
+        PMMA | {"effects": ("sensor-lag",)}, PMMA_VALUES | {"time_constant": 0.01},
+        recording(np.linspace(0, 0.8, 161), "elongation", STEPS, ConstantLoad(5.0)), "0.21 N/um", 2.37e-6,
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(params=RIGS.values(), ids=RIGS.keys())
+def rig(request, make_model):
+    """A rig with its model, and a recording of it in which each reading is 3 sd off at random."""
+    own = request.param
+    model = make_model(**own.choice, random_field=True)
+    values = dict(own.values)
+    if "lag of the gauge" in request.node.name:
+        lag = next(n for n in model.names if n in ("tau", "time_constant", "lag"))
+        values[lag] = values.pop("time_constant")
+        own = replace(own, values=values)
+    own = replace(own, values={n: v for n, v in values.items() if n in model.names or "." in n})
+    y = predict(model, own.experiment, own.run, own.values | FIELD, trend=own.trend, rtol=1e-9).y
+    sd = 1e-3 * float(np.ptp(y)) + 1e-6
+    rng = np.random.default_rng(3)
+    return replace(own, run=replace(own.run, observed=y + 3 * sd * rng.standard_normal(y.size))), model, sd
+
+
+def test_without_a_field_it_is_the_free_running_likelihood(rig):
+    own, model, sd = rig
+    values = own.values | {"field_amplitude": 0.0, "field_length": 4.0, "gauge_white": sd}
+    found = filter_run(model, own.experiment, own.run, values, trend=own.trend, rtol=1e-9)
+    free = predict(model, own.experiment, own.run, values, trend=own.trend, rtol=1e-9).y
+    assert found.whole
+    assert np.abs(found.found.nu - (own.run.observed - free)).max() < 2e-3 * sd
+    assert np.allclose(found.found.S, sd**2, rtol=1e-12)
+    residual = own.run.observed - free
+    ordinary = -0.5 * np.sum((residual / sd) ** 2 + np.log(2 * np.pi * sd**2))
+    assert found.log_likelihood == pytest.approx(ordinary, abs=5e-3)
+
+
+def test_derivatives_are_those_of_the_likelihood(rig):
+    own, model, sd = rig
+    values = own.values | FIELD | {"gauge_white": 3 * sd, "gauge_colour1": 2 * sd, "gauge_time1": 0.05}
+    by = [n for n in values if values[n]]
+    if own.stiffness.endswith("1/um"):
+        by.append("K")
+        values["K"] = 0.01
+    exact = filter_run(model, own.experiment, own.run, values, by=by, trend=own.trend, rtol=1e-8)
+    assert exact.whole
+    worst = {}
+    for j, name in enumerate(by):
+        step = 1e-4 * abs(values[name])
+        sides = [
+            filter_run(
+                model, own.experiment, own.run, values | {name: values[name] + sign * step}, trend=own.trend, rtol=1e-8
+            )
+            for sign in (1, -1)
+        ]
+        nu_d = (sides[0].found.nu - sides[1].found.nu) / (2 * step)
+        S_d = (sides[0].found.S - sides[1].found.S) / (2 * step)
+        for ours, theirs in ((exact.found.nu_d[:, j], nu_d), (exact.found.S_d[:, j], S_d)):
+            scale = np.abs(theirs).max()
+            if scale * step > 1e-7 * sd:  # a difference of nothing tells nothing
+                worst[name] = max(worst.get(name, 0.0), np.abs(ours - theirs).max() / scale)
+    assert len(worst) >= len(by) - 2
+    assert max(worst.values()) < 1e-3, worst  # stick-slip is the worst, and there the differences are
+
+
+def test_a_linear_model_agrees_with_statsmodels(make_model):
+    """About steady sliding at one velocity everything is linear: matrix exponentials and a filter of another library."""
+    kalman = pytest.importorskip("statsmodels.tsa.statespace.kalman_smoother")
+    own = RIGS["paper"]
+    model = make_model(**PMMA, random_field=True)
+    n, dt, sd, tau, s = 160, 0.005, 0.02, 0.03, 0.015
+    run = recording(dt * np.arange(n), "elongation", Drive.constant(5.0), ConstantLoad(5.0))
+    used = np.ones(n, bool)
+    used[60:75] = False
+    values = own.values | FIELD | {"gauge_white": sd, "gauge_colour1": s, "gauge_time1": tau, "r.trend": 0.0}
+    steady = predict(model, replace(own, run=run).experiment, run, values | {"field_start": 0.0}, rtol=1e-10).y
+    run = replace(run, observed=steady, used=used)
+    own = replace(own, run=run)
+    found = filter_run(model, own.experiment, run, values, by=["r.trend"], trend="time", rtol=1e-12, keep=True)
+
+    p = model.vector(
+        {k: v for k, v in values.items() if k in model.names} | {"V": 5.0, "W0": 5.0, "K": 0.21, "M": 2.37e-6}
+    )
+    x0 = np.asarray(model.steady(p))
+    J, g = np.asarray(model.rates_jacobian(x0, 5.0, 5.0, 0.0, p)), np.asarray(model.field_gain(x0, 5.0, 5.0, 0.0, p))
+    k = x0.size
+    block = expm(np.block([[-J, np.outer(g, g)], [np.zeros((k, k)), J.T]]) * dt)  # Van Loan 1978
+    T = np.zeros((k + 1, k + 1))
+    T[:k, :k], T[k, k] = block[k:, k:].T, np.exp(-dt / tau)
+    Q = np.zeros_like(T)
+    Q[:k, :k], Q[k, k] = T[:k, :k] @ block[:k, k:], s**2 * (1 - np.exp(-2 * dt / tau))
+    columns = np.zeros((k, 2))
+    for j, name in enumerate(("field_start", "field_slope_start")):
+        up, down = (model.steady(model.vector(dict(zip(model.names, p, strict=True)) | {name: e})) for e in (0.5, -0.5))
+        columns[:, j] = np.asarray(up) - np.asarray(down)
+    P0 = np.zeros_like(T)
+    P0[:k, :k], P0[k, k] = columns @ columns.T, s**2
+
+    filt = kalman.KalmanSmoother(k_endog=1, k_states=k + 1, loglikelihood_burn=0)
+    filt["design"] = np.r_[1.0, np.zeros(k - 1), 1.0][None, :]
+    filt["obs_cov"], filt["transition"], filt["selection"] = np.array([[sd**2]]), T, np.eye(k + 1)
+    filt["state_cov"] = 0.5 * (Q + Q.T)
+    filt.initialize_known(np.zeros(k + 1), P0)
+    filt.tolerance = 0.0
+    data = run.t.copy()
+    data[~used] = np.nan
+    filt.bind(data[:, None].copy())
+    theirs = filt.smooth()
+    S, nu = theirs.forecasts_error_cov[0, 0], theirs.forecasts_error[0]
+    assert np.abs(found.found.S / S - 1).max() < 1e-8
+    linear = -found.found.nu_d[:, 0]  # innovations that readings proportional to time would bring, as all is linear
+    assert np.abs(linear - nu)[used].max() < 1e-8 * np.abs(nu[used]).max()
+    ours = -0.5 * np.sum(np.log(2 * np.pi * found.found.S[used]) + linear[used] ** 2 / found.found.S[used])
+    assert ours == pytest.approx(float(theirs.llf), rel=1e-8)
+    assert np.abs(found.smoothed().covariance[:, 0, 0] / theirs.smoothed_state_cov[0, 0] - 1).max() < 1e-6
+    assert np.abs(found.smoothed().covariance[:, 4, 4] / theirs.smoothed_state_cov[4, 4] - 1).max() < 1e-6
+
+
+def test_the_field_is_stationary_where_nothing_is_read(make_model):
+    own, model = RIGS["stick-slip, modulated"], make_model(**PMMA, random_field=True)
+    run = replace(own.run, used=np.zeros(own.run.t.size, bool))
+    values = own.values | {"field_amplitude": 1e-5, "field_length": 4.0, "gauge_white": 0.02}
+    kept = filter_run(model, own.experiment, run, values, keep=True).found.kept
+    block = kept.covariance[:, 4:6, 4:6] / 1e-10
+    assert np.abs(block - np.eye(2)).max() < 1e-3
+
+
+def test_particles_find_the_same_marginal_likelihood(make_model):
+    """A bootstrap particle filter knows nothing of linearisation, covariances or the integrator."""
+    model = make_model(**ROCK, random_field=True)
+    t = np.linspace(0, 12, 25)
+    run = recording(t, "friction", Drive.steps([(0.0, 3.0), (4.0, 12.0)]), ConstantLoad(20.0), stiffness=0.2)
+    own = replace(RIGS["rock by load, uneven"], run=run, stiffness="0.2 N/um", values=ROCK_VALUES)
+    sd, a, l = 3e-4, 8e-4, 3.0
+    values = own.values | {"field_amplitude": a, "field_length": l, "gauge_white": sd}
+    rng = np.random.default_rng(8)
+    p = model.vector(ROCK_VALUES | {"V": 3.0, "W0": 20.0, "K": 0.2, "field_amplitude": a, "field_length": l})
+    places, noise = {name: i for i, name in enumerate(model.states)}, model.index("field_noise")
+
+    def begin(count):
+        x = np.empty((count, len(model.states)))
+        for i in range(count):
+            q = p.copy()
+            q[model.index("field_start")], q[model.index("field_slope_start")] = rng.standard_normal(2)
+            x[i] = model.steady(q)
+        return x
+
+    def move(x, t0, t1, steps=60):
+        h = (t1 - t0) / steps
+        for k in range(steps):
+            V = 3.0 if t0 + (k + 0.5) * h < 4.0 else 12.0
+            q = p.copy()
+            w = rng.standard_normal(x.shape[0]) / np.sqrt(h)
+            gain = np.asarray(model.field_gain(x, V, 20.0, 0.0, q))
+            assert q[noise] == 0.0
+
+            def rate(y, V=V, q=q, kick=gain * w[:, None]):
+                return np.asarray(model.rates(y, V, 20.0, 0.0, q)) + kick
+
+            k1 = rate(x)
+            x = x + h * rate(x + 0.5 * h * k1)
+        return x
+
+    def reading(x):
+        return np.asarray(model.friction(x, 3.0, 20.0, 0.0, p))
+
+    truth, seen = begin(1), []
+    for k in range(t.size):
+        truth = truth if k == 0 else move(truth, t[k - 1], t[k])
+        seen.append(float(reading(truth)[0]) + sd * rng.standard_normal())
+    run = replace(run, observed=np.array(seen))
+    found = filter_run(model, replace(own, run=run).experiment, run, values)
+    estimates = []
+    for _ in range(4):
+        x, total = begin(4000), 0.0
+        for k in range(t.size):
+            x = x if k == 0 else move(x, t[k - 1], t[k])
+            z = (seen[k] - reading(x)) / sd
+            weights = np.exp(-0.5 * z**2) / (sd * np.sqrt(2 * np.pi))
+            total += np.log(weights.mean())
+            x = x[rng.choice(x.shape[0], x.shape[0], p=weights / weights.sum())]
+        estimates.append(total)
+    spread = np.std(estimates, ddof=1)
+    assert spread < 0.6
+    assert abs(np.mean(estimates) - found.log_likelihood) < 0.15 + 2 * spread
+    assert places["field"] == 2
+
+
+def made(model, seed, amplitude, *, sd=3e-4):
+    """Return two runs of steps on rock, each on a field of its own that is drawn by spectral sums, not by the model's states."""
+    experiment_runs, t = [], np.linspace(0, 24, 481)
+    rng = np.random.default_rng(seed)
+    from srfcli.numerics.motion import integrate
+
+    for k in range(2):
+        drive = Drive.steps([(0.0, 3.0), (8.0, 10.0 * (k + 1)), (16.0, 3.0)])
+        run = recording(t, "friction", drive, ConstantLoad(20.0), stiffness=0.2, name=f"r{k}")
+        waves = (
+            np.abs(rng.standard_t(3, 400)) / 3.0 * np.sqrt(3) / np.sqrt(3)
+        )  # spectrum of Matern 3/2, correlation length 3 um
+        phases = rng.uniform(0, 2 * np.pi, 400)
+        m = amplitude * np.sqrt(2 / 400)
+        from srfcli.splines import Spline
+
+        table = Spline.over(-5.0, 400.0, 0.25)
+        where = table.nodes
+        table = table.with_numbers(m * np.cos(np.outer(where, waves) + phases).sum(axis=1))
+        p = model.vector(ROCK_VALUES | {"V": 3.0, "W0": 20.0, "K": 0.2})
+        from srfcli.splines import appended
+
+        x0 = np.asarray(model.steady(appended(p, [table])))
+        x = integrate(model, p, drive=drive, load=ConstantLoad(20.0), t=t, start=x0, tables=[table], rtol=1e-8,
+                      atol=1e-8 * np.ones(x0.size)).x  # fmt: skip
+        y = np.asarray(model.friction(x, 3.0, 20.0, 0.0, appended(p, [table])))
+        experiment_runs.append(replace(run, observed=y + sd * rng.standard_normal(t.size)))
+    listed = tuple(
+        FitParameter(n, 1.3 * v if n != "mu0" else v, v / 4, v * 4, False, "1") for n, v in ROCK_VALUES.items()
+    )
+    return Experiment(Path(), "rock", ModelChoice("dieterich-ruina", "ruina", "rigid", False), None, "0.2 N/um", listed,
+                      tuple(experiment_runs), ())  # fmt: skip
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 1e-3])
+def test_a_fit_from_values_30_percent_off_finds_parameters_and_field(make_model, amplitude):
+    tabled = make_model(**ROCK, tables=(("mu", "slip"),))
+    model = make_model(**ROCK, random_field=True)
+    experiment = made(tabled, 5, amplitude)
+    found = fit_state_space(fit_problem(model, experiment))
+    assert found.maximum.status is Status.OK
+    errors = np.sqrt(np.diag(found.maximum.covariance))
+    for name, error in zip(found.likelihood.names, errors, strict=True):
+        if name in ROCK_VALUES:
+            assert abs(found.values[name] - ROCK_VALUES[name]) < 3.5 * error, name
+    assert found.maximum.point.rms == pytest.approx(1.0, abs=0.05)
+    assert found.values["gauge_white"] == pytest.approx(3e-4, rel=0.1)
+    assert found.smooth is (amplitude == 0)
+    if amplitude:
+        assert found.values["field_amplitude"] == pytest.approx(amplitude, rel=0.5)
+
+
+def test_threads_change_nothing(make_model):
+    model = make_model(**ROCK, random_field=True)
+    experiment = made(make_model(**ROCK, tables=(("mu", "slip"),)), 6, 1e-3)
+    problem = fit_problem(model, experiment)
+    one, two = (Likelihood(problem, threads=n) for n in (1, 2))
+    a, b = one.at(one.start), two.at(two.start)
+    assert a.log_likelihood == b.log_likelihood and np.array_equal(a.score, b.score)
+
+
+def test_a_model_without_a_field_has_no_filter(make_model):
+    own = RIGS["paper"]
+    with pytest.raises(SrfError, match=r"has no random friction field|unknown parameter"):
+        filter_run(make_model(**PMMA), own.experiment, own.run, own.values | FIELD | {"gauge_white": 0.02})
+
+
+def test_ctrl_c_keeps_the_likeliest_point_and_says_so(make_model):
+    model, calls = make_model(**ROCK, random_field=True), []
+    problem = fit_problem(model, made(make_model(**ROCK, tables=(("mu", "slip"),)), 6, 1e-3))
+
+    def stop(text):
+        calls.append(text)
+        if sum("standard errors" in c for c in calls) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted) as caught:
+        fit_state_space(problem, progress=stop)
+    kept = as_fit(stopped(problem, caught.value.values))
+    assert kept.status is Status.INTERRUPTED and np.isfinite(kept.log_likelihood)
+    first = Likelihood(problem)
+    assert kept.log_likelihood > first.at(first.start).log_likelihood
+    assert all(np.isfinite(list(kept.stderr.values())))
+
+
+def test_coloured_gauge_noise_is_found(make_model):
+    """Readings with noise of two times of correlation: errors allow for both, and no field takes their place."""
+    model = make_model(**ROCK, random_field=True)
+    experiment = made(make_model(**ROCK, tables=(("mu", "slip"),)), 7, 0.0, sd=2e-4)
+    rng, spoilt = np.random.default_rng(2), []
+    for run in experiment.runs:
+        colour = np.zeros(run.t.size)
+        keep = np.exp(-0.05 / 0.5)
+        for i in range(1, run.t.size):
+            colour[i] = keep * colour[i - 1] + 4e-4 * np.sqrt(1 - keep**2) * rng.standard_normal()
+        spoilt.append(replace(run, observed=run.observed + colour))
+    found = fit_state_space(fit_problem(model, replace(experiment, runs=tuple(spoilt))))
+    assert found.likelihood.processes == 1 and found.smooth
+    assert found.values["gauge_colour1"] == pytest.approx(4e-4, rel=0.3)
+    assert found.values["gauge_time1"] == pytest.approx(0.5, rel=0.5)
+    errors = np.sqrt(np.diag(found.maximum.covariance))
+    for name, error in zip(found.likelihood.names, errors, strict=True):
+        if name in ROCK_VALUES:
+            assert abs(found.values[name] - ROCK_VALUES[name]) < 3.5 * error, name
