@@ -112,15 +112,15 @@ def flag(fit: Fit, k: int) -> str:
 
 
 def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float, bool]]) -> list[str]:
-    notes = [f"rms over noise {fit.rms_over_noise():.4g} in the runs fitted"]
+    notes = [f"rms over noise {fit.rms_over_noise():.3f} in the runs fitted"]
     if any(f.holdout for f in fit.runs):
-        notes[0] += f", {fit.rms_over_noise(holdout=True):.4g} in those held out"
+        notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
     notes.append(
         "intervals: " + ("profile likelihood" if intervals else "1.96 standard errors; --profile refits") + ", 95 %"
     )
     if len(starts) > 1:
         notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
-    for time, size in fit.runs[0].colours:
+    for time, size in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):
         notes.append(
             f"gauge noise: {size:.3g} correlated over {time:.3g} s besides white noise, or physics that is missing"
         )

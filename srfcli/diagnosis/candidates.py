@@ -102,18 +102,19 @@ class Hypothesis:
         return tuple(e.reported for e in self.effects)
 
     def model(
-        self, registry: Registry, experiment: Experiment, *, rough: bool, hold: Hold | None = None
-    ) -> GeneratedModel:
+        self, registry: Registry, experiment: Experiment, *, rough: bool, hold: Hold | None = None,
+        random_field: bool = False,
+    ) -> GeneratedModel:  # fmt: skip
         """Return the model, with a table along the track if it is rough, and one for the recording if that holds."""
         return open_model(
             registry, **asdict(experiment.choice.plus(_key(registry, e) for e in self.effects)),
-            tables=((TRACK,) if rough else ()) + ((hold.table,) if hold else ()),
+            tables=((TRACK,) if rough else ()) + ((hold.table,) if hold else ()), random_field=random_field,
         )  # fmt: skip
 
     def problem(self, registry: Registry, experiment: Experiment, *, rough: bool, at: Mapping[str, float] | None = None,
-                trend: str | None = None, hold: Hold | None = None) -> Problem:  # fmt: skip
+                trend: str | None = None, hold: Hold | None = None, random_field: bool = False) -> Problem:  # fmt: skip
         """Return the fit of baseline and effects together, from the values in `at` where there are some."""
-        model = self.model(registry, experiment, rough=rough, hold=hold)
+        model = self.model(registry, experiment, rough=rough, hold=hold, random_field=random_field)
         added = [q for e in self.effects for q in fit_parameters(e, model, experiment)]
         at = at or {}
         names = {q.name for q in added}

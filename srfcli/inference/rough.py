@@ -56,7 +56,7 @@ def shared_field(found: StateSpaceFit) -> float:
     length = found.values["field_length"]
     products, first, second = 0.0, 0.0, 0.0
     for (a, x), (b, y) in combinations(fields.values(), 2):
-        s, r = _slip(a, x, states), _slip(b, y, states)
+        s, r = slip_along(a, x, states), slip_along(b, y, states)
         where = np.arange(max(s[0], r[0]), min(s[-1], r[-1]), 0.5 * length)
         if where.size < 10:
             continue
@@ -66,7 +66,7 @@ def shared_field(found: StateSpaceFit) -> float:
     return products / np.sqrt(first * second) if first and second else 0.0
 
 
-def _slip(run: Run, x: Array, states: tuple[str, ...]) -> Array:
+def slip_along(run: Run, x: Array, states: tuple[str, ...]) -> Array:
     """Return the slip (n,) in um along smoothed states, from the run's start on."""
     v = np.exp(x[:, states.index("ln_v")])
     moved = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(run.t))])

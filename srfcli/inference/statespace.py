@@ -14,7 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.signal import lfilter
@@ -30,7 +31,9 @@ from srfcli.numerics.filter import GAUGE_PROCESSES, Dual, Innovations, Smoothed,
 from srfcli.recording.values import Experiment, Run
 from srfcli.status import Status
 
-RTOL = 1e-5  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
+T = TypeVar("T")
+RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
+FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
 WIDE = (
     0.003,
@@ -39,12 +42,16 @@ WIDE = (
 )  # amplitudes of the field, over the friction of the recordings, of which a fit begins with the likeliest
 SHORT = (1.0, 0.25, 0.06)  # the same for its correlation length, over that of PIECES
 SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
-FAINT = 3e-4  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
+FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
+BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
+SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
 HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters, when one is not worth a fit
 PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
 STEPS = 40  # of Fisher scoring
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
-COLOUR = 3.5  # standard deviations of a correlation between innovations beyond which coloured gauge noise is fitted
+COLOUR = (
+    8.0  # standard deviations of a correlation between innovations, under a wide field, from which colour is fitted
+)
 DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
 
@@ -146,6 +153,15 @@ def filter_run(
     return Filtered(run, tuple(by), found)
 
 
+def field_columns(likelihood: Likelihood, run: Run, values: Mapping[str, float]) -> Array:
+    """Return how the state at the first sample (n,) answers to a field of 1 there."""
+    problem = likelihood.problem
+    model = problem.model
+    p = run_parameters(model, problem.experiment, run, {**values, "field_amplitude": 1.0})
+    x0, _ = start_state(model, run, p, values, [])
+    return _field_columns(model, run, p, x0)[:, 0]
+
+
 def gauge_process(number: int) -> tuple[str, str]:
     """Return the names of correlation time (s) and standard deviation of a process of coloured gauge noise; the first is 1."""
     return f"gauge_time{number}", f"gauge_colour{number}"
@@ -225,22 +241,24 @@ class Likelihood:
     """The log likelihood of a problem's runs; its model has a random friction field.
 
     Coordinates x are the problem's parameters, then the logarithms of field_amplitude and field_length unless the track is
-    `smooth`, of gauge_white, and of correlation time and standard deviation of each of the gauge's coloured `processes`.
+    `smooth`, of gauge_white, and of correlation time and standard deviation of each of the gauge's coloured `processes`. Runs of
+    another observable or sampling rate have a gauge noise of their own; their names then end in `[kind]`.
     """
 
     def __init__(
         self, problem: Problem, *, smooth: bool = False, processes: int = 0, rtol: float = RTOL, threads: int = 1
     ) -> None:
         self.problem, self.smooth, self.processes = problem, smooth, processes
-        self.rtol, self.threads, self.evaluations = rtol, threads, 0
+        self.rtol = FREE_RUNNING * rtol if smooth else rtol
+        self.threads, self.evaluations = threads, 0
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs)
-        wanted = [
-            *(() if smooth else FIELD),
-            "gauge_white",
-            *(n for j in range(processes) for n in gauge_process(j + 1)),
-        ]
-        own = [(n, *scales[n.rstrip("123")]) for n in wanted]
+        gauge = ["gauge_white", *(n for j in range(processes) for n in gauge_process(j + 1))]
+        kinds = {run.name: _kind(run) for run in problem.runs}
+        several = len(set(kinds.values())) > 1
+        self.own = {name: {g: f"{g}[{kind}]" if several else g for g in gauge} for name, kind in kinds.items()}
+        wanted = [*(() if smooth else FIELD), *dict.fromkeys(n for own in self.own.values() for n in own.values())]
+        own = [(n, *scales[n.partition("[")[0].rstrip("123")]) for n in wanted]
         self.names = (*problem.names, *(row[0] for row in own))
         start, low, high = np.log(np.array([row[1:] for row in own])).T
         self.start = np.concatenate([problem.start, start])
@@ -268,23 +286,46 @@ class Likelihood:
                 x[i] = np.log(max(values[name], 1e-300)) if self.logarithmic[i] else values[name]
         return np.clip(x, self.lower, self.upper)
 
+    def gauge(self, run: Run) -> dict[str, str]:
+        """Return the names of a run's gauge noise as they are here, by those that `filter_run` has for them."""
+        if run.name in self.own:
+            return self.own[run.name]
+        near = [r for r in self.problem.runs if r.observable == run.observable] or list(self.problem.runs)
+        step = np.log(_spacing(run))
+        return self.own[
+            min(near, key=lambda r: abs(np.log(_spacing(r)) - step)).name
+        ]  # held out: that sampled most alike
+
+    def filtered(self, run: Run, values: Mapping[str, float], *, slopes: bool = False, keep: bool = False) -> Filtered:
+        """Return one run filtered under values by name, with derivatives by the names that it depends on."""
+        gauge, problem = self.gauge(run), self.problem
+        back = {name: local for local, name in gauge.items()}
+        own = [
+            n for n in self.names if n in back or (("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
+        ]
+        found = filter_run(
+            problem.model, problem.experiment, run, {**values, **{local: values[n] for local, n in gauge.items()}},
+            by=[back.get(n, n) for n in own] if slopes else (), trend=None if run.holdout else problem.trend, rtol=self.rtol,
+            keep=keep,
+        )  # fmt: skip
+        return replace(found, names=tuple(own) if slopes else ())
+
+    def over_runs(self, work: Callable[[Run], T]) -> list[T]:
+        """Return what `work` makes of each run, on several threads where that was asked for."""
+        if self.threads > 1 and len(self.problem.runs) > 1:
+            with ThreadPoolExecutor(self.threads) as pool:
+                return list(pool.map(work, self.problem.runs))
+        return [work(run) for run in self.problem.runs]
+
     def at(self, x: Array, *, slopes: bool = True, keep: bool = False) -> Point:
         """Return log likelihood, score and information at x (k,)."""
         values, k = self.values(x), len(self.names)
-        problem, self.evaluations = self.problem, self.evaluations + 1
-        shared = [n for n in self.names if "." not in n]
+        self.evaluations += 1
 
         def one(run: Run) -> Filtered:
-            by = [*shared, *(n for n in self.names if n.startswith(f"{run.name}."))] if slopes else ()
-            return filter_run(
-                problem.model, problem.experiment, run, values, by=by, trend=problem.trend, rtol=self.rtol, keep=keep
-            )
+            return self.filtered(run, values, slopes=slopes, keep=keep)
 
-        if self.threads > 1 and len(problem.runs) > 1:
-            with ThreadPoolExecutor(self.threads) as pool:
-                runs = tuple(pool.map(one, problem.runs))
-        else:
-            runs = tuple(map(one, problem.runs))
+        runs = tuple(self.over_runs(one))
         total = float(sum(f.log_likelihood for f in runs))
         score, information = np.zeros(k), np.zeros((k, k))
         if slopes and np.isfinite(total):
@@ -301,10 +342,10 @@ class Likelihood:
 
 def _scales(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
     """Return start value and bounds of the parameters of field and gauge, from the recordings."""
-    friction = max(float(np.median([_friction(r) for r in runs])), 1e-6)
+    friction = max(float(np.median([typical_friction(r) for r in runs])), 1e-6)
     slid = max(float(np.sum(np.abs(r.drive(r.t[1:])) * np.diff(r.t))) for r in runs)
     level = float(np.median([first_level(r) for r in runs]))
-    spacing = float(np.median([np.median(np.diff(r.t)) for r in runs]))
+    spacing = float(np.median([_spacing(r) for r in runs]))
     longest = max(float(r.t[-1] - r.t[0]) for r in runs)
     length = max(slid, 1e-6) / PIECES
     return {
@@ -316,7 +357,16 @@ def _scales(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
     }
 
 
-def _friction(run: Run) -> float:
+def _spacing(run: Run) -> float:
+    return float(np.median(np.diff(run.t)))
+
+
+def _kind(run: Run) -> str:
+    """Return what runs that share a gauge noise have in common: the observable, and the sampling to two digits."""
+    return f"{run.observable}, {_spacing(run):.2g} s"
+
+
+def typical_friction(run: Run) -> float:
     """Return the typical friction coefficient of a recording."""
     observed, W = run.observed[run.used], run.load(run.t)[0][run.used]
     over = W if run.observable == "friction" else run.stiffness if run.observable == "elongation" else 1.0
@@ -414,11 +464,12 @@ def fit_state_space(
     start: Mapping[str, float] | None = None,
     smooth: bool | None = None,
     processes: int | None = None,
+    close: float = CONVERGED,
     threads: int = 1,
     rtol: float = RTOL,
     progress: Callable[[str], None] = lambda text: None,
 ) -> StateSpaceFit:
-    """Return the maximum-likelihood fit of parameters, random friction field and gauge noise.
+    """Return the maximum-likelihood fit of parameters, random friction field and gauge noise, `close` standard errors or nearer.
 
     From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
     `smooth` says whether there is no field, `processes` how many of coloured noise the gauge has; left out, Schwarz's criterion
@@ -431,7 +482,7 @@ def fit_state_space(
         return tried[-1]
 
     try:
-        return _fitted(likelihood, start or {}, smooth, processes, progress)
+        return _fitted(likelihood, start or {}, smooth, processes, close, progress)
     except KeyboardInterrupt as error:
         last = next((own.best for own in reversed(tried) if own.best is not None), None)
         raise Interrupted(last.values if last else problem.named(problem.start)) from error
@@ -439,7 +490,10 @@ def fit_state_space(
 
 def stopped(problem: Problem, values: Mapping[str, float], *, threads: int = 1) -> StateSpaceFit:
     """Return the state of a fit that was stopped: its parameters, with errors as if they were the maximum."""
-    smooth, processes = not values.get("field_amplitude"), sum(gauge_process(j)[1] in values for j in (1, 2, 3))
+    smooth, processes = (
+        not values.get("field_amplitude"),
+        sum(any(n.startswith(f"gauge_colour{j}") for n in values) for j in (1, 2, 3)),
+    )
     likelihood = Likelihood(problem, smooth=smooth, processes=processes, threads=threads)
     point = likelihood.at(likelihood.coordinates(values))
     return StateSpaceFit(likelihood, Maximum(point, np.inf, Status.INTERRUPTED, inverse(point.information)), 1)
@@ -450,25 +504,24 @@ def _fitted(
     start: Mapping[str, float],
     smooth: bool | None,
     processes: int | None,
+    close: float,
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
-    count = processes or 0
-    rough = likelihood(False, count)
-    x = _widest(rough, start or {}, progress)
-    found = maximise(
-        rough, x, held=FIELD if start is None or FIELD[0] not in start else (), steps=8, close=1.0, progress=progress
-    )
-    best = StateSpaceFit(rough, found, rough.evaluations)
+    wide = likelihood(False, processes or 0)
+    found = maximise(wide, _widest(wide, start, progress), steps=8, close=1.0, progress=progress)
+    best = StateSpaceFit(wide, found, wide.evaluations)
     if found.status is Status.INTEGRATION:
         return best
-    best = _with_or_without(best, smooth, likelihood, progress)
-    while processes is None and count < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
-        count += 1
-        wider = _coloured(best, likelihood(best.smooth, count), progress)
+    # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
+    while processes is None and best.likelihood.processes < GAUGE_PROCESSES:
+        if correlated(best.maximum.point) < COLOUR:
+            break
+        wider = _coloured(best, likelihood(False, best.likelihood.processes + 1), progress)
         if wider.criterion < best.criterion:
-            return _counted(best, wider.evaluations)
-        best = _with_or_without(wider, smooth, likelihood, progress)
-    return best
+            best = _counted(best, wider.evaluations)
+            break
+        best = _counted(wider, best.evaluations)
+    return _with_or_without(best, smooth, likelihood, close, progress)
 
 
 def correlated(point: Point) -> float:
@@ -491,51 +544,73 @@ def _with_or_without(
     begun: StateSpaceFit,
     smooth: bool | None,
     likelihood: Callable[[bool, int], Likelihood],
+    close: float,
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
     """Return the fit from where one begun stands, with a field or without, as `smooth` says or Schwarz's criterion."""
-    rough, plain = begun.likelihood, likelihood(True, begun.likelihood.processes)
-    before, x = begun.evaluations, begun.maximum.point.x
-    if begun.smooth:
-        return StateSpaceFit(rough, maximise(rough, x, progress=progress), rough.evaluations)
-    at = rough.names.index("field_amplitude")
+    rough, count = begun.likelihood, begun.evaluations
+    plain = likelihood(True, rough.processes)
+    at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
     faint = rough.lower[at] + np.log(FAINT / SMALL)
-    while True:
-        found = maximise(rough, x, steps=4, progress=progress)
-        ended = found.away < CONVERGED or np.array_equal(found.point.x, x) or rough.evaluations - before > STEPS
-        x = found.point.x
-        if ended or (x[at] < faint and smooth is None):
+
+    def bare(steps: int) -> StateSpaceFit:
+        progress("without a field")
+        values = plain.coordinates(found.point.values)
+        own = maximise(plain, values, steps=steps, close=close, progress=progress)
+        return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
+
+    tried: StateSpaceFit | None = None
+    while rough.evaluations - before < STEPS:
+        last = found.point.x
+        found = maximise(rough, last, steps=3, close=close, progress=progress)
+        if found.away < close or np.array_equal(found.point.x, last):
             break
-    best = StateSpaceFit(rough, found, rough.evaluations)
+        if found.point.x[at] < last[at] - SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
+            found = replace(found, point=_shrunk(rough, found.point, at))
+        if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
+            tried = bare(BARE_STEPS)
+            if tried.log_likelihood > found.point.log_likelihood and tried.maximum.away < close:
+                return tried
+    best = StateSpaceFit(rough, found, count + rough.evaluations - before + plain.evaluations)
     if smooth is False:
         return best
-    values = plain.coordinates(found.point.values)
-    if smooth is None and plain.at(values, slopes=False).log_likelihood < found.point.log_likelihood - HOPELESS:
-        return _counted(best, plain.evaluations)
-    progress("without a field")
-    bare = StateSpaceFit(plain, maximise(plain, values, progress=progress), plain.evaluations)
-    if smooth or bare.criterion > best.criterion:
-        return _counted(bare, rough.evaluations)
-    if not ended:  # the field is faint, and yet there
-        best = StateSpaceFit(rough, maximise(rough, x, progress=progress), rough.evaluations)
-    return _counted(best, plain.evaluations)
+    lost = found.point.log_likelihood - HOPELESS
+    if smooth or (
+        tried is None and plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood > lost
+    ):
+        tried = bare(STEPS)
+    return tried if tried is not None and (smooth or tried.criterion > best.criterion) else best
+
+
+def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
+    """Return the point with the likeliest of ever smaller amplitudes of the field, the other parameters as they are."""
+    best, x = (point.log_likelihood, point.x), point.x.copy()
+    while x[at] > rough.lower[at]:
+        x[at] = max(x[at] - SHRINKS, rough.lower[at])
+        found = rough.at(x, slopes=False).log_likelihood
+        if found < best[0]:
+            break
+        best = found, x.copy()
+    return point if best[1] is point.x else rough.at(best[1])
 
 
 def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str], None]) -> StateSpaceFit:
     """Return the fit with one more process of gauge noise, from the likeliest of a few correlation times."""
-    time, size = (wider.names.index(n) for n in gauge_process(wider.processes))
+    names = gauge_process(wider.processes)
+    times, sizes = ([i for i, n in enumerate(wider.names) if n.startswith(name)] for name in names)
     base = wider.coordinates(fitted.values)
-    base[size] = np.log(0.7 * fitted.values["gauge_white"])
-    base[wider.names.index("gauge_white")] += np.log(0.7)
+    for i, name in enumerate(wider.names):
+        if name.startswith("gauge_white"):
+            base[i] += np.log(0.7)
+    base[sizes] = base[[i for i, n in enumerate(wider.names) if n.startswith("gauge_white")]]
     trials = []
-    for tau in np.linspace(wider.lower[time] + np.log(2.0), wider.upper[time] - np.log(10.0), 4):
+    for share in (0.02, 0.3, 0.6, 0.9):  # of the way from the shortest time to the longest
         x = base.copy()
-        x[time] = tau
+        x[times] = (wider.lower + share * (wider.upper - wider.lower))[times]
         trials.append((wider.at(np.clip(x, wider.lower, wider.upper), slopes=False).log_likelihood, x))
     progress(f"coloured gauge noise: {wider.processes}")
-    return StateSpaceFit(
-        wider, maximise(wider, max(trials, key=lambda t: t[0])[1], progress=progress), wider.evaluations
-    )
+    found = maximise(wider, max(trials, key=lambda t: t[0])[1], steps=8, close=1.0, progress=progress)
+    return StateSpaceFit(wider, found, wider.evaluations)
 
 
 def _counted(fitted: StateSpaceFit, more: int) -> StateSpaceFit:
@@ -571,16 +646,12 @@ def as_fit(found: StateSpaceFit, *, status: Status | None = None) -> Fit:
     """
     likelihood, maximum = found.likelihood, found.maximum
     problem, values, k = likelihood.problem, found.values, len(likelihood.problem.names)
-    held = [
-        filter_run(problem.model, problem.experiment, run, values, rtol=likelihood.rtol)
-        for run in problem.experiment.runs
-        if run.holdout
-    ]
-    pairs = [gauge_process(j + 1) for j in range(likelihood.processes)]
-    colours = tuple((values[time], values[size]) for time, size in pairs)
-    runs = []
+    held = [likelihood.filtered(run, values) for run in problem.experiment.runs if run.holdout]
+    pairs, runs = [gauge_process(j + 1) for j in range(likelihood.processes)], []
     for f in (*maximum.point.runs, *held):
-        level = float(np.hypot(values["gauge_white"], f.run.quantum / np.sqrt(12)))
+        gauge = likelihood.gauge(f.run)
+        colours = tuple((values[gauge[time]], values[gauge[size]]) for time, size in pairs)
+        level = float(np.hypot(values[gauge["gauge_white"]], f.run.quantum / np.sqrt(12)))
         with np.errstate(invalid="ignore"):
             residual = f.found.nu / np.sqrt(f.found.S) * level
         y = f.run.observed - f.found.nu

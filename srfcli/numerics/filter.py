@@ -18,9 +18,10 @@ from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array
 from srfcli.numerics.compiled import LANES, compiled
 from srfcli.numerics.load import Load
-from srfcli.numerics.motion import MAX_STEPS, doubles, imposed_arguments, interruptible, rtol_of_estimate
+from srfcli.numerics.motion import doubles, imposed_arguments, interruptible, rtol_of_estimate
 from srfcli.numerics.program import Drive
 
+STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
 GAUGE_PROCESSES = 3  # of coloured gauge noise, at most
 
 
@@ -111,7 +112,7 @@ def kalman_filter(
     arrays = [np.full(shape, np.nan) for shape in shapes]
     stats, stop, reached = np.zeros(2), ctypes.c_int(0), n
     imposed, use = imposed_arguments(t, drive, load), np.ascontiguousarray(used, dtype=np.uint8)
-    size = rtol_of_estimate(rtol)
+    size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000)
     allowed = np.asarray(atol) * size / rtol
     for first in range(0, max(k, 1), LANES):
         own_nu, own_S = np.full((n, LANES), np.nan), np.full((n, LANES), np.nan)
@@ -119,7 +120,7 @@ def kalman_filter(
         arguments = (
             *imposed, doubles(p.packed(first)), doubles(start.packed(first)), doubles(covariance.packed(first)),
             gauge.v.shape[0], doubles(gauge.packed(first)), int(k > 0), ctypes.c_double(size), doubles(allowed),
-            ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(MAX_STEPS), n,
+            ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(most), n,
             doubles(t), doubles(observed), ctypes.c_void_p(use.ctypes.data), doubles(factor.packed(first)),
             doubles(offset.packed(first)), doubles(R.packed(first)), int(keeping), doubles(nu), doubles(S), doubles(own_nu),
             doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),

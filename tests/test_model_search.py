@@ -1,0 +1,122 @@
+"""The best-first search over state-space fits: what it says of recordings of another code, on rough tracks of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from srfcli.diagnosis.candidates import Hypothesis, applicable, own_parameters
+from srfcli.diagnosis.model_search import ModelSearch, conclude, log_evidence
+from srfcli.diagnosis.statespace_scores import Scores
+from srfcli.inference.statespace import Likelihood, fit_state_space
+from srfcli.numerics.compiled import compiler
+from srfcli.proof.draw import Gauge
+from srfcli.proof.folder import case_files
+from srfcli.proof.gauge import read_gauge
+from srfcli.proof.motion import move
+from srfcli.proof.physics import Physics
+from srfcli.proof.protocol import Plan
+from srfcli.proof.track import Track
+from srfcli.recording.experiment import read_experiment
+from srfcli.registry import bundled_registry
+
+SHIPPED = bundled_registry()
+PLANS = (
+    Plan("steps", ((0.6, 5), (0.5, 50), (0.8, 10)), 5.0, 0.004),
+    Plan("stickslip", ((0.4, 12), (2.2, 8)), 9.2, 0.004),
+    Plan("loadstep", ((3, 10),), 5.0, 0.004, steps=((1, 1.5), (2, -1.5))),
+    Plan("again", ((2, 15),), 6.0, 0.004, holdout=True, steps=((0.8, 1.5),)),
+)
+FEW = ("linker-dieterich", "viscous-drag", "friction-drift", "slip-evolution", "sensor-lag")
+pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
+
+
+def recorded(folder, physics, *, baseline=None, seed=5):
+    """Write an experiment whose runs each slid on a rough track of their own, and return its folder."""
+    rng, readings = np.random.default_rng(seed), {}
+    for number, plan in enumerate(PLANS):
+        own = replace(physics, track=Track(3e-4, 6.0, 100 * seed + number))
+        readings[plan] = read_gauge(move(own, plan).u, Gauge(), rng)
+    for name, text in case_files("small", baseline or Physics(), readings).items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def said(folder, effects=FEW):
+    search = ModelSearch(SHIPPED, read_experiment(folder, registry=SHIPPED, holdout=False), effects=effects)
+    search.run()
+    return conclude(search, read_experiment(folder, registry=SHIPPED))
+
+
+def test_a_rough_track_is_no_missing_physics(tmp_path):
+    found = said(recorded(tmp_path, Physics()))
+    assert found.verdict in ("none", "inconclusive") and not found.effects
+    assert found.best is found.baseline and not found.baseline.fit.smooth
+    assert sum(found.confidence.values()) == pytest.approx(1.0)
+    assert [h.baseline.run.name for h in found.held] == ["again"]
+
+
+def test_what_is_missing_is_named_on_rough_tracks(tmp_path):
+    found = said(recorded(tmp_path, Physics(alpha=0.03)))
+    assert (found.verdict, found.effects) == ("identified", ("linker-dieterich",))
+    best = found.best.fit
+    error = np.sqrt(np.diag(best.maximum.covariance))[best.likelihood.names.index("alpha")]
+    assert abs(best.values["alpha"] - 0.03) < 3.5 * error
+    assert sum(h.gain for h in found.held) > 0
+
+
+def test_another_ageing_law_has_its_name(tmp_path):
+    """Data of the slip law under a stated ageing law: the registered law, or the effect that is the same at its full size."""
+    found = said(recorded(tmp_path, Physics(slip_share=1.0)))
+    assert found.verdict in ("identified", "ambiguous")
+    assert set(found.effects) <= {"ruina", "slip-evolution"} and found.effects
+
+
+def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(tmp_path):
+    folder = recorded(tmp_path, Physics())
+    description = folder / "experiment.toml"
+    description.write_text(description.read_text().replace('ageing = "dieterich"', 'ageing = "perrin-rice-zheng"'))
+    experiment = read_experiment(folder, registry=SHIPPED, holdout=False)
+    candidates, _ = applicable(SHIPPED, experiment, FEW)
+    problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
+    begun = Likelihood(problem)
+    fitted = fit_state_space(problem, start=begun.values(begun.start), processes=0, close=1e3)
+    scores = Scores(SHIPPED, experiment, fitted, (), candidates)
+    assert "slip-evolution" in {x.effect for x in scores.excluded}
+    assert "closed form" in next(x.reason for x in scores.excluded if x.effect == "slip-evolution")
+    assert {s.effect.reported for s in scores.singles} >= {"viscous-drag", "friction-drift"}
+
+
+@pytest.mark.parametrize("name", ["viscous-drag", "linker-dieterich", "friction-drift", "drive-ripple"])
+def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
+    """The column of an effect against the likelihood of the model that has it, a little from its neutral value."""
+    experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
+    problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
+    fitted = fit_state_space(problem, processes=0)
+    effect = SHIPPED.get("effect", name)
+    scores = Scores(SHIPPED, experiment, fitted, (), [effect])
+    column = scores.columns[len(scores.columns) // 2]
+    model = Hypothesis((effect,)).model(SHIPPED, experiment, rough=False, random_field=True)
+    longs = {p.name: long for long, p in own_parameters(effect, model).items()}
+    values = dict(fitted.values) | {longs[n]: v for n, v in column.inner.items()}
+    size = scores.singles[0].stderr * 0.3
+    wider = Hypothesis((effect,)).problem(SHIPPED, experiment, rough=False, at=values, random_field=True)
+    gained = []
+    for step in (size, -size):
+        likelihood = Likelihood(wider, smooth=fitted.smooth, rtol=1e-6)
+        x = likelihood.coordinates(values | {longs[column.name]: step})
+        x[likelihood.names.index(longs[column.name])] = step  # beyond a bound too
+        gained.append(likelihood.at(x, slopes=False).log_likelihood)
+    slope = (gained[0] - gained[1]) / (2 * size)
+    first = float(column.columns[:, 0] @ scores.rest)
+    spread = float(np.linalg.norm(column.columns[:, 0]))  # standard deviation of the slope
+    assert abs(slope - first) < 0.15 * spread
+
+
+def test_evidence_charges_for_what_is_free(tmp_path):
+    experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
+    problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
+    fitted = fit_state_space(problem, processes=0)
+    assert log_evidence(fitted) < fitted.log_likelihood - 10.0
