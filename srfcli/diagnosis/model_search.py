@@ -13,6 +13,8 @@ import heapq
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +27,7 @@ from srfcli.inference.statespace import (
     Filtered,
     Likelihood,
     StateSpaceFit,
+    as_fit,
     correlated,
     fit_state_space,
     maximise,
@@ -34,7 +37,7 @@ from srfcli.laws import Effect
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
 from srfcli.status import Status
-from srfcli.units import to_base
+from srfcli.units import find_unit, from_base, split_quantity, to_base
 
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at (Bonferroni at 1e-8 each)
 CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
@@ -354,7 +357,15 @@ class ModelSearch:
         for effect, own in zip(best.model.effects, sizes, strict=True):
             if self.spent:
                 return
+            if any(n not in self._stated for n in effect.needs):
+                continue  # it is nothing without the other
             self._record(self.fit(_Move(0.0, 0, Model((effect,), best.model.ageing), dict(best.fit.values), (own,))))
+
+    @cached_property
+    def _stated(self) -> frozenset[str]:
+        """Return the parameters of the baseline's model."""
+        model = Hypothesis().model(self.registry, self.experiment, rough=False, random_field=True)
+        return frozenset(model.names)
 
     def _record(self, found: Fitted, *, anew: bool = False) -> Fitted:
         name = found.model.name
@@ -463,6 +474,26 @@ class Verdict:
     excluded: tuple[Excluded, ...]
     reasons: tuple[str, ...]
     ungated: str
+
+    @property
+    def shown(self) -> Fitted:
+        """Return the model that the answer calls augmented: the baseline itself where nothing is to be added."""
+        return self.baseline if self.verdict in ("none", "inconclusive") else self.best
+
+    def brought(self) -> dict[str, dict[str, Any]]:
+        """Return the parameters that the shown model adds to the baseline's, in declared units; a stiffness as a ratio too."""
+        fitted, problem = as_fit(self.shown.fit), self.shown.fit.likelihood.problem
+        units, own = {q.name: q.unit for q in problem.experiment.parameters}, self.baseline.fit.likelihood.problem.names
+        found: dict[str, dict[str, Any]] = {}
+        for name in (n for n in problem.names if n not in own and n in units):
+            unit = units[name]
+            value, error = (from_base(v, unit) for v in (fitted.values[name], fitted.stderr[name]))
+            found[name] = {"value": value, "stderr": error, "unit": unit}
+        if "K" in found:
+            number, unit = split_quantity(problem.experiment.stiffness_text, name="stiffness")
+            stated = from_base(number * find_unit(unit).factor, found["K"]["unit"])
+            found["ratio"] = {k: found["K"][k] / stated for k in ("value", "stderr")} | {"unit": "1"}
+        return found
 
     @property
     def effects(self) -> tuple[str, ...]:

@@ -35,23 +35,18 @@ T = TypeVar("T")
 RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
-WIDE = (
-    0.003,
-    0.03,
-    0.3,
-)  # amplitudes of the field, over the friction of the recordings, of which a fit begins with the likeliest
-SHORT = (1.0, 0.25, 0.06)  # the same for its correlation length, over that of PIECES
+# A fit begins with the likeliest of nine fields: amplitudes over the friction of the recordings, lengths over that of PIECES
+WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
 SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
 FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
 BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
 SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
+CLOSE_CALL = 50.0  # in log likelihood, by which a fit that was broken off early may be behind and still be finished
 HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters, when one is not worth a fit
 PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
 STEPS = 40  # of Fisher scoring
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
-COLOUR = (
-    8.0  # standard deviations of a correlation between innovations, under a wide field, from which colour is fitted
-)
+COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
 DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
 
@@ -464,6 +459,7 @@ def fit_state_space(
     start: Mapping[str, float] | None = None,
     smooth: bool | None = None,
     processes: int | None = None,
+    thorough: bool = True,
     close: float = CONVERGED,
     threads: int = 1,
     rtol: float = RTOL,
@@ -473,7 +469,8 @@ def fit_state_space(
 
     From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
     `smooth` says whether there is no field, `processes` how many of coloured noise the gauge has; left out, Schwarz's criterion
-    decides. The status is that of the last maximisation.
+    decides, on colour early and, if the fit is to be `thorough`, again at the maximum. The status is that of the last
+    maximisation.
     """
     tried: list[Likelihood] = []
 
@@ -482,7 +479,7 @@ def fit_state_space(
         return tried[-1]
 
     try:
-        return _fitted(likelihood, start or {}, smooth, processes, close, progress)
+        return _fitted(likelihood, start or {}, smooth, processes, thorough, close, progress)
     except KeyboardInterrupt as error:
         last = next((own.best for own in reversed(tried) if own.best is not None), None)
         raise Interrupted(last.values if last else problem.named(problem.start)) from error
@@ -504,6 +501,7 @@ def _fitted(
     start: Mapping[str, float],
     smooth: bool | None,
     processes: int | None,
+    thorough: bool,
     close: float,
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
@@ -513,15 +511,33 @@ def _fitted(
     if found.status is Status.INTEGRATION:
         return best
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
-    while processes is None and best.likelihood.processes < GAUGE_PROCESSES:
-        if correlated(best.maximum.point) < COLOUR:
-            break
-        wider = _coloured(best, likelihood(False, best.likelihood.processes + 1), progress)
+    best = _with_colour(best, likelihood, progress) if processes is None else best
+    best = _with_or_without(best, smooth, likelihood, close, progress)
+    if thorough and processes is None:
+        wider = _with_colour(best, likelihood, progress)
+        if wider.likelihood.processes > best.likelihood.processes:
+            return _with_or_without(wider, smooth, likelihood, close, progress)
+        best = wider
+        if smooth is None and not best.smooth and not best.likelihood.processes:  # colour in place of the field?
+            other = _coloured(best, likelihood(True, 1), progress)
+            if other.criterion > best.criterion - CLOSE_CALL:
+                own = maximise(other.likelihood, other.maximum.point.x, close=close, progress=progress)
+                other = StateSpaceFit(other.likelihood, own, other.likelihood.evaluations)
+            better, worse = (other, best) if other.criterion > best.criterion else (best, other)
+            best = _counted(better, worse.evaluations)
+    return best
+
+
+def _with_colour(
+    best: StateSpaceFit, likelihood: Callable[[bool, int], Likelihood], progress: Callable[[str], None]
+) -> StateSpaceFit:
+    """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants."""
+    while best.likelihood.processes < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
+        wider = _coloured(best, likelihood(best.smooth, best.likelihood.processes + 1), progress)
         if wider.criterion < best.criterion:
-            best = _counted(best, wider.evaluations)
-            break
+            return _counted(best, wider.evaluations)
         best = _counted(wider, best.evaluations)
-    return _with_or_without(best, smooth, likelihood, close, progress)
+    return best
 
 
 def correlated(point: Point) -> float:
@@ -549,6 +565,9 @@ def _with_or_without(
 ) -> StateSpaceFit:
     """Return the fit from where one begun stands, with a field or without, as `smooth` says or Schwarz's criterion."""
     rough, count = begun.likelihood, begun.evaluations
+    if rough.smooth:
+        own = maximise(rough, begun.maximum.point.x, close=close, progress=progress)
+        return StateSpaceFit(rough, own, rough.evaluations)
     plain = likelihood(True, rough.processes)
     at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
     faint = rough.lower[at] + np.log(FAINT / SMALL)
@@ -579,7 +598,12 @@ def _with_or_without(
         tried is None and plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood > lost
     ):
         tried = bare(STEPS)
-    return tried if tried is not None and (smooth or tried.criterion > best.criterion) else best
+    if tried is None or not (smooth or tried.criterion > best.criterion):
+        return best
+    if tried.maximum.away < close:
+        return tried
+    own = maximise(plain, tried.maximum.point.x, close=close, progress=progress)
+    return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
 
 
 def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:

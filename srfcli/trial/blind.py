@@ -23,6 +23,7 @@ from srfcli.trial.answer import FAILED, Answer
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.answer import RunView
+    from srfcli.diagnosis.model_search import Fitted, Held
     from srfcli.diagnosis.refits import Refit
     from srfcli.diagnosis.search import Search
     from srfcli.diagnosis.verdict import Diagnosis
@@ -83,38 +84,19 @@ def diagnose_case(folder: Path, plugins: tuple[Path, ...], *, by: type[Search] |
 
 def diagnose_by_state_space(folder: Path, plugins: tuple[Path, ...]) -> Answer:
     """Return what the best-first search over state-space fits says of the experiment in `folder`."""
-    from srfcli.diagnosis.model_search import Fitted, ModelSearch, conclude
-    from srfcli.inference.statespace import Filtered, as_fit
+    from srfcli.diagnosis.model_search import ModelSearch, conclude
     from srfcli.recording.experiment import read_experiment
-    from srfcli.units import find_unit, from_base, split_quantity
 
     registry = _registry(plugins)
     search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
     search.run()
     verdict = conclude(search, read_experiment(folder, registry=registry))
-    shown = verdict.best if verdict.verdict not in ("none", "inconclusive") else verdict.baseline
-    fitted, problem = as_fit(shown.fit), shown.fit.likelihood.problem
-    units = {q.name: q.unit for q in problem.experiment.parameters}
-    own = {*verdict.baseline.fit.likelihood.problem.names}
-    brought: dict[str, dict[str, Any]] = {
-        n: {
-            "value": from_base(fitted.values[n], units[n]),
-            "stderr": from_base(fitted.stderr[n], units[n]),
-            "unit": units[n],
-        }
-        for n in problem.names
-        if n not in own and n in units
-    }
-    if "K" in brought:
-        number, unit = split_quantity(problem.experiment.stiffness_text, name="stiffness")
-        stated = from_base(number * find_unit(unit).factor, brought["K"]["unit"])
-        brought["ratio"] = {k: brought["K"][k] / stated for k in ("value", "stderr")} | {"unit": "1"}
+    shown, same = verdict.shown, verdict.shown is verdict.baseline
 
-    def rms(found: Filtered) -> float | None:
-        return _finite(float(np.sqrt(np.mean(found.found.nu[found.run.used] ** 2))))
-
-    def over(found: Filtered) -> float | None:
-        return _finite(float(np.sqrt(np.mean(found.white**2))))
+    def errors(held: Held) -> Mapping[str, float | None]:
+        sides = {"baseline": held.baseline, "augmented": held.baseline if same else held.augmented}
+        rms = {n: _finite(float(np.sqrt(np.mean(f.found.nu[f.run.used] ** 2)))) for n, f in sides.items()}
+        return rms | {f"{n}_over_noise": _finite(float(np.sqrt(np.mean(f.white**2)))) for n, f in sides.items()}
 
     def kept(fit: Fitted) -> Mapping[str, float]:
         likelihood = fit.fit.likelihood
@@ -123,20 +105,13 @@ def diagnose_by_state_space(folder: Path, plugins: tuple[Path, ...]) -> Answer:
             "samples": likelihood.samples, "evidence": round(fit.evidence, 3), "fine": int(fit.fine),
         }  # fmt: skip
 
-    held = {
-        h.baseline.run.name: {
-            "baseline": rms(h.baseline), "augmented": rms(h.augmented if shown is verdict.best else h.baseline),
-            "baseline_over_noise": over(h.baseline),
-            "augmented_over_noise": over(h.augmented if shown is verdict.best else h.baseline),
-        }
-        for h in verdict.held
-    }  # fmt: skip
     return Answer(
         folder.name, verdict.verdict, tuple(verdict.effects), dict(verdict.confidence), (),
         tuple(dict.fromkeys(x.effect for x in verdict.excluded)),
-        {name: {k: _finite(v) for k, v in value.items()} for name, value in brought.items()},
+        {name: {k: _finite(v) for k, v in value.items()} for name, value in verdict.brought().items()},
         {"baseline": _finite(verdict.baseline.fit.maximum.point.rms), "augmented": _finite(shown.fit.maximum.point.rms)},
-        held, {f.model.name: kept(f) for f in reversed(verdict.ranked)}, verdict.ungated,
+        {h.baseline.run.name: errors(h) for h in verdict.held}, {f.model.name: kept(f) for f in reversed(verdict.ranked)},
+        verdict.ungated,
     )  # fmt: skip
 
 
