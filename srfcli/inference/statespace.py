@@ -41,6 +41,7 @@ SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordi
 FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
 BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
 SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
+NEEDED = 2.0  # gain in log likelihood that keeps a field: without one that is there, errors are too small
 CLOSE_CALL = 50.0  # in log likelihood, by which a fit that was broken off early may be behind and still be finished
 HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters, when one is not worth a fit
 PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
@@ -63,8 +64,9 @@ class Filtered:
 
     @property
     def whole(self) -> bool:
-        """Return whether the motion was followed to the last sample."""
-        return self.found.reached == self.run.t.size and bool(np.isfinite(self.found.nu).all())
+        """Return whether the motion was followed to the last sample, and every variance is one."""
+        f = self.found
+        return f.reached == self.run.t.size and bool(np.isfinite(f.nu).all() and (f.S > 0).all())
 
     @property
     def white(self) -> Array:
@@ -468,9 +470,9 @@ def fit_state_space(
     """Return the maximum-likelihood fit of parameters, random friction field and gauge noise, `close` standard errors or nearer.
 
     From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
-    `smooth` says whether there is no field, `processes` how many of coloured noise the gauge has; left out, Schwarz's criterion
-    decides, on colour early and, if the fit is to be `thorough`, again at the maximum. The status is that of the last
-    maximisation.
+    `smooth` says whether there is no field; left out, there is one where it gains 2 in log likelihood. `processes` says how many
+    of coloured noise the gauge has; left out, Schwarz's criterion decides, early and, if the fit is to be `thorough`, again at
+    the maximum. The status is that of the last maximisation.
     """
     tried: list[Likelihood] = []
 
@@ -563,7 +565,7 @@ def _with_or_without(
     close: float,
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
-    """Return the fit from where one begun stands, with a field or without, as `smooth` says or Schwarz's criterion."""
+    """Return the fit from where one begun stands, with a field or without, as `smooth` says or the likelihood."""
     rough, count = begun.likelihood, begun.evaluations
     if rough.smooth:
         own = maximise(rough, begun.maximum.point.x, close=close, progress=progress)
@@ -589,7 +591,10 @@ def _with_or_without(
         if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
             tried = bare(BARE_STEPS)
             if tried.log_likelihood > found.point.log_likelihood and tried.maximum.away < close:
-                return tried
+                small = _small_field(rough, tried.maximum.point, at)
+                if small is None:
+                    return tried
+                found = replace(found, point=small)
     best = StateSpaceFit(rough, found, count + rough.evaluations - before + plain.evaluations)
     if smooth is False:
         return best
@@ -598,12 +603,26 @@ def _with_or_without(
         tried is None and plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood > lost
     ):
         tried = bare(STEPS)
-    if tried is None or not (smooth or tried.criterion > best.criterion):
+    if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
         return best
     if tried.maximum.away < close:
         return tried
     own = maximise(plain, tried.maximum.point.x, close=close, progress=progress)
     return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
+
+
+def _small_field(rough: Likelihood, bare: Point, at: int) -> Point | None:
+    """Return the likeliest of a few small fields about a fit without one, None where none of them gains enough."""
+    length = rough.names.index("field_length")
+    best: tuple[float, Array] | None = None
+    for share in (0.03, 0.1, 0.3):
+        for short in SHORT:
+            x = rough.coordinates(bare.values)
+            x[at], x[length] = rough.lower[at] + np.log(share * FAINT / SMALL), rough.start[length] + np.log(short)
+            found = rough.at(x, slopes=False).log_likelihood
+            if found > bare.log_likelihood + NEEDED and (best is None or found > best[0]):
+                best = found, x
+    return None if best is None else rough.at(best[1])
 
 
 def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
