@@ -276,9 +276,8 @@ class ModelSearch:
         least = parent.fit.log_likelihood - ASTRAY
         heapq.heappush(self.queue, _Move(-expected, self.count, model, dict(parent.fit.values), sizes, least, fresh))
 
-    def _build(self, node: Fitted, effect: Effect, one: float) -> None:
-        """Push an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
-        model = Model((*node.model.effects, effect), node.model.ageing)
+    def _likelihood(self, model: Model, node: Fitted, name: str) -> Likelihood | None:
+        """Return the likelihood of a model beside a fitted one; one that cannot be joined is left out as `name`, with the reason."""
         try:
             problem = Hypothesis(model.effects).problem(
                 self.registry,
@@ -289,9 +288,17 @@ class ModelSearch:
                 random_field=True,
             )
         except SrfError as error:
-            self.excluded.append(Excluded(effect.reported, error.message))
+            self.excluded.append(Excluded(name, error.message))
+            return None
+        return Likelihood(problem, processes=self.processes, threads=self.threads, rtol=COARSE)
+
+    def _build(self, node: Fitted, effect: Effect, one: float) -> None:
+        """Push an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
+        model = Model((*node.model.effects, effect), node.model.ageing)
+        likelihood = self._likelihood(model, node, effect.reported)
+        if likelihood is None:
             return
-        likelihood = Likelihood(problem, processes=self.processes, threads=self.threads, rtol=COARSE)
+        problem = likelihood.problem
         own = [n for n in problem.names if n not in node.fit.likelihood.problem.names]
         place = likelihood.names.index(own[0])
         x = likelihood.coordinates(_followable(node.fit.values, problem))
@@ -327,20 +334,10 @@ class ModelSearch:
             if entry.name == stated:
                 continue
             model = Model((), "+".join([entry.name, *modifiers]))
-            try:
-                problem = Hypothesis().problem(
-                    self.registry,
-                    self._experiment(model),
-                    rough=False,
-                    at=node.fit.values,
-                    trend=self.trend,
-                    random_field=True,
-                )
-            except SrfError as error:
-                self.excluded.append(Excluded(entry.name, error.message))
+            likelihood = self._likelihood(model, node, entry.name)
+            if likelihood is None:
                 continue
-            likelihood = Likelihood(problem, processes=self.processes, threads=self.threads, rtol=COARSE)
-            x = likelihood.coordinates(_followable(node.fit.values, problem))
+            x = likelihood.coordinates(_followable(node.fit.values, likelihood.problem))
             found = maximise(likelihood, x, steps=3, close=1.0, progress=self.progress)
             if found.status is Status.INTEGRATION:
                 continue
