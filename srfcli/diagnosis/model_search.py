@@ -277,7 +277,7 @@ class ModelSearch:
         heapq.heappush(self.queue, _Move(-expected, self.count, model, dict(parent.fit.values), sizes, least, fresh))
 
     def _likelihood(self, model: Model, node: Fitted, name: str) -> Likelihood | None:
-        """Return the likelihood of a model beside a fitted one; one that cannot be joined is left out as `name`, with the reason."""
+        """Return the likelihood of a model beside a fitted one; what cannot be joined is left out, with the reason."""
         try:
             problem = Hypothesis(model.effects).problem(
                 self.registry,
