@@ -39,7 +39,7 @@ from srfcli.registry import Registry
 from srfcli.status import Status
 from srfcli.units import find_unit, from_base, split_quantity, to_base
 
-WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at (Bonferroni at 1e-8 each)
+WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, each at p = 1e-6
 CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
 LARGEST = 2  # effects of a model
 SINGLES, PAIRS = 5, 3  # promises of each model that are followed

@@ -10,7 +10,7 @@ from typing import Any
 from srfcli.errors import SrfError
 from srfcli.inference.fit import Fit, Interrupted, Problem, fit_problem, held_fit
 from srfcli.inference.rough import ALIKE, SURELY, SharedFit, fit_shared, shared_field
-from srfcli.inference.starts import Fitter, fit_from_several
+from srfcli.inference.starts import fit_from_several
 from srfcli.inference.statespace import StateSpaceFit, as_fit, fit_state_space, stopped
 from srfcli.model import open_model
 from srfcli.numerics.collocation import Array
@@ -18,8 +18,6 @@ from srfcli.numerics.compiled import compiler
 from srfcli.recording.values import Experiment
 from srfcli.registry import Registry
 from srfcli.status import Status
-
-TRACKS = ("smooth", "rough", "shared")
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ def _track(found: StateSpaceFit) -> Track:
 
 def _shared(found: SharedFit) -> Track:
     roughness = found.roughness
-    return Track(roughness.amplitude, roughness.length, bool(roughness.amplitude)) if roughness.amplitude else Track()
+    return Track(roughness.amplitude, roughness.length, True) if roughness.amplitude else Track()
 
 
 def _without_compiler(
@@ -128,9 +126,8 @@ def _without_compiler(
         raise SrfError(f"--track {track} needs a C compiler", "Install one, or the package ziglang.")
     model = open_model(registry, **asdict(experiment.choice))
     problem = fit_problem(model, experiment, free=free, trend=trend)
-    fitter: Fitter | None = None
     try:
-        several = fit_from_several(problem, fitter=fitter, count=starts, seed=seed, progress=progress)
+        several = fit_from_several(problem, count=starts, seed=seed, progress=progress)
     except Interrupted as error:
         return RecordingFit(problem, held_fit(problem, error.values), None, None, (), Status.INTERRUPTED)
     status = Status.INTERRUPTED if several.interrupted else several.best.status

@@ -681,7 +681,7 @@ def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[s
     return best[1]
 
 
-def as_fit(found: StateSpaceFit, *, status: Status | None = None) -> Fit:
+def as_fit(found: StateSpaceFit) -> Fit:
     """Return a state-space fit as other fits are: predictions are those of each reading from the ones before it.
 
     Residuals are innovations over their own standard deviation, in units of the gauge's white noise. Runs held out are filtered
@@ -705,5 +705,5 @@ def as_fit(found: StateSpaceFit, *, status: Status | None = None) -> Fit:
         )
     return Fit(
         problem.names, problem.named(maximum.point.x[:k]), maximum.covariance[:k, :k], problem.lower, problem.upper,
-        tuple(runs), found.log_likelihood, status or maximum.status, found.evaluations,
+        tuple(runs), found.log_likelihood, maximum.status, found.evaluations,
     )  # fmt: skip
