@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from srfcli.diagnosis.candidates import Hypothesis, applicable, own_parameters
-from srfcli.diagnosis.model_search import ModelSearch, conclude, log_evidence
-from srfcli.diagnosis.statespace_scores import Scores
-from srfcli.inference.statespace import Likelihood, fit_state_space
+from srfcli.diagnosis.model_search import CLOSE, ModelSearch, conclude, log_evidence
+from srfcli.diagnosis.statespace_scores import Remainder, Scores
+from srfcli.inference.statespace import COLOUR, Likelihood, correlated, fit_state_space
 from srfcli.numerics.compiled import compiler
 from srfcli.proof.draw import Gauge
 from srfcli.proof.folder import case_files
@@ -33,12 +33,12 @@ FEW = ("linker-dieterich", "viscous-drag", "friction-drift", "slip-evolution", "
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
 
 
-def recorded(folder, physics, *, baseline=None, seed=5):
-    """Write an experiment whose runs each slid on a rough track of their own, and return its folder."""
+def recorded(folder, physics, *, baseline=None, seed=5, shared=False, gauge=None):
+    """Write an experiment whose runs each slid on a rough track of their own, or all on one, and return its folder."""
     rng, readings = np.random.default_rng(seed), {}
     for number, plan in enumerate(PLANS):
-        own = replace(physics, track=Track(3e-4, 6.0, 100 * seed + number))
-        readings[plan] = read_gauge(move(own, plan).u, Gauge(), rng)
+        own = replace(physics, track=Track(3e-4, 6.0, 100 * seed + (0 if shared else number)))
+        readings[plan] = read_gauge(move(own, plan).u, gauge or Gauge(), rng)
     for name, text in case_files("small", baseline or Physics(), readings).items():
         (folder / name).write_text(text)
     return folder
@@ -110,9 +110,35 @@ def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
         x[likelihood.names.index(longs[column.name])] = step  # beyond a bound too
         gained.append(likelihood.at(x, slopes=False).log_likelihood)
     slope = (gained[0] - gained[1]) / (2 * size)
-    first = float(column.columns[:, 0] @ scores.rest)
+    first = float(column.columns[:, 0] @ scores.remainder.rest)
     spread = float(np.linalg.norm(column.columns[:, 0]))  # standard deviation of the slope
     assert abs(slope - first) < 0.15 * spread
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, shared):
+    """The gain of a shared field against a Gaussian density with its covariance written out, and its sign."""
+    experiment = read_experiment(recorded(tmp_path, Physics(), shared=shared), registry=SHIPPED, holdout=False)
+    fitted = fit_state_space(Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True), processes=0)
+    remainder = Remainder(fitted)
+    assert (remainder.shared.gain > CLOSE) == shared
+    if shared:
+        found = remainder.shared
+        absorbed = (found.u * found.absorbed) @ found.u.T  # I - inverse of the covariance
+        inverse = np.eye(remainder.left.size) - absorbed
+        gain = 0.5 * remainder.left @ absorbed @ remainder.left + 0.5 * np.linalg.slogdet(inverse)[1]
+        assert gain == pytest.approx(found.gain, rel=1e-8)
+
+
+def test_coloured_gauge_noise_is_not_taken_for_a_fine_field(tmp_path):
+    """From the file's start values the fit is as likely as from the field that was drawn."""
+    folder = recorded(tmp_path, Physics(), gauge=Gauge(lag1=0.7))
+    experiment = read_experiment(folder, registry=SHIPPED, holdout=False)
+    problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
+    found = fit_state_space(problem)
+    drawn = {"field_amplitude": 3e-4, "field_length": 6.0 * np.sqrt(3)}
+    assert found.log_likelihood > fit_state_space(problem, start=drawn, processes=1, smooth=False).log_likelihood - 1.0
+    assert correlated(found.maximum.point) < COLOUR
 
 
 def test_evidence_charges_for_what_is_free(tmp_path):

@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, neutral_values, own_parameters
-from srfcli.diagnosis.statespace_scores import Score, Scores
+from srfcli.diagnosis.statespace_scores import Remainder, Score, Scores
 from srfcli.errors import SrfError
 from srfcli.inference.fit import Problem
 from srfcli.inference.noise import stretches, white_level
 from srfcli.inference.statespace import (
+    NEEDED,
     Filtered,
     Likelihood,
     StateSpaceFit,
@@ -54,7 +55,10 @@ LOUD = 1.15  # gauge noise over that which differences of the recording show, be
 BUDGET = 150.0  # s of CPU
 SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 ASTRAY = 1000.0  # in log likelihood below its parent, from where a model is not fitted
-BUILT = 5  # sizes of what is built in, a mass or an interface, that are tried
+BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
+FAR = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
+AGAIN = 6  # of them, about the best, whose other parameters are fitted too where the model fails a test
+HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
 FOLLOWED = (
     0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 )
@@ -113,9 +117,7 @@ class _Move:
     values: dict[str, float] = field(compare=False)
     sizes: tuple[dict[str, float], ...] = field(compare=False)
     least: float = field(compare=False, default=-np.inf)  # log likelihood from which it is worth a fit
-    fresh: int = field(
-        compare=False, default=0
-    )  # how many of the last effects are new, at sizes that are only expected
+    fresh: int = field(compare=False, default=0)  # of the last effects, at sizes that are only expected; -1: once more
 
 
 class ModelSearch:
@@ -139,6 +141,7 @@ class ModelSearch:
         self.queue: list[_Move] = []
         self.count = 0
         self.processes = 0
+        self.shared = False
 
     # ------------------------------------------------------------------ models and their fits
 
@@ -165,7 +168,7 @@ class ModelSearch:
         for share in SHARES:
             values = dict(move.values)
             for number, (effect, sizes) in enumerate(zip(move.model.effects, move.sizes, strict=True)):
-                part = share if number >= len(move.sizes) - move.fresh else 1.0
+                part = share if number >= len(move.sizes) - max(move.fresh, 0) else 1.0
                 longs = {p.name: long for long, p in own_parameters(effect, own).items()}
                 neutral = neutral_values(effect)
                 for name, value in sizes.items():
@@ -189,6 +192,8 @@ class ModelSearch:
 
     def _judged(self, model: Model, found: StateSpaceFit) -> Fitted:
         evidence = log_evidence(found) + self._prior(model)
+        if self.shared:
+            evidence += max(Remainder(found).shared.gain - CLOSE, 0.0)
         return Fitted(model, found, evidence, tuple(shortcomings(found)))
 
     def _prior(self, model: Model) -> float:
@@ -207,8 +212,6 @@ class ModelSearch:
         self.progress("baseline")
         base = self._record(self.fit(None))
         base = self._expand(base)
-        if base.fine and not any(s.gain > WORTH for s in base.promised):
-            return base
         self._search()
         for further in (self._together, self._swap):  # dearer, or less likely
             if not self.best().fine and not self.spent:
@@ -236,6 +239,11 @@ class ModelSearch:
             except SrfError as error:
                 self.excluded.append(Excluded(move.model.name, error.message))
                 continue
+            if found is self.best() and not found.fine and move.fresh >= 0:
+                again = self._again(found)
+                if again:
+                    heapq.heappush(self.queue, again)
+                    continue
             if found is self.best() and len(found.model.effects) < LARGEST:
                 self._expand(found)
 
@@ -248,10 +256,13 @@ class ModelSearch:
         self.progress(f"{node.model.name}: scores")
         scores = Scores(self.registry, self._experiment(node.model), node.fit, present, joining)
         self.excluded += scores.excluded
+        if not node.model.reported and scores.shared.gain > CLOSE:  # all runs share a field
+            self.shared = True
+            node = replace(node, evidence=node.evidence + scores.shared.gain - CLOSE)
         node = replace(node, scores=scores)
         self.fitted[node.model.name] = node
         one = -float(np.log(2 * len(self.candidates))) - 3.0  # prior and Occam's factor of an effect
-        least = WORTH if node.fine else WORTH / 2
+        least = WORTH if node.fine and node.fit.smooth and not node.fit.likelihood.processes else HINT
         for score in [s for s in scores.singles if s.gain > least][:SINGLES]:
             model = Model((*present, score.effect), node.model.ageing)
             self._push(node.evidence + score.gain + one, model, node, (*self._sizes(node), score.values))
@@ -260,10 +271,9 @@ class ModelSearch:
                 self._build(node, effect, one)
         return node
 
-    def _sizes(self, node: Fitted) -> tuple[dict[str, float], ...]:
-        """Return the fitted values of a model's effects by the effects' own names."""
-        model = node.fit.likelihood.problem.model
-        values = node.fit.values
+    def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
+        """Return the values of a model's effects, those fitted if left out, by the effects' own names."""
+        model, values = node.fit.likelihood.problem.model, values or node.fit.values
         return tuple(
             {p.name: values[long] for long, p in own_parameters(e, model).items() if long in values}
             | {n: values[n] for n in e.frees if n in values}
@@ -304,19 +314,41 @@ class ModelSearch:
         x = likelihood.coordinates(_followable(node.fit.values, problem))
         low, high = likelihood.lower[place], likelihood.upper[place]
         trials = []
-        for size in np.geomspace(max(low, 1e-3 * high), high, BUILT + 2)[1:-1]:
+        for size in np.geomspace(max(low, 1e-3 * high), high, BUILT):
             y = x.copy()
             y[place] = size
-            trials.append((likelihood.at(y, slopes=False).log_likelihood, size))
-        best, size = max(trials)
+            trials.append((likelihood.at(y, slopes=False).log_likelihood, y))
+        best, x = max(trials, key=lambda t: t[0])
         if np.isfinite(best):
-            x[place] = size
             found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
             values = found.point.values
             self.count += 1
             expected = found.point.log_likelihood - node.fit.log_likelihood + node.evidence + one
             sizes = (*self._sizes(node), {own[0]: values[own[0]]})
             heapq.heappush(self.queue, _Move(-expected, self.count, model, dict(values), sizes))
+
+    def _again(self, node: Fitted) -> _Move | None:
+        """Return a model that fails a test from another size of what is built in, where that is likelier: a false maximum."""
+        built = [p.name for e in node.model.effects if e.settings for p in e.parameters]
+        likelihood = node.fit.likelihood
+        name = next((n for n in likelihood.problem.names if n in built), None)
+        if name is None:
+            return None
+        place, x = likelihood.names.index(name), node.fit.maximum.point.x
+        trials = []
+        for ratio in np.geomspace(1 / FAR, FAR, AGAIN):
+            y = likelihood.coordinates(_followable(node.fit.values, likelihood.problem))
+            y[place] = np.clip(x[place] * ratio, likelihood.lower[place], likelihood.upper[place])
+            trials.append(maximise(likelihood, y, held=[name], steps=3, close=1.0, progress=self.progress))
+        likeliest = max(trials, key=lambda f: f.point.log_likelihood)
+        found = maximise(likelihood, likeliest.point.x, steps=4, close=1.0, progress=self.progress)
+        gain = found.point.log_likelihood - node.fit.log_likelihood
+        if gain < NEEDED:
+            return None
+        self.count += 1
+        values = dict(found.point.values)
+        expected = node.evidence + gain + WORTH
+        return _Move(-expected, self.count, node.model, values, self._sizes(node, values), fresh=-1)
 
     def _together(self, node: Fitted) -> None:
         """Push the pairs of effects that promise more together than the best alone."""

@@ -20,7 +20,7 @@ from srfcli.diagnosis.candidates import Excluded, inner_grid, neutral_values, ow
 from srfcli.diagnosis.columns import Shape, along_table
 from srfcli.errors import SrfError
 from srfcli.inference.rough import slip_along
-from srfcli.inference.statespace import Filtered, Point, StateSpaceFit, field_columns, filter_run
+from srfcli.inference.statespace import Filtered, StateSpaceFit, field_columns, filter_run
 from srfcli.laws import Effect
 from srfcli.model import GeneratedModel, open_model
 from srfcli.numerics.collocation import Array
@@ -28,6 +28,7 @@ from srfcli.recording.values import Experiment, Run
 from srfcli.registry import Registry
 from srfcli.units import split_quantity, to_base
 
+NODES, MOST_NODES = 0.4, 400  # of a shared field: correlation lengths between them; how many
 FINE = 20  # points between samples at which a function of slip or stage is averaged
 
 
@@ -68,6 +69,75 @@ class _Column:
     columns: Array
 
 
+@dataclass(frozen=True)
+class SharedField:
+    """A random friction field that all runs share, at first order: `gain` in log marginal likelihood at its best `amplitude`.
+
+    In directions `u` (2 m, q) it absorbs the parts `absorbed` (q,) of what is left, `left` (q,).
+    """
+
+    u: Array = field(repr=False)
+    absorbed: Array = field(repr=False)
+    left: Array = field(repr=False)
+    gain: float
+    amplitude: float = 0.0
+
+
+class Remainder:
+    """What a fit leaves, `left` (2 m,): standardised innovations and their squares, projected off what was fitted.
+
+    `rest` (2 m,) is the same before that, `base` (2 m, p) are orthonormal directions of what was fitted.
+    """
+
+    def __init__(self, fitted: StateSpaceFit) -> None:
+        self.fitted, point = fitted, fitted.maximum.point
+        self.rest = np.concatenate([_stacked(f.white, (f.white**2 - 1) / np.sqrt(2)) for f in point.runs])
+        base = np.zeros((self.rest.size, len(fitted.likelihood.names)))
+        at = 0
+        for f in point.runs:
+            block = _stacked(*_whitened(f))
+            base[at : at + len(block), [fitted.likelihood.names.index(n) for n in f.names]] = block
+            at += len(block)
+        size = np.linalg.norm(base, axis=0)
+        base = base[:, size > 0] / size[size > 0]
+        u, s, _ = np.linalg.svd(base, full_matrices=False)
+        self.base = u[:, s > 1e-7 * s[0]]
+        self.left = self.free(self.rest)
+
+    def free(self, columns: Array) -> Array:
+        """Return columns (2 m, k) projected off what was fitted."""
+        return np.asarray(columns - self.base @ (self.base.T @ columns))
+
+    @cached_property
+    def runs(self) -> tuple[Filtered, ...]:
+        """Return the runs filtered once more, with what the smoother needs."""
+        return self.fitted.likelihood.at(self.fitted.maximum.point.x, slopes=False, keep=True).runs
+
+    @cached_property
+    def shared(self) -> SharedField:
+        """Return the field that all runs share, of the correlation length that each run's own has."""
+        if self.fitted.smooth or len(self.fitted.likelihood.problem.runs) < 2:
+            return SharedField(np.zeros((self.left.size, 0)), np.zeros(0), np.zeros(0), 0.0)
+        values, states = self.fitted.values, self.fitted.likelihood.problem.model.states
+        slips = [slip_along(f.run, f.found.kept.mean, states) for f in self.runs if f.found.kept]
+        first, last = min(s.min() for s in slips), max(s.max() for s in slips)
+        count = int(np.clip(np.ceil((last - first) / (NODES * values["field_length"])) + 1, 2, MOST_NODES))
+        nodes = np.linspace(first, last, count)
+        r = np.sqrt(3) * np.abs(nodes[:, None] - nodes) / values["field_length"]
+        root = np.linalg.cholesky((1 + r) * np.exp(-r) + 1e-9 * np.eye(count))
+        hat = Shape("slip", lambda s, k: np.interp(s, nodes, np.arange(count) == k), ("node",))
+        columns = np.concatenate([_carried(f, self.fitted, [(hat, [k]) for k in range(count)]) for f in self.runs])
+        u, size, _ = np.linalg.svd(self.free(columns @ root), full_matrices=False)
+        left = u.T @ self.left
+        best = SharedField(u, np.zeros(count), left, 0.0)
+        for amplitude in values["field_amplitude"] * np.geomspace(0.01, 3.0, 30):
+            power = (amplitude * size) ** 2
+            gain = 0.5 * float(np.sum(left**2 * power / (1 + power) - np.log1p(power)))
+            if gain > best.gain:
+                best = SharedField(u, power / (1 + power), left, gain, float(amplitude))
+        return best
+
+
 class Scores:
     """The scores around a fit of a model that has the effects `present`; `excluded` are those that cannot join it."""
 
@@ -81,24 +151,10 @@ class Scores:
     ) -> None:
         self.registry, self.experiment, self.fitted, self.present = registry, experiment, fitted, tuple(present)
         self.excluded: list[Excluded] = []
-        point = fitted.maximum.point
-        self.rest = np.concatenate([_stacked(f.white, (f.white**2 - 1) / np.sqrt(2)) for f in point.runs])
-        base = np.zeros((self.rest.size, len(fitted.likelihood.names)))
-        at = 0
-        for f in point.runs:
-            block = _stacked(*_whitened(f))
-            base[at : at + len(block), [fitted.likelihood.names.index(n) for n in f.names]] = block
-            at += len(block)
-        size = np.linalg.norm(base, axis=0)
-        base = base[:, size > 0] / size[size > 0]
-        u, s, _ = np.linalg.svd(base, full_matrices=False)
-        self.base = u[:, s > 1e-7 * s[0]]
-        self.left = self._free(self.rest)
+        self.remainder = Remainder(fitted)
+        self.shared = self.remainder.shared
         self.columns = self._all(candidates)
         self.singles = self._singles()
-
-    def _free(self, columns: Array) -> Array:
-        return np.asarray(columns - self.base @ (self.base.T @ columns))
 
     def _all(self, candidates: Sequence[Effect]) -> list[_Column]:
         shapes = {e.name: shape for e in candidates if (shape := along_table(e)) is not None}
@@ -187,18 +243,14 @@ class Scores:
 
     def _lagging(self) -> Array:
         """Return the column of a gauge that follows late: of first order in the delay, it shows less by what u gained in it."""
-        blocks = [_carried(f, self.fitted, (), late=True) for f in self._kept.runs]
+        blocks = [_carried(f, self.fitted, (), late=True) for f in self.remainder.runs]
         return np.concatenate(blocks)
-
-    @cached_property
-    def _kept(self) -> Point:
-        return self.fitted.likelihood.at(self.fitted.maximum.point.x, slopes=False, keep=True)
 
     def _along(self, effects: Sequence[Effect], shapes: Mapping[str, Shape]) -> list[_Column]:
         """Return the columns of effects that are functions of slip, time or stage position, for all inner values."""
         wanted = [(e, group) for e in effects for group in _phases(inner_grid(e))]
         blocks = []
-        for f in self._kept.runs:
+        for f in self.remainder.runs:
             functions = [
                 (shapes[e.name], [inner.get(n, 0.0) for n in shapes[e.name].inner])
                 for e, group in wanted
@@ -214,14 +266,24 @@ class Scores:
 
     def _judge(self, columns: Array) -> tuple[float, Array, Array, Array]:
         """Return gain, sizes, their covariance and the free columns."""
-        free = self._free(columns)
-        gram, g = free.T @ free, free.T @ self.left
+        free = self.remainder.free(columns)
+        gram, g = free.T @ free, free.T @ self.remainder.left
+        plain = self._solved(gram, g)
+        if not self.shared.gain:
+            return (*plain, free)
+        along = self.shared.u.T @ free
+        kept = along * self.shared.absorbed[:, None]
+        beside = self._solved(gram - along.T @ kept, g - kept.T @ self.shared.left)
+        gain = max(plain[0] - self.shared.gain, beside[0])
+        return (gain, *(beside if gain == beside[0] else plain)[1:], free)
+
+    def _solved(self, gram: Array, g: Array) -> tuple[float, Array, Array]:
         d = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         values, vectors = np.linalg.eigh(gram / np.outer(d, d))
         keep = values > 1e-9 * max(values[-1], 1e-300)
         inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T / np.outer(d, d)
         size = inverse @ g
-        return 0.5 * float(g @ size), size, inverse, free
+        return 0.5 * float(g @ size), size, inverse
 
     def _singles(self) -> list[Score]:
         best: dict[str, Score] = {}

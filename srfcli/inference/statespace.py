@@ -12,9 +12,10 @@ Kristensen, Madsen and Jorgensen, Automatica 40 (2004); Hartikainen and Sarkka 2
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import TypeVar
 
 import numpy as np
@@ -48,6 +49,8 @@ PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 
 STEPS = 40  # of Fisher scoring
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
+TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
+COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
 DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
 
@@ -581,11 +584,16 @@ def _with_or_without(
         return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
 
     tried: StateSpaceFit | None = None
+    elsewhere = False  # a field finer than the samples, or one that is slow, may be a maximum of its own
     while rough.evaluations - before < STEPS:
         last = found.point.x
         found = maximise(rough, last, steps=3, close=close, progress=progress)
         if found.away < close or np.array_equal(found.point.x, last):
-            break
+            other = None if elsewhere else _small_field(rough, found.point, at)
+            if other is None:
+                break
+            elsewhere, found = True, replace(found, point=other)
+            continue
         if found.point.x[at] < last[at] - SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
             found = replace(found, point=_shrunk(rough, found.point, at))
         if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
@@ -612,10 +620,10 @@ def _with_or_without(
 
 
 def _small_field(rough: Likelihood, bare: Point, at: int) -> Point | None:
-    """Return the likeliest of a few small fields about a fit without one, None where none of them gains enough."""
+    """Return the likeliest of a few small fields beside a fit without one or with another, None where none gains enough."""
     length = rough.names.index("field_length")
     best: tuple[float, Array] | None = None
-    for share in (0.03, 0.1, 0.3):
+    for share in (0.03, 0.1, 0.3, 1.0):
         for short in SHORT:
             x = rough.coordinates(bare.values)
             x[at], x[length] = rough.lower[at] + np.log(share * FAINT / SMALL), rough.start[length] + np.log(short)
@@ -638,22 +646,47 @@ def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
 
 
 def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str], None]) -> StateSpaceFit:
-    """Return the fit with one more process of gauge noise, from the likeliest of a few correlation times."""
-    names = gauge_process(wider.processes)
-    times, sizes = ([i for i, n in enumerate(wider.names) if n.startswith(name)] for name in names)
-    base = wider.coordinates(fitted.values)
-    for i, name in enumerate(wider.names):
-        if name.startswith("gauge_white"):
-            base[i] += np.log(0.7)
-    base[sizes] = base[[i for i, n in enumerate(wider.names) if n.startswith("gauge_white")]]
-    trials = []
-    for share in (0.02, 0.3, 0.6, 0.9):  # of the way from the shortest time to the longest
-        x = base.copy()
-        x[times] = (wider.lower + share * (wider.upper - wider.lower))[times]
-        trials.append((wider.at(np.clip(x, wider.lower, wider.upper), slopes=False).log_likelihood, x))
+    """Return the fit with one more process of gauge noise, from the likeliest correlation time and share of each kind of run."""
+    time, size = gauge_process(wider.processes)
+    kinds = {
+        own[time]: [wider.names.index(own[name]) for name in ("gauge_white", time, size)] for own in wider.own.values()
+    }
+    wide, x = wider.upper - wider.lower, wider.coordinates(fitted.values)
+    best = -np.inf
+    for base in _slow_fields(wider, x):
+        likeliest: dict[str, tuple[float, Array]] = {}  # each kind of run has its own noise
+        for share, part in product(TIMES, COLOURED):
+            trial = base.copy()
+            for white, at, colour in kinds.values():
+                trial[at] = wider.lower[at] + share * wide[at]
+                trial[white], trial[colour] = base[white] + 0.5 * np.log([1 - part, part])
+            trial = np.clip(trial, wider.lower, wider.upper)
+            found = dict.fromkeys(kinds, 0.0)
+            for f in wider.at(trial, slopes=False).runs:
+                found[wider.own[f.run.name][time]] += f.log_likelihood
+            for kind, likelihood in found.items():
+                if kind not in likeliest or likelihood > likeliest[kind][0]:
+                    likeliest[kind] = likelihood, trial[kinds[kind]]
+        total = sum(likelihood for likelihood, _ in likeliest.values())
+        if total > best:
+            best, x = total, base
+            for kind, (_, noise) in likeliest.items():
+                x[kinds[kind]] = noise
     progress(f"coloured gauge noise: {wider.processes}")
-    found = maximise(wider, max(trials, key=lambda t: t[0])[1], steps=8, close=1.0, progress=progress)
-    return StateSpaceFit(wider, found, wider.evaluations)
+    maximum = maximise(wider, x, steps=8, close=1.0, progress=progress)
+    return StateSpaceFit(wider, maximum, wider.evaluations)
+
+
+def _slow_fields(wider: Likelihood, x: Array) -> Iterator[Array]:
+    """Yield x, and x with a field that is too slow to have taken up what is the gauge's."""
+    yield x.copy()
+    if wider.smooth:
+        return
+    amplitude, length = (wider.names.index(n) for n in FIELD)
+    for share in (0.1, 1.0):
+        slow = x.copy()
+        slow[amplitude], slow[length] = wider.lower[amplitude] + np.log(share * FAINT / SMALL), wider.start[length]
+        yield slow
 
 
 def _counted(fitted: StateSpaceFit, more: int) -> StateSpaceFit:
