@@ -132,6 +132,7 @@ def open_model(
 def _source(registry: Registry, kind: str, name: str) -> tuple[Law, str]:
     """Return a law without its formula, and the hash of its source: a registered name or a file, as Registry.get takes them."""
     if name.endswith((".toml", ".py")):
+        registry.check_trusted(name)
         try:
             return Law(name, source=name), hashlib.sha256(Path(name).read_bytes()).hexdigest()
         except OSError as error:

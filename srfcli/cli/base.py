@@ -24,12 +24,13 @@ CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_w
 
 @dataclass
 class Session:
-    """The switches of one run of `srf`; -q, -v and --debug may stand before or after the command's name."""
+    """The switches of one run of `srf`; -q, -v, --debug and --trust may stand before or after the command's name."""
 
     arguments: tuple[str, ...] = ()
     quiet: bool = False
     verbose: int = 0
     debug: bool = False
+    trust: bool = False
 
     @staticmethod
     def current() -> Session:
@@ -55,17 +56,18 @@ def _switch(context: click.Context, parameter: click.Parameter, value: Any) -> N
 
 
 def switches() -> list[click.Option]:
-    """Return the options -q, -v and --debug; they set the session and are no argument of the command."""
+    """Return the options -q, -v, --debug and --trust; they set the session and are no argument of the command."""
     common: dict[str, Any] = {"expose_value": False, "callback": _switch, "is_eager": True}
     return [
         click.Option(["-q", "--quiet"], is_flag=True, help="No progress and no remarks on stderr.", **common),
         click.Option(["-v", "--verbose"], count=True, help="Say more on stderr.", **common),
         click.Option(["--debug"], is_flag=True, help="Show the traceback of an error.", **common),
+        click.Option(["--trust"], is_flag=True, help="Run Python that an experiment or srf.toml names.", **common),
     ]
 
 
 class SrfCommand(click.Command):
-    """A command with -q, -v and --debug, whose epilog, the examples, is printed as it is written."""
+    """A command with the switches, whose epilog, the examples, is printed as it is written."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

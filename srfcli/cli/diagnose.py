@@ -49,14 +49,14 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
     explain beyond the baseline's own parameters and a rough track. Held-out runs are opened when the models are final, and judge
     them. Verdicts are none, identified, ambiguous, unknown and inconclusive.
     """
-    from srfcli.registry import load_registry
+    from srfcli.cli.options import open_registry
 
     folder = None if options["out"] is None else Path(options["out"]).expanduser()
     if folder is not None:
         from srfcli.cli.diagnose_out import check_answer
 
         check_answer(folder, force=options["force"])
-    registry = load_registry(plugins)
+    registry = open_registry(plugins)
     _check_effects(registry, effects)
     _diagnose(source, registry, effects, folder, options)
 

@@ -51,9 +51,9 @@ def law() -> None:
 @plugins_option
 def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
     """Show formula, parameters and references of a law; NAME may be a file."""
-    from srfcli.registry import load_registry
+    from srfcli.cli.options import open_registry
 
-    found = _find(load_registry(plugins), name, kind)
+    found = _find(open_registry(plugins), name, kind)
     if as_json:
         documents = [_document(one) for one in found]
         click.echo(json.dumps({"schema": "srf.law/1", "laws": documents}, indent=2, allow_nan=False))
@@ -103,10 +103,10 @@ def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, 
 
     Of an effect: parses, units, a neutral value at which the model is the baseline, derivatives.
     """
+    from srfcli.cli.options import open_registry
     from srfcli.lawcheck import Outcome, check_law
-    from srfcli.registry import load_registry
 
-    registry = load_registry(plugins)
+    registry = open_registry(plugins)
     try:
         outcomes = [outcome for one in _find(registry, name, kind) for outcome in check_law(one)]
     except SrfError as error:

@@ -125,7 +125,11 @@ def _build(command: tuple[str, ...], source: str, path: Path) -> Path:
         text.write_text(source, encoding="utf-8")
         end = [] if sys.platform == "win32" else ["-lm"]
         done = subprocess.run(
-            [*command, *flags(), "-o", str(library), str(text), *end], capture_output=True, text=True, check=False
+            [*command, *flags(), "-o", str(library), str(text), *end],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "PYTHONSAFEPATH": "1"},  # `python -m ziglang` would look in the current folder first
         )
         if done.returncode:
             first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])

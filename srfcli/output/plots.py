@@ -7,6 +7,7 @@ import importlib.util
 import io
 import itertools
 import logging
+import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -72,13 +73,25 @@ def _missing() -> SrfError:
     return SrfError("--plot needs matplotlib, which is not installed", 'pip install "srfcli[plot]"')
 
 
+def load_matplotlib() -> None:
+    """Import matplotlib from elsewhere than the current folder, whose `matplotlibrc` it would read: it may be a stranger's."""
+    if "matplotlib" in sys.modules:
+        return
+    try:
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError):  # a current folder that is gone holds no settings either
+                stack.enter_context(contextlib.chdir(Path(__file__).parent))
+            import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise _missing() from error
+
+
 @contextlib.contextmanager
 def house_style() -> Iterator[None]:
     """Draw and save with the house's settings, whatever the user's matplotlibrc says."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise _missing() from error
+    load_matplotlib()
+    import matplotlib
+
     logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # cache chatter is not the user's concern
     with matplotlib.rc_context():
         matplotlib.rcParams.update({k: v for k, v in matplotlib.rcParamsDefault.items() if not k.startswith("backend")})

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.plots import COLOURS, house_style
+from srfcli.output.plots import COLOURS, house_style, load_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +24,7 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
     A run is {name, t, observed, label, used, V, W, holdout, gaps}: arrays (n,), `label` the observable with its unit, `gaps`
     pairs of times. Samples that are not used are marked, gaps are shaded.
     """
+    load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.plots import COLOURS, DASHES, Values, house_style
+from srfcli.output.plots import COLOURS, DASHES, Values, house_style, load_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,6 +57,7 @@ def _several(records: Sequence[Mapping[str, Any]], title: str) -> Figure:
 
 
 def _grid(rows: int, columns: int, *, size: tuple[float, float]) -> tuple[Figure, list[list[Axes]]]:
+    load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
