@@ -6,10 +6,11 @@ import contextlib
 import difflib
 import errno
 import io
+import logging
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn, cast
 
@@ -128,10 +129,37 @@ class SrfGroup(click.Group):
         sys.exit(_run(self, arguments, session, prog_name=prog_name or "srf", obj=session, **extra))
 
 
+class _Told(logging.Handler):
+    """What the package warns of, as one line on stderr."""
+
+    def __init__(self, session: Session) -> None:
+        super().__init__(logging.WARNING)
+        self.session = session
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.session.say(f"Warning: {record.getMessage()}")
+
+
+@contextlib.contextmanager
+def _telling(session: Session) -> Iterator[None]:
+    log, told = logging.getLogger("srfcli"), _Told(session)
+    log.addHandler(told)
+    try:
+        yield
+    finally:
+        log.removeHandler(told)
+
+
 def _run(group: click.Group, arguments: list[str], session: Session, **extra: Any) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for a Greek letter, it does not fail
+    with _telling(session):
+        return _ended(group, arguments, session, **extra)
+
+
+def _ended(group: click.Group, arguments: list[str], session: Session, **extra: Any) -> int:
+    """Run the command and return its exit code, every error told."""
     try:
         code = click.Group.main(group, arguments, standalone_mode=False, **extra)
         sys.stdout.flush()  # here, where a closed pipe can still be caught
