@@ -10,13 +10,13 @@ import logging
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn, TextIO, cast
 
 import click
 
-from srfcli.errors import ExpressionError, SrfError, did_you_mean
+from srfcli.errors import ExpressionError, SrfError, did_you_mean, printable
 
 EXIT_OK, EXIT_UNEXPECTED, EXIT_USAGE, EXIT_PARTIAL, EXIT_CONDITION, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
 
@@ -42,12 +42,12 @@ class Session:
     def say(self, text: str) -> None:
         """Write one line to stderr, unless -q was given."""
         if not self.quiet:
-            click.echo(text, err=True)
+            click.echo(printable(text, line=True), err=True)
 
     def detail(self, text: str) -> None:
         """Write one line to stderr if -v was given."""
         if self.verbose and not self.quiet:
-            click.echo(text, err=True)
+            click.echo(printable(text, line=True), err=True)
 
 
 def _switch(context: click.Context, parameter: click.Parameter, value: Any) -> None:
@@ -129,6 +129,42 @@ class SrfGroup(click.Group):
         sys.exit(_run(self, arguments, session, prog_name=prog_name or "srf", obj=session, **extra))
 
 
+class Screen:
+    """A text stream on which nothing acts: whatever is written to it is made printable; `unescaped` is the stream below.
+
+    All of stdout and stderr goes through one, tracebacks and what libraries say too. It has no `buffer`, which would be a way
+    round.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.unescaped = stream
+
+    def write(self, text: str) -> int:
+        """Write the text, printable."""
+        self.unescaped.write(printable(text))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Write every text, printable."""
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("buffer", "detach"):
+            raise AttributeError(name)
+        return getattr(self.unescaped, name)
+
+
+@contextlib.contextmanager
+def _screened() -> Iterator[None]:
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (cast(TextIO, Screen(s)) for s in before)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
 class _Told(logging.Handler):
     """What the package warns of, as one line on stderr."""
 
@@ -154,7 +190,7 @@ def _run(group: click.Group, arguments: list[str], session: Session, **extra: An
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for a Greek letter, it does not fail
-    with _telling(session):
+    with _screened(), _telling(session):
         return _ended(group, arguments, session, **extra)
 
 

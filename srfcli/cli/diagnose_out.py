@@ -104,11 +104,12 @@ def write_answer(
     from srfcli.diagnosis.augment import augment
     from srfcli.diagnosis.diagram import stability
     from srfcli.output.provenance import Provenance, write_sidecar
+    from srfcli.output.records import json_text
     from srfcli.recording.experiment import read_experiment
 
     last = final(diagnosis)
     with whole_folder(folder, force=force) as fresh:
-        text = (json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+        text = (json_text(found, indent=2) + "\n").encode("utf-8")
         write_atomic(fresh / ANSWER, text)
         runs = diagnosis.experiment.runs
         inputs = (diagnosis.experiment.path, *dict.fromkeys(r.file for r in runs))

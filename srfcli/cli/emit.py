@@ -13,7 +13,7 @@ import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, EXIT_OK, EXIT_PARTIAL, Session
 from srfcli.cli.options import OutputOptions
-from srfcli.errors import SrfError
+from srfcli.errors import SrfError, printable
 from srfcli.laws import Law
 from srfcli.output import records, tables
 from srfcli.output.files import is_special, write_atomic
@@ -115,6 +115,7 @@ class Progress:
     def __init__(self, label: str, total: int | None = None, *, stream: Any = None, quiet: bool | None = None) -> None:
         self.label, self.total, self.done = label, total, 0
         self._stream = sys.stderr if stream is None else stream
+        self._raw = getattr(self._stream, "unescaped", self._stream)
         self._active = self._stream.isatty() and not (Session.current().quiet if quiet is None else quiet)
         self._shown_at = 0.0
 
@@ -125,7 +126,7 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._active and self._shown_at:
-            self._stream.write("\r\x1b[K")  # the line was for waiting; nothing of it stays
+            self._raw.write("\r\x1b[K")  # the line was for waiting; nothing of it stays
             self._stream.flush()
 
     def advance(self, steps: int = 1, *, note: str = "") -> None:
@@ -137,5 +138,5 @@ class Progress:
         self._shown_at = now
         count = f"{self.done}" if self.total is None else f"{self.done}/{self.total}"
         line = f"{self.label}: {count}  {note}".rstrip()
-        self._stream.write(f"\r\x1b[K{line[:100]}")
+        self._raw.write(f"\r\x1b[K{printable(line[:100], line=True)}")
         self._stream.flush()

@@ -8,11 +8,12 @@ import io
 import itertools
 import logging
 import sys
+import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from srfcli.errors import SrfError
+from srfcli.errors import SrfError, printable
 from srfcli.output.files import check_target, write_atomic
 
 if TYPE_CHECKING:
@@ -93,10 +94,16 @@ def house_style() -> Iterator[None]:
     import matplotlib
 
     logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # cache chatter is not the user's concern
-    with matplotlib.rc_context():
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)  # a name in a script that the font lacks
         matplotlib.rcParams.update({k: v for k, v in matplotlib.rcParamsDefault.items() if not k.startswith("backend")})
         matplotlib.rcParams.update(STYLE)
         yield
+
+
+def name_text(name: str) -> str:
+    """Return a user's text so that a figure shows it as it is: a dollar sign opens no formula, a line does not break."""
+    return printable(" ".join(name.split())).replace("$", r"\$")
 
 
 def new_figure(rows: int = 1, *, size: tuple[float, float] | None = None) -> tuple[Figure, list[Axes]]:

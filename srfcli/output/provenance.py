@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ from typing import Any
 from srfcli import __version__
 from srfcli.laws import Law
 from srfcli.output.files import write_atomic
+from srfcli.output.records import json_text
 from srfcli.output.tables import plain_value
 
 SCHEMA = "srf.provenance/1"
@@ -41,7 +41,7 @@ def write_sidecar(path: Path, content: bytes, provenance: Provenance) -> Path:
     data = {"schema": SCHEMA, "file": path.name, "sha256": hashlib.sha256(content).hexdigest(), **describe(provenance)}
     data["timings"] = {name: round(seconds, 6) for name, seconds in provenance.timings.items()}
     place = sidecar_path(path)
-    write_atomic(place, json.dumps(plain_value(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_atomic(place, json_text(plain_value(data), indent=2) + "\n")
     return place
 
 

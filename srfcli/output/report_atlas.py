@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srfcli.output.plots import _decade_ticks, house_style, load_matplotlib
+from srfcli.output.plots import _decade_ticks, house_style, load_matplotlib, name_text
 from srfcli.output.recordings import _settle
-from srfcli.output.report_runs import BEFORE, name_text
+from srfcli.output.report_runs import BEFORE
 from srfcli.output.report_text import NARROW, finite, number
 
 if TYPE_CHECKING:

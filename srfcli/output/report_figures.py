@@ -7,9 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srfcli.output.plots import COLOURS, DASHES, DOTTED, _decade_ticks, _gaps, house_style, load_matplotlib, new_figure
+from srfcli.output.plots import (
+    COLOURS,
+    DASHES,
+    DOTTED,
+    _decade_ticks,
+    _gaps,
+    house_style,
+    load_matplotlib,
+    name_text,
+    new_figure,
+)
 from srfcli.output.recordings import _settle, _thinned
-from srfcli.output.report_runs import AFTER, BEFORE, name_text
+from srfcli.output.report_runs import AFTER, BEFORE
 from srfcli.output.report_text import finite
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.output.plots import house_style, load_matplotlib
+from srfcli.output.plots import house_style, load_matplotlib, name_text
 from srfcli.output.recordings import _imposed, _settle, _thinned
 
 if TYPE_CHECKING:
@@ -111,11 +111,6 @@ def local_rms(t: Array, z: Array) -> tuple[Array, Array]:
     pieces = np.array_split(np.arange(t.size), max(min(BLOCKS, t.size // LEAST), 1))
     borders = [t[p[0]] for p in pieces if p.size] + [t[-1]]
     return np.asarray(borders), np.asarray([rms_over_noise(z[p]) for p in pieces if p.size])
-
-
-def name_text(name: str) -> str:
-    """Return a user's text so that a figure shows it as it is: a dollar sign opens no formula, a line does not break."""
-    return " ".join(name.split()).replace("$", r"\$")
 
 
 def overview(traces: Sequence[Trace]) -> Figure:

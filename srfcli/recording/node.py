@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
-from srfcli.errors import SrfError, did_you_mean
+from srfcli.errors import SrfError, did_you_mean, printable
 from srfcli.recording.places import Place, key_lines
 from srfcli.recording.quantities import parse_quantity
 
@@ -37,7 +37,7 @@ class Node:
 
     def fail(self, message: str, hint: str | None = None) -> NoReturn:
         """Raise SrfError that names this place."""
-        raise SrfError(_plain(f"{self.where}: {message}"), hint)
+        raise SrfError(printable(f"{self.where}: {message}", line=True), hint)
 
     def expected(self, what: str, hint: str | None = None) -> NoReturn:
         """Raise SrfError that says what was found here and what was expected."""
@@ -54,7 +54,7 @@ class Node:
     def require(self, key: str, hint: str) -> Node:
         """Return the value under a key; raises SrfError where there is none."""
         if key not in self.value:
-            raise SrfError(_plain(f"{self._where((*self.place, key))}: missing"), hint)
+            raise SrfError(printable(f"{self._where((*self.place, key))}: missing", line=True), hint)
         return self.child(key)
 
     def keys(self, known: Iterable[str]) -> None:
@@ -151,11 +151,6 @@ def shown(value: object) -> str:
     except (ValueError, RecursionError):
         return "a value too long to show"
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _plain(text: str) -> str:
-    """Return the text with what is no printable character escaped, so that it stays on its line."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _spelled(place: Place) -> str:
