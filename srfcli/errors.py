@@ -23,6 +23,24 @@ def printable(text: str, *, line: bool = False) -> str:
     return _UNSEEN.sub(lambda found: ascii(found.group())[1:-1], text)
 
 
+def shortened(text: str, most: int = 2000) -> str:
+    """Return the text, without its middle where it is longer than `most`: a key of 100 kB is told by its ends."""
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
+
+
+def shown(value: object) -> str:
+    """Return a value as a TOML author knows it, cut where it is long."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int) and abs(value) >= 10**60:
+        return "a number of more than 60 digits"
+    try:
+        text = f'"{value}"' if isinstance(value, str) else repr(value)
+    except (ValueError, RecursionError):
+        return "a value too long to show"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
 class SrfError(Exception):
     """Misuse that stops a command: `message` says what and where, `hint` what to do instead.
 
@@ -32,7 +50,7 @@ class SrfError(Exception):
     exit_code = 2
 
     def __init__(self, message: str, hint: str | None = None, *, exit_code: int | None = None) -> None:
-        message, hint = printable(message), hint and printable(hint)
+        message, hint = printable(shortened(message)), hint and printable(shortened(hint))
         super().__init__(message)
         self.message = message
         self.hint = hint

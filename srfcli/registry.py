@@ -16,6 +16,7 @@ from srfcli.lawfile import PLUGIN_KINDS, kind_of, read_header, read_law
 from srfcli.laws import AgeingLaw, AgeingModifier, Law
 from srfcli.pylaw import find_law, find_reader, laws_in, load_module, scan_python
 from srfcli.reader import Reader
+from srfcli.reading import read_plain
 
 GROUP = "srf.laws"
 
@@ -140,7 +141,7 @@ class Registry:
 
     def fingerprint(self, entry: Entry) -> str:
         """Return the sha256 of the file that holds a law."""
-        return hashlib.sha256(entry.location.read_bytes()).hexdigest()
+        return hashlib.sha256(read_plain(entry.location)).hexdigest()
 
 
 def _resolved(path: Path) -> Path:
@@ -246,9 +247,10 @@ class _Collector:
             self.file(origin, path)
 
     def file(self, origin: str, path: Path, module: str | None = None, only: str | None = None) -> None:
-        if path.resolve() in self.seen:
+        place = _resolved(path)
+        if place in self.seen:
             return
-        self.seen.add(path.resolve())
+        self.seen.add(place)
         self.guard(path.stem, origin, path, lambda: self.add(origin, path, module, only))
 
     def add(self, origin: str, path: Path, module: str | None, only: str | None) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from srfcli.api import Source, SrfError, reader
 
+MOST = 10_000  # columns of a matrix
 NUMERIC = {"double", "single", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"}
 
 
@@ -33,6 +34,8 @@ def matlab(path: Path) -> Source:
         if kind not in NUMERIC or len(shape) != 2 or 0 in shape:
             continue
         rows, columns = (max(shape), 1) if 1 in shape else shape
+        if columns > MOST:
+            raise SrfError(f"{path}: variable '{name}' has {columns} columns", f"A recording has up to {MOST} of them.")
         for k in range(columns):
             heading = name if columns == 1 else f"{name}_{k + 1}"
             places[heading], lengths[heading] = (name, k), rows

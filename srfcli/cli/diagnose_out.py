@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import shutil
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from srfcli.cli.base import Session
 from srfcli.errors import SrfError
 from srfcli.output.files import write_atomic
+from srfcli.reading import parse_json, read_plain
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.answer import RunView
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from srfcli.registry import Registry
 
 ANSWER = "answer.json"
+LARGEST = 2**28  # bytes of an answer
 FORM = "closed-form.toml"
 SCHEMA = "srf.diagnose/"
 UNITS = {"elongation": "um", "force": "N", "friction": "1"}
@@ -53,8 +54,8 @@ def check_answer(folder: Path, *, force: bool) -> None:
 
 def _is_diagnosis(folder: Path) -> bool:
     try:
-        data = json.loads((folder / ANSWER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        data = parse_json(read_plain(folder / ANSWER, limit=LARGEST), folder)
+    except (OSError, SrfError):
         return False
     return isinstance(data, dict) and str(data.get("schema", "")).startswith(SCHEMA)
 

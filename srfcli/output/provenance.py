@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from srfcli import __version__
+from srfcli.errors import SrfError
 from srfcli.laws import Law
 from srfcli.output.files import write_atomic
 from srfcli.output.records import json_text
 from srfcli.output.tables import plain_value
+from srfcli.reading import open_plain
 
 SCHEMA = "srf.provenance/1"
 _LIBRARIES = ("click", "matplotlib", "numpy", "pint", "scipy", "sympy")
@@ -65,8 +67,9 @@ def describe_law(law: Law) -> dict[str, Any]:
 def file_hash(path: Path) -> str | None:
     """Return the SHA-256 of a file's bytes, or None where there is no such file."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except (OSError, ValueError):
+        with open_plain(path) as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except (OSError, SrfError, ValueError):
         return None
 
 

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import tempfile
-import tomllib
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +17,8 @@ import numpy as np
 
 from srfcli.errors import SrfError
 from srfcli.numerics.program import Drive
+from srfcli.reading import parse_toml, read_text
+from srfcli.recording.node import LARGEST
 from srfcli.recording.values import Experiment, FitParameter, Run
 from srfcli.units import find_unit
 
@@ -71,8 +72,8 @@ def check_folder(folder: Path, *, force: bool) -> None:
 def _own_files(folder: Path) -> set[str]:
     """Return the names that belong to the experiment in `folder`: the description, the files of its runs, sidecars."""
     try:
-        data = tomllib.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        data = parse_toml(read_text(folder / DESCRIPTION, limit=LARGEST), folder)
+    except (OSError, SrfError):
         return set()
     if not str(data.get("format", "")).startswith("srf-experiment/"):
         return set()
