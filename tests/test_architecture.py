@@ -19,7 +19,7 @@ PACKAGE = ROOT / "srfcli"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # each module and what it may import of the package, also inside functions; a folder stands for all that is in it
-BASE = {"errors", "status", "reading"}
+BASE = {"errors", "status", "reading", "atomic"}
 LAWS = BASE | {"laws", "reader"}
 LAW_FILES = LAWS | {"expression", "dimensions", "lawfile", "effectfile", "pylaw"}
 SYMBOLS = LAW_FILES | {"registry", "system", "derive", "closed_limits"}
@@ -27,6 +27,7 @@ MAY: dict[str, set[str]] = {
     "errors": set(),
     "status": set(),
     "reading": {"errors"},
+    "atomic": {"errors", "reading"},
     "units": BASE,
     "expression": BASE,
     "laws": BASE | {"expression"},
@@ -65,7 +66,8 @@ MAY: dict[str, set[str]] = {
     "output": LAWS | {"output"},
     "parallel": BASE | {"output"},
     "trial": BASE | {"registry", "recording", "diagnosis", "model", "output", "parallel", "proof"},
-    "proof": {"errors", "output", "parallel", "reading"},  # shares no equation and no integrator with what it is to prove
+    # shares no equation and no integrator with what it is to prove
+    "proof": {"errors", "output", "parallel", "reading", "atomic"},
 }
 HEAVY = {"sympy", "scipy", "numpy", "matplotlib", "pint", "numba"}
 FORBIDDEN = {

@@ -68,8 +68,10 @@ def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) 
 @click.option("--force", is_flag=True, help="Overwrite a file, or take a name that a law already has.")
 def new(name: str, kind: str, python: bool, force: bool) -> None:
     """Write a commented law into the current folder; it passes `srf law check` as it is."""
+    from srfcli.atomic import recover
     from srfcli.lawfile import valid_name
     from srfcli.lawtemplate import template
+    from srfcli.output.files import write_atomic
     from srfcli.registry import bundled_registry
 
     if not valid_name(name):
@@ -79,9 +81,10 @@ def new(name: str, kind: str, python: bool, force: bool) -> None:
             f"there is a shipped {kind} law '{name}'; two of one name cannot be used", f"srf law new my-{name}"
         )
     path = Path(name + (".py" if python else ".toml"))
+    recover(path)
     if path.exists() and not force:
         raise SrfError(f"{path} exists", "Give --force to overwrite it, or another name.")
-    path.write_text(template(kind, name, python=python), encoding="utf-8")
+    write_atomic(path, template(kind, name, python=python))
     click.echo(str(path))
     click.echo(f"Next: srf law check {path}" + _use(kind, name), err=True)
 

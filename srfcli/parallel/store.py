@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from srfcli import __version__
+from srfcli.atomic import clear
 from srfcli.errors import SrfError
 from srfcli.output.files import write_atomic
 from srfcli.reading import parse_json, read_plain
@@ -37,6 +38,8 @@ class Store:
         """Make the folder, or check that what it holds is of these very tasks; SrfError where it is not."""
         said = {"schema": "srf.run/1", "version": __version__, "tasks": len(tasks), "sha256": fingerprint(tasks)}
         note = self.folder / NOTE
+        if self.folder.is_dir():
+            clear(self.folder)
         if note.exists():
             try:
                 before = parse_json(read_plain(note), note)
