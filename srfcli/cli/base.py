@@ -10,6 +10,7 @@ import logging
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn, TextIO, cast
@@ -190,7 +191,8 @@ def _run(group: click.Group, arguments: list[str], session: Session, **extra: An
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for a Greek letter, it does not fail
-    with _screened(), _telling(session):
+    with _screened(), _telling(session), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # NumPy's, of an overflow on the way: rows and statuses tell
         return _ended(group, arguments, session, **extra)
 
 

@@ -12,6 +12,7 @@ import os
 import signal
 import threading
 import traceback
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -150,6 +151,7 @@ def _work(pipe: Connection) -> None:
     """Do what comes through the pipe until it closes; the parent decides what an interrupt means."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    warnings.simplefilter("ignore", RuntimeWarning)  # as in the parent: rows and statuses tell
     while True:
         try:
             function, task = pipe.recv()
