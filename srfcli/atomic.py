@@ -88,6 +88,8 @@ def whole_folder(folder: Path, check: Callable[[], None]) -> Iterator[Path]:
 
 def recover(target: Path) -> None:
     """End what a process that died had begun to write to `target`, and remove what it left beside it."""
+    if fcntl is None:
+        return
     note = _note(target)
     with contextlib.suppress(OSError, SrfError):
         if (lock := _locked(note)) is not None:
@@ -109,7 +111,7 @@ def recover(target: Path) -> None:
 
 def clear(folder: Path) -> None:
     """Remove from a folder the parts of files that dead processes were writing into it, whatever their names."""
-    for part in folder.glob(".*.part"):
+    for part in folder.glob(".*.part") if fcntl is not None else ():
         with contextlib.suppress(OSError):
             if (lock := _locked(part)) is not None:
                 with lock:
@@ -165,7 +167,7 @@ def _locked(place: Path) -> contextlib.ExitStack | None:
     """Return a lock on a file or folder until it is closed, None where it is gone, no plain one, or another's."""
     held = contextlib.ExitStack()
     if fcntl is None:
-        return held if os.path.lexists(place) and not place.name.endswith(".moves") else None
+        return held
     try:
         handle = os.open(place, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
