@@ -69,6 +69,18 @@ def test_parameters_at_their_bounds(options: list[str]) -> None:
         assert done.exit_code in (0, 2, 3) and "unexpected" not in done.stderr, (command, done.stderr)
 
 
+@pytest.mark.parametrize(
+    "options", [("--ageing", "nagata", "--set", "c=0"), ("--ageing", "dieterich+linker-dieterich", "--set", "B=0")]
+)
+def test_where_nothing_can_be_computed(options: tuple[str, ...]) -> None:
+    done = srf("floquet", "--V", "8", "--W0", "9", "--eps", "0.09", *options)
+    assert (
+        done.exit_code == 3
+        and "nothing can be computed at these values" in done.stderr
+        and "unexpected" not in done.stderr
+    )
+
+
 def test_one_command_one_result_for_any_number_of_workers() -> None:
     grid = ["map", "--eps", "0.09", "--over", "V=1:100:3", "--over", "K/W0=0.002:0.03:3", "--csv"]
     results = {srf(*grid, "--workers", workers).stdout for workers in ("1", "2", "3")}

@@ -222,6 +222,10 @@ def _ended(group: click.Group, arguments: list[str], session: Session, **extra: 
         where = f"{error.filename}: " if error.filename else ""
         return _end(f"{where}{error.strerror or error}", None, EXIT_UNEXPECTED, error, session)
     except Exception as error:
+        if isinstance(error, ArithmeticError) or type(error).__name__ == "LinAlgError":  # NumPy's, not imported for it
+            text = f"nothing can be computed at these values: {error}"
+            hint = "A parameter at the end of its range, 0 above all, may leave nothing to solve; --debug shows where."
+            return _end(text, hint, EXIT_PARTIAL, error, session)
         text = f"unexpected {type(error).__name__}: {error}" if str(error) else f"unexpected {type(error).__name__}"
         return _end(text, "Run with --debug for the traceback.", EXIT_UNEXPECTED, error, session)
 
