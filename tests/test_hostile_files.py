@@ -31,7 +31,7 @@ from srfcli.recording.quantities import parse_quantity as quantity_of_file
 from srfcli.recording.source import open_source
 from srfcli.registry import bundled_registry
 from srfcli.settings import load_toml, resolve
-from srfcli.trial.answer import read_answers
+from srfcli.trial.answer import Answer, read_answers, to_line
 from srfcli.units import parse_quantity
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
@@ -266,7 +266,16 @@ def test_headers_that_claim_too_much(claim: str) -> None:
 
 def test_answers_that_are_no_text() -> None:
     place = Path("answers.jsonl")
-    for data in (b"\xff\xfe\n", b"[" * 100_000 + b"\n", LONG.encode() + b"\n", b"{}\n", b"null\n"):
+    whole = to_line(Answer("case-000", "none")).encode()
+    for data in (
+        whole.replace(b'"effects": []', b'"effects": 0'),
+        whole.replace(b'"equivalent": []', b'"equivalent": [1]'),
+        b"\xff\xfe\n",
+        b"[" * 100_000 + b"\n",
+        LONG.encode() + b"\n",
+        b"{}\n",
+        b"null\n",
+    ):
         place.write_bytes(data)
         with pytest.raises(SrfError):
             read_answers(place)

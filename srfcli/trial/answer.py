@@ -66,8 +66,11 @@ def from_line(line: str, *, where: str) -> Answer:
             raise ValueError(f"verdict {found['verdict']!r}")
     except (SrfError, ValueError) as error:
         raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
-    equivalent = tuple(tuple(names) for names in found["equivalent"])
-    lists = {name: tuple(found[name]) for name in ("effects", "not_identifiable")}
+    try:
+        equivalent = tuple(tuple(names) for names in found["equivalent"])
+        lists = {name: tuple(found[name]) for name in ("effects", "not_identifiable")}
+    except TypeError as error:
+        raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
     return Answer(**{**found, **lists, "equivalent": equivalent})
 
 
