@@ -65,6 +65,8 @@ _FACTOR = re.compile(r"([A-Za-z]+|1)(?:(?:\^|\*\*)(-?\d))?", re.ASCII)
 
 def parse_unit(text: str) -> Unit:
     """Return the unit written as `um/s`, `1/um`, `N*s**2/um` or `N/um^2`; raises `SrfError` on anything else."""
+    if len(text) > 200:
+        raise SrfError(f"{len(text)} characters are no unit", "Write it as um/s, 1/um or N/um^2.")
     factor, dimension = 1.0, NONE
     parts = re.split(r"([*/])", text.strip().replace("**", "^").replace("µ", "u").replace("μ", "u"))
     for index in range(0, len(parts), 2):
@@ -76,6 +78,8 @@ def parse_unit(text: str) -> Unit:
         unit = UNITS[match[1]]
         factor *= unit.factor**power
         dimension = multiply(dimension, unit.dimension, Fraction(power))
+        if not 1e-100 < factor < 1e100:
+            raise SrfError(f"{text!r} is no unit of use", "Write it as um/s, 1/um or N/um^2.")
     return Unit(factor, dimension)
 
 

@@ -22,6 +22,7 @@ KEYS = (
     "format", "kind", "name", "about", "cites", "parameters", "constants", *SLOTS, "states", "settings", "frees", "needs",
     "lacks", "observed", "constitutive", "answers",
 )  # fmt: skip
+MOST = 1000  # values of an inner parameter
 SCAN = 8  # values at which an inner parameter is tried where its author says nothing
 _TAKEN = {*PLACES, *RUN_NAMES, *COMMON, "mu", "W", "v", "phi", "u", "kappa", "force", "start", "begin"}
 _PARAMETER = ("default", "unit", "lower", "upper", "bounds", "about", "neutral", "scan")
@@ -147,8 +148,8 @@ class EffectReader(LawReader):
                 neutral.append((name, self.number(f"{where}.neutral", entry["neutral"])))
                 continue
             count = self.number(f"{where}.scan", entry.get("scan", SCAN))
-            if count != int(count) or count < 1:
-                self.fail(f"{where}.scan", f"found {count:g}, expected a whole number of values to try")
+            if not (count.is_integer() and 1 <= count <= MOST):
+                self.fail(f"{where}.scan", f"found {count:g}, expected a whole number of values to try, up to {MOST}")
             scans.append((name, int(count)))
         return tuple(neutral), tuple(scans)
 

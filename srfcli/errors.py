@@ -3,7 +3,42 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
+
+# control characters but tab and newline, DEL and the second set, marks that are not seen or turn the line round, lone
+# surrogates (bytes of file names that are no text): what a terminal acts on, or shows as something else than it is
+_UNSEEN = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
+    "\ud800-\udfff\U000e0000-\U000e0fff]"
+)
+
+
+def printable(text: str, *, line: bool = False) -> str:
+    """Return the text with all that a terminal would act on spelt out, ESC as \\x1b; in a `line` tabs and newlines, too."""
+    if line and ("\n" in text or "\t" in text):
+        text = text.replace("\n", "\\n").replace("\t", "\\t")
+    if text.isascii() and text.replace("\n", "").replace("\t", "").isprintable():
+        return text
+    return _UNSEEN.sub(lambda found: ascii(found.group())[1:-1], text)
+
+
+def shortened(text: str, most: int = 2000) -> str:
+    """Return the text, without its middle where it is longer than `most`: a key of 100 kB is told by its ends."""
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
+
+
+def shown(value: object) -> str:
+    """Return a value as a TOML author knows it, cut where it is long."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int) and abs(value) >= 10**60:
+        return "a number of more than 60 digits"
+    try:
+        text = f'"{value}"' if isinstance(value, str) else repr(value)
+    except (ValueError, RecursionError):
+        return "a value too long to show"
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 class SrfError(Exception):
@@ -15,6 +50,7 @@ class SrfError(Exception):
     exit_code = 2
 
     def __init__(self, message: str, hint: str | None = None, *, exit_code: int | None = None) -> None:
+        message, hint = printable(shortened(message)), hint and printable(shortened(hint))
         super().__init__(message)
         self.message = message
         self.hint = hint
@@ -34,7 +70,8 @@ class ExpressionError(SrfError):
         """Return the expression with a caret under the offending column, or None when it has no place."""
         if self.column is None:
             return None
-        return f"  {self.text}\n  {' ' * self.column}^"
+        text = _UNSEEN.sub("?", self.text.replace("\n", " ").replace("\t", " "))  # one sign for one, as the caret counts
+        return f"  {text}\n  {' ' * self.column}^"
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

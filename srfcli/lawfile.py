@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -13,6 +12,7 @@ from srfcli.dimensions import QUANTITY_UNITS, parse_unit
 from srfcli.errors import ExpressionError, SrfError, did_you_mean
 from srfcli.laws import AgeingLaw, AgeingModifier, Check, Effect, FrictionLaw, Interface, Law, Parameter, State
 from srfcli.reader import Reader
+from srfcli.reading import parse_toml, read_text
 
 if TYPE_CHECKING:
     import sympy
@@ -67,11 +67,9 @@ def known_symbols(kind: str, parameters: Iterable[str], states: Iterable[State] 
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the table in a TOML file; raises `SrfError` with the place where it is not TOML."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise SrfError(f"{path}: not TOML: {error}", 'Text goes in quotes: mu = "mu0 + A*log(v/V0)".') from None
-    except UnicodeDecodeError:
-        raise SrfError(f"{path}: not UTF-8 text", "Save the file as UTF-8.") from None
+        return parse_toml(read_text(path, what="a law"), path)
+    except SrfError as error:
+        raise SrfError(error.message, error.hint or 'Text goes in quotes: mu = "mu0 + A*log(v/V0)".') from None
     except OSError as error:
         raise SrfError(f"{path}: cannot be read: {error.strerror}", "Check path and permissions.") from None
 
@@ -172,7 +170,10 @@ class LawReader:
     def number(self, where: str, value: object) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
             self.fail(where, f"found {_shown(value)}, expected a number")
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            self.fail(where, f"found {_shown(value)}, which is too large", "Write it as in 1e300, or inf.")
 
     def kind(self) -> str:
         found = self.table.get("format")
@@ -316,5 +317,8 @@ class LawReader:
 
 
 def _shown(value: object) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        return "a value too long to show"
     return text if len(text) <= 60 else text[:57] + "..."

@@ -16,6 +16,7 @@ from srfcli import FORMAT, __version__
 from srfcli.cache import cached_source, content_key
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.laws import Law, Parameter
+from srfcli.reading import read_plain
 from srfcli.units import from_base, to_base
 
 if TYPE_CHECKING:
@@ -132,8 +133,9 @@ def open_model(
 def _source(registry: Registry, kind: str, name: str) -> tuple[Law, str]:
     """Return a law without its formula, and the hash of its source: a registered name or a file, as Registry.get takes them."""
     if name.endswith((".toml", ".py")):
+        registry.check_trusted(name)
         try:
-            return Law(name, source=name), hashlib.sha256(Path(name).read_bytes()).hexdigest()
+            return Law(name, source=name), hashlib.sha256(read_plain(Path(name), what="a law")).hexdigest()
         except OSError as error:
             raise SrfError(f"cannot read the law file '{name}': {error.strerror}", "check the path") from error
     entry = registry.find(kind, name)

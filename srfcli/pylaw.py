@@ -16,6 +16,7 @@ from srfcli.errors import SrfError
 from srfcli.lawfile import kind_of, valid_name
 from srfcli.laws import Law
 from srfcli.reader import Reader
+from srfcli.reading import check_plain, read_plain
 
 DECORATORS = {
     "friction_law": "friction",
@@ -33,7 +34,7 @@ def scan_python(path: Path) -> list[tuple[str, str, str]]:
     A file that imports `srfcli.api` and shows no law, and a decorator whose name is not written out, raise `SrfError`.
     """
     try:
-        tree = ast.parse(path.read_bytes(), filename=str(path))
+        tree = ast.parse(read_plain(path, what="a law"), filename=str(path))
     except SyntaxError as error:
         raise SrfError(f"{path}: not Python: {error.msg}, line {error.lineno}") from None
     except (OSError, ValueError, RecursionError, MemoryError) as error:
@@ -55,7 +56,10 @@ def scan_python(path: Path) -> list[tuple[str, str, str]]:
 def load_module(location: Path, module: str | None) -> ModuleType:
     """Import a plugin, by module name where an entry point gave one, else from its file; any failure is `SrfError`."""
     try:
-        return importlib.import_module(module) if module else _from_file(location)
+        if module:
+            return importlib.import_module(module)
+        check_plain(location)
+        return _from_file(location)
     except SrfError as error:
         raise SrfError(f"{location}: {error.message}", error.hint) from error
     except (Exception, SystemExit) as error:

@@ -16,6 +16,7 @@ from srfcli.lawfile import PLUGIN_KINDS, kind_of, read_header, read_law
 from srfcli.laws import AgeingLaw, AgeingModifier, Law
 from srfcli.pylaw import find_law, find_reader, laws_in, load_module, scan_python
 from srfcli.reader import Reader
+from srfcli.reading import read_plain
 
 GROUP = "srf.laws"
 
@@ -46,9 +47,18 @@ class Problem:
 class Registry:
     """The laws that were found, by kind and name; a law is loaded when it is first asked for, and then kept."""
 
-    def __init__(self, entries: Sequence[Entry], problems: Sequence[Problem] = ()) -> None:
+    def __init__(
+        self,
+        entries: Sequence[Entry],
+        problems: Sequence[Problem] = (),
+        *,
+        named: Sequence[Path] = (),
+        trust: bool = False,
+    ) -> None:
         self._entries = tuple(sorted(entries, key=lambda e: (PLUGIN_KINDS.index(e.kind), e.name, str(e.location))))
         self.problems = tuple(problems)
+        self._trust = trust
+        self._own = {_resolved(path) for path in (*named, *(e.location for e in self._entries))}
         self._loaded: dict[Entry, Law] = {}
         self._readers: dict[Entry, Reader] = {}
 
@@ -79,8 +89,17 @@ class Registry:
     def get(self, kind: str, name: str) -> Law:
         """Return the law of that kind and name, or in the file of that name where it ends in .toml or .py."""
         if name.endswith((".toml", ".py")):
+            self.check_trusted(name)
             return one_law(Path(name), kind)
         return self.load(self.find(kind, name))
+
+    def check_trusted(self, name: str) -> None:
+        """Raise `SrfError` for a Python file that only a file names: to read its law would be to run it.
+
+        What a person named (`named`, `plugins`) or installed may run, and with `trust` anything may.
+        """
+        if name.endswith(".py") and not self._trust and _resolved(Path(name)) not in self._own:
+            raise SrfError(f"'{name}' is Python code, which a file may not have run", untrusted_hint(name))
 
     def load(self, entry: Entry) -> Law:
         """Return the law of an entry, imported or parsed at the first call."""
@@ -122,13 +141,34 @@ class Registry:
 
     def fingerprint(self, entry: Entry) -> str:
         """Return the sha256 of the file that holds a law."""
-        return hashlib.sha256(entry.location.read_bytes()).hexdigest()
+        return hashlib.sha256(read_plain(entry.location)).hexdigest()
 
 
-def load_registry(plugins: Sequence[Path] = (), *, user: bool = True, entry_points: bool = True) -> Registry:
+def _resolved(path: Path) -> Path:
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError, ValueError):  # a link to itself, a zero byte: nothing that could be run
+        return path
+
+
+def untrusted_hint(name: str) -> str:
+    """Return what a person does who has read a Python file that a file names."""
+    return f"Once you have read it, give --plugins {Path(name).parent} or --trust"
+
+
+def load_registry(
+    plugins: Sequence[Path] = (),
+    *,
+    user: bool = True,
+    entry_points: bool = True,
+    named: Sequence[Path] = (),
+    trust: bool = False,
+) -> Registry:
     """Return the laws of the bundled folder, entry points, the user's data folder, SRF_PLUGINS and `plugins`.
 
-    A folder in `plugins` or SRF_PLUGINS that does not exist raises `SrfError`; every other fault becomes a `Problem`.
+    A law that an experiment names by the path of a Python file runs only where the file is one of these or in `named`, or
+    with `trust`. A folder in `plugins` or SRF_PLUGINS that does not exist raises `SrfError`; every other fault becomes a
+    `Problem`.
     """
     collect = _Collector()
     collect.folder("bundled", bundled_folder())
@@ -144,7 +184,7 @@ def load_registry(plugins: Sequence[Path] = (), *, user: bool = True, entry_poin
         if not path.exists():
             raise SrfError(f"{origin}: no folder {path}", "Give a folder that holds law files.")
         collect.folder(origin, path)
-    return Registry(collect.entries, collect.problems)
+    return Registry(collect.entries, collect.problems, named=named, trust=trust)
 
 
 @functools.cache
@@ -166,8 +206,10 @@ def user_folder() -> Path:
     """Return the folder of the user's own laws, which need not exist."""
     if os.environ.get("SRF_DATA"):
         return Path(os.environ["SRF_DATA"])
-    base = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    return Path(base) / "srf" / "plugins"
+    base = Path(os.environ.get("XDG_DATA_HOME", ""))
+    if not base.is_absolute():  # as the specification of these folders says; it would be one in the current folder
+        base = Path.home() / ".local" / "share"
+    return base / "srf" / "plugins"
 
 
 def read_file(path: Path) -> tuple[Law, ...]:
@@ -205,9 +247,10 @@ class _Collector:
             self.file(origin, path)
 
     def file(self, origin: str, path: Path, module: str | None = None, only: str | None = None) -> None:
-        if path.resolve() in self.seen:
+        place = _resolved(path)
+        if place in self.seen:
             return
-        self.seen.add(path.resolve())
+        self.seen.add(place)
         self.guard(path.stem, origin, path, lambda: self.add(origin, path, module, only))
 
     def add(self, origin: str, path: Path, module: str | None, only: str | None) -> None:

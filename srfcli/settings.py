@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from srfcli.errors import SrfError, did_you_mean
+from srfcli.errors import SrfError, did_you_mean, shown
 from srfcli.laws import Parameter
+from srfcli.reading import parse_toml, read_text
 from srfcli.units import parse_quantity, to_base
 
 FILE_NAME = "srf.toml"
+SMALLEST = 1e-30  # of a parameter that is not zero, in its own unit: powers and products of it are numbers, too
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,10 @@ def load_toml(path: Path | None) -> TomlSettings:
     if path is None:
         return TomlSettings()
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        data = parse_toml(read_text(path, what="settings"), path)
+    except SrfError as error:
         raise SrfError(
-            f"{path} is not valid TOML: {error}", 'A setting looks like K = "0.21 N/um" below [parameters].'
+            error.message, error.hint or 'A setting looks like K = "0.21 N/um" below [parameters].'
         ) from error
     except OSError as error:
         raise SrfError(f"{path} cannot be read: {error.strerror}", exit_code=1) from error
@@ -152,7 +153,7 @@ def _typed(key: str, value: Any, where: str) -> Any:
             raise SrfError(f"{where}: {key} = {value!r} is neither true nor false", f"Known: {', '.join(words)}")
         return words[str(value).lower()]
     if isinstance(default, float):
-        return parse_quantity(str(value), "1", name=f"{where}: {key}")
+        return parse_quantity(value if isinstance(value, str) else shown(value), "1", name=f"{where}: {key}")
     if not isinstance(value, str):
         raise SrfError(f"{where}: {key} = {value!r} is not text", f'Write {key} = "{default}".')
     return value
@@ -217,11 +218,19 @@ def require_parameter(name: str, parameters: Sequence[Parameter], *, where: str 
 def check_value(parameter: Parameter, value: str | float, *, origin: str = "flag") -> float:
     """Return `value` in the parameter's declared unit; raises SrfError unless it is finite and within bounds."""
     name = parameter.name
-    number = parse_quantity(value, parameter.unit, name=name) if isinstance(value, str) else float(value)
+    try:
+        number = parse_quantity(value, parameter.unit, name=name) if isinstance(value, str) else float(value)
+    except OverflowError:  # an integer of more than 308 digits
+        number = math.inf
     source = None if origin == "flag" else f"It was set by {origin}."
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     if not math.isfinite(number):
         raise SrfError(f"{name} = {number}{unit} is not a finite number", source)
+    if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
+        raise SrfError(
+            f"{name} = {number:g}{unit} is beyond what can be computed with",
+            source or f"Choose a size from {SMALLEST:g} to {1 / SMALLEST:g}{unit}.",
+        )
     for bound, side, outside in (
         (parameter.lower, "below its lower", number < parameter.lower),
         (parameter.upper, "above its upper", number > parameter.upper),

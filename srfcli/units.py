@@ -37,6 +37,7 @@ _TABLE = {
     "deg": Unit(math.pi / 180.0, (0, 0, 0, 1)),
 }
 
+LONGEST = 200  # characters of a number with its unit
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
 # A product of names with one-digit powers: pint never sees a tower of powers that it would have to work out.
 _FACTOR = r"(?:1|[A-Za-zµ°Ωθ%_]+(?:(?:\^|\*\*)-?[1-9])?)"
@@ -64,6 +65,8 @@ def parse_quantity(text: str, unit: str, *, name: str) -> float:
 
 def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float, str]:
     """Return the number and the unit that `text` states; the unit is "" for a bare number."""
+    if len(text) > LONGEST:
+        raise SrfError(f"{name}: {len(text)} characters are no number", f"Write it as in {name}='{example}'.")
     match = _NUMBER.fullmatch(text)
     if not match:
         raise SrfError(
@@ -99,6 +102,8 @@ def tidy(value: float) -> float:
 
 def find_unit(text: str, *, where: str = "") -> Unit:
     """Return the unit that `text` names; raises SrfError, beginning with `where`, if there is none."""
+    if len(text) > LONGEST:
+        raise SrfError(f"{where}: {len(text)} characters are no unit".lstrip(": "), "Write a unit as in N/um, um/s.")
     spelled = text.strip().replace("μ", "µ").replace("µm", "um")
     if spelled in _TABLE:
         return _TABLE[spelled]
@@ -125,6 +130,8 @@ def _from_pint(text: str, prefix: str) -> Unit:
             f"{prefix}{text!r} is not a mechanical unit", "Write it in um, s, N, kg, deg or products of these."
         )
     um, s, newton, rad = (int(p) for p in exponents)
+    if not 1e-100 < factor < 1e100 or abs(um) + abs(mass) > 20:
+        raise SrfError(f"{prefix}{text!r} is no unit of use", "Write it in um, s, N, kg or products of these.")
     return Unit(factor * 1e6 ** (um + mass) / 1e6**mass, (um, s, newton, rad))
 
 

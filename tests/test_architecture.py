@@ -19,13 +19,15 @@ PACKAGE = ROOT / "srfcli"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # each module and what it may import of the package, also inside functions; a folder stands for all that is in it
-BASE = {"errors", "status"}
+BASE = {"errors", "status", "reading", "atomic"}
 LAWS = BASE | {"laws", "reader"}
 LAW_FILES = LAWS | {"expression", "dimensions", "lawfile", "effectfile", "pylaw"}
 SYMBOLS = LAW_FILES | {"registry", "system", "derive", "closed_limits"}
 MAY: dict[str, set[str]] = {
     "errors": set(),
     "status": set(),
+    "reading": {"errors"},
+    "atomic": {"errors", "reading"},
     "units": BASE,
     "expression": BASE,
     "laws": BASE | {"expression"},
@@ -50,7 +52,7 @@ MAY: dict[str, set[str]] = {
     "generate": SYMBOLS | {"numpytext", "staged"},
     "generate_motion": SYMBOLS | {"generate", "numpytext", "staged"},
     "splines": set(),
-    "cache": set(),
+    "cache": {"errors", "reading"},
     "model": SYMBOLS | {"generate", "generate_motion", "cache", "units"},
     "derivation": SYMBOLS | {"notation", "units"},
     "paper_forms": SYMBOLS,
@@ -64,7 +66,8 @@ MAY: dict[str, set[str]] = {
     "output": LAWS | {"output"},
     "parallel": BASE | {"output"},
     "trial": BASE | {"registry", "recording", "diagnosis", "model", "output", "parallel", "proof"},
-    "proof": {"errors", "output", "parallel"},  # shares no equation and no integrator with what it is to prove
+    # shares no equation and no integrator with what it is to prove
+    "proof": {"errors", "output", "parallel", "reading", "atomic"},
 }
 HEAVY = {"sympy", "scipy", "numpy", "matplotlib", "pint", "numba"}
 FORBIDDEN = {

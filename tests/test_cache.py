@@ -1,7 +1,9 @@
-"""The cache of generated modules: lost, broken, shared or read-only, it changes nothing but the time taken."""
+"""The cache: lost, broken, shared or read-only, it changes nothing but the time taken, and what others put there never runs."""
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import os
 import shutil
 import subprocess
@@ -10,9 +12,13 @@ import threading
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
-from srfcli.cache import cached_source, content_key
+from srfcli import cache
+from srfcli.cache import cache_folder, cached_source, content_key
+from srfcli.cli.main import cli
 from srfcli.model import open_model
+from srfcli.numerics.compiled import compiled, compiler
 from srfcli.registry import bundled_folder, load_registry
 
 TEXT = "value = 1\nother = 2\n"
@@ -21,6 +27,7 @@ TEXT = "value = 1\nother = 2\n"
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("SRF_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     return tmp_path / "cache"
 
 
@@ -119,3 +126,186 @@ def test_a_second_start_imports_no_sympy(folder: Path) -> None:
     ]
     assert runs == ["True\n", "False\n"]
     shutil.rmtree(folder)
+
+
+# no way in: what others could have put there
+
+
+POSIX = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="no owners and modes here")
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing in memory, and no warning told yet."""
+    monkeypatch.setattr(cache, "_memory", {})
+    cache._warn.cache_clear()
+
+
+def kept_nowhere(folder: Path, caplog: pytest.LogCaptureFixture, said: str) -> None:
+    """The cache is refused with one warning, what lies there is not read, and memory stands in for it."""
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    with caplog.at_level(logging.WARNING, "srfcli"):
+        for _ in range(3):
+            assert cached_source("k", lambda: TEXT) == TEXT
+        assert cached_source("k", never) == TEXT
+    assert len(caplog.messages) == 1 and said in caplog.messages[0]
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
+
+
+@POSIX
+@pytest.mark.usefixtures("fresh")
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o707, 0o1777])
+def test_a_folder_that_others_may_write_to_is_refused(
+    folder: Path, caplog: pytest.LogCaptureFixture, mode: int
+) -> None:
+    cached_source("k", lambda: "evil = 1\n")
+    folder.chmod(mode)
+    kept_nowhere(folder, caplog, f"others may write to {folder}")
+
+
+@POSIX
+@pytest.mark.usefixtures("fresh")
+def test_a_folder_that_others_may_replace_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    monkeypatch.setenv("SRF_CACHE", str(tmp_path / "open" / "cache"))
+    kept_nowhere(tmp_path / "open", caplog, "others may replace")
+
+
+@POSIX
+@pytest.mark.usefixtures("fresh")
+def test_a_folder_of_another_is_refused(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    cached_source("k", lambda: "evil = 1\n")
+    try:
+        os.chown(folder, os.geteuid() + 1, -1)
+    except PermissionError:
+        pytest.skip("only root can give a folder away")
+    kept_nowhere(folder, caplog, "belongs to another user")
+
+
+@POSIX
+@pytest.mark.usefixtures("fresh")
+@pytest.mark.parametrize("harm", ["open", "short", "link", "fifo"])
+def test_a_secret_that_is_not_the_users_alone_is_refused(
+    folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, harm: str
+) -> None:
+    cached_source("k", lambda: "evil = 1\n")
+    key = tmp_path / "state" / "srf" / "cache.key"
+    assert key.stat().st_mode & 0o777 == 0o600 and key.stat().st_size == 32
+    if harm == "open":
+        key.chmod(0o644)
+    elif harm == "short":
+        key.write_bytes(b"")
+    else:
+        key.rename(tmp_path / "moved")
+        key.symlink_to(tmp_path / "moved") if harm == "link" else os.mkfifo(key, 0o600)
+    kept_nowhere(folder, caplog, "cache.key")
+
+
+@pytest.mark.usefixtures("fresh")
+def test_a_forged_entry_never_runs(folder: Path, tmp_path: Path) -> None:
+    evil = "raise SystemExit('forged')\n"
+    cached_source("k", lambda: TEXT)
+    forgeries = [
+        f"# sha256 {hashlib.sha256(evil.encode()).hexdigest()}\n{evil}",
+        f"# seal {hashlib.sha256(evil.encode()).hexdigest()}\n{evil}",
+        f"{(folder / 'k.py').read_text().partition(chr(10))[0]}\n{evil}",
+        evil,
+    ]
+    key = tmp_path / "state" / "srf" / "cache.key"
+    own = key.read_bytes()
+    key.write_bytes(bytes(32))
+    cached_source("other", lambda: evil)  # sealed with the secret of somebody else
+    forgeries.append((folder / "other.py").read_text())
+    key.write_bytes(own)
+    cached_source("mine", lambda: evil)  # sealed rightly, but moved to another key
+    forgeries.append((folder / "mine.py").read_text())
+    for text in forgeries:
+        (folder / "k.py").write_text(text)
+        assert cached_source("k", lambda: TEXT) == TEXT
+        assert cached_source("k", never) == TEXT
+
+
+@pytest.mark.usefixtures("fresh")
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+def test_a_forged_library_is_never_loaded(folder: Path, tmp_path: Path, make_model, monkeypatch) -> None:
+    command = compiler()
+    assert command is not None
+    for name, code in ("good", "int srf_integrate(void) { return 7; }"), ("evil", "int srf_integrate(void) { return 13; }"):
+        (tmp_path / f"{name}.c").write_text(code)
+        subprocess.run([*command, "-shared", "-fPIC", "-o", tmp_path / f"{name}.so", tmp_path / f"{name}.c"], check=True)
+    evil = (tmp_path / "evil.so").read_bytes()
+    quick = tmp_path / "cc.py"  # compiles everything to good.so
+    quick.write_text(
+        f"import shutil, sys\nshutil.copy({str(tmp_path / 'good.so')!r}, sys.argv[sys.argv.index('-o') + 1])\n"
+    )
+    monkeypatch.setenv("SRF_CC", f"{sys.executable} {quick}")
+    model = make_model()
+
+    def found(place: Path) -> int:
+        """What is loaded from this folder, new to this process: a library of a known path is not loaded again."""
+        monkeypatch.setenv("SRF_CACHE", str(place))
+        compiled.cache_clear(), compiler.cache_clear()
+        library = compiled(model)
+        assert library is not None
+        return int(library.srf_integrate())
+
+    try:
+        assert found(folder) == 7
+        (library,) = folder.glob("*.so")
+        forgeries = {
+            "hash": hashlib.sha256(evil).hexdigest(),
+            "of another name": cache.seal("other.so", evil),
+            "of what was there": library.with_suffix(".sum").read_text(),
+            "empty": "",
+        }
+        for number, mark in enumerate(forgeries.values()):
+            place = tmp_path / f"forged{number}"
+            place.mkdir(mode=0o700)
+            (place / library.name).write_bytes(evil)
+            (place / library.with_suffix(".sum").name).write_text(mark)
+            assert found(place) == 7
+        place = tmp_path / "own"
+        place.mkdir(mode=0o700)
+        (place / library.name).write_bytes(evil)
+        (place / library.with_suffix(".sum").name).write_text(cache.seal(library.name, evil))
+        assert found(place) == 13  # with the right seal it is what is loaded: the others were refused for theirs
+    finally:
+        compiled.cache_clear(), compiler.cache_clear()
+
+
+@POSIX
+@pytest.mark.usefixtures("fresh", "empty_folder")
+def test_a_command_says_once_that_nothing_is_cached(folder: Path) -> None:
+    folder.mkdir()
+    folder.chmod(0o777)
+    for more, said in ((), 1), (("-q",), 0):
+        cache._warn.cache_clear()
+        done = CliRunner().invoke(cli, ["linear", *more], prog_name="srf")
+        assert done.exit_code == 0, done.output
+        assert done.stderr.count("Warning: nothing is cached: others may write to") == said
+    assert not list(folder.iterdir())
+
+
+def test_relative_folders_of_the_desktop_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SRF_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", "theirs")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    assert cache_folder() == tmp_path / ".cache" / "srf"
+
+
+@POSIX
+def test_folders_are_made_private_whatever_the_umask(folder: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("SRF_CACHE", str(tmp_path / "new" / "cache"))
+    before = os.umask(0)
+    try:
+        cached_source("k", lambda: TEXT)
+    finally:
+        os.umask(before)
+    assert cached_source("k", never) == TEXT
+    for made in (tmp_path / "new", tmp_path / "new" / "cache", tmp_path / "state" / "srf"):
+        assert made.stat().st_mode & 0o777 == 0o700

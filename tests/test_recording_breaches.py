@@ -207,7 +207,7 @@ def test_no_experiment(tmp_path: Path, registry: Registry) -> None:
         (b"", "experiment.toml: format: missing, expected 'srf-experiment/1'"),
         (b"a = " + b"[" * 5000 + b"]" * 5000, "experiment.toml: nested too deeply"),
         (b"a = " + b"1" * 5000, "experiment.toml: not TOML: Exceeds the limit"),
-        (b"#" * (16 * 2**20 + 1), "experiment.toml: 16777217 bytes are no description"),
+        (b"#" * (16 * 2**20 + 1), "experiment.toml: longer than 16 MB, too long for a description"),
     ],
 )
 def test_a_description_that_is_none(content: bytes, message: str, tmp_path: Path, registry: Registry) -> None:

@@ -14,7 +14,7 @@ BLOCK = 4 * 2**20  # bytes that are parsed at a time
 LONGEST = 2**20  # bytes of a line
 SAMPLE = 2**16  # bytes by which the number of lines is estimated
 NOTHING = {"", "nan", "na", "n/a", "null", "none", "-nan", "#n/a"}
-NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+-]?\d+)?")
+NUMBER = re.compile(r"[+-]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eEdD][+-]?\d++)?")  # possessive: in the time that the cell is long
 INFINITE = re.compile(r"[+-]?inf(?:inity)?", re.IGNORECASE)
 
 

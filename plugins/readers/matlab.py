@@ -1,13 +1,38 @@
 """MATLAB files of version 5: one vector for each column."""
 
+import os
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from srfcli.api import Source, SrfError, reader
 
-NUMERIC = {"double", "single", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"}
+# Read here and not by scipy.io.loadmat, whose compiled code ends the process on some damaged files.
+MOST = 10_000  # columns of a matrix, and variables of a file
+HEAD = 4096  # bytes in which the header of a variable must lie
+TEXT, MATRIX, COMPRESSED = 128, 14, 15
+STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+NUMERIC = range(6, 16)  # classes: double, single, and integers
+COMPLEX = 0x0800
+WHOLE = "Was the file copied to its end?"
+
+
+@dataclass(frozen=True)
+class _Variable:
+    """A matrix of numbers: where its element lies in the file, and where in the element its numbers begin."""
+
+    name: str
+    shape: tuple[int, int]
+    at: int
+    size: int
+    packed: bool
+    begin: int
+    is_complex: bool
 
 
 @reader(
@@ -17,25 +42,24 @@ NUMERIC = {"double", "single", "int8", "uint8", "int16", "uint16", "int32", "uin
 )
 def matlab(path: Path) -> Source:
     """MATLAB 5 file, a vector for each column, or a matrix `data` as data_1, data_2, ...; units in [columns]"""
-    from scipy.io import loadmat, whosmat
-
     with path.open("rb") as stream:
-        head = stream.read(512)
-    if head.startswith(b"MATLAB 7.3"):
-        raise SrfError(f"{path}: MATLAB 7.3 is another format (HDF5)", "Save it with save(..., '-v7') or as CSV.")
-    try:
-        found = whosmat(path)
-    except Exception as error:
-        raise SrfError(f"{path}: not a whole MATLAB 5 file: {error}", "Was the file copied to its end?") from None
-    places: dict[str, tuple[str, int]] = {}
+        head = stream.read(TEXT)
+        if head.startswith(b"MATLAB 7.3"):
+            raise SrfError(f"{path}: MATLAB 7.3 is another format (HDF5)", "Save it with save(..., '-v7') or as CSV.")
+        order = "<" if head[126:128] == b"IM" else ">"
+        try:
+            variables = list(_variables(stream, order))
+        except (ValueError, struct.error, zlib.error, UnicodeDecodeError) as error:
+            raise SrfError(f"{path}: not a whole MATLAB 5 file: {error}", WHOLE) from None
+    places: dict[str, tuple[_Variable, int]] = {}
     lengths: dict[str, int] = {}
-    for name, shape, kind in found:
-        if kind not in NUMERIC or len(shape) != 2 or 0 in shape:
-            continue
-        rows, columns = (max(shape), 1) if 1 in shape else shape
+    for variable in variables:
+        rows, columns = (max(variable.shape), 1) if 1 in variable.shape else variable.shape
+        if columns > MOST:
+            raise SrfError(f"{path}: variable '{variable.name}' has {columns} columns", f"At most {MOST} are read.")
         for k in range(columns):
-            heading = name if columns == 1 else f"{name}_{k + 1}"
-            places[heading], lengths[heading] = (name, k), rows
+            heading = variable.name if columns == 1 else f"{variable.name}_{k + 1}"
+            places[heading], lengths[heading] = (variable, k), rows
     if not places:
         raise SrfError(f"{path}: holds no vector of numbers", "Save one variable for each column, as time, force.")
     rows = max(lengths.values())
@@ -43,14 +67,91 @@ def matlab(path: Path) -> Source:
 
     def blocks(wanted: tuple[int, ...]) -> Iterator[Sequence[np.ndarray]]:
         chosen = [places[headings[k]] for k in wanted]
-        try:
-            values = loadmat(path, variable_names=sorted({name for name, _ in chosen}))
-        except Exception as error:
-            raise SrfError(f"{path}: cannot be read: {error}", "Was the file copied to its end?") from None
-        arrays = {name: np.asarray(values[name]) for name, _ in chosen}
-        for name, array in arrays.items():
-            if np.iscomplexobj(array):
-                raise SrfError(f"{path}: variable '{name}' is complex", "Save its real part.")
-        yield [a.ravel() if 1 in (a := arrays[name]).shape else a[:, k] for name, k in chosen]
+        arrays: dict[str, np.ndarray] = {}
+        with path.open("rb") as stream:
+            for variable, _ in chosen:
+                if variable.is_complex:
+                    raise SrfError(f"{path}: variable '{variable.name}' is complex", "Save its real part.")
+                if variable.name not in arrays:
+                    try:
+                        arrays[variable.name] = _numbers(stream, order, variable)
+                    except (ValueError, struct.error, zlib.error) as error:
+                        raise SrfError(f"{path}: variable '{variable.name}': {error}", WHOLE) from None
+        yield [a.ravel() if 1 in (a := arrays[v.name]).shape else a[:, k] for v, k in chosen]
 
     return Source(headings, blocks, rows, whole=True)
+
+
+def _variables(stream: BinaryIO, order: str) -> Iterator[_Variable]:
+    """Yield the matrices of numbers in a file; its other variables are passed over."""
+    end, at, count = os.fstat(stream.fileno()).st_size, TEXT, 0
+    while at + 8 <= end:
+        stream.seek(at)
+        kind, size = struct.unpack(f"{order}II", stream.read(8))
+        if kind not in (MATRIX, COMPRESSED) or at + 8 + size > end:
+            raise ValueError(f"an element of type {kind} and {size} bytes at byte {at}")
+        count += 1
+        if count > MOST:
+            raise ValueError(f"more than {MOST} variables")
+        data = stream.read(min(size, HEAD))
+        if kind == COMPRESSED:
+            data = zlib.decompressobj().decompress(data, HEAD)
+            if struct.unpack_from(f"{order}I", data)[0] != MATRIX:
+                raise ValueError(f"no matrix in the element at byte {at}")
+            data = data[8:]
+        found = _header(data, order) if size else None
+        if found is not None:
+            name, shape, begin, is_complex = found
+            packed = kind == COMPRESSED
+            yield _Variable(name, shape, at + 8, size, packed, begin + (8 if packed else 0), is_complex)
+        at += 8 + size
+
+
+def _part(data: bytes, at: int, order: str) -> tuple[int, bytes, int]:
+    """Return type and content of the part that begins at `at`, and where the next one does."""
+    kind, size = struct.unpack_from(f"{order}II", data, at)
+    if kind >> 16:  # a small part: its size and its content share the tag
+        kind, size, begin, after = kind & 0xFFFF, kind >> 16, at + 4, at + 8
+        if size > 4:
+            raise ValueError(f"a small part of {size} bytes")
+    else:
+        begin, after = at + 8, at + 8 + -(-size // 8) * 8
+    if begin + size > len(data):
+        raise ValueError("the header of a variable breaks off")
+    return kind, data[begin : begin + size], after
+
+
+def _header(data: bytes, order: str) -> tuple[str, tuple[int, int], int, bool] | None:
+    """Return name, shape, where the numbers begin and whether they are complex; None for what is no matrix of numbers."""
+    _, flags, at = _part(data, 0, order)
+    flag = struct.unpack_from(f"{order}I", flags)[0]
+    if flag & 0xFF not in NUMERIC:
+        return None
+    _, sizes, at = _part(data, at, order)
+    shape = struct.unpack(f"{order}{len(sizes) // 4}i", sizes[: len(sizes) // 4 * 4])
+    _, name, at = _part(data, at, order)
+    if min(shape, default=-1) < 0:
+        raise ValueError(f"a matrix of shape {shape}")
+    if len(shape) != 2 or 0 in shape:
+        return None
+    return name.decode("latin-1"), (shape[0], shape[1]), at, bool(flag & COMPLEX)
+
+
+def _numbers(stream: BinaryIO, order: str, variable: _Variable) -> np.ndarray:
+    """Return the numbers of a variable, in its shape; ValueError where they are not all there."""
+    count = variable.shape[0] * variable.shape[1]
+    most = variable.begin + 8 + 8 * count
+    stream.seek(variable.at)
+    data = stream.read(variable.size if variable.packed else min(variable.size, most))
+    if variable.packed:
+        data = zlib.decompressobj().decompress(data, most)
+    kind, size = struct.unpack_from(f"{order}II", data, variable.begin)
+    begin = variable.begin + 8
+    if kind >> 16:
+        kind, size, begin = kind & 0xFFFF, kind >> 16, variable.begin + 4
+    if kind not in STORED:
+        raise ValueError(f"numbers of type {kind}")
+    dtype = np.dtype(STORED[kind]).newbyteorder(order)
+    if size != count * dtype.itemsize or begin + size > len(data):
+        raise ValueError(f"{size} bytes for {count} numbers of {dtype.itemsize}, {max(len(data) - begin, 0)} are there")
+    return np.frombuffer(data, dtype, count, begin).astype(float).reshape(variable.shape, order="F")

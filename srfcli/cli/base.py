@@ -6,16 +6,18 @@ import contextlib
 import difflib
 import errno
 import io
+import logging
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn, TextIO, cast
 
 import click
 
-from srfcli.errors import ExpressionError, SrfError, did_you_mean
+from srfcli.errors import ExpressionError, SrfError, did_you_mean, printable
 
 EXIT_OK, EXIT_UNEXPECTED, EXIT_USAGE, EXIT_PARTIAL, EXIT_CONDITION, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
 
@@ -24,12 +26,13 @@ CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_w
 
 @dataclass
 class Session:
-    """The switches of one run of `srf`; -q, -v and --debug may stand before or after the command's name."""
+    """The switches of one run of `srf`; -q, -v, --debug and --trust may stand before or after the command's name."""
 
     arguments: tuple[str, ...] = ()
     quiet: bool = False
     verbose: int = 0
     debug: bool = False
+    trust: bool = False
 
     @staticmethod
     def current() -> Session:
@@ -40,12 +43,12 @@ class Session:
     def say(self, text: str) -> None:
         """Write one line to stderr, unless -q was given."""
         if not self.quiet:
-            click.echo(text, err=True)
+            click.echo(printable(text, line=True), err=True)
 
     def detail(self, text: str) -> None:
         """Write one line to stderr if -v was given."""
         if self.verbose and not self.quiet:
-            click.echo(text, err=True)
+            click.echo(printable(text, line=True), err=True)
 
 
 def _switch(context: click.Context, parameter: click.Parameter, value: Any) -> None:
@@ -55,17 +58,18 @@ def _switch(context: click.Context, parameter: click.Parameter, value: Any) -> N
 
 
 def switches() -> list[click.Option]:
-    """Return the options -q, -v and --debug; they set the session and are no argument of the command."""
+    """Return the options -q, -v, --debug and --trust; they set the session and are no argument of the command."""
     common: dict[str, Any] = {"expose_value": False, "callback": _switch, "is_eager": True}
     return [
         click.Option(["-q", "--quiet"], is_flag=True, help="No progress and no remarks on stderr.", **common),
         click.Option(["-v", "--verbose"], count=True, help="Say more on stderr.", **common),
         click.Option(["--debug"], is_flag=True, help="Show the traceback of an error.", **common),
+        click.Option(["--trust"], is_flag=True, help="Run Python that an experiment or srf.toml names.", **common),
     ]
 
 
 class SrfCommand(click.Command):
-    """A command with -q, -v and --debug, whose epilog, the examples, is printed as it is written."""
+    """A command with the switches, whose epilog, the examples, is printed as it is written."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -126,10 +130,74 @@ class SrfGroup(click.Group):
         sys.exit(_run(self, arguments, session, prog_name=prog_name or "srf", obj=session, **extra))
 
 
+class Screen:
+    """A text stream on which nothing acts: whatever is written to it is made printable; `unescaped` is the stream below.
+
+    All of stdout and stderr goes through one, tracebacks and what libraries say too. It has no `buffer`, which would be a way
+    round.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.unescaped = stream
+
+    def write(self, text: str) -> int:
+        """Write the text, printable."""
+        self.unescaped.write(printable(text))
+        return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Write every text, printable."""
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("buffer", "detach"):
+            raise AttributeError(name)
+        return getattr(self.unescaped, name)
+
+
+@contextlib.contextmanager
+def _screened() -> Iterator[None]:
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (cast(TextIO, Screen(s)) for s in before)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+class _Told(logging.Handler):
+    """What the package warns of, as one line on stderr."""
+
+    def __init__(self, session: Session) -> None:
+        super().__init__(logging.WARNING)
+        self.session = session
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.session.say(f"Warning: {record.getMessage()}")
+
+
+@contextlib.contextmanager
+def _telling(session: Session) -> Iterator[None]:
+    log, told = logging.getLogger("srfcli"), _Told(session)
+    log.addHandler(told)
+    try:
+        yield
+    finally:
+        log.removeHandler(told)
+
+
 def _run(group: click.Group, arguments: list[str], session: Session, **extra: Any) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for a Greek letter, it does not fail
+    with _screened(), _telling(session), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # NumPy's, of an overflow on the way: rows and statuses tell
+        return _ended(group, arguments, session, **extra)
+
+
+def _ended(group: click.Group, arguments: list[str], session: Session, **extra: Any) -> int:
+    """Run the command and return its exit code, every error told."""
     try:
         code = click.Group.main(group, arguments, standalone_mode=False, **extra)
         sys.stdout.flush()  # here, where a closed pipe can still be caught
@@ -154,6 +222,10 @@ def _run(group: click.Group, arguments: list[str], session: Session, **extra: An
         where = f"{error.filename}: " if error.filename else ""
         return _end(f"{where}{error.strerror or error}", None, EXIT_UNEXPECTED, error, session)
     except Exception as error:
+        if isinstance(error, ArithmeticError) or type(error).__name__ == "LinAlgError":  # NumPy's, not imported for it
+            text = f"nothing can be computed at these values: {error}"
+            hint = "A parameter at the end of its range, 0 above all, may leave nothing to solve; --debug shows where."
+            return _end(text, hint, EXIT_PARTIAL, error, session)
         text = f"unexpected {type(error).__name__}: {error}" if str(error) else f"unexpected {type(error).__name__}"
         return _end(text, "Run with --debug for the traceback.", EXIT_UNEXPECTED, error, session)
 

@@ -78,12 +78,12 @@ def command(
     from srfcli.cli.base import EXIT_CONDITION, EXIT_OK
     from srfcli.cli.check_rows import report
     from srfcli.cli.emit import emit
+    from srfcli.cli.options import open_registry
     from srfcli.recording.checks import check_run
     from srfcli.recording.experiment import read_experiment
-    from srfcli.registry import load_registry
 
     _check_kinds(fail_on)
-    begun, registry = time.perf_counter(), load_registry(plugins)
+    begun, registry = time.perf_counter(), open_registry(plugins)
     found = read_experiment(experiment, registry=registry, format=format, limit=int(limit * 2**20))
     checks = [check_run(run) for run in _chosen(found, names)]
     forecast = _forecast(found, checks, registry) if simulate else None

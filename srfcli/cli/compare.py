@@ -13,11 +13,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from srfcli.cli.options import APPARATUS, LOADINGS, OutputOptions, SrfCommand, output_options, values_option
+from srfcli.cli.options import (
+    APPARATUS,
+    LOADINGS,
+    OutputOptions,
+    SrfCommand,
+    check_origins,
+    open_registry,
+    output_options,
+    values_option,
+)
 from srfcli.cli.ranges import Range, over_option
 from srfcli.cli.workers import Spread, worker_options
 from srfcli.laws import Parameter
-from srfcli.settings import Resolved, TomlSettings, choose, find_toml, load_toml, parse_assignment, resolve
+from srfcli.settings import Resolved, Setting, TomlSettings, choose, find_toml, load_toml, parse_assignment, resolve
 from srfcli.status import Status
 
 if TYPE_CHECKING:
@@ -144,17 +153,19 @@ def _models(
     """Return names, models and parameters of every pair of a friction and an ageing law."""
     from srfcli.errors import SrfError
     from srfcli.model import open_model
-    from srfcli.registry import load_registry
 
     toml = load_toml(find_toml())
-    shared = {k: choose(k, system[k], toml=toml).value for k in ("interface", "loading", "inertia")}
-    laws = laws or (choose("law", None, toml=toml).value,)
-    ageings = ageings or (choose("ageing", None, toml=toml).value,)
+    chosen = {k: choose(k, system[k], toml=toml) for k in ("interface", "loading", "inertia")}
+    chosen |= {k: choose(k, None, toml=toml) for k, given in (("law", laws), ("ageing", ageings)) if not given}
+    check_origins(toml, chosen)
+    shared = {k: chosen[k].value for k in ("interface", "loading", "inertia")}
+    named = (*chosen.values(), *(Setting(name, "flag") for name in (*laws, *ageings)))
+    laws, ageings = laws or (chosen["law"].value,), ageings or (chosen["ageing"].value,)
     pairs = list(dict.fromkeys(itertools.product(laws, ageings)))
     if len(pairs) < 2:
         raise SrfError("one law is nothing to compare", "Name more: --law srf-vsat --law log-log, or several --ageing.")
     folders = [Path(p) for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
-    registry = load_registry((*system["plugins"], *folders))
+    registry = open_registry((*system["plugins"], *folders), named)
     models = [open_model(registry, law=law, ageing=ageing, **shared) for law, ageing in pairs]
     short = len(set(ageings)) == 1, len(set(laws)) == 1
     names = [law if short[0] else ageing if short[1] else f"{law}/{ageing}" for law, ageing in pairs]

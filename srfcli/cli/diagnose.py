@@ -49,14 +49,14 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
     explain beyond the baseline's own parameters and a rough track. Held-out runs are opened when the models are final, and judge
     them. Verdicts are none, identified, ambiguous, unknown and inconclusive.
     """
-    from srfcli.registry import load_registry
+    from srfcli.cli.options import open_registry
 
     folder = None if options["out"] is None else Path(options["out"]).expanduser()
     if folder is not None:
         from srfcli.cli.diagnose_out import check_answer
 
         check_answer(folder, force=options["force"])
-    registry = load_registry(plugins)
+    registry = open_registry(plugins)
     _check_effects(registry, effects)
     _diagnose(source, registry, effects, folder, options)
 
@@ -77,7 +77,6 @@ def _check_effects(registry: Registry, effects: tuple[str, ...]) -> None:
 def _diagnose(
     source: Path, registry: Registry, effects: tuple[str, ...], folder: Path | None, options: dict[str, Any]
 ) -> None:
-    import json
     import time
 
     from srfcli.cli.diagnose_text import print_answer
@@ -86,6 +85,7 @@ def _diagnose(
     from srfcli.diagnosis.locate import locate
     from srfcli.diagnosis.search import Search
     from srfcli.diagnosis.verdict import conclude
+    from srfcli.output.records import json_text
     from srfcli.output.tables import plain_value
     from srfcli.recording.experiment import read_experiment
     from srfcli.status import Status
@@ -122,7 +122,7 @@ def _diagnose(
             force=options["force"], missing=missing, parting=parting,
         )  # fmt: skip
     if options["as_json"]:
-        click.echo(json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False))
+        click.echo(json_text(found, indent=2))
     else:
         print_answer(found, diagnosis, location, folder)
     finish(status)

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import re
 import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from srfcli.atomic import recover, whole_folder
 from srfcli.cli.base import Session
 from srfcli.errors import SrfError
 from srfcli.output.files import write_atomic
+from srfcli.reading import parse_json, read_plain
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.answer import RunView
@@ -25,6 +23,7 @@ if TYPE_CHECKING:
     from srfcli.registry import Registry
 
 ANSWER = "answer.json"
+LARGEST = 2**28  # bytes of an answer
 FORM = "closed-form.toml"
 SCHEMA = "srf.diagnose/"
 UNITS = {"elongation": "um", "force": "N", "friction": "1"}
@@ -32,6 +31,7 @@ UNITS = {"elongation": "um", "force": "N", "friction": "1"}
 
 def check_answer(folder: Path, *, force: bool) -> None:
     """Raise SrfError now if a diagnosis could not be written to `folder` later."""
+    recover(folder.resolve())
     parent = folder.resolve().parent
     if not parent.is_dir():
         raise SrfError(f"--out {folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
@@ -53,33 +53,10 @@ def check_answer(folder: Path, *, force: bool) -> None:
 
 def _is_diagnosis(folder: Path) -> bool:
     try:
-        data = json.loads((folder / ANSWER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        data = parse_json(read_plain(folder / ANSWER, limit=LARGEST), folder)
+    except (OSError, SrfError):
         return False
     return isinstance(data, dict) and str(data.get("schema", "")).startswith(SCHEMA)
-
-
-@contextmanager
-def whole_folder(folder: Path, *, force: bool) -> Iterator[Path]:
-    """Give a folder to write to, which takes the place of `folder` when all went well and vanishes otherwise."""
-    target = folder.resolve()
-    scratch = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part"))
-    fresh, old = scratch / target.name, scratch / ".old"
-    try:
-        fresh.mkdir()  # with the usual permissions, which mkdtemp's folder does not have
-        yield fresh
-        check_answer(folder, force=force)  # an hour may have passed
-        if target.exists():
-            target.rename(old)
-        try:
-            fresh.rename(target)
-        except BaseException:
-            if old.exists():
-                old.rename(target)
-            raise
-    finally:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(scratch)
 
 
 def write_answer(
@@ -104,11 +81,12 @@ def write_answer(
     from srfcli.diagnosis.augment import augment
     from srfcli.diagnosis.diagram import stability
     from srfcli.output.provenance import Provenance, write_sidecar
+    from srfcli.output.records import json_text
     from srfcli.recording.experiment import read_experiment
 
     last = final(diagnosis)
-    with whole_folder(folder, force=force) as fresh:
-        text = (json.dumps(found, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+    with whole_folder(folder, lambda: check_answer(folder, force=force)) as fresh:  # an hour may have passed
+        text = (json_text(found, indent=2) + "\n").encode("utf-8")
         write_atomic(fresh / ANSWER, text)
         runs = diagnosis.experiment.runs
         inputs = (diagnosis.experiment.path, *dict.fromkeys(r.file for r in runs))

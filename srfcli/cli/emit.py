@@ -13,11 +13,10 @@ import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, EXIT_OK, EXIT_PARTIAL, Session
 from srfcli.cli.options import OutputOptions
-from srfcli.errors import SrfError
+from srfcli.errors import SrfError, printable
 from srfcli.laws import Law
 from srfcli.output import records, tables
-from srfcli.output.files import is_special, write_atomic
-from srfcli.output.provenance import Provenance, write_sidecar
+from srfcli.output.provenance import Provenance, write_result
 from srfcli.output.tables import Table
 from srfcli.status import Status
 
@@ -59,18 +58,17 @@ def emit(
             _to_stdout(one, options.format)
     else:
         content = "\n".join(render(one, options.format) for one in shown).encode("utf-8")
-        write_atomic(options.out, content)
-        _wrote(options.out, content, provenance, options)
+        _write(options.out, content, provenance, options)
     if options.format == "csv" or options.out is not None:
         for note in table.notes:  # CSV has no place for them, and a file is not looked at at once
             Session.current().say(f"Note: {note}")
     if options.plot is not None:
         if figure is None:
             raise SrfError(f"--plot {options.plot}: there is nothing to draw", "Leave --plot out.")
-        from srfcli.output.plots import save_figure
+        from srfcli.output.plots import figure_bytes
 
         drawn = figure() if callable(figure) else figure
-        _wrote(options.plot, save_figure(drawn, options.plot), provenance, options)
+        _write(options.plot, figure_bytes(drawn, options.plot.suffix), provenance, options)
 
 
 def render(table: Table, format: str) -> str:
@@ -85,10 +83,10 @@ def _to_stdout(table: Table, format: str) -> None:
         click.echo(render(table, format), nl=False)
 
 
-def _wrote(path: Path, content: bytes, provenance: Provenance, options: OutputOptions) -> None:
+def _write(path: Path, content: bytes, provenance: Provenance, options: OutputOptions) -> None:
     session = Session.current()
-    if options.provenance and not is_special(path):
-        session.detail(f"Wrote {write_sidecar(path, content, provenance)}")
+    if (beside := write_result(path, content, provenance if options.provenance else None)) is not None:
+        session.detail(f"Wrote {beside}")
     session.say(f"Wrote {path}")
 
 
@@ -115,6 +113,7 @@ class Progress:
     def __init__(self, label: str, total: int | None = None, *, stream: Any = None, quiet: bool | None = None) -> None:
         self.label, self.total, self.done = label, total, 0
         self._stream = sys.stderr if stream is None else stream
+        self._raw = getattr(self._stream, "unescaped", self._stream)
         self._active = self._stream.isatty() and not (Session.current().quiet if quiet is None else quiet)
         self._shown_at = 0.0
 
@@ -125,7 +124,7 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._active and self._shown_at:
-            self._stream.write("\r\x1b[K")  # the line was for waiting; nothing of it stays
+            self._raw.write("\r\x1b[K")  # the line was for waiting; nothing of it stays
             self._stream.flush()
 
     def advance(self, steps: int = 1, *, note: str = "") -> None:
@@ -137,5 +136,5 @@ class Progress:
         self._shown_at = now
         count = f"{self.done}" if self.total is None else f"{self.done}/{self.total}"
         line = f"{self.label}: {count}  {note}".rstrip()
-        self._stream.write(f"\r\x1b[K{line[:100]}")
+        self._raw.write(f"\r\x1b[K{printable(line[:100], line=True)}")
         self._stream.flush()

@@ -51,9 +51,9 @@ def law() -> None:
 @plugins_option
 def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
     """Show formula, parameters and references of a law; NAME may be a file."""
-    from srfcli.registry import load_registry
+    from srfcli.cli.options import open_registry
 
-    found = _find(load_registry(plugins), name, kind)
+    found = _find(open_registry(plugins), name, kind)
     if as_json:
         documents = [_document(one) for one in found]
         click.echo(json.dumps({"schema": "srf.law/1", "laws": documents}, indent=2, allow_nan=False))
@@ -68,8 +68,10 @@ def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) 
 @click.option("--force", is_flag=True, help="Overwrite a file, or take a name that a law already has.")
 def new(name: str, kind: str, python: bool, force: bool) -> None:
     """Write a commented law into the current folder; it passes `srf law check` as it is."""
+    from srfcli.atomic import recover
     from srfcli.lawfile import valid_name
     from srfcli.lawtemplate import template
+    from srfcli.output.files import write_atomic
     from srfcli.registry import bundled_registry
 
     if not valid_name(name):
@@ -79,9 +81,10 @@ def new(name: str, kind: str, python: bool, force: bool) -> None:
             f"there is a shipped {kind} law '{name}'; two of one name cannot be used", f"srf law new my-{name}"
         )
     path = Path(name + (".py" if python else ".toml"))
+    recover(path)
     if path.exists() and not force:
         raise SrfError(f"{path} exists", "Give --force to overwrite it, or another name.")
-    path.write_text(template(kind, name, python=python), encoding="utf-8")
+    write_atomic(path, template(kind, name, python=python))
     click.echo(str(path))
     click.echo(f"Next: srf law check {path}" + _use(kind, name), err=True)
 
@@ -103,10 +106,10 @@ def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, 
 
     Of an effect: parses, units, a neutral value at which the model is the baseline, derivatives.
     """
+    from srfcli.cli.options import open_registry
     from srfcli.lawcheck import Outcome, check_law
-    from srfcli.registry import load_registry
 
-    registry = load_registry(plugins)
+    registry = open_registry(plugins)
     try:
         outcomes = [outcome for one in _find(registry, name, kind) for outcome in check_law(one)]
     except SrfError as error:

@@ -41,11 +41,11 @@ srf laws --json | jq .rows          for a program
 @plugins_option
 def laws(kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
     """List the laws that are found; none is imported for that."""
+    from srfcli.cli.options import open_registry
     from srfcli.output.records import to_json
     from srfcli.output.tables import print_terminal, to_text
-    from srfcli.registry import load_registry
 
-    registry = load_registry(plugins)
+    registry = open_registry(plugins)
     table = laws_table(registry, kind)
     if as_json:
         click.echo(to_json(table).rstrip("\n"))

@@ -85,11 +85,10 @@ class SystemOptions:
 
     def registry(self) -> Registry:
         """Return the registry of shipped and installed laws and those in --plugins."""
-        from srfcli.registry import load_registry
-
-        return load_registry(self.plugins)
+        return open_registry(self.plugins, (self.law, self.ageing, self.interface))
 
     def _chosen(self) -> dict[str, Any]:
+        check_origins(self.toml, {"law": self.law, "ageing": self.ageing, "interface": self.interface})
         return {key: getattr(self, key).value for key in ("law", "ageing", "interface", "loading", "inertia")}
 
     def system(self) -> System:
@@ -132,6 +131,32 @@ class SystemOptions:
             hint = f"Choose a small number, such as {DEFAULTS['tol'].value:g}; it was set by {chosen.origin}."
             raise SrfError(f"tol = {chosen.value:g} is not between 0 and 1", hint)
         return chosen
+
+
+def open_registry(plugins: Sequence[Path], settings: Sequence[Setting] = ()) -> Registry:
+    """Return the laws there are; Python files that flags or the environment name may run, those of files with --trust."""
+    from srfcli.registry import load_registry
+
+    words = [word.strip() for s in settings if _by_person(s) for word in str(s.value).split("+")]
+    named = [Path(word) for word in words if word.endswith(".py")]
+    return load_registry(plugins, named=named, trust=Session.current().trust)
+
+
+def _by_person(setting: Setting) -> bool:
+    return setting.origin == "flag" or setting.origin.startswith("environment ")
+
+
+def check_origins(toml: TomlSettings, settings: Mapping[str, Setting]) -> None:
+    """Raise SrfError for a Python file that srf.toml names, unless --trust is given: srf.toml may be a stranger's."""
+    from srfcli.registry import untrusted_hint
+
+    for key, setting in settings.items():
+        for word in str(setting.value).split("+"):
+            if word.strip().endswith(".py") and setting.origin == toml.origin and not Session.current().trust:
+                raise SrfError(
+                    f"{toml.origin}: [defaults] {key}: '{word.strip()}' is Python code, which a file may not have run",
+                    untrusted_hint(word.strip()),
+                )
 
 
 def system_options(function: F) -> F:

@@ -184,14 +184,12 @@ def _report(trial: Trial, workers: int, unfinished: bool, format: str) -> None:
 
 def _keep(trial: Trial, seed: int, table: Table, more: Sequence[Table], listed: Table) -> None:
     """Write the report beside the answers: for a reader in few digits, for a program in all, and one line per case."""
-    from srfcli.output.files import write_atomic
-    from srfcli.output.provenance import Provenance, write_sidecar
+    from srfcli.output.provenance import Provenance, write_result
     from srfcli.output.records import to_csv, to_json
     from srfcli.output.tables import to_text
 
     text = "\n".join(to_text(t, full=False) for t in [table, *more])
     provenance = Provenance(Session.current().arguments, inputs=(trial.answers, trial.apart), seed=seed)
     for name, content in (("report.txt", text), ("report.json", to_json(table)), ("cases.csv", to_csv(listed))):
-        write_atomic(trial.folder / name, content)
-        write_sidecar(trial.folder / name, content.encode("utf-8"), provenance)
+        write_result(trial.folder / name, content.encode("utf-8"), provenance)
         Session.current().say(f"Wrote {trial.folder / name}")

@@ -248,15 +248,21 @@ def _write(
     timings: dict[str, float],
 ) -> None:
     """Write the experiment folder and its sidecar; an unfinished one is not written, as nothing in it would say so."""
-    from srfcli.output.provenance import Provenance, write_sidecar
-    from srfcli.recording.writing import write_experiment
+    from srfcli.output.provenance import Provenance, sidecar, sidecar_path
+    from srfcli.recording.writing import DESCRIPTION, write_experiment
 
     session = Session.current()
     if not status.ok:
         session.say(f"Not written: {folder}, as its records are not complete")
         return
-    files = write_experiment(work.experiment(records), folder, force=output.force)
+    made = Provenance(session.arguments, work.parameters, work.model.laws, work.inputs, work.gauge.seed, timings)
+    place = folder / DESCRIPTION
+    files = write_experiment(
+        work.experiment(records),
+        folder,
+        force=output.force,
+        sidecar=(lambda content: sidecar(place, content, made)) if output.provenance else None,
+    )
     if output.provenance:
-        made = Provenance(session.arguments, work.parameters, work.model.laws, work.inputs, work.gauge.seed, timings)
-        session.detail(f"Wrote {write_sidecar(files[0], files[0].read_bytes(), made)}")
+        session.detail(f"Wrote {sidecar_path(place)}")
     session.say(f"Wrote {folder} ({len(files) - 1} run{'s' if len(files) != 2 else ''})")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.foldlaws import Folded, fold, law_files
 from srfcli.inference.latent import LatentFit
 from srfcli.laws import Effect
+from srfcli.recording.node import open_node
 from srfcli.recording.values import Experiment, FitParameter
 from srfcli.recording.writing import DESCRIPTION, KILOGRAM, shortest
 from srfcli.registry import Registry, bundled_folder
@@ -72,7 +72,7 @@ def augment(
     inertia = bool(settings.get("inertia", experiment.choice.inertia))
     mass = values.get("M", experiment.mass) if inertia else experiment.mass
     effects, sources = _beside(laws.left)
-    description = tomllib.loads(experiment.path.read_text(encoding="utf-8"))
+    description = open_node(experiment.path).value
     runs, copies = _runs(description["runs"], experiment.path.parent, folder, reader)
     title = experiment.title + (
         f" (augmented with {', '.join(hypothesis.reported)})" if hypothesis.effects else " (fitted)"

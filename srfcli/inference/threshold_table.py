@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,12 +14,16 @@ import numpy as np
 
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.numerics.collocation import Array
+from srfcli.reading import open_plain, read_text
 from srfcli.units import find_unit, tidy
 
 UNITS = {"V": "um/s", "eps": "1", "W0c": "N", "sigma": "N"}
 REQUIRED = ("V", "eps", "W0c")
 RELATIVE_ERROR = 0.03  # of the critical load, where the table gives none: the paper's "typically 3 %"
 PERCENT = ("eps", "sigma")  # columns that may be given in %
+LARGEST = 64 * 2**20  # bytes of a table
+LONGEST, LINES = 2**16, 10_000  # characters of the line of names, and lines that are searched for it
+CELL = 500  # characters of a heading that are looked through for its unit
 _HEADER = re.compile(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*")
 
 
@@ -66,11 +71,11 @@ def thresholds_csv(table: Thresholds) -> str:
 def is_threshold_table(path: Path) -> bool:
     """Return whether the first line of the file at `path` that says something names the columns V, eps and W0c."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            _, header = next(_filled(stream), (0, ""))
-    except (OSError, UnicodeDecodeError):
+        with io.TextIOWrapper(open_plain(path), encoding="utf-8-sig", newline="") as stream:
+            _, header = next(_filled(stream.readline(LONGEST) for _ in range(LINES)), (0, ""))
+    except (OSError, SrfError, UnicodeDecodeError):
         return False
-    names = {(_HEADER.fullmatch(cell) or _HEADER.fullmatch(""))[1] for cell in _split(header)}  # type: ignore[index]
+    names = {_name_and_unit(cell)[0] for cell in _split(header)}
     return names >= set(REQUIRED)
 
 
@@ -81,11 +86,9 @@ def read_thresholds(path: Path) -> Thresholds:
     be read.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path, limit=LARGEST, what="a table of critical loads")
     except OSError as error:
         raise SrfError(f"{path} cannot be read: {error.strerror}", exit_code=1) from error
-    except UnicodeDecodeError as error:
-        raise SrfError(f"{path} is not text in UTF-8", "Save it as CSV in UTF-8.") from error
     lines = list(_filled(text.splitlines()))
     if not lines:
         raise SrfError(f"{path} is empty", "Begin it with a line of names: V [um/s],eps,W0c [N],sigma [N]")
@@ -131,8 +134,7 @@ def _columns(header: str, where: str) -> list[tuple[str, float]]:
     """Return name and factor to base units of each column; the factor of a relative sigma is negative."""
     found: list[tuple[str, float]] = []
     for cell in _split(header):
-        match = _HEADER.fullmatch(cell)
-        name, unit = (match[1], match[2]) if match else (cell.strip(), None)
+        name, unit = _name_and_unit(cell)
         if name not in UNITS:
             hint = f"{did_you_mean(name, UNITS)}; other columns have no place in a table of critical loads."
             raise SrfError(f"{where}: unknown column {name!r}", hint)
@@ -146,6 +148,11 @@ def _columns(header: str, where: str) -> list[tuple[str, float]]:
             "A table has V, eps and W0c and, if known, sigma: V [um/s],eps,W0c [N],sigma [N]",
         )
     return found
+
+
+def _name_and_unit(cell: str) -> tuple[str, str | None]:
+    match = _HEADER.fullmatch(cell) if len(cell) <= CELL else None
+    return (match[1], match[2]) if match else (cell.strip(), None)
 
 
 def _factor(name: str, unit: str | None, where: str) -> float:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import hashlib
 import importlib.util
 import os
 import platform
@@ -21,10 +20,11 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
-from srfcli.cache import cache_folder, content_key
+from srfcli.cache import LARGEST, cache_folder, content_key, is_sealed, seal
 from srfcli.errors import SrfError
 from srfcli.model import GeneratedModel
 from srfcli.numerics.ctext import LAMBERTW, TABLES, c_function, dual_arithmetic
+from srfcli.reading import read_plain
 
 FLAGS = (  # no contraction: the digits are the same whatever the processor
     "-O3", "-std=c99", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off", "-Wno-psabi",
@@ -105,42 +105,44 @@ def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
     source = c_source(model)
     key = content_key([source, " ".join(command), " ".join(flags()), platform.platform(), platform.machine()])
     folder = cache_folder()
-    if folder is None:
-        return _load(_build(command, source, Path(tempfile.mkdtemp(prefix="srf-")) / f"{key}.so"))
-    path = folder / f"{key}.so"
-    if _intact(path):
-        with contextlib.suppress(OSError):
-            return _load(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        return _load(_build(command, source, path))
-    except OSError:  # a cache that cannot be written, or a disk from which nothing may be run
-        return _load(_build(command, source, Path(tempfile.mkdtemp(prefix="srf-")) / f"{key}.so"))
+    if folder is not None:
+        path = folder / f"{key}.so"
+        with contextlib.suppress(OSError):  # a cache that cannot be written, or a disk from which nothing may be run
+            return _load(path if _intact(path) else _build(command, source, path, sealed=True))
+    with tempfile.TemporaryDirectory(prefix="srf-", ignore_cleanup_errors=True) as scratch:
+        return _load(_build(command, source, Path(scratch) / f"{key}.so"))  # it stays in memory when its file is gone
 
 
-def _build(command: tuple[str, ...], source: str, path: Path) -> Path:
-    """Compile to a file beside `path`, then put it in place: a reader sees a whole library or none."""
+def _build(command: tuple[str, ...], source: str, path: Path, *, sealed: bool = False) -> Path:
+    """Compile to a file beside `path`, then put it in place, sealed for a later process if it is to stay."""
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
         text, library = Path(folder) / "model.c", Path(folder) / "model.so"
         text.write_text(source, encoding="utf-8")
         end = [] if sys.platform == "win32" else ["-lm"]
         done = subprocess.run(
-            [*command, *flags(), "-o", str(library), str(text), *end], capture_output=True, text=True, check=False
+            [*command, *flags(), "-o", str(library), str(text), *end],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "PYTHONSAFEPATH": "1"},  # `python -m ziglang` would look in the current folder first
         )
         if done.returncode:
             first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
             raise SrfError(f"{' '.join(command)} cannot compile the integrator: {first}", "SRF_CC= turns compiling off")
-        digest = hashlib.sha256(library.read_bytes()).hexdigest()
+        if sealed:
+            mark = Path(folder) / "model.sum"
+            mark.write_text(seal(path.name, library.read_bytes()), encoding="ascii")
+            mark.replace(path.with_suffix(".sum"))
         library.replace(path)
-        path.with_suffix(".sum").write_text(digest, encoding="ascii")
     return path
 
 
 def _intact(path: Path) -> bool:
-    """Return whether a library lies there as it was built: loading half of one would end the process."""
+    """Return whether a library lies there as this user built it: to load it is to run it, and half of one ends the process."""
     try:
-        return path.with_suffix(".sum").read_text(encoding="ascii") == hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
+        found = read_plain(path.with_suffix(".sum"), limit=1000).decode("ascii", errors="replace")
+        return is_sealed(path.name, read_plain(path, limit=LARGEST), found)
+    except (OSError, SrfError):
         return False
 
 

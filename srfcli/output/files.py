@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import stat
-import tempfile
 from pathlib import Path
 
+from srfcli.atomic import recover, write_files
 from srfcli.errors import SrfError
 
 
 def check_target(path: Path, *, force: bool, what: str = "--out") -> None:
     """Raise SrfError now if `path` could not be written later: before an hour of computing, not after it."""
+    recover(path.resolve() if path.is_symlink() else path)
     if path.is_dir():
         raise SrfError(f"{what} {path} is a directory", f"Name a file in it: {what} {path / 'result.csv'}")
     if not path.parent.is_dir():
@@ -42,25 +42,5 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     data = content.encode("utf-8") if isinstance(content, str) else content
     if is_special(path):
         path.write_bytes(data)
-        return
-    target = path.resolve()  # through a link, so that the link survives
-    descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(name).chmod(_mode(target))  # mkstemp's 0600 would hide a result from its group
-        Path(name).replace(target)
-    except BaseException:  # also Ctrl-C
-        with contextlib.suppress(OSError):
-            Path(name).unlink()
-        raise
-
-
-def _mode(target: Path) -> int:
-    if target.exists():
-        return stat.S_IMODE(target.stat().st_mode)
-    mask = os.umask(0)
-    os.umask(mask)
-    return 0o666 & ~mask
+    else:
+        write_files({path: data})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.plots import house_style
+from srfcli.output.plots import house_style, name_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,7 +30,7 @@ def fit_figure(rows: Sequence[FitRow], *, quantity: str, unit: str) -> Figure:
             above, below = figure.add_subplot(cell[0]), figure.add_subplot(cell[1])
             above.plot(t, recorded, ".", color="0.65", markersize=1.5, label="recorded", rasterized=True)
             above.plot(t, predicted, color="C0", linewidth=1.0, label="fitted" if not holdout else "predicted")
-            above.set_title(f"{name} (held out)" if holdout else name, loc="left")
+            above.set_title(name_text(f"{name} (held out)" if holdout else name), loc="left")
             above.set_ylabel(label)
             above.tick_params(labelbottom=False)
             below.plot(

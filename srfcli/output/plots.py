@@ -7,11 +7,13 @@ import importlib.util
 import io
 import itertools
 import logging
+import sys
+import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from srfcli.errors import SrfError
+from srfcli.errors import SrfError, printable
 from srfcli.output.files import check_target, write_atomic
 
 if TYPE_CHECKING:
@@ -72,18 +74,36 @@ def _missing() -> SrfError:
     return SrfError("--plot needs matplotlib, which is not installed", 'pip install "srfcli[plot]"')
 
 
+def load_matplotlib() -> None:
+    """Import matplotlib from elsewhere than the current folder, whose `matplotlibrc` it would read: it may be a stranger's."""
+    if "matplotlib" in sys.modules:
+        return
+    try:
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError):  # a current folder that is gone holds no settings either
+                stack.enter_context(contextlib.chdir(Path(__file__).parent))
+            import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise _missing() from error
+
+
 @contextlib.contextmanager
 def house_style() -> Iterator[None]:
     """Draw and save with the house's settings, whatever the user's matplotlibrc says."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise _missing() from error
+    load_matplotlib()
+    import matplotlib
+
     logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # cache chatter is not the user's concern
-    with matplotlib.rc_context():
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)  # a name in a script that the font lacks
         matplotlib.rcParams.update({k: v for k, v in matplotlib.rcParamsDefault.items() if not k.startswith("backend")})
         matplotlib.rcParams.update(STYLE)
         yield
+
+
+def name_text(name: str) -> str:
+    """Return a user's text so that a figure shows it as it is: a dollar sign opens no formula, a line does not break."""
+    return printable(" ".join(name.split())).replace("$", r"\$")
 
 
 def new_figure(rows: int = 1, *, size: tuple[float, float] | None = None) -> tuple[Figure, list[Axes]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -11,9 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from srfcli import __version__
+from srfcli.atomic import SIDECAR, write_files
+from srfcli.errors import SrfError
 from srfcli.laws import Law
-from srfcli.output.files import write_atomic
+from srfcli.output.files import is_special, write_atomic
+from srfcli.output.records import json_text
 from srfcli.output.tables import plain_value
+from srfcli.reading import open_plain
 
 SCHEMA = "srf.provenance/1"
 _LIBRARIES = ("click", "matplotlib", "numpy", "pint", "scipy", "sympy")
@@ -33,16 +36,33 @@ class Provenance:
 
 def sidecar_path(path: Path) -> Path:
     """Return the place of the sidecar of the result at `path`."""
-    return path.with_name(f"{path.name}.provenance.json")
+    return path.with_name(path.name + SIDECAR)
+
+
+def write_result(path: Path, content: bytes, provenance: Provenance | None) -> Path | None:
+    """Write a result with its sidecar, both or neither, and return the sidecar's place.
+
+    Without `provenance`, and for a device or a pipe, there is no sidecar.
+    """
+    if provenance is None or is_special(path):
+        write_atomic(path, content)
+        return None
+    target = path.resolve()  # a sidecar lies beside the file itself, not beside a link to it
+    write_files({target: content, sidecar_path(target): sidecar(path, content, provenance).encode("utf-8")})
+    return sidecar_path(path)
 
 
 def write_sidecar(path: Path, content: bytes, provenance: Provenance) -> Path:
-    """Write the sidecar of the result `content` at `path` and return its place; the timings are its last key."""
+    """Write the sidecar of the result `content` at `path` and return its place."""
+    write_atomic(sidecar_path(path), sidecar(path, content, provenance))
+    return sidecar_path(path)
+
+
+def sidecar(path: Path, content: bytes, provenance: Provenance) -> str:
+    """Return the text of the sidecar of the result `content` at `path`; the timings are its last key."""
     data = {"schema": SCHEMA, "file": path.name, "sha256": hashlib.sha256(content).hexdigest(), **describe(provenance)}
     data["timings"] = {name: round(seconds, 6) for name, seconds in provenance.timings.items()}
-    place = sidecar_path(path)
-    write_atomic(place, json.dumps(plain_value(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
-    return place
+    return json_text(plain_value(data), indent=2) + "\n"
 
 
 def describe(provenance: Provenance) -> dict[str, Any]:
@@ -65,8 +85,9 @@ def describe_law(law: Law) -> dict[str, Any]:
 def file_hash(path: Path) -> str | None:
     """Return the SHA-256 of a file's bytes, or None where there is no such file."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except (OSError, ValueError):
+        with open_plain(path) as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except (OSError, SrfError, ValueError):
         return None
 
 

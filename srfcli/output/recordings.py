@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.plots import COLOURS, house_style
+from srfcli.output.plots import COLOURS, house_style, load_matplotlib, name_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +24,7 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
     A run is {name, t, observed, label, used, V, W, holdout, gaps}: arrays (n,), `label` the observable with its unit, `gaps`
     pairs of times. Samples that are not used are marked, gaps are shaded.
     """
+    load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -40,7 +41,7 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
             _panel(axes, run)
             figure.align_ylabels(axes)
         if title:
-            figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+            figure.suptitle(name_text(title), x=0.01, ha="left", fontsize=11)
         _settle(figure)
         return figure
 
@@ -70,7 +71,7 @@ def _panel(axes: list[Axes], run: Mapping[str, Any]) -> None:
     _imposed(axes[1], np.asarray(run["V"]), wide=True)
     _imposed(axes[2], np.asarray(run["W"]), wide=False)
     marked = _mark_unused(axes[0], t, np.asarray(run["observed"]), ~np.asarray(run["used"]))
-    axes[0].set_title(f"{run['name']}{' (held out)' if run.get('holdout') else ''}{marked}")
+    axes[0].set_title(f"{name_text(run['name'])}{' (held out)' if run.get('holdout') else ''}{marked}")
     axes[2].set_xlabel("t  [s]")
     for axis in axes[:2]:
         axis.tick_params(labelbottom=False)

@@ -9,6 +9,7 @@ import math
 from typing import Any
 
 from srfcli import __version__
+from srfcli.errors import printable
 from srfcli.output.tables import Table, plain_value
 
 
@@ -16,7 +17,7 @@ def to_csv(table: Table) -> str:
     """Return the rows as CSV in full precision; an empty cell stands for nothing, NaN or an infinity."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow([c.name for c in table.columns])
+    writer.writerow([printable(c.name) for c in table.columns])
     for row in table.rows:
         writer.writerow([_csv_cell(v) for v in row])
     return buffer.getvalue()
@@ -30,7 +31,15 @@ def _csv_cell(value: Any) -> str:
         return ""
     if isinstance(simple, bool):
         return "true" if simple else "false"
-    return repr(simple) if isinstance(simple, float) else str(simple)
+    return repr(simple) if isinstance(simple, float) else printable(str(simple))
+
+
+def json_text(data: Any, *, indent: int | None = None) -> str:
+    """Return plain data as JSON that a terminal shows as it is: what it would act on is spelt \\u001b."""
+    text = json.dumps(data, indent=indent, ensure_ascii=False, allow_nan=False)
+    if printable(text) == text:
+        return text
+    return "".join(c if c == "\n" or printable(c) == c else json.dumps(c)[1:-1] for c in text)
 
 
 def envelope(table: Table) -> dict[str, Any]:
@@ -53,7 +62,7 @@ def to_json(table: Table) -> str:
     """Return the envelope as JSON text, one row a line; NaN and infinities are null."""
     data = envelope(table)
     rows = data.pop("rows")
-    text = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
-    lines = ",\n".join("    " + json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows)
+    text = json_text(data, indent=2)
+    lines = ",\n".join("    " + json_text(row) for row in rows)
     block = f"[\n{lines}\n  ]" if rows else "[]"
     return f'{text[: text.rindex("}")].rstrip()},\n  "rows": {block}\n}}\n'

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srfcli.output.plots import _decade_ticks, house_style
+from srfcli.output.plots import _decade_ticks, house_style, load_matplotlib, name_text
 from srfcli.output.recordings import _settle
-from srfcli.output.report_runs import BEFORE, name_text
+from srfcli.output.report_runs import BEFORE
 from srfcli.output.report_text import NARROW, finite, number
 
 if TYPE_CHECKING:
@@ -117,6 +117,7 @@ def foremost(found: Sequence[Spot], *, each: int = 2, most: int = 12) -> list[Sp
 
 def atlas_figure(rows: Sequence[Mapping[str, Any]]) -> Figure | None:
     """Return a panel for each axis of the atlas with several bins, but runs and windows in time; None where there is none."""
+    load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

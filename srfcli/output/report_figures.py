@@ -7,9 +7,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srfcli.output.plots import COLOURS, DASHES, DOTTED, _decade_ticks, _gaps, house_style, new_figure
+from srfcli.output.plots import (
+    COLOURS,
+    DASHES,
+    DOTTED,
+    _decade_ticks,
+    _gaps,
+    house_style,
+    load_matplotlib,
+    name_text,
+    new_figure,
+)
 from srfcli.output.recordings import _settle, _thinned
-from srfcli.output.report_runs import AFTER, BEFORE, name_text
+from srfcli.output.report_runs import AFTER, BEFORE
 from srfcli.output.report_text import finite
 
 if TYPE_CHECKING:
@@ -86,6 +96,7 @@ def _limits(values: Any, band: Any) -> tuple[Any, Any]:
 
 def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, unit: str = "N") -> Figure | None:
     """Return the missing force of all runs against slip velocity, age and load, averaged in pieces; None without a state."""
+    load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

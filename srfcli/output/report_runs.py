@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.output.plots import house_style
+from srfcli.output.plots import house_style, load_matplotlib, name_text
 from srfcli.output.recordings import _imposed, _settle, _thinned
 
 if TYPE_CHECKING:
@@ -113,13 +113,9 @@ def local_rms(t: Array, z: Array) -> tuple[Array, Array]:
     return np.asarray(borders), np.asarray([rms_over_noise(z[p]) for p in pieces if p.size])
 
 
-def name_text(name: str) -> str:
-    """Return a user's text so that a figure shows it as it is: a dollar sign opens no formula, a line does not break."""
-    return " ".join(name.split()).replace("$", r"\$")
-
-
 def overview(traces: Sequence[Trace]) -> Figure:
     """Return all runs as strips over their own clocks, dark where the residual exceeds the noise, before and after."""
+    load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
@@ -170,6 +166,7 @@ def _plain_log(axis: Any, top: float, *, most: int) -> None:
 
 def run_figure(one: Trace) -> Figure:
     """Return a run: recording and both simulations, the residuals in units of noise, local rms, what was imposed; a close-up."""
+    load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any, TextIO
 
+from srfcli.errors import printable
+
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
@@ -25,7 +27,7 @@ class Column:
     @property
     def heading(self) -> str:
         """Return the name with its unit, unless that is 1."""
-        return self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]"
+        return printable(self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]", line=True)
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def cell_text(value: Any, format: str | None = None) -> str:
         return "yes" if simple else "no"
     if isinstance(simple, float):
         return format_number(simple, format) if format else repr(simple)
-    return " ".join(str(simple).split())
+    return printable(" ".join(str(simple).split()))
 
 
 def format_number(value: float, format: str) -> str:
@@ -105,11 +107,11 @@ def to_text(table: Table, *, full: bool = True) -> str:
     headings = [c.heading for c in table.columns]
     widths = [max(len(line[i]) for line in [headings, *cells]) for i in range(len(headings))]
     right = [is_numeric(table, i) for i in range(len(headings))]
-    lines = [table.title] if table.title else []
+    lines = [printable(table.title)] if table.title else []
     for line in [headings, *cells] if headings else []:
         padded = (t.rjust(w) if r else t.ljust(w) for t, w, r in zip(line, widths, right, strict=True))
         lines.append("  ".join(padded).rstrip())
-    return "\n".join([*lines, *(f"Note: {note}" for note in table.notes)]) + "\n"
+    return "\n".join([*lines, *(f"Note: {printable(note, line=True)}" for note in table.notes)]) + "\n"
 
 
 def is_numeric(table: Table, index: int) -> bool:
@@ -124,6 +126,7 @@ def print_terminal(table: Table, stream: TextIO) -> None:
     from rich.text import Text
 
     text = to_text(table, full=False)
+    stream = getattr(stream, "unescaped", stream)  # rich's own colours are meant; every text is made printable before
     console = Console(file=stream, highlight=False, soft_wrap=True)
     rule = 3 * len(table.columns)
     body = text.splitlines()[: len(table.rows) + 2]
@@ -131,11 +134,11 @@ def print_terminal(table: Table, stream: TextIO) -> None:
         stream.write(text)
         return
     if table.title:
-        console.print(Text(table.title, style="bold"))
+        console.print(Text(printable(table.title), style="bold"))
     if table.columns:
         console.print(_rich_table(table))
     for note in table.notes:
-        console.print(Text.assemble(("Note: ", "bold"), note))
+        console.print(Text.assemble(("Note: ", "bold"), printable(note, line=True)))
 
 
 def _rich_table(table: Table) -> RichTable:

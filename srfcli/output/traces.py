@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.plots import COLOURS, DASHES, Values, house_style
+from srfcli.output.plots import COLOURS, DASHES, Values, house_style, load_matplotlib, name_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +37,7 @@ def _one(record: Mapping[str, Any], title: str) -> Figure:
         column[1].set_ylabel("µ")
     _velocities(column[-2], record)
     _load(column[-1], record)
-    column[0].set_title(title)
+    column[0].set_title(name_text(title))
     column[-1].set_xlabel("time  [s]")
     figure.align_ylabels(column)
     return figure
@@ -49,14 +49,15 @@ def _several(records: Sequence[Mapping[str, Any]], title: str) -> Figure:
         _observable(row[0], record)
         _velocities(row[1], record)
         _load(row[2], record)
-        row[0].set_title(record["name"])
+        row[0].set_title(name_text(record["name"]))
     for ax in axes[-1]:
         ax.set_xlabel("time  [s]")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=10.5)
+    figure.suptitle(name_text(title), x=0.01, ha="left", fontsize=10.5)
     return figure
 
 
 def _grid(rows: int, columns: int, *, size: tuple[float, float]) -> tuple[Figure, list[list[Axes]]]:
+    load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

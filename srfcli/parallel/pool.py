@@ -12,6 +12,7 @@ import os
 import signal
 import threading
 import traceback
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -25,7 +26,10 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 ATTEMPTS = 3  # a task that took this many workers with it is at fault itself
-_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
+_ENVIRONMENT = {
+    **dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1"),
+    "PYTHONSAFEPATH": "1",  # a worker is started by `python -c`, which would import from the current folder first
+}
 
 
 @dataclass
@@ -109,8 +113,8 @@ def _started() -> _Worker:
     """Return a new worker, its linear algebra on one thread: matrices here are small, and the workers share the cores."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when the worker loads NumPy
+    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    os.environ.update(_ENVIRONMENT)  # read when the worker starts, and when it loads NumPy
     try:
         process = context.Process(target=_work, args=(theirs,), daemon=True)
         process.start()
@@ -147,6 +151,7 @@ def _work(pipe: Connection) -> None:
     """Do what comes through the pipe until it closes; the parent decides what an interrupt means."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    warnings.simplefilter("ignore", RuntimeWarning)  # as in the parent: rows and statuses tell
     while True:
         try:
             function, task = pipe.recv()

@@ -7,19 +7,23 @@ import io
 import json
 import pickle
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from srfcli import __version__
+from srfcli.atomic import clear
 from srfcli.errors import SrfError
 from srfcli.output.files import write_atomic
+from srfcli.reading import parse_json, read_plain
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 NOTE = "srf-run.json"
+LARGEST = 2**30  # bytes of a finished task
 Arrays = Mapping[str, "NDArray[Any]"]
 Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 
@@ -34,10 +38,12 @@ class Store:
         """Make the folder, or check that what it holds is of these very tasks; SrfError where it is not."""
         said = {"schema": "srf.run/1", "version": __version__, "tasks": len(tasks), "sha256": fingerprint(tasks)}
         note = self.folder / NOTE
+        if self.folder.is_dir():
+            clear(self.folder)
         if note.exists():
             try:
-                before = json.loads(note.read_text(encoding="utf-8"))
-            except (OSError, ValueError):
+                before = parse_json(read_plain(note), note)
+            except (OSError, SrfError):
                 before = None
             if before != said:
                 raise SrfError(
@@ -55,9 +61,9 @@ class Store:
         import numpy as np
 
         try:
-            with np.load(io.BytesIO(self._place(index).read_bytes()), allow_pickle=False) as data:
+            with np.load(io.BytesIO(read_plain(self._place(index), limit=LARGEST)), allow_pickle=False) as data:
                 return {name: data[name] for name in data.files}
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        except (OSError, SrfError, ValueError, EOFError, KeyError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error):
             return None
 
     def write(self, index: int, result: Arrays) -> None:

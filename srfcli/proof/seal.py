@@ -11,6 +11,9 @@ from typing import Any
 
 from srfcli.errors import SrfError
 from srfcli.output.files import write_atomic
+from srfcli.reading import parse_json, read_plain
+
+LARGEST = 2**28  # bytes of a file of a bank
 
 SEAL, SCHEMA = "seal.json", "srf.seal/1"
 Truths = dict[str, dict[str, Any]]
@@ -69,7 +72,7 @@ def case_digest(folder: Path) -> str:
     """Return the SHA-256 over names and contents of all files of a case."""
     whole = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-        name, data = path.relative_to(folder).as_posix().encode(), path.read_bytes()
+        name, data = path.relative_to(folder).as_posix().encode(), read_plain(path, limit=LARGEST)
         whole.update(f"{len(name)} {len(data)} ".encode() + name + data)
     return whole.hexdigest()
 
@@ -80,7 +83,7 @@ def _canonical(value: Mapping[str, Any]) -> bytes:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_plain(path, limit=LARGEST)
     except OSError as error:
         raise SrfError(
             f"{path}: {error.strerror}", "Name the bank, and the file of its truths.", exit_code=1
@@ -89,9 +92,9 @@ def _bytes(path: Path) -> bytes:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(_bytes(path))
-    except ValueError as error:
-        raise SrfError(f"{path}: no JSON: {error}", "The seal is damaged; make the bank anew.") from None
+        data = parse_json(_bytes(path), path)
+    except SrfError as error:
+        raise SrfError(error.message, "The seal is damaged; make the bank anew.") from None
     if not isinstance(data, dict):
         raise SrfError(f"{path}: a JSON object was expected", "The seal is damaged; make the bank anew.")
     return data

@@ -17,6 +17,7 @@ from srfcli.recording.values import OBSERVABLES, Array, Notice
 
 LIMIT = 512 * 2**20  # bytes of needed columns that are held at a time
 HUGE = 1e30  # um, s, N: no measurement, but a gauge's word for none
+LONGEST = 500  # characters of a heading that are looked through for its unit
 _HEADING = re.compile(r"\s*(.*?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
 
 
@@ -51,7 +52,7 @@ class Columns:
 
 def split_heading(heading: str) -> tuple[str, str | None]:
     """Return the name and the unit of `name [unit]` or `name (unit)`; the unit is None for a bare name."""
-    match = _HEADING.fullmatch(heading)
+    match = _HEADING.fullmatch(heading) if len(heading) <= LONGEST else None
     if match is None:
         return heading.strip(), None
     return match[1], match[2] if match[2] is not None else match[3]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from srfcli.atomic import recover
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.recording.node import Node, open_node
 from srfcli.recording.quantities import same_dimension, unit_factor
@@ -109,6 +110,8 @@ def read_description(path: Path) -> Description:
 
 def find_file(path: Path) -> Path:
     """Return the TOML file that `path`, an experiment's folder or file, means."""
+    if not path.exists():
+        recover(path.resolve())  # a process that replaced it may have been killed
     if not path.exists():
         raise SrfError(f"no experiment {path}", f"Give a folder with an {FILE_NAME}, or the TOML file.")
     if path.is_dir():

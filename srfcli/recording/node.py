@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
-from srfcli.errors import SrfError, did_you_mean
+from srfcli.errors import SrfError, did_you_mean, printable, shown
+from srfcli.reading import parse_toml, read_text
 from srfcli.recording.places import Place, key_lines
 from srfcli.recording.quantities import parse_quantity
 
+SMALLEST = 1e-30  # of a number that is not zero: powers and products of it are numbers, too
 LARGEST = 16 * 2**20  # bytes of a description
 
 
@@ -37,7 +38,7 @@ class Node:
 
     def fail(self, message: str, hint: str | None = None) -> NoReturn:
         """Raise SrfError that names this place."""
-        raise SrfError(_plain(f"{self.where}: {message}"), hint)
+        raise SrfError(printable(f"{self.where}: {message}", line=True), hint)
 
     def expected(self, what: str, hint: str | None = None) -> NoReturn:
         """Raise SrfError that says what was found here and what was expected."""
@@ -54,7 +55,7 @@ class Node:
     def require(self, key: str, hint: str) -> Node:
         """Return the value under a key; raises SrfError where there is none."""
         if key not in self.value:
-            raise SrfError(_plain(f"{self._where((*self.place, key))}: missing"), hint)
+            raise SrfError(printable(f"{self._where((*self.place, key))}: missing", line=True), hint)
         return self.child(key)
 
     def keys(self, known: Iterable[str]) -> None:
@@ -98,6 +99,8 @@ class Node:
             number = math.inf
         if not math.isfinite(number):
             self.expected("a finite number")
+        if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
+            self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g}")
         return number
 
     def quantity(self, unit: str) -> float:
@@ -109,7 +112,10 @@ class Node:
             return self.number()
         try:
             name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
-            return parse_quantity(self.value, unit, name=name)
+            number = parse_quantity(self.value, unit, name=name)
+            if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
+                self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g} {unit}")
+            return number
         except SrfError as error:
             self.fail(error.message, error.hint)
 
@@ -117,45 +123,21 @@ class Node:
 def open_node(path: Path) -> Node:
     """Return the table of a TOML file with the lines of its keys; raises SrfError where it is none."""
     try:
-        if path.stat().st_size > LARGEST:
-            raise SrfError(f"{path}: {path.stat().st_size} bytes are no description", "Name the experiment.toml.")
-        text = path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
-    except UnicodeDecodeError as error:
-        raise SrfError(f"{path}: not UTF-8 text (byte {error.start})", "Save the file as UTF-8.") from None
+        text = read_text(path, limit=LARGEST).replace("\r\n", "\n")
     except OSError as error:
         raise SrfError(
             f"{path}: cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1
         ) from None
     try:
-        table = tomllib.loads(text)
-    except RecursionError:
-        raise SrfError(f"{path}: nested too deeply", "An experiment needs a few levels.") from None
-    except ValueError as error:  # TOMLDecodeError is one, and numbers of thousands of digits raise another
+        table = parse_toml(text, path)
+    except SrfError as error:
         if path.suffix.lower() != ".toml":
             raise SrfError(
                 f"{path}: a data file, not the description of an experiment",
                 f'Name the folder or the experiment.toml whose [[run]] says file = "{path.name}".',
             ) from None
-        raise SrfError(f"{path}: not TOML: {error}", 'Text goes in quotes: law = "srf-vsat".') from None
+        raise SrfError(error.message, error.hint or 'Text goes in quotes: law = "srf-vsat".') from None
     return Node(path, table, (), key_lines(text))
-
-
-def shown(value: object) -> str:
-    """Return a value as a TOML author knows it, cut where it is long."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int) and abs(value) >= 10**60:
-        return "a number of more than 60 digits"
-    try:
-        text = f'"{value}"' if isinstance(value, str) else repr(value)
-    except (ValueError, RecursionError):
-        return "a value too long to show"
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _plain(text: str) -> str:
-    """Return the text with what is no printable character escaped, so that it stays on its line."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _spelled(place: Place) -> str:

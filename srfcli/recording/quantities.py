@@ -7,7 +7,7 @@ import re
 
 from srfcli.dimensions import UNITS, Dimension, Unit, describe, multiply
 from srfcli.errors import SrfError, did_you_mean
-from srfcli.units import find_unit, split_quantity, tidy
+from srfcli.units import LONGEST, find_unit, split_quantity, tidy
 
 _SAME = {"": "1", "-": "1", "micron": "um", "microns": "um", "micrometer": "um", "sec": "s", "secs": "s", "second": "s"}
 _SAME |= {"seconds": "s", "dimensionless": "1", "none": "1", "hz": "Hz", "newton": "N", "newtons": "N", "kgs": "kg"}
@@ -52,6 +52,8 @@ def same_dimension(text: str, base: str) -> bool:
 
 
 def _find(text: str) -> Unit:
+    if len(text) > LONGEST:
+        raise SrfError(f"{len(text)} characters are no unit", "Write a unit as in N/um, um/s.")
     spelled = text.strip().replace("**", "^").replace("µ", "u").replace("μ", "u")
     spelled = _SAME.get(spelled.lower(), spelled)
     factor, dimension = 1.0, UNITS["1"].dimension
@@ -65,6 +67,8 @@ def _find(text: str) -> Unit:
         unit = _KNOWN[match[1]]
         factor *= unit.factor**power
         dimension = multiply(dimension, unit.dimension, UNITS["1"].dimension[0] + power)
+        if not 1e-100 < factor < 1e100:
+            raise SrfError(f"{text!r} is no unit of use", "Write a unit as in N/um, um/s.")
     return Unit(factor, dimension)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.reader import Reader, Source
+from srfcli.reading import open_plain
 from srfcli.recording.values import Array
 from srfcli.registry import Entry, Registry
 
@@ -45,13 +46,11 @@ def open_source(path: Path, *, registry: Registry, format: str | None = None) ->
 
 def _head(path: Path) -> bytes:
     try:
-        with path.open("rb") as stream:
+        with open_plain(path) as stream:
             head = stream.read(SNIFFED)
     except FileNotFoundError:
         near = did_you_mean(path.name, (p.name for p in path.parent.glob("*"))) if path.parent.is_dir() else None
         raise SrfError(f"no file {path}", near or f"There is no folder {path.parent}.") from None
-    except IsADirectoryError:
-        raise SrfError(f"no file {path}, but a folder", "Name a file in it.") from None
     except OSError as error:
         raise SrfError(
             f"{path}: cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1

@@ -2,39 +2,43 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
-import shutil
-import tempfile
-import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from srfcli.atomic import SIDECAR, clear, recover, whole_folder
 from srfcli.errors import SrfError
 from srfcli.numerics.program import Drive
+from srfcli.reading import parse_toml, read_text
+from srfcli.recording.node import LARGEST
 from srfcli.recording.values import Experiment, FitParameter, Run
 from srfcli.units import find_unit
 
 DESCRIPTION = "experiment.toml"
-SIDECAR = ".provenance.json"
 OBSERVABLES = {"elongation": "elongation [um]", "force": "force [N]", "friction": "friction [1]"}
 KILOGRAM = 1e-6  # N s^2/um
 
 
-def write_experiment(experiment: Experiment, folder: Path, *, force: bool = False) -> tuple[Path, ...]:
+def write_experiment(
+    experiment: Experiment, folder: Path, *, force: bool = False, sidecar: Callable[[bytes], str] | None = None
+) -> tuple[Path, ...]:
     """Write `experiment` to `folder`, so that `read_experiment` finds its values again, and return the files.
 
     Times, loads and observables keep every digit. A drive of steps is written as a list, any other as the mean velocity from
     each sample to the next, which keeps the displacement at every sample. With `force` an experiment that is there already is
-    replaced, but nothing else is. Raises SrfError for what cannot be written; the folder is whole or absent.
+    replaced, but nothing else is.
+    `sidecar` makes that of the description from its content. Raises SrfError for what cannot be written; the folder is whole or
+    absent.
     """
-    return write_folder(experiment_files(experiment), folder, force=force)
+    files = experiment_files(experiment)
+    beside = {} if sidecar is None else {DESCRIPTION + SIDECAR: sidecar(files[DESCRIPTION].encode("utf-8"))}
+    return write_folder(files | beside, folder, force=force)[: len(files)]
 
 
 def experiment_files(experiment: Experiment) -> dict[str, str]:
@@ -50,6 +54,7 @@ def experiment_files(experiment: Experiment) -> dict[str, str]:
 
 def check_folder(folder: Path, *, force: bool) -> None:
     """Raise SrfError now if an experiment could not be written to `folder` later."""
+    recover(folder.resolve())
     parent = folder.resolve().parent
     if not parent.is_dir():
         raise SrfError(f"{folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
@@ -59,6 +64,7 @@ def check_folder(folder: Path, *, force: bool) -> None:
         return
     if not folder.is_dir() or folder.is_symlink():
         raise SrfError(f"{folder} exists and is not a folder", "Name another folder.")
+    clear(folder)
     strangers = sorted(p.name for p in folder.iterdir() if p.name not in _own_files(folder))
     if strangers:
         raise SrfError(
@@ -71,8 +77,8 @@ def check_folder(folder: Path, *, force: bool) -> None:
 def _own_files(folder: Path) -> set[str]:
     """Return the names that belong to the experiment in `folder`: the description, the files of its runs, sidecars."""
     try:
-        data = tomllib.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        data = parse_toml(read_text(folder / DESCRIPTION, limit=LARGEST), folder)
+    except (OSError, SrfError):
         return set()
     if not str(data.get("format", "")).startswith("srf-experiment/"):
         return set()
@@ -85,27 +91,12 @@ def _own_files(folder: Path) -> set[str]:
 def write_folder(files: Mapping[str, str], folder: Path, *, force: bool = False) -> tuple[Path, ...]:
     """Write text files, name -> text, as the whole content of `folder`: beside its place first, then moved there."""
     check_folder(folder, force=force)
-    target = folder.resolve()
-    scratch = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part"))
-    fresh, old = scratch / "new", scratch / "old"
-    try:
-        fresh.mkdir()  # with the usual permissions, which mkdtemp's folder does not have
+    with whole_folder(folder, lambda: check_folder(folder, force=force)) as fresh:
         for name, text in files.items():
             with (fresh / name).open("w", encoding="utf-8", newline="\n") as stream:
                 stream.write(text)
                 stream.flush()
                 os.fsync(stream.fileno())
-        if target.exists():
-            target.rename(old)
-        try:
-            fresh.rename(target)
-        except BaseException:
-            if old.exists():
-                old.rename(target)
-            raise
-    finally:
-        with contextlib.suppress(OSError):
-            shutil.rmtree(scratch)
     return tuple(folder / name for name in files)
 
 

@@ -10,6 +10,9 @@ from typing import Any
 
 from srfcli.errors import SrfError
 from srfcli.output.files import write_atomic
+from srfcli.reading import parse_json, read_text
+
+LARGEST = 64 * 2**20  # bytes of all answers
 
 FAILED = "failed"  # beside the verdicts: the diagnosis raised, ran out of time, or ended its process
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive", FAILED)
@@ -56,22 +59,25 @@ def to_line(answer: Answer) -> str:
 def from_line(line: str, *, where: str) -> Answer:
     """Return the answer of a line; SrfError, naming `where`, for one that is no answer."""
     try:
-        found = json.loads(line)
+        found = parse_json(line, "the line")
         if not isinstance(found, dict) or set(found) != {f.name for f in fields(Answer)}:
             raise ValueError("not the keys of an answer")
         if found["verdict"] not in VERDICTS:
             raise ValueError(f"verdict {found['verdict']!r}")
-    except ValueError as error:
+    except (SrfError, ValueError) as error:
         raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
-    equivalent = tuple(tuple(names) for names in found["equivalent"])
-    lists = {name: tuple(found[name]) for name in ("effects", "not_identifiable")}
+    try:
+        equivalent = tuple(tuple(names) for names in found["equivalent"])
+        lists = {name: tuple(found[name]) for name in ("effects", "not_identifiable")}
+    except TypeError as error:
+        raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
     return Answer(**{**found, **lists, "equivalent": equivalent})
 
 
 def read_answers(path: Path) -> dict[str, Answer]:
     """Return the answers of a file by case, none where there is no file; SrfError for a damaged line or a case named twice."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, limit=LARGEST, what="answers")
     except FileNotFoundError:
         return {}
     found: dict[str, Answer] = {}

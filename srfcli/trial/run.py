@@ -17,6 +17,7 @@ from srfcli.output.files import write_atomic
 from srfcli.parallel.pool import run_processes
 from srfcli.proof.bank import make_bank
 from srfcli.proof.seal import SEAL, Truths, check_cases, unseal
+from srfcli.reading import parse_json, read_plain
 from srfcli.trial.answer import Answer, read_answers, write_answers
 from srfcli.trial.blind import Diagnose, Task, answer_case, diagnose_case, failed
 
@@ -58,8 +59,8 @@ class Trial:
     def asked(self) -> dict[str, Any]:
         """Return what was asked for: cases, seed and kinds; SrfError where the folder is none of a trial."""
         try:
-            found = json.loads(self.note.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            found = parse_json(read_plain(self.note), self.note)
+        except (OSError, SrfError) as error:
             raise SrfError(f"{self.folder}: no trial: {self.note.name} cannot be read: {error}",
                            "Name the folder that --out of srf prove has made.") from None  # fmt: skip
         if not isinstance(found, dict) or found.get("schema") != SCHEMA:

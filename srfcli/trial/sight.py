@@ -24,6 +24,7 @@ from srfcli.proof.gauge import play
 from srfcli.proof.motion import move
 from srfcli.proof.physics import Physics
 from srfcli.proof.protocol import Plan
+from srfcli.reading import read_text
 from srfcli.recording.experiment import read_experiment
 from srfcli.registry import load_registry
 
@@ -129,7 +130,7 @@ def _read(kept: Path) -> dict[str, Sight]:
     if not kept.exists():
         return {}
     try:
-        sights = [Sight(**json.loads(line)) for line in kept.read_text(encoding="utf-8").splitlines()]
-    except (ValueError, TypeError) as error:
+        sights = [Sight(**json.loads(line)) for line in read_text(kept).splitlines()]
+    except (SrfError, ValueError, TypeError, RecursionError) as error:
         raise SrfError(f"{kept}: not what was written: {error}", "Delete the file; it is computed again.") from None
     return {sight.case: sight for sight in sights}

@@ -1,0 +1,177 @@
+"""Random parameters over the declared bounds through the commands, and stability against brute force.
+
+    python benchmarks/stress.py --draws 20 --points 200 --seed 1
+
+Each friction law with the paper's ageing law and interface, each ageing law, modifier and interface with the paper's friction
+law: every parameter is drawn at random, in its logarithm within its bounds and some decades of its default (`--decades`), and
+so are V, W0, eps and f. A command may say that it did not converge (3) or that the system is none (2). What counts as a failure
+is a traceback, a warning of Python or NumPy, and a NaN or a missing number in a row whose status is ok. The second table
+compares the verdict of `srf floquet` with multipliers from shooting with DOP853 on the paper's equations written by hand
+(`tests/brute.py`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import json
+import math
+import random
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+from click.testing import CliRunner
+
+from srfcli.cli.main import cli
+from srfcli.laws import Parameter
+from srfcli.model import open_model
+from srfcli.registry import bundled_registry
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from brute import Slider, shoot, steady
+
+decades = 3.0  # how far from its default a parameter may be
+
+
+def systems() -> list[dict[str, str]]:
+    """The systems that are tried, by the options that name them."""
+    registry = bundled_registry()
+    found = [{"law": e.name} for e in registry.entries("friction")]
+    found += [{"ageing": e.name} for e in registry.entries("ageing") if e.name != "dieterich"]
+    found += [{"ageing": f"dieterich+{e.name}"} for e in registry.entries("modifier")]
+    return found + [{"interface": e.name} for e in registry.entries("interface") if e.name != "elastic"]
+
+
+def drawn(parameter: Parameter, chance: random.Random) -> float:
+    """A value within the bounds and some decades of the default."""
+    size = abs(parameter.default) or 1.0
+    if parameter.lower < 0:
+        return chance.uniform(max(parameter.lower, -10 * size), min(parameter.upper, 10 * size))
+    low = max(parameter.lower, size * 10**-decades)
+    high = min(parameter.upper, size * 10**decades)
+    return (
+        0.0
+        if parameter.lower == 0 and chance.random() < 0.05
+        else math.exp(chance.uniform(math.log(low), math.log(high)))
+    )
+
+
+def draw(parameters: tuple[Parameter, ...], chance: random.Random) -> tuple[list[str], dict[str, float]]:
+    """Options that set every parameter but those of the point, and a point V, W0, eps, f."""
+    own = [p for p in parameters if p.name not in ("V", "W0", "eps", "f")]
+    options = [word for p in own for word in ("--set", f"{p.name}={drawn(p, chance)!r}")]
+    point = {"V": 10 ** chance.uniform(-2, 3), "W0": 10 ** chance.uniform(-1, 2)}
+    return options, point | {"eps": chance.uniform(0.01, 0.9), "f": 10 ** chance.uniform(0, 3)}
+
+
+def commands(point: dict[str, float]) -> dict[str, list[str]]:
+    """The commands that are tried at a point."""
+    V, W0, eps, f = (repr(point[n]) for n in ("V", "W0", "eps", "f"))
+    length, rate = repr(min(5.0, 20 / point["V"])), repr(50 / min(5.0, 20 / point["V"]))
+    return {
+        "linear": ["linear", "--over", f"V={V}"],
+        "floquet": ["floquet", "--V", V, "--W0", W0, "--eps", eps, "--f", f],
+        "critical": ["critical", "--V", V, "--eps", eps, "--f", f],
+        "simulate": ["simulate", "--V", V, "--W0", W0, "--eps", eps, "--f", f, "--for", length, "--rate", rate],
+    }
+
+
+def verdict(arguments: list[str]) -> tuple[str, str]:
+    """Run a command and say what it did: ok, not converged, refused, or how it failed."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        done = CliRunner().invoke(cli, [*arguments, "--json"], prog_name="srf")
+    said = done.stderr.strip().splitlines()[:1]
+    if done.exit_code not in (0, 2, 3) or "unexpected" in done.stderr:
+        return "failed", f"exit {done.exit_code}: {said}"
+    if done.exit_code == 2:
+        return "refused", str(said)
+    for row in json.loads(done.stdout)["rows"]:
+        if row.get("status") == "ok" and any(
+            row.get(n, 0) is None for n in ("W0", "K_over_W0", "Omega_c", "theta", "modulus")
+        ):
+            return "failed", f"no number in a row that is ok: {row}"
+    return ("ok" if done.exit_code == 0 else "not converged"), ""
+
+
+def stable_by_hand(s: Slider) -> bool | None:
+    """Whether the periodic state is stable, by shooting; None where it is not found, or the multiplier too near to 1."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        try:
+            orbit = shoot(s, steady(s), rtol=1e-9, tol=1e-7)
+        except Exception:  # shooting from steady sliding need not converge
+            return None
+    largest = float(np.abs(orbit.multipliers).max())
+    return None if not np.isfinite(largest) or abs(largest - 1) < 1e-4 else largest < 1
+
+
+def compared(points: int, chance: random.Random, seconds: float) -> collections.Counter[str]:
+    """Count on how many random points of the paper's system the two verdicts agree."""
+    counts: collections.Counter[str] = collections.Counter()
+    begun = time.monotonic()
+    while counts["agree"] + counts["differ"] < points and time.monotonic() - begun < seconds:
+        s = Slider(V=10 ** chance.uniform(0, 2), W0=chance.uniform(4, 40), eps=chance.uniform(0.01, 0.25),
+                   f=chance.uniform(40, 300), A=chance.uniform(0.008, 0.02), B=chance.uniform(0.015, 0.04),
+                   D0=chance.uniform(0.2, 0.8), lam=chance.uniform(0.3, 1.0), K=chance.uniform(0.1, 0.4))  # fmt: skip
+        by_hand = stable_by_hand(s)
+        given = {"V": s.V, "W0": s.W0, "eps": s.eps, "f": s.f, "K": s.K}
+        options = [w for n, v in given.items() for w in (f"--{n}", repr(v))]
+        options += [
+            w for n, v in (("A", s.A), ("B", s.B), ("D0", s.D0), ("lambda", s.lam)) for w in ("--set", f"{n}={v!r}")
+        ]
+        done = CliRunner().invoke(cli, ["floquet", *options, "--json"], prog_name="srf")
+        if by_hand is None or done.exit_code != 0:
+            counts["by hand not found" if by_hand is None else "not converged"] += 1
+            continue
+        found = json.loads(done.stdout)
+        ours = max(row["modulus"] for row in found["rows"]) < 1
+        counts["agree" if ours == by_hand else "differ"] += 1
+        counts["stable" if by_hand else "unstable"] += 1
+        if ours != by_hand:
+            print(f"DIFFER {s}", flush=True)
+    return counts
+
+
+def main() -> None:
+    """Run both parts and print their tables."""
+    asked = argparse.ArgumentParser(description=__doc__)
+    asked.add_argument("--draws", type=int, default=20)
+    asked.add_argument("--points", type=int, default=200)
+    asked.add_argument("--seed", type=int, default=1)
+    asked.add_argument("--seconds", type=float, default=float("inf"), help="stop each part after so long")
+    asked.add_argument("--decades", type=float, default=3.0)
+    asked.add_argument("--skip", default="", help="commands that are left out, with commas")
+    given = asked.parse_args()
+    global decades
+    decades = given.decades
+    chance = random.Random(given.seed)
+    counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+    registry, begun = bundled_registry(), time.monotonic()
+    for number in range(given.draws):
+        for names in systems():
+            if time.monotonic() - begun > given.seconds:
+                break
+            options, point = draw(open_model(registry, **names).parameters, chance)
+            named = [w for k, v in names.items() for w in (f"--{k}", v)]
+            for command, arguments in commands(point).items():
+                if command in given.skip.split(","):
+                    continue
+                said, why = verdict([*arguments, *named, *options])
+                counts[command][said] += 1
+                if said == "failed":
+                    print(f"FAILED draw {number}: srf {' '.join([*arguments, *named, *options])}: {why}", flush=True)
+    print("| command | draws | ok | not converged | refused | failed |\n|---|---|---|---|---|---|")
+    for command, count in counts.items():
+        cells = " | ".join(str(count[n]) for n in ("ok", "not converged", "refused", "failed"))
+        print(f"| {command} | {count.total()} | {cells} |")
+    print("\n| stability of the paper's system at random points | |\n|---|---|")
+    for name, value in compared(given.points, chance, given.seconds).items():
+        print(f"| {name} | {value} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""Random parameters within their bounds: no traceback, no warning, no row that is ok without numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import warnings
+
+import pytest
+from click.testing import CliRunner, Result
+
+from srfcli.cli.main import cli
+from srfcli.model import open_model
+from srfcli.registry import bundled_registry
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def srf(*arguments: str) -> Result:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return CliRunner().invoke(cli, arguments, prog_name="srf")
+
+
+@pytest.mark.parametrize("law", [e.name for e in bundled_registry().entries("friction")])
+def test_any_parameters(law: str) -> None:
+    """A sample of benchmarks/stress.py."""
+    chance = random.Random(law)
+    for _ in range(2):
+        options = ["--law", law]
+        for p in open_model(bundled_registry(), law=law).parameters:
+            if p.name in ("V", "W0", "eps", "f"):
+                continue
+            low, high = max(p.lower, p.default / 10), min(p.upper, p.default * 10)
+            value = (
+                chance.uniform(low, high) if p.lower < 0 else math.exp(chance.uniform(math.log(low), math.log(high)))
+            )
+            options += ["--set", f"{p.name}={value!r}"]
+        V, W0 = repr(10 ** chance.uniform(-1, 2)), repr(10 ** chance.uniform(0, 1.5))
+        for command in (
+            ["linear", "--over", f"V={V}"],
+            ["floquet", "--V", V, "--W0", W0, "--eps", "0.1"],
+            ["simulate", "--V", V, "--W0", W0, "--for", "0.2", "--rate", "50"],
+        ):
+            done = srf(*command, *options, "--json")
+            assert done.exit_code in (0, 3) and "unexpected" not in done.stderr, (command, options, done.stderr)
+            for row in json.loads(done.stdout)["rows"]:
+                if row.get("status", "ok") == "ok":
+                    needed = [n for n in ("W0", "Omega_c", "modulus", "mu", "v") if n in row]
+                    assert needed and all(row[n] is not None for n in needed), (command, options, row)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["A=1e-6"], ["B=0"], ["Vsat=0"], ["mu0=0"], ["D0=1e-6"], ["lambda=1e-6"], ["K=1e-12"], ["K=1e12"], ["M=1e-12"],
+        ["M=1e12"], ["A=1", "B=1"], ["V0=1e-12"], ["Vsat=1e30"], ["D0=1e30"], ["lambda=1e30"],
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_parameters_at_their_bounds(options: list[str]) -> None:
+    given = [word for option in options for word in ("--set", option)]
+    for command in (
+        ["linear", "--over", "V=8"],
+        ["simulate", "--V", "8", "--W0", "5", "--for", "0.01", "--rate", "300"],
+    ):
+        done = srf(*command, *given)
+        assert done.exit_code in (0, 2, 3) and "unexpected" not in done.stderr, (command, done.stderr)
+
+
+@pytest.mark.parametrize(
+    "options", [("--ageing", "nagata", "--set", "c=0"), ("--ageing", "dieterich+linker-dieterich", "--set", "B=0")]
+)
+def test_where_nothing_can_be_computed(options: tuple[str, ...]) -> None:
+    done = srf("floquet", "--V", "8", "--W0", "9", "--eps", "0.09", *options)
+    assert (
+        done.exit_code == 3
+        and "nothing can be computed at these values" in done.stderr
+        and "unexpected" not in done.stderr
+    )
+
+
+def test_one_command_one_result_for_any_number_of_workers() -> None:
+    grid = ["map", "--eps", "0.09", "--over", "V=1:100:3", "--over", "K/W0=0.002:0.03:3", "--csv"]
+    results = {srf(*grid, "--workers", workers).stdout for workers in ("1", "2", "3")}
+    assert len(results) == 1 and results.pop().count("\n") >= 9
