@@ -18,9 +18,10 @@ def test_crossings_far_above_the_load_at_rest(model):
     line = critical_line(model, base)
     assert line.status is Status.OK and line.crossings == (1,)
     (point,) = line.points
-    W0 = point.value(model, "W0")
-    assert W0 > load_window(model, [base])[1] and W0 == pytest.approx(619.634311, rel=1e-8)
-    error, _ = error_of_load(Slider(100.0, W0, 0.3), point.orbit.x[0, 0])
+    load = point.value(model, "W0")
+    assert load == pytest.approx(619.634311, rel=1e-8)
+    assert load_window(model, [base])[1] < load
+    error, _ = error_of_load(Slider(100.0, load, 0.3), point.orbit.x[0, 0])
     assert abs(error) < 1e-6
 
 
@@ -37,14 +38,14 @@ def test_islands_far_below(model):
 
 @pytest.mark.parametrize(
     ("law", "ageing", "V", "eps"),
-    [("log-log", "ruina", 30.0, 0.3), ("rice-regularized", "dieterich", 3.0, 0.45), ("srf-vsat", "dieterich", 150.0, 0.1)],
+    [("bowden-tabor", "dieterich", 3.0, 0.4), ("srf-vsat", "dieterich", 150.0, 0.1)],
 )
 def test_nothing_is_missed_that_a_wide_scan_sees(make_model, law, ageing, V, eps):
     model = make_model(law=law, ageing=ageing)
     base = model.vector({"V": V, "eps": eps})
     line = critical_line(model, base, tol=1e-6)
     found = np.array([q.value(model, "W0") for q in line.points])
-    scan = scan_line(model, base, "W0", np.geomspace(0.02, 2e4, 700), intervals=64)
+    scan = scan_line(model, base, "W0", np.geomspace(0.02, 2e4, 500), intervals=32)
     seen = np.array([(scan.values[i] * scan.values[i + 1]) ** 0.5 for i in scan.brackets()])
     assert line.status is Status.OK
     assert [np.abs(np.log(found / w)).min() < 0.02 for w in seen] == [True] * len(seen)

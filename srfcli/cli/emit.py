@@ -92,6 +92,14 @@ def _wrote(path: Path, content: bytes, provenance: Provenance, options: OutputOp
     session.say(f"Wrote {path}")
 
 
+def warn_uncompiled(cost: str) -> None:
+    """Say in one line that no C compiler was found and what that costs; nothing where there is one or SRF_CC is empty."""
+    from srfcli.numerics.compiled import GET_COMPILER, uncompiled
+
+    if uncompiled():
+        Session.current().say(f"Warning: no C compiler was found: {cost}. Try: {GET_COMPILER}")
+
+
 def finish(status: Status) -> None:
     """End the command with the exit code of `status`: 0 where its numbers can be used, 130 interrupted, else 3.
 

@@ -85,6 +85,14 @@ def compiler() -> tuple[str, ...] | None:
     return None
 
 
+GET_COMPILER = "pip install ziglang, or install cc, gcc or clang"
+
+
+def uncompiled() -> bool:
+    """Return whether there is no C compiler though nobody asked for none (an empty SRF_CC does)."""
+    return os.environ.get("SRF_CC") is None and compiler() is None
+
+
 @cache
 def flags() -> tuple[str, ...]:
     """Return the compiler's options: FLAGS, and the widest vectors that this processor says it has."""

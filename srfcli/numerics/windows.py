@@ -91,7 +91,7 @@ def _follow(
 ) -> tuple[tuple[LineScan, ...], bool]:
     scans: list[LineScan] = []
     settled = _settled(model, last, direction)
-    while not settled and len(scans) < FARTHEST and not (scans and last.lost.size):
+    while not settled and len(scans) < FARTHEST and not (scans and 2 * last.lost.size > last.values.size):
         edge = last.values[OVERLAP - 1] if direction < 0 else last.values[-OVERLAP]
         loads = (edge / DECADE, edge) if direction < 0 else (edge, edge * DECADE)
         last = _piece(model, base, loads, direction, resolution)
