@@ -17,6 +17,7 @@ _FUNCTIONS = {
 }
 _FUNCTIONS |= {name: f"srf_{name}" for name in ("lut", "lut1", "lut2")}
 _FUNCTIONS |= {"arctan": "atan", "arcsinh": "asinh", "lambertw": "srf_lambertw"}
+_POINTERS = ("x", "p", "_w", "_a")  # arguments that are vectors
 _OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 _PI = "3.14159265358979323846"
 
@@ -112,7 +113,7 @@ def dual_arithmetic(source: str) -> str:
 
 
 def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str:
-    """Return function `name` of the generated module `source` as `static void label(x, V, W, W_dot, p, out)`.
+    """Return function `name` of the generated module `source` as `static void label(..., out)`, its arguments as they are.
 
     In dual numbers x, p and out are such. Entries of `out` that the formulas leave at zero are not written: the caller clears it.
     Raises SrfError for no such function.
@@ -142,7 +143,7 @@ def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str
             else:
                 lines.append(f"const double {_safe(target.id)} = {_text(value)};")
     unused = "".join(f" (void){_safe(a)};" for a in arguments)
-    kinds = {a: "const dual *" if dual else "const double *" for a in ("x", "p")}
+    kinds = {a: "const dual *" if dual else "const double *" for a in _POINTERS}
     declared = ", ".join(f"{kinds.get(a, 'const double ')}{_safe(a)}" for a in arguments)
     body = "\n".join(f"    {line}" for line in lines)
     return f"static void {label}({declared}, {'dual' if dual else 'double'} *out) {{\n   {unused}\n{body}\n}}\n"
@@ -205,7 +206,7 @@ def _flat(target: ast.Subscript, shape: tuple[int, ...]) -> int:
 
 def _safe(name: str) -> str:
     """Return a name that no keyword or macro of C shadows."""
-    return f"q_{name}" if name not in ("x", "p") else name
+    return name if name in _POINTERS else f"q_{name}"
 
 
 @singledispatch
