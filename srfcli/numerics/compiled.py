@@ -17,7 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -146,30 +146,43 @@ def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
     """Return the compiled integrator of this model, or None where there is no compiler; SrfError where it fails on the text."""
     if compiler() is None:
         return None
-    library = library_of(c_source(model))
+    library = library_of(lambda: c_source(model), ["motion", model.source])
     library.srf_integrate.restype = ctypes.c_int
     if hasattr(library, "srf_filter"):
         library.srf_filter.restype = ctypes.c_int
     return library
 
 
-def library_of(source: str) -> ctypes.CDLL:
-    """Return C text compiled and loaded, from the cache where it was built before; SrfError where the compiler fails on it."""
+@cache
+def _writers() -> str:
+    """Return the hash of all that C text is written with, besides the model: files of this package."""
+    here, data = files("srfcli") / "numerics", files("srfcli") / "data"
+    written = [here / name for name in ("compiled.py", "ctext.py", "collocation.py", "orbit.py")]
+    written += [data / name for name in ("radau.c", "filter.c", "orbit.c")]
+    return content_key([path.read_text(encoding="utf-8") for path in written])
+
+
+def library_of(write: Callable[[], str], parts: Sequence[str]) -> ctypes.CDLL:
+    """Return the C text of `write` compiled and loaded, from the cache where it was built before from the same `parts`.
+
+    With this package's own files the parts determine the text, which is therefore written only where it must be compiled. Raises
+    SrfError where the compiler fails on it.
+    """
     command = compiler()
     assert command is not None
-    key = content_key([source, " ".join(command), " ".join(flags()), platform.platform(), platform.machine()])
+    key = content_key([*parts, _writers(), " ".join(command), " ".join(flags()), platform.platform(), platform.machine()])
     folder = cache_folder()
     if folder is None:
-        return _load(_build(command, source, Path(tempfile.mkdtemp(prefix="srf-")) / f"{key}.so"))
+        return _load(_build(command, write(), Path(tempfile.mkdtemp(prefix="srf-")) / f"{key}.so"))
     path = folder / f"{key}.so"
     if _intact(path):
         with contextlib.suppress(OSError):
             return _load(path)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        return _load(_build(command, source, path))
+        return _load(_build(command, write(), path))
     except OSError:  # a cache that cannot be written, or a disk from which nothing may be run
-        return _load(_build(command, source, Path(tempfile.mkdtemp(prefix="srf-")) / f"{key}.so"))
+        return _load(_build(command, write(), Path(tempfile.mkdtemp(prefix="srf-")) / f"{key}.so"))
 
 
 def _build(command: tuple[str, ...], source: str, path: Path) -> Path:

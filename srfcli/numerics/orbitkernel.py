@@ -6,15 +6,15 @@ Every function takes the library of `kernel(model)`; where that is None collocat
 from __future__ import annotations
 
 import ctypes
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.errors import SrfError
 from srfcli.model import GeneratedModel
 from srfcli.numerics.compiled import compiler, library_of, orbit_source
+from srfcli.numerics.ctext import NoForm
 
 Array = NDArray[Any]
 
@@ -29,10 +29,10 @@ def kernel(model: GeneratedModel) -> ctypes.CDLL | None:
         return None
     scheme = gauss()
     try:
-        text = orbit_source(model, {"MI": scheme.inverse, "STEP": scheme.step}, LOG_STEP)
-    except SrfError:
+        write = partial(orbit_source, model, {"MI": scheme.inverse, "STEP": scheme.step}, LOG_STEP)
+        library = library_of(write, ["orbits", model.source])
+    except NoForm:
         return None
-    library = library_of(text)
     library.srf_orbits.restype = ctypes.c_int
     library.srf_condense.restype = library.srf_growth.restype = None
     return library
