@@ -93,7 +93,7 @@ def command(
     Components are looked for on lines across the window, each is followed by pseudo-arclength continuation through its
     folds, and every point is polished until its error is met. Ctrl-C keeps what is done.
     """
-    from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.errors import SrfError
     from srfcli.numerics.atlas import AtlasSettings, find_components
     from srfcli.numerics.continuation import StepSettings
@@ -118,6 +118,7 @@ def command(
         scan_lines, samples, tol=tolerance, max_mesh=max_mesh, steps=StepSettings(largest=step, max_steps=max_steps)
     )
     axes = _axes(model, over, eps)
+    warn_uncompiled("boundaries take about twice as long")
     swept = {"W0", *(a.name for a in axes)} if len(axes) == 1 else {a.name for a in axes}
     extra = tuple(a.name for a in axes if a.name not in ("V", "W0", "eps"))
     begun, atlases, status = time.perf_counter(), [], Status.OK
