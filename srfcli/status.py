@@ -16,6 +16,7 @@ class Status(Enum):
     LEFT_WINDOW = "left-window"
     CLOSED = "closed"
     NO_HOPF = "no-hopf"
+    UNSETTLED = "window-not-settled"
     INTEGRATION = "integration-stopped"
     EVALUATIONS = "max-evaluations"
     INTERRUPTED = "interrupted"
@@ -40,6 +41,7 @@ _ADVICE = {
     Status.LEFT_WINDOW: "The curve left the window that was asked for.",
     Status.CLOSED: "The curve returned to its start.",
     Status.NO_HOPF: "Velocity strengthening: no Hopf bifurcation.",
+    Status.UNSETTLED: "Crossings may lie beyond the loads looked at; look there with --window LOW:HIGH or --over W0=LOW:HIGH.",
     Status.INTEGRATION: "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
     Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise --max-evaluations, or start nearer.",
     Status.INTERRUPTED: "Interrupted; what was finished is kept.",

@@ -80,7 +80,7 @@ def test_points_agree_with_critical_loads_at_the_same_velocity(model, atlas):
     """A sample of points against scans of W0, which know nothing of the curve."""
     checked = 0
     for branch in atlas.branches:
-        for i in [*range(0, len(branch.points), 25), len(branch.points) - 1]:
+        for i in [*range(0, len(branch.points), 16), len(branch.points) - 1]:
             point = branch.points[i]
             if abs(point.slope) < STEEP:
                 continue  # beside a fold; see the next test
@@ -132,7 +132,7 @@ def test_parity_and_number_of_crossings(model, atlas):
             assert number is None or (number % 2 == 1) == (point.slope > 0)
     checked = 0
     for branch, row in zip(atlas.branches, numbers, strict=True):
-        for i in range(5, len(row), 40):
+        for i in range(5, len(row), 25):
             V, W0 = (branch.points[i].value(model, name) for name in ("V", "W0"))
             line = critical_line(model, model.vector({"eps": 0.18, "V": V}), lo=4.0, hi=400.0, tol=1e-6)
             if abs(branch.points[i].slope) > STEEP:

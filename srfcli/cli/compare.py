@@ -106,7 +106,7 @@ def command(
     low velocity, so that what differs is the law and not its calibration.
     """
     from srfcli.cli.compare_rows import COLUMNS, compare_figure, law_meta, law_notes, law_rows, sentences
-    from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.errors import SrfError
     from srfcli.numerics.compare import LawTask, read_study, study_law
     from srfcli.output.tables import Table
@@ -120,6 +120,7 @@ def command(
     names, models, resolved = _models(laws, ageings, system)
     goal, matches = _matches(names, models, resolved, _velocity(at), tuple(adjust.split(",")), matched)
     window = _window(models[0], matches[0].p, goal, over)
+    warn_uncompiled("boundaries take about twice as long")
     usable = [k for k, m in enumerate(matches) if m.status.ok]
     tasks = [LawTask(models[k].source, models[k].key, matches[k].p, amplitudes, window) for k in usable]
     studies: dict[int, LawStudy] = {}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -23,11 +25,14 @@ from srfcli.laws import Parameter
 from srfcli.status import Status
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from matplotlib.figure import Figure
 
     from srfcli.model import GeneratedModel
     from srfcli.numerics.atlas import Atlas
     from srfcli.numerics.plane import Axis, Plane
+    from srfcli.numerics.windows import LoadWindow
     from srfcli.settings import Resolved
 
 EXAMPLES = """
@@ -37,6 +42,7 @@ srf continue --V 7 --over eps=0.01:0.4 --over W0=4:100
 srf continue --eps 0.09 --law log-log --ageing dieterich+linker-dieterich
 """
 AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation amplitudes, a boundary for each")
+LINES = 5  # that are followed outwards to find the loads to look between
 
 
 @click.command("continue", cls=SrfCommand, epilog=EXAMPLES)
@@ -87,7 +93,7 @@ def command(
     Components are looked for on lines across the window, each is followed by pseudo-arclength continuation through its
     folds, and every point is polished until its error is met. Ctrl-C keeps what is done.
     """
-    from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.errors import SrfError
     from srfcli.numerics.atlas import AtlasSettings, find_components
     from srfcli.numerics.continuation import StepSettings
@@ -111,65 +117,88 @@ def command(
     settings = AtlasSettings(
         scan_lines, samples, tol=tolerance, max_mesh=max_mesh, steps=StepSettings(largest=step, max_steps=max_steps)
     )
-    planes = _planes(model, resolved, over, eps)
-    extra = tuple(a.name for a in (planes[0].x, planes[0].y) if a.name not in ("V", "W0", "eps"))
+    axes = _axes(model, over, eps)
+    warn_uncompiled("boundaries take about twice as long")
+    swept = {"W0", *(a.name for a in axes)} if len(axes) == 1 else {a.name for a in axes}
+    extra = tuple(a.name for a in axes if a.name not in ("V", "W0", "eps"))
     begun, atlases, status = time.perf_counter(), [], Status.OK
     with Progress("continue") as progress:
-        for plane in planes:
-            atlas: Atlas | None = None
-            for found in find_components(model, plane, settings, progress=lambda said: progress.advance(0, note=said)):
-                atlas = found
-            if atlas is not None:
+        try:
+            for plane, window in _planes(model, resolved, axes, eps):
+                atlas: Atlas | None = None
+                dense = settings if window is None else replace(settings, samples=math.ceil(samples * window.widening))
+                for found in find_components(model, plane, dense, progress=lambda said: progress.advance(0, note=said)):
+                    atlas = found
+                assert atlas is not None
+                if window is not None:
+                    _judge_window(model, atlas, window)
                 atlases.append(atlas)
-            if atlas is None or atlas.status is Status.INTERRUPTED:
-                status = Status.INTERRUPTED
-                break
+                if atlas.status is Status.INTERRUPTED:
+                    raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
     status = status if status is Status.INTERRUPTED else worst([a.status for a in atlases])
     rows, notes = _rows(model, atlases, extra)
     units = {q.name: q for q in model.parameters}
     columns = (*COLUMNS, *(Column(n, units[n].unit, units[n].about) for n in extra))
-    swept = {planes[0].x.name, planes[0].y.name, "eps"}
-    described = {k: v for k, v in resolved.described().items() if k not in swept}
+    described = {k: v for k, v in resolved.described().items() if k not in {*swept, "eps"}}
     table = Table("srf.continue/1", columns, rows, model.title, tuple(notes), described, status=status.value)
     timings = {"solve": time.perf_counter() - begun}
     emit(table, output, laws=model.laws, timings=timings, figure=lambda: _figure(model, atlases))
     finish(status)
 
 
-def _planes(
-    model: GeneratedModel, resolved: Resolved, over: tuple[Range, ...], eps: tuple[float, ...] | None
-) -> list[Plane]:
-    """Return one plane for each amplitude; eps itself may be an axis."""
+def _axes(model: GeneratedModel, over: tuple[Range, ...], eps: tuple[float, ...] | None) -> list[Axis]:
+    """Return the axes that --over names, one or two, x first; V from 1 to 100 um/s where it names none."""
     from srfcli.errors import SrfError
-    from srfcli.numerics.plane import Plane
-    from srfcli.numerics.windows import load_window
 
     if len(over) > 2:
         raise SrfError(f"--over is given {len(over)} times", "A plane has two axes: --over V=1:100 --over W0=4:400.")
-    ranges = over or (parse_over("V=1:100"),)
-    axes = [_axis(model, r) for r in ranges]
-    names = [a.name for a in axes]
-    if "eps" in names and eps:
+    axes = [_axis(model, r) for r in over or (parse_over("V=1:100"),)]
+    if "eps" in [a.name for a in axes] and eps:
         raise SrfError("eps is an axis and has values too", "Leave out --eps, or take eps out of --over.")
-    if len(axes) == 2 and names[0] in ("W0",):
-        axes, names = axes[::-1], names[::-1]  # stability is followed across the load
-    amplitudes = eps if eps else (None,) if "eps" in names else (resolved.values["eps"],)
-    planes = []
+    if axes[0].name == "W0":
+        if len(axes) == 1:
+            raise SrfError("--over W0 alone spans no plane", "Add the other axis: --over V=1:100.")
+        axes = axes[::-1]  # stability is followed across the load
+    return axes
+
+
+def _planes(
+    model: GeneratedModel, resolved: Resolved, axes: list[Axis], eps: tuple[float, ...] | None
+) -> Iterator[tuple[Plane, LoadWindow | None]]:
+    """Yield one plane for each amplitude, and the loads that were found for it, if any were; eps itself may be an axis."""
+    from srfcli.numerics.plane import Axis, Plane
+    from srfcli.numerics.windows import found_window
+
+    x = axes[0]
+    amplitudes = eps if eps else (None,) if "eps" in [a.name for a in axes] else (resolved.values["eps"],)
     for amplitude in amplitudes:
         base = model.vector(resolved.values | ({} if amplitude is None else {"eps": amplitude}))
-        both = axes
-        if len(axes) == 1:
-            if axes[0].name == "W0":
-                raise SrfError("--over W0 alone spans no plane", "Add the other axis: --over V=1:100.")
-            corners = []
-            for x in axes[0].samples(5):
-                corner = base.copy()
-                corner[model.index(axes[0].name)] = x
-                corners.append(corner)
-            lo, hi = load_window(model, corners)
-            both = [axes[0], _axis(model, Range("W0", lo=lo, hi=hi, spacing="log"))]
-        planes.append(Plane(base, both[0], both[1]))
-    return planes
+        if len(axes) == 2:
+            yield Plane(base, x, axes[1]), None
+            continue
+        lines = [base.copy() for _ in range(LINES)]
+        for line, value in zip(lines, x.samples(LINES), strict=True):
+            line[model.index(x.name)] = value
+        window = found_window(model, lines)
+        yield Plane(base, x, Axis("W0", window.lo, window.hi)), window
+
+
+def _judge_window(model: GeneratedModel, atlas: Atlas, window: LoadWindow) -> None:
+    """Say in `atlas` where its curves leave the loads that were found, and what of those loads is not certain."""
+    x = atlas.plane.x.name
+    for number, branch in enumerate(atlas.branches, 1):
+        for point in (branch.points[0], branch.points[-1]):
+            W0 = point.value(model, "W0")
+            side = "above" if 0.999 * window.hi < W0 else "below" if 1.001 * window.lo > W0 else ""
+            if side:
+                at = f"{x} = {model.declared(x, point.value(model, x)):.4g}"
+                atlas.notes.append(f"component {number} goes on {side} W0 = {W0:.4g} N at {at} (--over W0=LOW:HIGH for more)")
+    if not window.certain:
+        atlas.notes.append(f"crossings below {window.lo:.4g} or above {window.hi:.4g} N are not ruled out")
+        if atlas.status is Status.OK:
+            atlas.status = Status.UNSETTLED
 
 
 def _axis(model: GeneratedModel, given: Range) -> Axis:
@@ -213,6 +242,8 @@ def _figure(model: GeneratedModel, atlases: list[Atlas]) -> Figure:
     from srfcli.numerics.hopf import critical_point
     from srfcli.output import plots
 
+    if not atlases:
+        return plots.stability_diagram([], title=model.title)
     plane = atlases[0].plane
     usual = (plane.x.name, plane.y.name) == ("V", "W0")
     branches = []

@@ -40,7 +40,7 @@ AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation ampli
 @click.option(
     "--window",
     metavar="LOW:HIGH",
-    help="Loads to look between, in N; else 0.4 to 40 times the critical load at eps = 0.",
+    help="Loads to look between, in N; else all at which a crossing can be.",
 )
 @click.option("--tol", type=float, help="Relative error of a critical load.", default=1e-8, show_default=True)
 @click.option(
@@ -80,7 +80,6 @@ def command(
     from srfcli.cli.emit import Progress, emit, finish
     from srfcli.errors import SrfError
     from srfcli.numerics.critical import critical_line
-    from srfcli.numerics.windows import load_window
     from srfcli.output.tables import Table
 
     if not 1e-12 < tol < 0.1 or not 1e-8 < resolution < 1:
@@ -90,28 +89,34 @@ def command(
     velocities = V or (resolved.values["V"],)
     amplitudes = eps or (resolved.values["eps"],)
     limits = None if window is None else _window(window).fitted(model.parameters, where=model.title)
+    lo, hi = (limits.lo, limits.hi) if limits else (None, None)
     begun, rows, notes, statuses = time.perf_counter(), [], [], []
+    low, high = [], []
     interrupted = False
     with Progress("critical", total=len(velocities) * len(amplitudes)) as progress:
         try:
             for amplitude in amplitudes:
                 for velocity in velocities:
                     base = model.vector({**resolved.values, "V": velocity, "eps": amplitude})
-                    lo, hi = (limits.lo, limits.hi) if limits else load_window(model, [base])
                     line = critical_line(
                         model, base, lo=lo, hi=hi, tol=tol, samples=samples, resolution=resolution, max_mesh=max_mesh
                     )
                     rows += [boundary_row(model, q, None, k) for q, k in zip(line.points, line.crossings, strict=True)]
-                    statuses += [q.status for q in line.points]
+                    statuses += [line.status, *(q.status for q in line.points)]
+                    first, last = float(line.scans[0].values[0]), float(line.scans[-1].values[-1])
+                    low.append(first)
+                    high.append(last)
                     place = f"eps = {amplitude:g}, V = {velocity:g} um/s"
                     notes += [f"{place}: {note}" for note in line.notes]
                     if not line.points:
-                        notes.append(f"{place}: no crossing between W0 = {lo:.4g} and {hi:.4g} N; {_side(line.scan.g)}")
+                        side = _side([g for scan in line.scans for g in scan.g.tolist()])
+                        notes.append(f"{place}: no crossing between W0 = {first:.4g} and {last:.4g} N; {side}")
                     progress.advance(note=place)
         except KeyboardInterrupt:
             interrupted = True
-    span = f"{limits.lo:g} to {limits.hi:g} N" if limits else "0.4 to 40 times the critical load at eps = 0"
-    notes.append(f"looked from {span}; pairs of crossings closer than {resolution:g} in ln W0 are not looked for")
+    if low:
+        span = f"{min(low):.4g} to {max(high):.4g} N" + ("" if limits else ", to where the growth rate settles")
+        notes.append(f"looked from {span}; pairs of crossings closer than {resolution:g} in ln W0 are not looked for")
     status = Status.INTERRUPTED if interrupted else worst(statuses)
     described = {k: v for k, v in resolved.described().items() if k not in ("W0", "V", "eps")}
     table = Table("srf.critical/1", COLUMNS, rows, model.title, tuple(notes), described, status=status.value)
@@ -145,9 +150,9 @@ def _side(g: object) -> str:
     if not np.isfinite(values).all():
         return "no sign change among the samples that were found"
     return (
-        "stable throughout"
+        "stable at every load looked at"
         if values.size and (values < 0).all()
-        else "unstable throughout"
+        else "unstable at every load looked at"
         if values.size
         else "no periodic state found"
     )

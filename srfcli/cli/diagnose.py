@@ -85,6 +85,7 @@ def _diagnose(
     from srfcli.diagnosis.locate import locate
     from srfcli.diagnosis.search import Search
     from srfcli.diagnosis.verdict import conclude
+    from srfcli.numerics.compiled import GET_COMPILER, compiler
     from srfcli.output.records import json_text
     from srfcli.output.tables import plain_value
     from srfcli.recording.experiment import read_experiment
@@ -92,6 +93,8 @@ def _diagnose(
 
     begun = time.perf_counter()
     experiment = read_experiment(source, registry=registry, format=options["reader"], holdout=False)
+    if compiler() is None:
+        raise SrfError("srf diagnose needs a C compiler: it fits dozens of models", GET_COMPILER)
     with Progress("diagnose") as progress:
 
         def report(text: str) -> None:

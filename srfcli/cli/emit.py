@@ -90,6 +90,14 @@ def _write(path: Path, content: bytes, provenance: Provenance, options: OutputOp
     session.say(f"Wrote {path}")
 
 
+def warn_uncompiled(cost: str) -> None:
+    """Say in one line that no C compiler was found and what that costs; nothing where there is one or SRF_CC is empty."""
+    from srfcli.numerics.compiled import GET_COMPILER, uncompiled
+
+    if uncompiled():
+        Session.current().say(f"Warning: no C compiler was found: {cost}. Try: {GET_COMPILER}")
+
+
 def finish(status: Status) -> None:
     """End the command with the exit code of `status`: 0 where its numbers can be used, 130 interrupted, else 3.
 
@@ -103,7 +111,9 @@ def finish(status: Status) -> None:
 
 
 class Progress:
-    """One line on stderr that says how far a long loop is; silent where stderr is no terminal, and under -q.
+    """One line on stderr that says how far a long loop is, and with a `total` about how long the rest will take.
+
+    Silent where stderr is no terminal, and under -q.
 
     with Progress("boundary", total=60) as progress:
         for point in points:
@@ -116,6 +126,7 @@ class Progress:
         self._raw = getattr(self._stream, "unescaped", self._stream)
         self._active = self._stream.isatty() and not (Session.current().quiet if quiet is None else quiet)
         self._shown_at = 0.0
+        self._begun = time.monotonic()
 
     def __enter__(self) -> Progress:
         return self
@@ -135,6 +146,13 @@ class Progress:
             return
         self._shown_at = now
         count = f"{self.done}" if self.total is None else f"{self.done}/{self.total}"
-        line = f"{self.label}: {count}  {note}".rstrip()
+        line = f"{self.label}: {count}{self._left(now)}  {note}".rstrip()
         self._raw.write(f"\r\x1b[K{printable(line[:100], line=True)}")
         self._stream.flush()
+
+    def _left(self, now: float) -> str:
+        """Return what is left at the pace so far, once that is worth saying."""
+        if self.total is None or not 0 < self.done < self.total or now - self._begun < 2:
+            return ""
+        seconds = (now - self._begun) / self.done * (self.total - self.done)
+        return f", about {seconds:.0f} s left" if seconds < 100 else f", about {seconds / 60:.0f} min left"

@@ -96,7 +96,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     import time
     from dataclasses import asdict, replace
 
-    from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.cli.fit_tables import parameter_table, run_table
     from srfcli.inference.profile import profile
     from srfcli.inference.recordings import fit_recordings
@@ -109,6 +109,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     asked = options["profile"] or options["sample"]
     if options["track"] == "shared" and asked:
         raise SrfError("--track shared does not go with --profile or --sample", "Leave it out, or name --track rough.")
+    warn_uncompiled("the fit has no random friction field, and takes up to 34 times as long")
     begun = time.perf_counter()
     intervals: list[Interval] = []
     draws = None

@@ -102,7 +102,7 @@ def command(
     followed as a curve, islands included, and polished until its error is met. Text lists the components and their special
     points; CSV and JSON hold the grid.
     """
-    from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.errors import SrfError
     from srfcli.numerics.atlas import AtlasSettings
     from srfcli.numerics.continuation import StepSettings
@@ -119,15 +119,22 @@ def command(
     model = system.model()
     resolved, grid = _resolved_grid(system, model, over, {"eps": eps, "V": V, "W0": W0})
     settings = AtlasSettings(tol=system.tolerance(tol).value, max_mesh=max_mesh, steps=StepSettings(largest=step))
+    warn_uncompiled("a map takes about twice as long")
     begun = time.perf_counter()
     with Progress("map") as progress:
+
+        def tiles(done: int, count: int) -> None:
+            progress.total, progress.done = count, done
+            progress.advance(0, note="tiles")
+
         found = compute_map(
             model,
             grid,
             MapSettings(mesh_error=mesh_error, depth=depth),
             run=spread.run,
-            progress=lambda done, count: progress.advance(0, note=f"tile {done} of {count}"),
+            progress=tiles,
         )
+        progress.total = None
         mapped = time.perf_counter() - begun
         boundaries &= found.finished
         atlas, special, cubic = _boundaries(model, found, settings, (boundaries, criticality), progress)

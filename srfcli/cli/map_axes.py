@@ -123,7 +123,7 @@ def label(model: GeneratedModel, axis: MapAxis) -> str:
 def _load_axis(model: GeneratedModel, base: Array, x: MapAxis) -> MapAxis:
     """Return K/W0 over the loads at which boundaries are expected along `x`."""
     from srfcli.numerics.mapgrid import MapAxis
-    from srfcli.numerics.windows import load_window
+    from srfcli.numerics.windows import found_window
 
     if "W0" in (x.moved, x.held):
         raise SrfError(f"--over {x.name} alone spans no plane", "Add the other axis: --over V=1:100:80.")
@@ -132,7 +132,8 @@ def _load_axis(model: GeneratedModel, base: Array, x: MapAxis) -> MapAxis:
         corner = base.copy()
         corner[model.index(x.moved)] = x.parameter(model, base, value)
         corners.append(corner)
-    lo, hi = load_window(model, corners)
+    window = found_window(model, corners)
+    lo, hi = window.lo, window.hi
     if "K" in (x.moved, x.held):
         return MapAxis("W0", lo, hi, ROWS)
     K = float(base[model.index("K")])

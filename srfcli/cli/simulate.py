@@ -140,10 +140,11 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
     Drive and load are programs of pieces, or those of the runs of EXPERIMENT, a folder or its experiment.toml. Errors are
     controlled; slip velocities may fall to 1e-12 um/s and below. The records can be written as a new experiment, with noise.
     """
-    from srfcli.cli.emit import emit, finish
+    from srfcli.cli.emit import emit, finish, warn_uncompiled
     from srfcli.cli.simulated import curves, record_table
 
     _check(given, experiment, output)
+    warn_uncompiled("a simulation takes up to 34 times as long")
     work = _own(system, given) if experiment is None else _repeated(system, experiment, given)
     begun = time.perf_counter()
     records, status = _simulate_all(work, given["rtol"])

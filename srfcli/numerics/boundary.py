@@ -23,6 +23,7 @@ from srfcli.numerics.collocation import (
     running_products,
     stage_parameters,
 )
+from srfcli.numerics.orbitkernel import growth_compiled, kernel
 
 Names = tuple[str, ...]
 
@@ -64,7 +65,15 @@ def linearise_boundary(
     rho = np.take_along_axis(values, chosen[..., None], -1)[..., 0]
     if growth is None:
         r = np.take_along_axis(right_vectors, chosen[..., None, None], -1)[..., 0]
-        growth = _growth_row(model, p, orbit, condensed, names, rho, r, _left_vector(M, rho, r))
+        left = _left_vector(M, rho, r)
+        library = kernel(model)
+        if condensed.pivots is None or library is None:
+            growth = _growth_row(model, p, orbit, condensed, names, rho, r, left)
+        else:
+            which = np.array([model.index(name) for name in names], dtype=np.intc)
+            factored = condensed.block, condensed.pivots, condensed.local, condensed.maps, condensed.prefix
+            stages, frame = np.ascontiguousarray(orbit.stages), (orbit.phases, orbit.steps)
+            growth = growth_compiled(library, frame, p, stages, which, factored, (rho, r, left))
     end = condensed.prefix[..., -1, :n, :].copy()
     index = np.arange(n)
     end[..., index, index] -= 1

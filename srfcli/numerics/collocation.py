@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.model import GeneratedModel
+from srfcli.numerics.orbitkernel import condense_compiled, kernel
 
 Array = NDArray[Any]  # real; shapes are in the docstrings
 ComplexArray = NDArray[Any]
@@ -80,14 +81,16 @@ def join(parts: Sequence[Discretisation]) -> Discretisation:
 class Condensed:
     """A linearised orbit problem.
 
-    `block` (..., N, mn, mn) is the stage matrix; `local` (..., N, m, n, n+1+k) the stages' response to the interval's
-    first state, the residual and k parameters; `prefix` (..., N+1, n+1+k, n+1+k) the affine maps from tau = 0 to each mesh point.
+    `block` (..., N, mn, mn) is the stage matrix, in compiled code its factors, with their `pivots` (..., N, mn);
+    `local` (..., N, m, n, n+1+k) the stages' response to the interval's first state, the residual and k parameters;
+    `prefix` (..., N+1, n+1+k, n+1+k) the affine maps from tau = 0 to each mesh point.
     """
 
     block: Array
     local: Array
     maps: Array
     prefix: Array
+    pivots: Array | None = None
 
     @property
     def monodromy(self) -> Array:
@@ -125,8 +128,21 @@ def _frame(edges: bytes, m: int, n: int) -> _Frame:
 def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tuple[str, ...] = ()) -> Condensed:
     """Return the linearisation of the collocation equations about `orbit`, with columns for the parameters `names`.
 
-    `p` is (n_parameters, ...), in the model's order.
+    `p` is (n_parameters, ...), in the model's order. Compiled where it can be: `block` then holds factors.
     """
+    library = kernel(model) if orbit.stages.shape[-2] == STAGES else None
+    if library is None:
+        return condense_plainly(model, p, orbit, names)
+    which = np.array([model.index(name) for name in names], dtype=np.intc)
+    x, stages = np.ascontiguousarray(orbit.x), np.ascontiguousarray(orbit.stages)
+    lu, pivots, local, maps, prefix = condense_compiled(library, (orbit.phases, orbit.steps), p, x, stages, which)
+    return Condensed(lu, local, maps, prefix, pivots)
+
+
+def condense_plainly(
+    model: GeneratedModel, p: Array, orbit: Discretisation, names: tuple[str, ...] = ()
+) -> Condensed:
+    """Return what `condense` does, in NumPy, the stage matrices as they are."""
     x, X = orbit.x, orbit.stages
     m, n = X.shape[-2:]
     k, size, batch = len(names), m * n, X.shape[:-2]  # batch includes the intervals

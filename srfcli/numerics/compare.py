@@ -7,7 +7,7 @@ V; and the smallest amplitude at which a line meets more than one boundary (re-e
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -176,7 +176,8 @@ def _reentrance(model: GeneratedModel, task: LawTask, several: Sequence[bool]) -
     """Return the brackets of the amplitudes at which re-entrance begins, and is gone again; see LawStudy."""
 
     def there(eps: float) -> bool:
-        return _reentrant(_followed(model, task, eps) if eps > 0 else _without(model, task)[0], task.window)
+        found = _followed(model, task, eps) if eps > 0 else iter([_without(model, task)[0]])
+        return any(_reentrant(curves, task.window) for curves in found)
 
     def halved(low: float, high: float) -> tuple[float, float]:
         after = known[high]
@@ -198,13 +199,13 @@ def _reentrance(model: GeneratedModel, task: LawTask, several: Sequence[bool]) -
     return (*brackets, *((np.nan, np.nan),) * (2 - len(brackets)))
 
 
-def _followed(model: GeneratedModel, task: LawTask, eps: float) -> list[Array]:
-    """Return the components at one amplitude from a search on lines, which is quicker than a map."""
+def _followed(model: GeneratedModel, task: LawTask, eps: float) -> Iterator[list[Array]]:
+    """Yield the components at one amplitude, as they are found by a search on lines, which is quicker than a map."""
     base = task.p.copy()
     base[model.index("eps")] = eps
     plane = Plane(base, Axis("V", *task.window.V), Axis("W0", *task.window.W0))
-    *_, atlas = find_components(model, plane, AtlasSettings(lines=8, tol=1e-4))
-    return [_curve(model, b) for b in atlas.branches]
+    for atlas in find_components(model, plane, AtlasSettings(lines=8, tol=1e-4)):
+        yield [_curve(model, b) for b in atlas.branches]
 
 
 def changed_areas(crossings: Sequence[Array], window: Window) -> tuple[float, float]:

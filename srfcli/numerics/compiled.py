@@ -1,6 +1,6 @@
-"""The integrator in C, compiled with a model's own rates by whatever C compiler there is, and kept by content.
+"""Integrator, filter and periodic orbits in C, compiled with a model's own rates by what C compiler there is, kept by content.
 
-Without a compiler everything still works, an order of magnitude slower, on LSODA: `compiled(model)` is then None. SRF_CC names
+Without a compiler motion is LSODA's and orbits are NumPy's, which are slower: `compiled(model)` is then None. SRF_CC names
 the compiler; an empty SRF_CC turns compilation off.
 """
 
@@ -16,9 +16,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from srfcli.cache import LARGEST, cache_folder, content_key, is_sealed, seal
 from srfcli.errors import SrfError
@@ -35,6 +39,7 @@ DUAL_FUNCTIONS = {
     "rates": "srf_d_rates", "rates_jacobian": "srf_d_jacobian", "field_gain": "srf_d_gain", "elongation": "srf_d_reading",
     "elongation_gradient": "srf_d_gradient",
 }  # fmt: skip
+ORBIT_FUNCTIONS = {"cycle": "srf_cycle", "cycle_jacobian": "srf_cycle_jacobian", "cycle_bilinear": "srf_bilinear"}
 LANES = 8  # derivatives that the filter carries along at a time
 TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
 
@@ -50,6 +55,38 @@ def c_source(model: GeneratedModel) -> str:
     body = "\n".join(c_function(model.source, name, label=label) for name, label in functions.items())
     own = (files("srfcli") / "data" / "radau.c").read_text(encoding="utf-8")
     return head + needs + body + own + (_filter_source(model) if "field_gain" in model.namespace else "")
+
+
+def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_step: float) -> str:
+    """Return the C text of Newton's equations of periodic orbits; `scheme` holds the arrays of the collocation."""
+    stages = len(scheme["STEP"])
+    text = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n#define MS {stages}\n"
+    text += f"#define LOG_STEP {log_step!r}\n"
+    text += f"static const int LOGS[NX] = {{{', '.join(str(int(v)) for v in model.logarithmic)}}};\n"
+    for name, array in scheme.items():
+        sizes = "".join(f"[{n}]" for n in array.shape)
+        text += f"static const double {name}{sizes} = {{{', '.join(repr(float(v)) for v in array.ravel())}}};\n"
+    text += LAMBERTW if "lambertw(" in model.source else ""
+    text += "\n".join(c_function(model.source, name, label=label) for name, label in ORBIT_FUNCTIONS.items())
+    calls = {"CYCLE_PARAMETER": "", "CYCLE_BILINEAR_PARAMETER": ""}
+    for table in calls:
+        for place, name in enumerate(model.names):
+            own = model.namespace[table][name].__name__
+            text += c_function(model.source, own, label=f"srf_{own}")
+            rest = "x, p, out" if table == "CYCLE_PARAMETER" else "x, p, _w, _a, &out"
+            calls[table] += f"    case {place}: srf_{own}(tau, {rest}); break;\n"
+    point = "int which, double tau, const double *x, const double *p"
+    forms = {
+        "CYCLE_PARAMETER": (f"static void srf_cycle_parameter({point}, double *out)", "", ""),
+        "CYCLE_BILINEAR_PARAMETER": (
+            f"static double srf_bilinear_parameter({point}, const double *_w, const double *_a)",
+            "    double out = 0.0;\n",
+            "    return out;\n",
+        ),
+    }
+    for table, (head, before, after) in forms.items():
+        text += f"{head} {{\n{before}    switch (which) {{\n{calls[table]}    }}\n{after}}}\n"
+    return text + (files("srfcli") / "data" / "orbit.c").read_text(encoding="utf-8")
 
 
 def _filter_source(model: GeneratedModel) -> str:
@@ -85,6 +122,14 @@ def compiler() -> tuple[str, ...] | None:
     return None
 
 
+GET_COMPILER = "pip install ziglang, or install cc, gcc or clang"
+
+
+def uncompiled() -> bool:
+    """Return whether there is no C compiler though nobody asked for none (an empty SRF_CC does)."""
+    return os.environ.get("SRF_CC") is None and compiler() is None
+
+
 @cache
 def flags() -> tuple[str, ...]:
     """Return the compiler's options: FLAGS, and the widest vectors that this processor says it has."""
@@ -99,18 +144,40 @@ def flags() -> tuple[str, ...]:
 @cache
 def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
     """Return the compiled integrator of this model, or None where there is no compiler; SrfError where it fails on the text."""
-    command = compiler()
-    if command is None:
+    if compiler() is None:
         return None
-    source = c_source(model)
-    key = content_key([source, " ".join(command), " ".join(flags()), platform.platform(), platform.machine()])
+    library = library_of(lambda: c_source(model), ["motion", model.source])
+    library.srf_integrate.restype = ctypes.c_int
+    if hasattr(library, "srf_filter"):
+        library.srf_filter.restype = ctypes.c_int
+    return library
+
+
+@cache
+def _writers() -> str:
+    """Return the hash of all that C text is written with, besides the model: files of this package."""
+    here, data = files("srfcli") / "numerics", files("srfcli") / "data"
+    written = [here / name for name in ("compiled.py", "ctext.py", "collocation.py", "orbit.py")]
+    written += [data / name for name in ("radau.c", "filter.c", "orbit.c")]
+    return content_key([path.read_text(encoding="utf-8") for path in written])
+
+
+def library_of(write: Callable[[], str], parts: Sequence[str]) -> ctypes.CDLL:
+    """Return the C text of `write` compiled and loaded, from the cache where it was built before from the same `parts`.
+
+    With this package's own files the parts determine the text, which is therefore written only where it must be compiled. Raises
+    SrfError where the compiler fails on it.
+    """
+    command = compiler()
+    assert command is not None
+    key = content_key([*parts, _writers(), " ".join(command), " ".join(flags()), platform.platform(), platform.machine()])
     folder = cache_folder()
     if folder is not None:
         path = folder / f"{key}.so"
         with contextlib.suppress(OSError):  # a cache that cannot be written, or a disk from which nothing may be run
-            return _load(path if _intact(path) else _build(command, source, path, sealed=True))
+            return _load(path if _intact(path) else _build(command, write(), path, sealed=True))
     with tempfile.TemporaryDirectory(prefix="srf-", ignore_cleanup_errors=True) as scratch:
-        return _load(_build(command, source, Path(scratch) / f"{key}.so"))  # it stays in memory when its file is gone
+        return _load(_build(command, write(), Path(scratch) / f"{key}.so"))  # it stays in memory when its file is gone
 
 
 def _build(command: tuple[str, ...], source: str, path: Path, *, sealed: bool = False) -> Path:
@@ -128,7 +195,7 @@ def _build(command: tuple[str, ...], source: str, path: Path, *, sealed: bool = 
         )
         if done.returncode:
             first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
-            raise SrfError(f"{' '.join(command)} cannot compile the integrator: {first}", "SRF_CC= turns compiling off")
+            raise SrfError(f"{' '.join(command)} cannot compile a model: {first}", "SRF_CC= turns compiling off")
         if sealed:
             mark = Path(folder) / "model.sum"
             mark.write_text(seal(path.name, library.read_bytes()), encoding="ascii")
@@ -147,8 +214,4 @@ def _intact(path: Path) -> bool:
 
 
 def _load(path: Path) -> ctypes.CDLL:
-    library = ctypes.CDLL(str(path))
-    library.srf_integrate.restype = ctypes.c_int
-    if hasattr(library, "srf_filter"):
-        library.srf_filter.restype = ctypes.c_int
-    return library
+    return ctypes.CDLL(str(path))

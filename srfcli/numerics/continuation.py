@@ -19,7 +19,7 @@ from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
 from srfcli.numerics.plane import Plane
 from srfcli.status import Status
 
-STALE = 0.1  # of the step's length: a larger correction spoils the tangent
+STALE = 0.3  # of the step's length: a larger correction spoils the tangent
 ORBIT_WEIGHT = 0.05  # of the orbit's change in the arclength: regular where the curve has a cusp in the plane
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array, Discretisation
 from srfcli.numerics.polish import BoundaryPoint, along, polish
 from srfcli.numerics.scan import LineScan, scan_line
+from srfcli.numerics.windows import Reach, follow_outwards, load_window
 from srfcli.status import Status
 
 SAMPLES = 192
@@ -21,7 +22,8 @@ DEPTH = 4  # rescans of a bracket that Newton's method left
 class CriticalLine:
     """The critical values of `name` in [lo, hi], rising, and the scan that found them.
 
-    `crossings[i]` numbers points[i] from the low end: odd where stability is lost as the parameter rises.
+    `crossings[i]` numbers points[i] from the low end: odd where stability is lost as the parameter rises. `reach` is what was
+    looked at beyond [lo, hi] where no window was given. `status` is not OK where a crossing may be missing.
     """
 
     name: str
@@ -29,6 +31,13 @@ class CriticalLine:
     crossings: tuple[int, ...]
     scan: LineScan
     notes: tuple[str, ...]
+    status: Status = Status.OK
+    reach: Reach | None = None
+
+    @property
+    def scans(self) -> tuple[LineScan, ...]:
+        """Return all that was looked at, from low values to high."""
+        return (self.scan,) if self.reach is None else (*self.reach.below[::-1], self.scan, *self.reach.above)
 
 
 def critical_line(
@@ -36,8 +45,8 @@ def critical_line(
     base: Array,
     *,
     name: str = "W0",
-    lo: float,
-    hi: float,
+    lo: float | None = None,
+    hi: float | None = None,
     tol: float = 1e-8,
     samples: int = SAMPLES,
     resolution: float = 1e-3,
@@ -46,8 +55,12 @@ def critical_line(
 ) -> CriticalLine:
     """Return every crossing of the stability boundary along `name` in [lo, hi] at the parameters `base` (n_parameters,).
 
-    A pair of crossings closer than the scan's resolution (in ln name) may be missed; the notes say so where it may matter.
+    Without a window the loads W0 are followed to where the growth rate settles (numerics/windows.py). A pair of crossings closer
+    than the scan's resolution (in ln name) may be missed; the notes say so where it may matter.
     """
+    whole = lo is None or hi is None
+    if lo is None or hi is None:
+        lo, hi = load_window(model, [base])
     values = np.geomspace(lo, hi, samples) if guess is None else guess.values
     scan = scan_line(
         model,
@@ -58,11 +71,16 @@ def critical_line(
         guess=None if guess is None else guess.orbit,
         resolution=resolution,
     )
-    points = locate_crossings(model, base, scan, tol=tol, max_mesh=max_mesh)
-    first = np.nonzero(np.isfinite(scan.g))[0]
-    stable_below = bool(scan.g[first[0]] < 0) if first.size else True
+    reach = follow_outwards(model, base, scan, scan, resolution=resolution) if whole else None
+    line = CriticalLine(name, (), (), scan, (), reach=reach)
+    found = [locate_crossings(model, base, piece, tol=tol, max_mesh=max_mesh) for piece in line.scans]
+    points = _distinct(sorted((q for part in found for q in part), key=lambda q: q.value(model, name)), model, name)
+    signs = np.concatenate([piece.g for piece in line.scans])
+    signs = signs[np.isfinite(signs)]
+    stable_below = bool(signs[0] < 0) if signs.size else True
     crossings = tuple(i + (1 if stable_below else 2) for i in range(len(points)))
-    return CriticalLine(name, tuple(points), crossings, scan, tuple(_notes(scan, points, crossings)))
+    notes, status = _notes(model, line, points, crossings)
+    return replace(line, points=tuple(points), crossings=crossings, notes=tuple(notes), status=status)
 
 
 def locate_crossings(
@@ -131,15 +149,34 @@ def polish_brackets(
     return polish(model, p, guess, target, along(scan.name, len(left)), tol=tol, max_mesh=max_mesh)
 
 
-def _notes(scan: LineScan, points: list[BoundaryPoint], crossings: tuple[int, ...]) -> list[str]:
-    notes = []
-    if scan.lost.size:
-        notes.append(
-            f"no forced periodic state was found at {scan.lost.size} of {len(scan.values)} samples of {scan.name}"
-        )
-    for point, crossing in zip(points, crossings, strict=True):
-        if point.slope and (point.slope > 0) != (crossing % 2 == 1):
+def _notes(
+    model: GeneratedModel, line: CriticalLine, points: list[BoundaryPoint], crossings: tuple[int, ...]
+) -> tuple[list[str], Status]:
+    """Return what is to be said of the search, and OK where nothing of it puts a crossing in doubt."""
+    notes, status = [], Status.OK
+    for scan in line.scans:
+        if scan.lost.size:
+            span = f"between {scan.lost.min():.4g} and {scan.lost.max():.4g}"
             notes.append(
-                f"crossing {crossing} has the wrong direction: a crossing closer than {scan.resolution:.1g} was missed"
+                f"no forced periodic state was found at {scan.lost.size} of {len(scan.values)} samples of {scan.name} {span}"
             )
-    return notes
+            status = Status.NO_CONVERGENCE
+    expected = True  # that stability is lost as the parameter rises
+    for point, crossing in zip(points, crossings, strict=True):
+        if crossing == crossings[0]:
+            expected = crossing % 2 == 1
+        losing = point.slope > 0 if point.slope else expected
+        if losing != expected:
+            notes.append(
+                f"crossing {crossing} has the wrong direction: a crossing closer than {line.scan.resolution:.1g} was missed"
+            )
+            status = Status.NO_CONVERGENCE
+        expected = not losing
+    if line.reach is not None and not line.reach.settled:
+        low, high = line.scans[0].values[0], line.scans[-1].values[-1]
+        ends = [f"below {low:.4g} N"] * (not line.reach.settled_below) + [f"above {high:.4g} N"] * (
+            not line.reach.settled_above
+        )
+        notes.append(f"the growth rate had not settled: there may be crossings {' and '.join(ends)}")
+        status = Status.UNSETTLED
+    return notes, status

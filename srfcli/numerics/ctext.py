@@ -8,7 +8,7 @@ Evaluating Derivatives, 2008).
 from __future__ import annotations
 
 import ast
-from functools import singledispatch
+from functools import lru_cache, singledispatch
 
 from srfcli.errors import SrfError
 
@@ -17,6 +17,13 @@ _FUNCTIONS = {
 }
 _FUNCTIONS |= {name: f"srf_{name}" for name in ("lut", "lut1", "lut2")}
 _FUNCTIONS |= {"arctan": "atan", "arcsinh": "asinh", "lambertw": "srf_lambertw"}
+
+
+class NoForm(SrfError):
+    """A formula of a generated module that cannot be written in C."""
+
+
+_POINTERS = ("x", "p", "_w", "_a")  # arguments that are vectors
 _OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 _PI = "3.14159265358979323846"
 
@@ -112,12 +119,12 @@ def dual_arithmetic(source: str) -> str:
 
 
 def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str:
-    """Return function `name` of the generated module `source` as `static void label(x, V, W, W_dot, p, out)`.
+    """Return function `name` of the generated module `source` as `static void label(..., out)`, its arguments as they are.
 
     In dual numbers x, p and out are such. Entries of `out` that the formulas leave at zero are not written: the caller clears it.
     Raises SrfError for no such function.
     """
-    function = next((d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef) and d.name == name), None)
+    function = _functions(source).get(name)
     if function is None:
         raise SrfError(f"generated module has no function '{name}'")
     arguments = [a.arg for a in function.args.args]
@@ -142,10 +149,16 @@ def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str
             else:
                 lines.append(f"const double {_safe(target.id)} = {_text(value)};")
     unused = "".join(f" (void){_safe(a)};" for a in arguments)
-    kinds = {a: "const dual *" if dual else "const double *" for a in ("x", "p")}
+    kinds = {a: "const dual *" if dual else "const double *" for a in _POINTERS}
     declared = ", ".join(f"{kinds.get(a, 'const double ')}{_safe(a)}" for a in arguments)
     body = "\n".join(f"    {line}" for line in lines)
     return f"static void {label}({declared}, {'dual' if dual else 'double'} *out) {{\n   {unused}\n{body}\n}}\n"
+
+
+@lru_cache(maxsize=4)
+def _functions(source: str) -> dict[str, ast.FunctionDef]:
+    """Return the functions of a generated module, parsed once: dozens are asked for."""
+    return {d.name: d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef)}
 
 
 def _value(node: ast.AST, duals: set[str] | None) -> str:
@@ -205,12 +218,12 @@ def _flat(target: ast.Subscript, shape: tuple[int, ...]) -> int:
 
 def _safe(name: str) -> str:
     """Return a name that no keyword or macro of C shadows."""
-    return f"q_{name}" if name not in ("x", "p") else name
+    return name if name in _POINTERS else f"q_{name}"
 
 
 @singledispatch
 def _text(node: ast.AST) -> str:
-    raise SrfError(f"{type(node).__name__} in a generated function has no form in C")
+    raise NoForm(f"{type(node).__name__} in a generated function has no form in C")
 
 
 @_text.register
@@ -249,5 +262,5 @@ def _(node: ast.BinOp) -> str:
 def _(node: ast.Call) -> str:
     assert isinstance(node.func, ast.Name)
     if node.func.id not in _FUNCTIONS:
-        raise SrfError(f"function {node.func.id} of a generated module has no form in C")
+        raise NoForm(f"function {node.func.id} of a generated module has no form in C")
     return f"{_FUNCTIONS[node.func.id]}({', '.join(_text(a) for a in node.args)})"

@@ -11,7 +11,7 @@ from srfcli.numerics.collocation import (
     Array,
     ComplexArray,
     Discretisation,
-    condense,
+    condense_plainly,
     gauss,
     log_determinant,
     mesh_error,
@@ -137,4 +137,4 @@ def _liouville(model: GeneratedModel, p: Array, orbit: Discretisation) -> float:
     exponents = (trace @ gauss(orbit.stages.shape[-2]).weights) * orbit.steps
     if np.abs(exponents).max() > STIFF:
         return float("nan")
-    return float(abs(np.expm1(log_determinant(condense(model, p, orbit), orbit) - exponents.sum())))
+    return float(abs(np.expm1(log_determinant(condense_plainly(model, p, orbit), orbit) - exponents.sum())))

@@ -12,6 +12,7 @@ from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import Array, ComplexArray, Discretisation
 from srfcli.numerics.mapgrid import MapGrid, MapSettings, TileTask, tile_tasks
 from srfcli.numerics.maprefine import solve_tile
+from srfcli.numerics.orbitkernel import kernel
 
 # of a point: no orbit found; stable; unstable by a multiplier off the real axis, a negative, a positive one
 KINDS = ("unresolved", "stable", "ns", "pd", "fold")
@@ -141,6 +142,7 @@ def compute_map(
     settings = settings or MapSettings()
     tasks = tile_tasks(model, grid, settings)
     tiles: dict[int, Tile] = {}
+    kernel(model)  # compiled here, not by every worker at once
     try:
         for index, tile in run(solve_tile, tasks):
             tiles[index] = tile

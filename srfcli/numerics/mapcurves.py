@@ -16,7 +16,7 @@ from srfcli.numerics.collocation import Array, Discretisation
 from srfcli.numerics.continuation import Curve, CurvePoint, correct, trace
 from srfcli.numerics.critical import locate_crossings
 from srfcli.numerics.map import Brink, Seed, StabilityMap
-from srfcli.numerics.mapfolds import fold_at, leads_on
+from srfcli.numerics.mapfolds import fold_at, leads_on, not_led_on
 from srfcli.numerics.plane import Axis, Plane
 from srfcli.numerics.polish import BoundaryPoint, along, bifurcation_kind, polish
 from srfcli.numerics.scan import scan_line
@@ -63,13 +63,17 @@ def find_boundaries(
     brinks = list(found.brinks)
     traced: list[_Traced] = []
     missed: list[Seed] = []
-    endless = 0
+    endless, sifted = 0, False
     try:
         while waiting or brinks:
             if waiting:
                 seed = waiting.pop(0)
                 start = starting_point(model, atlas.plane, seed, settings)
                 missed += [seed] if start is None else []
+            elif not sifted:
+                progress(f"{len(brinks)} places where a state may end")
+                brinks, sifted = not_led_on(model, atlas.plane, brinks), True
+                continue
             else:
                 end = leads_on(model, atlas.plane, brinks.pop(len(brinks) // 2))
                 if end is None:

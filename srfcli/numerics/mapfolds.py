@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import Discretisation
+from srfcli.numerics.collocation import Array, Discretisation
 from srfcli.numerics.continuation import CurvePoint, correct
 from srfcli.numerics.map import Brink
 from srfcli.numerics.orbit import scales, solve_orbits
@@ -15,7 +17,41 @@ from srfcli.numerics.polish import bifurcation_kind
 FINEST = 2.0**-12  # of the way to the neighbour: where the halving of steps ends
 NEAR = 0.5  # in logarithms, or V, or um: a larger step of the state is not taken for the same state
 MEETS = 0.8  # of the leading multiplier, from where the fold itself is solved for
+STEPS = (3, 8)  # of equal length, in which most states reach their neighbour; those that do not in the first try the next
 REACH = 0.01  # of the window: a fold farther from where the state was last found is another
+
+
+def not_led_on(model: GeneratedModel, plane: Plane, brinks: Sequence[Brink], steps: Sequence[int] = STEPS) -> list[Brink]:
+    """Return the brinks whose stable state is not met at their neighbour after a few equal steps; in batches, for `leads_on`.
+
+    Each step starts from the state before with the change of steady sliding, and the change of what remained over the last step.
+    """
+    left: list[Brink] = []
+    by_mesh: dict[int, list[Brink]] = {}
+    for brink in brinks:
+        by_mesh.setdefault(len(brink.orbit.edges), []).append(brink)
+    for group in by_mesh.values():
+        edges, ends = group[0].orbit.edges, np.stack([b.ends for b in group])
+        x, stages = np.stack([b.orbit.x for b in group]), np.stack([b.orbit.stages for b in group])
+        before = _points(model, plane, ends[:, 0])
+        going, dx, dstages = np.ones(len(group), bool), np.zeros_like(x), np.zeros_like(stages)
+        for share in np.arange(1, steps[0] + 1) / steps[0]:
+            p = _points(model, plane, ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))
+            shift = (model.steady(p) - model.steady(before))[:, None, :]
+            guess = Discretisation(x + shift + dx, stages + shift[:, None] + dstages, edges)
+            found = solve_orbits(model, p, guess, tol=1e-7, max_iterations=10)
+            off = (np.abs(found.orbit.x - guess.x) / scales(model, p)[:, None, :]).max(axis=(-1, -2))
+            with np.errstate(invalid="ignore"):
+                going &= found.converged & (off < NEAR) & (np.abs(found.multipliers[:, 0]) < 1)
+            dx, dstages = found.orbit.x - x - shift, found.orbit.stages - stages - shift[:, None]
+            x, stages, before = found.orbit.x, found.orbit.stages, p
+        left += [brink for brink, led in zip(group, going, strict=True) if not led]
+    return not_led_on(model, plane, left, steps[1:]) if left and steps[1:] else left
+
+
+def _points(model: GeneratedModel, plane: Plane, q: Array) -> Array:
+    """Return the parameters (n_parameters, B) at unit coordinates q (B, 2)."""
+    return np.stack([plane.point(model, row) for row in q], axis=1)
 
 
 def leads_on(model: GeneratedModel, plane: Plane, brink: Brink) -> Brink | None:

@@ -16,7 +16,7 @@ import numpy as np
 from srfcli.model import GeneratedModel
 from srfcli.numerics.atlas import Branch
 from srfcli.numerics.boundary import pick_multiplier
-from srfcli.numerics.collocation import Array, ComplexArray, Condensed, Discretisation, condense, gauss
+from srfcli.numerics.collocation import Array, ComplexArray, Condensed, Discretisation, condense_plainly, gauss
 from srfcli.numerics.continuation import CurvePoint
 from srfcli.numerics.plane import Plane
 from srfcli.numerics.special import RESONANCES, SpecialPoint, locate
@@ -37,7 +37,7 @@ def cubic_coefficient(model: GeneratedModel, p: Array, orbit: Discretisation, rh
 
 def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: complex) -> tuple[float, ComplexArray]:
     """Return d and the critical eigenvector at tau = 0 (n,), in the unit that d is in."""
-    c = condense(model, p, orbit)
+    c = condense_plainly(model, p, orbit)
     n = orbit.x.shape[-1]
     values, vectors = np.linalg.eig(c.monodromy)
     k = int(pick_multiplier(values.astype(complex), np.asarray(rho.real + 1j * abs(rho.imag))))

@@ -20,6 +20,7 @@ from srfcli.numerics.collocation import (
     gauss,
     join,
 )
+from srfcli.numerics.orbitkernel import kernel, newton_orbits
 
 CHUNK = 48  # parameter points solved together: their blocks fit the cache
 LOG_STEP = 3.0  # a Newton step changes no velocity or age by more than a factor e^3
@@ -198,6 +199,14 @@ def _solve_one(model: GeneratedModel, p: Array, guess: Discretisation, tol: floa
 
 
 def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: float, max_iterations: int) -> OrbitBatch:
+    library = kernel(model) if guess.stages.shape[-2] == STAGES else None
+    if library is not None:
+        found = Discretisation(guess.x.copy(), guess.stages.copy(), guess.edges)
+        size = np.ascontiguousarray(scales(model, p))
+        monodromy, converged, used = newton_orbits(
+            library, (found.phases, found.steps), p, found.x, found.stages, size, tol, max_iterations
+        )
+        return OrbitBatch(p, found, monodromy, converged, used)
     if p.shape[1] == 1:
         return _solve_one(model, p, guess, tol, max_iterations)
     B, n = p.shape[1], len(model.states)

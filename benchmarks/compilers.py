@@ -1,0 +1,75 @@
+"""What it takes to compile a model: CPU time of every C compiler there is, size of what it makes, and numba beside them.
+
+    .venv/bin/python benchmarks/compilers.py
+
+Compiled are the integrator, and integrator and filter of a model with a random friction field, each twice: the first time a
+compiler may still build what it needs itself. numba, where it is installed, compiles the rates and their two derivatives alone.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import resource
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from srfcli.model import GeneratedModel, open_model
+from srfcli.numerics.compiled import _build, c_source
+from srfcli.registry import load_registry
+
+
+def children() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def commands() -> dict[str, tuple[str, ...]]:
+    found = {name: (name,) for name in ("gcc", "clang") if shutil.which(name)}
+    if importlib.util.find_spec("ziglang"):
+        found["ziglang"] = (sys.executable, "-m", "ziglang", "cc")
+    return found
+
+
+def with_numba(model: GeneratedModel) -> float:
+    """Return the CPU seconds that numba takes for the rates, their Jacobian and their parameter derivatives."""
+    sys.path = [p for p in sys.path if Path(p) != Path(__file__).parent]  # numba would take coverage.py for another's
+    from numba import njit
+
+    n, count = len(model.states), len(model.names)
+    sizes = {"rates": (n,), "rates_jacobian": (n, n), "rates_parameters": (n, count)}
+    begun = time.process_time()
+    for name, shape in sizes.items():
+        body = model.source[model.source.index(f"def {name}(") :].split("\n\n\n")[0]
+        body = body.replace("[..., ", "[").replace("W_dot, p)", "W_dot, p, out)").replace("out = _empty", "# ")
+        space = {k: getattr(math, k) for k in ("exp", "log", "cos", "pi", "sqrt")}
+        exec(body, space)
+        njit(space[name])(np.ones(n), 1.0, 1.0, 1.0, np.ones(count), np.zeros(shape))
+    return time.process_time() - begun
+
+
+def main() -> None:
+    registry = load_registry()
+    models = {"integrator": open_model(registry), "with filter": open_model(registry, random_field=True)}
+    print("compiler      text         lines   CPU s, twice     bytes")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, command in commands().items():
+            for kind, model in models.items():
+                text, taken = c_source(model), []
+                for _ in range(2):
+                    before = children()
+                    path = _build(command, text, Path(folder) / "model.so")
+                    taken.append(children() - before)
+                size = path.stat().st_size
+                print(f"{name:12}  {kind:11} {len(text.splitlines()):6}   {taken[0]:.2f} {taken[1]:.2f} {size:12}")
+    if importlib.util.find_spec("numba"):
+        print(f"numba         three functions      {with_numba(models['integrator']):.2f}")
+
+
+if __name__ == "__main__":
+    main()

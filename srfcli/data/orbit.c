@@ -1,0 +1,377 @@
+/* Newton's equations of periodic orbits: Gauss collocation over one forcing period, condensed interval by interval.
+
+   The same equations, in the same order, as numerics/collocation.py and numerics/boundary.py, which hold where there is no
+   compiler. Compiled together with a model: NX states, NP parameters, MS Gauss points, LOGS, LOG_STEP, and
+     srf_cycle(tau, x, p, out[NX])                    srf_cycle_jacobian(tau, x, p, out[NX*NX])
+     srf_cycle_parameter(which, tau, x, p, out[NX])
+     srf_bilinear(tau, x, p, w, a, out[NX])           srf_bilinear_parameter(which, tau, x, p, w, a)
+   MI is the inverse of the collocation matrix, STEP the weights of x_1 = x_0 + STEP . (X - x_0).
+   Arrays are row-major, batches of parameter points first; p is (points, NP). */
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define S (MS * NX)
+#define PAD (8 * ((NX + 3 + 7) / 8)) /* columns of the right side, room for two parameters among them */
+#define T (S + PAD)
+#define THRESHOLD 0.1 /* of a column's largest entry: a diagonal entry above it is the pivot */
+
+#ifdef _WIN32
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT
+#endif
+
+/* LU with partial pivoting in place; returns 0 where the matrix is singular or not finite */
+static int orbit_factor(int n, double *a, int *pivot) {
+    for (int k = 0; k < n; k++) {
+        int best = k;
+        double largest = fabs(a[k * n + k]);
+        for (int i = k + 1; i < n; i++)
+            if (fabs(a[i * n + k]) > largest) {
+                largest = fabs(a[i * n + k]);
+                best = i;
+            }
+        pivot[k] = best;
+        if (!(largest > 0.0) || !isfinite(largest)) return 0;
+        if (best != k)
+            for (int j = 0; j < n; j++) {
+                double t = a[k * n + j];
+                a[k * n + j] = a[best * n + j];
+                a[best * n + j] = t;
+            }
+        double inverse = 1.0 / a[k * n + k];
+        for (int i = k + 1; i < n; i++) {
+            double f = a[i * n + k] *= inverse;
+            if (f != 0.0)
+                for (int j = k + 1; j < n; j++) a[i * n + j] -= f * a[k * n + j];
+        }
+    }
+    return 1;
+}
+
+/* b := a^-1 b for w columns */
+static void orbit_solve(int n, int w, const double *a, const int *pivot, double *b) {
+    for (int k = 0; k < n; k++)
+        if (pivot[k] != k)
+            for (int j = 0; j < w; j++) {
+                double t = b[k * w + j];
+                b[k * w + j] = b[pivot[k] * w + j];
+                b[pivot[k] * w + j] = t;
+            }
+    for (int i = 1; i < n; i++)
+        for (int k = 0; k < i; k++) {
+            double f = a[i * n + k];
+            if (f != 0.0)
+                for (int j = 0; j < w; j++) b[i * w + j] -= f * b[k * w + j];
+        }
+    for (int i = n - 1; i >= 0; i--) {
+        for (int k = i + 1; k < n; k++) {
+            double f = a[i * n + k];
+            if (f != 0.0)
+                for (int j = 0; j < w; j++) b[i * w + j] -= f * b[k * w + j];
+        }
+        double inverse = 1.0 / a[i * n + i];
+        for (int j = 0; j < w; j++) b[i * w + j] *= inverse;
+    }
+}
+
+/* b := a^-T b for two columns */
+static void orbit_solve_transposed(int n, const double *a, const int *pivot, double *b) {
+    for (int i = 0; i < n; i++) {
+        double inverse = 1.0 / a[i * n + i], re = b[2 * i] * inverse, im = b[2 * i + 1] * inverse;
+        b[2 * i] = re;
+        b[2 * i + 1] = im;
+        for (int k = i + 1; k < n; k++) {
+            b[2 * k] -= a[i * n + k] * re;
+            b[2 * k + 1] -= a[i * n + k] * im;
+        }
+    }
+    for (int i = n - 1; i > 0; i--)
+        for (int k = 0; k < i; k++) {
+            b[2 * k] -= a[i * n + k] * b[2 * i];
+            b[2 * k + 1] -= a[i * n + k] * b[2 * i + 1];
+        }
+    for (int k = n - 1; k >= 0; k--)
+        if (pivot[k] != k)
+            for (int c = 0; c < 2; c++) {
+                double t = b[2 * k + c];
+                b[2 * k + c] = b[2 * pivot[k] + c];
+                b[2 * pivot[k] + c] = t;
+            }
+}
+
+/* Row elimination of [a | b] in rows of the fixed length T, which compilers turn into vectors; a ends as its LU factors, b as a^-1 b */
+static int eliminate(double m[S][T], int *pivot) {
+    for (int k = 0; k < S; k++) {
+        double largest = 0.0, row[T];
+        for (int i = k; i < S; i++) largest = fabs(m[i][k]) > largest ? fabs(m[i][k]) : largest;
+        if (!(largest > 0.0) || !isfinite(largest)) return 0;
+        pivot[k] = k;
+        if (fabs(m[k][k]) < THRESHOLD * largest) { /* seldom: the search costs more than the rest of the step */
+            while (fabs(m[pivot[k]][k]) < largest) pivot[k]++;
+            for (int j = 0; j < T; j++) {
+                double t = m[k][j];
+                m[k][j] = m[pivot[k]][j];
+                m[pivot[k]][j] = t;
+            }
+        }
+        double inverse = 1.0 / m[k][k];
+        for (int j = 0; j < T; j++) row[j] = j > k ? m[k][j] : 0.0; /* factors to the left stay */
+        for (int i = k + 1; i < S; i++) {
+            double f = m[i][k] * inverse;
+            for (int j = 0; j < T; j++) m[i][j] -= f * row[j];
+            m[i][k] = f;
+        }
+    }
+    for (int i = S - 1; i >= 0; i--) {
+        double sum[PAD], inverse = 1.0 / m[i][i];
+        for (int j = 0; j < PAD; j++) sum[j] = m[i][S + j];
+        for (int k = i + 1; k < S; k++) {
+            double f = m[i][k];
+            for (int j = 0; j < PAD; j++) sum[j] -= f * m[k][S + j];
+        }
+        for (int j = 0; j < PAD; j++) m[i][S + j] = sum[j] * inverse;
+    }
+    return 1;
+}
+
+/* One interval: its stage matrix factored, the stages' response `local` (S, w) and the map (NX, w) of its first state, w = NX + 1 + k.
+   Columns: NX for the first state, one for the residual, k for the parameters, of which those beyond PAD are solved for apart.
+   `lu` and `pivot` get the factors where lu is not 0. */
+static int interval(double h, const double *tau, const double *p, const double *x, const double *X, const double *next, int k,
+                    const int *which, double *lu, int *pivot, double *local, double *map) {
+    const int w = NX + 1 + k, near = w < PAD ? w : PAD;
+    double m[S][T], f[NX], J[NX * NX], inverse = 1.0 / h;
+    memset(m, 0, sizeof m);
+    for (int j = 0; j < MS; j++) {
+        double rows = 0.0;
+        for (int i = 0; i < MS; i++) {
+            double c = MI[j][i] * inverse;
+            rows += c;
+            for (int a = 0; a < NX; a++) m[j * NX + a][i * NX + a] = c;
+        }
+        memset(f, 0, sizeof f);
+        memset(J, 0, sizeof J);
+        srf_cycle(tau[j], X + j * NX, p, f);
+        srf_cycle_jacobian(tau[j], X + j * NX, p, J);
+        for (int a = 0; a < NX; a++) {
+            double slope = 0.0, *row = m[j * NX + a];
+            for (int b = 0; b < NX; b++) row[j * NX + b] -= J[a * NX + b];
+            for (int i = 0; i < MS; i++) slope += MI[j][i] * (X[i * NX + a] - x[a]);
+            row[S + a] = rows;
+            row[S + NX] = f[a] - slope * inverse;
+        }
+        for (int c = 0; c < k; c++) {
+            memset(f, 0, sizeof f);
+            srf_cycle_parameter(which[c], tau[j], X + j * NX, p, f);
+            for (int a = 0; a < NX; a++) {
+                if (NX + 1 + c < PAD) m[j * NX + a][S + NX + 1 + c] = f[a];
+                else local[(j * NX + a) * w + NX + 1 + c] = f[a];
+            }
+        }
+    }
+    if (!eliminate(m, pivot)) return 0;
+    for (int s = 0; s < S; s++)
+        for (int c = 0; c < near; c++) local[s * w + c] = m[s][S + c];
+    if (lu)
+        for (int s = 0; s < S; s++) memcpy(lu + s * S, m[s], sizeof(double) * S);
+    for (int c = PAD; c < w; c++) {
+        double column[S];
+        for (int s = 0; s < S; s++) column[s] = local[s * w + c];
+        orbit_solve(S, 1, lu, pivot, column);
+        for (int s = 0; s < S; s++) local[s * w + c] = column[s];
+    }
+    double rest = 1.0;
+    for (int j = 0; j < MS; j++) rest -= STEP[j];
+    for (int a = 0; a < NX; a++) {
+        for (int c = 0; c < w; c++) {
+            double sum = 0.0;
+            for (int j = 0; j < MS; j++) sum += STEP[j] * local[(j * NX + a) * w + c];
+            map[a * w + c] = sum;
+        }
+        map[a * w + a] += rest;
+        double gap = x[a] - next[a];
+        for (int j = 0; j < MS; j++) gap += STEP[j] * (X[j * NX + a] - x[a]);
+        map[a * w + NX] += gap;
+    }
+    return 1;
+}
+
+/* out = map after before, of affine maps (NX, w) whose last w - NX rows are those of the identity */
+static void chained(int w, const double *map, const double *before, double *out) {
+    for (int a = 0; a < NX; a++)
+        for (int c = 0; c < w; c++) {
+            double sum = c < NX ? 0.0 : map[a * w + c];
+            for (int b = 0; b < NX; b++) sum += map[a * w + b] * before[b * w + c];
+            out[a * w + c] = sum;
+        }
+}
+
+/* Newton's method for the periodic orbits of B points, each until its step is below tol; x (B, N, NX) and X (B, N, MS, NX) are the
+   guesses, then the last iterates. `size` (B, NX) measures x. Returns the most iterations that any took, -1 without memory. */
+EXPORT int srf_orbits(int B, int N, const double *tau, const double *h, const double *p, double *x, double *X, const double *size,
+                      double tol, int max_iterations, double *monodromy, unsigned char *converged) {
+    enum { w = NX + 1 };
+    double *local = malloc(sizeof(double) * N * (S * w + NX * w + NX + S)), map[NX * w];
+    if (!local) return -1;
+    double *prefix = local + (size_t)N * S * w, *dx = prefix + (size_t)N * NX * w, *dX = dx + (size_t)N * NX;
+    int pivot[S], most = 0;
+    for (int b = 0; b < B; b++) {
+        const double *own = p + (size_t)b * NP, *scale = size + (size_t)b * NX;
+        double *y = x + (size_t)b * N * NX, *Y = X + (size_t)b * N * S, *M = monodromy + (size_t)b * NX * NX;
+        converged[b] = 0;
+        for (int iteration = 1; iteration <= max_iterations; iteration++) {
+            double now[NX * w], then[NX * w];
+            memset(now, 0, sizeof now);
+            for (int a = 0; a < NX; a++) now[a * w + a] = 1.0;
+            int good = 1;
+            most = iteration > most ? iteration : most;
+            for (int i = 0; i < N && good; i++) {
+                memcpy(prefix + (size_t)i * NX * w, now, sizeof now);
+                good = interval(h[i], tau + i * MS, own, y + i * NX, Y + i * S, y + (i + 1 < N ? i + 1 : 0) * NX, 0, 0, 0, pivot,
+                                local + (size_t)i * S * w, map);
+                chained(w, map, now, then);
+                memcpy(now, then, sizeof now);
+            }
+            if (!good) break;
+            double matrix[NX * NX], start[NX];
+            for (int a = 0; a < NX; a++) {
+                for (int c = 0; c < NX; c++) {
+                    M[a * NX + c] = now[a * w + c];
+                    matrix[a * NX + c] = (a == c) - now[a * w + c];
+                }
+                start[a] = now[a * w + NX];
+            }
+            if (!orbit_factor(NX, matrix, pivot)) break;
+            orbit_solve(NX, 1, matrix, pivot, start);
+            double change = 0.0, swing = 0.0;
+            int finite = 1;
+            for (int i = 0; i < N; i++) {
+                const double *P = prefix + (size_t)i * NX * w, *L = local + (size_t)i * S * w;
+                for (int a = 0; a < NX; a++) {
+                    double sum = P[a * w + NX];
+                    for (int c = 0; c < NX; c++) sum += P[a * w + c] * start[c];
+                    dx[i * NX + a] = sum;
+                    finite &= isfinite(sum) != 0;
+                    change = fmax(change, fabs(sum) / scale[a]);
+                    if (LOGS[a]) swing = fmax(swing, fabs(sum));
+                }
+                for (int s = 0; s < S; s++) {
+                    double sum = L[s * w + NX];
+                    for (int c = 0; c < NX; c++) sum += L[s * w + c] * dx[i * NX + c];
+                    dX[i * S + s] = sum;
+                    finite &= isfinite(sum) != 0;
+                    if (LOGS[s % NX]) swing = fmax(swing, fabs(sum));
+                }
+            }
+            if (!finite) break;
+            double limit = swing > LOG_STEP ? LOG_STEP / swing : 1.0;
+            for (int i = 0; i < N * NX; i++) y[i] += limit * dx[i];
+            for (int i = 0; i < N * S; i++) Y[i] += limit * dX[i];
+            if (change < tol) {
+                converged[b] = 1;
+                break;
+            }
+        }
+    }
+    free(local);
+    return most;
+}
+
+/* The linearisation about B orbits with k parameter columns: factored stage matrices lu (B, N, S, S) with pivots (B, N, S), local
+   (B, N, S, w), maps (B, N, w, w) and prefix (B, N + 1, w, w), w = NX + 1 + k. `good` (B) is 0 where a matrix is singular. */
+EXPORT void srf_condense(int B, int N, int k, const int *which, const double *tau, const double *h, const double *p, const double *x,
+                         const double *X, double *lu, int *pivot, double *local, double *maps, double *prefix, unsigned char *good) {
+    const int w = NX + 1 + k;
+    for (int b = 0; b < B; b++) {
+        const double *y = x + (size_t)b * N * NX, *Y = X + (size_t)b * N * S;
+        double *P = prefix + (size_t)b * (N + 1) * w * w;
+        memset(P, 0, sizeof(double) * (N + 1) * w * w);
+        for (int i = 0; i <= N; i++)
+            for (int a = i ? NX : 0; a < w; a++) P[(size_t)i * w * w + a * w + a] = 1.0;
+        good[b] = 1;
+        for (int i = 0; i < N && good[b]; i++) {
+            size_t at = (size_t)b * N + i;
+            double *map = maps + at * w * w;
+            memset(map, 0, sizeof(double) * w * w);
+            for (int a = NX; a < w; a++) map[a * w + a] = 1.0;
+            good[b] = interval(h[i], tau + i * MS, p + (size_t)b * NP, y + i * NX, Y + i * S, y + (i + 1 < N ? i + 1 : 0) * NX, k, which,
+                               lu + at * S * S, pivot + at * S, local + at * S * w, map);
+            chained(w, map, P + (size_t)i * w * w, P + (size_t)(i + 1) * w * w);
+        }
+    }
+}
+
+/* The derivative row (B, w) of ln |rho| by (dx_0, residual, parameters), from a linearisation and the right and left eigenvectors r
+   and l (B, NX, 2) of the monodromy matrix for rho (B, 2), l . r = 1; complex numbers as pairs. */
+EXPORT void srf_growth(int B, int N, int k, const int *which, const double *tau, const double *p, const double *X, const double *lu,
+                       const int *pivot, const double *local, const double *maps, const double *prefix, const double *rho,
+                       const double *r, const double *l, double *row) {
+    const int w = NX + 1 + k;
+    for (int b = 0; b < B; b++) {
+        const double *own = p + (size_t)b * NP, *P = prefix + (size_t)b * (N + 1) * w * w;
+        double *out = row + (size_t)b * w, back[2 * NX];
+        double square = rho[2 * b] * rho[2 * b] + rho[2 * b + 1] * rho[2 * b + 1];
+        double scale_re = rho[2 * b] / square, scale_im = -rho[2 * b + 1] / square;
+        memset(out, 0, sizeof(double) * w);
+        for (int a = 0; a < NX; a++) { /* 1/rho goes with l */
+            double re = l[(b * NX + a) * 2], im = l[(b * NX + a) * 2 + 1];
+            back[2 * a] = re * scale_re - im * scale_im;
+            back[2 * a + 1] = re * scale_im + im * scale_re;
+        }
+        for (int i = N - 1; i >= 0; i--) {
+            size_t at = (size_t)b * N + i;
+            const double *here = P + (size_t)i * w * w, *L = local + at * S * w, *map = maps + at * w * w;
+            double v0[2 * NX], v[2][S], seed[2 * S], own_row[NX + 1 + k];
+            for (int a = 0; a < NX; a++)
+                for (int c = 0; c < 2; c++) {
+                    double sum = 0.0;
+                    for (int d = 0; d < NX; d++) sum += here[a * w + d] * r[(b * NX + d) * 2 + c];
+                    v0[2 * a + c] = sum;
+                }
+            for (int s = 0; s < S; s++)
+                for (int c = 0; c < 2; c++) {
+                    double sum = 0.0;
+                    for (int d = 0; d < NX; d++) sum += L[s * w + d] * v0[2 * d + c];
+                    v[c][s] = sum;
+                    seed[2 * s + c] = STEP[s / NX] * back[2 * (s % NX) + c];
+                }
+            orbit_solve_transposed(S, lu + at * S * S, pivot + at * S, seed);
+            memset(own_row, 0, sizeof(double) * w);
+            for (int j = 0; j < MS; j++) {
+                double w_re[NX], w_im[NX], g[NX], g_im[NX];
+                for (int a = 0; a < NX; a++) {
+                    w_re[a] = seed[2 * (j * NX + a)];
+                    w_im[a] = seed[2 * (j * NX + a) + 1];
+                }
+                const double *Y = X + (at * MS + j) * NX;
+                memset(g, 0, sizeof g);
+                memset(g_im, 0, sizeof g_im);
+                srf_bilinear(tau[i * MS + j], Y, own, w_re, v[0] + j * NX, g);
+                srf_bilinear(tau[i * MS + j], Y, own, w_im, v[1] + j * NX, g_im);
+                for (int a = 0; a < NX; a++) {
+                    double weight = g[a] - g_im[a];
+                    for (int c = 0; c < w; c++) own_row[c] += weight * L[(j * NX + a) * w + c];
+                }
+                for (int c = 0; c < k; c++)
+                    out[NX + 1 + c] += srf_bilinear_parameter(which[c], tau[i * MS + j], Y, own, w_re, v[0] + j * NX) -
+                                       srf_bilinear_parameter(which[c], tau[i * MS + j], Y, own, w_im, v[1] + j * NX);
+            }
+            for (int c = 0; c < w; c++) {
+                double sum = c < NX ? 0.0 : own_row[c];
+                for (int d = 0; d < NX; d++) sum += own_row[d] * here[d * w + c];
+                out[c] += sum;
+            }
+            double before[2 * NX];
+            for (int a = 0; a < NX; a++)
+                for (int c = 0; c < 2; c++) {
+                    double sum = 0.0;
+                    for (int d = 0; d < NX; d++) sum += map[d * w + a] * back[2 * d + c];
+                    before[2 * a + c] = sum;
+                }
+            memcpy(back, before, sizeof back);
+        }
+    }
+}

@@ -1,0 +1,68 @@
+"""Without a window every crossing on a line is found, however far from the critical load at eps = 0, or the status says not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from brute import Slider, error_of_load, shoot
+
+from srfcli.numerics.critical import critical_line
+from srfcli.numerics.scan import scan_line
+from srfcli.numerics.windows import found_window, load_window
+from srfcli.status import Status
+
+
+def test_crossings_far_above_the_load_at_rest(model):
+    """At 100 um/s the boundary lies at 47 times the load at eps = 0."""
+    base = model.vector({"V": 100.0, "eps": 0.3})
+    line = critical_line(model, base)
+    assert line.status is Status.OK and line.crossings == (1,)
+    (point,) = line.points
+    load = point.value(model, "W0")
+    assert load == pytest.approx(619.634311, rel=1e-8)
+    assert load_window(model, [base])[1] < load
+    error, _ = error_of_load(Slider(100.0, load, 0.3), point.orbit.x[0, 0])
+    assert abs(error) < 1e-6
+
+
+def test_islands_far_below(model):
+    """Where the slider swings on spring and interface at half the forcing frequency, it does so at 0.07 N."""
+    line = critical_line(model, model.vector({"V": 0.1, "eps": 0.18}), tol=1e-7)
+    low = [q for q in line.points if q.value(model, "W0") < 0.1]
+    assert line.status is Status.OK and [q.kind for q in low] == ["pd", "pd"]
+    for point in low:
+        orbit = shoot(Slider(0.1, point.value(model, "W0"), 0.18), point.orbit.x[0, 0])
+        assert np.abs(orbit.multipliers + 1).min() < 1e-5
+    assert line.crossings == tuple(range(1, len(line.points) + 1))
+
+
+@pytest.mark.parametrize(
+    ("law", "ageing", "V", "eps"),
+    [("bowden-tabor", "dieterich", 3.0, 0.4), ("srf-vsat", "dieterich", 150.0, 0.1)],
+)
+def test_nothing_is_missed_that_a_wide_scan_sees(make_model, law, ageing, V, eps):
+    model = make_model(law=law, ageing=ageing)
+    base = model.vector({"V": V, "eps": eps})
+    line = critical_line(model, base, tol=1e-6)
+    found = np.array([q.value(model, "W0") for q in line.points])
+    scan = scan_line(model, base, "W0", np.geomspace(0.02, 2e4, 500), intervals=32)
+    seen = np.array([(scan.values[i] * scan.values[i + 1]) ** 0.5 for i in scan.brackets()])
+    assert line.status is Status.OK
+    assert [np.abs(np.log(found / w)).min() < 0.02 for w in seen] == [True] * len(seen)
+    assert len(found) >= len(seen)
+
+
+def test_a_window_is_widened_to_what_crosses_beyond_it(model):
+    lines = [model.vector({"V": V, "eps": 0.4}) for V in (30.0, 100.0)]
+    usual, window = load_window(model, lines), found_window(model, lines)
+    assert window.certain and usual[1] < 1194.7 < window.hi < 3 * 1194.7 and window.widening > 1
+    calm = [model.vector({"V": 10.0, "eps": 0.05})]
+    window = found_window(model, calm)
+    assert (window.lo, window.hi) == load_window(model, calm) and window.certain
+
+
+def test_what_has_not_settled_is_said(model):
+    """A strong modulation of fast sliding: the growth rate has no end that could be told from samples."""
+    line = critical_line(model, model.vector({"V": 400.0, "eps": 0.97}), samples=40, tol=1e-4)
+    assert line.status is Status.UNSETTLED and not line.status.ok
+    assert any("had not settled" in note for note in line.notes)
