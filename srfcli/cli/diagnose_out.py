@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 ANSWER = "answer.json"
 FORM = "closed-form.toml"
 SCHEMA = "srf.diagnose/"
-UNITS = {"elongation": "um", "force": "N", "friction": "1"}
 
 
 def check_answer(folder: Path, *, force: bool) -> None:
@@ -189,7 +188,7 @@ def prediction_csv(view: RunView) -> str:
     """Return a run as recorded and as predicted by both models, in full precision; empty where there is nothing."""
     import numpy as np
 
-    unit = UNITS[view.run.observable]
+    unit = view.run.unit
     lines = [f"time [s],observed [{unit}],baseline [{unit}],augmented [{unit}]"]
     observed = np.where(view.run.used, view.run.observed, np.nan)
     columns = (view.run.t, observed, view.baseline, view.augmented)

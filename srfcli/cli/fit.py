@@ -64,7 +64,13 @@ def command(source: Path, system: SystemOptions, output: OutputOptions, **option
     """
     if source.suffix.lower() == ".csv":
         from srfcli.cli.fit_thresholds import fit_thresholds
+        from srfcli.recording.draft import looks_like_recording
 
+        if looks_like_recording(source, registry=system.registry()):
+            raise SrfError(
+                f"{source}: a recording, and no experiment yet",
+                f"`srf new {source}` writes the experiment.toml to fit.",
+            )
         _refuse(options, ("starts", "profile", "trend", "track", "sample", "reader"), "recordings")
         fit_thresholds(
             source, system=system, output=output, free=options["free"], bounds=options["bounds"],
@@ -137,7 +143,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     for run in experiment.runs:
         for notice in run.notices:
             Session.current().detail(f"{run.name}: {notice}")
-    runs = run_table(fit)
+    runs = run_table(fit, experiment)
     table = parameter_table(problem, fit, intervals, found.starts, draws, runs, status)
     if found.track is not None:
         table = replace(
@@ -159,7 +165,7 @@ def _figure(problem: Problem, fit: Fit) -> Callable[[], Any]:
 
         runs = {r.name: r for r in problem.experiment.runs}
         rows = [(f.name, f.holdout, runs[f.name].t, runs[f.name].observed, f.prediction.y, f.white) for f in fit.runs]
-        unit = {"elongation": "um", "force": "N", "friction": "1"}[next(iter(runs.values())).observable]
-        return fit_figure(rows, quantity=next(iter(runs.values())).observable, unit=unit)
+        one = next(iter(runs.values()))
+        return fit_figure(rows, quantity=one.quantity, unit=one.unit)
 
     return draw

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from srfcli.inference.fit import Fit, Problem
     from srfcli.inference.profile import Interval
+    from srfcli.recording.values import Experiment
 
 PARAMETERS = (
     Column("parameter", "", "name"),
@@ -29,8 +30,9 @@ RUNS = (
     Column("run", "", "name"),
     Column("role", "", "fit, or held out"),
     Column("samples", "", "compared"),
-    Column("rms", "", "of the residual, in the observable's unit"),
+    Column("rms", "", "of the residual, in the unit beside it"),
     Column("noise", "", "standard deviation of the gauge's white noise"),
+    Column("unit", "", "of the two columns before"),
     Column("rms_over_noise", "", "1 where the model explains all but the noise", ".4g"),
     Column("lag1", "", "correlation of neighbouring residuals", ".3g"),
     Column("order", "", "how many times of correlation the gauge's noise has"),
@@ -51,13 +53,16 @@ def parameter_table(
     by_name = {i.name: i for i in intervals}
     rows = []
     for k, name in enumerate(fit.names):
-        unit = unit_of(problem, name)
+        declared = unit_of(problem, name)
+        unit, factor = problem.experiment.shown(declared)
         value, error = fit.values[name], fit.stderr[name]
         found = by_name.get(name)
         ends = (value - 1.96 * error, value + 1.96 * error) if found is None else (found.low, found.high)
         cells = [value, error, *ends]
-        shown = [None if c is None else from_base(c, unit) for c in cells]
-        rows.append((name, *shown, unit, from_base(float(problem.start[k]), unit), flag(fit, k)))
+        *shown, start = [
+            None if c is None else from_base(c, declared) * factor for c in (*cells, float(problem.start[k]))
+        ]
+        rows.append((name, *shown, unit, start, flag(fit, k)))
     notes = _notes(fit, intervals, starts)
     meta = {
         "runs": [dict(zip((c.name for c in RUNS), row, strict=True)) for row in runs.rows],
@@ -75,15 +80,16 @@ def parameter_table(
     return Table("srf.fit/1", PARAMETERS, rows, problem.experiment.title, tuple(notes), {}, meta, status=status.value)
 
 
-def run_table(fit: Fit) -> Table:
+def run_table(fit: Fit, experiment: Experiment) -> Table:
     """Return one row for each run, fitted or held out."""
     from srfcli.inference.noise import lag_one
 
-    rows = []
+    rows, units = [], {run.name: run.unit for run in experiment.runs}
     for f in fit.runs:
         size = sum(b - a for a, b in f.parts)
+        ratio = f.rms / f.white if f.white else None
         rows.append(
-            (f.name, "held out" if f.holdout else "fit", size, f.rms, f.white, f.rms / f.white if f.white else None,
+            (f.name, "held out" if f.holdout else "fit", size, f.rms, f.white, units[f.name], ratio,
              lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
         )  # fmt: skip
     return Table("srf.fit.runs/1", RUNS, rows, "runs")

@@ -25,6 +25,7 @@ COMMANDS = {
     "map": "srfcli.cli.map:command",
     "response": "srfcli.cli.response:command",
     "compare": "srfcli.cli.compare:command",
+    "new": "srfcli.cli.new:command",
     "check": "srfcli.cli.check:command",
     "fit": "srfcli.cli.fit:command",
     "diagnose": "srfcli.cli.diagnose:command",
