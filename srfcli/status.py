@@ -42,5 +42,5 @@ _ADVICE = {
     Status.NO_HOPF: "Velocity strengthening: no Hopf bifurcation.",
     Status.INTEGRATION: "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
     Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise --max-evaluations, or start nearer.",
-    Status.INTERRUPTED: "Interrupted; what was finished is kept.",
+    Status.INTERRUPTED: "what was finished is kept.",
 }

@@ -107,6 +107,7 @@ def command(
             )
     model = system.model()
     resolved = system.resolve(model.parameters, V=V, W0=W0)
+    system.say_defaults(resolved, {"V", "W0"} - spanned - {part for r in over for part in r.name.split("/")})
     tolerance = system.tolerance(tol).value
     settings = AtlasSettings(
         scan_lines, samples, tol=tolerance, max_mesh=max_mesh, steps=StepSettings(largest=step, max_steps=max_steps)

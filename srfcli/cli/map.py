@@ -251,7 +251,8 @@ def _summary(
     bad = sum(not s.status.ok for marks in special for s in marks)
     if bad:
         notes.append(f"{bad} special points could not be located; their rows say so")
-    return (*notes, *atlas.notes), meta, status if not status.ok else atlas.status
+    stopped = atlas.status is Status.INTERRUPTED  # counts before what else went wrong
+    return (*notes, *atlas.notes), meta, atlas.status if stopped or status.ok else status
 
 
 def _plain(table: Table) -> list[dict[str, Any]]:

@@ -79,6 +79,7 @@ def command(
     for name, value in (("V", V), ("W0", W0)):
         if value is not None and name == swept.name:
             raise SrfError(f"{name} is swept and has a value too", f"Leave out --{name}, or sweep another parameter.")
+    system.say_defaults(resolved, {"V", "W0"} - {swept.name})
     begun = time.perf_counter()
     tolerance = system.tolerance(tol).value
     if mean:

@@ -43,6 +43,8 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     """Return the one record that the options describe; raises SrfError for what cannot be simulated or written."""
     model = system.model()
     resolved = system.resolve(model.parameters, **{name: given[name] for name in ("V", "W0", "eps")})
+    taken = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
+    system.say_defaults(resolved, [name for name, program in taken.items() if program is None])
     values, observable = resolved.values, given["observable"] or "elongation"
     p = model.vector(values)
     recorded, begin, span, found = _recorded_load(system, given["load_file"], given["reader"])
