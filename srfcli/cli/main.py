@@ -29,6 +29,7 @@ COMMANDS = {
     "check": "srfcli.cli.check:command",
     "fit": "srfcli.cli.fit:command",
     "diagnose": "srfcli.cli.diagnose:command",
+    "report": "srfcli.cli.report:command",
     "simulate": "srfcli.cli.simulate:command",
     "prove": "srfcli.cli.prove:command",
     "config": "srfcli.cli.config:command",

@@ -47,6 +47,7 @@ pre { background: #f5f5f3; padding: 0.7rem 0.9rem; overflow-x: auto; font-size: 
 code { font-family: "DejaVu Sans Mono", Menlo, Consolas, monospace; font-size: 0.92em; }
 pre code { font-size: 1em; }
 details summary { cursor: pointer; color: #00548a; }
+thead th, thead th.n { white-space: normal; overflow-wrap: anywhere; }
 .wide { overflow-x: auto; } .numbers { display: flex; flex-wrap: wrap; gap: 0 4rem; align-items: flex-start; }
 .lead { max-width: 52rem; }
 @media screen and (max-width: 640px) {

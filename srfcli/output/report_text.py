@@ -275,7 +275,7 @@ def bracketed(value: Any, error: Any) -> str:
         return "–"
     if not finite(error) or error <= 0:
         return number(value, 4)
-    digits = 2 if float(f"{error:.0e}") < 3 * 10.0 ** math.floor(math.log10(float(f"{error:.0e}"))) else 1
+    digits = 2 if int(f"{error:.0e}"[0]) < 3 else 1
     place = math.floor(math.log10(float(f"{error:.{digits - 1}e}"))) - digits + 1
     size = max(abs(value), error)
     power = 0 if PLAIN[0] <= size < PLAIN[1] else math.floor(math.log10(size))
