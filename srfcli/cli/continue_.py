@@ -20,6 +20,7 @@ from srfcli.cli.options import (
     values_option,
 )
 from srfcli.laws import Parameter
+from srfcli.output.plots import titled
 from srfcli.status import Status
 
 if TYPE_CHECKING:
@@ -133,7 +134,13 @@ def command(
     described = {k: v for k, v in resolved.described().items() if k not in swept}
     table = Table("srf.continue/1", columns, rows, model.title, tuple(notes), described, status=status.value)
     timings = {"solve": time.perf_counter() - begun}
-    emit(table, output, laws=model.laws, timings=timings, figure=lambda: _figure(model, atlases))
+    emit(
+        table,
+        output,
+        laws=model.laws,
+        timings=timings,
+        figure=lambda: _figure(model, atlases, titled(model.title, described)),
+    )
     finish(status)
 
 
@@ -208,7 +215,7 @@ def _rows(
     return rows, notes
 
 
-def _figure(model: GeneratedModel, atlases: list[Atlas]) -> Figure:
+def _figure(model: GeneratedModel, atlases: list[Atlas], title: str) -> Figure:
     import numpy as np
 
     from srfcli.numerics.hopf import critical_point
@@ -238,7 +245,7 @@ def _figure(model: GeneratedModel, atlases: list[Atlas]) -> Figure:
             p[model.index("V")] = velocity
             point = critical_point(model, p)[0]
             hopf.append(None if point is None else float(p[model.index("K")]) / point.W0)
-        return plots.stability_diagram(branches, hopf={"V": velocities, "K_over_W0": hopf}, title=model.title)
+        return plots.stability_diagram(branches, hopf={"V": velocities, "K_over_W0": hopf}, title=title)
     unit = {q.name: q.unit for q in model.parameters}
     return plots.boundaries(
         branches,
@@ -246,7 +253,7 @@ def _figure(model: GeneratedModel, atlases: list[Atlas]) -> Figure:
         ylabel=_label(plane.y.name, unit),
         logx=plane.x.log,
         logy=plane.y.log,
-        title=model.title,
+        title=title,
     )
 
 

@@ -203,11 +203,22 @@ def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> P
 
 def _figure(problem: Problem, fit: Fit) -> Callable[[], Any]:
     def draw() -> Any:
+        from srfcli.cli.fit_tables import unit_of
         from srfcli.output.fits import fit_figure
+        from srfcli.output.report_text import NARROW, bracketed, unit_text
+        from srfcli.units import from_base
 
         runs = {r.name: r for r in problem.experiment.runs}
         rows = [(f.name, f.holdout, runs[f.name].t, runs[f.name].observed, f.prediction.y, f.white) for f in fit.runs]
         one = next(iter(runs.values()))
-        return fit_figure(rows, quantity=one.quantity, unit=one.unit)
+        told = []
+        for name in fit.names:
+            declared = unit_of(problem, name)
+            unit, factor = problem.experiment.shown(declared)
+            value, error = (from_base(x, declared) * factor for x in (fit.values[name], fit.stderr[name]))
+            told.append(f"{name} = {bracketed(value, error)}" + ("" if unit == "1" else f"{NARROW}{unit_text(unit)}"))
+        choice = problem.experiment.choice
+        title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
+        return fit_figure(rows, quantity=one.quantity, unit=one.unit, title=title, found=", ".join(told))
 
     return draw

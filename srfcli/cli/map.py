@@ -22,6 +22,7 @@ from srfcli.cli.options import (
     system_options,
 )
 from srfcli.cli.workers import Spread, worker_options
+from srfcli.output.plots import titled
 from srfcli.status import Status
 
 if TYPE_CHECKING:
@@ -135,7 +136,15 @@ def command(
     shown = _tables(model, found, (atlas, special, cubic), boundaries, resolved)
     grid_rows, components, marks, points, status = shown
     text = output.format == "text" and boundaries
-    figure = functools.partial(map_figure, model, found, atlas, special, cubic, model.title)
+    figure = functools.partial(
+        map_figure,
+        model,
+        found,
+        atlas,
+        special,
+        cubic,
+        titled(model.title, {k: v for k, v in grid_rows.parameters.items() if k != "eps"}),
+    )
     more = (marks,) if text and marks.rows else ()
     emit(components if text else grid_rows, output, more=more, laws=model.laws, timings=timings, figure=figure)
     if place is not None:
