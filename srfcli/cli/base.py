@@ -192,7 +192,7 @@ def _usage_text(error: click.ClickException, group: click.Group, arguments: Sequ
     choices = getattr(getattr(getattr(error, "param", None), "type", None), "choices", None)
     if choices and (found := re.search(r"'([^']*)' is not one of", error.format_message())):
         message = error.format_message().partition(" is not one of")[0]
-        return f"{message[:1].lower()}{message[1:]} is none of its values", did_you_mean(found[1], choices)
+        return f"{message[:1].lower()}{message[1:]} is not one of its values", did_you_mean(found[1], choices)
     if not isinstance(error, click.NoSuchOption):
         message = error.format_message().strip().rstrip(".")
         return message[:1].lower() + message[1:], f"{path} --help"

@@ -108,12 +108,12 @@ def command(
             )
     model = system.model()
     resolved = system.resolve(model.parameters, V=V, W0=W0)
-    system.say_defaults(resolved, {"V", "W0"} - spanned - {part for r in over for part in r.name.split("/")})
     tolerance = system.tolerance(tol).value
     settings = AtlasSettings(
         scan_lines, samples, tol=tolerance, max_mesh=max_mesh, steps=StepSettings(largest=step, max_steps=max_steps)
     )
     planes = _planes(model, resolved, over, eps)
+    system.say_defaults(resolved, {"V", "W0"} - spanned - {part for r in over for part in r.name.split("/")})
     extra = tuple(a.name for a in (planes[0].x, planes[0].y) if a.name not in ("V", "W0", "eps"))
     begun, atlases, status = time.perf_counter(), [], Status.OK
     with Progress("continue") as progress:

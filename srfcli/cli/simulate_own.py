@@ -43,8 +43,6 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     """Return the one record that the options describe; raises SrfError for what cannot be simulated or written."""
     model = system.model()
     resolved = system.resolve(model.parameters, **{name: given[name] for name in ("V", "W0", "eps")})
-    taken = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
-    system.say_defaults(resolved, [name for name, program in taken.items() if program is None])
     values, observable = resolved.values, given["observable"] or "elongation"
     p = model.vector(values)
     recorded, begin, span, found = _recorded_load(system, given["load_file"], given["reader"])
@@ -56,6 +54,8 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     base = recorded or _base_load(given, values["W0"], begin)
     load, modulation = _modulated(base, given["onset"], values, begin)
     load.check(float(t[0]), float(t[-1]))
+    taken = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
+    system.say_defaults(resolved, [name for name, program in taken.items() if program is None])
     start = start_state(model, p, given["start"], drive=drive, load=load.rest(begin), begin=begin)
     job, mover = Job(NAME, p, drive, load, t, start, observable, f, modulation), model
     if (track := _track(system, given)) is not None:
