@@ -84,7 +84,10 @@ class Registry:
         for problem in self.problems:
             if problem.name == name:
                 raise SrfError(problem.message, problem.hint)
-        raise SrfError(f"unknown {what} '{name}'", did_you_mean(name, (e.name for e in self.entries(kind))))
+        others = [e.kind for e in self._entries if e.name == name]
+        known = did_you_mean(name, (e.name for e in self.entries(kind)))
+        hint = f"'{name}' is of kind {others[0]}. Known: {known.rpartition('Known: ')[2]}" if others else known
+        raise SrfError(f"unknown {what} '{name}'", hint)
 
     def get(self, kind: str, name: str) -> Law:
         """Return the law of that kind and name, or in the file of that name where it ends in .toml or .py."""

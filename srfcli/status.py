@@ -44,5 +44,5 @@ _ADVICE = {
     Status.UNSETTLED: "Crossings may lie beyond the loads looked at; look there with --window LOW:HIGH or --over W0=LOW:HIGH.",
     Status.INTEGRATION: "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
     Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise --max-evaluations, or start nearer.",
-    Status.INTERRUPTED: "Interrupted; what was finished is kept.",
+    Status.INTERRUPTED: "what was finished is kept.",
 }

@@ -1,6 +1,6 @@
 """What a user types, in the unit they type it in, to um, s, N; angles to radians.
 
-The units of the shipped laws need no library; any other is looked up in pint, which is imported on that occasion.
+The usual units, and products and powers of them, need no library; any other is looked up in pint where that is installed.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
-from srfcli.errors import SrfError
+from srfcli.errors import SrfError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -21,27 +21,35 @@ class Unit:
     powers: tuple[int, int, int, int]
 
 
-_TABLE = {
-    "1": Unit(1.0, (0, 0, 0, 0)),
-    "um": Unit(1.0, (1, 0, 0, 0)),
-    "s": Unit(1.0, (0, 1, 0, 0)),
-    "N": Unit(1.0, (0, 0, 1, 0)),
-    "N/um": Unit(1.0, (-1, 0, 1, 0)),
-    "um/s": Unit(1.0, (1, -1, 0, 0)),
-    "s/um": Unit(1.0, (-1, 1, 0, 0)),
-    "1/um": Unit(1.0, (-1, 0, 0, 0)),
-    "1/s": Unit(1.0, (0, -1, 0, 0)),
-    "Hz": Unit(1.0, (0, -1, 0, 0)),
-    "kg": Unit(1e-6, (-1, 2, 1, 0)),  # 1 kg = 1 N s^2/m
-    "rad": Unit(1.0, (0, 0, 0, 1)),
-    "deg": Unit(math.pi / 180.0, (0, 0, 0, 1)),
+DIMENSIONLESS, LENGTH, TIME, FORCE = (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)
+STRESS, RATE, MASS, ANGLE = (-2, 0, 1, 0), (0, -1, 0, 0), (-1, 2, 1, 0), (0, 0, 0, 1)
+_TABLE = {  # factors to um, s, N, rad
+    name: Unit(factor, powers)
+    for powers, names in {
+        DIMENSIONLESS: {"1": 1.0, "%": 0.01},
+        LENGTH: {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6},
+        TIME: {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
+        RATE: {"Hz": 1.0, "kHz": 1e3},
+        FORCE: {"mN": 1e-3, "N": 1.0, "kN": 1e3, "MN": 1e6},
+        STRESS: {"Pa": 1e-12, "kPa": 1e-9, "MPa": 1e-6, "GPa": 1e-3, "bar": 1e-7},
+        MASS: {"g": 1e-9, "kg": 1e-6},  # 1 kg = 1 N s^2/m
+        ANGLE: {"rad": 1.0, "deg": math.pi / 180.0},
+    }.items()
+    for name, factor in names.items()
 }
+_SPELLED = {  # in small letters, as headings of recordings have them
+    "": "1", "-": "1", "none": "1", "dimensionless": "1", "micron": "um", "microns": "um", "micrometer": "um",
+    "micrometers": "um", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "hz": "Hz", "newton": "N", "newtons": "N",
+    "kgs": "kg", "mpa": "MPa",
+}  # fmt: skip
+SQUARE_MILLIMETRE = 1e6  # um^2: a stress is taken as the force on this area
 
 LONGEST = 200  # characters of a number with its unit
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
 # A product of names with one-digit powers: pint never sees a tower of powers that it would have to work out.
-_FACTOR = r"(?:1|[A-Za-zµ°Ωθ%_]+(?:(?:\^|\*\*)-?[1-9])?)"
+_FACTOR = r"(?:1|[A-Za-zµ°Ωθ%_]+(?:\^-?[1-9])?)"
 _UNIT = re.compile(rf"{_FACTOR}(?:\s*[*/ ]\s*{_FACTOR})*")
+_PART = re.compile(r"\s*([*/ ]?)\s*([^\s*/^]+)(?:\^(-?\d))?")
 
 
 def to_base(value: float, unit: str) -> float:
@@ -83,15 +91,38 @@ def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float
 
 
 def convert(number: float, written: str, unit: str, *, name: str) -> float:
-    """Return `number`, given in `written`, in `unit`; raises SrfError if the two do not measure the same thing."""
+    """Return `number`, given in `written`, in `unit`; raises SrfError if the two do not measure the same thing.
+
+    A stress counts as the force on 1 mm^2, so that 1 MPa is 1 N and 1 MPa/mm is 1e-3 N/um.
+    """
     if written == unit:
         return number
     where = f"{name} = {number:g} {written}"
-    source, target = find_unit(written, where=where), find_unit(unit)
-    if source.powers != target.powers:
+    factor = factor_between(find_unit(written, where=where), find_unit(unit))
+    if factor is None:
         expected = "a plain number" if unit == "1" else f"{unit}, or a unit of the same dimension"
         raise SrfError(f"{where}: {written!r} is the wrong unit", f"Write {name} in {expected}.")
-    return number * tidy(source.factor / target.factor)  # N/mm -> N/um is 1e-3, not 0.0010000000000000002
+    return number * factor
+
+
+def factor_between(source: Unit, target: Unit) -> float | None:
+    """Return what a number in `source` is multiplied by to be in `target`, None where they measure different things."""
+    ratio, gap = source.factor / target.factor, source.powers[0] - target.powers[0]
+    if source.powers[1:] != target.powers[1:]:
+        return None
+    if gap == 0:
+        return tidy(ratio)  # N/mm -> N/um is 1e-3, not 0.0010000000000000002
+    if source.powers[2] == 1 and gap == -2:  # a stress for a force
+        return tidy(ratio * SQUARE_MILLIMETRE)
+    if source.powers[2] == 1 and gap == 2:
+        return tidy(ratio / SQUARE_MILLIMETRE)
+    return None
+
+
+def is_stress(text: str) -> bool:
+    """Return whether a unit is one of stress, or of stress per length, and not of force."""
+    um, s, newton, _ = find_unit(text).powers
+    return newton == 1 and s == 0 and um in (-2, -3)
 
 
 def tidy(value: float) -> float:
@@ -104,24 +135,36 @@ def find_unit(text: str, *, where: str = "") -> Unit:
     """Return the unit that `text` names; raises SrfError, beginning with `where`, if there is none."""
     if len(text) > LONGEST:
         raise SrfError(f"{where}: {len(text)} characters are no unit".lstrip(": "), "Write a unit as in N/um, um/s.")
-    spelled = text.strip().replace("μ", "µ").replace("µm", "um")
+    spelled = text.strip().replace("**", "^").replace("μ", "u").replace("µ", "u")
+    spelled = _SPELLED.get(spelled.lower(), spelled)
     if spelled in _TABLE:
         return _TABLE[spelled]
     prefix = f"{where}: " if where else ""
     if not _UNIT.fullmatch(spelled):
         raise SrfError(f"{prefix}{text!r} is not a unit", "Write a unit as in N/um, um/s or kg*m/s^2.")
-    return _from_pint(spelled, prefix)
+    factor, powers, over = 1.0, [0, 0, 0, 0], 1
+    for sign, word, power in _PART.findall(spelled):
+        over = -1 if sign == "/" else 1
+        known = word if word in _TABLE else _SPELLED.get(word.lower(), word)
+        if known not in _TABLE:
+            return _from_pint(spelled, prefix, word)
+        exponent = over * int(power or 1)
+        factor *= _TABLE[known].factor ** exponent
+        powers = [p + exponent * q for p, q in zip(powers, _TABLE[known].powers, strict=True)]
+    if not 1e-100 < factor < 1e100:
+        raise SrfError(f"{prefix}{text!r} is no unit of use", "Write a unit as in N/um, um/s.")
+    um, s, newton, rad = powers
+    return Unit(factor, (um, s, newton, rad))
 
 
-def _from_pint(text: str, prefix: str) -> Unit:
-    registry = _pint_registry(text, prefix)
+def _from_pint(text: str, prefix: str = "", word: str = "") -> Unit:
+    registry = _pint_registry(text, prefix, word)
     try:
         quantity = registry.Quantity(1.0, registry.Unit(text)).to_base_units()
         powers = {name: float(power) for name, power in quantity.unit_items()}
         factor = float(quantity.magnitude)
     except Exception as error:  # pint raises its own, tokenizer and arithmetic errors for a bad unit
-        hint = f"Known without a library: {', '.join(_TABLE)}; otherwise any unit that pint knows."
-        raise SrfError(f"{prefix}unknown unit {text!r}", hint) from error
+        raise SrfError(f"{prefix}unknown unit {text!r}", did_you_mean(word, _TABLE)) from error
     mass, metre = powers.pop("kilogram", 0.0), powers.pop("meter", 0.0)
     second, radian = powers.pop("second", 0.0), powers.pop("radian", 0.0)
     exponents = (metre - mass, second + 2 * mass, mass, radian)  # kg = 1e-6 N s^2/um
@@ -135,14 +178,14 @@ def _from_pint(text: str, prefix: str) -> Unit:
     return Unit(factor * 1e6 ** (um + mass) / 1e6**mass, (um, s, newton, rad))
 
 
-def _pint_registry(text: str, prefix: str) -> Any:
+def _pint_registry(text: str, prefix: str, word: str) -> Any:
     global _REGISTRY
     if _REGISTRY is None:
         try:
             import pint
         except ImportError as error:
-            hint = f'Write it in {", ".join(_TABLE)}, or install pint: pip install "srfcli[units]"'
-            raise SrfError(f"{prefix}the unit {text!r} needs pint, which is not installed", hint) from error
+            hint = f'{did_you_mean(word, _TABLE)}, products and powers of these; more with pip install "srfcli[units]"'
+            raise SrfError(f"{prefix}unknown unit {text!r}", hint) from error
         _REGISTRY = pint.UnitRegistry()
     return _REGISTRY
 

@@ -133,7 +133,6 @@ def test_apparatus_names_are_those_of_the_system() -> None:
 
 
 def test_units_agree_with_those_a_user_types() -> None:
-    pytest.importorskip("pint")
     from srfcli.units import find_unit
 
     for name, unit in UNITS.items():

@@ -63,7 +63,7 @@ def test_json_of_arrays_and_complex_meta() -> None:
 def test_plain_text_is_never_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "20")
     wide = Table("s", (Column("x"), Column("long")), [(1 / 3, "w" * 300)])
-    assert "w" * 300 in to_text(wide) and "0.3333333333333333" in to_text(wide)
+    assert "w" * 300 in to_text(wide) and " 0.333333333333 " in f" {to_text(wide).splitlines()[1]}"
     lines = to_text(TABLE).splitlines()
     assert lines[0] == "a title" and lines[1].split() == ["V", "[um/s]", "W0", "[N]", "type", "status"]
     assert "inf" in lines[4] and lines[-1] == "Note: two"

@@ -193,7 +193,7 @@ def test_no_experiment(tmp_path: Path, registry: Registry) -> None:
     assert answer(tmp_path / "none", registry)[0].startswith("no experiment ")
     assert answer(tmp_path, registry) == (
         f"{tmp_path}: holds no experiment.toml",
-        "See docs/recordings.md for its form.",
+        "srf new DATA.csv writes one for recorded data.",
     )
     (tmp_path / "mine.toml").write_text(TOML, encoding="utf-8")
     assert answer(tmp_path, registry)[1] == "Name the file: mine.toml"
@@ -219,7 +219,7 @@ def test_a_description_that_is_none(content: bytes, message: str, tmp_path: Path
 def test_a_data_file_is_no_description(tmp_path: Path, registry: Registry) -> None:
     place = write(tmp_path) / "one.csv"
     found, hint = answer(place, registry)
-    assert found == f"{place}: a data file, not the description of an experiment" and 'file = "one.csv"' in hint
+    assert found == f"{place}: a data file, not the description of an experiment" and "srf new" in hint
 
 
 def test_a_file_that_may_not_be_read_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from srfcli.output import report
+from srfcli.output import report, report_text
 from srfcli.output.plots import figure_bytes
 from srfcli.output.report import write_report
 from srfcli.output.report_atlas import foremost, spots
@@ -21,6 +21,7 @@ from srfcli.output.report_page import VOID, Markup, tag
 from srfcli.output.report_runs import close_up, local_rms, run_figure, trace
 from srfcli.output.report_sections import command_lines, merged
 from srfcli.output.report_text import number, percent, probability, spans, with_error
+from srfcli.registry import bundled_registry
 
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
 NOISE = 0.02
@@ -166,7 +167,8 @@ def test_the_page_is_well_formed_and_needs_nothing_else(written: tuple[str, Path
     ids = [a["id"] for _, a in page.elements if "id" in a]
     assert len(ids) == len(set(ids))
     for _, attributes in page.elements:
-        assert not [a for a in attributes if a.startswith("on") or a == "srcset"]
+        assert not [a for a in attributes if a.startswith("on")]
+        assert str(attributes.get("srcset", "data:image/svg+xml;base64,")).startswith("data:image/svg+xml;base64,")
         source, link = attributes.get("src"), attributes.get("href")
         assert source is None or source.startswith("data:image/svg+xml;base64,")
         if link is not None and link.startswith("#"):
@@ -208,15 +210,59 @@ def test_equal_answers_give_equal_bytes(tmp_path: Path) -> None:
         assert first.name == second.name and first.read_bytes() == second.read_bytes(), first.name
 
 
-SENTENCES = {
-    "none": "Nothing is missing: the baseline explains the recordings down to the noise (residuals are 3.19 times the noise "
-    "in the fitted runs, 4.75 times in the held-out ones).",
-    "identified": "The baseline lacks linker-dieterich (contacts lose age when the load rises): with it, residuals fall from "
-    "3.19 to 0.99 times the noise in the fitted runs, and from 4.75 to 1.02 times in runs that the fit never saw.",
-    "ambiguous": "Something is missing, and these recordings cannot tell which of linker-dieterich and second-state it is:",
-    "unknown": "Something is missing that no registered effect explains: even with the best of those tried, linker-dieterich,",
-    "inconclusive": "Nothing has to be added to the baseline, but this experiment could not have seen most effects",
+SENTENCES: dict[str, list[str]] = {  # in their order: what is wrong, what to do, what is gained
+    "none": [
+        "Nothing is missing: the model explains the recordings down to the noise.",
+        "What to do. Go on with the parameters below;",
+        "residuals are 3.19 times the noise in the fitted runs, 4.75 times in the held-out ones.",
+    ],
+    "identified": [
+        "A change of the load changes the age of contacts: alpha = 0.0120(4).",
+        'What to do. Add "+linker-dieterich" to the name of the ageing law, with alpha = 0.01200; go on with the augmented model',
+        "Residuals fall from 3.19 to 0.99 times the noise in the fitted runs, and from 4.75 to 1.02 times in runs that",
+        "It rests on 2 fitted runs, most on “onset” (61",
+    ],
+    "ambiguous": [
+        "Something is missing, and these recordings cannot tell which of linker-dieterich or second-state it is.",
+        "What to do. Make the experiment described below: the candidates foretell different records of it.",
+    ],
+    "unknown": [
+        "Something is missing that no registered effect explains.",
+        "What to do. Look at the missing force below, against time and against the state, for what it goes with.",
+        "With the best that was tried, residuals fall from",
+    ],
+    "inconclusive": [
+        "Nothing has to be added, but this experiment could not have seen most effects of a size that matters.",
+        "What to do. Vary the load, or record more or with less noise",
+    ],
 }
+
+
+def test_a_wrong_stiffness_is_told_with_what_was_stated_and_what_to_set(tmp_path: Path) -> None:
+    answer, material = made_answer("identified"), made_material("identified")
+    answer["effects"] = ["stiffness-error"]
+    wanted = {"name": "K", "unit": "1/um", "baseline": None, "augmented": 0.006531, "augmented_stderr": 5e-5}
+    material["parameters"] = [*material["parameters"], wanted]
+    material |= {"stated": {"stiffness": "0.0050 1/µm"}, "own": {"stiffness-error": ["K"]}}
+    text = report_text.verdict_sentence(answer, material)
+    assert text == "Stated stiffness 0.0050 1/µm; the recordings want 0.00653(5)\u00a01/µm."
+    assert report_text.remedy(answer, material).startswith(
+        'Set stiffness = "0.006531\u00a01/µm" in [apparatus], and calibrate'
+    )
+
+
+def test_every_shipped_effect_has_a_remedy() -> None:
+    shipped = {e.name for e in bundled_registry().entries("effect")}
+    assert shipped <= set(report_text.REMEDIES)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [(0.006534, 5e-5, "0.00653(5)"), (0.5549, 5e-4, "0.5549(5)"), (19.04, 1.23, "19.0(12)"), (-0.012, 4e-4, "−0.0120(4)"),
+     (280.0, 33.0, "280(30)"), (1.23e-5, 2e-7, "1.230(20)·10⁻⁵"), (3.0, 0.0, "3.000"), (None, 1.0, "–")],
+)  # fmt: skip
+def test_errors_in_brackets(value: float | None, error: float, text: str) -> None:
+    assert report_text.bracketed(value, error) == text
 
 
 @pytest.mark.usefixtures("bare")
@@ -227,8 +273,9 @@ def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Pat
     write_report(tmp_path, made_answer(verdict), material)
     page = read(tmp_path)
     first = page.text.partition("PMMA <on> PMMA: " + verdict)[2]
-    assert SENTENCES[verdict] in first
-    assert first.index(SENTENCES[verdict]) < first.index("residual / noise") < first.index("What was left out")
+    places = [first.find(sentence) for sentence in SENTENCES[verdict]]
+    assert -1 not in places and places == sorted(places), places
+    assert places[-1] < first.index("residual / noise") < first.index("What was left out")
     nothing = verdict in ("none", "inconclusive")
     assert ("No place stands out beyond what noise does." in page.text) == nothing
     place = "61 % of the excess misfit is in the run “onset”, from 1.00 to 1.50 s."
@@ -273,9 +320,9 @@ def test_two_runs_whose_names_make_one_file_name_keep_both_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report, "figure_bytes", lambda figure, suffix: f"{figure}{suffix}".encode())
-    monkeypatch.setattr(report, "overview", lambda traces: None)
-    monkeypatch.setattr(report, "atlas_figure", lambda rows: None)
-    monkeypatch.setattr(report, "run_figure", lambda one: one.name)
+    monkeypatch.setattr(report, "overview", lambda traces, narrow=False: None)
+    monkeypatch.setattr(report, "atlas_figure", lambda rows, narrow=False: None)
+    monkeypatch.setattr(report, "run_figure", lambda one, narrow=False: one.name)
     material = made_material("none")
     empty = made_run("empty") | {"used": np.zeros(900, dtype=bool)}  # nothing to draw
     material["runs"] = [run | {"baseline": run["augmented"]} for run in (made_run("a b"), made_run("A/b"), empty)]

@@ -8,6 +8,7 @@ import errno
 import io
 import logging
 import os
+import re
 import sys
 import traceback
 import warnings
@@ -104,7 +105,7 @@ class SrfGroup(click.Group):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Show the help, and succeed, where nothing was asked."""
-        if not args and not self.invoke_without_command:
+        if not args and not (self.invoke_without_command or ctx.resilient_parsing):
             click.echo(ctx.get_help(), color=ctx.color)
             ctx.exit(EXIT_OK)
         return super().parse_args(ctx, args)
@@ -114,13 +115,19 @@ class SrfGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Return the command that `args` begin with; raises SrfError with the nearest names for a misspelt one."""
         name = args[0]
-        if name in self.commands or name.startswith("-"):
+        if name in self.commands or name.startswith("-") or ctx.resilient_parsing:
             return super().resolve_command(ctx, args)
         raise SrfError(f"no such command {name!r} of {ctx.command_path}", did_you_mean(name, self.commands))
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the epilog verbatim."""
         write_epilog(self.epilog, formatter)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands with their first sentence, all of it."""
+        rows = [(name, command.get_short_help_str(limit=1000)) for name, command in self.commands.items()]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
 
     def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> NoReturn:  # type: ignore[override]
         """Run the command line and leave with its exit code; every error ends here."""
@@ -254,6 +261,10 @@ def _silence_stdout() -> None:
 def _usage_text(error: click.ClickException, group: click.Group, arguments: Sequence[str]) -> tuple[str, str | None]:
     """Return what click objects to, in a sentence like the others, and where to read on."""
     path, command = _named_command(group, arguments)
+    choices = getattr(getattr(getattr(error, "param", None), "type", None), "choices", None)
+    if choices and (found := re.search(r"'([^']*)' is not one of", error.format_message())):
+        message = error.format_message().partition(" is not one of")[0]
+        return f"{message[:1].lower()}{message[1:]} is not one of its values", did_you_mean(found[1], choices)
     if not isinstance(error, click.NoSuchOption):
         message = error.format_message().strip().rstrip(".")
         return message[:1].lower() + message[1:], f"{path} --help"

@@ -12,6 +12,7 @@ import click
 
 from srfcli.cli.laws import plugins_option
 from srfcli.cli.options import OutputOptions, SrfCommand, output_options
+from srfcli.units import split_quantity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,7 +90,7 @@ def command(
     forecast = _forecast(found, checks, registry) if simulate else None
     table, more = _table(found, checks, forecast), []
     if output.format == "text":
-        more = report(table.rows, forecast)
+        more = report(table.rows, forecast, load_unit="MPa" if found.stress else "N")
         more[-1] = dataclasses.replace(more[-1], notes=table.notes)
         title = f"{table.title}\n{_model_line(found)}"
         table = dataclasses.replace(table, columns=(), rows=(), notes=(), title=title)
@@ -135,13 +136,20 @@ def _model_line(experiment: Experiment) -> str:
     mass = "" if experiment.mass is None else f", mass {experiment.mass * 1e6:.6g} kg"
     inertia = "on" if choice.inertia else "off"
     laws = ", ".join([choice.law, choice.ageing, choice.interface, f"inertia {inertia}", *choice.effects])
-    return f"{laws}; stiffness {experiment.stiffness_text}{mass}"
+    return f"{laws}; stiffness {_stiffness(experiment)}{mass}"
+
+
+def _stiffness(experiment: Experiment) -> str:
+    number, base = split_quantity(experiment.stiffness_text, name="stiffness")
+    unit, factor = experiment.shown(base) if base in ("N/um", "1/um") else (base, 1.0)
+    return f"{number * factor:.6g} {unit}"
 
 
 def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecast | None) -> Table:
     from srfcli.cli.check_rows import COLUMNS, described, row, tells
     from srfcli.cli.check_sentences import NOISE, sentences
     from srfcli.output.tables import Table
+    from srfcli.recording.values import shown_unit
     from srfcli.units import from_base
 
     told = [None] * len(checks) if forecast is None else forecast.runs
@@ -157,25 +165,22 @@ def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecas
         "runs": [described(check, one) for check, one in zip(checks, told, strict=True)],
         "together": together and tells(together),
     }
-    parameters = {
-        p.name: {
-            "value": from_base(p.value, p.unit),
-            "unit": p.unit,
-            "origin": "fixed"
-            if p.fixed
-            else f"start, {from_base(p.lower, p.unit):g} to {from_base(p.upper, p.unit):g}",
-        }
-        for p in experiment.parameters
-    }
+    parameters = {}
+    for p in experiment.parameters:
+        unit, factor = experiment.shown(p.unit)
+        value, low, high = (from_base(x, p.unit) * factor for x in (p.value, p.lower, p.upper))
+        origin = "fixed" if p.fixed else f"start, {low:g} to {high:g}"
+        parameters[p.name] = {"value": value, "unit": unit, "origin": origin}
     title = experiment.title or experiment.path.parent.name
     rows = [row(check, one) for check, one in zip(checks, told, strict=True)]
-    return Table("srf.check/1", COLUMNS, rows, title, tuple(notes), parameters, meta)
+    columns = tuple(dataclasses.replace(c, unit=shown_unit(c.unit, stress=experiment.stress)) for c in COLUMNS)
+    return Table("srf.check/1", columns, rows, title, tuple(notes), parameters, meta)
 
 
 def _figure(experiment: Experiment, checks: Sequence[RunCheck]) -> Figure:
     from srfcli.output.recordings import recordings
+    from srfcli.output.report_text import unit_text
 
-    labels = {"elongation": "elongation  [µm]", "force": "force  [N]", "friction": "friction"}
     runs = []
     for check in checks:
         run, t = check.run, check.run.t
@@ -185,7 +190,8 @@ def _figure(experiment: Experiment, checks: Sequence[RunCheck]) -> Figure:
                 "holdout": run.holdout,
                 "t": t,
                 "observed": run.observed,
-                "label": labels[run.observable],
+                "label": run.quantity + (f"\n[{unit_text(run.unit)}]" if run.unit != "1" else ""),
+                "load_unit": run.load_unit,
                 "used": run.used,
                 "V": run.drive(t),
                 "W": run.load(t)[0],

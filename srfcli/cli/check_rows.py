@@ -25,6 +25,7 @@ COLUMNS = (
     Column("spikes", about="samples of the observable flagged as spikes"),
     Column("resets", about="transducers set anew"),
     Column("observable"),
+    Column("unit", about="of the readings: um, N, MPa or 1"),
     Column("lowest", about="smallest reading that is compared, in the observable's unit"),
     Column("highest", about="largest one"),
     Column("noise", about="standard deviation about the trend, in the observable's unit"),
@@ -62,7 +63,7 @@ def row(check: RunCheck, told: Reach | None) -> tuple[Any, ...]:
         "run": run.name, "holdout": run.holdout, "samples": run.t.size, "used": int(run.used.sum()),
         "duration": float(np.ptp(run.t)), "rate_low": min(rates), "rate_high": max(rates),
         "gaps": int(check.sampling.gaps.size), "spikes": check.spikes, "resets": check.count("reset"),
-        "observable": run.observable, "lowest": float(read.min()), "highest": float(read.max()),
+        "observable": run.quantity, "unit": run.unit, "lowest": float(read.min()), "highest": float(read.max()),
         "noise": check.noise.total, "lag1": check.noise.lag1, "white": check.noise.white, "quantum": run.quantum,
         "V_low": check.slowest, "V_high": check.fastest,
         "W_mean": load.mean, "W_low": load.lowest, "W_high": load.highest, "W_rate": load.rate,
@@ -73,10 +74,14 @@ def row(check: RunCheck, told: Reach | None) -> tuple[Any, ...]:
     return tuple(cells[column.name] for column in COLUMNS)
 
 
-def report(rows: Sequence[Sequence[Any]], forecast: Forecast | None) -> list[Table]:
+def report(rows: Sequence[Sequence[Any]], forecast: Forecast | None, *, load_unit: str = "N") -> list[Table]:
     """Return the rows as tables no wider than a page, rounded: samples, readings, what was imposed, what the load can tell."""
     cells = [{c.name: cell for c, cell in zip(COLUMNS, r, strict=True)} for r in rows]
-    tables = [_shown(title, columns, cells) for title, columns in SHOWN.items()]
+    shown = {
+        title: {heading.replace("[N]", f"[{load_unit}]"): of for heading, of in columns.items()}
+        for title, columns in SHOWN.items()
+    }
+    tables = [_shown(title, columns, cells) for title, columns in shown.items()]
     return tables if forecast is None else [*tables, _told(forecast)]
 
 
@@ -115,9 +120,9 @@ SHOWN: dict[str, dict[str, Callable[[Cells], Any]]] = {
         "spikes": lambda r: r["spikes"],
         "resets": lambda r: r["resets"],
     },
-    "Readings, in um, N or 1": {
+    "Readings": {
         "run": lambda r: r["run"],
-        "observable": lambda r: r["observable"],
+        "observable": lambda r: r["observable"] + (f" [{r['unit']}]" if r["unit"] != "1" else ""),
         "lowest": _digits("lowest", 5),
         "highest": _digits("highest", 5),
         "noise": _digits("noise", 3),

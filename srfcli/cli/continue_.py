@@ -22,6 +22,7 @@ from srfcli.cli.options import (
     values_option,
 )
 from srfcli.laws import Parameter
+from srfcli.output.plots import titled
 from srfcli.status import Status
 
 if TYPE_CHECKING:
@@ -119,6 +120,7 @@ def command(
     )
     axes = _axes(model, over, eps)
     warn_uncompiled("boundaries take about twice as long")
+    system.say_defaults(resolved, {"V", "W0"} - spanned - {part for r in over for part in r.name.split("/")})
     swept = {"W0", *(a.name for a in axes)} if len(axes) == 1 else {a.name for a in axes}
     extra = tuple(a.name for a in axes if a.name not in ("V", "W0", "eps"))
     begun, atlases, status = time.perf_counter(), [], Status.OK
@@ -144,7 +146,13 @@ def command(
     described = {k: v for k, v in resolved.described().items() if k not in {*swept, "eps"}}
     table = Table("srf.continue/1", columns, rows, model.title, tuple(notes), described, status=status.value)
     timings = {"solve": time.perf_counter() - begun}
-    emit(table, output, laws=model.laws, timings=timings, figure=lambda: _figure(model, atlases))
+    emit(
+        table,
+        output,
+        laws=model.laws,
+        timings=timings,
+        figure=lambda: _figure(model, atlases, titled(model.title, described)),
+    )
     finish(status)
 
 
@@ -236,7 +244,7 @@ def _rows(
     return rows, notes
 
 
-def _figure(model: GeneratedModel, atlases: list[Atlas]) -> Figure:
+def _figure(model: GeneratedModel, atlases: list[Atlas], title: str) -> Figure:
     import numpy as np
 
     from srfcli.numerics.hopf import critical_point
@@ -268,7 +276,7 @@ def _figure(model: GeneratedModel, atlases: list[Atlas]) -> Figure:
             p[model.index("V")] = velocity
             point = critical_point(model, p)[0]
             hopf.append(None if point is None else float(p[model.index("K")]) / point.W0)
-        return plots.stability_diagram(branches, hopf={"V": velocities, "K_over_W0": hopf}, title=model.title)
+        return plots.stability_diagram(branches, hopf={"V": velocities, "K_over_W0": hopf}, title=title)
     unit = {q.name: q.unit for q in model.parameters}
     return plots.boundaries(
         branches,
@@ -276,7 +284,7 @@ def _figure(model: GeneratedModel, atlases: list[Atlas]) -> Figure:
         ylabel=_label(plane.y.name, unit),
         logx=plane.x.log,
         logy=plane.y.log,
-        title=model.title,
+        title=title,
     )
 
 

@@ -19,6 +19,7 @@ from srfcli.cli.options import (
     values_option,
 )
 from srfcli.laws import Parameter
+from srfcli.output.plots import titled
 from srfcli.status import Status
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ def command(
         output,
         laws=model.laws,
         timings={"solve": time.perf_counter() - begun},
-        figure=lambda: _figure(rows, model.title),
+        figure=lambda: _figure(rows, titled(model.title, described)),
     )
     finish(status)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from srfcli.cli.base import EXIT_INTERRUPTED
 from srfcli.cli.laws import plugins_option
 from srfcli.cli.options import Session, SrfCommand
 from srfcli.errors import SrfError, did_you_mean
@@ -81,7 +82,7 @@ def _diagnose(
 
     from srfcli.cli.diagnose_text import print_answer
     from srfcli.cli.emit import Progress, finish
-    from srfcli.diagnosis.answer import answer, final
+    from srfcli.diagnosis.answer import answer, final, ranked_rows
     from srfcli.diagnosis.locate import locate
     from srfcli.diagnosis.search import Search
     from srfcli.diagnosis.verdict import conclude
@@ -128,7 +129,11 @@ def _diagnose(
         click.echo(json_text(found, indent=2))
     else:
         print_answer(found, diagnosis, location, folder)
-    finish(status)
+    fitted = ", ".join(sorted(str(r["name"]) for r in ranked_rows(diagnosis)))
+    finish(
+        status,
+        advice=f"the answer rests on what was fitted until then: {fitted}. Effects not among these were not tried.",
+    )
 
 
 def _explained(search: Search, diagnosis: Diagnosis) -> dict[str, Any]:
@@ -155,6 +160,10 @@ def _searched(search: Search) -> Any:
         search.run()
     except KeyboardInterrupt:
         if not any(not r.hypothesis.effects for r in search.tried.values()):
-            raise
+            raise SrfError(
+                "interrupted before the baseline was fitted; nothing is kept",
+                "`srf fit` of the same experiment keeps what it has at any time.",
+                exit_code=EXIT_INTERRUPTED,
+            ) from None
         return Status.INTERRUPTED
     return Status.OK

@@ -13,20 +13,22 @@ from srfcli.atomic import recover, whole_folder
 from srfcli.cli.base import Session
 from srfcli.errors import SrfError
 from srfcli.output.files import write_atomic
+from srfcli.output.report_text import unit_text
 from srfcli.reading import parse_json, read_plain
+from srfcli.units import split_quantity
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.answer import RunView
     from srfcli.diagnosis.locate import Location
     from srfcli.diagnosis.parting import Parting
     from srfcli.diagnosis.verdict import Diagnosis
+    from srfcli.recording.values import Run
     from srfcli.registry import Registry
 
 ANSWER = "answer.json"
 LARGEST = 2**28  # bytes of an answer
 FORM = "closed-form.toml"
 SCHEMA = "srf.diagnose/"
-UNITS = {"elongation": "um", "force": "N", "friction": "1"}
 
 
 def check_answer(folder: Path, *, force: bool) -> None:
@@ -112,6 +114,7 @@ def write_answer(
             registry, diagnosis.experiment, diagnosis.baseline.fit.values,
             read_experiment(fresh / "augmented", registry=registry, format=reader),
         )  # fmt: skip
+        _in_shown_units(made_of, diagnosis)
         if missing:
             made_of["force"] = missing["force"]
             if missing["toml"] is not None:
@@ -120,6 +123,43 @@ def write_answer(
             made_of["parting"] = _proposed(fresh, folder, found, diagnosis, registry, parting, reader=reader)
         _report(fresh, found, made_of)
     Session.current().say(f"Wrote {folder}")
+
+
+def _in_shown_units(made_of: dict[str, Any], diagnosis: Diagnosis) -> None:
+    """Put what the report shows into the units of the recordings, and add what the user stated and where the runs were made."""
+    import numpy as np
+
+    experiment = diagnosis.experiment
+    runs = {run.name: run for run in experiment.runs}
+    for shown in made_of["runs"]:
+        run = runs[shown["name"]]
+        unit = f"  [{unit_text(run.unit)}]" if run.unit != "1" else ""
+        shown |= {"label": f"{run.quantity}{unit}", "load_unit": run.load_unit}
+    for row in made_of["parameters"]:
+        row["unit"], factor = experiment.shown(str(row["unit"]))
+        for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
+            row[key] = row[key] and row[key] * factor
+    number, unit = split_quantity(experiment.stiffness_text, name="stiffness")
+    shown_unit, factor = experiment.shown(unit) if unit in ("N/um", "1/um") else (unit, 1.0)
+    made_of["stated"] = {"stiffness": f"{number * factor:.4g} {unit_text(shown_unit)}"}
+    made_of["own"] = {
+        effect.reported: [*(p.name for p in effect.parameters), *effect.frees]
+        for ranked in diagnosis.ranked for effect in ranked.hypothesis.effects
+    }  # fmt: skip
+    if made_of.get("diagram"):
+        marks = {(float(f"{V:.3g}"), float(f"{np.mean(r.load(r.t)[0]):.3g}"))
+                 for r in experiment.runs for V, share in _velocities(r) if share > 0.1}  # fmt: skip
+        made_of["diagram"] |= {"marks": sorted(marks), "load_unit": "MPa" if experiment.stress else "N"}
+
+
+def _velocities(run: Run) -> list[tuple[float, float]]:
+    """Return the velocities at which a run was driven forward, to three digits, and the share of its time for each."""
+    import numpy as np
+
+    V, counts = np.unique(
+        [float(f"{v:.3g}") for v in run.drive(run.t[:: max(run.t.size // 2000, 1)])], return_counts=True
+    )
+    return [(float(v), float(c) / float(counts.sum())) for v, c in zip(V, counts, strict=True) if v > 0]
 
 
 def _proposed(
@@ -167,7 +207,7 @@ def prediction_csv(view: RunView) -> str:
     """Return a run as recorded and as predicted by both models, in full precision; empty where there is nothing."""
     import numpy as np
 
-    unit = UNITS[view.run.observable]
+    unit = view.run.unit
     lines = [f"time [s],observed [{unit}],baseline [{unit}],augmented [{unit}]"]
     observed = np.where(view.run.used, view.run.observed, np.nan)
     columns = (view.run.t, observed, view.baseline, view.augmented)

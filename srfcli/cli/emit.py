@@ -23,6 +23,8 @@ from srfcli.status import Status
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+PATIENCE, LITTLE = 2.0, 0.01  # s that nobody needs an estimate for; share of the work from which one can be made
+
 
 def emit(
     table: Table,
@@ -39,7 +41,7 @@ def emit(
 
     `more` are tables that text shows below the first; in JSON its `meta` should hold what they say, CSV has the first only.
     `figure` may be a function that draws it, called only for --plot. `laws`, `inputs`, `seed` and `timings` go into
-    the sidecar, as do the table's parameters. A terminal gets a formatted table, a pipe plain text in full precision;
+    the sidecar, as do the table's parameters. A terminal gets a formatted table, a pipe plain text of twelve digits;
     beside CSV and a file the notes go to stderr.
     """
     provenance = Provenance(
@@ -72,7 +74,7 @@ def emit(
 
 
 def render(table: Table, format: str) -> str:
-    """Return the table as `format`: text (full precision), json or csv."""
+    """Return the table as `format`: text (twelve digits), json or csv (full precision)."""
     return {"text": tables.to_text, "json": records.to_json, "csv": records.to_csv}[format](table)
 
 
@@ -98,22 +100,23 @@ def warn_uncompiled(cost: str) -> None:
         Session.current().say(f"Warning: no C compiler was found: {cost}. Try: {GET_COMPILER}")
 
 
-def finish(status: Status) -> None:
+def finish(status: Status, *, advice: str | None = None) -> None:
     """End the command with the exit code of `status`: 0 where its numbers can be used, 130 interrupted, else 3.
 
-    Call it last, after `emit`; the status' advice is printed on stderr.
+    Call it last, after `emit`; the status' advice is printed on stderr, or that of the command.
     """
     if status.ok:
         raise click.exceptions.Exit(EXIT_OK)
     interrupted = status is Status.INTERRUPTED
-    click.echo(f"{'Interrupted' if interrupted else 'Not finished'}: {status.advice}", err=True)
+    click.echo(f"{'Interrupted' if interrupted else 'Not finished'}: {advice or status.advice}", err=True)
     raise click.exceptions.Exit(EXIT_INTERRUPTED if interrupted else EXIT_PARTIAL)
 
 
 class Progress:
-    """One line on stderr that says how far a long loop is, and with a `total` about how long the rest will take.
+    """One line on stderr that says how far a long loop is and, after two seconds, how long the rest will take.
 
-    Silent where stderr is no terminal, and under -q.
+    It is silent where stderr is no terminal, and under -q. The rest is estimated from the share that is done: of `total`, or as
+    `advance` is told; without either the line says how long it has been.
 
     with Progress("boundary", total=60) as progress:
         for point in points:
@@ -125,8 +128,7 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._raw = getattr(self._stream, "unescaped", self._stream)
         self._active = self._stream.isatty() and not (Session.current().quiet if quiet is None else quiet)
-        self._shown_at = 0.0
-        self._begun = time.monotonic()
+        self._shown_at, self._begun = 0.0, time.monotonic()
 
     def __enter__(self) -> Progress:
         return self
@@ -138,21 +140,33 @@ class Progress:
             self._raw.write("\r\x1b[K")  # the line was for waiting; nothing of it stays
             self._stream.flush()
 
-    def advance(self, steps: int = 1, *, note: str = "") -> None:
-        """Count `steps` more and show it, at most ten times a second."""
+    def advance(self, steps: int = 1, *, note: str = "", share: float | None = None) -> None:
+        """Count `steps` more and show it, at most ten times a second; `share` of the work is done, from 0 to 1."""
         self.done += steps
         now = time.monotonic()
         if not self._active or now - self._shown_at < 0.1:
             return
         self._shown_at = now
         count = f"{self.done}" if self.total is None else f"{self.done}/{self.total}"
-        line = f"{self.label}: {count}{self._left(now)}  {note}".rstrip()
-        self._raw.write(f"\r\x1b[K{printable(line[:100], line=True)}")
+        if share is None and self.total:
+            share = self.done / self.total
+        line = f"{self.label}: {count}  {note}".rstrip()
+        self._raw.write(f"\r\x1b[K{printable(line[:100], line=True)}{remaining(now - self._begun, share)}")
         self._stream.flush()
 
-    def _left(self, now: float) -> str:
-        """Return what is left at the pace so far, once that is worth saying."""
-        if self.total is None or not 0 < self.done < self.total or now - self._begun < 2:
-            return ""
-        seconds = (now - self._begun) / self.done * (self.total - self.done)
-        return f", about {seconds:.0f} s left" if seconds < 100 else f", about {seconds / 60:.0f} min left"
+
+def remaining(elapsed: float, share: float | None) -> str:
+    """Return how long the rest will take after `elapsed` seconds for a share of the work; how long it has been for None."""
+    if elapsed < PATIENCE or (share is not None and share >= 1.0):
+        return ""
+    if share is None or share < LITTLE:
+        return f"  [{duration(elapsed)} so far]"
+    return f"  [about {duration(elapsed * (1.0 / share - 1.0))} left]"
+
+
+def duration(seconds: float) -> str:
+    """Return a time to two digits in s, min or h."""
+    for size, unit in ((3600.0, "h"), (60.0, "min")):
+        if seconds >= 1.5 * size:
+            return f"{float(f'{seconds / size:.2g}'):g} {unit}"
+    return f"{float(f'{max(seconds, 1.0):.2g}'):.0f} s"

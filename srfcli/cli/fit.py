@@ -15,11 +15,13 @@ if TYPE_CHECKING:
 
     from srfcli.inference.fit import Fit, Problem
     from srfcli.inference.profile import Interval
+    from srfcli.inference.sample import Posterior
 
 EXAMPLES = """
 srf fit EXPERIMENT                                  a folder with experiment.toml, or that file
 srf fit EXPERIMENT --profile --starts 5 --json
 srf fit EXPERIMENT --trend slip --free A,B,D0
+srf fit EXPERIMENT --sample 4000 --draws draws.nc    the posterior; the draws for ArviZ
 srf fit EXPERIMENT --track smooth                   no random friction field, whatever the recording says
 srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c, sigma
 """
@@ -43,6 +45,7 @@ srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c,
 @click.option(
     "--sample", type=click.IntRange(100, 1_000_000), metavar="N", help="Draw N points of the posterior (emcee)."
 )
+@click.option("--draws", metavar="FILE.nc", help="Keep the draws of --sample as ArviZ's netCDF.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of further starts and of the sampler.")
 @click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
 @click.option(
@@ -64,8 +67,14 @@ def command(source: Path, system: SystemOptions, output: OutputOptions, **option
     """
     if source.suffix.lower() == ".csv":
         from srfcli.cli.fit_thresholds import fit_thresholds
+        from srfcli.recording.draft import looks_like_recording
 
-        _refuse(options, ("starts", "profile", "trend", "track", "sample", "reader"), "recordings")
+        if looks_like_recording(source, registry=system.registry()):
+            raise SrfError(
+                f"{source}: a recording, and no experiment yet",
+                f"`srf new {source}` writes the experiment.toml to fit.",
+            )
+        _refuse(options, ("starts", "profile", "trend", "track", "sample", "draws", "reader"), "recordings")
         fit_thresholds(
             source, system=system, output=output, free=options["free"], bounds=options["bounds"],
             methods=options["method"], tol=options["tol"], max_evaluations=options["max_evaluations"],
@@ -93,13 +102,15 @@ def _refuse(options: dict[str, Any], names: tuple[str, ...], purpose: str) -> No
 
 
 def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
+    import re
     import time
     from dataclasses import asdict, replace
 
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.cli.fit_tables import parameter_table, run_table
+    from srfcli.cli.fit_tables import ADVICE, parameter_table, posterior_table, run_table
     from srfcli.inference.profile import profile
     from srfcli.inference.recordings import fit_recordings
+    from srfcli.inference.sample import sample, to_arviz
     from srfcli.recording.experiment import read_experiment
     from srfcli.status import Status
 
@@ -109,14 +120,18 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     asked = options["profile"] or options["sample"]
     if options["track"] == "shared" and asked:
         raise SrfError("--track shared does not go with --profile or --sample", "Leave it out, or name --track rough.")
+    kept = _draws_file(options["draws"], options["sample"], output)
     warn_uncompiled("the fit has no random friction field, and takes up to 34 times as long")
-    begun = time.perf_counter()
+    begun, starts = time.perf_counter(), options["starts"]
     intervals: list[Interval] = []
-    draws = None
+    posterior: Posterior | None = None
     with Progress("fit") as progress:
 
         def report(text: str) -> None:
-            progress.advance(note=text)
+            number = re.match(
+                r"start (\d+) of", text
+            )  # of several starts those that ended tell how long the rest takes
+            progress.advance(note=text, share=(int(number[1]) - 1) / starts if number else None)
 
         found = fit_recordings(
             registry, experiment, free=free, trend=options["trend"], track=options["track"], ask_shared=not asked,
@@ -125,42 +140,86 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
         problem, fit, status = found.problem, found.fit, found.status
         try:
             if options["profile"] and status is not Status.INTERRUPTED:
-                for name in problem.names:
-                    intervals.append(profile(problem, fit, name, rough=found.state_space, progress=report))
+                with Progress("profile", total=2 * len(problem.names)) as ends:
+                    for name in problem.names:
+                        intervals.append(
+                            profile(
+                                problem,
+                                fit,
+                                name,
+                                rough=found.state_space,
+                                progress=lambda text: ends.advance(note=text),
+                            )
+                        )
             if options["sample"] and status is not Status.INTERRUPTED:
-                from srfcli.inference.sample import sample
-
-                draws = sample(
-                    problem, fit, options["sample"], rough=found.state_space, seed=options["seed"], progress=report
-                )
+                with Progress("sample") as drawn:
+                    posterior = sample(
+                        problem, fit, options["sample"], rough=found.state_space, seed=options["seed"],
+                        progress=lambda text, share: drawn.advance(note=text, share=share),
+                    )  # fmt: skip
+                status = Status.INTERRUPTED if posterior.interrupted else status
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
     for run in experiment.runs:
         for notice in run.notices:
             Session.current().detail(f"{run.name}: {notice}")
-    runs = run_table(fit)
-    table = parameter_table(problem, fit, intervals, found.starts, draws, runs, status)
+    runs = run_table(fit, experiment)
+    table = parameter_table(problem, fit, intervals, found.starts, posterior, runs, status)
     if found.track is not None:
         table = replace(
             table, notes=(*table.notes, str(found.track)), meta={**table.meta, "track": asdict(found.track)}
         )
-    if status is Status.INTERRUPTED and options["starts"] > 1:
-        note = f"interrupted: {len(found.starts)} of {options['starts']} starts were done"
+    if status is Status.INTERRUPTED and found.status is Status.INTERRUPTED and starts > 1:
+        note = f"interrupted: {len(found.starts)} of {starts} starts were done"
         table = replace(table, notes=(*table.notes, note))
+    more = [runs] if posterior is None else [runs, posterior_table(problem, posterior)]
     emit(
-        table, output, more=[runs], laws=problem.model.laws, inputs=[experiment.path, *(r.file for r in experiment.runs)],
+        table, output, more=more, laws=problem.model.laws, inputs=[experiment.path, *(r.file for r in experiment.runs)],
         seed=options["seed"], timings={"fit": time.perf_counter() - begun}, figure=_figure(problem, fit),
     )  # fmt: skip
-    finish(status)
+    if posterior is not None and kept is not None:
+        to_arviz(posterior).to_netcdf(str(kept))
+        Session.current().say(f"Wrote {kept}")
+    finish(status, advice=ADVICE.get(status))
+
+
+def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> Path | None:
+    """Return where the draws go; raises SrfError now for what could not be written later."""
+    import importlib.util
+
+    from srfcli.output.files import check_target
+
+    if name is None:
+        return None
+    if count is None:
+        raise SrfError("--draws keeps what --sample draws, and nothing is drawn", "Add --sample 4000.")
+    place = Path(name).expanduser()
+    if place.suffix.lower() != ".nc":
+        raise SrfError(f"--draws {name} is no .nc file", f"End it in .nc: --draws {place.with_suffix('.nc')}")
+    check_target(place, force=output.force, what="--draws")
+    if importlib.util.find_spec("arviz") is None:
+        raise SrfError("--draws needs arviz, which is not installed", 'pip install "srfcli[arviz]"')
+    return place
 
 
 def _figure(problem: Problem, fit: Fit) -> Callable[[], Any]:
     def draw() -> Any:
+        from srfcli.cli.fit_tables import unit_of
         from srfcli.output.fits import fit_figure
+        from srfcli.output.report_text import NARROW, bracketed, unit_text
+        from srfcli.units import from_base
 
         runs = {r.name: r for r in problem.experiment.runs}
         rows = [(f.name, f.holdout, runs[f.name].t, runs[f.name].observed, f.prediction.y, f.white) for f in fit.runs]
-        unit = {"elongation": "um", "force": "N", "friction": "1"}[next(iter(runs.values())).observable]
-        return fit_figure(rows, quantity=next(iter(runs.values())).observable, unit=unit)
+        one = next(iter(runs.values()))
+        told = []
+        for name in fit.names:
+            declared = unit_of(problem, name)
+            unit, factor = problem.experiment.shown(declared)
+            value, error = (from_base(x, declared) * factor for x in (fit.values[name], fit.stderr[name]))
+            told.append(f"{name} = {bracketed(value, error)}" + ("" if unit == "1" else f"{NARROW}{unit_text(unit)}"))
+        choice = problem.experiment.choice
+        title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
+        return fit_figure(rows, quantity=one.quantity, unit=one.unit, title=title, found=", ".join(told))
 
     return draw

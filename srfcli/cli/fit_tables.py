@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +11,10 @@ from srfcli.status import Status
 from srfcli.units import from_base
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from srfcli.inference.fit import Fit, Problem
     from srfcli.inference.profile import Interval
+    from srfcli.inference.sample import Posterior
+    from srfcli.recording.values import Experiment
 
 PARAMETERS = (
     Column("parameter", "", "name"),
@@ -29,12 +30,30 @@ RUNS = (
     Column("run", "", "name"),
     Column("role", "", "fit, or held out"),
     Column("samples", "", "compared"),
-    Column("rms", "", "of the residual, in the observable's unit"),
+    Column("rms", "", "of the residual, in the unit beside it"),
     Column("noise", "", "standard deviation of the gauge's white noise"),
+    Column("unit", "", "of the two columns before"),
     Column("rms_over_noise", "", "1 where the model explains all but the noise", ".4g"),
     Column("lag1", "", "correlation of neighbouring residuals", ".3g"),
     Column("order", "", "how many times of correlation the gauge's noise has"),
 )
+POSTERIOR = (
+    Column("parameter", "", "name"),
+    Column("mean", "", "of the draws, in the unit beside them"),
+    Column("sd", "", "their standard deviation", ".3g"),
+    Column("low", "", "2.5 % of the draws are below"),
+    Column("median", "", "of the draws"),
+    Column("high", "", "97.5 % of the draws are below"),
+    Column("unit", "", "of all the columns before"),
+    Column("effective", "", "independent draws that these are worth", ".0f"),
+    Column("r_hat", "", "spread over all chains to that within them; 1 where they agree", ".4f"),
+)
+ENOUGH, MIXED = 400.0, 1.01  # independent draws and R-hat that intervals should rest on (Vehtari and others 2021)
+ADVICE = {
+    Status.NO_CONVERGENCE: "the likelihood's maximum was not reached. Try --starts 5, other start values or bounds, or hold a "
+    "parameter that is tied to another (--free).",
+    Status.INTERRUPTED: "the likeliest parameters so far are above.",
+}
 CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
 
 
@@ -43,7 +62,7 @@ def parameter_table(
     fit: Fit,
     intervals: Sequence[Interval],
     starts: Sequence[tuple[float, bool]],
-    draws: NDArray[Any] | None,
+    posterior: Posterior | None,
     runs: Table,
     status: Status,
 ) -> Table:
@@ -51,14 +70,17 @@ def parameter_table(
     by_name = {i.name: i for i in intervals}
     rows = []
     for k, name in enumerate(fit.names):
-        unit = unit_of(problem, name)
+        declared = unit_of(problem, name)
+        unit, factor = problem.experiment.shown(declared)
         value, error = fit.values[name], fit.stderr[name]
         found = by_name.get(name)
         ends = (value - 1.96 * error, value + 1.96 * error) if found is None else (found.low, found.high)
         cells = [value, error, *ends]
-        shown = [None if c is None else from_base(c, unit) for c in cells]
-        rows.append((name, *shown, unit, from_base(float(problem.start[k]), unit), flag(fit, k)))
-    notes = _notes(fit, intervals, starts)
+        *shown, start = [
+            None if c is None else from_base(c, declared) * factor for c in (*cells, float(problem.start[k]))
+        ]
+        rows.append((name, *shown, unit, start, flag(fit, k)))
+    notes = _notes(fit, intervals, starts) + ([] if posterior is None else _posterior_notes(posterior))
     meta = {
         "runs": [dict(zip((c.name for c in RUNS), row, strict=True)) for row in runs.rows],
         "correlation": fit.correlation,
@@ -70,20 +92,59 @@ def parameter_table(
             for f in fit.runs
         },
         "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in starts],
-        "posterior": None if draws is None else {"names": fit.names, "draws": draws},
+        "posterior": None if posterior is None else _described(posterior),
     }
     return Table("srf.fit/1", PARAMETERS, rows, problem.experiment.title, tuple(notes), {}, meta, status=status.value)
 
 
-def run_table(fit: Fit) -> Table:
+def posterior_table(problem: Problem, posterior: Posterior) -> Table:
+    """Return mean, spread and quantiles of each parameter, and what its draws are worth."""
+    import numpy as np
+
+    rows, draws = [], posterior.draws
+    for k, name in enumerate(posterior.names):
+        declared = unit_of(problem, name)
+        unit, factor = problem.experiment.shown(declared)
+        shown = [from_base(float(x), declared) * factor for x in (draws[:, k].mean(), draws[:, k].std(ddof=1),
+                 *np.quantile(draws[:, k], (0.025, 0.5, 0.975)))]  # fmt: skip
+        rows.append((name, *shown, unit, float(posterior.effective[k]), float(posterior.r_hat[k])))
+    return Table("srf.fit.posterior/1", POSTERIOR, rows, "posterior")
+
+
+def _described(posterior: Posterior) -> dict[str, Any]:
+    return {
+        "names": posterior.names, "draws": posterior.draws, "burn_in": posterior.burn_in, "accepted": posterior.accepted,
+        "effective": posterior.effective, "r_hat": posterior.r_hat,
+    }  # fmt: skip
+
+
+def _posterior_notes(posterior: Posterior) -> list[str]:
+    worth, worst = float(posterior.effective.min()), float(posterior.r_hat.max())
+    count, chains = posterior.draws.shape[0], posterior.chains.shape[1]
+    notes = [
+        f"posterior: {count} draws of {chains} chains after {posterior.burn_in} steps of burn-in, worth {worth:.0f} independent "
+        f"ones or more; R-hat up to {worst:.3f}; {posterior.accepted:.0%} of the proposals taken"
+    ]
+    if posterior.interrupted:
+        notes.append("posterior: interrupted; the draws so far are kept")
+    if not (worth >= ENOUGH and worst <= MIXED):
+        more = max(math.ceil(1.2 * count * ENOUGH / max(worth, 1.0) / 100) * 100, 2 * count if worst > MIXED else 0)
+        notes.append(
+            f"posterior: intervals should rest on {ENOUGH:.0f} independent draws with R-hat up to {MIXED}: --sample {more}"
+        )
+    return notes
+
+
+def run_table(fit: Fit, experiment: Experiment) -> Table:
     """Return one row for each run, fitted or held out."""
     from srfcli.inference.noise import lag_one
 
-    rows = []
+    rows, units = [], {run.name: run.unit for run in experiment.runs}
     for f in fit.runs:
         size = sum(b - a for a, b in f.parts)
+        ratio = f.rms / f.white if f.white else None
         rows.append(
-            (f.name, "held out" if f.holdout else "fit", size, f.rms, f.white, f.rms / f.white if f.white else None,
+            (f.name, "held out" if f.holdout else "fit", size, f.rms, f.white, units[f.name], ratio,
              lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
         )  # fmt: skip
     return Table("srf.fit.runs/1", RUNS, rows, "runs")
@@ -115,9 +176,11 @@ def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float
     notes = [f"rms over noise {fit.rms_over_noise():.3f} in the runs fitted"]
     if any(f.holdout for f in fit.runs):
         notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
-    notes.append(
-        "intervals: " + ("profile likelihood" if intervals else "1.96 standard errors; --profile refits") + ", 95 %"
+    done = [i.name for i in intervals]
+    whose = "profile likelihood" + (
+        f" of {', '.join(done)}, else 1.96 standard errors" if len(done) < len(fit.names) else ""
     )
+    notes.append("intervals: " + (whose if intervals else "1.96 standard errors; --profile refits") + ", 95 %")
     if len(starts) > 1:
         notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
     for time, size in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):

@@ -59,6 +59,7 @@ def command(
 
     model = system.model()
     resolved = system.resolve(model.parameters, V=V, W0=W0, eps=eps)
+    system.say_defaults(resolved, ("V", "W0", "eps"))
     tolerance = system.tolerance(tol).value
     begun = time.perf_counter()
     result = solve_floquet(model, model.vector(resolved.values), tol=tolerance, max_mesh=max_mesh, harmonics=harmonics)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 from pathlib import Path
@@ -11,7 +12,7 @@ import click
 
 from srfcli.cli.base import EXIT_USAGE, SrfCommand, SrfGroup
 from srfcli.cli.laws import LAW_KIND, plugins_option
-from srfcli.errors import ExpressionError, SrfError, did_you_mean
+from srfcli.errors import ExpressionError, SrfError
 
 if TYPE_CHECKING:
     from srfcli.laws import Effect, Law
@@ -143,8 +144,20 @@ def _find(registry: Registry, name: str, kind: str | None) -> list[Law]:
         broken = [problem for problem in registry.problems if problem.name == name]
         if broken:
             raise SrfError(broken[0].message, broken[0].hint)
-        raise SrfError(f"unknown law '{name}'", did_you_mean(name, {e.name for e in registry.entries(kind)}))
+        raise SrfError(f"unknown law '{name}'", _nearest(registry, name, kind))
     return [registry.get(k, name) for k in kinds]
+
+
+def _nearest(registry: Registry, name: str, kind: str | None) -> str:
+    """Return what the name may have meant, and all names of that one kind."""
+    kinds = [kind] if kind else sorted({e.kind for e in registry.entries() if e.kind != "reader"})
+    by_name = {e.name: e.kind for k in kinds for e in registry.entries(k)}
+    close = difflib.get_close_matches(name, by_name, n=1, cutoff=0.5)
+    if not close:
+        return f"`srf laws` lists the laws of every kind: {', '.join(kinds)}."
+    found = by_name[close[0]]
+    listed = ", ".join(sorted(e.name for e in registry.entries(found)))
+    return f"Did you mean '{close[0]}'? Known of kind {found}: {listed}"
 
 
 def _document(one: Law) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from srfcli.cli.options import (
     system_options,
 )
 from srfcli.cli.workers import Spread, worker_options
+from srfcli.output.plots import titled
 from srfcli.status import Status
 
 if TYPE_CHECKING:
@@ -142,7 +143,15 @@ def command(
     shown = _tables(model, found, (atlas, special, cubic), boundaries, resolved)
     grid_rows, components, marks, points, status = shown
     text = output.format == "text" and boundaries
-    figure = functools.partial(map_figure, model, found, atlas, special, cubic, model.title)
+    figure = functools.partial(
+        map_figure,
+        model,
+        found,
+        atlas,
+        special,
+        cubic,
+        titled(model.title, {k: v for k, v in grid_rows.parameters.items() if k != "eps"}),
+    )
     more = (marks,) if text and marks.rows else ()
     emit(components if text else grid_rows, output, more=more, laws=model.laws, timings=timings, figure=figure)
     if place is not None:
@@ -258,7 +267,8 @@ def _summary(
     bad = sum(not s.status.ok for marks in special for s in marks)
     if bad:
         notes.append(f"{bad} special points could not be located; their rows say so")
-    return (*notes, *atlas.notes), meta, status if not status.ok else atlas.status
+    stopped = atlas.status is Status.INTERRUPTED  # counts before what else went wrong
+    return (*notes, *atlas.notes), meta, atlas.status if stopped or status.ok else status
 
 
 def _plain(table: Table) -> list[dict[str, Any]]:

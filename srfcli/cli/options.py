@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -68,6 +68,7 @@ APPARATUS = {  # the flags that have their own option; every other parameter is 
 }
 LOADINGS = ("vertical", "inclined")
 FORMATS = ("text", "json", "csv")
+SUFFIXES = ("", ".txt", ".json", ".csv")
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,14 @@ class SystemOptions:
         for sentence in resolved.unused:
             Session.current().say(f"Warning: {sentence}")
         return resolved
+
+    def say_defaults(self, resolved: Resolved, names: Iterable[str]) -> None:
+        """Say on stderr which of these parameters have a value that nobody chose."""
+        taken = [p for p in resolved.parameters if p.name in set(names) and resolved.origins[p.name] == "law default"]
+        if taken:
+            values = ", ".join(f"{p.name} = {p.default:g}{'' if p.unit == '1' else f' {p.unit}'}" for p in taken)
+            flags = " and ".join(f"--{p.name}" for p in taken)
+            Session.current().say(f"Note: {values} by default; {flags} set{'s' if len(taken) == 1 else ''} it")
 
     def choices(self) -> dict[str, Setting]:
         """Return every setting of DEFAULTS by name, for listing."""
@@ -291,6 +300,11 @@ def read_output(
         check_plot(figure, force=force)
     if place is not None and figure is not None and place.resolve() == figure.resolve() and not is_special(place):
         raise SrfError(f"--out and --plot are the same file, {place}", "Give them different names.")
+    if place is not None and place.suffix.lower() not in SUFFIXES and not (as_json or as_csv or is_special(place)):
+        raise SrfError(
+            f"--out {place} ends in {place.suffix!r}",
+            f"End it in .txt, .json or .csv: --out {place.with_suffix('.csv')}; or name the format, --json or --csv.",
+        )
     suffix = place.suffix.lower().lstrip(".") if place is not None else ""
     format = "json" if as_json else "csv" if as_csv else suffix if suffix in FORMATS else "text"
     return OutputOptions(format, place, figure, force, provenance)

@@ -18,6 +18,7 @@ from srfcli.cli.options import (
     values_option,
 )
 from srfcli.laws import Parameter
+from srfcli.output.plots import titled
 from srfcli.status import Status
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ def command(
     for name, value in (("V", V), ("W0", W0)):
         if value is not None and name == swept.name:
             raise SrfError(f"{name} is swept and has a value too", f"Leave out --{name}, or sweep another parameter.")
+    system.say_defaults(resolved, {"V", "W0"} - {swept.name})
     begun = time.perf_counter()
     tolerance = system.tolerance(tol).value
     if mean:
@@ -121,7 +123,11 @@ def _linear(model: GeneratedModel, resolved: Resolved, swept: Range) -> tuple[Ta
     table = Table("srf.response/1", columns, rows, model.title, tuple(notes), _described(resolved, swept.name, "eps"))
     status = Status.OK if np.isfinite(np.array(cells)).all() else Status.NO_CONVERGENCE
     log = swept.values is None and swept.spacing == "log"
-    return table, lambda: _bode(shown, parts, f"{swept.name}  [{unit}]", log, model.title), status
+    return (
+        table,
+        lambda: _bode(shown, parts, f"{swept.name}  [{unit}]", log, titled(model.title, table.parameters)),
+        status,
+    )
 
 
 def _bode(x: list[float], parts: dict[str, Any], xlabel: str, log: bool, title: str) -> Figure:
@@ -172,7 +178,13 @@ def _mean(
         label = f"{swept.name}  [{unit.replace('um', 'µm')}]"
         names = [f"ε = {eps:g}" for eps in amplitudes]
         return plots.lines(
-            shown, curves, names, label, "drop of the mean friction force / W$_0$", log, title=model.title
+            shown,
+            curves,
+            names,
+            label,
+            "drop of the mean friction force / W$_0$",
+            log,
+            title=titled(model.title, table.parameters),
         )
 
     return table, figure, worst(statuses)

@@ -88,11 +88,12 @@ def fit_recordings(
         return RecordingFit(problem, as_fit(found), found, _track(found), (), Status.INTERRUPTED)
     found, status = several.beside, Status.INTERRUPTED if several.interrupted else several.best.status
     result = RecordingFit(problem, several.best, found, _track(found), tuple(several.rows), status)
-    wanted = track == "shared" or (ask_shared and track is None and shared_field(found) > ALIKE)
-    if several.interrupted or not wanted or len(problem.runs) < 2:
+    if several.interrupted or len(problem.runs) < 2:
         return result
-    tabled = open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),))
     try:
+        if not (track == "shared" or (ask_shared and track is None and shared_field(found) > ALIKE)):
+            return result
+        tabled = open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),))
         shared = fit_shared(replace(problem, model=tabled), several.best, progress=progress)
     except KeyboardInterrupt:
         return replace(result, status=Status.INTERRUPTED)

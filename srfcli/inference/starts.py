@@ -63,7 +63,7 @@ def fit_from_several(
 
         try:
             fits.append((fit(problem, start=start, progress=report), None) if fitter is None else fitter(start, report))
-        except Interrupted:
+        except (Interrupted, KeyboardInterrupt):
             if not fits:
                 raise
             interrupted = True

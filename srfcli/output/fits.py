@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.plots import house_style, name_text
+from srfcli.output.plots import COLOURS, house_style, name_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -13,37 +14,43 @@ if TYPE_CHECKING:
 FitRow = tuple[str, bool, Any, Any, Any, float]
 
 
-def fit_figure(rows: Sequence[FitRow], *, quantity: str, unit: str) -> Figure:
-    """Return a figure of two panels for each run; a row is (name, held out, t in s, recorded, predicted, noise level)."""
+def fit_figure(rows: Sequence[FitRow], *, quantity: str, unit: str, title: str = "", found: str = "") -> Figure:
+    """Return a figure of two panels for each run; a row is (name, held out, t in s, recorded, predicted, noise level).
+
+    `title` names the laws, `found` the parameters with their errors.
+    """
     with house_style():
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         columns = 2 if len(rows) > 1 else 1
         lines = -(-len(rows) // columns)
-        figure = Figure(figsize=(5.2 * columns, 2.6 * lines), layout="constrained")
+        figure = Figure(figsize=(6.0 * columns if columns == 1 else 5.2 * columns, 2.9 * lines + 0.9))
         FigureCanvasAgg(figure)
         grid = figure.add_gridspec(lines, columns)
-        label = quantity if unit == "1" else f"{quantity} ({unit})"
+        label = quantity if unit == "1" else f"{quantity}\n[{unit.replace('um', 'µm')}]"
+        handles: list[Any] = []
         for place, (name, holdout, t, recorded, predicted, noise) in enumerate(rows):
             cell = grid[place // columns, place % columns].subgridspec(2, 1, height_ratios=(2, 1), hspace=0.05)
-            above, below = figure.add_subplot(cell[0]), figure.add_subplot(cell[1])
-            above.plot(t, recorded, ".", color="0.65", markersize=1.5, label="recorded", rasterized=True)
-            above.plot(t, predicted, color="C0", linewidth=1.0, label="fitted" if not holdout else "predicted")
-            above.set_title(name_text(f"{name} (held out)" if holdout else name), loc="left")
+            above = figure.add_subplot(cell[0])
+            below = figure.add_subplot(cell[1], sharex=above)
+            dots = above.plot(t, recorded, ".", color="#777777", markersize=2.0, label="recorded", rasterized=True)
+            line = above.plot(t, predicted, color=COLOURS[0], linewidth=1.2, label="model")
+            handles = handles or [*dots, *line]
+            above.set_title(name_text(name) + (" (held out)" if holdout else ""))
             above.set_ylabel(label)
+            above.ticklabel_format(axis="y", useOffset=False)
             above.tick_params(labelbottom=False)
-            below.plot(
-                t,
-                (recorded - predicted) / noise if noise else recorded - predicted,
-                ".",
-                color="C1",
-                markersize=1.5,
-                rasterized=True,
-            )
-            below.axhline(0, color="0.3", linewidth=0.6)
+            off = (recorded - predicted) / noise if noise else recorded - predicted
+            below.plot(t, off, ".", color=COLOURS[1], markersize=2.0, rasterized=True)
+            for level in (-2.0, 2.0) if noise else ():
+                below.axhline(level, color="#000000", linewidth=0.7, linestyle=(0, (1, 1.5)))
             below.set_ylabel("residual\n/ noise" if noise else "residual")
-            below.set_xlabel("time (s)")
-            if place == 0:
-                above.legend(loc="best", markerscale=4)
+            below.set_xlabel("t  [s]")
+            above.margins(x=0.01)
+            figure.align_ylabels([above, below])
+        figure.legend(handles=handles, loc="outside lower right", ncols=2, markerscale=4, fontsize=9)
+        if title or found:
+            told = [fill(title, 52 * columns), fill(found, 62 * columns)]
+            figure.suptitle("\n".join(t for t in told if t), x=0.01, ha="left", fontsize=10)
         return figure

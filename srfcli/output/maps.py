@@ -144,6 +144,8 @@ def _draw_boundaries(ax: Axes, branches: Sequence[tuple[Values, Values, Sequence
 
 def _draw_marks(ax: Axes, special: Sequence[Mapping[str, Any]]) -> None:
     """Mark the special points, one kind of mark for each, each named once."""
+    from matplotlib.patheffects import withStroke
+
     for what in dict.fromkeys(str(s["what"]) for s in special):
         marker, label = MARKS.get(what, CRITICALITY)
         mine = [s for s in special if str(s["what"]) == what]
@@ -152,30 +154,41 @@ def _draw_marks(ax: Axes, special: Sequence[Mapping[str, Any]]) -> None:
             [s["y"] for s in mine],
             linestyle="none",
             marker=marker,
-            markersize=5.5,
-            markerfacecolor="white",
+            markersize=6.5 if marker == "P" else 5.5,
+            markerfacecolor="none",  # one mark does not hide another
             markeredgecolor="black",
+            path_effects=[withStroke(linewidth=2.4, foreground="white")],
             label=label,
         )
 
 
 def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title: str = "") -> Figure:
-    """Return gain and phase of complex transfer functions `parts`, {label: values}, over one x."""
+    """Return gain and phase of complex transfer functions `parts`, {label: values}, over one x; `[unit]` in a label: an axis."""
     import numpy as np
+    from matplotlib.ticker import MultipleLocator
 
+    measured = [label for label in parts if "[" in label]  # what has a unit has an axis of its own
     with house_style():
-        figure, (above, below) = new_figure(2, size=(6.0, 5.2))
+        figure, axes = new_figure(2 + len(measured), size=(6.0, 5.2 + 1.5 * len(measured)))
+        above, below, own = axes[0], axes[-1], dict(zip(measured, axes[1:], strict=False))
         for k, (label, values) in enumerate(parts.items()):
             look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[k % len(DASHES)]}
-            above.plot(list(x), np.abs(values), label=label, **look)
-            below.plot(list(x), np.degrees(np.unwrap(np.angle(values))), **look)
-        above.set_yscale("log")
+            own.get(label, above).plot(list(x), np.abs(values), label=label, **look)
+            below.plot(list(x), np.degrees(np.unwrap(np.angle(values))), label=label.partition("  [")[0], **look)
+        for label, axis in own.items():
+            axis.set_ylabel(f"gain of {label}")
+        for axis in axes[:-1]:
+            axis.set_yscale("log")
         below.set_xscale("log" if logx else "linear")
         above.set_ylabel("gain for ε = 1")
         below.set_ylabel("phase  [deg]")
+        below.yaxis.set_major_locator(MultipleLocator(90))
         below.set_xlabel(xlabel)
         above.set_title(title)
-        above.legend(loc="best", handlelength=2.8, ncols=2)
+        figure.legend(
+            *below.get_legend_handles_labels(), loc="outside lower center", handlelength=2.8, ncols=len(parts)
+        )
         below.margins(x=0.0)
+        figure.align_ylabels(axes)
         _decade_ticks(below)
         return figure

@@ -28,6 +28,7 @@ SUFFIXES = (".png", ".svg", ".pdf")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (9, 2)), (0, (3, 1, 1, 1, 1, 1)), (0, (2, 2)))
 DOTTED = (0, (1, 1.2))  # kept for the constant load
+TITLE = ("V", "W0", "eps", "f", "K", "M")  # parameters that stand under a figure's title
 FEW_NAMES = 5  # of curves that a legend holds within the axes; more are named below them
 NAME_COLUMNS, NAME_ROW = 2, 0.2  # there, and the height of a row in inches
 
@@ -101,9 +102,13 @@ def house_style() -> Iterator[None]:
         yield
 
 
-def name_text(name: str) -> str:
-    """Return a user's text so that a figure shows it as it is: a dollar sign opens no formula, a line does not break."""
-    return printable(" ".join(name.split())).replace("$", r"\$")
+def name_text(name: str, *, narrow: bool = False) -> str:
+    """Return a user's text so that a figure shows it as it is: a dollar sign opens no formula, a line does not break.
+
+    It is cut where it would leave the figure no room, early in one for small screens.
+    """
+    words, most = printable(" ".join(name.split())), 18 if narrow else 48
+    return (words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$")
 
 
 def new_figure(rows: int = 1, *, size: tuple[float, float] | None = None) -> tuple[Figure, list[Axes]]:
@@ -123,6 +128,14 @@ def figure_bytes(figure: Figure, suffix: str) -> bytes:
     with house_style():
         figure.savefig(buffer, format=suffix.lstrip(".").lower(), metadata=_METADATA[suffix.lower()])
     return buffer.getvalue()
+
+
+def titled(title: str, described: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a figure's title with the values under it that its axes do not show; `described` as a table's parameters are."""
+    shown = [(name, described[name]) for name in TITLE if isinstance(described.get(name, {}).get("value"), float)]
+    units = {name: "" if p.get("unit") == "1" else f" {str(p.get('unit')).replace('um', 'µm')}" for name, p in shown}
+    names = {"W0": "W$_0$", "eps": "ε"}
+    return "\n".join([title, ", ".join(f"{names.get(n, n)} = {p['value']:g}{units[n]}" for n, p in shown)]).strip()
 
 
 def save_figure(figure: Figure, path: Path) -> bytes:
@@ -247,9 +260,14 @@ def _shade_stable(ax: Axes, curves: Sequence[tuple[Values, Values]], colour: str
     levels[0] = top
     for j, heights in enumerate(edges):
         levels[1 : len(heights) + 1, j] = sorted(heights, reverse=True)
+    from matplotlib.colors import to_rgb
+
+    pale = tuple(1.0 - 0.10 * (1.0 - part) for part in to_rgb(colour))  # opaque, so that no seam shows between pieces
     for k in range(0, most + 1, 2):
         # where a column has fewer crossings than k the levels coincide, so that nothing is drawn there
-        ax.fill_between(columns, levels[k + 1], levels[k], where=covered, color=colour, alpha=0.10, linewidth=0)
+        upper, lower = levels[k], levels[k + 1]
+        there = covered & (upper > lower)
+        ax.fill_between(columns, lower, upper, where=there, facecolor=pale, edgecolor=pale, linewidth=0.6, zorder=0.2)
     ax.annotate("stable", (0.98, 0.97), xycoords="axes fraction", ha="right", va="top", color="#333333")
     ax.annotate("oscillates", (0.02, 0.03), xycoords="axes fraction", ha="left", va="bottom", color="#333333")
 

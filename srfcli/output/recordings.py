@@ -59,7 +59,7 @@ def _panel(axes: list[Axes], run: Mapping[str, Any]) -> None:
     import numpy as np
 
     t = np.asarray(run["t"])
-    labels = (run["label"], "V\n[µm/s]", "W\n[N]")
+    labels = (run["label"], "V\n[µm/s]", f"W\n[{run.get('load_unit', 'N')}]")
     for axis, key, label, colour in zip(axes, ("observed", "V", "W"), labels, COLOURS, strict=False):
         axis.plot(*_thinned(t, np.asarray(run[key])), color=colour, linewidth=0.8)
         axis.set_ylabel(label)

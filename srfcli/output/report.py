@@ -17,7 +17,7 @@ from srfcli.output.report_atlas import atlas_figure
 from srfcli.output.report_figures import diagram_figure, force_by_state, force_figure, parameters_figure
 from srfcli.output.report_page import Markup, page, tag
 from srfcli.output.report_runs import Trace, overview, run_figure, trace
-from srfcli.output.report_text import verdict_sentence
+from srfcli.output.report_text import gain_sentence, remedy, verdict_sentence
 from srfcli.output.tables import plain_value
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ FIGURES = "figures"
 ARRAYS = ("force", "diagram")  # parts of the material that figures take as they are
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
 
-Drawing = tuple[str, Callable[[], "Figure | None"]]
+Drawing = tuple[str, Callable[..., "Figure | None"]]
 
 
 def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str, Any]) -> tuple[Path, ...]:
@@ -60,17 +60,20 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
 def _tables(material: Mapping[str, Any]) -> dict[str, Any]:
     """Return the material as plain data, without the long arrays."""
     found = {k: plain_value(v) for k, v in material.items() if k not in ("runs", *ARRAYS)}
-    found["runs"] = [{"name": str(r["name"]), "rms": plain_value(r.get("rms"))} for r in material.get("runs", ())]
+    found["runs"] = [
+        {"name": str(r["name"]), "rms": plain_value(r.get("rms")), "holdout": bool(r.get("holdout"))}
+        for r in material.get("runs", ())
+    ]
     force, diagram = material.get("force") or {}, material.get("diagram") or {}
     found["force"] = {k: force[k] for k in ("form", "unit") if force.get(k)} | ({"runs": True} if force else {})
-    found["diagram"] = {"note": diagram.get("note")}
+    found["diagram"] = {"note": diagram.get("note"), "marks": plain_value(diagram.get("marks") or ())}
     return found
 
 
 def _drawn(
     folder: Path, traces: tuple[Trace, ...], material: Mapping[str, Any], written: list[Path]
 ) -> Iterator[tuple[str, bytes]]:
-    """Draw and write the figures one after the other, and yield each one's name and SVG."""
+    """Draw and write the figures one after the other, and yield each one's name and SVG, and that for small screens."""
     folder.mkdir(exist_ok=True)
     for name, draw in _drawings(traces, material):
         figure = draw()
@@ -82,6 +85,9 @@ def _drawn(
             write_atomic(place, data)
             written.append(place)
         yield name, content[".svg"]
+        small = draw(narrow=True)
+        if small is not None:
+            yield sections.narrow_name(name), figure_bytes(small, ".svg")
 
 
 def _free(folder: Path, name: str, suffix: str, written: list[Path]) -> Path:
@@ -139,6 +145,9 @@ def _page(matter: sections.Matter) -> str:
     head = [
         tag("p", title, class_="of"),
         tag("h1", tag("span", verdict, class_=f"verdict {verdict if verdict in VERDICTS else 'unknown'}"), sentence),
+        tag("p", tag("strong", "What to do. "), remedy(matter.answer, matter.tables), class_="lead"),
+        tag("p", gain_sentence(matter.answer, matter.tables), class_="lead"),
+        sections.first_picture(matter),
         sections.numbers(matter),
     ]
     if not matter.pictures:

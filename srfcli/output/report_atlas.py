@@ -12,6 +12,7 @@ import numpy as np
 from srfcli.output.plots import _decade_ticks, house_style, load_matplotlib, name_text
 from srfcli.output.recordings import _settle
 from srfcli.output.report_runs import BEFORE
+from srfcli.output.report_runs import NARROW as NARROW_FIGURE
 from srfcli.output.report_text import NARROW, finite, number
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def foremost(found: Sequence[Spot], *, each: int = 2, most: int = 12) -> list[Sp
     return kept
 
 
-def atlas_figure(rows: Sequence[Mapping[str, Any]]) -> Figure | None:
+def atlas_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
     """Return a panel for each axis of the atlas with several bins, but runs and windows in time; None where there is none."""
     load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -128,21 +129,21 @@ def atlas_figure(rows: Sequence[Mapping[str, Any]]) -> Figure | None:
     shown = {k: v for k, v in by_axis.items() if len({(s.low, s.high, s.name) for s in v}) >= BINS}
     if not shown:
         return None
-    columns = min(3, len(shown))
+    columns = 1 if narrow else min(3, len(shown))
     lines = math.ceil(len(shown) / columns)
     label = "−log$_{10}$ p" if any(finite(r.get("log_p")) for r in rows) else "|statistic|"
     with house_style():
-        figure = Figure(figsize=(3.5 * columns + 0.2, 2.3 * lines + 0.2))
+        figure = Figure(figsize=(NARROW_FIGURE if narrow else 3.5 * columns + 0.2, 2.3 * lines + 0.2))
         FigureCanvasAgg(figure)
         panels = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
         for k, (axis, (name, found)) in enumerate(zip(panels, shown.items(), strict=False)):
-            about, unit = AXES.get(name, (name_text(name), ""))
+            about, unit = AXES.get(name, (name_text(name, narrow=narrow), ""))
             axis.set_title(about + (f"  [{unit}]" if unit else ""), fontsize=9.5)
             if math.isfinite(found[0].low):
                 _bins(axis, found)
                 axis.set_ylabel(label if k % columns == 0 else "")
             else:
-                _names(axis, found)
+                _names(axis, found, narrow=narrow)
                 axis.set_xlabel(label)
         for axis in panels[len(shown) :]:
             axis.set_axis_off()
@@ -187,10 +188,10 @@ def _columns(bins: Sequence[Spot], log: bool) -> list[Spot]:
     ]
 
 
-def _names(axis: Axes, found: Sequence[Spot]) -> None:
+def _names(axis: Axes, found: Sequence[Spot], *, narrow: bool) -> None:
     highest: dict[str, Spot] = {}
     for spot in found:
-        highest.setdefault(name_text(spot.name), spot)
+        highest.setdefault(name_text(spot.name, narrow=narrow), spot)
     shown = list(highest.items())[:BARS][::-1]
     colours = [BEFORE if s.sure else "#AAAAAA" for _, s in shown]
     axis.barh([k for k, _ in shown], [s.height for _, s in shown], color=colours)

@@ -19,7 +19,7 @@ from srfcli.output.plots import (
     new_figure,
 )
 from srfcli.output.recordings import _settle, _thinned
-from srfcli.output.report_runs import AFTER, BEFORE
+from srfcli.output.report_runs import AFTER, BEFORE, NARROW
 from srfcli.output.report_text import finite
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ STATES = (("v", "slip velocity v  [µm/s]", True), ("phi", "age φ  [s]", True),
 WIDE = 10.0  # ratio from which a quantity has a logarithmic axis
 
 
-def parameters_figure(parameters: Sequence[Mapping[str, Any]]) -> Figure | None:
+def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
     """Return how far each parameter of the baseline had been bent, in its own standard errors; None where none is known."""
     rows = [p for p in parameters if finite(p.get("shift_sigma"))][::-1]
     if not rows:
@@ -39,38 +39,41 @@ def parameters_figure(parameters: Sequence[Mapping[str, Any]]) -> Figure | None:
     shifts = [float(p["shift_sigma"]) for p in rows]
     size = max(abs(s) for s in shifts)
     with house_style():
-        figure, (axis,) = new_figure(size=(6.6, 0.32 * len(rows) + 1.0))
+        figure, (axis,) = new_figure(size=(NARROW if narrow else 6.6, 0.32 * len(rows) + 1.0))
         axis.axvspan(-2, 2, color="#DDDDDD", linewidth=0)
         axis.axvline(0, color="#777777", linewidth=0.8)
         for k, shift in enumerate(shifts):
             axis.plot([0, shift], [k, k], color=BEFORE, linewidth=1.6)
             axis.plot(shift, k, "o", color=BEFORE, markersize=5)
-        axis.set_yticks(range(len(rows)), [name_text(str(p["name"])) for p in rows])
+        axis.set_yticks(range(len(rows)), [name_text(str(p["name"]), narrow=narrow) for p in rows])
         axis.set_ylim(-0.6, len(rows) - 0.4)
         if size > 30:
             axis.set_xscale("symlog", linthresh=3.0)
             ticks = [t for t in (-1000, -100, -30, -10, -3, 0, 3, 10, 30, 100, 1000) if abs(t) < 2 * size]
             axis.set_xticks(ticks, [f"{t}".replace("-", "−") for t in ticks])
             axis.set_xticks([], minor=True)
+            axis.set_xlim(
+                *(1.6 * (end if abs(end) > 3.0 else 3.0 * side) for end, side in ((min(shifts), -1), (max(shifts), 1)))
+            )
         axis.set_xlabel("baseline less augmented model  [standard errors]")
         axis.grid(axis="y", visible=False)
         _settle(figure)
         return figure
 
 
-def force_figure(name: str, force: Mapping[str, Any], *, unit: str = "N") -> Figure:
+def force_figure(name: str, force: Mapping[str, Any], *, unit: str = "N", narrow: bool = False) -> Figure:
     """Return a run's missing force (n,) over time with its band, above the load and the slip velocity where they are known."""
     t = np.asarray(force["t"], dtype=float)
     imposed = [(k, label) for k, label in (("v", "v\n[µm/s]"), ("W", "W\n[N]")) if force.get(k) is not None]
     with house_style():
-        figure, axes = new_figure(1 + len(imposed), size=(9.0, 2.6 + 1.0 * len(imposed)))
+        figure, axes = new_figure(1 + len(imposed), size=(NARROW if narrow else 9.0, 2.6 + 1.0 * len(imposed)))
         values, band = np.asarray(force["force"], dtype=float), force.get("band")
         if band is not None:
             low, high = _limits(values, np.asarray(band, dtype=float))
             axes[0].fill_between(t, low, high, color=AFTER, alpha=0.22, linewidth=0, label="95 % band")
         axes[0].plot(*_thinned(t, values), color=AFTER, linewidth=1.2, label="missing force")
         axes[0].axhline(0, color="#777777", linewidth=0.8)
-        axes[0].set_title(name_text(name))
+        axes[0].set_title(name_text(name, narrow=narrow), pad=22 if narrow else None)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=2, fontsize=8.5, borderaxespad=0.0)
         axes[0].set_ylabel(f"missing force\n[{unit}]" if unit != "1" else "missing friction\ncoefficient")
         for axis, (key, label) in zip(axes[1:], imposed, strict=True):
@@ -94,7 +97,7 @@ def _limits(values: Any, band: Any) -> tuple[Any, Any]:
     return (band[0], band[1]) if band.shape[0] == 2 else (band[:, 0], band[:, 1])
 
 
-def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, unit: str = "N") -> Figure | None:
+def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, unit: str = "N", narrow: bool = False) -> Figure | None:
     """Return the missing force of all runs against slip velocity, age and load, averaged in pieces; None without a state."""
     load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -104,9 +107,10 @@ def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, unit: str = "N") 
     if not shown:
         return None
     with house_style():
-        figure = Figure(figsize=(3.5 * len(shown) + 0.4, 3.1))
+        lines = len(shown) if narrow else 1
+        figure = Figure(figsize=(NARROW if narrow else 3.2 * len(shown) + 0.4, 0.5 + 2.6 * lines))
         FigureCanvasAgg(figure)
-        axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+        axes = figure.subplots(lines, len(shown) // lines, sharey=True, squeeze=False).ravel()
         for axis, (key, label, wide) in zip(axes, shown, strict=True):
             spans = [np.asarray(f[key], dtype=float) for f in forces.values() if f.get(key) is not None]
             low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
@@ -114,7 +118,7 @@ def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, unit: str = "N") 
             for index, (name, force) in enumerate(forces.items()):
                 if force.get(key) is not None:
                     _by_state(axis, np.asarray(force[key], dtype=float), np.asarray(force["force"], dtype=float), log,
-                              name_text(name), index)  # fmt: skip
+                              name_text(name, narrow=narrow), index)  # fmt: skip
             axis.axhline(0, color="#777777", linewidth=0.8)
             axis.set_xlabel(label)
             if log:
@@ -141,7 +145,7 @@ def _by_state(axis: Axes, x: Any, y: Any, log: bool, label: str, index: int) -> 
     axis.plot(np.exp(middle) if log else middle, mean, color=colour, linestyle=DASHES[index % len(DASHES)], label=label)
 
 
-def diagram_figure(diagram: Mapping[str, Any]) -> Figure | None:
+def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figure | None:
     """Return the stability boundary W0 (N) against V (um/s) of baseline and augmented model; keys V, W0_baseline, W0_augmented.
 
     `V_augmented` where the second has velocities of its own, `W0_hopf` under constant load, None or NaN for gaps.
@@ -153,18 +157,24 @@ def diagram_figure(diagram: Mapping[str, Any]) -> Figure | None:
     if not drawn or diagram.get("V") is None:
         return None
     with house_style():
-        figure, (axis,) = new_figure(size=(6.4, 4.2))
+        figure, (axis,) = new_figure(size=(NARROW, 4.6) if narrow else (6.4, 4.2))
         for key, label, colour, dash in drawn:
             own = diagram.get(key.replace("W0", "V"))
             V = diagram["V"] if own is None else own
             axis.plot(_gaps(V), _gaps(diagram[key]), color=colour, linestyle=dash, label=label)
         axis.set_xscale("log")
-        axis.margins(x=0.0)
-        heights = np.concatenate([_gaps(diagram[c[0]]) for c in drawn])
+        marks = [(float(V), float(W)) for V, W in diagram.get("marks") or () if V > 0 and W > 0]
+        if marks:
+            axis.plot(
+                *zip(*marks, strict=True), "+", color="#000000", markersize=9, markeredgewidth=1.6, linestyle="none",
+                label="your runs", zorder=5, clip_on=False,
+            )  # fmt: skip
+        axis.margins(x=0.0 if not marks else 0.02)
+        heights = np.concatenate([*(_gaps(diagram[c[0]]) for c in drawn), [W for _, W in marks]])
         if np.nanmax(heights) > WIDE * np.nanmin(heights) > 0:
             axis.set_yscale("log")
         axis.set_xlabel("V  [µm/s]")
-        axis.set_ylabel("critical load W$_0$  [N]")
+        axis.set_ylabel(f"critical load W$_0$  [{diagram.get('load_unit', 'N')}]")
         legend = axis.legend(
             loc="best", handlelength=2.8, title="sliding is steady below the first boundary", alignment="left"
         )

@@ -7,7 +7,8 @@ import html
 from collections.abc import Sequence
 from typing import Any, final
 
-VOID = frozenset({"br", "hr", "img", "meta"})
+VOID = frozenset({"br", "hr", "img", "meta", "source"})
+SMALL = "(max-width: 640px)"  # screens on which tables are read row by row, and figures are drawn narrow
 MIME = {".svg": "image/svg+xml", ".png": "image/png"}
 
 # No script, and nothing may be fetched, whatever a title or a name in a recording says.
@@ -46,11 +47,25 @@ pre { background: #f5f5f3; padding: 0.7rem 0.9rem; overflow-x: auto; font-size: 
 code { font-family: "DejaVu Sans Mono", Menlo, Consolas, monospace; font-size: 0.92em; }
 pre code { font-size: 1em; }
 details summary { cursor: pointer; color: #00548a; }
+thead th, thead th.n { white-space: normal; overflow-wrap: anywhere; }
 .wide { overflow-x: auto; } .numbers { display: flex; flex-wrap: wrap; gap: 0 4rem; align-items: flex-start; }
+.lead { max-width: 52rem; }
+@media screen and (max-width: 640px) {
+  body { padding: 1rem 0.8rem 3rem; } h1 { font-size: 1.15rem; } figure.small img { width: 100%; }
+  table, tbody, tr, th, td, caption { display: block; } thead { display: none; }
+  tbody tr { padding: 0.5rem 0; border-bottom: 1px solid #bbb; } th, td { border: 0; padding: 0.1rem 0; }
+  tbody th { font-weight: 600; overflow-wrap: anywhere; }
+  td { display: grid; grid-template-columns: 45% 1fr; gap: 0.6rem; overflow-wrap: anywhere; text-align: left; }
+  td::before { content: attr(data-label); color: #555; } td[data-label=""] { display: block; }
+  .n { text-align: left; white-space: normal; } .wide { overflow-x: visible; }
+  pre { white-space: pre-wrap; overflow-wrap: anywhere; } code, li, p { overflow-wrap: anywhere; }
+  .numbers { gap: 0; flex-direction: column; } .numbers > div { width: 100%; }
+}
 @media print {
   body { font-size: 10pt; max-width: none; padding: 0; } nav, details { display: none; }
   h2, h3 { break-after: avoid; } tr, figure { break-inside: avoid; } a { color: inherit; text-decoration: none; }
-  pre { white-space: pre-wrap; }
+  pre { white-space: pre-wrap; overflow-wrap: anywhere; } .wide { overflow: visible; } table { font-size: 8.5pt; }
+  th, td { padding-right: 0.5rem; overflow-wrap: anywhere; } .n { white-space: normal; }
 }
 """
 
@@ -97,7 +112,7 @@ def table(
     body = []
     for k, row in enumerate(rows):
         cells = [tag("th", row[0], scope="row", class_=side.get(0))]
-        cells += [tag("td", cell, class_=side.get(i)) for i, cell in enumerate(row[1:], 1)]
+        cells += [tag("td", cell, class_=side.get(i), data_label=columns[i]) for i, cell in enumerate(row[1:], 1)]
         body.append(tag("tr", cells, class_="chosen" if k in chosen else None))
     parts = [tag("caption", caption)] if caption else []
     return tag("div", tag("table", parts, head, tag("tbody", body)), class_="wide")
@@ -109,10 +124,18 @@ def bar(share: float) -> Markup:
     return tag("span", tag("span", style=f"width:{width:.0f}%"), class_="bar", aria_hidden="true")
 
 
-def picture(content: bytes, suffix: str, *, alt: str, caption: Any = "", small: bool = False) -> Markup:
-    """Return a figure with its picture inside the page; `alt` says in words what it shows."""
-    source = f"data:{MIME[suffix]};base64,{base64.b64encode(content).decode('ascii')}"
-    parts = [tag("img", src=source, alt=alt)] + ([tag("figcaption", caption)] if caption else [])
+def picture(
+    content: bytes, suffix: str, *, alt: str, caption: Any = "", small: bool = False, narrow: bytes | None = None
+) -> Markup:
+    """Return a figure with its picture inside the page; `alt` says in words what it shows, `narrow` is for small screens."""
+
+    def source(data: bytes) -> str:
+        return f"data:{MIME[suffix]};base64,{base64.b64encode(data).decode('ascii')}"
+
+    shown = tag("img", src=source(content), alt=alt)
+    if narrow is not None:
+        shown = tag("picture", tag("source", media=SMALL, srcset=source(narrow)), shown)
+    parts = [shown] + ([tag("figcaption", caption)] if caption else [])
     return tag("figure", parts, class_="small" if small else None)
 
 

@@ -30,6 +30,7 @@ FAINT = 2.0  # of the noise's variance: less than that needs no close-up
 ZOOM = 0.3  # of a run: a close-up of more would show nothing new
 VARIES = 1e-3  # relative variation of a load from which it is worth a panel
 LABELS = {"elongation": "elongation  [µm]", "force": "force  [N]", "friction": "friction coefficient"}
+NARROW = 4.3  # inches: a figure for a small screen, whose text keeps its size there
 GAP = 5.0  # usual steps in time after which a record has a gap
 SAME = 1e-9  # of the noise: predictions that differ by less are one
 
@@ -49,6 +50,7 @@ class Trace:
     V: Array = field(repr=False)
     W: Array = field(repr=False)
     windows: tuple[tuple[float, float], ...]
+    load_unit: str = "N"
 
     @property
     def before(self) -> Array:
@@ -76,9 +78,8 @@ class Trace:
 
     @property
     def worst(self) -> tuple[float, float] | None:
-        """Return the window that holds most of what the baseline does not explain."""
-        over = [float(np.sum(self.before[(self.t >= a) & (self.t <= b)] ** 2 - 1.0)) for a, b in self.windows]
-        return max(zip(over, self.windows, strict=True))[1] if self.windows else None
+        """Return the window that is shaded darkest: where a sample is furthest from what the baseline explains."""
+        return max(zip(self.heights(), self.windows, strict=True))[1] if self.windows else None
 
 
 def trace(run: Mapping[str, Any]) -> Trace:
@@ -98,6 +99,7 @@ def trace(run: Mapping[str, Any]) -> Trace:
         **kept,
         noise=noise if noise > 0 else max(float(np.std(kept["observed"])) * 1e-3, 1e-12) if kept["t"].size else 1.0,
         windows=windows,
+        load_unit=str(run.get("load_unit") or "N"),
     )
 
 
@@ -113,8 +115,11 @@ def local_rms(t: Array, z: Array) -> tuple[Array, Array]:
     return np.asarray(borders), np.asarray([rms_over_noise(z[p]) for p in pieces if p.size])
 
 
-def overview(traces: Sequence[Trace]) -> Figure:
-    """Return all runs as strips over their own clocks, dark where the residual exceeds the noise, before and after."""
+def overview(traces: Sequence[Trace], *, narrow: bool = False) -> Figure:
+    """Return all runs as strips over their own clocks, dark where the residual exceeds the noise, before and after.
+
+    `narrow` sets the two models below each other, for a small screen.
+    """
     load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import LogNorm
@@ -124,9 +129,11 @@ def overview(traces: Sequence[Trace]) -> Figure:
     local = [(x, local_rms(x.t, x.before), local_rms(x.t, x.after)) for x in traces if x.t.size > 1]
     top = max((float(np.max(r)) for _, *two in local for _, r in two), default=1.0)
     with house_style():
-        figure = Figure(figsize=(9.6, 0.36 * len(local) + 1.5))
+        count = 2 if both else 1
+        lines = count if narrow else 1
+        figure = Figure(figsize=(NARROW if narrow else 9.6, lines * (0.36 * len(local) + 0.7) + 0.8))
         FigureCanvasAgg(figure)
-        axes = figure.subplots(1, 2 if both else 1, sharex=True, sharey=True, squeeze=False)[0]
+        axes = figure.subplots(lines, count // lines, sharex=True, sharey=True, squeeze=False).ravel()
         for k, (axis, title) in enumerate(zip(axes, ("baseline", "augmented model"), strict=False)):
             for row, (one, *found) in enumerate(local):
                 borders, values = found[k]
@@ -142,14 +149,17 @@ def overview(traces: Sequence[Trace]) -> Figure:
                 if k == 0 and one.worst is not None:
                     axis.plot(one.worst, [row - 0.42] * 2, color="#000000", linewidth=2.0, solid_capstyle="butt")
             axis.set_title(title)
-            axis.set_xlabel("t  [s]")
+            axis.set_xlabel("t  [s]" if not narrow or axis is axes[-1] else "")
             axis.grid(False)
-        names = [name_text(x.name) + (" (held out)" if x.holdout else "") for x, *_ in local]
+        held = "\n(held out)" if narrow else " (held out)"
+        names = [name_text(x.name, narrow=narrow) + (held if x.holdout else "") for x, *_ in local]
         axes[0].set_yticks(range(len(names)), names)
         axes[0].set_ylim(len(names) - 0.4, -0.6)
-        bar = figure.colorbar(shade, ax=list(axes), pad=0.02, aspect=14)
+        bar = figure.colorbar(
+            shade, ax=list(axes), pad=0.02, aspect=30 if narrow else 14, location="bottom" if narrow else "right"
+        )
         bar.set_label("residual / noise")
-        _plain_log(bar.ax.yaxis, max(3.0, top), most=8)
+        _plain_log(bar.ax.xaxis if narrow else bar.ax.yaxis, max(3.0, top), most=5 if narrow else 8)
         _settle(figure)
         return figure
 
@@ -164,23 +174,26 @@ def _plain_log(axis: Any, top: float, *, most: int) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def run_figure(one: Trace) -> Figure:
-    """Return a run: recording and both simulations, the residuals in units of noise, local rms, what was imposed; a close-up."""
+def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
+    """Return a run: recording and both simulations, the residuals in units of noise, local rms, what was imposed; a close-up.
+
+    `narrow` leaves the close-up out and gives the legend a row of its own, for a small screen.
+    """
     load_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     imposed = [k for k in ("V", "W") if np.ptp(getattr(one, k)) > VARIES * float(np.abs(getattr(one, k)).max())]
-    piece = close_up(one)
+    piece = None if narrow else close_up(one)
     heights = [3.0, 2.2, 1.1, *[0.75] * len(imposed)]
     with house_style():
-        figure = Figure(figsize=(11.0 if piece else 9.0, 0.72 * sum(heights) + 1.1))
+        figure = Figure(figsize=(NARROW if narrow else 10.4 if piece else 9.0, 0.72 * sum(heights) + 1.1))
         FigureCanvasAgg(figure)
         widths = (1.75, 1.0) if piece else (1.0,)
         grid = figure.add_gridspec(len(heights), len(widths), height_ratios=heights, width_ratios=widths)
         axes = _column(figure, grid, 0, [slice(i, i + 1) for i in range(len(heights))])
         _shade(axes, one)
-        _whole(axes, one)
+        _whole(axes, one, narrow=narrow)
         for axis, key in zip(axes[3:], imposed, strict=True):
             _imposed_panel(axis, one, key, slice(None))
         _end_column(axes)
@@ -219,20 +232,21 @@ def _shade(axes: Sequence[Axes], one: Trace) -> None:
     if one.worst is not None:
         middle = 0.5 * sum(one.worst)
         axes[1].annotate(
-            "most here", (middle, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
+            "worst here", (middle, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
             ha="center", va="bottom", color="#7A4A00", fontsize=8.5,
         )  # fmt: skip
 
 
-def _whole(axes: Sequence[Axes], one: Trace) -> None:
+def _whole(axes: Sequence[Axes], one: Trace, *, narrow: bool = False) -> None:
     """Draw the whole run on the first three axes."""
-    title = name_text(one.name) + (" (held out)" if one.holdout else "")
+    title = name_text(one.name, narrow=narrow) + (" (held out)" if one.holdout else "")
     above, below, local = axes[:3]
     _models(above, one, slice(None))
-    above.set_title(title)
+    above.set_title(title, pad=22 if narrow else None)
     above.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3, fontsize=8.5, handlelength=2.4, borderaxespad=0.0
-    )
+        loc="lower left" if narrow else "lower right", bbox_to_anchor=(-0.02 if narrow else 1.0, 0.99), ncols=3, fontsize=8.5,
+        handlelength=1.4 if narrow else 2.4, borderaxespad=0.0, columnspacing=1.0,
+    )  # fmt: skip
     _residual(below, one)
     sets = [(one.before, BEFORE, "-"), (one.after, AFTER, (0, (4, 1.2)))]
     for z, colour, dash in [(one.before, AFTER, "-")] if one.same else sets:
@@ -298,7 +312,7 @@ def _imposed_panel(axis: Axes, one: Trace, key: str, part: slice) -> None:
         ends = sorted({float(f"{x:.3g}") for x in (getattr(one, key)[part].min(), getattr(one, key)[part].max())})
         axis.set_yticks(ends, [f"{x:g}" for x in ends])
         axis.set_yticks([], minor=True)
-    axis.set_ylabel("W\n[N]" if key == "W" else "V\n[µm/s]")
+    axis.set_ylabel(f"W\n[{one.load_unit}]" if key == "W" else "V\n[µm/s]")
 
 
 def _near(axes: Sequence[Axes], one: Trace, part: slice) -> None:

@@ -14,6 +14,7 @@ from srfcli.output.report_atlas import LEVEL, axis_text, foremost, spots
 from srfcli.output.report_page import Markup, bar, commands, picture, section, table, tag
 from srfcli.output.report_runs import Trace, rms_over_noise
 from srfcli.output.report_text import (
+    NARROW,
     finite,
     joined,
     number,
@@ -76,7 +77,18 @@ class Matter:
         """Return a figure, or nothing where it was not drawn."""
         if name not in self.pictures:
             return Markup("")
-        return picture(self.pictures[name], ".svg", alt=alt, caption=caption, small=small)
+        near = self.pictures.get(narrow_name(name))
+        return picture(self.pictures[name], ".svg", alt=alt, caption=caption, small=small, narrow=near)
+
+
+def narrow_name(name: str) -> str:
+    """Return the name of a figure's form for small screens."""
+    return f"narrow {name}"
+
+
+def first_picture(matter: Matter) -> Markup:
+    """Return the run that the verdict rests on most, as the page's first picture."""
+    return _run(matter, matter.fitted[0]) if matter.fitted else Markup("")
 
 
 def numbers(matter: Matter) -> Markup:
@@ -105,7 +117,7 @@ def places(matter: Matter) -> Markup:
             "All runs as strips over time, dark where the residual exceeds the noise.",
             "Every run on its own clock; light is noise, dark is what the model does not explain."
             + (
-                " A black line marks the worst of the times that are shaded below."
+                " A black line marks the times that are shaded darkest in the figures of the runs."
                 if any(t.windows for t in matter.traces)
                 else ""
             ),
@@ -114,7 +126,11 @@ def places(matter: Matter) -> Markup:
     parts.append(_run_table(matter))
     if any(t.windows for t in matter.fitted):
         parts.append(tag("p", SHADED))
-    parts += [_run(matter, one) for one in matter.fitted[:SHOWN]]
+    if matter.fitted:
+        parts.append(
+            tag("p", f"“{matter.fitted[0].name}”, the run with the largest part, is drawn at the top of this page.")
+        )
+    parts += [_run(matter, one) for one in matter.fitted[1:SHOWN]]
     if len(matter.fitted) > SHOWN:
         parts.append(tag("p", f"The other {len(matter.fitted) - SHOWN} runs are drawn in the folder figures."))
     return section("where", "Where simulation and recording part", parts, atlas(matter))
@@ -155,13 +171,23 @@ def _location_sentences(matter: Matter) -> list[str]:
         found.append(
             f"It goes with the {name}: a function of it alone explains {percent(coordinate['r2'])} of the misfit's power."
         )
-    if location.get("frequencies_hz"):
-        found.append(f"In frequency it is at {joined([f'{f:.4g}' for f in location['frequencies_hz']])} Hz.")
+    found += _frequencies(matter, [float(f) for f in location.get("frequencies_hz") or ()])
     phase = location.get("forcing_phase")
     if isinstance(phase, list | tuple) and len(phase) == 2:
         stretch = f"{number(phase[0])} and {number(phase[1])} rad"
         found.append(f"In the forcing's period it is between {stretch}, 0 being the maximum of the load.")
     return found
+
+
+def _frequencies(matter: Matter, narrow: Sequence[float]) -> list[str]:
+    """Return where in frequency the misfit is, the strongest place of the table and the figure first."""
+    seen = [s for s in spots(matter.tables.get("atlas") or ()) if s.axis == "frequency" and s.sure]
+    if not seen:
+        return []
+    low, high = seen[0].low, seen[0].high
+    others = [f for f in narrow if not low - (high - low) <= f <= high + (high - low)]
+    also = f", with narrow lines at {joined([f'{f:.4g}' for f in others])}{NARROW}Hz besides" if others else ""
+    return [f"In frequency it is strongest at {seen[0].place}{also}."]
 
 
 def merged(windows: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
@@ -182,7 +208,7 @@ def merged(windows: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
 def _run(matter: Matter, one: Trace) -> Markup:
     before, after = matter.rms(one)
     fell = f"{rms(before)}" if matter.same else f"{rms(before)} before, {rms(after)} after"
-    where = f"; they part at the shaded times, most from {spans([one.worst])}" if one.worst else ""
+    where = f"; they part at the shaded times, furthest from {spans([one.worst])}" if one.worst else ""
     alt = f"Run {one.name}: recording, simulations and residuals over time{where}."
     caption = f"{one.name}: residual over noise {fell}{where}. Dotted lines: two standard deviations of the noise."
     return matter.figure(f"run {one.name}", alt, caption)
@@ -272,7 +298,7 @@ def scores(matter: Matter) -> Markup:
     caption = (
         "At first order: the gain in log likelihood that each effect promises, the size it would have from its neutral value, "
         "the share of its signal that the baseline's own parameters cannot absorb, and the smallest size that this experiment "
-        "could have seen (um, s, N)."
+        "could have seen (in um, s and N, or MPa)."
     )
     heads = ["effect", "gain", "expected size", "survives", "could be seen from"]
     return tag(
@@ -295,14 +321,8 @@ def parameters(matter: Matter) -> Markup:
     heads = ["parameter", "baseline"] + ([] if matter.same else ["augmented model", "shift / standard error"])
     parts: list[Any] = []
     if bent and not matter.same:
-        size, name = max(bent)
-        others = f", and {len(bent) - 1} more by over {BENT:g}" if len(bent) > 1 else ""
-        parts.append(
-            tag(
-                "p",
-                f"To make up for what it lacks, the baseline had bent {name} by {number(size, 2)} standard errors{others}.",
-            )
-        )
+        told = joined([f"{name} by {number(size, 2)}" for size, name in sorted(bent, reverse=True)])
+        parts.append(tag("p", f"To make up for what it lacks, the baseline had bent {told} standard errors."))
     parts.append(table(heads, rows, numeric=(1, 2, 3)))
     if not matter.same:
         parts.append(matter.figure("parameters", "Shift of each parameter between the two fits, in standard errors.",
@@ -345,7 +365,7 @@ def missing_force(matter: Matter) -> Markup:
     parts += [
         matter.figure(name, f"The {name} over time with its band.")
         for name in matter.pictures
-        if name.startswith("force ")
+        if name.startswith("force ")  # those for small screens begin otherwise
     ]
     parts.append(matter.figure("force-by-state", "The missing force against slip velocity, age and load.",
                                "Samples and their averages: a curve that all runs share is a law."))  # fmt: skip
@@ -358,7 +378,10 @@ def diagram(matter: Matter) -> Markup:
     if not (note or drawn):
         return Markup("")
     caption = "Critical load against driving velocity, baseline and augmented model."
-    figure = matter.figure("diagram", caption, small=True) if drawn else ""
+    marks = (matter.tables.get("diagram") or {}).get("marks") or ()
+    if marks:
+        caption += " Crosses: the velocities and loads of your runs."
+    figure = matter.figure("diagram", caption, caption, small=True) if drawn else ""
     return section("diagram", "What it does to the stability diagram", tag("p", str(note)) if note else "", figure)
 
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeGuard
 
-UNITS = {"um": "µm", "um/s": "µm/s", "1/um": "1/µm", "N/um": "N/µm", "1": ""}
 SMALLEST_P = 1e-290
 NARROW = "\u00a0"  # between a number and its unit no line breaks
 PLAIN = (1e-4, 1e6)  # between these a number is written without a power of ten
@@ -78,7 +77,7 @@ def rms(value: Any) -> str:
 
 def unit_text(unit: Any) -> str:
     """Return a unit as it is printed, nothing for 1."""
-    return UNITS.get(str(unit), str(unit)) if unit else ""
+    return "" if unit in (None, "", "1") else str(unit).replace("um", "µm")
 
 
 def spans(windows: Sequence[Sequence[float]], most: int = 4) -> str:
@@ -93,34 +92,203 @@ def joined(words: Sequence[str], last: str = "and") -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}" if words else ""
 
 
+REMEDIES = {  # what is wrong, and what to do; {value} is the size with its error, {number} the size, {stated} what was stated
+    "stiffness-error": (
+        "stated stiffness {stated}; the recordings want {value}",
+        'set stiffness = "{number}" in [apparatus], and calibrate the machine',
+    ),
+    "inertia": (
+        "the slider's mass counts, and the model has none; the recordings want {value}",
+        'set mass = "{number}" and inertia = true',
+    ),
+    "interface-compliance": (
+        "the interface is elastic, and the model has it rigid: elastic length {value}",
+        'set interface = "elastic" with lambda = {number}',
+    ),
+    "linker-dieterich": (
+        "a change of the load changes the age of contacts: {value}",
+        'add "+linker-dieterich" to the name of the ageing law, with alpha = {number}',
+    ),
+    "stiffness-exponent": (
+        "the interface stiffens with a power of the load: {value}",
+        'set interface = "power" with n = {number}',
+    ),
+    "age-saturation": (
+        "young contacts do not weaken as a bare logarithm of age has it: {value}",
+        "use a law with a short-age cut-off, as srf-vsat",
+    ),
+    "log-log-coupling": ("velocity and age strengthen each other: {value}", 'use law = "log-log"'),
+    "slip-evolution": (
+        "contacts change with slip more than with time: {value}",
+        'use ageing = "ruina" where the share is 1, the augmented model where it is less',
+    ),
+    "second-state": ("friction has a second state: {value}", 'use law = "two-state"'),
+    "viscous-drag": (
+        "a drag grows with velocity: {value}",
+        "add it to the law, and look for a fluid or a guide that rubs",
+    ),
+    "adhesion-offset": (
+        "friction does not vanish with the load: {value}",
+        "zero the load cell, weigh what rests on the slider, or use the augmented model",
+    ),
+    "load-transmission": (
+        "asperities feel only a part of the imposed modulation: {value} times it",
+        "record the load at the interface, or multiply the modulation by {number}",
+    ),
+    "load-distortion": (
+        "a second harmonic of the load reaches the interface and not the load cell: {value}",
+        "look at the load beside the interface, and use the augmented model until then",
+    ),
+    "tangential-crosstalk": (
+        "the load pushes along the sliding direction: {value}",
+        "realign the load, or subtract {number} times (W - W0) from the force",
+    ),
+    "track-topography": (
+        "friction repeats along the track: {value}",
+        "use another track, or the augmented model, which has it",
+    ),
+    "friction-drift": (
+        "friction drifts in time: {value}",
+        "run in longer, or take a window before it sets in",
+    ),
+    "friction-drift-slip": ("friction drifts with slip: {value}", "run in longer, or fit with --trend slip"),
+    "drive-ripple": (
+        "the stage's velocity ripples with its position: {value}",
+        "measure the stage's own motion, and give it as load_point_displacement",
+    ),
+    "sensor-lag": (
+        "the gauge lags behind: {value}",
+        "undo its filter of first order in the recording, or take a faster gauge",
+    ),
+}
+
+
 def verdict_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
-    """Return the verdict in one sentence that needs no other."""
+    """Return what is wrong and how much, in one sentence that needs no other."""
     effects = [str(e) for e in answer.get("effects", ())]
-    fell = _fell(answer)
     verdict = answer.get("verdict")
     if verdict == "none":
-        return (
-            f"Nothing is missing: the baseline explains the recordings down to the noise{_level(answer, 'baseline')}."
-        )
+        return "Nothing is missing: the model explains the recordings down to the noise."
     if verdict == "identified":
-        about = [_about(e, material) for e in effects]
-        what = joined([f"{e}{f' ({a})' if a else ''}" for e, a in zip(effects, about, strict=True)])
-        return f"The baseline lacks {what}: with {'it' if len(effects) == 1 else 'them'}, {fell}."
+        return " ".join(_capital(_wrong(e, answer, material)) + "." for e in effects)
     if verdict == "ambiguous":
-        return (
-            f"Something is missing, and these recordings cannot tell which of {joined(effects)} it is: "
-            f"each explains them as well; with the best of them, {fell}."
-        )
+        return f"Something is missing, and these recordings cannot tell which of {joined(effects, 'or')} it is."
     if verdict == "unknown":
-        best = next((str(r["name"]) for r in material.get("ranked", ()) if r.get("name") != "none"), "")
-        tried = f"even with the best of those tried, {best}, {fell}" if best else fell
-        return f"Something is missing that no registered effect explains: {tried}."
+        return "Something is missing that no registered effect explains."
     if verdict == "inconclusive":
-        return (
-            "Nothing has to be added to the baseline, but this experiment could not have seen most effects even if they "
-            "were of a size that matters; the sizes that it could have seen are listed below."
-        )
+        return "Nothing has to be added, but this experiment could not have seen most effects of a size that matters."
     return f"The verdict is {verdict}."
+
+
+def remedy(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    """Return what to do about it, in a sentence or two."""
+    effects, verdict = [str(e) for e in answer.get("effects", ())], answer.get("verdict")
+    if verdict == "none":
+        return "Go on with the parameters below; a fit with held-out runs shows how far they carry."
+    if verdict == "identified":
+        told = [_filled(REMEDIES[e][1], e, answer, material) for e in effects if e in REMEDIES]
+        rest = "go on with the augmented model in the folder beside this page, which has it"
+        return _capital("; ".join([*told, rest])) + "."
+    if verdict == "ambiguous":
+        if material.get("parting"):
+            return "Make the experiment described below: the candidates foretell different records of it."
+        return "Vary in another run what these runs have in common: the load, the velocity or the stiffness."
+    if verdict == "unknown":
+        form = (material.get("force") or {}).get("form")
+        tail = f" Its best closed form so far is {form}." if form else ""
+        return f"Look at the missing force below, against time and against the state, for what it goes with.{tail}"
+    return "Vary the load, or record more or with less noise: the sizes that could have been seen are listed below."
+
+
+def gain_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    """Return what is gained by the better model, and on what that rests."""
+    verdict = answer.get("verdict")
+    if verdict in ("none", "inconclusive"):
+        return f"With the model as it is{_level(answer, 'baseline')}." if _level(answer, "baseline") else ""
+    ranked = [r for r in material.get("ranked", ()) if finite(r.get("evidence"))]
+    zero = next((r["evidence"] for r in ranked if r.get("name") == "none"), None)
+    name = "+".join(sorted(str(e) for e in answer.get("effects", ())))
+    own = next((r["evidence"] for r in ranked if "+".join(sorted(str(r["name"]).split("+"))) == name), None)
+    best = own if own is not None else max((r["evidence"] for r in ranked), default=None)
+    parts = [f"{'With the best that was tried, ' if verdict in ('unknown', 'ambiguous') else ''}{_fell(answer)}"]
+    if verdict == "identified" and zero is not None and best is not None and best > zero:
+        parts.append(f"the log evidence rises by {number(best - zero)}")
+    sure = (answer.get("confidence") or {}).get(name)
+    if verdict == "identified" and finite(sure):
+        parts.append(f"confidence {percent(sure)}")
+    runs = len([r for r in material.get("runs", ()) if not r.get("holdout")])
+    located = [r for r in (answer.get("location") or {}).get("runs", ()) if finite(r.get("share"))]
+    rests = f"It rests on {runs} fitted run{'s' if runs != 1 else ''}" if runs else ""
+    if rests and located:
+        worst = max(located, key=lambda r: r["share"])
+        rests += f", most on “{worst['name']}” ({percent(worst['share'])} of what noise does not explain)"
+    return _capital("; ".join(parts)) + "." + (f" {rests}." if rests else "")
+
+
+def _wrong(effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    if effect in REMEDIES:
+        return _filled(REMEDIES[effect][0], effect, answer, material)
+    sizes = _sizes(effect, material)
+    about = _about(effect, material)
+    return f"the model lacks {effect}{f' ({about})' if about else ''}" + (f": {sizes}" if sizes else "")
+
+
+def _filled(text: str, effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    row = next(iter(_rows(effect, material)), {})
+    unit = unit_text(row.get("unit"))
+    value = bracketed(row.get("augmented"), row.get("augmented_stderr"))
+    tail = f"{NARROW}{unit}" if unit else ""
+    sizes = (
+        _sizes(effect, material)
+        if effect not in ("stiffness-error", "inertia", "load-transmission")
+        else f"{value}{tail}"
+    )
+    plain = f"{number(row.get('augmented'), 4)}{tail}"
+    return text.format(
+        value=sizes or "its size is below", number=plain, stated=material.get("stated", {}).get("stiffness", "–")
+    )
+
+
+def _rows(effect: str, material: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the parameters that an effect has and the baseline has not."""
+    names = [str(n) for n in (material.get("own") or {}).get(effect, ())]
+    rows = [p for p in material.get("parameters", ()) if p.get("name") in names] if names else []
+    return rows or [
+        p for p in material.get("parameters", ()) if p.get("baseline") is None and finite(p.get("augmented"))
+    ]
+
+
+def _sizes(effect: str, material: Mapping[str, Any]) -> str:
+    told = []
+    for p in _rows(effect, material):
+        unit = unit_text(p.get("unit"))
+        told.append(
+            f"{p['name']} = {bracketed(p.get('augmented'), p.get('augmented_stderr'))}"
+            + (f"{NARROW}{unit}" if unit else "")
+        )
+    return joined(told)
+
+
+def bracketed(value: Any, error: Any) -> str:
+    """Return `0.00653(5)`: a value to the last digit of its error, which stands in brackets with one digit, two below 3."""
+    if not finite(value):
+        return "–"
+    if not finite(error) or error <= 0:
+        return number(value, 4)
+    digits = 2 if int(f"{error:.0e}"[0]) < 3 else 1
+    place = math.floor(math.log10(float(f"{error:.{digits - 1}e}"))) - digits + 1
+    size = max(abs(value), error)
+    power = 0 if PLAIN[0] <= size < PLAIN[1] else math.floor(math.log10(size))
+    decimals = max(power - place, 0)
+    shown = round(error / 10.0 ** min(place, power)) if place <= power else round(error)
+    if place > 0 and power == 0:
+        shown = round(error / 10.0**place) * 10**place
+    text = f"{value / 10.0**power:.{decimals}f}({shown})"
+    return _minus(text + (f"·10{str(power).translate(SUPERSCRIPT)}" if power else ""))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _about(effect: str, material: Mapping[str, Any]) -> str:
@@ -133,7 +301,7 @@ def _level(answer: Mapping[str, Any], key: str) -> str:
     if fit is None:
         return ""
     held_out = f", {rms(held)} times in the held-out ones" if held is not None else ""
-    return f" (residuals are {rms(fit)} times the noise in the fitted runs{held_out})"
+    return f" residuals are {rms(fit)} times the noise in the fitted runs{held_out}"
 
 
 def _fell(answer: Mapping[str, Any]) -> str:

@@ -77,7 +77,7 @@ def plain_value(value: Any) -> Any:
 
 
 def cell_text(value: Any, format: str | None = None) -> str:
-    """Return one cell as text: in full precision, or in `format`; "-" for nothing, "inf" for an infinity."""
+    """Return one cell as text: with twelve digits, or in `format`; "-" for nothing, "inf" for an infinity."""
     if isinstance(value, float) and math.isinf(value):
         return str(float(value))
     simple = plain_value(value)
@@ -86,7 +86,7 @@ def cell_text(value: Any, format: str | None = None) -> str:
     if isinstance(simple, bool):
         return "yes" if simple else "no"
     if isinstance(simple, float):
-        return format_number(simple, format) if format else repr(simple)
+        return format_number(simple, format) if format else repr(float(f"{simple:.12g}"))
     return printable(" ".join(str(simple).split()))
 
 
@@ -99,7 +99,7 @@ def format_number(value: float, format: str) -> str:
 
 
 def to_text(table: Table, *, full: bool = True) -> str:
-    """Return the table as aligned plain text, as wide as it is; `full` shows every digit, else the columns' formats."""
+    """Return the table as aligned plain text, as wide as it is; `full` shows twelve digits, else the columns' formats."""
     cells = [
         [cell_text(v, None if full else c.format) for v, c in zip(row, table.columns, strict=True)]
         for row in table.rows

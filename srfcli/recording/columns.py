@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -144,18 +144,20 @@ def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
             f"{run.file}: no column 'time'; found: {', '.join(finder.headings)}",
             f'Head it `time [s]`, or write [columns] time = {{ name = "...", unit = "s" }}. {_near(["time"], names)}'.strip(),
         )
-    observables = [c for role in OBSERVABLES if (c := finder.find(role))]
+    roles = (*OBSERVABLES, "shear_stress")
+    observables = [c for role in roles if (c := finder.find(role))]
     if not observables:
         raise SrfError(
-            f"{run.file}: none of the columns {', '.join(OBSERVABLES)}; found: {', '.join(finder.headings)}",
-            f"One of them is needed; [columns] can name it. {_near(OBSERVABLES, names)}".strip(),
+            f"{run.file}: none of the columns {', '.join(roles)}; found: {', '.join(finder.headings)}",
+            f"One of them is needed; [columns] can name it. {_near(roles, names)}".strip(),
         )
     listed = [c for c in observables if c.role in finder.specs] or observables
     if len(observables) > 1:
         others = ", ".join(c.role for c in observables if c is not listed[0])
         what = f"{listed[0].role} is what is compared; the file also has {others}, left aside"
         finder.notices.append(Notice("observable", str(run.file), what))
-    channels = [time, listed[0]]
+    observable = listed[0] if listed[0].role in OBSERVABLES else replace(listed[0], role="force")
+    channels = [time, observable]
     moves = finder.find("load_point_velocity")
     if moves is None and run.drive is None:
         moves = finder.find("load_point_displacement")

@@ -10,7 +10,7 @@ from srfcli.atomic import recover
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.recording.node import Node, open_node
 from srfcli.recording.quantities import same_dimension, unit_factor
-from srfcli.units import split_quantity
+from srfcli.units import is_stress, split_quantity
 
 FORMAT = "srf-experiment/1"
 FILE_NAME = "experiment.toml"
@@ -22,6 +22,7 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
     "normal_stress": "MPa",
     "elongation": "um",
     "force": "N",
+    "shear_stress": "MPa",
     "friction": "1",
 }
 _TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs")
@@ -32,12 +33,16 @@ _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
 
 @dataclass(frozen=True)
 class Apparatus:
-    """The loading stage: `stiffness` in N/um, or in 1/um where `per_load` (friction per micron), and the mass or None."""
+    """The loading stage: `stiffness` in N/um, or in 1/um where `per_load` (friction per micron), and the mass or None.
+
+    `text` states it in N/um or 1/um, `unit` is which of the two, `stated` the unit that the description has.
+    """
 
     stiffness: float
     per_load: bool
     text: str
     unit: str
+    stated: str
     mass: float | None
 
 
@@ -118,7 +123,7 @@ def find_file(path: Path) -> Path:
         file = path / FILE_NAME
         if not file.is_file():
             others = sorted(p.name for p in path.glob("*.toml"))
-            hint = f"Name the file: {path / others[0]}" if others else "See docs/recordings.md for its form."
+            hint = f"Name the file: {path / others[0]}" if others else "srf new DATA.csv writes one for recorded data."
             raise SrfError(f"{path}: holds no {FILE_NAME}", hint)
         return file
     if not path.is_file():
@@ -128,8 +133,8 @@ def find_file(path: Path) -> Path:
 
 def _apparatus(node: Node) -> Apparatus:
     node.keys(("stiffness", "mass"))
-    stiffness = node.require("stiffness", 'Write stiffness = "0.21 N/um", or "1.0e-3 1/um" for friction per micron.')
-    hint = 'Write "0.21 N/um", or "1.0e-3 1/um" for friction per micron.'
+    hint = 'Write stiffness = "0.21 N/um", "1.5 MPa/mm", or "1.0e-3 1/um" for friction per micron.'
+    stiffness = node.require("stiffness", hint)
     if not isinstance(stiffness.value, str):
         stiffness.expected("text with a number and its unit", hint)
     try:
@@ -148,8 +153,9 @@ def _apparatus(node: Node) -> Apparatus:
     kilograms = mass.quantity("kg") if mass else 0.0
     if mass and kilograms < 0:
         mass.expected('a mass of 0 or more, as "2.37 kg"')
-    unit = "1/um" if per_load else "N/um"
-    return Apparatus(value, per_load, stiffness.value, unit, kilograms * 1e-6 if kilograms else None)
+    base = "1/um" if per_load else "N/um"
+    text = f"{value!r} {base}" if is_stress(unit) else stiffness.value  # nothing below this knows of stresses
+    return Apparatus(value, per_load, text, base, unit, kilograms * 1e-6 if kilograms else None)
 
 
 def _columns(node: Node) -> dict[str, ColumnSpec]:

@@ -45,4 +45,5 @@ def read_experiment(
         parameters,
         runs,
         notices,
+        described.apparatus.stated,
     )

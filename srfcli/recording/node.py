@@ -134,7 +134,7 @@ def open_node(path: Path) -> Node:
         if path.suffix.lower() != ".toml":
             raise SrfError(
                 f"{path}: a data file, not the description of an experiment",
-                f'Name the folder or the experiment.toml whose [[run]] says file = "{path.name}".',
+                f"`srf new {path}` writes an experiment.toml for it.",
             ) from None
         raise SrfError(error.message, error.hint or 'Text goes in quotes: law = "srf-vsat".') from None
     return Node(path, table, (), key_lines(text))

@@ -18,6 +18,9 @@ from srfcli.recording.series import find_sampling, kept_samples, sampling_notice
 from srfcli.recording.source import open_source
 from srfcli.recording.values import OBSERVABLES, Array, Notice, Run
 from srfcli.registry import Registry
+from srfcli.units import is_stress, split_quantity
+
+FORCES = ("force", "normal_load", "normal_stress")
 
 
 def read_run(
@@ -51,6 +54,10 @@ def read_run(
     stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
     rise = np.abs(drive(t)) * {"elongation": 1.0, "force": stiffness, "friction": stiffness / at_start}[role]
     place = Place(run.file, columns.channels[role].heading, rows, t)
+    units = _units(run, columns, apparatus)
+    if len(set(units.values())) > 1:
+        named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())
+        notices.append(Notice("unit", run.file.name, f"{named}: a stress counts as the force on 1 mm^2"))
     observed, used, quantum, flaws = clean_observable(place, arrays[role], rise=rise, load=load)
     return Run(
         name=run.name,
@@ -68,7 +75,18 @@ def read_run(
         modulation=run.modulation,
         quantum=quantum,
         notices=(*notices, *told, *weighed, *flaws),
+        stress=any(units.values()),
     )
+
+
+def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[str, bool]:
+    """Return for each force of the run, by name, whether it is stated as a stress."""
+    found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in FORCES}
+    if run.load is not None and isinstance(text := run.node.child("load").value, str):
+        found["load"] = is_stress(split_quantity(text, name="load")[1] or "N")
+    if not apparatus.per_load:
+        found["the stiffness"] = is_stress(apparatus.stated)
+    return found
 
 
 def _drive(run: RunDescription, columns: Columns, t: Array, arrays: dict[str, Array]) -> tuple[Drive, list[Notice]]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.numerics.program import Drive, Load
+from srfcli.units import factor_between, find_unit
 
 Array = NDArray[np.float64]
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
@@ -61,6 +62,7 @@ class Run:
     `observed` is finite everywhere; where `used` is False it is a placeholder and a notice says why. `drive` and `load` hold
     on all of [t[0], t[-1]]. `start` is the place on the track in um, `initial` "steady" or "free", `stiffness` K in N/um,
     `modulation` the declared frequency (Hz), relative amplitude and onset (s), `quantum` the quantisation step, or 0.
+    `stress` where stresses were recorded: a stress counts as the force on 1 mm^2, so that what is in N is in MPa.
     """
 
     name: str
@@ -78,6 +80,23 @@ class Run:
     modulation: tuple[float, float, float] | None
     quantum: float
     notices: tuple[Notice, ...]
+    stress: bool = False
+
+    @property
+    def unit(self) -> str:
+        """Return the unit of the observable as it is shown: um, N, MPa or 1."""
+        return shown_unit(OBSERVABLES[self.observable], stress=self.stress)
+
+    @property
+    def load_unit(self) -> str:
+        """Return the unit of the load as it is shown: N or MPa."""
+        return shown_unit("N", stress=self.stress)
+
+    @property
+    def quantity(self) -> str:
+        """Return what is observed, in words: spring elongation, force, shear stress or friction coefficient."""
+        names = {"elongation": "elongation", "force": "shear stress" if self.stress else "force"}
+        return names.get(self.observable, "friction coefficient")
 
 
 @dataclass(frozen=True)
@@ -92,3 +111,22 @@ class Experiment:
     parameters: tuple[FitParameter, ...]
     runs: tuple[Run, ...]
     notices: tuple[Notice, ...]
+    stiffness_unit: str = ""
+
+    @property
+    def stress(self) -> bool:
+        """Return whether stresses were recorded, so that forces are shown in MPa."""
+        return any(run.stress for run in self.runs)
+
+    def shown(self, unit: str) -> tuple[str, float]:
+        """Return the unit that a quantity declared in `unit` is shown in, and the factor to it: a stiffness as it was stated."""
+        if self.stiffness_unit and unit in ("N/um", "1/um"):
+            factor = factor_between(find_unit(unit), find_unit(self.stiffness_unit))
+            if factor is not None:
+                return self.stiffness_unit, factor
+        return shown_unit(unit, stress=self.stress), 1.0
+
+
+def shown_unit(unit: str, *, stress: bool) -> str:
+    """Return a unit of N as one of MPa where stresses were recorded."""
+    return unit.replace("N", "MPa") if stress and unit in ("N", "N/um", "N/s") else unit

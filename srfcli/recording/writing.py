@@ -17,11 +17,10 @@ from srfcli.errors import SrfError
 from srfcli.numerics.program import Drive
 from srfcli.reading import parse_toml, read_text
 from srfcli.recording.node import LARGEST
-from srfcli.recording.values import Experiment, FitParameter, Run
+from srfcli.recording.values import OBSERVABLES, Experiment, FitParameter, Run
 from srfcli.units import find_unit
 
 DESCRIPTION = "experiment.toml"
-OBSERVABLES = {"elongation": "elongation [um]", "force": "force [N]", "friction": "friction [1]"}
 KILOGRAM = 1e-6  # N s^2/um
 
 
@@ -111,7 +110,9 @@ def run_csv(run: Run) -> str:
     columns = (run.t, _velocity_column(run.drive, run.t), W)
     texts = [map(repr, column.tolist()) for column in columns]
     seen = (repr(u) if used else "" for u, used in zip(run.observed.tolist(), run.used.tolist(), strict=True))
-    header = f"time [s],load_point_velocity [um/s],normal_load [N],{OBSERVABLES[run.observable]}"
+    weight, force = ("normal_stress [MPa]", "shear_stress [MPa]") if run.stress else ("normal_load [N]", "force [N]")
+    observable = {"elongation": "elongation [um]", "force": force, "friction": "friction [1]"}[run.observable]
+    header = f"time [s],load_point_velocity [um/s],{weight},{observable}"
     return "\n".join([header, *map(",".join, zip(*texts, seen, strict=True))]) + "\n"
 
 

@@ -1,0 +1,199 @@
+"""`srf new`: from a table of recorded numbers to an experiment.toml that the other commands take."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from srfcli.cli.laws import plugins_option
+from srfcli.cli.options import Session, SrfCommand
+from srfcli.errors import SrfError
+
+if TYPE_CHECKING:
+    from srfcli.recording.draft import Wish
+    from srfcli.registry import Registry
+
+EXAMPLES = """
+srf new run1.csv --stiffness '5.4e-3 1/um'             friction per micron, as rock labs state it
+srf new run1.csv run2.csv --stiffness '55 MPa/mm'      one experiment, two runs
+srf new shs.csv --kind shs --stiffness '1.2e-3 1/um' --window 100,900
+srf new a.txt --column 'shear_stress=S [kPa]' --drive '60:3, 60:10' --load '20 MPa' --stiffness '55 MPa/mm'
+srf new run1.csv --stiffness '5.4e-3 1/um' && srf check . && srf fit .
+"""
+KINDS = ("steps", "shs", "oscillation")
+
+
+@click.command("new", cls=SrfCommand, epilog=EXAMPLES)
+@click.argument("files", metavar="DATA...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--stiffness", metavar="K", help="Of the machine: '0.21 N/um', '55 MPa/mm', '5e-3 1/um' (friction per um)."
+)
+@click.option(
+    "--kind",
+    type=click.Choice(KINDS),
+    help="Velocity steps, slide-hold-slide, or a load that oscillates; else as found.",
+)
+@click.option(
+    "--column",
+    "columns",
+    multiple=True,
+    metavar="ROLE=HEADING",
+    help="Which column plays a role: 'shear_stress=S [kPa]'.",
+)
+@click.option(
+    "--drive", metavar="V|D:V,...", help="What was imposed, if no column has it: um/s, or durations in s and um/s."
+)
+@click.option("--load", metavar="W", help="Constant normal load or stress, if no column has it: '5 N', '20 MPa'.")
+@click.option("--mass", metavar="M", help="Of the slider, '2.37 kg'; without it the slider is quasi-static.")
+@click.option("--window", metavar="FROM,TO", help="Only this part of the recordings, in s of the file's clock.")
+@click.option("--law", metavar="NAME", default="dieterich-ruina", show_default=True, help="Friction law.")
+@click.option(
+    "--ageing", metavar="NAME", help="Ageing law; else dieterich, with Linker's term where the load oscillates."
+)
+@click.option("--interface", metavar="NAME", default="rigid", show_default=True, help="Elasticity of the interface.")
+@click.option("--holdout", multiple=True, metavar="RUN", help="Keep this run from every fit, to judge it.")
+@click.option("--title", default="", metavar="TEXT", help="Title of the experiment.")
+@click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
+@click.option(
+    "--out", metavar="FILE", help="The file to write; - is stdout.  [default: experiment.toml in this folder]"
+)
+@click.option("--force", is_flag=True, help="Overwrite an existing file.")
+@plugins_option
+def command(files: tuple[Path, ...], out: str | None, force: bool, plugins: tuple[Path, ...], **options: Any) -> None:
+    """Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take.
+
+    Columns are recognised by heading and unit; time, what was imposed and what was observed are found in the data. What no table
+    says, the stiffness first of all, is asked for on a terminal and otherwise taken from the options.
+    """
+    from srfcli.output.files import check_target, write_atomic
+    from srfcli.recording.draft import draft
+    from srfcli.recording.source import open_source
+    from srfcli.registry import load_registry
+
+    place = Path("experiment.toml" if out in (None, "") else str(out)).expanduser()
+    if place.is_dir():
+        place /= "experiment.toml"
+    if out != "-":
+        check_target(place, force=force)
+    registry = load_registry(plugins)
+    for path in files:
+        open_source(path, registry=registry, format=options["reader"])
+    wish = _wish(files, options, registry)
+    made = draft(files, place.parent, wish, registry=registry)
+    session = Session.current()
+    for column in made.columns:
+        session.say(f"{column.heading!r} is the {column.role.replace('_', ' ')}, in {column.unit}")
+    for remark in made.remarks:
+        session.say(f"Note: {remark}")
+    if out == "-":
+        click.echo(made.text, nl=False)
+        return
+    write_atomic(place, made.text.encode("utf-8"))
+    click.echo(str(place))
+    where = "." if place.name == "experiment.toml" and place.parent == Path() else str(place)
+    session.say(f"Next: srf check {where}   and then: srf fit {where}")
+
+
+def _wish(files: tuple[Path, ...], options: dict[str, Any], registry: Registry) -> Wish:
+    """Return what the options say; what they leave open is asked for where somebody can answer."""
+    from srfcli.recording.draft import Wish
+
+    columns = dict(_column(text) for text in options["columns"])
+    drive, load, stiffness = options["drive"], options["load"], options["stiffness"]
+    if sys.stdin.isatty() and sys.stderr.isatty():
+        drive, load, stiffness = _asked(files[0], columns, options, registry)
+    if stiffness is None:
+        raise SrfError(
+            "the stiffness of the machine is in no table",
+            "Say it with --stiffness: '5.4e-3 1/um' (friction per micron), '55 MPa/mm' (shear stress) or '0.21 N/um' (force).",
+        )
+    given = {key: options[key] for key in ("kind", "mass", "law", "ageing", "interface", "title", "reader", "holdout")}
+    return Wish(
+        stiffness=_stiffness(stiffness),
+        columns=columns,
+        drive=_drive(drive),
+        load=load,
+        window=_window(options["window"]),
+        **given,
+    )
+
+
+def _asked(
+    path: Path, columns: dict[str, str], options: dict[str, Any], registry: Registry
+) -> tuple[str | None, str | None, str]:
+    """Ask for what neither the first file nor the options say; answers for columns go into `columns`."""
+    from srfcli.recording.draft import Wish, missing, name_columns
+    from srfcli.recording.source import open_source
+
+    drive, load, stiffness = options["drive"], options["load"], options["stiffness"]
+    headings = open_source(path, registry=registry, format=options["reader"]).headings
+    while True:
+        wish = Wish(stiffness or "1 1/um", columns=columns, drive=_drive(drive), load=load)
+        lacks = missing(name_columns(headings, columns, path=path, per_load=False), wish, path, headings)
+        if not lacks:
+            break
+        option, sentence = lacks[0]
+        if option.startswith("--column time"):
+            columns["time"] = click.prompt(f"{sentence}. Time", err=True)
+        elif option.startswith("--column"):
+            role = click.prompt(f"{sentence}.\nWhat was observed", err=True, type=click.Choice(OBSERVED))
+            columns[role] = click.prompt("In the column", err=True)
+        elif option.startswith("--drive"):
+            drive = click.prompt(f"{sentence}. Velocity in um/s, or duration:velocity, ...", err=True)
+        else:
+            load = click.prompt(f"{sentence}. Normal load or stress, as 5 N or 20 MPa", err=True)
+    if stiffness is None:
+        stiffness = click.prompt("Stiffness of the machine, as 5.4e-3 1/um, 55 MPa/mm or 0.21 N/um", err=True)
+    return drive, load, stiffness
+
+
+OBSERVED = ("friction", "shear_stress", "force", "elongation")
+
+
+def _column(text: str) -> tuple[str, str]:
+    role, equals, heading = text.partition("=")
+    if not (equals and role.strip() and heading.strip()):
+        raise SrfError(f"--column {text!r} is no ROLE=HEADING", "As in --column 'shear_stress=tau [MPa]'.")
+    return role.strip(), heading.strip()
+
+
+def _stiffness(text: str) -> str:
+    from srfcli.units import split_quantity
+
+    number, unit = split_quantity(text, name="--stiffness", example="5e-3 1/um")
+    if not unit:
+        raise SrfError(
+            f"--stiffness {text!r} has no unit",
+            "'5e-3 1/um' is friction per micron, '55 MPa/mm' shear stress per length.",
+        )
+    return f"{number!r} {unit}"
+
+
+def _drive(text: str | None) -> list[tuple[float, float]] | float | None:
+    """Return a drive as (duration, velocity) pairs in s and um/s, or as one velocity."""
+    from srfcli.units import parse_quantity
+
+    if text is None:
+        return None
+    if ":" not in text:
+        return parse_quantity(text, "um/s", name="--drive")
+    steps = []
+    for part in text.split(","):
+        duration, _, velocity = part.partition(":")
+        steps.append((parse_quantity(duration, "s", name="--drive"), parse_quantity(velocity, "um/s", name="--drive")))
+    return steps
+
+
+def _window(text: str | None) -> tuple[float, float] | None:
+    from srfcli.units import parse_quantity
+
+    if text is None:
+        return None
+    parts = text.replace(":", ",").split(",")
+    if len(parts) != 2:
+        raise SrfError(f"--window {text!r} is not FROM,TO", "As in --window 100,900, in s of the file's own clock.")
+    begin, end = (parse_quantity(part, "s", name="--window") for part in parts)
+    return begin, end

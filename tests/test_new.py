@@ -1,0 +1,208 @@
+"""`srf new`: tables as laboratories write them become experiments that `srf check` accepts and `srf fit` fits."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from srfcli.cli.main import cli
+
+SHARED = Path(os.environ.get("SRF_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+B819 = SHARED / "data" / "basalt-b819-velocity-step" / "velstep4_BRAVA_expb819_basalt.txt"
+P446 = SHARED / "data" / "psu-p446-20MPa" / "p446_20MPa.csv"
+TRUE = {"mu0": 0.6, "A": 0.009, "B": 0.006, "D0": 12.0, "V0": 1.0}
+k = 2e-3  # 1/um
+SIGMA = 20.0  # MPa
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+
+
+def srf(*arguments: str, code: int = 0) -> Result:
+    done = CliRunner().invoke(cli, list(arguments), prog_name="srf")
+    assert done.exit_code == code, done.stderr
+    return done
+
+
+def steps() -> dict[str, np.ndarray]:
+    """Return a velocity step as a spring slider without mass makes it: d mu/dt = k (V - v), v from the friction law, by Euler."""
+    dt, rng = 2e-4, np.random.default_rng(5)
+    t = np.arange(0.0, 60.0, dt)
+    V = np.where(t < 20.0, 1.0, 10.0)
+    mu, theta = TRUE["mu0"], TRUE["D0"] / 1.0
+    seen = np.empty(t.size)
+    for i in range(t.size):
+        v = TRUE["V0"] * np.exp((mu - TRUE["mu0"] - TRUE["B"] * np.log(TRUE["V0"] * theta / TRUE["D0"])) / TRUE["A"])
+        seen[i] = mu
+        mu += dt * k * (V[i] - v)
+        theta += dt * (1 - v * theta / TRUE["D0"])
+    part = slice(None, None, 500)  # 10 Hz
+    friction = seen[part] + rng.normal(0.0, 1e-4, seen[part].size)
+    x = np.cumsum(V) * dt
+    return {"t": t[part], "V": V[part], "x": x[part], "mu": friction, "sigma": np.full(friction.size, SIGMA)}
+
+
+@pytest.fixture(scope="module")
+def step() -> dict[str, np.ndarray]:
+    return steps()
+
+
+def table(headings: Sequence[str], columns: Sequence[np.ndarray], name: str = "run1.csv", by: str = ",") -> Path:
+    rows = [by.join(f"{x:.8g}" for x in row) for row in zip(*columns, strict=True)]
+    path = Path(name)
+    path.write_text("\n".join([by.join(headings), *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+FORMS = {
+    "brackets": (["Time(s)", "Displ(microns)", "Friction", "Normal_stress(MPa)"], (1, 1, 1, 1), "txmS", "5e-3 1/um"),
+    "suffixes": (
+        ["time_s", "lp_disp_mm", "shear_stress_MPa", "normal_stress_MPa"],
+        (1, 1e-3, SIGMA, 1),
+        "txmS",
+        "40 MPa/mm",
+    ),
+    "kilopascal": (
+        ["t", "velocity [mm/s]", "tau [kPa]", "sigma_n [kPa]"],
+        (1, 1e-3, 1e3 * SIGMA, 1e3),
+        "tVmS",
+        "40 MPa/mm",
+    ),
+    "letters": (["t (min)", "v_lp (um/s)", "mu", "sigma (MPa)"], (1 / 60, 1, 1, 1), "tVmS", "2e-3 1/um"),
+    "forces": (["Elapsed time", "LP Disp", "Fs [kN]", "Fn [kN]"], (1, 1, SIGMA / 1e3, 1e-3), "txmS", "40 N/mm"),
+    "spring": (["time [s]", "stage_um", "u [mm]", "load [N]"], (1, 1, 0.5, 1), "txmS", "40 N/mm"),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_laboratory_s_table_becomes_an_experiment(form: str, step: dict[str, np.ndarray]) -> None:
+    headings, factors, which, stiffness = FORMS[form]
+    keys = {"t": "t", "x": "x", "V": "V", "m": "mu", "S": "sigma"}
+    table(headings, [step[keys[c]] * f for c, f in zip(which, factors, strict=True)])
+    done = srf("new", "run1.csv", "--stiffness", stiffness)
+    assert done.stdout.strip() == "experiment.toml"
+    assert "steps, as the drive goes from 1 to 10 um/s" in done.stderr
+    checked = srf("check", ".", "--no-simulate").stdout
+    assert "1 to 10" in checked and "20" in checked
+    stress = form not in ("forces", "spring")
+    assert ("W [MPa]" in checked) is stress and ("W [N]" in checked) is not stress
+    assert {"suffixes": "shear stress [MPa]", "forces": "force [N]", "spring": "elongation [um]"}.get(
+        form, "run1"
+    ) in checked
+    mu0 = tomllib.loads(Path("experiment.toml").read_text())["parameters"]["mu0"]["value"]
+    assert mu0 == pytest.approx(0.605, abs=0.01)
+
+
+def test_the_first_fit_is_two_commands_away_and_in_the_units_of_the_recording(step: dict[str, np.ndarray]) -> None:
+    table(
+        ["time_s", "velocity_um_s", "tau_MPa", "sigma_n_MPa"], [step["t"], step["V"], SIGMA * step["mu"], step["sigma"]]
+    )
+    srf("new", "run1.csv", "--stiffness", f"{k * SIGMA * 1e3:g} MPa/mm")
+    lines = Path("experiment.toml").read_text().replace("# K =", "K =")
+    Path("experiment.toml").write_text(lines)
+    done = CliRunner().invoke(cli, ["fit", ".", "--track", "smooth", "--csv", "--plot", "fit.svg"], prog_name="srf")
+    rows = {line.split(",")[0]: line.split(",") for line in done.stdout.splitlines()}
+    for name in ("A", "B", "D0"):
+        value, error = float(rows[name][1]), float(rows[name][2])
+        assert abs(value - TRUE[name]) < 4 * error, (name, value, error)
+        assert error < 0.2 * TRUE[name]
+    assert rows["K"][5] == "MPa/mm" and float(rows["K"][1]) == pytest.approx(k * SIGMA * 1e3, rel=0.2)
+    assert "shear stress" in Path("fit.svg").read_text()  # labels are text
+
+
+def test_the_draft_says_what_it_is_and_can_be_piped(step: dict[str, np.ndarray]) -> None:
+    table(["t", "V", "mu", "layer thickness"], [step["t"], step["V"], step["mu"], step["x"]])
+    done = srf("new", "run1.csv", "--stiffness", "2e-3 1/um", "--out", "-")
+    assert "A is a, B is b, D0 is Dc" in done.stdout and not Path("experiment.toml").exists()
+    assert "left aside: layer thickness" in done.stderr
+    assert tomllib.loads(done.stdout)["columns"]["friction"] == {"name": "mu", "unit": "1"}
+
+
+def test_holds_and_oscillations_are_told_from_steps() -> None:
+    t = np.arange(0.0, 60.0, 0.05)
+    V = np.where((t > 20) & (t < 40), 0.0, 5.0)
+    table(["time_s", "v", "mu", "sigma_MPa"], [t, V, 0.6 + 0 * t, 10 + 0 * t], "shs.csv")
+    assert "shs, as the drive of shs holds for 33%" in srf("new", "shs.csv", "--stiffness", "2e-3 1/um").stderr
+    sigma = 10 * (1 + 0.1 * np.sin(2 * np.pi * 0.5 * t))
+    table(["time_s", "v", "mu", "sigma_MPa"], [t, 5 + 0 * t, 0.6 + 0 * t, sigma], "osc.csv")
+    done = srf("new", "osc.csv", "--stiffness", "2e-3 1/um", "--force")
+    assert "oscillates by 10 % at 0.5 Hz" in done.stderr
+    made = tomllib.loads(Path("experiment.toml").read_text())
+    assert made["model"]["ageing"] == "dieterich+linker-dieterich" and "alpha" in made["parameters"]
+    assert made["runs"][0]["modulation"]["frequency"] == pytest.approx(0.5)
+    assert srf("check", ".", "--no-simulate").exit_code == 0
+    srf("new", "osc.csv", "--kind", "steps", "--stiffness", "2e-3 1/um", "--force")
+    assert "modulation" not in tomllib.loads(Path("experiment.toml").read_text())["runs"][0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said", "hint"),
+    [
+        (["run1.csv"], "the stiffness of the machine is in no table", "--stiffness: '5.4e-3 1/um'"),
+        (["run1.csv", "--stiffness", "5"], "'5' has no unit", "friction per micron"),
+        (["run1.csv", "--stiffness", "5 s"], "'s' measures s", "1.5 MPa/mm"),
+        (["run2.csv", "--stiffness", "5 N/m"], "no file run2.csv", "Did you mean 'run1.csv'?"),
+        (["run2.csv"], "no file run2.csv", "Did you mean 'run1.csv'?"),
+        (["bare.csv", "--stiffness", "1 1/um"], "which column is the time? It has 'a', 'b'", "--column time=HEADING"),
+        (
+            ["run1.csv", "--stiffness", "1 1/um", "--column", "tau=mu"],
+            "--column tau: no such role",
+            "Known: elongation",
+        ),
+        (["run1.csv", "--stiffness", "1 1/um", "--column", "friction=nu"], "no column 'nu'", "Did you mean 'mu'?"),
+        (["run1.csv", "--stiffness", "1 1/um", "--column", "friction"], "is no ROLE=HEADING", "As in"),
+        (["run1.csv", "--stiffness", "1 1/um", "--window", "3"], "is not FROM,TO", "--window 100,900"),
+        (["run1.csv", "--stiffness", "1 1/um", "--window", "900,999"], "no sample of", "file's own clock"),
+        (
+            ["run1.csv", "--stiffness", "1 1/um", "--law", "dietrich-ruina"],
+            "dietrich-ruina",
+            "Did you mean 'dieterich-ruina'?",
+        ),
+        (["run1.csv", "--stiffness", "1 1/um", "--holdout", "run7"], "no such run", "Did you mean 'run1'?"),
+        (["still.csv", "--stiffness", "1 1/um"], "no column has the load point's velocity", "--drive VELOCITY"),
+        (["lift.csv", "--stiffness", "1 1/um"], "the load is -1 N", "--window FROM,TO"),
+    ],
+)
+def test_what_is_missing_or_wrong_is_said_in_a_line_and_nothing_is_written(
+    arguments: list[str], said: str, hint: str
+) -> None:
+    t = np.arange(0.0, 10.0, 0.1)
+    table(["t", "v", "mu", "sigma_MPa"], [t, 1 + t, 0.6 + 0 * t, 5 + 0 * t])
+    table(["t", "mu"], [t, t], "still.csv")
+    table(["a", "b"], [t, t], "bare.csv")
+    table(["t", "v", "mu", "sigma_MPa"], [t, 1 + t, t, t - 1], "lift.csv")
+    done = srf("new", *arguments, code=2)
+    error, way_out = done.stderr.strip().splitlines()
+    assert error.startswith("Error: ") and said in error, error
+    assert way_out.startswith("Try: ") and hint in way_out, way_out
+    assert not Path("experiment.toml").exists()
+
+
+def test_an_existing_file_is_kept() -> None:
+    t = np.arange(0.0, 10.0, 0.1)
+    table(["t", "v", "mu"], [t, 1 + t, 0.6 + 0 * t])
+    Path("experiment.toml").write_text("mine")
+    srf("new", "run1.csv", "--stiffness", "1 1/um", code=2)
+    assert Path("experiment.toml").read_text() == "mine"
+
+
+@pytest.mark.parametrize("command", ["fit", "check", "diagnose"])
+@pytest.mark.parametrize("name", ["run1.csv", "run1.txt"])
+def test_other_commands_given_a_recording_name_this_one(command: str, name: str) -> None:
+    t = np.arange(0.0, 10.0, 0.1)
+    table(["t", "v", "mu"], [t, 1 + t, 0.6 + 0 * t], name)
+    done = srf(command, name, code=2)
+    assert f"srf new {name}" in done.stderr.splitlines()[1]
+
+
+@pytest.mark.parametrize(("path", "stiffness", "unit"), [(B819, "5.4e-3 1/um", "MPa"), (P446, "55 MPa/mm", "MPa")])
+def test_real_recordings(path: Path, stiffness: str, unit: str) -> None:
+    if not path.is_file():
+        pytest.skip(f"REFERENCE DATA ABSENT: {path} does not exist; set SRF_SHARED to check against it")
+    srf("new", str(path), "--stiffness", stiffness)
+    assert f"W [{unit}]" in srf("check", ".", "--no-simulate").stdout

@@ -1,0 +1,69 @@
+"""`srf report`: one page on what was written to a folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from test_report import Page
+from test_report_browser import BROWSER, WIDTHS, laid_out
+
+from srfcli.cli.main import cli
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+HOSTILE = '<script>alert("1")</script>'
+
+
+def srf(*arguments: str, code: int = 0) -> Result:
+    done = CliRunner().invoke(cli, list(arguments), prog_name="srf")
+    assert done.exit_code == code, done.stderr
+    return done
+
+
+@pytest.fixture
+def results() -> Path:
+    folder = Path("results")
+    folder.mkdir()
+    srf("linear", "--over", "V=1:100:5", "--out", "results/linear.json", "--plot", "results/linear.svg")
+    rows = [
+        {"parameter": "A", "value": 0.00881, "stderr": 3.4e-4, "unit": "1", "flag": ""},
+        {"parameter": "D0", "value": 5.8, "stderr": 0.33, "unit": "um", "flag": f"tied to {HOSTILE}"},
+    ]
+    columns = {name: {"unit": "", "about": ""} for name in rows[0]}
+    fit = {"schema": "srf.fit/1", "title": HOSTILE, "status": "interrupted", "columns": columns, "rows": rows, "notes": ["n"]}
+    (folder / "fit.json").write_text(json.dumps(fit), encoding="utf-8")
+    (folder / "other.json").write_text("{}", encoding="utf-8")
+    return folder
+
+
+def test_a_folder_of_results_becomes_one_page(results: Path) -> None:
+    done = srf("report", "results")
+    assert done.stdout.strip() == "results/report.html"
+    text = (results / "report.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert "A = 0.0088(3), D0 = 5.8(3) µm. Not finished: interrupted." in page.text
+    assert "Critical load under constant load" in page.text and "set by" in page.text
+    assert "srf linear --over V=1:100:5" in page.text  # how it was made
+    assert len(page.all("img")) == 1 and "<script>" not in text
+    srf("report", "results", code=2)
+    assert srf("report", "results", "--force", "--title", "May").exit_code == 0
+
+
+def test_it_reads_well_at_three_widths(results: Path) -> None:
+    if BROWSER is None:
+        pytest.skip("BROWSER ABSENT: no headless Chromium, the page is not laid out")
+    srf("report", "results")
+    found = laid_out(results.resolve())
+    assert "error" not in found
+    for width in WIDTHS:
+        assert not found[str(width)]["faults"], (width, found[str(width)]["faults"][:10])
+
+
+def test_a_folder_without_results_says_what_to_do() -> None:
+    Path("empty").mkdir()
+    assert "srf fit EXPERIMENT --out" in srf("report", "empty", code=2).stderr
+    assert "not a folder" in srf("report", "nowhere", code=2).stderr
+    Path("empty/answer.json").write_text("{}")
+    assert "Its report is empty/report.html" in srf("report", "empty", code=2).stderr
