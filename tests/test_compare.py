@@ -123,7 +123,7 @@ def test_a_study_without_re_entrance_says_so(model):
 def test_re_entrance_that_comes_and_goes_between_two_amplitudes_is_seen(model, monkeypatch, several, there, onset, end):
     """`several` is what the maps at 0 and 0.13 say; between them each amplitude is asked for, and brackets hold the edges."""
     fold, plain = np.array([[5.0, 10], [9, 12], [7, 15]]), np.array([[5.0, 10], [9, 12]])
-    monkeypatch.setattr(compare, "_followed", lambda m, t, eps: [fold if there(eps) else plain])
+    monkeypatch.setattr(compare, "_followed", lambda m, t, eps: iter([[fold if there(eps) else plain]]))
     task = LawTask(model.source, model.key, model.vector(), (0.0, 0.13), WINDOW, onset=1e-3)
     for (low, high), edge in zip(compare._reentrance(model, task, several), (onset, end), strict=True):
         if edge is None:
