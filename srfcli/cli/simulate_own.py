@@ -54,8 +54,6 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     base = recorded or _base_load(given, values["W0"], begin)
     load, modulation = _modulated(base, given["onset"], values, begin)
     load.check(float(t[0]), float(t[-1]))
-    taken = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
-    system.say_defaults(resolved, [name for name, program in taken.items() if program is None])
     start = start_state(model, p, given["start"], drive=drive, load=load.rest(begin), begin=begin)
     job, mover = Job(NAME, p, drive, load, t, start, observable, f, modulation), model
     if (track := _track(system, given)) is not None:
@@ -79,6 +77,8 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     inputs = () if given["load_file"] is None else (given["load_file"],)
     notes = (*found, *noted, *_sampling_notes(rates, f, given, pieces))
     meta = {"rate_Hz": sorted(set(rates)), "rtol": given["rtol"], "onset": modulation and modulation[2], **told}
+    taken = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
+    system.say_defaults(resolved, [name for name, program in taken.items() if program is None])
     return Work(mover, (job,), gauge, described, experiment, inputs, notes, meta)
 
 
