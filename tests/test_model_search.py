@@ -83,7 +83,7 @@ def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(tmp_path):
     problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
     begun = Likelihood(problem)
     fitted = fit_state_space(problem, start=begun.values(begun.start), processes=0, close=1e3)
-    scores = Scores(SHIPPED, experiment, fitted, (), candidates)
+    scores = Scores(SHIPPED, experiment, Remainder(fitted), (), candidates)
     assert "slip-evolution" in {x.effect for x in scores.excluded}
     assert "closed form" in next(x.reason for x in scores.excluded if x.effect == "slip-evolution")
     assert {s.effect.reported for s in scores.singles} >= {"viscous-drag", "friction-drift"}
@@ -96,7 +96,7 @@ def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
     problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
     fitted = fit_state_space(problem, processes=0)
     effect = SHIPPED.get("effect", name)
-    scores = Scores(SHIPPED, experiment, fitted, (), [effect])
+    scores = Scores(SHIPPED, experiment, Remainder(fitted), (), [effect])
     column = scores.columns[len(scores.columns) // 2]
     model = Hypothesis((effect,)).model(SHIPPED, experiment, rough=False, random_field=True)
     longs = {p.name: long for long, p in own_parameters(effect, model).items()}

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, neutral_values, own_parameters
+from srfcli.diagnosis.columns import along_table
 from srfcli.diagnosis.statespace_scores import Remainder, Score, Scores
 from srfcli.errors import SrfError
 from srfcli.inference.fit import Problem
@@ -88,12 +89,16 @@ class Model:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model fitted: log evidence, what speaks against it (nothing where it passes), and what the effects still promise."""
+    """A model fitted: log evidence, what speaks against it (nothing where it passes), what it leaves, what effects promise.
+
+    The evidence holds what a field that all runs share gains beyond CLOSE, unless an effect says what all runs share along slip.
+    """
 
     model: Model
     fit: StateSpaceFit
     evidence: float
     against: tuple[str, ...]
+    remainder: Remainder = field(repr=False)
     scores: Scores | None = field(default=None, repr=False)
 
     @property
@@ -141,7 +146,6 @@ class ModelSearch:
         self.queue: list[_Move] = []
         self.count = 0
         self.processes = 0
-        self.shared = False
 
     # ------------------------------------------------------------------ models and their fits
 
@@ -191,10 +195,11 @@ class ModelSearch:
         return best[1]
 
     def _judged(self, model: Model, found: StateSpaceFit) -> Fitted:
+        remainder = Remainder(found)
         evidence = log_evidence(found) + self._prior(model)
-        if self.shared:
-            evidence += max(Remainder(found).shared.gain - CLOSE, 0.0)
-        return Fitted(model, found, evidence, tuple(shortcomings(found)))
+        if not any((shape := along_table(e)) and shape.argument == "slip" for e in model.effects):
+            evidence += max(remainder.shared.gain - CLOSE, 0.0)  # a track is a function of slip or a random one
+        return Fitted(model, found, evidence, tuple(shortcomings(found)), remainder)
 
     def _prior(self, model: Model) -> float:
         """Return the log prior of a model: each effect is one of those that there are, and halves its share."""
@@ -254,11 +259,8 @@ class ModelSearch:
         there = {p.name for p in node.fit.likelihood.problem.model.parameters}
         joining = [e for e in self.candidates if e.reported not in names and there.issuperset(e.needs)]
         self.progress(f"{node.model.name}: scores")
-        scores = Scores(self.registry, self._experiment(node.model), node.fit, present, joining)
+        scores = Scores(self.registry, self._experiment(node.model), node.remainder, present, joining)
         self.excluded += scores.excluded
-        if not node.model.reported and scores.shared.gain > CLOSE:  # all runs share a field
-            self.shared = True
-            node = replace(node, evidence=node.evidence + scores.shared.gain - CLOSE)
         node = replace(node, scores=scores)
         self.fitted[node.model.name] = node
         one = -float(np.log(2 * len(self.candidates))) - 3.0  # prior and Occam's factor of an effect

@@ -139,19 +139,19 @@ class Remainder:
 
 
 class Scores:
-    """The scores around a fit of a model that has the effects `present`; `excluded` are those that cannot join it."""
+    """The scores around a fit, of a model that has the effects `present`; `excluded` are those that cannot join it."""
 
     def __init__(
         self,
         registry: Registry,
         experiment: Experiment,
-        fitted: StateSpaceFit,
+        remainder: Remainder,
         present: Sequence[Effect],
         candidates: Sequence[Effect],
     ) -> None:
-        self.registry, self.experiment, self.fitted, self.present = registry, experiment, fitted, tuple(present)
+        self.registry, self.experiment, self.present = registry, experiment, tuple(present)
+        self.remainder, self.fitted = remainder, remainder.fitted
         self.excluded: list[Excluded] = []
-        self.remainder = Remainder(fitted)
         self.shared = self.remainder.shared
         self.columns = self._all(candidates)
         self.singles = self._singles()
