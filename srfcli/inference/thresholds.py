@@ -370,6 +370,8 @@ def generated(
         if share * amplitude > 0:
             lo, hi = load_window(model, [base])
             odd = [q for q in critical_line(model, base, lo=lo, hi=hi, tol=tol).points if q.slope > 0]
+            if not odd:  # none around that without modulation
+                odd = [q for q in critical_line(model, base, tol=tol).points if q.slope > 0]
             load = odd[0].value(model, "W0") if odd else None
         else:
             point = critical_point(model, base)[0]
