@@ -486,3 +486,9 @@ def test_exit_codes_of_unfinished_fits(fit_command: Any, small: Any, monkeypatch
     monkeypatch.setattr(Progress, "advance", interrupt)
     done = fit_command(*arguments)
     assert done.exit_code == 130 and "powell,lambda" in done.stdout and "least-squares" not in done.stdout
+
+
+def test_a_threshold_far_above_that_without_modulation_is_found(model: Any) -> None:
+    """At V = 100 um/s and eps = 0.3 the load is 619.634 N, beyond the window around the critical load without modulation."""
+    found = generated(model, np.array([100.0]), np.array([0.3]), values=model.defaults())
+    assert found.W0c[0] == pytest.approx(619.634, rel=1e-5)
