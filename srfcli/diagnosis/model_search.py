@@ -264,7 +264,8 @@ class ModelSearch:
         node = replace(node, scores=scores)
         self.fitted[node.model.name] = node
         one = -float(np.log(2 * len(self.candidates))) - 3.0  # prior and Occam's factor of an effect
-        least = WORTH if node.fine and node.fit.smooth and not node.fit.likelihood.processes else HINT
+        random = not node.fit.smooth or node.fit.likelihood.processes > 0
+        least = HINT if node.fine and random and not node.model.reported else WORTH if node.fine else WORTH / 2
         for score in [s for s in scores.singles if s.gain > least][:SINGLES]:
             model = Model((*present, score.effect), node.model.ageing)
             self._push(node.evidence + score.gain + one, model, node, (*self._sizes(node), score.values))
