@@ -61,7 +61,7 @@ def run(system: SystemOptions, over: tuple[Range, ...], output: OutputOptions, V
         "srf": SrfError("bad thing", "do it well"),
         "caret": ExpressionError("no such name 'q'", "p", text="1 + q", column=4),
         "os": FileNotFoundError(2, "No such file or directory", "x.toml"),
-        "bug": ZeroDivisionError("a\nb"),
+        "bug": TypeError("a\nb"),
     }
     if fail == "interrupt":
         raise KeyboardInterrupt
@@ -137,7 +137,7 @@ def test_every_command_has_help_with_examples_or_subcommands() -> None:
         (["run", "--fail", "srf"], 2, ["Error: bad thing\nTry: do it well\n"]),
         (["run", "--fail", "caret"], 2, ["Error: no such name 'q'\n  1 + q\n      ^\nTry: p\n"]),
         (["run", "--fail", "os"], 1, ["Error: x.toml: No such file or directory\n"]),
-        (["run", "--fail", "bug"], 1, ["Error: unexpected ZeroDivisionError: a b\n", "--debug"]),
+        (["run", "--fail", "bug"], 1, ["Error: unexpected TypeError: a b\n", "--debug"]),
         (["run", "--fail", "interrupt"], 130, ["Error: interrupted"]),
         (["run", "--fail", "no-convergence"], 3, ["Newton's method did not converge"]),
         (["run", "--fail", "interrupted"], 130, ["what was finished is kept"]),

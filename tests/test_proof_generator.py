@@ -311,4 +311,4 @@ def test_it_shares_nothing_with_what_it_proves():
         names = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
         names |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
         own = {n for n in names if n.startswith("srfcli") and not n.startswith("srfcli.proof.")}
-        assert own <= {"srfcli.errors", "srfcli.output.files", "srfcli.parallel.pool"}, path
+        assert own <= {"srfcli.errors", "srfcli.output.files", "srfcli.parallel.pool", "srfcli.reading"}, path

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from srfcli.errors import SrfError
 from srfcli.output import report, report_text
 from srfcli.output.plots import figure_bytes
 from srfcli.output.report import write_report
@@ -339,7 +340,7 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkey
         raise OSError("no space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(SrfError, match="no space"):
         write_report(tmp_path, made_answer("none"), made_material("none"))
     assert (tmp_path / "report.html").read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]

@@ -52,9 +52,7 @@ def _head(path: Path) -> bytes:
         near = did_you_mean(path.name, (p.name for p in path.parent.glob("*"))) if path.parent.is_dir() else None
         raise SrfError(f"no file {path}", near or f"There is no folder {path.parent}.") from None
     except OSError as error:
-        raise SrfError(
-            f"{path}: cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1
-        ) from None
+        raise _unreadable(path, error) from None
     if not head:
         raise SrfError(f"{path}: the file is empty", "A recording has a line of headings and a line for each sample.")
     return head
@@ -96,7 +94,13 @@ def _passes(reader: Reader, head: bytes) -> bool:
         return False
 
 
+def _unreadable(path: Path, error: OSError) -> SrfError:
+    return SrfError(f"{path}: cannot be read: {error.strerror or error}", "Check path and permissions.", exit_code=1)
+
+
 def _refusal(reader: Reader, path: Path, error: Exception) -> SrfError:
+    if isinstance(error, OSError):
+        return _unreadable(path, error)
     told = " ".join(str(error).split())[:200]
     return SrfError(
         f"{path}: the reader '{reader.name}' stopped: {type(error).__name__}: {told}",
