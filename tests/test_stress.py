@@ -69,11 +69,26 @@ def test_parameters_at_their_bounds(options: list[str]) -> None:
         assert done.exit_code in (0, 2, 3) and "unexpected" not in done.stderr, (command, done.stderr)
 
 
-@pytest.mark.parametrize(
-    "options", [("--ageing", "nagata", "--set", "c=0"), ("--ageing", "dieterich+linker-dieterich", "--set", "B=0")]
-)
-def test_where_nothing_can_be_computed(options: tuple[str, ...]) -> None:
-    done = srf("floquet", "--V", "8", "--W0", "9", "--eps", "0.09", *options)
+def test_a_term_of_weight_zero_is_no_term() -> None:
+    """The rate of stress that an ageing law holds is solved for: not by its weight, which may be 0 or next to it."""
+    for command, weights in (
+        (["linear", "--over", "V=8"], ("0", "1e-12")),
+        (["floquet", "--V", "8", "--W0", "9", "--eps", "0.09"], ("0",)),
+        (["simulate", "--V", "8", "--W0", "9", "--for", "0.05", "--rate", "50"], ("0",)),
+    ):
+        plain = json.loads(srf(*command, "--json").stdout)["rows"]
+        for weight in weights:
+            done = srf(*command, "--ageing", "nagata", "--set", f"c={weight}", "--json")
+            assert done.exit_code == 0, done.stderr
+            for row, expected in zip(json.loads(done.stdout)["rows"], plain, strict=True):
+                numbers = {n: x for n, x in expected.items() if isinstance(x, float)}
+                assert {n: row[n] for n in numbers} == pytest.approx(numbers, rel=1e-6, abs=1e-8)
+
+
+def test_where_nothing_can_be_computed() -> None:
+    done = srf(
+        "floquet", "--V", "8", "--W0", "9", "--eps", "0.09", "--ageing", "dieterich+linker-dieterich", "--set", "B=0"
+    )
     assert (
         done.exit_code == 3
         and "nothing can be computed at these values" in done.stderr
