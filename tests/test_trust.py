@@ -197,3 +197,22 @@ def test_a_compiler_in_python_is_not_taken_from_the_current_folder() -> None:
     )  # fmt: skip
     assert done.returncode == 2 and "this one was asked" in done.stderr
     assert not Path("ran").exists()
+
+
+def test_a_law_of_the_settings_lies_beside_them() -> None:
+    """A relative name is as seen from srf.toml, wherever below it one works."""
+    Path("srf.toml").write_text('[defaults]\nlaw = "laws/own.toml"\nageing = "dieterich"\n')
+    Path(".git").mkdir()
+    Path("laws").mkdir()
+    text = template("friction", "own", python=False)
+    Path("laws/own.toml").write_text(text)
+    below = Path("below")
+    (below / "laws").mkdir(parents=True)
+    (below / "laws" / "own.toml").write_text("another one, which is none")
+    here = srf("linear", "--over", "V=8", "--csv")
+    os.chdir(below)
+    there = srf("linear", "--over", "V=8", "--csv")
+    assert here.exit_code == 0 and there.stdout == here.stdout, there.stderr
+    Path("../srf.toml").write_text('[defaults]\nlaw = "x.py"\n')
+    Path("../x.py").write_text(CODE)
+    refused(srf("linear"), "srf.toml: [defaults]")
