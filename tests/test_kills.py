@@ -138,6 +138,24 @@ def test_at_every_step(case: str, number: signal.Signals, stride: int) -> None:
     assert code == 0 and state(Path()) == new and step > 6
 
 
+def test_the_sidecar_of_an_older_result_goes_with_it() -> None:
+    """--no-provenance: no sidecar beside what it does not describe, at no step of a kill that the next start sees."""
+    srf(*command(FILE, "9"), "--no-provenance")
+    new = state(Path())
+    assert set(new) == {"a.csv"}
+    srf(*command(FILE, "8"))
+    old, kept = state(Path()), Path.cwd().parent / "kept"
+    shutil.copytree(Path.cwd(), kept)
+    for step in range(1, 100):
+        code = killed_at(step, signal.SIGKILL, (*command(FILE, "9"), "--no-provenance"))
+        CliRunner().invoke(cli, [w for w in command(FILE, "8") if w != "--force"])
+        assert state(Path()) in (old, new) and hidden() == []
+        if code == 0:
+            break
+        shutil.copytree(kept, Path.cwd(), dirs_exist_ok=True)
+    assert code == 0 and state(Path()) == new and step > 6
+
+
 def test_a_stranger_s_note_moves_nothing_else() -> None:
     srf(*command(FILE, "8"))
     Path("precious").write_text("kept")
