@@ -106,7 +106,7 @@ def command(words: tuple[str, ...], value: str) -> tuple[str, ...]:
     ("case", "number", "stride"),
     [
         *((case, signal.SIGKILL, 1) for case in CASES),
-        *((case, n, 4) for case in CASES for n in (signal.SIGTERM, signal.SIGINT)),
+        *((case, n, 7) for case in CASES for n in (signal.SIGTERM, signal.SIGINT)),
     ],
     ids=lambda v: getattr(v, "name", str(v)),
 )
@@ -234,7 +234,7 @@ def test_at_random_moments() -> None:
     new = state(Path())
     srf(*command(words, before))
     old = state(Path())
-    for _ in range(12):
+    for _ in range(6):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             child = os.fork()
