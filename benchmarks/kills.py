@@ -22,7 +22,10 @@ import tempfile
 import time
 from pathlib import Path
 
-START = "import sys; from srfcli.cli.main import main; main(sys.argv[1:])"
+START = """import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the campaign runs in the background
+from srfcli.cli.main import main
+main(sys.argv[1:])"""
 DRIVE = ("--drive", "0.3:10, 0.7:20", "--W0", "5", "--rate", "200", "--noise", "0.02", "--seed", "1")
 GRID = ("--eps", "0.09", "--over", "V=1:100:4", "--over", "K/W0=0.002:0.03:4")
 COMMANDS = {  # what is written, and how the command goes on

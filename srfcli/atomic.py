@@ -32,31 +32,32 @@ SIDECAR = ".provenance.json"
 OLD = "replaced"
 
 
-def write_files(contents: Mapping[Path, bytes]) -> None:
+def write_files(contents: Mapping[Path, bytes | None]) -> None:
     """Write these files of one folder so that a crash leaves all old or, at the latest after `recover`, all new.
 
-    The moves of several files are noted in a file beside the first before any is made. Raises SrfError with exit code 1 where
-    something cannot be written; nothing has changed then.
+    None removes a file, and is not for the first. The moves of several files are noted in a file beside the first before any is
+    made. Raises SrfError with exit code 1 where something cannot be written; nothing has changed then.
     """
-    targets = [path.resolve() for path in contents]  # through a link, so that the link survives
+    targets = [Path(os.path.realpath(path)) for path in contents]  # through a link, so that the link survives
     recover(targets[0])
     with contextlib.ExitStack() as held:
-        parts = []
+        parts: list[tuple[Path | None, Path]] = []
         for target, data in zip(targets, contents.values(), strict=True):
             with _told(target):
-                part = held.enter_context(_part(target))
-                _fill(part, data, _mode(target))
-                parts.append(part)
-        moves = {part.name: target.name for part, target in zip(parts, targets, strict=True)}
+                part = held.enter_context(_part(target)) if data is not None else None
+                if part is not None and data is not None:
+                    _fill(part, data, _mode(target))
+                parts.append((part, target))
+        moves = {(part or target).name: target.name if part else None for part, target in parts}
         with _told(targets[0]), _uninterrupted():
-            if len(targets) == 1:
-                parts[0].replace(targets[0])
+            if len(moves) == 1 and (only := parts[0][0]) is not None:
+                only.replace(targets[0])
                 return
             note = held.enter_context(_part(targets[0]))
             _fill(note, json.dumps(moves).encode(), 0o600)
             note.replace(_note(targets[0]))
-            for part, target in zip(parts, targets, strict=True):
-                part.replace(target)
+            for part, target in parts:
+                target.unlink(missing_ok=True) if part is None else part.replace(target)
             _note(targets[0]).unlink()
 
 
@@ -67,7 +68,7 @@ def whole_folder(folder: Path, check: Callable[[], None]) -> Iterator[Path]:
     `check` is called before it does, and raises where `folder` must not be replaced. Where the system can exchange two folders
     in one step, `folder` is there at every moment.
     """
-    target = folder.resolve()
+    target = Path(os.path.realpath(folder))
     recover(target)
     with _told(target), _part(target, folder=True) as scratch:
         fresh, old = scratch / target.name, scratch / OLD
@@ -87,9 +88,13 @@ def whole_folder(folder: Path, check: Callable[[], None]) -> Iterator[Path]:
 
 
 def recover(target: Path) -> None:
-    """End what a process that died had begun to write to `target`, and remove what it left beside it."""
+    """End what a process that died had begun to write to `target`, and remove what it left beside it.
+
+    A link is followed, one to itself to nowhere.
+    """
     if fcntl is None:
         return
+    target = Path(os.path.realpath(target))  # Path.resolve raises for a link to itself
     note = _note(target)
     with contextlib.suppress(OSError, SrfError):
         if (lock := _locked(note)) is not None:
@@ -138,7 +143,9 @@ def _move_on(target: Path, moves: Mapping[Any, Any]) -> None:
     """Make the noted moves that were not made; a note that names anything but parts of this result is none of ours."""
     known = {part.name for part in _parts(target)}
     for part, name in moves.items():
-        if part in known and name in (target.name, f"{target.name}{SIDECAR}"):
+        if name is None and part == f"{target.name}{SIDECAR}":
+            target.with_name(part).unlink(missing_ok=True)
+        elif part in known and name in (target.name, f"{target.name}{SIDECAR}"):
             target.with_name(part).replace(target.with_name(name))
 
 

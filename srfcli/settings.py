@@ -109,12 +109,22 @@ def load_toml(path: Path | None) -> TomlSettings:
         if not isinstance(table, dict):
             raise SrfError(f"{path}: {name!r} is not a table", f"Write [{name}] on a line of its own.")
     _refuse_unknown(tables["defaults"], DEFAULTS, f"setting in [defaults] of {path}")
+    for name in tables["defaults"].keys() & {"law", "ageing", "interface"}:
+        tables["defaults"][name] = _from_here(tables["defaults"][name], path.parent)
     for name, value in tables["parameters"].items():
         if isinstance(value, bool) or not isinstance(value, str | int | float):
             raise SrfError(
                 f"{path}: {name} is not a number", f'Write {name} = 0.21 or, with its unit, {name} = "0.21 N/um".'
             )
     return TomlSettings(path, tables["parameters"], tables["defaults"])
+
+
+def _from_here(names: Any, folder: Path) -> Any:
+    """Return names of laws, those of files as seen from the folder of the settings in which they stand."""
+    if not isinstance(names, str) or folder.absolute() == Path.cwd():
+        return names
+    words = [word.strip() for word in names.split("+")]
+    return "+".join(str(folder / word) if word.endswith((".toml", ".py")) else word for word in words)
 
 
 def _refuse_unknown(given: Mapping[str, Any], known: Mapping[str, Any] | set[str], what: str) -> None:

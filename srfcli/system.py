@@ -366,12 +366,55 @@ def solve_linear(balance: list[sp.Expr], wanted: list[sp.Symbol], system: System
             f"ageing law '{system.ageing.name}' is not linear in mu_dot, W_dot or F_dot_over_W",
             "write the coupling to the rates of friction and load as a factor times mu_dot, W_dot or F_dot_over_W",
         ) from error
-    solved = matrix.LUsolve(right) if matrix.shape[0] == matrix.shape[1] else None
+    solved = _eliminated(matrix, right, system)
     if solved is None:
         raise SrfError(
             f"the equations of {system.title} do not determine the motion", "check the laws with `srf law check`"
         )
     return dict(zip(wanted, [tidy(e) for e in solved], strict=True))
+
+
+def _eliminated(matrix: sp.Matrix, right: sp.Matrix, system: System) -> list[sp.Expr] | None:
+    """Solve a square linear system by elimination, None where it has no one solution.
+
+    The pivot is never a factor that a parameter at 0 makes vanish where another will do: with c = 0 in (c/B) phi F_dot_over_W
+    the equations are those without the term, and near 0 no figures are lost. Of the others the one that fills least is taken.
+    """
+    vanishing = [symbol(p.name) for p in system.parameters if p.lower <= 0 <= p.upper]
+
+    def weak(entry: sp.Expr) -> bool:
+        return any(entry.has(x) and entry.subs(x, 0) == 0 for x in vanishing)
+
+    if matrix.shape[0] != matrix.shape[1]:
+        return None
+    rows = [{j: e for j, e in enumerate(matrix.row(i)) if e != 0} for i in range(matrix.shape[0])]
+    values, order = list(right), []
+    left = set(range(len(rows)))
+    while left:
+        used = Counter(j for i in left for j in rows[i])
+        entries = [(i, j, e) for i in sorted(left) for j, e in rows[i].items()]
+        if not entries or any(not rows[i] for i in left):
+            return None
+        i, j, pivot = min(
+            entries,
+            key=lambda x: (
+                weak(x[2]), (len(rows[x[0]]) - 1) * (used[x[1]] - 1), not x[2].is_number, sp.count_ops(x[2]), x[0], x[1]
+            ),
+        )  # fmt: skip
+        left.remove(i)
+        order.append((i, j, pivot))
+        for k in left:
+            if (entry := rows[k].pop(j, None)) is None:
+                continue
+            factor = entry / pivot
+            values[k] -= factor * values[i]
+            for m, other in rows[i].items():
+                if m != j and (new := rows[k].pop(m, sp.S.Zero) - factor * other) and sp.expand(new) != 0:
+                    rows[k][m] = new
+    found: dict[int, sp.Expr] = {}
+    for i, j, pivot in reversed(order):
+        found[j] = (values[i] - sum((e * found[m] for m, e in rows[i].items() if m != j), sp.S.Zero)) / pivot
+    return [found[j] for j in range(len(rows))]
 
 
 def tidy(expression: sp.Expr) -> sp.Expr:

@@ -64,7 +64,7 @@ MAY: dict[str, set[str]] = {
     "inference": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "settings", "splines", "units"},
     "diagnosis": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "inference", "splines", "units"},
     "output": LAWS | {"output"},
-    "parallel": BASE | {"output"},
+    "parallel": BASE | {"cache", "output"},
     "trial": BASE | {"registry", "recording", "diagnosis", "model", "output", "parallel", "proof"},
     # shares no equation and no integrator with what it is to prove
     "proof": {"errors", "output", "parallel", "reading", "atomic"},

@@ -106,7 +106,7 @@ def command(words: tuple[str, ...], value: str) -> tuple[str, ...]:
     ("case", "number", "stride"),
     [
         *((case, signal.SIGKILL, 1) for case in CASES),
-        *((case, n, 4) for case in CASES for n in (signal.SIGTERM, signal.SIGINT)),
+        *((case, n, 7) for case in CASES for n in (signal.SIGTERM, signal.SIGINT)),
     ],
     ids=lambda v: getattr(v, "name", str(v)),
 )
@@ -135,6 +135,24 @@ def test_at_every_step(case: str, number: signal.Signals, stride: int) -> None:
             break
         if state(Path()) != old:
             shutil.copytree(kept, Path.cwd(), dirs_exist_ok=True)
+    assert code == 0 and state(Path()) == new and step > 6
+
+
+def test_the_sidecar_of_an_older_result_goes_with_it() -> None:
+    """--no-provenance: no sidecar beside what it does not describe, at no step of a kill that the next start sees."""
+    srf(*command(FILE, "9"), "--no-provenance")
+    new = state(Path())
+    assert set(new) == {"a.csv"}
+    srf(*command(FILE, "8"))
+    old, kept = state(Path()), Path.cwd().parent / "kept"
+    shutil.copytree(Path.cwd(), kept)
+    for step in range(1, 100):
+        code = killed_at(step, signal.SIGKILL, (*command(FILE, "9"), "--no-provenance"))
+        CliRunner().invoke(cli, [w for w in command(FILE, "8") if w != "--force"])
+        assert state(Path()) in (old, new) and hidden() == []
+        if code == 0:
+            break
+        shutil.copytree(kept, Path.cwd(), dirs_exist_ok=True)
     assert code == 0 and state(Path()) == new and step > 6
 
 
@@ -216,7 +234,7 @@ def test_at_random_moments() -> None:
     new = state(Path())
     srf(*command(words, before))
     old = state(Path())
-    for _ in range(12):
+    for _ in range(6):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             child = os.fork()

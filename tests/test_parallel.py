@@ -13,7 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from srfcli.cli.main import cli
 from srfcli.cli.workers import Spread
 from srfcli.errors import SrfError
 from srfcli.numerics.map import compute_map
@@ -27,6 +29,10 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def square(task):
     return {"value": np.array(task[0]) ** 2}
+
+
+def cube(task):
+    return {"value": np.array(task[0] or 0) ** 3}
 
 
 def fragile(task):
@@ -144,6 +150,65 @@ def test_a_store_gives_back_what_it_kept(tmp_path):
     calls.clear()
     assert values(stored(run_here, store, counted, TASKS)) == SQUARES
     assert calls == [2, 4]  # the lost one and the damaged one, no other
+
+
+def test_a_forged_part_is_not_taken_for_a_result(tmp_path):
+    """Not one that somebody wrote, nor one with another's seal, nor one of another place or another run."""
+    store, calls = Store(tmp_path / "parts"), []
+
+    def counted(task):
+        calls.append(task[0])
+        return square(task)
+
+    list(stored(run_here, store, square, TASKS))
+    list(stored(run_here, Store(tmp_path / "other"), cube, [*TASKS[:-1], (99, None)]))
+    parts = [tmp_path / "parts" / f"part-{i:05d}.npz" for i in range(len(TASKS))]
+    np.savez(parts[0], value=np.array(666))
+    parts[1].write_bytes(parts[0].read_bytes() + parts[1].read_bytes()[-64:])
+    parts[2].write_bytes(parts[3].read_bytes())
+    parts[4].write_bytes((tmp_path / "other" / "part-00004.npz").read_bytes())
+    assert values(stored(run_here, store, counted, TASKS)) == SQUARES
+    assert calls == [0, 1, 2, 4]
+    assert values(stored(run_here, store, counted, TASKS)) == SQUARES and len(calls) == 4
+
+
+def test_parts_that_cannot_be_sealed_are_not_begun(tmp_path, monkeypatch):
+    (tmp_path / "srf").mkdir()
+    (tmp_path / "srf" / "cache.key").write_text("short")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    with pytest.raises(SrfError, match=r"parts cannot be sealed: .*cache.key is damaged"):
+        list(stored(run_here, Store(tmp_path / "parts"), square, TASKS))
+    assert not (tmp_path / "parts").exists()
+
+
+def test_a_map_resumed_later_in_another_way(tmp_path, monkeypatch):
+    """The clock set back and the parts damaged: the same bytes. The law edited: refused, and nothing is lost."""
+    monkeypatch.chdir(tmp_path)
+    law = (ROOT / "plugins" / "friction" / "dieterich-ruina.toml").read_text(encoding="utf-8")
+    Path("own.toml").write_text(law, encoding="utf-8")
+    grid = ["map", "--law", "./own.toml", "--eps", "0.09", "--over", "V=1:100:3", "--over", "K/W0=0.002:0.03:3"]
+    grid += ["--interface", "rigid", "--no-boundaries", "--no-provenance", "--resume", "parts"]
+
+    def run(out):
+        return CliRunner().invoke(cli, [*grid, "--out", out], prog_name="srf")
+
+    assert run("a.csv").exit_code == 0
+    parts = sorted(Path("parts").glob("part-*.npz"))
+    parts[0].write_bytes(parts[0].read_bytes()[:-70])
+    for path in Path("parts").iterdir():
+        os.utime(path, (4e9, 4e9))  # in 2096: written before a clock that was wrong was set back
+    assert run("b.csv").exit_code == 0
+    assert Path("b.csv").read_bytes() == Path("a.csv").read_bytes()
+    assert [p.stat().st_mtime == 4e9 for p in parts] == [False, *[True] * (len(parts) - 1)]
+    before = {p.name: p.read_bytes() for p in Path("parts").iterdir()}
+    Path("own.toml").write_text(law.replace("default = 0.464", "default = 0.47"), encoding="utf-8")
+    done = run("c.csv")
+    assert done.exit_code == 2 and "--resume parts holds the parts of another run" in done.stderr
+    assert not Path("c.csv").exists() and {p.name: p.read_bytes() for p in Path("parts").iterdir()} == before
+    Path("own.toml").write_text(law, encoding="utf-8")
+    Path("parts/srf-run.json").write_text('{"schema"')
+    done = run("c.csv")
+    assert done.exit_code == 2 and "srf-run.json cannot be read" in done.stderr
 
 
 def test_a_store_of_another_run_is_refused(tmp_path):

@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -514,6 +515,43 @@ def test_a_bank_that_was_cut_short_is_made_again(quick, tmp_path):
     again = begin(cut.folder, cases=None, seed=None, kinds=(), resume=True, workers=1)
     assert again.digest() == whole.digest()
     assert sorted(p.name for p in cut.folder.iterdir()) == ["bank", "trial.json", "truths.json"]
+
+
+@pytest.mark.parametrize("at", ["before the note", "before the bank's rename", "after it"])
+def test_a_trial_that_was_killed_ends_as_one_that_was_not(quick, tmp_path, at):
+    whole, cut = new_trial(tmp_path / "a", 1), Trial(tmp_path / "b")
+    list(answer_all(whole, diagnose=says_none))
+    shutil.copytree(whole.folder, cut.folder)
+    cut.answers.unlink()
+    if at == "before the note":
+        shutil.rmtree(cut.folder)
+        cut.folder.mkdir()
+        (cut.folder / ".trial.json.abcdefgh.part").write_text('{"sch')
+    elif at == "before the bank's rename":
+        cut.bank.rename(cut.folder / "bank.part")
+        next((cut.folder / "bank.part").glob("case-*/*.csv")).write_text("cut sh")
+    before = cut.bank.stat().st_mtime_ns if cut.bank.exists() else None
+    begin(cut.folder, cases=1, seed=3, kinds=(), resume=True, workers=1)
+    assert before in (None, cut.bank.stat().st_mtime_ns)
+    assert (cut.digest(), cut.waiting()) == (whole.digest(), ["case-000"])
+    (cut.folder / ".answers.jsonl.abcdefgh.part").write_text('{"case": "case-0')  # killed while it wrote the first
+    list(answer_all(cut, diagnose=says_none))
+    assert sorted(p.name for p in cut.folder.iterdir()) == sorted(p.name for p in whole.folder.iterdir())
+    assert list(open_truths(cut)[0].items()) == list(open_truths(whole)[0].items())
+
+
+def test_answers_that_were_damaged_are_named_and_asked_for_again(quick, tmp_path):
+    trial = new_trial(tmp_path / "t", 2)
+    list(answer_all(trial, diagnose=says_none))
+    first, second = trial.answers.read_text().splitlines(keepends=True)
+    trial.answers.write_text(first + second[:40])
+    for reads in (lambda: list(answer_all(trial, diagnose=says_none)), lambda: open_truths(trial), trial.waiting):
+        with pytest.raises(SrfError, match=r"answers.jsonl, line 2: no answer"):
+            reads()
+    assert trial.answers.read_text() == first + second[:40] and not trial.opened.exists()
+    trial.answers.write_text(first)
+    assert [a.case for a in answer_all(trial, diagnose=says_none)] == ["case-001"]
+    assert trial.answers.read_text().startswith(first)
 
 
 def test_a_diagnosis_is_given_the_case_and_nothing_else(quick, tmp_path):

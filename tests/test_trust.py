@@ -138,14 +138,14 @@ def own_law(folder: Path) -> None:
 
 def test_what_is_named_or_trusted_runs() -> None:
     own_law(Path())
-    assert srf("linear", "--law", "./my-law.py").exit_code == 0
-    assert srf("linear", "--law", "my-law", "--plugins", ".").exit_code == 0
+    assert srf("config", "show", "--law", "./my-law.py").exit_code == 0
+    assert srf("config", "show", "--law", "my-law", "--plugins", ".").exit_code == 0
     Path("srf.toml").write_text('[defaults]\nlaw = "my-law.py"\n')
     refused(srf("linear"), "srf.toml: [defaults] law: 'my-law.py'")
-    assert srf("linear", "--trust").exit_code == srf("--trust", "linear").exit_code == 0
-    assert srf("linear", "--law", "srf-vsat").exit_code == 0  # what stands in the file does not count then
+    assert srf("config", "show", "--trust").exit_code == srf("--trust", "config", "show").exit_code == 0
+    assert srf("config", "show", "--law", "srf-vsat").exit_code == 0  # what stands in the file does not count then
     Path("srf.toml").unlink()
-    assert CliRunner(env={"SRF_LAW": "my-law.py"}).invoke(cli, ["linear"]).exit_code == 0
+    assert CliRunner(env={"SRF_LAW": "my-law.py"}).invoke(cli, ["linear", "--over", "V=8"]).exit_code == 0
 
 
 def test_an_experiment_with_a_trusted_law_is_read() -> None:
@@ -192,8 +192,27 @@ def test_a_compiler_in_python_is_not_taken_from_the_current_folder() -> None:
     (own / "wrapped.py").write_text("import sys\nsys.exit('error: this one was asked')\n")
     Path("wrapped.py").write_text(CODE)
     done = process(
-        "simulate", "--V", "8", "--W0", "6", "--for", "1", "--rate", "10",
+        "simulate", "--V", "8", "--W0", "6", "--for", "1", "--rate", "10", "--interface", "rigid", "--no-inertia",
         SRF_CC=f"{sys.executable} -m wrapped", SRF_CACHE="", PYTHONPATH=str(own.resolve()),
     )  # fmt: skip
     assert done.returncode == 2 and "this one was asked" in done.stderr
     assert not Path("ran").exists()
+
+
+def test_a_law_of_the_settings_lies_beside_them() -> None:
+    """A relative name is as seen from srf.toml, wherever below it one works."""
+    Path("srf.toml").write_text('[defaults]\nlaw = "laws/own.toml"\nageing = "dieterich"\n')
+    Path(".git").mkdir()
+    Path("laws").mkdir()
+    text = template("friction", "own", python=False)
+    Path("laws/own.toml").write_text(text)
+    below = Path("below")
+    (below / "laws").mkdir(parents=True)
+    (below / "laws" / "own.toml").write_text("another one, which is none")
+    here = srf("linear", "--over", "V=8", "--csv")
+    os.chdir(below)
+    there = srf("linear", "--over", "V=8", "--csv")
+    assert here.exit_code == 0 and there.stdout == here.stdout, there.stderr
+    Path("../srf.toml").write_text('[defaults]\nlaw = "x.py"\n')
+    Path("../x.py").write_text(CODE)
+    refused(srf("linear"), "srf.toml: [defaults]")

@@ -33,8 +33,8 @@ SCHEMA = "srf.diagnose/"
 
 def check_answer(folder: Path, *, force: bool) -> None:
     """Raise SrfError now if a diagnosis could not be written to `folder` later."""
-    recover(folder.resolve())
-    parent = folder.resolve().parent
+    recover(folder)
+    parent = Path(os.path.realpath(folder)).parent
     if not parent.is_dir():
         raise SrfError(f"--out {folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
     if not os.access(parent, os.W_OK):

@@ -12,7 +12,7 @@ from srfcli.errors import SrfError
 
 def check_target(path: Path, *, force: bool, what: str = "--out") -> None:
     """Raise SrfError now if `path` could not be written later: before an hour of computing, not after it."""
-    recover(path.resolve() if path.is_symlink() else path)
+    recover(path)
     if path.is_dir():
         raise SrfError(f"{what} {path} is a directory", f"Name a file in it: {what} {path / 'result.csv'}")
     if not path.parent.is_dir():
@@ -23,7 +23,7 @@ def check_target(path: Path, *, force: bool, what: str = "--out") -> None:
         return
     if path.exists() and not force:
         raise SrfError(f"{what} {path} exists already", "Overwrite it with --force, or name another file.")
-    if not os.access(path.resolve().parent, os.W_OK):
+    if not os.access(Path(os.path.realpath(path)).parent, os.W_OK):
         raise SrfError(
             f"{what} {path}: the directory {path.parent} is not writable", "Name a file elsewhere.", exit_code=1
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -42,12 +43,16 @@ def sidecar_path(path: Path) -> Path:
 def write_result(path: Path, content: bytes, provenance: Provenance | None) -> Path | None:
     """Write a result with its sidecar, both or neither, and return the sidecar's place.
 
-    Without `provenance`, and for a device or a pipe, there is no sidecar.
+    Without `provenance` there is no sidecar, and that of an older result goes; a device or a pipe has none.
     """
-    if provenance is None or is_special(path):
+    if is_special(path):
         write_atomic(path, content)
         return None
-    target = path.resolve()  # a sidecar lies beside the file itself, not beside a link to it
+    target = Path(os.path.realpath(path))  # a sidecar lies beside the file itself, not beside a link to it
+    if provenance is None:
+        older = {sidecar_path(target): None} if os.path.lexists(sidecar_path(target)) else {}
+        write_files({target: content, **older})
+        return None
     write_files({target: content, sidecar_path(target): sidecar(path, content, provenance).encode("utf-8")})
     return sidecar_path(path)
 

@@ -1,4 +1,8 @@
-"""Finished tasks kept in a folder, so that a run that was killed goes on where it stopped, to the same bytes."""
+"""Finished tasks kept in a folder, so that a run that was killed goes on where it stopped, to the same bytes.
+
+Every part ends in a seal over its run, its number and its content, under the user's secret. A part that was damaged, changed,
+moved from another place or run, or made by somebody else fails it, and its task is done again.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from srfcli import __version__
 from srfcli.atomic import clear
+from srfcli.cache import is_sealed, seal
 from srfcli.errors import SrfError
 from srfcli.output.files import write_atomic
 from srfcli.reading import parse_json, read_plain
@@ -24,27 +29,36 @@ if TYPE_CHECKING:
 
 NOTE = "srf-run.json"
 LARGEST = 2**30  # bytes of a finished task
+SEAL = 64  # hexadecimal digits at the end of a part
 Arrays = Mapping[str, "NDArray[Any]"]
 Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Store:
     """A folder of finished tasks, each a mapping of names to arrays, of one run and no other."""
 
     folder: Path
+    run: str = ""  # hash of the tasks, known when it is open
 
     def open(self, tasks: Sequence[Any]) -> None:
         """Make the folder, or check that what it holds is of these very tasks; SrfError where it is not."""
-        said = {"schema": "srf.run/1", "version": __version__, "tasks": len(tasks), "sha256": fingerprint(tasks)}
+        self.run = fingerprint(tasks)
+        said = {"schema": "srf.run/1", "version": __version__, "tasks": len(tasks), "sha256": self.run}
+        try:
+            seal(self.run, b"")
+        except (OSError, RuntimeError) as error:
+            raise SrfError(
+                f"--resume {self.folder}: parts cannot be sealed: {error}", "Set XDG_STATE_HOME to a folder of your own."
+            ) from error
         note = self.folder / NOTE
         if self.folder.is_dir():
             clear(self.folder)
         if note.exists():
             try:
                 before = parse_json(read_plain(note), note)
-            except (OSError, SrfError):
-                before = None
+            except (OSError, SrfError) as error:
+                raise SrfError(f"--resume {note} cannot be read: {error}", "Name another folder, or a new one.") from error
             if before != said:
                 raise SrfError(
                     f"--resume {self.folder} holds the parts of another run",
@@ -57,11 +71,15 @@ class Store:
         write_atomic(note, json.dumps(said, indent=2) + "\n")
 
     def read(self, index: int) -> dict[str, NDArray[Any]] | None:
-        """Return a finished task, or None where there is none or its file is damaged: it is then done again."""
+        """Return a finished task, or None where there is none or its file fails its seal: it is then done again."""
         import numpy as np
 
         try:
-            with np.load(io.BytesIO(read_plain(self._place(index), limit=LARGEST)), allow_pickle=False) as data:
+            whole = read_plain(self._place(index), limit=LARGEST)
+            content, found = whole[:-SEAL], whole[-SEAL:].decode("ascii", "replace")
+            if not is_sealed(self._name(index), content, found):
+                return None
+            with np.load(io.BytesIO(content), allow_pickle=False) as data:
                 return {name: data[name] for name in data.files}
         except (OSError, SrfError, ValueError, EOFError, KeyError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error):
             return None
@@ -72,7 +90,11 @@ class Store:
 
         buffer = io.BytesIO()
         np.savez(buffer, **result)  # type: ignore[arg-type]
-        write_atomic(self._place(index), buffer.getvalue())
+        content = buffer.getvalue()
+        write_atomic(self._place(index), content + seal(self._name(index), content).encode())
+
+    def _name(self, index: int) -> str:
+        return f"{self.run}/{index}"
 
     def _place(self, index: int) -> Path:
         return self.folder / f"part-{index:05d}.npz"

@@ -116,7 +116,7 @@ def read_description(path: Path) -> Description:
 def find_file(path: Path) -> Path:
     """Return the TOML file that `path`, an experiment's folder or file, means."""
     if not path.exists():
-        recover(path.resolve())  # a process that replaced it may have been killed
+        recover(path)  # a process that replaced it may have been killed
     if not path.exists():
         raise SrfError(f"no experiment {path}", f"Give a folder with an {FILE_NAME}, or the TOML file.")
     if path.is_dir():

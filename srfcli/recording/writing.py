@@ -53,8 +53,8 @@ def experiment_files(experiment: Experiment) -> dict[str, str]:
 
 def check_folder(folder: Path, *, force: bool) -> None:
     """Raise SrfError now if an experiment could not be written to `folder` later."""
-    recover(folder.resolve())
-    parent = folder.resolve().parent
+    recover(folder)
+    parent = Path(os.path.realpath(folder)).parent
     if not parent.is_dir():
         raise SrfError(f"{folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
     if not os.access(parent, os.W_OK):

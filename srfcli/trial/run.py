@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from srfcli.atomic import clear
 from srfcli.errors import SrfError
 from srfcli.output.files import write_atomic
 from srfcli.parallel.pool import run_processes
@@ -85,6 +86,8 @@ def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[
     Raises SrfError for a folder that exists where nothing is resumed, and for a trial of other cases.
     """
     trial = Trial(folder)
+    if folder.is_dir():
+        clear(folder)
     if trial.note.exists() and resume:
         asked = trial.asked()
         given = {"cases": cases, "seed": seed, "kinds": sorted(kinds) or None}
