@@ -381,17 +381,21 @@ class ModelSearch:
             heapq.heappush(self.queue, _Move(-expected, self.count, model, dict(found.point.values), ()))
 
     def _eliminate(self) -> None:
-        """Refit the best model's parts alone, from its parameters (backward elimination)."""
-        best = self.best()
-        if len(best.model.effects) < 2:
-            return
-        sizes = self._sizes(best)
-        for effect, own in zip(best.model.effects, sizes, strict=True):
-            if self.spent:
-                return
-            if any(n not in self._stated for n in effect.needs):
-                continue  # it is nothing without the other
-            self._record(self.fit(_Move(0.0, 0, Model((effect,), best.model.ageing), dict(best.fit.values), (own,))))
+        """Refit the parts of the best model, and of those that come close, alone from its parameters (backward elimination)."""
+        top = self.best().evidence
+        close = [f for f in self.ranked() if top - f.evidence < CLOSE and len(f.model.effects) > 1]
+        for node in close:
+            for effect, own in zip(node.model.effects, self._sizes(node), strict=True):
+                part = Model((effect,), node.model.ageing)
+                known = self.fitted.get(part.name)
+                if known is not None and known.fine and known.evidence > top - CLOSE:
+                    continue
+                if any(n not in self._stated for n in effect.needs):
+                    continue  # it is nothing without the other
+                try:
+                    self._record(self.fit(_Move(0.0, 0, part, dict(node.fit.values), (own,))))
+                except SrfError as error:
+                    self.excluded.append(Excluded(part.name, error.message))
 
     @cached_property
     def _stated(self) -> frozenset[str]:
