@@ -262,12 +262,15 @@ def _shade_stable(ax: Axes, curves: Sequence[tuple[Values, Values]], colour: str
         levels[1 : len(heights) + 1, j] = sorted(heights, reverse=True)
     from matplotlib.colors import to_rgb
 
-    pale = tuple(1.0 - 0.10 * (1.0 - part) for part in to_rgb(colour))  # opaque, so that no seam shows between pieces
+    pale = tuple(1.0 - 0.10 * (1.0 - part) for part in to_rgb(colour))  # opaque: pieces may overlap
+    half = np.sqrt(columns[1] / columns[0])
+    sides = np.stack([columns / half, columns * half], axis=1).ravel()  # strips that meet, as levels jump at a fold
     for k in range(0, most + 1, 2):
         # where a column has fewer crossings than k the levels coincide, so that nothing is drawn there
-        upper, lower = levels[k], levels[k + 1]
-        there = covered & (upper > lower)
-        ax.fill_between(columns, lower, upper, where=there, facecolor=pale, edgecolor=pale, linewidth=0.6, zorder=0.2)
+        upper, lower = (np.repeat(levels[j], 2) for j in (k, k + 1))
+        there = np.repeat(covered, 2) & (upper > lower)
+        ax.fill_between(sides, lower, upper, where=there, facecolor=pale, linewidth=0, antialiased=False, zorder=0.2)
+    ax.set_xlim(low, high)
     ax.annotate("stable", (0.98, 0.97), xycoords="axes fraction", ha="right", va="top", color="#333333")
     ax.annotate("oscillates", (0.02, 0.03), xycoords="axes fraction", ha="left", va="bottom", color="#333333")
 
