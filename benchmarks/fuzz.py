@@ -18,7 +18,10 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import common  # noqa: F401  tests/ can be imported
 import numpy as np
+import sound_files
+from sound_files import SETTINGS, THRESHOLDS
 
 from srfcli.dimensions import parse_unit
 from srfcli.errors import SrfError
@@ -36,29 +39,8 @@ from srfcli.settings import load_toml, resolve
 from srfcli.trial.answer import Answer, read_answers, to_line
 from srfcli.units import parse_quantity
 
-DATA = "time [s],load_point_velocity [um/s],normal_load [N],elongation [um]\n"
-DATA += "".join(f"{i / 100},10.0,5.0,{10 + 0.01 * (i % 7)}\n" for i in range(60))
-EXPERIMENT = """format = "srf-experiment/1"
-title = "their own"
-[apparatus]
-stiffness = "0.21 N/um"
-mass = "2.37 kg"
-[model]
-law = "srf-vsat"
-ageing = "dieterich"
-[parameters]
-mu0 = { value = 0.33, lower = 0.1, upper = 1.0 }
-[columns]
-elongation = { name = "elongation", unit = "um", scale = 1.0, offset = 0.0 }
-[[runs]]
-name = "one"
-file = "one.csv"
-window = [0.0, 0.5]
-drive = [{ duration = 1.0, velocity = 10.0 }, { duration = 1.0, velocity = 20.0 }]
-modulation = { frequency = 12.0, amplitude = 0.09, onset = 2.0 }
-"""
-SETTINGS = '[parameters]\nA = 0.01\nK = "0.21 N/um"\n[defaults]\nlaw = "srf-vsat"\ninertia = true\ntol = 1e-6\n'
-THRESHOLDS = "# measured\nV [um/s],eps [%],W0c [N],sigma [N]\n10,0,7.80,0.23\n50,20.9,23.5,\n"
+DATA = sound_files.recording(60)
+EXPERIMENT = sound_files.EXPERIMENT.replace("window = [0.0, 1.5]", "window = [0.0, 0.5]")
 PIECES = [b"", b"[", b"]", b'"', b"'", b"{", b"}", b"=", b",", b".", b"\n", b"\r", b"\0", b"\x1b[2J", b"\xff", b"1e999",
           b"nan", b"-inf", b"-1", b"9" * 400, b"1e-320", b"0x" + b"f" * 400, b"true", b"[" * 900, b"a." * 300, b"\\u0000",
           b"x.py", b"../x.toml", b"(" * 40, b"**9" * 9, b"PK\x03\x04"]  # fmt: skip

@@ -122,7 +122,8 @@ class _Move:
     values: dict[str, float] = field(compare=False)
     sizes: tuple[dict[str, float], ...] = field(compare=False)
     least: float = field(compare=False, default=-np.inf)  # log likelihood from which it is worth a fit
-    fresh: int = field(compare=False, default=0)  # of the last effects, at sizes that are only expected; -1: once more
+    fresh: int = field(compare=False, default=0)  # how many of the last effects are at sizes that are only expected
+    again: bool = field(compare=False, default=False)  # fitted before, from other sizes
 
 
 class ModelSearch:
@@ -172,7 +173,7 @@ class ModelSearch:
         for share in SHARES:
             values = dict(move.values)
             for number, (effect, sizes) in enumerate(zip(move.model.effects, move.sizes, strict=True)):
-                part = share if number >= len(move.sizes) - max(move.fresh, 0) else 1.0
+                part = share if number >= len(move.sizes) - move.fresh else 1.0
                 longs = {p.name: long for long, p in own_parameters(effect, own).items()}
                 neutral = neutral_values(effect)
                 for name, value in sizes.items():
@@ -244,7 +245,7 @@ class ModelSearch:
             except SrfError as error:
                 self.excluded.append(Excluded(move.model.name, error.message))
                 continue
-            if found is self.best() and not found.fine and move.fresh >= 0:
+            if found is self.best() and not found.fine and not move.again:
                 again = self._again(found)
                 if again:
                     heapq.heappush(self.queue, again)
@@ -264,8 +265,9 @@ class ModelSearch:
         node = replace(node, scores=scores)
         self.fitted[node.model.name] = node
         one = -float(np.log(2 * len(self.candidates))) - 3.0  # prior and Occam's factor of an effect
-        random = not node.fit.smooth or node.fit.likelihood.processes > 0
-        least = HINT if node.fine and random and not node.model.reported else WORTH if node.fine else WORTH / 2
+        least = WORTH if node.fine else WORTH / 2
+        if node.fine and not node.model.reported and (not node.fit.smooth or node.fit.likelihood.processes):
+            least = HINT
         for score in [s for s in scores.singles if s.gain > least][:SINGLES]:
             model = Model((*present, score.effect), node.model.ageing)
             self._push(node.evidence + score.gain + one, model, node, (*self._sizes(node), score.values))
@@ -351,7 +353,7 @@ class ModelSearch:
         self.count += 1
         values = dict(found.point.values)
         expected = node.evidence + gain + WORTH
-        return _Move(-expected, self.count, node.model, values, self._sizes(node, values), fresh=-1)
+        return _Move(-expected, self.count, node.model, values, self._sizes(node, values), again=True)
 
     def _together(self, node: Fitted) -> None:
         """Push the pairs of effects that promise more together than the best alone."""

@@ -589,7 +589,7 @@ def _with_or_without(
         last = found.point.x
         found = maximise(rough, last, steps=3, close=close, progress=progress)
         if found.away < close or np.array_equal(found.point.x, last):
-            other = None if elsewhere else _small_field(rough, found.point, at)
+            other = None if elsewhere else _small_field(rough, found.point)
             if other is None:
                 break
             elsewhere, found = True, replace(found, point=other)
@@ -599,7 +599,7 @@ def _with_or_without(
         if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
             tried = bare(BARE_STEPS)
             if tried.log_likelihood > found.point.log_likelihood and tried.maximum.away < close:
-                small = _small_field(rough, tried.maximum.point, at)
+                small = _small_field(rough, tried.maximum.point)
                 if small is None:
                     return tried
                 found = replace(found, point=small)
@@ -619,14 +619,12 @@ def _with_or_without(
     return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
 
 
-def _small_field(rough: Likelihood, bare: Point, at: int) -> Point | None:
+def _small_field(rough: Likelihood, bare: Point) -> Point | None:
     """Return the likeliest of a few small fields beside a fit without one or with another, None where none gains enough."""
-    length = rough.names.index("field_length")
     best: tuple[float, Array] | None = None
     for share in (0.03, 0.1, 0.3, 1.0):
         for short in SHORT:
-            x = rough.coordinates(bare.values)
-            x[at], x[length] = rough.lower[at] + np.log(share * FAINT / SMALL), rough.start[length] + np.log(short)
+            x = _under_field(rough, rough.coordinates(bare.values), share * FAINT, short)
             found = rough.at(x, slopes=False).log_likelihood
             if found > bare.log_likelihood + NEEDED and (best is None or found > best[0]):
                 best = found, x
@@ -682,11 +680,16 @@ def _slow_fields(wider: Likelihood, x: Array) -> Iterator[Array]:
     yield x.copy()
     if wider.smooth:
         return
-    amplitude, length = (wider.names.index(n) for n in FIELD)
     for share in (0.1, 1.0):
-        slow = x.copy()
-        slow[amplitude], slow[length] = wider.lower[amplitude] + np.log(share * FAINT / SMALL), wider.start[length]
-        yield slow
+        yield _under_field(wider, x, share * FAINT, 1.0)
+
+
+def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Array:
+    """Return x under a field of amplitude `wide` over the friction of the recordings, its length `short` times the start's."""
+    amplitude, length = (rough.names.index(n) for n in FIELD)
+    found = x.copy()
+    found[amplitude], found[length] = rough.lower[amplitude] + np.log(wide / SMALL), rough.start[length] + np.log(short)
+    return found
 
 
 def _counted(fitted: StateSpaceFit, more: int) -> StateSpaceFit:
@@ -702,9 +705,7 @@ def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[s
     best = (-np.inf, x)
     for wide in WIDE:
         for short in SHORT:
-            trial = x.copy()
-            trial[amplitude] = rough.lower[amplitude] + np.log(wide / SMALL)
-            trial[length] = rough.start[length] + np.log(short)
+            trial = _under_field(rough, x, wide, short)
             found = rough.at(trial, slopes=False).log_likelihood
             progress(
                 f"field of {np.exp(trial[amplitude]):.2g} over {np.exp(trial[length]):.2g} um: log likelihood {found:.1f}"
