@@ -154,7 +154,7 @@ def _cell(value: Any) -> str:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return number(value, 5) if finite(value) else str(value)
+    return number(value, 5) if isinstance(value, float) and finite(value) else str(value)  # counts are whole
 
 
 def _made(path: Path, data: Mapping[str, Any]) -> Markup:

@@ -49,8 +49,10 @@ def _head(path: Path) -> bytes:
         with open_plain(path) as stream:
             head = stream.read(SNIFFED)
     except FileNotFoundError:
-        near = did_you_mean(path.name, (p.name for p in path.parent.glob("*"))) if path.parent.is_dir() else None
-        raise SrfError(f"no file {path}", near or f"There is no folder {path.parent}.") from None
+        if not path.parent.is_dir():
+            raise SrfError(f"no file {path}", f"There is no folder {path.parent}.") from None
+        names = [p.name for p in path.parent.glob("*")]
+        raise SrfError(f"no file {path}", did_you_mean(path.name, names) if names else "Its folder is empty.") from None
     except OSError as error:
         raise _unreadable(path, error) from None
     if not head:
