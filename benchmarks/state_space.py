@@ -76,7 +76,7 @@ def one(task: tuple[float, bool, int]) -> dict[str, object]:
     found = fit_state_space(replace(problem, start=start(far)))
     used = time.process_time() - begun
     near = fit_state_space(replace(problem, start=start(truth)))
-    errors = np.sqrt(np.diag(found.maximum.covariance))
+    errors = np.sqrt(np.diag(found.covariance))
     off = {n: (found.values[n] - truth[n]) / errors[found.likelihood.names.index(n)] for n in truth}
     return {
         "amplitude": amplitude, "shared": shared, "seed": seed, "off": off, "missed": near.log_likelihood - found.log_likelihood,

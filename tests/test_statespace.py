@@ -316,7 +316,7 @@ def test_a_fit_from_values_30_percent_off_finds_parameters_and_field(make_model,
     experiment = made(tabled, 5, amplitude)
     found = fit_state_space(fit_problem(model, experiment))
     assert found.maximum.status is Status.OK
-    errors = np.sqrt(np.diag(found.maximum.covariance))
+    errors = np.sqrt(np.diag(found.covariance))
     for name, error in zip(found.likelihood.names, errors, strict=True):
         if name in ROCK_VALUES:
             assert abs(found.values[name] - ROCK_VALUES[name]) < 3.5 * error, name
@@ -375,7 +375,7 @@ def test_coloured_gauge_noise_is_found(make_model):
     assert found.likelihood.processes == 1 and found.smooth
     assert found.values["gauge_colour1"] == pytest.approx(4e-4, rel=0.3)
     assert found.values["gauge_time1"] == pytest.approx(0.5, rel=0.5)
-    errors = np.sqrt(np.diag(found.maximum.covariance))
+    errors = np.sqrt(np.diag(found.covariance))
     for name, error in zip(found.likelihood.names, errors, strict=True):
         if name in ROCK_VALUES:
             assert abs(found.values[name] - ROCK_VALUES[name]) < 3.5 * error, name

@@ -317,11 +317,11 @@ class ModelSearch:
         own = [n for n in problem.names if n not in node.fit.likelihood.problem.names]
         place = likelihood.names.index(own[0])
         x = likelihood.coordinates(_followable(node.fit.values, problem))
-        low, high = likelihood.lower[place], likelihood.upper[place]
+        low, high = (likelihood.values(edge)[own[0]] for edge in (likelihood.lower, likelihood.upper))
         trials = []
         for size in np.geomspace(max(low, 1e-3 * high), high, BUILT):
             y = x.copy()
-            y[place] = size
+            y[place] = np.log(size) if likelihood.logarithmic[place] else size
             trials.append((likelihood.at(y, slopes=False).log_likelihood, y))
         best, x = max(trials, key=lambda t: t[0])
         if np.isfinite(best):
@@ -339,11 +339,10 @@ class ModelSearch:
         name = next((n for n in likelihood.problem.names if n in built), None)
         if name is None:
             return None
-        place, x = likelihood.names.index(name), node.fit.maximum.point.x
         trials = []
         for ratio in np.geomspace(1 / FAR, FAR, AGAIN):
-            y = likelihood.coordinates(_followable(node.fit.values, likelihood.problem))
-            y[place] = np.clip(x[place] * ratio, likelihood.lower[place], likelihood.upper[place])
+            values = _followable(node.fit.values, likelihood.problem)
+            y = likelihood.coordinates({**values, name: values[name] * ratio})
             trials.append(maximise(likelihood, y, held=[name], steps=3, close=1.0, progress=self.progress))
         likeliest = max(trials, key=lambda f: f.point.log_likelihood)
         found = maximise(likelihood, likeliest.point.x, steps=4, close=1.0, progress=self.progress)

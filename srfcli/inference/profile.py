@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from srfcli.inference.fit import Fit, Problem, Search
 from srfcli.inference.statespace import CLOSER, StateSpaceFit, maximise
@@ -32,6 +33,7 @@ class _Valley:
     """Where a likelihood is largest: `best` (k,), its covariance and bounds, and what it costs to hold one coordinate.
 
     `held(k, value, start)` returns the others' best values, minus twice the log likelihood there, and how often it was asked.
+    Coordinates that are `logarithmic` are those of a parameter's logarithm.
     """
 
     best: Array
@@ -40,6 +42,7 @@ class _Valley:
     lower: Array
     upper: Array
     held: Held
+    logarithmic: NDArray[np.bool_]
 
 
 def profile(
@@ -61,7 +64,7 @@ def profile(
     for side in (-1.0, 1.0):
         end, used = _end(valley, k, side)
         progress(f"{name}: {'upper' if side > 0 else 'lower'} end")
-        ends.append(end)
+        ends.append(float(np.exp(end)) if end is not None and valley.logarithmic[k] else end)
         count += used
     return Interval(name, ends[0], ends[1], count)
 
@@ -103,8 +106,9 @@ def _of_state_space(found: StateSpaceFit) -> _Valley:
         return others.point.x, -2 * others.point.log_likelihood, likelihood.evaluations - before
 
     return _Valley(
-        maximum.point.x, -2 * found.log_likelihood, maximum.covariance, likelihood.lower, likelihood.upper, held
-    )
+        maximum.point.x, -2 * found.log_likelihood, maximum.covariance, likelihood.lower, likelihood.upper, held,
+        likelihood.logarithmic,
+    )  # fmt: skip
 
 
 def _of_residuals(problem: Problem, fit: Fit) -> _Valley:
@@ -132,4 +136,4 @@ def _of_residuals(problem: Problem, fit: Fit) -> _Valley:
         return np.insert(found, k, value), search.trail[-1][0], search.evaluations
 
     best = np.array([fit.values[n] for n in problem.names])
-    return _Valley(best, cost(best), fit.covariance, problem.lower, problem.upper, held)
+    return _Valley(best, cost(best), fit.covariance, problem.lower, problem.upper, held, np.zeros(best.size, dtype=bool))

@@ -226,8 +226,7 @@ def _log_posterior(problem: Problem, fit: Fit, rough: StateSpaceFit | None) -> C
         if (theta <= problem.lower).any() or (theta >= problem.upper).any():
             return -np.inf
         if rough is not None:
-            x = rough.maximum.point.x.copy()
-            x[: theta.size] = theta
+            x = rough.likelihood.coordinates({**rough.values, **dict(zip(problem.names, theta.tolist(), strict=True))})
             found = rough.likelihood.at(x, slopes=False).log_likelihood
             return found if np.isfinite(found) else -np.inf
         total = 0.0

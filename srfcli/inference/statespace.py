@@ -47,6 +47,7 @@ CLOSE_CALL = 50.0  # in log likelihood, by which a fit that was broken off early
 HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters, when one is not worth a fit
 PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
 STEPS = 40  # of Fisher scoring
+PATIENCE = 5  # times the steps of integration of the point before, after which a trial is given up
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
 TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
@@ -115,12 +116,13 @@ def filter_run(
     trend: str | None = None,
     rtol: float = RTOL,
     keep: bool = False,
+    most: int | None = None,
 ) -> Filtered:
     """Return `run` filtered under `values` (um, s, N), with derivatives by the parameters `by`.
 
     `values` hold those of the model, field_amplitude and field_length among them, `gauge_white`, the standard deviation of white
     gauge noise in the observable's unit, `gauge_colour1` and `gauge_time1` (s) of an exponentially correlated part, and so on up
-    to 3 of these, and what belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend.
+    to 3 of these, and what belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. After `most` steps it is given up.
     """
     k, n = len(by), run.t.size
     p = run_parameters(model, experiment, run, values)
@@ -149,6 +151,7 @@ def filter_run(
     found = kalman_filter(
         model, Dual(p, d), drive=run.drive, load=run.load, t=run.t, observed=run.observed, used=run.used, start=start,
         covariance=P0, gauge=gauge, factor=factor, offset=offset, R=R, rtol=rtol, atol=rtol * size * fine, keep=keep,
+        most=most,
     )  # fmt: skip
     return Filtered(run, tuple(by), found)
 
@@ -240,9 +243,10 @@ class Point:
 class Likelihood:
     """The log likelihood of a problem's runs; its model has a random friction field.
 
-    Coordinates x are the problem's parameters, then the logarithms of field_amplitude and field_length unless the track is
-    `smooth`, of gauge_white, and of correlation time and standard deviation of each of the gauge's coloured `processes`. Runs of
-    another observable or sampling rate have a gauge noise of their own; their names then end in `[kind]`.
+    Coordinates x are the problem's parameters, then field_amplitude and field_length unless the track is `smooth`, gauge_white,
+    and correlation time and standard deviation of each of the gauge's coloured `processes`; those with a positive lower bound by
+    their logarithms, in which friction laws are nearly linear. Runs of another observable or sampling rate have a gauge noise of
+    their own; their names then end in `[kind]`.
     """
 
     def __init__(
@@ -260,10 +264,12 @@ class Likelihood:
         wanted = [*(() if smooth else FIELD), *dict.fromkeys(n for own in self.own.values() for n in own.values())]
         own = [(n, *scales[n.partition("[")[0].rstrip("123")]) for n in wanted]
         self.names = (*problem.names, *(row[0] for row in own))
-        start, low, high = np.log(np.array([row[1:] for row in own])).T
-        self.start = np.concatenate([problem.start, start])
-        self.lower, self.upper = np.concatenate([problem.lower, low]), np.concatenate([problem.upper, high])
-        self.logarithmic = np.array([n in wanted for n in self.names])
+        rows = [*zip(problem.start, problem.lower, problem.upper, strict=True), *(row[1:] for row in own)]
+        self.logarithmic = np.array([low > 0 for _, low, _ in rows])
+        self.start, self.lower, self.upper = (
+            np.array([np.log(v) if log else v for v, log in zip(column, self.logarithmic, strict=True)])
+            for column in zip(*rows, strict=True)
+        )
 
     @property
     def samples(self) -> int:
@@ -277,6 +283,10 @@ class Likelihood:
             zip(self.names, plain.tolist(), strict=True)
         )
         return found | ({"field_amplitude": 0.0, "field_length": 1.0} if self.smooth else {})
+
+    def unit(self, x: Array) -> Array:
+        """Return the derivatives (k,) of the parameters by x."""
+        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), 1.0)
 
     def coordinates(self, values: Mapping[str, float]) -> Array:
         """Return x for values by name; those left out are the start's. Within the bounds."""
@@ -296,7 +306,9 @@ class Likelihood:
             min(near, key=lambda r: abs(np.log(_spacing(r)) - step)).name
         ]  # held out: that sampled most alike
 
-    def filtered(self, run: Run, values: Mapping[str, float], *, slopes: bool = False, keep: bool = False) -> Filtered:
+    def filtered(
+        self, run: Run, values: Mapping[str, float], *, slopes: bool = False, keep: bool = False, most: int | None = None
+    ) -> Filtered:
         """Return one run filtered under values by name, with derivatives by the names that it depends on."""
         gauge, problem = self.gauge(run), self.problem
         back = {name: local for local, name in gauge.items()}
@@ -306,7 +318,7 @@ class Likelihood:
         found = filter_run(
             problem.model, problem.experiment, run, {**values, **{local: values[n] for local, n in gauge.items()}},
             by=[back.get(n, n) for n in own] if slopes else (), trend=None if run.holdout else problem.trend, rtol=self.rtol,
-            keep=keep,
+            keep=keep, most=most,
         )  # fmt: skip
         return replace(found, names=tuple(own) if slopes else ())
 
@@ -317,19 +329,20 @@ class Likelihood:
                 return list(pool.map(work, self.problem.runs))
         return [work(run) for run in self.problem.runs]
 
-    def at(self, x: Array, *, slopes: bool = True, keep: bool = False) -> Point:
-        """Return log likelihood, score and information at x (k,)."""
+    def at(self, x: Array, *, slopes: bool = True, keep: bool = False, like: Point | None = None) -> Point:
+        """Return log likelihood, score and information at x (k,); -inf where a run takes PATIENCE times the steps of `like`."""
         values, k = self.values(x), len(self.names)
         self.evaluations += 1
+        most = {f.run.name: PATIENCE * f.found.steps for f in like.runs} if like else {}
 
         def one(run: Run) -> Filtered:
-            return self.filtered(run, values, slopes=slopes, keep=keep)
+            return self.filtered(run, values, slopes=slopes, keep=keep, most=most.get(run.name))
 
         runs = tuple(self.over_runs(one))
         total = float(sum(f.log_likelihood for f in runs))
         score, information = np.zeros(k), np.zeros((k, k))
         if slopes and np.isfinite(total):
-            unit = np.array([values[n] if log else 1.0 for n, log in zip(self.names, self.logarithmic, strict=True)])
+            unit = self.unit(x)
             for f in runs:
                 at = [self.names.index(n) for n in f.names]
                 score[at] += f.score * unit[at]
@@ -375,7 +388,7 @@ def typical_friction(run: Run) -> float:
 
 @dataclass(frozen=True)
 class Maximum:
-    """Where Fisher scoring ended: the point, how far the maximum may still be in standard errors, and the status."""
+    """Where Fisher scoring ended: the point, how far the maximum may still be in standard errors, the status, covariance by x."""
 
     point: Point
     away: float
@@ -394,14 +407,15 @@ def maximise(
 ) -> Maximum:
     """Return the maximum from x (k,), by Fisher scoring with Levenberg's damping; parameters `held` stay where they are.
 
-    It ends within `close` standard errors of the maximum, by the score. Parameters that a step would push out stay at their
+    It ends within `close` standard errors of the maximum, by the score, or where two steps running each gain less than a quarter
+    of what that distance is worth. Parameters that a step would push out stay at their
     bounds. A likelihood that cannot be evaluated at x is a status.
     """
     free = np.array([n not in held for n in likelihood.names])
     point, damping = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper)), 1e-3
     if not np.isfinite(point.log_likelihood):
         return Maximum(point, np.inf, Status.INTEGRATION, np.full((x.size, x.size), np.nan))
-    away = np.inf
+    away, sure, slow = np.inf, True, 0
     for _ in range(steps):
         low, high = point.x <= likelihood.lower, point.x >= likelihood.upper
         moving = np.nonzero(free & ~(low & (point.score < 0)) & ~(high & (point.score > 0)))[0]
@@ -410,17 +424,22 @@ def maximise(
         scaled = I / np.outer(d, d)
         away = np.sqrt(max(float(g @ inverse(I) @ g), 0.0)) if moving.size else 0.0
         progress(f"log likelihood {point.log_likelihood:.1f}, {away:.2g} standard errors from the maximum")
-        if away < close:
+        if away < close or slow == 2:
             break
         while damping < 1e8:
             x = point.x.copy()
             move = np.linalg.solve(scaled + damping * np.eye(moving.size), g / d) / d
-            x[moving] += np.where(likelihood.logarithmic[moving], np.clip(move, -1.5, 1.5), move)
-            trial = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper))
-            if trial.log_likelihood > point.log_likelihood:
-                point, damping = trial, max(damping / 10, 1e-9)
+            move = np.where(likelihood.logarithmic[moving], np.clip(move, -1.5, 1.5), move)
+            x[moving] += move
+            trial = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper), slopes=sure, like=point)
+            gain = trial.log_likelihood - point.log_likelihood
+            if gain > 0:
+                share = gain / max(float(g @ move - 0.5 * move @ I @ move), 1e-300)  # of what the model of it promised
+                damping = max(damping * (0.1 if share > 0.5 else 1.0 if share > 0.25 else 2.0), 1e-9)
+                point, sure = trial if sure else likelihood.at(trial.x), share > 0.25
+                slow = slow + 1 if gain < close**2 / 8 else 0
                 break
-            damping = max(10 * damping, 1e-3)
+            damping, sure = max(10 * damping, 1e-3), False  # what may fail is tried without derivatives: a quarter of the work
         else:
             break
     at_bound = ((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0))
@@ -446,6 +465,12 @@ class StateSpaceFit:
     def values(self) -> dict[str, float]:
         """Return all parameters by name, those of field and gauge too, in um, s, N."""
         return self.maximum.point.values
+
+    @property
+    def covariance(self) -> Array:
+        """Return the covariance (k, k) of all parameters, in um, s, N; zero for one at a bound."""
+        unit = self.likelihood.unit(self.maximum.point.x)
+        return np.asarray(self.maximum.covariance * np.outer(unit, unit))
 
     @property
     def log_likelihood(self) -> float:
@@ -671,7 +696,7 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
             for kind, (_, noise) in likeliest.items():
                 x[kinds[kind]] = noise
     progress(f"coloured gauge noise: {wider.processes}")
-    maximum = maximise(wider, x, steps=8, close=1.0, progress=progress)
+    maximum = maximise(wider, x, steps=20, close=1.0, progress=progress)
     return StateSpaceFit(wider, maximum, wider.evaluations)
 
 
@@ -738,6 +763,6 @@ def as_fit(found: StateSpaceFit) -> Fit:
             RunFit(f.run.name, f.run.holdout, prediction, residual, parts, Noise(level, (), level), level, colours)
         )
     return Fit(
-        problem.names, problem.named(maximum.point.x[:k]), maximum.covariance[:k, :k], problem.lower, problem.upper,
+        problem.names, {**problem.held, **{n: values[n] for n in problem.names}}, found.covariance[:k, :k], problem.lower, problem.upper,
         tuple(runs), found.log_likelihood, maximum.status, found.evaluations,
     )  # fmt: skip

@@ -91,13 +91,14 @@ def kalman_filter(
     rtol: float = 1e-6,
     atol: Array,
     keep: bool = False,
+    most: int | None = None,
 ) -> Innovations:
     """Return the innovations of the readings `observed` (n,) at the rising times `t` (s), of which those `used` are taken up.
 
     A reading is `factor` (n,) times the elongation (or the gauge's own state) plus `offset` (n,) plus gauge noise: white of
     variance `R` (n,), and processes e' = -e/tau + s sqrt(2/tau) w whose (tau, s) are the rows of `gauge` (g, 2), g <= 3.
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
-    numbers in the same k directions. Raises SrfError without a compiler, or for a model without a random friction field.
+    numbers in the same k directions. After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a compiler, or for a model without a random friction field.
     """
     library = compiled(model)
     if library is None:
@@ -112,7 +113,7 @@ def kalman_filter(
     arrays = [np.full(shape, np.nan) for shape in shapes]
     stats, stop, reached = np.zeros(2), ctypes.c_int(0), n
     imposed, use = imposed_arguments(t, drive, load), np.ascontiguousarray(used, dtype=np.uint8)
-    size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000)
+    size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000) if most is None else most
     allowed = np.asarray(atol) * size / rtol
     for first in range(0, max(k, 1), LANES):
         own_nu, own_S = np.full((n, LANES), np.nan), np.full((n, LANES), np.nan)
