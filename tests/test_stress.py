@@ -86,15 +86,23 @@ def test_a_term_of_weight_zero_is_no_term() -> None:
                 assert {n: row[n] for n in numbers} == pytest.approx(numbers, rel=1e-6, abs=1e-8)
 
 
-def test_where_nothing_can_be_computed() -> None:
-    done = srf(
-        "floquet", "--V", "8", "--W0", "9", "--eps", "0.09", "--ageing", "dieterich+linker-dieterich", "--set", "B=0"
-    )
-    assert (
-        done.exit_code == 3
-        and "nothing can be computed at these values" in done.stderr
-        and "unexpected" not in done.stderr
-    )
+@pytest.mark.parametrize("ageing", ["dieterich+linker-dieterich", "nagata"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["floquet", "--V", "8", "--W0", "9", "--eps", "0.09"],
+        ["critical", "--V", "8", "--eps", "0.09"],
+        ["continue"],
+        ["map", "--over", "V=1:9:2", "--over", "K/W0=0.002:0.03:2"],
+        ["response", "--over", "f=1:9:2"],
+        ["simulate", "--for", "0.1", "--rate", "50"],
+    ],
+    ids=lambda c: c[0],
+)
+def test_where_nothing_can_be_computed(command: list[str], ageing: str) -> None:
+    done = srf(*command, "--ageing", ageing, "--set", "B=0")
+    assert done.exit_code == 2 and "nothing can be computed at B = 0" in done.stderr and done.stdout == ""
+    assert srf("linear", "--over", "V=8", "--ageing", ageing, "--set", "B=0").exit_code == 0  # the load is constant there
 
 
 def test_one_command_one_result_for_any_number_of_workers() -> None:

@@ -204,6 +204,8 @@ def _matches(
     from srfcli.numerics.comparematch import Match, check_adjusted, match, observe
 
     vectors = [m.vector(r.values) for m, r in zip(models, resolved, strict=True)]
+    for model, p in zip(models, vectors, strict=True):
+        model.check_changing_load(p)
     goal = observe(models[0], vectors[0], at)
     if goal is None:
         raise SrfError(
