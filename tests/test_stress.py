@@ -102,7 +102,15 @@ def test_a_term_of_weight_zero_is_no_term() -> None:
 def test_where_nothing_can_be_computed(command: list[str], ageing: str) -> None:
     done = srf(*command, "--ageing", ageing, "--set", "B=0")
     assert done.exit_code == 2 and "nothing can be computed at B = 0" in done.stderr and done.stdout == ""
-    assert srf("linear", "--over", "V=8", "--ageing", ageing, "--set", "B=0").exit_code == 0  # the load is constant there
+    steady = srf("linear", "--over", "V=8", "--ageing", ageing, "--set", "B=0")
+    assert steady.exit_code == 0  # under a constant load
+
+
+def test_a_record_of_which_nothing_was_reached() -> None:
+    words = "simulate --law rice-regularized --V 0.5 --W0 0.3 --eps 0.4 --f 1.3 --for 5 --rate 10"
+    values = ["K=6.4", "M=0.2", "mu0=123.7", "A=3.9e-5", "B=2.7e-4", "D0=15.7", "V0=4.9", "lambda=0.015"]
+    done = srf(*words.split(), *(w for v in values for w in ("--set", v)))
+    assert done.exit_code == 3 and "nothing of the record was reached" in done.output, done.output
 
 
 def test_one_command_one_result_for_any_number_of_workers() -> None:
