@@ -106,6 +106,13 @@ def test_where_nothing_can_be_computed(command: list[str], ageing: str) -> None:
     assert steady.exit_code == 0  # under a constant load
 
 
+def test_a_jacobian_that_overflows() -> None:
+    words = "linear --over V=0.027 --law rice-regularized --set A=0.000366 --set B=0.00959 --set V0=163 --set mu0=0.0177"
+    (row,) = json.loads(srf(*words.split(), "--set", "lambda=337", "--set", "D0=29.2", "--json").stdout)["rows"]
+    assert row["W0"] > 0 and row["lyapunov"] is None and row["criticality"] is None
+    assert row["status"] == "no Lyapunov coefficient: the Jacobian overflows"
+
+
 def test_a_record_of_which_nothing_was_reached() -> None:
     words = "simulate --law rice-regularized --V 0.5 --W0 0.3 --eps 0.4 --f 1.3 --for 5 --rate 10"
     values = ["K=6.4", "M=0.2", "mu0=123.7", "A=3.9e-5", "B=2.7e-4", "D0=15.7", "V0=4.9", "lambda=0.015"]
