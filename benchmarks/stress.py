@@ -89,6 +89,8 @@ def verdict(arguments: list[str]) -> tuple[str, str]:
         return "failed", f"exit {done.exit_code}: {said}"
     if done.exit_code == 2:
         return "refused", str(said)
+    if not done.stdout:
+        return ("failed" if "at these values" in done.stderr else "not converged"), f"{said} names no parameter"
     for row in json.loads(done.stdout)["rows"]:
         if row.get("status") == "ok" and any(
             row.get(n, 0) is None for n in ("W0", "K_over_W0", "Omega_c", "theta", "modulus")

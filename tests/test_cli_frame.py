@@ -206,7 +206,20 @@ def test_a_full_disk_is_one_line() -> None:
         code = "from srfcli.cli.main import main\nmain(['--version'])"
         env = {**os.environ, "PYTHONPATH": str(ROOT)}
         done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, env=env, timeout=60)
-    assert done.returncode == 1 and done.stderr.startswith(b"Error: No space left on device")
+    assert done.returncode == 1 and done.stderr.startswith(b"Error: standard output: No space left on device")
+
+
+def test_streams_that_are_closed_are_no_files(tmp_path: Path) -> None:
+    """What is written to a closed stream goes nowhere, and never into the file that is opened next."""
+    if os.name != "posix":
+        pytest.skip("closes streams by a shell")
+    code = "from srfcli.cli.main import main; main(['linear', '--over', 'V=8', '--json', '--out', 'a.json', '-v'])"
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    for closed in (">&-", "2>&-", "<&- >&- 2>&-"):
+        subprocess.run(["sh", "-c", f'"$0" -c "$1" {closed}', sys.executable, code], cwd=tmp_path, env=env, check=True)
+        json.loads((tmp_path / "a.json").read_text())
+        (tmp_path / "a.json").unlink()
+        (tmp_path / "a.json.provenance.json").unlink()
 
 
 def test_sigint_ends_with_130() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
+import signal
+import time
 
 import numpy as np
 import pytest
@@ -102,6 +104,31 @@ def test_re_entrance_begins_between_one_crossing_and_three(model, study):
         task = LawTask(model.source, model.key, model.vector(), (eps,), WINDOW, onset=1.0)
         counts.append(np.isfinite(read_study(study_law(task)).crossings[0]).sum(axis=1).max())
     assert counts[0] == 1 and counts[1] == 3
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="timers of the system")
+def test_an_interrupted_study_is_none(model):
+    """At whatever moment: half a study, kept by --resume, would be taken for a whole one."""
+    task = LawTask(model.source, model.key, model.vector(), (0.13,), Window((5.0, 40.0), (5.0, 40.0), 5, 7), onset=1.0)
+    begun = time.process_time()
+    whole = study_law(task)
+    spent = time.process_time() - begun
+    before = signal.signal(signal.SIGVTALRM, signal.default_int_handler)
+    ended = 0
+    try:
+        for share in (0.1, 0.3, 0.5, 0.7, 0.9):
+            signal.setitimer(signal.ITIMER_VIRTUAL, share * spent)
+            try:
+                found = study_law(task)
+            except KeyboardInterrupt:
+                ended += 1
+            else:
+                signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+                assert all(np.array_equal(found[name], whole[name], equal_nan=True) for name in whole)
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.signal(signal.SIGVTALRM, before)
+    assert ended
 
 
 def test_a_study_without_re_entrance_says_so(model):

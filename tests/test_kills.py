@@ -20,6 +20,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
+from srfcli.numerics.compiled import compiler
 
 pytestmark = [
     pytest.mark.usefixtures("empty_folder"),
@@ -222,6 +223,45 @@ def test_a_full_disk(case: str, size: int) -> None:
     if told.exists():
         name = {"experiment": "made", "law": "my-law.toml"}.get(case, "a.csv")
         assert "cannot be written" in told.read_text() and name in told.read_text()
+
+
+WINDOW = ("--eps", "0.09", "--over", "V=1:100:3", "--over", "K/W0=0.002:0.03:3", "--no-boundaries")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("map", *WINDOW, "--out", "map.csv", "--resume", "parts"), "part-00000.npz cannot be written"),
+        (("report", "."), "report.html cannot be written"),
+        (("linear", "--over", "V=8", "--plot", "a.svg"), "a.svg cannot be written"),
+        pytest.param(
+            ("simulate", "--law", "log-log", "--set", "mu0=0.3", "--for", "0.1", "--rate", "50"),
+            "no model can be compiled in the folder of temporary files",
+            marks=pytest.mark.skipif(compiler() is None, reason="NO COMPILER"),
+        ),
+    ],
+    ids=["part", "page", "figure", "library"],
+)
+def test_a_full_disk_names_the_file(
+    arguments: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    if arguments[0] == "simulate":
+        monkeypatch.setenv("SRF_CACHE", str(tmp_path_factory.mktemp("cache")))  # nothing is compiled there
+    elif arguments[0] == "map":
+        srf("map", *WINDOW)  # what it compiles is kept
+    srf("linear", "--over", "V=8", "--out", "a.json")
+    before, told = state(Path()), Path.cwd().parent / "told"
+
+    def work() -> int:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (600, resource.RLIM_INFINITY))
+        done = CliRunner().invoke(cli, arguments, prog_name="srf")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+        told.write_text(done.stderr)
+        return done.exit_code
+
+    code = forked(work)
+    assert code == 1 and said in told.read_text()
+    assert {n: d for n, d in state(Path()).items() if n != "parts/srf-run.json"} == before and hidden() == []
 
 
 def test_at_random_moments() -> None:

@@ -86,15 +86,38 @@ def test_a_term_of_weight_zero_is_no_term() -> None:
                 assert {n: row[n] for n in numbers} == pytest.approx(numbers, rel=1e-6, abs=1e-8)
 
 
-def test_where_nothing_can_be_computed() -> None:
-    done = srf(
-        "floquet", "--V", "8", "--W0", "9", "--eps", "0.09", "--ageing", "dieterich+linker-dieterich", "--set", "B=0"
-    )
-    assert (
-        done.exit_code == 3
-        and "nothing can be computed at these values" in done.stderr
-        and "unexpected" not in done.stderr
-    )
+@pytest.mark.parametrize("ageing", ["dieterich+linker-dieterich", "nagata"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["floquet", "--V", "8", "--W0", "9", "--eps", "0.09"],
+        ["critical", "--V", "8", "--eps", "0.09"],
+        ["continue"],
+        ["map", "--over", "V=1:9:2", "--over", "K/W0=0.002:0.03:2"],
+        ["response", "--over", "f=1:9:2"],
+        ["simulate", "--for", "0.1", "--rate", "50"],
+    ],
+    ids=lambda c: c[0],
+)
+def test_where_nothing_can_be_computed(command: list[str], ageing: str) -> None:
+    done = srf(*command, "--ageing", ageing, "--set", "B=0")
+    assert done.exit_code == 2 and "nothing can be computed at B = 0" in done.stderr and done.stdout == ""
+    steady = srf("linear", "--over", "V=8", "--ageing", ageing, "--set", "B=0")
+    assert steady.exit_code == 0  # under a constant load
+
+
+def test_a_jacobian_that_overflows() -> None:
+    words = "linear --over V=0.027 --law rice-regularized --set A=0.000366 --set B=0.00959 --set V0=163 --set mu0=0.0177"
+    (row,) = json.loads(srf(*words.split(), "--set", "lambda=337", "--set", "D0=29.2", "--json").stdout)["rows"]
+    assert row["W0"] > 0 and row["lyapunov"] is None and row["criticality"] is None
+    assert row["status"] == "no Lyapunov coefficient: the Jacobian overflows"
+
+
+def test_a_record_of_which_nothing_was_reached() -> None:
+    words = "simulate --law rice-regularized --V 0.5 --W0 0.3 --eps 0.4 --f 1.3 --for 5 --rate 10"
+    values = ["K=6.4", "M=0.2", "mu0=123.7", "A=3.9e-5", "B=2.7e-4", "D0=15.7", "V0=4.9", "lambda=0.015"]
+    done = srf(*words.split(), *(w for v in values for w in ("--set", v)))
+    assert done.exit_code == 3 and "nothing of the record was reached" in done.output, done.output
 
 
 def test_one_command_one_result_for_any_number_of_workers() -> None:

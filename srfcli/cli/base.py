@@ -21,6 +21,7 @@ import click
 from srfcli.errors import ExpressionError, SrfError, did_you_mean, printable
 
 EXIT_OK, EXIT_UNEXPECTED, EXIT_USAGE, EXIT_PARTIAL, EXIT_CONDITION, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
+STDOUT, STDERR = "standard output", "standard error"
 
 CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 
@@ -144,13 +145,27 @@ class Screen:
     round.
     """
 
-    def __init__(self, stream: TextIO) -> None:
-        self.unescaped = stream
+    def __init__(self, stream: TextIO, name: str) -> None:
+        self.unescaped, self.called = stream, name
 
     def write(self, text: str) -> int:
         """Write the text, printable."""
-        self.unescaped.write(printable(text))
+        with self._named():
+            self.unescaped.write(printable(text))
         return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream below."""
+        with self._named():
+            self.unescaped.flush()
+
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:  # of a full disk or the like: which file it was is otherwise not said
+            error.filename = error.filename or self.called
+            raise
 
     def writelines(self, lines: Iterable[str]) -> None:
         """Write every text, printable."""
@@ -166,7 +181,7 @@ class Screen:
 @contextlib.contextmanager
 def _screened() -> Iterator[None]:
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = (cast(TextIO, Screen(s)) for s in before)
+    sys.stdout, sys.stderr = (cast(TextIO, Screen(s, n)) for s, n in zip(before, (STDOUT, STDERR), strict=True))
     try:
         yield
     finally:
@@ -194,7 +209,16 @@ def _telling(session: Session) -> Iterator[None]:
         log.removeHandler(told)
 
 
+def _open_streams() -> None:
+    """Lead standard streams that were closed (>&-) to nothing: the next file to be opened would take their place."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # the lowest number that is free is the one that was closed
+            handle = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, os.fdopen(handle, mode, encoding="utf-8", closefd=False))
+
+
 def _run(group: click.Group, arguments: list[str], session: Session, **extra: Any) -> int:
+    _open_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for a Greek letter, it does not fail
@@ -227,6 +251,8 @@ def _ended(group: click.Group, arguments: list[str], session: Session, **extra: 
             _silence_stdout()
             return EXIT_UNEXPECTED
         where = f"{error.filename}: " if error.filename else ""
+        if error.filename == STDOUT:
+            _silence_stdout()
         return _end(f"{where}{error.strerror or error}", None, EXIT_UNEXPECTED, error, session)
     except Exception as error:
         if isinstance(error, ArithmeticError) or type(error).__name__ == "LinAlgError":  # NumPy's, not imported for it

@@ -8,6 +8,7 @@ import math
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -125,9 +126,15 @@ def command(
     tasks = [LawTask(models[k].source, models[k].key, matches[k].p, amplitudes, window) for k in usable]
     studies: dict[int, LawStudy] = {}
     with Progress("compare", total=len(tasks)) as progress:
-        for place, arrays in spread.run(study_law, tasks):
-            studies[usable[place]] = read_study(arrays)
-            progress.advance(note=names[usable[place]])
+        try:
+            for place, arrays in spread.run(study_law, tasks):
+                studies[usable[place]] = read_study(arrays)
+                progress.advance(note=names[usable[place]])
+        except KeyboardInterrupt:
+            if not studies:
+                raise
+            left = [k for k in usable if k not in studies]
+            matches = [replace(m, status=Status.INTERRUPTED) if k in left else m for k, m in enumerate(matches)]
     pairs, said = sentences(names, models, matches, studies, amplitudes, window)
     described = {n: v for n, v in resolved[0].described().items() if n not in ("V", "W0", "eps")}
     rows, worst = law_rows(names, matches, studies, amplitudes, largest, window)
@@ -204,6 +211,8 @@ def _matches(
     from srfcli.numerics.comparematch import Match, check_adjusted, match, observe
 
     vectors = [m.vector(r.values) for m, r in zip(models, resolved, strict=True)]
+    for model, p in zip(models, vectors, strict=True):
+        model.check_changing_load(p)
     goal = observe(models[0], vectors[0], at)
     if goal is None:
         raise SrfError(

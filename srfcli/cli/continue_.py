@@ -114,6 +114,7 @@ def command(
             )
     model = system.model()
     resolved = system.resolve(model.parameters, V=V, W0=W0)
+    model.check_changing_load(model.vector(resolved.values))
     tolerance = system.tolerance(tol).value
     settings = AtlasSettings(
         scan_lines, samples, tol=tolerance, max_mesh=max_mesh, steps=StepSettings(largest=step, max_steps=max_steps)

@@ -87,6 +87,7 @@ def command(
         raise SrfError(f"--tol {tol:g} or --resolution {resolution:g} is out of range", "--tol 1e-8 --resolution 1e-3")
     model = system.model()
     resolved = system.resolve(model.parameters)
+    model.check_changing_load(model.vector(resolved.values))
     velocities = V or (resolved.values["V"],)
     amplitudes = eps or (resolved.values["eps"],)
     limits = None if window is None else _window(window).fitted(model.parameters, where=model.title)

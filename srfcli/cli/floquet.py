@@ -61,8 +61,9 @@ def command(
     resolved = system.resolve(model.parameters, V=V, W0=W0, eps=eps)
     system.say_defaults(resolved, ("V", "W0", "eps"))
     tolerance = system.tolerance(tol).value
-    begun = time.perf_counter()
-    result = solve_floquet(model, model.vector(resolved.values), tol=tolerance, max_mesh=max_mesh, harmonics=harmonics)
+    begun, p = time.perf_counter(), model.vector(resolved.values)
+    model.check_changing_load(p)
+    result = solve_floquet(model, p, tol=tolerance, max_mesh=max_mesh, harmonics=harmonics)
     timings = {"solve": time.perf_counter() - begun}
     table = _table(model, result, resolved.described())
     emit(table, output, laws=model.laws, timings=timings, figure=lambda: _figure(model, result))

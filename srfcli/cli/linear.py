@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -91,10 +92,11 @@ def _rows(model: GeneratedModel, p: Any, names: Sequence[str], all_roots: bool) 
 def _point_cells(model: GeneratedModel, point: HopfPoint, value: dict[str, float]) -> dict[str, Any]:
     cells: dict[str, Any] = {"W0": point.W0, "K_over_W0": value["K"] / point.W0, "Omega_c": point.Omega}
     cells["crossing_rate"], cells["lyapunov"], cells["leading"] = point.crossing_rate, point.lyapunov, point.leading
-    cells["criticality"] = "direct" if point.direct else "inverted"
+    known = math.isfinite(point.lyapunov)
+    cells["criticality"] = ("direct" if point.direct else "inverted") if known else None
     if "D0" in value:
         cells["Omega_reduced"] = value["D0"] * point.Omega / value["V"]
-    return cells | {"status": "ok"}
+    return cells | {"status": "ok" if known else "no Lyapunov coefficient: the Jacobian overflows"}
 
 
 def _table(

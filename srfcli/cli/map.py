@@ -173,7 +173,9 @@ def _resolved_grid(
                 f"{name} is an axis and has a value too", f"Leave out --{name}, or take {name} out of --over."
             )
     resolved = system.resolve(model.parameters, **given)
-    return resolved, read_grid(model, model.vector(resolved.values), over)
+    p = model.vector(resolved.values)
+    model.check_changing_load(p)
+    return resolved, read_grid(model, p, over)
 
 
 def _tables(

@@ -81,6 +81,7 @@ def command(
         if value is not None and name == swept.name:
             raise SrfError(f"{name} is swept and has a value too", f"Leave out --{name}, or sweep another parameter.")
     system.say_defaults(resolved, {"V", "W0"} - {swept.name})
+    model.check_changing_load(model.vector(resolved.values))
     begun = time.perf_counter()
     tolerance = system.tolerance(tol).value
     if mean:

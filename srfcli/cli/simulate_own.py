@@ -45,6 +45,7 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     resolved = system.resolve(model.parameters, **{name: given[name] for name in ("V", "W0", "eps")})
     values, observable = resolved.values, given["observable"] or "elongation"
     p = model.vector(values)
+    model.check_changing_load(p)
     recorded, begin, span, found = _recorded_load(system, given["load_file"], given["reader"])
     pieces = _drive_pieces(given, values["V"], span)
     f = values["f"] if values["eps"] else None

@@ -109,6 +109,7 @@ def _job(model: GeneratedModel, experiment: Experiment, run: Run, flags: Mapping
     mass = {"M": experiment.mass} if experiment.mass and "M" in model.names else {}
     values = _values(model, experiment) | {"K": run.stiffness} | mass | _asked_by_effects(model, run) | dict(flags)
     p = model.vector(values)
+    model.check_changing_load(p)
     try:
         state = start_state(model, p, start, drive=run.drive, load=run.load.rest(begin), begin=begin)
     except SrfError as error:

@@ -208,6 +208,8 @@ def summary(r: Record, *, named: bool) -> list[str]:
     import numpy as np
 
     n, trace, lead = r.done, r.trace, f"{r.job.name}: " if named else ""
+    if n == 0:
+        return [f"{lead}nothing of the record was reached: {trace.status.advice}"]
     t, v = trace.t[:n], trace.v[:n]
     low, high = int(np.argmin(v)), int(np.argmax(v))
     slip = f"slip velocity from {v[low]:.3g} um/s at t = {t[low]:.6g} s to {v[high]:.3g} um/s at t = {t[high]:.6g} s"

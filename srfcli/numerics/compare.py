@@ -74,7 +74,10 @@ class LawStudy:
 
 
 def study_law(task: LawTask) -> dict[str, Array]:
-    """Return the study of a law as plain arrays, which `read_study` puts together; it depends on nothing but `task`."""
+    """Return the study of a law as plain arrays, which `read_study` puts together; it depends on nothing but `task`.
+
+    A KeyboardInterrupt ends it: half a search is no study, and must not be kept as one.
+    """
     model = load_source(task.source, key=task.key)
     out: dict[str, Array] = {"amplitudes": np.array(task.amplitudes)}
     several = []
@@ -118,6 +121,8 @@ def _boundaries(model: GeneratedModel, task: LawTask, eps: float) -> tuple[list[
     grid = MapGrid(base, MapAxis("V", *window.V, window.columns), MapAxis("W0", *window.W0, window.rows))
     found = compute_map(model, grid, MapSettings(depth=3))
     *_, atlas = find_boundaries(model, found, AtlasSettings(tol=task.tol))
+    if not found.finished or atlas.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
     curves = [_curve(model, b) for b in atlas.branches]
     odd = len(unexplained(model, found, atlas))
     status = Status.NO_CONVERGENCE if odd or found.lost else atlas.status
@@ -205,6 +210,8 @@ def _followed(model: GeneratedModel, task: LawTask, eps: float) -> Iterator[list
     base[model.index("eps")] = eps
     plane = Plane(base, Axis("V", *task.window.V), Axis("W0", *task.window.W0))
     for atlas in find_components(model, plane, AtlasSettings(lines=8, tol=1e-4)):
+        if atlas.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
         yield [_curve(model, b) for b in atlas.branches]
 
 

@@ -176,8 +176,15 @@ def library_of(write: Callable[[], str], parts: Sequence[str]) -> ctypes.CDLL:
         path = folder / f"{key}.so"
         with contextlib.suppress(OSError):  # a cache that cannot be written, or a disk from which nothing may be run
             return _load(path if _intact(path) else _build(command, write(), path, sealed=True))
-    with tempfile.TemporaryDirectory(prefix="srf-", ignore_cleanup_errors=True) as scratch:
-        return _load(_build(command, write(), Path(scratch) / f"{key}.so"))  # it stays in memory when its file is gone
+    try:
+        with tempfile.TemporaryDirectory(prefix="srf-", ignore_cleanup_errors=True) as scratch:
+            return _load(_build(command, write(), Path(scratch) / f"{key}.so"))  # it stays in memory when its file is gone
+    except OSError as error:
+        raise SrfError(
+            f"no model can be compiled in {error.filename or 'the folder of temporary files'}: {error.strerror or error}",
+            "Make room there, name another folder by TMPDIR, or turn compiling off: SRF_CC=",
+            exit_code=1,
+        ) from error
 
 
 def _build(command: tuple[str, ...], source: str, path: Path, *, sealed: bool = False) -> Path:

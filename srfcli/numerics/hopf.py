@@ -6,6 +6,7 @@ that belong to a pair of imaginary roots are polished on the exact characteristi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,9 +184,12 @@ def rest_state(model: GeneratedModel, p: Array) -> tuple[Array, Array]:
 def lyapunov_coefficient(model: GeneratedModel, p: Array, Omega: float) -> float:
     """Return Re(c)/Omega of the normal form z' = i Omega z + c |z|^2 z at a Hopf point (Kuznetsov, eq. 5.62).
 
-    z is scaled so that the perturbation of ln v is 2 Re z.
+    z is scaled so that the perturbation of ln v is 2 Re z. NaN where the Jacobian overflows.
     """
-    x, A = rest_state(model, p)
+    with np.errstate(all="ignore"):
+        x, A = rest_state(model, p)
+    if not np.isfinite(A).all():
+        return math.nan
     n = x.shape[-1]
     values, vectors = np.linalg.eig(A)
     k = int(np.argmin(np.abs(values - 1j * Omega)))

@@ -364,9 +364,9 @@ def _read(sketch: _Sketch, registry: Registry) -> tuple[list[Run], tuple[str, ..
                     if name not in free:
                         free = (*free, name)
                         continue
-                if "no contact" in error.message or "the load is" in error.message:
-                    raise SrfError(error.message, "Take the part in contact: --window FROM,TO in seconds.") from None
-                raise SrfError(re.sub(r"\S*experiment\.toml(, line \d+)?: ", "", error.message), error.hint) from None
+                apart = "no contact" in error.message or "the load is" in error.message
+                hint = "Take the part in contact: --window FROM,TO in seconds." if apart else error.hint
+                raise SrfError(re.sub(rf"{re.escape(str(file))}(, line \d+)?: ", "", error.message), hint) from None
 
 
 def _check(text: str, registry: Registry) -> None:
