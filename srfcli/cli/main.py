@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import importlib
 import os
 from collections.abc import Iterator, MutableMapping, Sequence
@@ -132,6 +134,8 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run `srf` with `argv`, or with the process's arguments, and exit."""
     for library in ("OPENBLAS", "MKL", "OMP"):  # all matrices here are small: threads only cost their start
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    gc.set_threshold(100_000, 10, 10)  # to look for cycles among what is imported, and at the end, is a sixth of a short run
+    atexit.register(gc.freeze)
     cli.main(argv)
 
 
