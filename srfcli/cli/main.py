@@ -99,6 +99,9 @@ class Commands(MutableMapping[str, click.Command]):
             command = self._kept[name] = getattr(importlib.import_module(module), attribute)
         return command
 
+    def __contains__(self, name: object) -> bool:
+        return name in self._kept
+
     def __setitem__(self, name: str, command: click.Command) -> None:
         self._kept[name] = command
 
