@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy
 
 from srfcli.model import open_model
 from srfcli.prebuilt import FOLDER, find_built
@@ -50,6 +51,9 @@ def test_every_shipped_system_is_there_under_its_present_key(monkeypatch: pytest
     ids=str,
 )
 def test_the_text_is_what_is_derived(asked: dict[str, Any]) -> None:
+    writer = (FOLDER / "sympy.txt").read_text(encoding="utf-8").strip()
+    if writer != sympy.__version__:
+        pytest.skip(f"the shipped modules were written with sympy {writer}, here is {sympy.__version__}")
     name, text = tool().module_file(**asked)
     assert (FOLDER / name).read_text(encoding="utf-8") == text, REPAIR
 

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import sympy
+
 from srfcli.lawfile import read_header
 from srfcli.model import open_model
 from srfcli.prebuilt import FOLDER, MARK, header_key
@@ -45,6 +47,7 @@ def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER
     folder.mkdir(exist_ok=True)
     (folder / "headers.json").write_text(headers_text(), encoding="utf-8")
+    (folder / "sympy.txt").write_text(f"{sympy.__version__}\n", encoding="utf-8")
     wanted = [module_file(**asked) for asked in shipped_systems()]
     for path in {*folder.glob("*.py")} - {folder / name for name, _ in wanted}:
         path.unlink()
