@@ -14,6 +14,7 @@ from pathlib import Path
 from srfcli.errors import SrfError, did_you_mean
 from srfcli.lawfile import PLUGIN_KINDS, kind_of, read_header, read_law
 from srfcli.laws import AgeingLaw, AgeingModifier, Law
+from srfcli.prebuilt import header_key, known_headers
 from srfcli.pylaw import find_law, find_reader, laws_in, load_module, scan_python
 from srfcli.reader import Reader
 from srfcli.reading import read_plain
@@ -257,7 +258,7 @@ class _Collector:
         self.guard(path.stem, origin, path, lambda: self.add(origin, path, module, only))
 
     def add(self, origin: str, path: Path, module: str | None, only: str | None) -> None:
-        found = [read_header(path)] if path.suffix == ".toml" else scan_python(path)
+        found = _known(path) or ([read_header(path)] if path.suffix == ".toml" else scan_python(path))
         if only is not None:
             found = [entry for entry in found if entry[1] == only.replace("_", "-")]
         self.entries += [Entry(name, kind, origin, path, about, module) for kind, name, about in found]
@@ -294,6 +295,14 @@ def _law_files(folder: Path) -> Iterator[Path]:
             yield from sorted(
                 p for p in place.iterdir() if p.suffix in (".toml", ".py") and not p.name.startswith(("_", "."))
             )
+
+
+def _known(path: Path) -> list[tuple[str, str, str]] | None:
+    """Return what the package already knows of a file of this name and content, None where that is nothing."""
+    try:
+        return known_headers().get(header_key(path, read_plain(path)))
+    except (OSError, SrfError):  # its reader says what is wrong
+        return None
 
 
 def _has_laws(place: Path) -> bool:

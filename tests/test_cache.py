@@ -117,7 +117,7 @@ def test_a_changed_law_is_derived_anew(folder: Path, tmp_path: Path) -> None:
 def test_a_second_start_imports_no_sympy(folder: Path) -> None:
     code = (
         "import sys; from srfcli.model import open_model; from srfcli.registry import load_registry; "
-        "open_model(load_registry()); print('sympy' in sys.modules)"
+        "open_model(load_registry(), inertia=False, loading='inclined'); print('sympy' in sys.modules)"
     )
     environment = {**os.environ, "SRF_CACHE": str(folder)}
     runs = [
@@ -234,9 +234,14 @@ def test_a_forged_entry_never_runs(folder: Path, tmp_path: Path) -> None:
 def test_a_forged_library_is_never_loaded(folder: Path, tmp_path: Path, make_model, monkeypatch) -> None:
     command = compiler()
     assert command is not None
-    for name, code in ("good", "int srf_integrate(void) { return 7; }"), ("evil", "int srf_integrate(void) { return 13; }"):
+    for name, code in (
+        ("good", "int srf_integrate(void) { return 7; }"),
+        ("evil", "int srf_integrate(void) { return 13; }"),
+    ):
         (tmp_path / f"{name}.c").write_text(code)
-        subprocess.run([*command, "-shared", "-fPIC", "-o", tmp_path / f"{name}.so", tmp_path / f"{name}.c"], check=True)
+        subprocess.run(
+            [*command, "-shared", "-fPIC", "-o", tmp_path / f"{name}.so", tmp_path / f"{name}.c"], check=True
+        )
     evil = (tmp_path / "evil.so").read_bytes()
     quick = tmp_path / "cc.py"  # compiles everything to good.so
     quick.write_text(
@@ -284,7 +289,7 @@ def test_a_command_says_once_that_nothing_is_cached(folder: Path) -> None:
     folder.chmod(0o777)
     for more, said in ((), 1), (("-q",), 0):
         cache._warn.cache_clear()
-        done = CliRunner().invoke(cli, ["linear", *more], prog_name="srf")
+        done = CliRunner().invoke(cli, ["linear", "--no-inertia", "--loading", "inclined", *more], prog_name="srf")
         assert done.exit_code == 0, done.output
         assert done.stderr.count("Warning: nothing is cached: others may write to") == said
     assert not list(folder.iterdir())

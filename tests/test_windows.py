@@ -36,6 +36,14 @@ def test_islands_far_below(model):
     assert line.crossings == tuple(range(1, len(line.points) + 1))
 
 
+def test_a_jump_between_branches_is_no_crossing(model):
+    """Where the slider's swing is driven at its own frequency, two stable states end in folds, with unstable ones between."""
+    line = critical_line(model, model.vector({"V": 0.1, "eps": 0.5}), lo=6.7242987, hi=7.0565009, samples=3)
+    assert line.status is Status.NO_CONVERGENCE
+    assert line.points and all(q.status is Status.NO_CONVERGENCE for q in line.points)
+    assert len(line.notes) == len(line.points) and all("was not located" in note for note in line.notes)
+
+
 @pytest.mark.parametrize(
     ("law", "ageing", "V", "eps"),
     [("bowden-tabor", "dieterich", 3.0, 0.4), ("srf-vsat", "dieterich", 150.0, 0.1)],

@@ -2,37 +2,73 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import importlib
 import os
-from collections.abc import Sequence
-from typing import NoReturn
+from collections.abc import Iterator, MutableMapping, Sequence
+from typing import Any, NoReturn
 
 import click
 
 from srfcli import __version__
 from srfcli.cli.base import CONTEXT, SrfGroup, switches
 
-# command -> module:attribute, in the order of `srf --help`
+# command -> module:attribute and the first sentence of its help, in the order of `srf --help`, which imports none of them
 COMMANDS = {
-    "laws": "srfcli.cli.laws:laws",
-    "law": "srfcli.cli.law:law",
-    "derive": "srfcli.cli.derive:command",
-    "code": "srfcli.cli.code:command",
-    "linear": "srfcli.cli.linear:command",
-    "critical": "srfcli.cli.critical:command",
-    "continue": "srfcli.cli.continue_:command",
-    "floquet": "srfcli.cli.floquet:command",
-    "map": "srfcli.cli.map:command",
-    "response": "srfcli.cli.response:command",
-    "compare": "srfcli.cli.compare:command",
-    "new": "srfcli.cli.new:command",
-    "check": "srfcli.cli.check:command",
-    "fit": "srfcli.cli.fit:command",
-    "diagnose": "srfcli.cli.diagnose:command",
-    "report": "srfcli.cli.report:command",
-    "simulate": "srfcli.cli.simulate:command",
-    "prove": "srfcli.cli.prove:command",
-    "config": "srfcli.cli.config:command",
+    "laws": ("srfcli.cli.laws:laws", "List the laws that are found; none is imported for that."),
+    "law": ("srfcli.cli.law:law", "Show, write and check laws."),
+    "derive": (
+        "srfcli.cli.derive:command",
+        "Steady state, slopes, equations, dispersion relation and closed critical loads of a system, by algebra.",
+    ),
+    "code": (
+        "srfcli.cli.code:command",
+        "Print the generated NumPy module of a system: rates, Jacobians, derivatives by the parameters, "
+        "characteristic polynomial.",
+    ),
+    "linear": ("srfcli.cli.linear:command", "Critical load, K/W0 and frequency of steady sliding under constant load."),
+    "critical": ("srfcli.cli.critical:command", "Every critical load at the given velocities, numbered from low W0."),
+    "continue": (
+        "srfcli.cli.continue_:command",
+        "The stability boundary of the forced sliding state in a plane of two parameters.",
+    ),
+    "floquet": (
+        "srfcli.cli.floquet:command",
+        "The forced periodic state at one V, W0 and eps: multipliers, mean friction, harmonics.",
+    ),
+    "map": ("srfcli.cli.map:command", "The stability of the forced sliding state over a plane of two parameters."),
+    "response": (
+        "srfcli.cli.response:command",
+        "How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t).",
+    ),
+    "compare": (
+        "srfcli.cli.compare:command",
+        "Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment tells them apart.",
+    ),
+    "new": (
+        "srfcli.cli.new:command",
+        "Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take.",
+    ),
+    "check": ("srfcli.cli.check:command", "Read and validate an experiment and report what its recordings are like."),
+    "fit": (
+        "srfcli.cli.fit:command",
+        "Fit the model of an experiment to its recordings, all runs together, by maximum likelihood.",
+    ),
+    "diagnose": (
+        "srfcli.cli.diagnose:command",
+        "Say where recordings and their model part, and which physics the model lacks.",
+    ),
+    "report": (
+        "srfcli.cli.report:command",
+        "Write one page on the fits, maps, comparisons and other results of a folder.",
+    ),
+    "simulate": (
+        "srfcli.cli.simulate:command",
+        "Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding.",
+    ),
+    "prove": ("srfcli.cli.prove:command", "Prove the diagnosis on experiments whose truth nobody has seen."),
+    "config": ("srfcli.cli.config:command", "Show which values are used, and who set them."),
 }
 
 EPILOG = """
@@ -50,26 +86,59 @@ Exit codes: 0 done, 1 unexpected or I/O, 2 usage or a bad law, 3 did not converg
 """
 
 
-@click.group(cls=SrfGroup, name="srf", epilog=EPILOG, context_settings=CONTEXT, params=switches())
+class Commands(MutableMapping[str, click.Command]):
+    """The commands by name; one of COMMANDS is imported when it is asked for."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, click.Command | None] = dict.fromkeys(COMMANDS)
+
+    def __getitem__(self, name: str) -> click.Command:
+        command = self._kept[name]
+        if command is None:
+            module, _, attribute = COMMANDS[name][0].partition(":")
+            command = self._kept[name] = getattr(importlib.import_module(module), attribute)
+        return command
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._kept
+
+    def __setitem__(self, name: str, command: click.Command) -> None:
+        self._kept[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        del self._kept[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._kept)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+
+class Srf(SrfGroup):
+    """`srf` itself: its commands stand in COMMANDS, and only the one that runs is imported."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.commands = Commands()
+
+    def summaries(self) -> list[tuple[str, str]]:
+        """Return the commands' names and first sentences."""
+        return [(name, sentence) for name, (_, sentence) in COMMANDS.items()]
+
+
+@click.group(cls=Srf, name="srf", epilog=EPILOG, context_settings=CONTEXT, params=switches())
 @click.version_option(__version__, prog_name="srf", message="%(prog)s %(version)s")
 def cli() -> None:
     """State-and-rate friction: from a law to the boundary between steady sliding and stick-slip."""
-
-
-def register(group: click.Group) -> None:
-    """Add every command of COMMANDS to `group`."""
-    for name, place in COMMANDS.items():
-        module, _, attribute = place.partition(":")
-        group.add_command(getattr(importlib.import_module(module), attribute), name)
-
-
-register(cli)
 
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run `srf` with `argv`, or with the process's arguments, and exit."""
     for library in ("OPENBLAS", "MKL", "OMP"):  # all matrices here are small: threads only cost their start
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    gc.set_threshold(100_000, 10, 10)  # to look for cycles among what is imported, and at the end, is a sixth of a short run
+    atexit.register(gc.freeze)
     cli.main(argv)
 
 

@@ -198,7 +198,7 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
     direction = _across(model, plane, pts)
     polished: list[BoundaryPoint | None] = [None] * len(pts)
     meshes = np.array([len(pt.orbit.edges) for pt in pts])
-    for edges in np.unique(meshes):
+    for edges in sorted(set(meshes.tolist())):  # np.unique imports numpy.ma
         index = np.nonzero(meshes == edges)[0]
         group = [pts[i] for i in index]
         found = polish(

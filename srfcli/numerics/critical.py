@@ -16,6 +16,7 @@ from srfcli.status import Status
 SAMPLES = 192
 INTERVALS = 16
 DEPTH = 4  # rescans of a bracket that Newton's method left
+JUMP = 0.5  # of the growth rates at a bracket's ends: what stays of them on a quarter of its width where they jump
 
 
 @dataclass(frozen=True)
@@ -92,11 +93,14 @@ def locate_crossings(
     max_mesh: int = 512,
     brackets: list[int] | None = None,
     depth: int = 0,
+    outer: tuple[float, ...] = (),
 ) -> list[BoundaryPoint]:
     """Return the polished boundary point of every sign change of a scan, or of those in `brackets`, rising.
 
     Newton's method may leave its bracket for a neighbour's root, and a coarse mesh may misplace a bracket; such a bracket is
-    scanned again, nine samples on twice the mesh, down to DEPTH levels.
+    scanned again, nine samples on twice the mesh, down to DEPTH levels; `outer` holds the growth rates' difference across the
+    brackets around this scan. Where that stays twice though the bracket is narrower, the forced state jumps from one branch to
+    another, as beyond a fold, and there is no crossing to be located.
     """
     brackets = scan.brackets() if brackets is None else brackets
     found = []
@@ -106,13 +110,19 @@ def locate_crossings(
         inside = lower / margin <= point.value(model, scan.name) <= upper * margin
         rising = scan.g[i] < scan.g[i + 1]
         trusted = inside and point.status is not Status.NO_CONVERGENCE and (point.slope > 0) == rising
-        if trusted or depth == DEPTH:
+        across = (*outer, float(abs(scan.g[i + 1] - scan.g[i])))
+        if trusted or depth == DEPTH or _jumps(across):
             found.append(point)
             continue
         values = np.geomspace(lower / margin, upper * margin, 9)
         again = scan_line(model, base, scan.name, values, intervals=2 * (len(scan.orbit.edges) - 1), resolution=1e-6)
-        found += locate_crossings(model, base, again, tol=tol, max_mesh=max_mesh, depth=depth + 1)
+        found += locate_crossings(model, base, again, tol=tol, max_mesh=max_mesh, depth=depth + 1, outer=across)
     return _distinct(sorted(found, key=lambda q: q.value(model, scan.name)), model, scan.name)
+
+
+def _jumps(across: tuple[float, ...]) -> bool:
+    """Return whether a difference stayed twice though its bracket was narrowed."""
+    return len(across) > 2 and across[-1] > JUMP * across[-2] > JUMP**2 * across[-3]
 
 
 def _distinct(points: list[BoundaryPoint], model: GeneratedModel, name: str) -> list[BoundaryPoint]:
@@ -161,17 +171,24 @@ def _notes(
                 f"no forced periodic state was found at {scan.lost.size} of {len(scan.values)} samples of {scan.name} {span}"
             )
             status = Status.NO_CONVERGENCE
-    expected = True  # that stability is lost as the parameter rises
+    expected: bool | None = True  # that stability is lost as the parameter rises; None where it cannot be said
     for point, crossing in zip(points, crossings, strict=True):
         if crossing == crossings[0]:
             expected = crossing % 2 == 1
+        if point.status is Status.NO_CONVERGENCE:
+            place = f"{line.scan.name} = {point.value(model, line.scan.name):.4g}"
+            notes.append(
+                f"crossing {crossing} near {place} was not located: where the forced state has several branches they end in folds"
+            )
+            status, expected = Status.NO_CONVERGENCE, None
+            continue
         losing = point.slope > 0 if point.slope else expected
-        if losing != expected:
+        if expected is not None and losing != expected:
             notes.append(
                 f"crossing {crossing} has the wrong direction: a crossing closer than {line.scan.resolution:.1g} was missed"
             )
             status = Status.NO_CONVERGENCE
-        expected = not losing
+        expected = None if losing is None else not losing
     if line.reach is not None and not line.reach.settled:
         low, high = line.scans[0].values[0], line.scans[-1].values[-1]
         ends = [f"below {low:.4g} N"] * (not line.reach.settled_below) + [f"above {high:.4g} N"] * (

@@ -148,7 +148,7 @@ def polish(
         index, coarse, known = waiting.pop()
         N = coarse.orbit.x.shape[-2]
         wanted = wanted_mesh(mesh_error(model, coarse.orbit), N, tol, max_mesh)
-        for mesh in np.unique(wanted):
+        for mesh in sorted(set(wanted.tolist())):  # np.unique imports numpy.ma
             here = np.nonzero(wanted == mesh)[0]
             part = _select(coarse, here)
             start = part.orbit if mesh == N else interpolate(part.orbit, uniform_mesh(int(mesh)))
