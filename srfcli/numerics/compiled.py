@@ -157,7 +157,7 @@ def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
 def _writers() -> str:
     """Return the hash of all that C text is written with, besides the model: files of this package."""
     here, data = files("srfcli") / "numerics", files("srfcli") / "data"
-    written = [here / name for name in ("compiled.py", "ctext.py", "collocation.py", "orbit.py")]
+    written = [here / name for name in ("compiled.py", "ctext.py", "gauss.py", "orbitkernel.py")]
     written += [data / name for name in ("radau.c", "filter.c", "orbit.c")]
     return content_key([path.read_text(encoding="utf-8") for path in written])
 
