@@ -28,7 +28,7 @@ def kernel(model: GeneratedModel) -> ctypes.CDLL | None:
     scheme = gauss()
     try:
         write = partial(orbit_source, model, {"MI": scheme.inverse, "STEP": scheme.step}, LOG_STEP)
-        library = library_of(write, ["orbits", model.source])
+        library = library_of(write, ["orbits", model.source, repr(scheme), repr(LOG_STEP)])
     except NoForm:
         return None
     library.srf_orbits.restype = ctypes.c_int
