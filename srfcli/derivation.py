@@ -9,9 +9,10 @@ import sympy as sp
 
 from srfcli.closed_limits import ClosedLimits, closed_limits, in_law_parameters, weakening_first
 from srfcli.derive import characteristic_polynomial, friction_slopes, paper_coefficients, slope_symbols
+from srfcli.equations import equations_of, steady_states
 from srfcli.expression import symbol
 from srfcli.notation import latex_name
-from srfcli.system import System, state_rate, steady_states
+from srfcli.system import System, state_rate
 from srfcli.units import to_base
 
 EXTRAS = ("jacobian", "parameters")
@@ -61,7 +62,7 @@ def _laws(system: System) -> Section:
         formulas.append(_one("kappa", system.interface.kappa))
     imposed = "W is the imposed load, W0 (1 + eps cos(2 pi f t)), and W_dot its rate"
     if system.loading == "inclined":
-        formulas.append(_one("normal load", system.equations.load, r"W_{\text{normal}}"))
+        formulas.append(_one("normal load", equations_of(system).load, r"W_{\text{normal}}"))
         imposed += "; in the laws W stands for the normal load"
     return Section("laws", "Laws", tuple(formulas), (imposed,))
 
@@ -103,14 +104,14 @@ def _rate_name(name: str) -> tuple[str, str]:
 
 
 def _equations(system: System) -> Section:
-    eq = system.equations
+    eq = equations_of(system)
     formulas = tuple(Formula(*_rate_name(n), e) for n, e in zip(eq.names, eq.rates, strict=True))
     unknowns = ", ".join(n.replace("ln_", "ln ") for n in eq.names)
     return Section("equations", f"First-order equations in ({unknowns})", formulas)
 
 
 def _jacobian(system: System) -> Section:
-    eq = system.equations
+    eq = equations_of(system)
     formulas = []
     for name, rate in zip(eq.names, eq.rates, strict=True):
         for j, other in enumerate(eq.names):
@@ -123,7 +124,7 @@ def _jacobian(system: System) -> Section:
 
 
 def _parameters(system: System) -> Section:
-    eq, t = system.equations, symbol("t")
+    eq, t = equations_of(system), symbol("t")
     W0, eps, f = symbol("W0"), symbol("eps"), symbol("f")
     load = W0 * (1 + eps * sp.cos(2 * sp.pi * f * t))
     imposed = {symbol("W"): load, symbol("W_dot"): sp.diff(load, t)}

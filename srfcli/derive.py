@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 
 import sympy as sp
 
+from srfcli.equations import settle, steady_states
 from srfcli.expression import symbol
-from srfcli.system import System, settle, state_rate, steady_states
+from srfcli.system import System, state_rate
 
 
 @dataclass(frozen=True)

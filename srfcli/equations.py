@@ -2,16 +2,107 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
+from functools import lru_cache
 
 import sympy as sp
+from sympy.solvers.solveset import NonlinearError
 
 from srfcli.errors import SrfError
 from srfcli.expression import symbol
 from srfcli.laws import ExtraState
-from srfcli.system import FOLLOWED, Equations, System, lut, solve_linear, state_rate, steady_states, tidy
+from srfcli.system import FOLLOWED, System, state_rate
 
 AUXILIARY = {"slip": "v", "stage": "V", "time": "1"}  # unknowns that an effect may name, um, um, s, and their rates
+MAX_CANCEL = 80  # operations: beyond it a common denominator takes a minute to find and shortens nothing
+
+
+@dataclass(frozen=True)
+class Equations:
+    """x' = rates(x, t): `unknowns` are the symbols that stand in the formulas (v, not ln v), `logarithmic` says which.
+
+    `load` is W as a function of the imposed load `W` and its rate `W_dot`; `spring` is the elongation u, an unknown or a formula.
+    """
+
+    names: tuple[str, ...]
+    unknowns: tuple[sp.Symbol, ...]
+    logarithmic: tuple[bool, ...]
+    rates: tuple[sp.Expr, ...]
+    spring: sp.Expr
+    load: sp.Expr
+    mu: sp.Expr
+    steady: tuple[sp.Expr, ...]
+
+    def derivative(self, expression: sp.Expr, index: int) -> sp.Expr:
+        """Return d(expression)/d(unknown), by the logarithm where the unknown is logarithmic."""
+        s = self.unknowns[index]
+        d = sp.diff(expression, s)
+        return s * d if self.logarithmic[index] else d
+
+
+class lut(sp.Function):
+    """lut(i, x): the i-th table, a cubic spline of x whose numbers follow the parameters."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return the slope by x."""
+        return lut1(*self.args)
+
+
+class lut1(sp.Function):
+    """The first derivative of a table."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return the slope by x."""
+        return lut2(*self.args)
+
+
+class lut2(sp.Function):
+    """The second derivative of a table."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return no slope: it is asked for in the Jacobian's column of time alone, which meets a sensitivity that is none."""
+        return sp.S.Zero
+
+
+@lru_cache(maxsize=32)
+def steady_states(system: System) -> tuple[sp.Expr, ...]:
+    """Return each state variable in steady sliding at velocity v, as a formula in v.
+
+    Raises SrfError where no closed form is found; laws with phi = y D0/v, y a constant or a Lambert function, have one.
+    """
+    v = symbol("v")
+    still = {symbol(n): sp.S.Zero for n in ("mu_dot", "W_dot", "F_dot_over_W")}
+    found = []
+    for state in system.friction.states:
+        rate = state_rate(system, state).subs(still)
+        length, phi = symbol(state.length), symbol(state.name)
+        y = sp.Symbol("y", positive=True)
+        reduced = sp.expand_log(sp.simplify(rate.subs(phi, y * length / v)), force=True)
+        found.append(_steady_root(reduced, y, system.ageing.name) * length / v)
+    return tuple(found)
+
+
+def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
+    for guess in (sp.S.One, sp.S(2)):
+        if sp.simplify(reduced.subs(y, guess)) == 0:
+            return guess
+    try:
+        roots = [r for r in sp.solve(reduced, y) if not r.has(sp.I)]
+    except NotImplementedError:
+        roots = []
+    if not roots:
+        raise SrfError(
+            f"no closed form for the steady state of ageing law '{name}' was found",
+            "write the rate in terms of v*phi/D0 so that it vanishes at a constant, as 1 - v*phi/D0 does",
+        )
+    return roots[0]
 
 
 @dataclass(frozen=True)
@@ -95,7 +186,8 @@ def auxiliary(system: System, parts: Parts) -> tuple[str, ...]:
     return tuple(a for a in AUXILIARY if a in used)
 
 
-def build_equations(system: System) -> Equations:
+@lru_cache(maxsize=32)
+def equations_of(system: System) -> Equations:
     """Return x' = f(x, t) of `system`, solved for the derivatives.
 
     The slip relation d(W mu/kappa)/dt = z - v, the force balance and the ageing laws are linear in the unknown derivatives
@@ -298,3 +390,92 @@ class _Builder:
             (load, self.total_load()),
             (self.imposed, W),
         ]
+
+
+def solve_linear(balance: list[sp.Expr], wanted: list[sp.Symbol], system: System) -> dict[sp.Symbol, sp.Expr]:
+    try:
+        matrix, right = sp.linear_eq_to_matrix(balance, wanted)
+    except NonlinearError as error:
+        raise SrfError(
+            f"ageing law '{system.ageing.name}' is not linear in mu_dot, W_dot or F_dot_over_W",
+            "write the coupling to the rates of friction and load as a factor times mu_dot, W_dot or F_dot_over_W",
+        ) from error
+    solved = _eliminated(matrix, right, system)
+    if solved is None:
+        raise SrfError(
+            f"the equations of {system.title} do not determine the motion", "check the laws with `srf law check`"
+        )
+    return dict(zip(wanted, [tidy(e) for e in solved], strict=True))
+
+
+def _eliminated(matrix: sp.Matrix, right: sp.Matrix, system: System) -> list[sp.Expr] | None:
+    """Solve a square linear system by elimination, None where it has no one solution.
+
+    The pivot is never a factor that a parameter at 0 makes vanish where another will do: with c = 0 in (c/B) phi F_dot_over_W
+    the equations are those without the term, and near 0 no figures are lost. Of the others the one that fills least is taken.
+    """
+    vanishing = [symbol(p.name) for p in system.parameters if p.lower <= 0 <= p.upper]
+
+    def weak(entry: sp.Expr) -> bool:
+        return any(entry.has(x) and entry.subs(x, 0) == 0 for x in vanishing)
+
+    if matrix.shape[0] != matrix.shape[1]:
+        return None
+    rows = [{j: e for j, e in enumerate(matrix.row(i)) if e != 0} for i in range(matrix.shape[0])]
+    values, order = list(right), []
+    left = set(range(len(rows)))
+    while left:
+        used = Counter(j for i in left for j in rows[i])
+        entries = [(i, j, e) for i in sorted(left) for j, e in rows[i].items()]
+        if not entries or any(not rows[i] for i in left):
+            return None
+        i, j, pivot = min(
+            entries,
+            key=lambda x: (
+                weak(x[2]), (len(rows[x[0]]) - 1) * (used[x[1]] - 1), not x[2].is_number, sp.count_ops(x[2]), x[0], x[1]
+            ),
+        )  # fmt: skip
+        left.remove(i)
+        order.append((i, j, pivot))
+        for k in left:
+            if (entry := rows[k].pop(j, None)) is None:
+                continue
+            factor = entry / pivot
+            values[k] -= factor * values[i]
+            for m, other in rows[i].items():
+                if m != j and (new := rows[k].pop(m, sp.S.Zero) - factor * other) and sp.expand(new) != 0:
+                    rows[k][m] = new
+    found: dict[int, sp.Expr] = {}
+    for i, j, pivot in reversed(order):
+        found[j] = (values[i] - sum((e * found[m] for m, e in rows[i].items() if m != j), sp.S.Zero)) / pivot
+    return [found[j] for j in range(len(rows))]
+
+
+def tidy(expression: sp.Expr) -> sp.Expr:
+    """Return the shortest of a few equal forms of `expression`."""
+    forms = [expression, sp.factor_terms(expression)]
+    if sp.count_ops(expression) <= MAX_CANCEL:
+        shielded, back = shield(expression)
+        forms.append(sp.cancel(shielded).xreplace(back))
+    return min(forms, key=lambda e: (sp.count_ops(e), str(e)))
+
+
+def settle(expression: sp.Expr) -> sp.Expr:
+    """Return `expression` simplified, but for Lambert functions: there sympy trades exp(-v/Vc) for exp(v/Vc), which overflows."""
+    return expression if expression.has(sp.LambertW) else sp.simplify(expression)
+
+
+def shield(expression: sp.Basic) -> tuple[sp.Basic, dict[sp.Symbol, sp.Expr]]:
+    """Return `expression` with its transcendental parts replaced by symbols, and what puts them back.
+
+    Algebra on exp(-V/Vc) otherwise turns it into exp(V/Vc), which overflows.
+    """
+    kinds = (sp.exp, sp.LambertW)
+    atoms = sorted(expression.atoms(*kinds), key=lambda e: (-sp.count_ops(e), str(e)))
+    back: dict[sp.Symbol, sp.Expr] = {}
+    for atom in atoms:  # longest first: an inner one then lives on inside what its outer one puts back
+        name = sp.Symbol(f"shield{len(back)}", positive=True)
+        replaced = expression.xreplace({atom: name})
+        if replaced != expression:
+            back[name], expression = atom, replaced
+    return expression, back

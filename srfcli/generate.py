@@ -11,10 +11,11 @@ import sympy as sp
 
 from srfcli.closed_limits import closed_limits, in_law_parameters
 from srfcli.derive import Linearisation, linearise
+from srfcli.equations import Equations, equations_of, tidy
 from srfcli.expression import symbol
 from srfcli.numpytext import FUNCTIONS, NumPyText, python_name, renamed
 from srfcli.staged import Staged, Step, joined, staged
-from srfcli.system import Equations, System, tidy
+from srfcli.system import System
 
 
 class Writer:
@@ -98,7 +99,7 @@ class Writer:
 
 def generate(system: System) -> str:
     """Return the source of the module that computes everything numerical about `system`."""
-    eq = system.equations
+    eq = equations_of(system)
     linear = linearise(system)
     writer = Writer(system, eq)
     _write_statics(writer, eq, linear)

@@ -80,16 +80,6 @@ def read_header(path: Path) -> tuple[str, str, str]:
     return reader.kind(), reader.name(), reader.text("about")
 
 
-def read_law(path: Path) -> Law:
-    """Return the law, or the effect, in a TOML file."""
-    table = read_toml(path)
-    if table.get("kind") == "effect":
-        from srfcli.effectfile import EffectReader
-
-        return EffectReader(path, table).effect()
-    return LawReader(path, table).law()
-
-
 def valid_name(name: object) -> bool:
     """True for a kebab-case law name of at most 64 letters."""
     return isinstance(name, str) and len(name) <= 64 and LAW_NAME.fullmatch(name) is not None

@@ -11,6 +11,7 @@ import sympy as sp
 
 from srfcli.closed_limits import closed_limits, in_law_parameters
 from srfcli.derive import characteristic_polynomial, paper_coefficients
+from srfcli.equations import equations_of
 from srfcli.expression import symbol
 from srfcli.system import System, state_rate
 
@@ -44,25 +45,25 @@ def _slip_perturbation(system: System) -> sp.Expr:
 
 def _z_rate(system: System) -> sp.Expr:
     load, W0, eps, coswt = _s("W W0 eps coswt")
-    equations = system.equations
+    equations = equations_of(system)
     return equations.rates[equations.names.index("z")].subs(load, W0 * (1 + eps * coswt))
 
 
 def _steady_age(system: System) -> sp.Expr:
-    equations = system.equations
+    equations = equations_of(system)
     return equations.steady[equations.names.index("ln_phi")]
 
 
 def _force(system: System) -> sp.Expr:
     """Return M x'' = M z' with the friction force carried by the interface, kappa (x - x_pl)."""
     M, load, u, V, t, x, kappa, xpl = _s("M W u V t x kappa xpl")
-    spring = sp.expand(M * system.equations.rates[1] + load * system.friction.mu)
+    spring = sp.expand(M * equations_of(system).rates[1] + load * system.friction.mu)
     return spring.subs(u, V * t - x) - kappa * (x - xpl)
 
 
 def _slider_force(system: System) -> sp.Expr:
     M, load, u, V, t, x, W0, mu = _s("M W u V t x W0 mu")
-    return sp.expand(M * system.equations.rates[1] + load * system.friction.mu).subs(u, V * t - x) - W0 * mu
+    return sp.expand(M * equations_of(system).rates[1] + load * system.friction.mu).subs(u, V * t - x) - W0 * mu
 
 
 def _linear_force(system: System) -> sp.Expr:
@@ -124,10 +125,10 @@ FORMS: dict[str, Form] = {
     "stiffness": lambda system: system.interface.kappa,
     "force": _force,
     "interface_force": lambda system: symbol("W") * system.friction.mu,
-    "u_rate": lambda system: system.equations.rates[0],
+    "u_rate": lambda system: equations_of(system).rates[0],
     "z_rate": _z_rate,
-    "v_rate": lambda system: symbol("v") * system.equations.rates[2],
-    "phi_rate": lambda system: symbol("phi") * system.equations.rates[3],
+    "v_rate": lambda system: symbol("v") * equations_of(system).rates[2],
+    "phi_rate": lambda system: symbol("phi") * equations_of(system).rates[3],
     "steady_age": _steady_age,
     "slip_velocity": slip_velocity,
     "eta": eta,

@@ -18,6 +18,7 @@ from srfcli.laws import Law
 from srfcli.reader import Reader
 from srfcli.reading import check_plain, read_plain
 
+API = "srfcli.api"  # what a plugin imports its decorators from
 DECORATORS = {
     "friction_law": "friction",
     "ageing_law": "ageing",
@@ -31,7 +32,7 @@ DECORATORS = {
 def scan_python(path: Path) -> list[tuple[str, str, str]]:
     """Return (kind, name, about) of each decorated law in a Python file, which is read but not run.
 
-    A file that imports `srfcli.api` and shows no law, and a decorator whose name is not written out, raise `SrfError`.
+    A file that imports API and shows no law, and a decorator whose name is not written out, raise `SrfError`.
     """
     try:
         tree = ast.parse(read_plain(path, what="a law"), filename=str(path))
@@ -49,7 +50,7 @@ def scan_python(path: Path) -> list[tuple[str, str, str]]:
             if kind:
                 found.append((kind, *_name_and_about(path, node, decorator)))
     if imports_api and not found:
-        raise SrfError(f"{path}: imports srfcli.api but no law is found", "Decorate a function at the top level.")
+        raise SrfError(f"{path}: imports {API} but no law is found", "Decorate a function at the top level.")
     return found
 
 
@@ -109,20 +110,21 @@ def _from_file(path: Path) -> ModuleType:
 
 def _decorator_names(tree: ast.Module) -> tuple[dict[str, str], bool]:
     """Return the local names of the decorators, dotted where all of api is imported, and whether it is imported."""
+    package, _, module = API.rpartition(".")
     aliases: dict[str, str] = {}
     imports_api = False
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module == "srfcli.api":
+        if isinstance(node, ast.ImportFrom) and node.module == API:
             imports_api = True
             for item in node.names:
                 if item.name in DECORATORS:
                     aliases[item.asname or item.name] = DECORATORS[item.name]
-        elif isinstance(node, ast.ImportFrom) and node.module == "srfcli":
-            prefixes = [item.asname or item.name for item in node.names if item.name == "api"]
+        elif isinstance(node, ast.ImportFrom) and node.module == package:
+            prefixes = [item.asname or item.name for item in node.names if item.name == module]
             imports_api = imports_api or bool(prefixes)
             aliases |= {f"{prefix}.{name}": kind for prefix in prefixes for name, kind in DECORATORS.items()}
         elif isinstance(node, ast.Import):
-            prefixes = [item.asname or item.name for item in node.names if item.name == "srfcli.api"]
+            prefixes = [item.asname or item.name for item in node.names if item.name == API]
             imports_api = imports_api or bool(prefixes)
             aliases |= {f"{prefix}.{name}": kind for prefix in prefixes for name, kind in DECORATORS.items()}
     return aliases, imports_api

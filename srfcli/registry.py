@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import srfcli
 from srfcli.errors import SrfError, did_you_mean
-from srfcli.lawfile import PLUGIN_KINDS, kind_of, read_header, read_law
+from srfcli.lawfile import PLUGIN_KINDS, LawReader, kind_of, read_header, read_toml
 from srfcli.laws import AgeingLaw, AgeingModifier, Law
 from srfcli.prebuilt import header_key, known_headers
-from srfcli.pylaw import find_law, find_reader, laws_in, load_module, scan_python
+from srfcli.pylaw import API, find_law, find_reader, laws_in, load_module, scan_python
 from srfcli.reader import Reader
 from srfcli.reading import read_plain
 
@@ -201,7 +202,7 @@ def bundled_registry() -> Registry:
 
 def bundled_folder() -> Path:
     """Return the folder of shipped laws: inside the wheel, else beside the package in a checkout."""
-    package = Path(__file__).resolve().parent
+    package = Path(srfcli.__file__).resolve().parent
     inside = package / "plugins"
     return inside if inside.is_dir() else package.parent / "plugins"
 
@@ -216,6 +217,16 @@ def user_folder() -> Path:
     return base / "srf" / "plugins"
 
 
+def read_law(path: Path) -> Law:
+    """Return the law, or the effect, in a TOML file; its `kind` says which reader it needs."""
+    table = read_toml(path)
+    if table.get("kind") == "effect":
+        from srfcli.effectfile import EffectReader  # imports sympy
+
+        return EffectReader(path, table).effect()
+    return LawReader(path, table).law()
+
+
 def read_file(path: Path) -> tuple[Law, ...]:
     """Return the laws in one file, TOML or Python; a Python file is run."""
     if not path.is_file():
@@ -226,7 +237,7 @@ def read_file(path: Path) -> tuple[Law, ...]:
         raise SrfError(f"{path}: neither .toml nor .py", "Laws are written as TOML or Python.")
     laws = tuple(laws_in(load_module(path, None)))
     if not laws:
-        raise SrfError(f"{path}: holds no law", "Decorate a function with @friction_law(...) from srfcli.api.")
+        raise SrfError(f"{path}: holds no law", f"Decorate a function with @friction_law(...) from {API}.")
     return laws
 
 

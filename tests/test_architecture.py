@@ -22,7 +22,7 @@ MODULES = sorted(p for p in PACKAGE.rglob("*.py") if "data" not in p.parts)  # t
 BASE = {"errors", "status", "reading", "atomic"}
 LAWS = BASE | {"laws", "reader"}
 LAW_FILES = LAWS | {"expression", "dimensions", "lawfile", "effectfile", "pylaw"}
-SYMBOLS = LAW_FILES | {"registry", "system", "derive", "closed_limits"}
+SYMBOLS = LAW_FILES | {"registry", "system", "equations", "derive", "closed_limits"}
 MAY: dict[str, set[str]] = {
     "errors": set(),
     "status": set(),
@@ -33,8 +33,8 @@ MAY: dict[str, set[str]] = {
     "laws": BASE | {"expression"},
     "reader": set(),
     "dimensions": BASE,
-    "lawfile": LAW_FILES,
-    "effectfile": LAW_FILES,
+    "lawfile": LAWS | {"expression", "dimensions"},
+    "effectfile": LAWS | {"expression", "dimensions", "lawfile"},
     "lawtemplate": BASE,
     "pylaw": LAW_FILES,
     "prebuilt": set(),
@@ -45,9 +45,9 @@ MAY: dict[str, set[str]] = {
     "effectcheck": SYMBOLS | {"checking", "generate_motion", "model"},
     "notation": {"expression"},
     "staged": set(),
-    "system": LAWS | {"expression", "registry", "equations"},
+    "system": LAWS | {"expression", "registry"},
     "equations": LAWS | {"expression", "system"},
-    "derive": LAWS | {"expression", "system"},
+    "derive": LAWS | {"expression", "system", "equations"},
     "closed_limits": LAWS | {"expression", "system", "derive"},
     "numpytext": {"expression"},
     "generate": SYMBOLS | {"numpytext", "staged"},

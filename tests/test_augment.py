@@ -16,6 +16,7 @@ from srfcli.diagnosis import augment as augmenting
 from srfcli.diagnosis.augment import augment
 from srfcli.diagnosis.candidates import Hypothesis
 from srfcli.diagnosis.foldlaws import Folded, fold, law_files
+from srfcli.equations import equations_of
 from srfcli.errors import SrfError
 from srfcli.laws import Effect
 from srfcli.recording.experiment import read_experiment
@@ -43,7 +44,7 @@ def folded(choice: ModelChoice, names: tuple[str, ...], folder: Path, values: di
 def rates(names: dict[str, Any]) -> tuple[dict[str, sp.Expr], dict[str, float]]:
     """Return the rates by unknown, and the parameters' defaults in um, s, N."""
     system = build_system(REGISTRY, **names)
-    eq = system.equations
+    eq = equations_of(system)
     return dict(zip(eq.names, eq.rates, strict=True)), {p.name: p.default for p in system.parameters}
 
 

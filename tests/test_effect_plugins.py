@@ -18,11 +18,10 @@ from srfcli.cli.laws import laws as laws_command
 from srfcli.errors import ExpressionError, SrfError
 from srfcli.expression import parse_expression
 from srfcli.lawcheck import check_law
-from srfcli.lawfile import read_law
 from srfcli.laws import Effect
 from srfcli.lawtemplate import template
 from srfcli.model import open_model
-from srfcli.registry import bundled_registry, load_registry
+from srfcli.registry import bundled_registry, load_registry, read_law
 
 SHIPPED = bundled_registry()
 NAMES = [e.name for e in SHIPPED.entries("effect")]

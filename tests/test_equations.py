@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from srfcli.checking import STEP, evaluate
+from srfcli.equations import equations_of
 from srfcli.errors import SrfError
 from srfcli.laws import Effect
 from srfcli.model import load_source
 from srfcli.numerics.compiled import compiler
 from srfcli.numerics.load import Modulation
-from srfcli.numerics.lsoda import integrate_lsoda
-from srfcli.numerics.motion import integrate
+from srfcli.numerics.motion import integrate, integrate_lsoda
 from srfcli.numerics.program import Drive
 from srfcli.numerics.scalar import scalar_function
 from srfcli.registry import bundled_registry
@@ -301,7 +301,7 @@ def test_parameters_of_one_name_are_told_apart(make_model):
 )
 def test_effects_that_do_not_apply_are_told(names, message):
     with pytest.raises(SrfError, match=message):
-        _ = build_system(REGISTRY, **names).equations
+        equations_of(build_system(REGISTRY, **names))
 
 
 @pytest.mark.parametrize(
@@ -321,7 +321,7 @@ def test_what_cannot_be_followed_is_told(tmp_path, formulas, names, message):
     text = f'format = "srf-law/1"\nkind = "effect"\n{formulas}\n[parameters]\na = {{ default = 0.1, neutral = 0.0 }}\n'
     (tmp_path / "mine.toml").write_text(text)
     with pytest.raises(SrfError, match=message):
-        _ = build_system(REGISTRY, effects=(str(tmp_path / "mine.toml"),), **names).equations
+        equations_of(build_system(REGISTRY, effects=(str(tmp_path / "mine.toml"),), **names))
 
 
 def test_a_motion_module_of_a_plain_system_is_the_whole_one_s(make_model):

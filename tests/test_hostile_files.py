@@ -24,13 +24,13 @@ from srfcli.dimensions import parse_unit
 from srfcli.errors import SrfError
 from srfcli.expression import parse_expression
 from srfcli.inference.threshold_table import is_threshold_table, read_thresholds
-from srfcli.lawfile import read_header, read_law
+from srfcli.lawfile import read_header
 from srfcli.lawtemplate import template
 from srfcli.pylaw import scan_python
 from srfcli.recording.experiment import read_experiment
 from srfcli.recording.quantities import parse_quantity as quantity_of_file
 from srfcli.recording.source import open_source
-from srfcli.registry import bundled_registry
+from srfcli.registry import bundled_registry, read_law
 from srfcli.settings import load_toml, resolve
 from srfcli.trial.answer import Answer, read_answers, to_line
 from srfcli.units import parse_quantity

@@ -20,9 +20,9 @@ from srfcli.dimensions import UNITS, dimension_of, parse_unit
 from srfcli.errors import ExpressionError, SrfError
 from srfcli.expression import log1p, parse_expression, symbol
 from srfcli.lawcheck import check_law, evaluate, reference_values, steady_age
-from srfcli.lawfile import APPARATUS, KINDS, formula_of, read_law
+from srfcli.lawfile import APPARATUS, KINDS, formula_of
 from srfcli.laws import Interface
-from srfcli.registry import Entry, bundled_registry
+from srfcli.registry import Entry, bundled_registry, read_law
 
 SHIPPED = bundled_registry()
 FRICTION = {

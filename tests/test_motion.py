@@ -17,8 +17,7 @@ from srfcli.numerics import compiled as compiled_module
 from srfcli.numerics.compiled import compiled, compiler
 from srfcli.numerics.load import ConstantLoad, Modulation
 from srfcli.numerics.loads import LoadSteps
-from srfcli.numerics.lsoda import integrate_lsoda
-from srfcli.numerics.motion import integrate
+from srfcli.numerics.motion import integrate, integrate_lsoda
 from srfcli.numerics.program import Drive
 from srfcli.status import Status
 
@@ -185,7 +184,7 @@ LONG = """
 import numpy as np
 from srfcli.model import open_model
 from srfcli.numerics.load import Modulation
-from srfcli.numerics.motion import integrate
+from srfcli.numerics.motion import integrate, integrate_lsoda
 from srfcli.numerics.program import Drive
 from srfcli.registry import load_registry
 

@@ -12,8 +12,7 @@ from srfcli.errors import SrfError
 from srfcli.inference.prediction import predict
 from srfcli.numerics.compiled import compiled, compiler
 from srfcli.numerics.load import Modulation
-from srfcli.numerics.lsoda import integrate_lsoda
-from srfcli.numerics.motion import integrate
+from srfcli.numerics.motion import integrate, integrate_lsoda
 from srfcli.numerics.program import Drive
 from srfcli.recording.experiment import read_experiment
 from srfcli.registry import load_registry

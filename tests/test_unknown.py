@@ -19,7 +19,6 @@ from srfcli.diagnosis.terms import FOLDER, explain_unknown, with_terms
 from srfcli.diagnosis.verdict import conclude
 from srfcli.effectfile import formula_text
 from srfcli.lawcheck import check_law
-from srfcli.lawfile import read_law
 from srfcli.proof.draw import Gauge
 from srfcli.proof.folder import case_files
 from srfcli.proof.gauge import read_gauge
@@ -27,7 +26,7 @@ from srfcli.proof.motion import move
 from srfcli.proof.physics import Physics
 from srfcli.proof.protocol import Plan
 from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry
+from srfcli.registry import bundled_registry, read_law
 
 TERMS = sorted(FOLDER.glob("*.toml"))
 SHIPPED = bundled_registry()

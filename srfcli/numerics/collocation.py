@@ -16,35 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.model import GeneratedModel
+from srfcli.numerics.gauss import STAGES, gauss
 from srfcli.numerics.orbitkernel import condense_compiled, kernel
 
 Array = NDArray[Any]  # real; shapes are in the docstrings
 ComplexArray = NDArray[Any]
-STAGES = 4
 COVERING = 10.0
 COVERING_RIGID = 30.0  # without the interface's compliance the slip velocity follows the load without delay
-
-
-@dataclass(frozen=True)
-class Scheme:
-    """Gauss points `nodes` in [0, 1], the inverse of the collocation matrix, and x_1 = x_0 + step . (X - x_0)."""
-
-    nodes: Array
-    inverse: Array
-    step: Array
-    weights: Array
-
-
-@lru_cache
-def gauss(m: int = STAGES) -> Scheme:
-    """Return the Gauss-Legendre scheme of `m` stages (order 2m at the mesh points)."""
-    points, weights = np.polynomial.legendre.leggauss(m)
-    nodes = (points + 1) / 2
-    powers = np.arange(1, m + 1)
-    vandermonde = nodes[:, None] ** (powers - 1)
-    integral = (nodes[:, None] ** powers / powers) @ np.linalg.inv(vandermonde)
-    inverse = np.linalg.inv(integral)
-    return Scheme(nodes, inverse, (weights / 2) @ inverse, weights / 2)
 
 
 @dataclass

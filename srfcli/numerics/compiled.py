@@ -155,10 +155,9 @@ def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
 
 @cache
 def _writers() -> str:
-    """Return the hash of all that C text is written with, besides the model: files of this package."""
-    here, data = files("srfcli") / "numerics", files("srfcli") / "data"
-    written = [here / name for name in ("compiled.py", "ctext.py", "collocation.py", "orbit.py")]
-    written += [data / name for name in ("radau.c", "filter.c", "orbit.c")]
+    """Return the hash of all that C text is written with, besides what its caller names: the files beside this one."""
+    places = (Path(__file__).parent, Path(__file__).parents[1] / "data")
+    written = sorted(p for place in places for p in place.iterdir() if p.suffix in (".py", ".c"))
     return content_key([path.read_text(encoding="utf-8") for path in written])
 
 

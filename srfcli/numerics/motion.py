@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import math
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,11 +24,19 @@ from srfcli.numerics.collocation import Array
 from srfcli.numerics.compiled import compiled
 from srfcli.numerics.load import Load
 from srfcli.numerics.program import Drive
+from srfcli.numerics.scalar import scalar_function
 from srfcli.splines import Spline, appended
 from srfcli.status import Status
 
 PATIENCE = 0.1  # s between looks for a signal where waiting for a thread cannot be interrupted (Windows)
 MAX_STEPS = 20_000_000  # of the compiled integrator, in all; a hundred times an hour of modulation
+MAX_LSODA_STEPS = 200_000  # between two output times
+S_SHARE = (
+    100.0  # sensitivities are solved so much less closely than states; left out of the control altogether, they diverge
+)
+BEYOND = 1e100  # a rate where the formula overflows: the step is then rejected and cut
+
+Rates = Callable[[float, Array], object]
 
 
 @dataclass(frozen=True)
@@ -68,8 +77,6 @@ def integrate(
     missing = len(model.namespace.get("TABLES", ())) - len(tables)
     p = appended(np.asarray(p, dtype=float), [*tables, *[Spline.none()] * missing]) if tables or missing else p
     if library is None:
-        from srfcli.numerics.lsoda import integrate_lsoda
-
         if by_tables:
             raise SrfError("derivatives by a table's numbers need a C compiler", "install one, or the package ziglang")
         return integrate_lsoda(model, p, drive, load, t, start, by, S0, rtol, atol)
@@ -183,3 +190,102 @@ def integers(array: Array) -> ctypes.c_void_p:
     pointer = ctypes.c_void_p(array.ctypes.data)
     pointer.array = array  # type: ignore[attr-defined]
     return pointer
+
+
+def integrate_lsoda(
+    model: GeneratedModel,
+    p: Array,
+    drive: Drive,
+    load: Load,
+    t: Array,
+    start: Array,
+    by: Sequence[int],
+    S0: Array,
+    rtol: float,
+    atol: Array,
+) -> Motion:
+    """Return what `integrate` returns, by LSODA; S is carried along as n k further unknowns."""
+    n, k = start.size, len(by)
+    y = np.full((t.size, n * (1 + k)), np.nan)
+    y[0] = state = np.concatenate([start, S0.ravel()])
+    loose = S_SHARE * rtol
+    tolerance = np.concatenate([atol, (S_SHARE * np.outer(atol, sensitivity_scale(p, by)[:k])).ravel()])
+    relative = np.concatenate([np.full(n, rtol), np.full(n * k, loose)])
+    system = _Rates(model, p, by)
+    status, reached, steps = Status.OK, float(t[0]), 0
+    for a, b in pieces(t, drive, load):
+        f, df = system.on_piece(drive, load, 0.5 * (a + b))
+        wanted = np.nonzero((t > a) & (t <= b))[0]
+        times = np.unique([a, *t[wanted], b])
+        found, good, count = _march(f, df if not k else None, state, times, relative, tolerance, load.longest_step)
+        steps += count
+        places = np.searchsorted(times, t[wanted])
+        y[wanted[places < good]] = found[places[places < good]]
+        reached, state = float(times[good - 1]), found[-1]
+        if good < times.size:
+            status = Status.INTEGRATION
+            break
+    return Motion(y[:, :n], y[:, n:].reshape(t.size, n, k), status, reached, steps)
+
+
+class _Rates:
+    """Rates of the state and of its sensitivities as functions of (t, y) on one smooth piece."""
+
+    def __init__(self, model: GeneratedModel, p: Array, by: Sequence[int]) -> None:
+        self.n, self.k = len(model.states), len(by)
+        self.rates, self.jacobian = (scalar_function(model, name, p) for name in ("rates", "rates_jacobian"))
+        self.by = np.array(by, dtype=int)
+        self.parameters = scalar_function(model, "rates_parameters", p) if self.k else None
+
+    def on_piece(self, drive: Drive, load: Load, within: float) -> tuple[Rates, Rates]:
+        """Return the rates and the Jacobian of the state, as functions of (t, y), where the piece at `within` holds."""
+        W_at = load.piece(within)
+        V0, acceleration, since = drive.piece(within)
+        n, k = self.n, self.k
+
+        def inputs(t: float) -> tuple[float, float, float]:
+            return (V0 + acceleration * (t - since) if acceleration else V0, *W_at(t))
+
+        def rates(t: float, y: Array) -> object:
+            try:
+                return self.rates(y.tolist(), *inputs(t))
+            except (ArithmeticError, ValueError):
+                return np.full(n, BEYOND)
+
+        def jacobian(t: float, y: Array) -> object:
+            try:
+                return self.jacobian(y.tolist(), *inputs(t))
+            except (ArithmeticError, ValueError):
+                return np.full((n, n), BEYOND)
+
+        def augmented(t: float, y: Array) -> object:
+            x, given = y[:n].tolist(), inputs(t)
+            try:
+                direct = np.array(self.parameters(x, *given))[:, self.by] * (self.by >= 0)  # type: ignore[misc]
+                S_rate = np.array(self.jacobian(x, *given)) @ y[n:].reshape(n, k) + direct
+                return np.concatenate([self.rates(x, *given), S_rate.ravel()])
+            except (ArithmeticError, ValueError):
+                return np.full(n * (1 + k), BEYOND)
+
+        return (augmented if k else rates), jacobian
+
+
+def _march(
+    f: Rates, df: Rates | None, start: Array, times: Array, rtol: Array, atol: Array, longest: float
+) -> tuple[Array, int, int]:
+    """Return the unknowns (times, n), how many times were reached, and the number of steps."""
+    from scipy.integrate import ODEintWarning, odeint
+
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", ODEintWarning)  # told by the status instead
+        y, info = odeint(
+            f, start, times, Dfun=df, tfirst=True, rtol=rtol, atol=atol, tcrit=[times[-1]],
+            hmax=longest if math.isfinite(longest) else 0.0, mxstep=MAX_LSODA_STEPS, full_output=True,
+        )  # fmt: skip
+    steps = int(info["nst"][-1])
+    if info["message"] == "Integration successful.":
+        finite = np.isfinite(y).all(axis=1)
+        return y, times.size if finite.all() else int(np.argmin(finite)), steps
+    # LSODA's own clock `tcur` stands still at the output interval it failed in; what lies beyond is not filled
+    failed = np.nonzero(info["tcur"] < times[1:])[0]
+    return y, int(failed[0]) + 1 if failed.size else 1, steps

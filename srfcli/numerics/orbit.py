@@ -10,20 +10,18 @@ import numpy as np
 
 from srfcli.model import GeneratedModel
 from srfcli.numerics.collocation import (
-    STAGES,
     Array,
     ComplexArray,
     Condensed,
     Discretisation,
     condense,
     expand,
-    gauss,
     join,
 )
+from srfcli.numerics.gauss import LOG_STEP, STAGES, gauss
 from srfcli.numerics.orbitkernel import kernel, newton_orbits
 
 CHUNK = 48  # parameter points solved together: their blocks fit the cache
-LOG_STEP = 3.0  # a Newton step changes no velocity or age by more than a factor e^3
 LARGEST_SWING = 2.0  # of a logarithm in the linear response that is a first guess
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from srfcli.model import GeneratedModel
 from srfcli.numerics.compiled import compiler, library_of, orbit_source
 from srfcli.numerics.ctext import NoForm
+from srfcli.numerics.gauss import LOG_STEP, gauss
 
 Array = NDArray[Any]
 
@@ -22,15 +23,12 @@ Array = NDArray[Any]
 @cache
 def kernel(model: GeneratedModel) -> ctypes.CDLL | None:
     """Return the compiled equations of this model, or None: no compiler, or a formula that has no form in C."""
-    from srfcli.numerics.collocation import gauss
-    from srfcli.numerics.orbit import LOG_STEP
-
     if compiler() is None:
         return None
     scheme = gauss()
     try:
         write = partial(orbit_source, model, {"MI": scheme.inverse, "STEP": scheme.step}, LOG_STEP)
-        library = library_of(write, ["orbits", model.source])
+        library = library_of(write, ["orbits", model.source, repr(scheme), repr(LOG_STEP)])
     except NoForm:
         return None
     library.srf_orbits.restype = ctypes.c_int
