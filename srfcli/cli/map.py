@@ -223,13 +223,20 @@ def _boundaries(
     *_, atlas = find_boundaries(
         model, found, settings, progress=lambda said: progress.advance(0, note=f"boundaries: {said}")
     )
-    special = [special_points(model, atlas.plane, b) for b in atlas.branches]
+    special: list[list[SpecialPoint]] = [[] for _ in atlas.branches]
     cubic = [np.full(len(b.points), np.nan) for b in atlas.branches]
-    for k, branch in enumerate(atlas.branches if wanted[1] else []):
-        progress.advance(0, note=f"criticality of boundary {k + 1}")
-        cubic[k] = branch_coefficients(model, branch)
-        changes = criticality_points(model, atlas.plane, branch, cubic[k])
-        special[k] = sorted([*special[k], *changes], key=lambda s: s.place)
+    try:
+        for k, branch in enumerate(atlas.branches):
+            progress.advance(0, note=f"special points of boundary {k + 1}")
+            special[k] = special_points(model, atlas.plane, branch)
+        for k, branch in enumerate(atlas.branches if wanted[1] else []):
+            progress.advance(0, note=f"criticality of boundary {k + 1}")
+            cubic[k] = branch_coefficients(model, branch)
+            changes = criticality_points(model, atlas.plane, branch, cubic[k])
+            special[k] = sorted([*special[k], *changes], key=lambda s: s.place)
+    except KeyboardInterrupt:
+        atlas.status = Status.INTERRUPTED
+        atlas.notes.append("interrupted: special points and criticality are not complete")
     return atlas, special, cubic
 
 
