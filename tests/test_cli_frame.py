@@ -327,10 +327,10 @@ def test_config_show_tells_every_origin(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_options_repeat_what_the_system_says() -> None:
-    from srfcli import system
+    from srfcli.system import ANGLE, APPARATUS, LOADINGS, MASS
 
-    assert options_module.LOADINGS == system.LOADINGS
-    declared = {p.name: p for p in (*system.APPARATUS, system.MASS, system.ANGLE)}
+    assert options_module.LOADINGS == LOADINGS
+    declared = {p.name: p for p in (*APPARATUS, MASS, ANGLE)}
     for name, text in options_module.APPARATUS.items():
         assert text.endswith(f", in {declared[name].unit}.")
 

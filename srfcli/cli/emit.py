@@ -140,6 +140,11 @@ class Progress:
             self._raw.write("\r\x1b[K")  # the line was for waiting; nothing of it stays
             self._stream.flush()
 
+    def stage(self, label: str) -> None:
+        """Begin another stage of the same work, with a count and a time of its own, unless it is the one that runs."""
+        if label != self.label:
+            self.label, self.total, self.done, self._begun = label, None, 0, time.monotonic()
+
     def advance(
         self, steps: int = 1, *, note: str = "", share: float | None = None, bound: float | None = None
     ) -> None:

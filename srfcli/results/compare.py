@@ -1,20 +1,26 @@
-"""What `srf compare` shows: a row for each law and amplitude, a sentence for each pair, the overlaid figure."""
+"""Laws side by side: a row for each law and amplitude, a sentence for each pair, their boundaries over each other."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.tables import Column
+from srfcli.output.tables import Column, Table
+from srfcli.results.base import Result
 from srfcli.status import Status
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from srfcli.model import GeneratedModel
     from srfcli.numerics.compare import LawStudy, Window
     from srfcli.numerics.comparematch import Match, Observables
+    from srfcli.tasks.system import SlidingSystem
 
 COLUMNS = (
     Column("law", "", "friction law, ageing law, or both"),
@@ -37,6 +43,57 @@ COLUMNS = (
     Column("miss", "1", "what matching left, relative", ".2g"),
     Column("status"),
 )
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class ComparisonResult(Result):
+    """The stability diagrams of several laws, each brought to the first one's observables at one low velocity.
+
+    Attributes
+    ----------
+    names : tuple of str
+        What the laws are called here; the first is the reference.
+    systems : tuple of SlidingSystem
+        The laws with their parameters before matching.
+    goal : Observables
+        Friction, slope, critical load and period of the reference.
+    matches : tuple of Match
+        The parameters of each law (um, s, N), which of them were adjusted, and what matching left.
+    studies : Mapping[int, LawStudy]
+        Critical loads and boundaries of each law that could be matched, by its number.
+    amplitudes, wanted : tuple of float
+        Amplitudes that were computed, and those of the table.
+    window : Window
+        Velocities (um/s) and loads (N) that were looked at.
+    """
+
+    names: tuple[str, ...]
+    systems: tuple[SlidingSystem, ...]
+    goal: Observables = field(repr=False)
+    matches: tuple[Match, ...] = field(repr=False)
+    studies: Mapping[int, LawStudy] = field(repr=False)
+    amplitudes: tuple[float, ...]
+    wanted: tuple[float, ...]
+    window: Window = field(repr=False)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each law and amplitude; the notes say what was matched, and where an experiment tells laws apart."""
+        names, models, matches = list(self.names), [s.model for s in self.systems], list(self.matches)
+        studies = dict(self.studies)
+        pairs, said = sentences(names, models, matches, studies, self.amplitudes, self.window)
+        rows, worst = law_rows(names, matches, studies, self.amplitudes, list(self.wanted), self.window)
+        notes = (*law_notes(names, models, matches, self.goal, self.window), *said)
+        meta = law_meta(names, models, matches, self.goal, pairs)
+        described = self.systems[0].described(without=("V", "W0", "eps"))
+        return Table("srf.compare/1", COLUMNS, rows, f"{len(names)} laws", notes, described, meta, worst.value)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the boundaries at the largest amplitude over each other, each law named with its matched parameters."""
+        return compare_figure(
+            list(self.names), [s.model for s in self.systems], list(self.matches), dict(self.studies), self.amplitudes,
+            self.window, self.table.parameters, ax,
+        )  # fmt: skip
 
 
 def law_rows(
@@ -161,21 +218,31 @@ def sentences(
 
 def compare_figure(
     names: list[str],
+    models: list[GeneratedModel],
+    matches: list[Match],
     studies: dict[int, LawStudy],
     amplitudes: tuple[float, ...],
     window: Window,
-    K: float,
-    matched: bool,
+    described: Mapping[str, Mapping[str, Any]],
+    ax: Axes | None = None,
 ) -> Figure:
-    """Return the laws' boundaries at the largest amplitude over each other."""
+    """Return the laws' boundaries at the largest amplitude over each other, each named with the parameters it was given."""
     from srfcli.output import plots
 
+    first, K = studies[min(studies)].crossings[0][:, 0], float(matches[0].p[models[0].index("K")])
+    labels = []
+    for name, model, m in zip(names, models, matches, strict=True):
+        values = {n: model.declared(n, float(m.p[model.index(n)])) for n in m.adjusted}
+        units = {q.name: q.unit for q in model.parameters}
+        told = ", ".join(plots.valued(n, value, units[n]) for n, value in values.items())
+        labels.append(f"{plots.name_text(name)}, matched with {told}" if told else plots.name_text(name))
     branches = [
-        {"eps": k, "label": names[k], "V": curve[:, 0].tolist(), "K_over_W0": (K / curve[:, 1]).tolist()}
+        {"eps": k, "label": labels[k], "V": curve[:, 0].tolist(), "K_over_W0": (K / curve[:, 1]).tolist()}
         for k, study in sorted(studies.items())
         for curve in study.curves[-1]
     ]
-    first = studies[min(studies)].crossings[0][:, 0]
     hopf = {"V": window.velocities().tolist(), "K_over_W0": (K / first).tolist()}
-    title = f"{'matched at low velocity' if matched else 'as given'}, ε = {amplitudes[-1]:g}"
-    return plots.stability_diagram(branches, hopf=hopf, title=title)
+    matched = any(m.adjusted for m in matches)
+    title = f"{len(names)} laws, {'matched at low velocity' if matched else 'as given'}, ε = {amplitudes[-1]:g}"
+    title = plots.titled(f"{title}; {names[0]} with", described)
+    return plots.stability_diagram(branches, hopf=hopf, title=title, ax=ax)

@@ -1,17 +1,21 @@
-"""What `srf simulate` found, as rows, sentences, curves and an experiment."""
+"""Simulated records: rows, sentences, curves, and the experiment that they make."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from srfcli.output.tables import Column, Table
+from srfcli.results.base import Result, own_figure
 from srfcli.status import Status
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
     from srfcli.model import GeneratedModel
@@ -127,6 +131,38 @@ class Work:
     inputs: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
     meta: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class SimulationResult(Result):
+    """Records of one slider over time.
+
+    Attributes
+    ----------
+    work : Work
+        What was to be simulated.
+    records : tuple of Record
+        What was finished: each with its trace in um, s, N and the observable.
+    worst : Status
+        The first status that is not ok, INTERRUPTED where the simulation was stopped.
+    """
+
+    work: Work = field(repr=False)
+    records: tuple[Record, ...] = field(repr=False)
+    worst: Status = Status.OK
+
+    @cached_property
+    def table(self) -> Table:
+        """Return the records one below the other, a row for each sample."""
+        return record_table(self.work, self.records, status=self.worst)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the records over time: observable, friction, velocities and load, a panel for each."""
+        from srfcli.output.plots import titled
+        from srfcli.output.traces import traces
+
+        own_figure(ax, "a simulation")
+        return traces(curves(self.records), title=titled(self.work.model.title, self.work.parameters))
 
 
 class Rows(Sequence[tuple[Any, ...]]):

@@ -1,18 +1,25 @@
-"""The tables that `srf fit` prints: parameters with their errors and flags, and how each run is fitted."""
+"""A fit of recordings: parameters with their errors and flags, how each run is fitted, the posterior where it was drawn."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from srfcli.output.tables import Column, Table
+from srfcli.results.base import Result, own_figure
 from srfcli.status import Status
 from srfcli.units import from_base
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from srfcli.inference.fit import Fit, Problem
     from srfcli.inference.profile import Interval
+    from srfcli.inference.recordings import RecordingFit
     from srfcli.inference.sample import Posterior
     from srfcli.recording.values import Experiment
 
@@ -55,6 +62,93 @@ ADVICE = {
     Status.INTERRUPTED: "the likeliest parameters so far are above.",
 }
 CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class FitResult(Result):
+    """The maximum-likelihood fit of a model to all recordings of an experiment.
+
+    Attributes
+    ----------
+    found : RecordingFit
+        The problem, the fit with its covariance, the random friction field, and how each start ended.
+    intervals : tuple of Interval
+        Profile-likelihood intervals of the parameters for which they were asked.
+    posterior : Posterior, optional
+        Draws of the posterior, where they were asked for.
+    asked : int
+        The number of starts that were asked for.
+    worst : Status
+        Whether the maximum was reached, INTERRUPTED where the fit was stopped.
+    """
+
+    found: RecordingFit = field(repr=False)
+    intervals: tuple[Interval, ...] = ()
+    posterior: Posterior | None = None
+    asked: int = 1
+    worst: Status = Status.OK
+
+    @property
+    def experiment(self) -> Experiment:
+        """Return the experiment whose recordings were fitted."""
+        return self.found.problem.experiment
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Return name -> estimate of the parameters, in um, s, N."""
+        return dict(self.found.fit.values)
+
+    @property
+    def stderr(self) -> dict[str, float]:
+        """Return name -> standard error, in um, s, N."""
+        return dict(self.found.fit.stderr)
+
+    @cached_property
+    def runs(self) -> Table:
+        """Return a row for each run, fitted or held out: residual, noise, and what is left of them."""
+        return run_table(self.found.fit, self.experiment)
+
+    @cached_property
+    def draws(self) -> Table | None:
+        """Return mean, spread and quantiles of the posterior draws, None where none were asked for."""
+        return None if self.posterior is None else posterior_table(self.found.problem, self.posterior)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each parameter: estimate, standard error, interval, unit, and what is to be known of it."""
+        found = self.found
+        made = parameter_table(
+            found.problem, found.fit, self.intervals, found.starts, self.posterior, self.runs, self.worst
+        )
+        if found.track is not None:
+            made = replace(
+                made, notes=(*made.notes, str(found.track)), meta={**made.meta, "track": asdict(found.track)}
+            )
+        if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
+            note = f"interrupted: {len(found.starts)} of {self.asked} starts were done"
+            made = replace(made, notes=(*made.notes, note))
+        return made
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return each run's recording and prediction above its residual."""
+        from srfcli.output.fits import fit_figure
+        from srfcli.output.plots import symbol_text
+        from srfcli.output.report_text import NARROW, bracketed, unit_text
+
+        own_figure(ax, "a fit")
+        problem, fit, experiment = self.found.problem, self.found.fit, self.experiment
+        runs = {r.name: r for r in experiment.runs}
+        rows = [(f.name, f.holdout, runs[f.name].t, runs[f.name].observed, f.prediction.y, f.white) for f in fit.runs]
+        one, told = next(iter(runs.values())), []
+        for name in fit.names:
+            declared = unit_of(problem, name)
+            unit, factor = experiment.shown(declared)
+            value, error = (from_base(x, declared) * factor for x in (fit.values[name], fit.stderr[name]))
+            shown = "" if unit == "1" else f"{NARROW}{unit_text(unit)}"
+            told.append(f"{symbol_text(name)} = {bracketed(value, error)}{shown}")
+        choice = experiment.choice
+        title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
+        return fit_figure(rows, quantity=one.quantity, unit=one.unit, title=title, found=", ".join(told))
 
 
 def parameter_table(
