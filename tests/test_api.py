@@ -193,3 +193,14 @@ def test_settings_of_the_folder_do_not_count(tmp_path: Path, monkeypatch: pytest
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SRF_K", "0.7")
     assert srf.system().parameters["K"] == 0.21
+
+
+def test_the_page_on_python_is_true(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("pandas", "matplotlib"):
+        pytest.importorskip(name)
+    monkeypatch.chdir(tmp_path)
+    text = (Path(__file__).resolve().parents[1] / "docs" / "python.md").read_text(encoding="utf-8")
+    space: dict = {}
+    exec(text.partition("```python\n")[2].partition("```")[0], space)
+    assert len(space["frame"]) == 3 and space["figure"].axes
+    assert all(f"srf.{name}(" in text for name in FUNCTIONS)
