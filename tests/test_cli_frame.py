@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import os
 import signal
@@ -20,7 +21,8 @@ from srfcli import settings
 from srfcli.cli import emit as emit_module
 from srfcli.cli import options as options_module
 from srfcli.cli.base import CONTEXT, SrfGroup, switches
-from srfcli.cli.emit import Progress, emit, finish
+from srfcli.cli.emit import Progress, emit, finish, remaining
+from srfcli.cli.fit import FitShare
 from srfcli.cli.main import cli
 from srfcli.cli.options import OutputOptions, SystemOptions, output_options, over_option, system_options, values_option
 from srfcli.cli.ranges import Range, parse_over, parse_overs, parse_values
@@ -246,6 +248,17 @@ def test_progress_is_for_terminals_only() -> None:
     assert silent.getvalue() == quiet.getvalue() == ""
 
 
+def test_what_is_left_is_told_from_the_share_that_is_done() -> None:
+    assert remaining(1.9, 0.5) == ""
+    assert remaining(20.0, 0.25) == "  [about 60 s left]"
+    assert remaining(20.0, None) == "  [20 s so far]"
+    assert remaining(30.0, 0.5, most=True) == "  [30 s so far, at most 30 s more]"
+    done = FitShare(starts=2)
+    shares = [done.after(f"start {1 + k // 40} of 2: step") for k in range(80)]
+    assert all(a <= b + 1e-12 for a, b in itertools.pairwise(shares))  # it never falls, and never is the whole
+    assert 0 < shares[0] < 0.05 and shares[39] < 0.5 <= shares[40] and shares[-1] < 1
+
+
 @pytest.mark.parametrize(("variable", "coloured"), [("", True), ("1", False)])
 def test_no_color(monkeypatch: pytest.MonkeyPatch, variable: str, coloured: bool) -> None:
     from rich.console import Console
@@ -327,10 +340,10 @@ def test_config_show_tells_every_origin(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_options_repeat_what_the_system_says() -> None:
-    from srfcli import system
+    from srfcli.system import ANGLE, APPARATUS, LOADINGS, MASS
 
-    assert options_module.LOADINGS == system.LOADINGS
-    declared = {p.name: p for p in (*system.APPARATUS, system.MASS, system.ANGLE)}
+    assert options_module.LOADINGS == LOADINGS
+    declared = {p.name: p for p in (*APPARATUS, MASS, ANGLE)}
     for name, text in options_module.APPARATUS.items():
         assert text.endswith(f", in {declared[name].unit}.")
 

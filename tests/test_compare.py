@@ -12,14 +12,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from srfcli.cli.compare_rows import compare_figure, highest_fold
 from srfcli.cli.main import cli
 from srfcli.errors import SrfError
+from srfcli.model import open_model
 from srfcli.numerics import compare
 from srfcli.numerics.compare import LawStudy, LawTask, Window, changed_areas, contrast, read_study, study_law, turns
-from srfcli.numerics.comparematch import check_adjusted, match, observe
+from srfcli.numerics.comparematch import Match, check_adjusted, match, observe
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
+from srfcli.registry import bundled_registry
+from srfcli.results.compare import compare_figure, highest_fold
 from srfcli.status import Status
 
 LAWS = [
@@ -211,18 +213,23 @@ def test_highest_fold():
     )
 
 
-@pytest.mark.parametrize(
-    ("matched", "title"), [(True, "matched at low velocity, ε = 0.1"), (False, "as given, ε = 0.1")]
-)
-def test_a_figure_says_whether_its_laws_were_matched(matched, title):
+@pytest.mark.parametrize("matched", [True, False])
+def test_a_figure_names_what_its_laws_were_given(matched):
     pytest.importorskip("matplotlib")
+    model = open_model(bundled_registry())
     lines = np.full((WINDOW.velocities().size, 1), 9.0)
     curve = np.array([[5.0, 10], [9, 12]])
     study = LawStudy(
         (lines, lines), ((), (curve,)), (0, 0), (0, 0), (np.nan, np.nan), (np.nan, np.nan), (Status.OK,) * 2
     )
-    figure = compare_figure(["a", "b"], {0: study, 1: study}, (0.0, 0.1), WINDOW, 0.21, matched)
-    assert figure.axes[0].get_title(loc="left") == title
+    p = model.vector()
+    matches = [Match(p, (), 0.0, Status.OK), Match(p, ("A", "D0") if matched else (), 0.0, Status.OK)]
+    described = {"K": {"value": 0.21, "unit": "N/um"}}
+    figure = compare_figure(["a", "b"], [model] * 2, matches, {0: study, 1: study}, (0.0, 0.1), WINDOW, described)
+    said = "matched at low velocity" if matched else "as given"
+    assert figure._suptitle.get_text() == f"2 laws, {said}, ε = 0.1; a with\nK = 0.21 N/µm"
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names[1:] == ["a", "b, matched with A = 0.0126, D$_0$ = 0.402 µm" if matched else "b"]
 
 
 def run(*arguments):

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.cli.map_axes import unit_text
+from srfcli.results.map import unit_text
 
 SMALL = ("map", "--eps", "0.18", "--over", "V=10:40:8", "--over", "K/W0=0.01:0.025:12")
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from srfcli.cli.programs import Piece, build_drive, parse_pieces, parse_rates, sample_times, usual_rate
-from srfcli.cli.simulated import Rows
 from srfcli.errors import SrfError
+from srfcli.results.simulation import Rows
 
 
 def test_pieces_with_units_and_ramps() -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
-import math
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,12 +25,10 @@ from srfcli.cli.ranges import Range, over_option
 from srfcli.cli.workers import Spread, worker_options
 from srfcli.laws import Parameter
 from srfcli.settings import Resolved, Setting, TomlSettings, choose, find_toml, load_toml, parse_assignment, resolve
-from srfcli.status import Status
 
 if TYPE_CHECKING:
     from srfcli.model import GeneratedModel
-    from srfcli.numerics.compare import LawStudy, Window
-    from srfcli.numerics.comparematch import Match, Observables
+    from srfcli.tasks.system import SlidingSystem
 
 EXAMPLES = """
 srf compare --law srf-vsat --law log-log --law bowden-tabor --eps 0.18 --plot laws.svg
@@ -106,47 +101,21 @@ def command(
     The first law is the reference. Every other one is brought to its friction, slope, critical load and critical period at one
     low velocity, so that what differs is the law and not its calibration.
     """
-    from srfcli.cli.compare_rows import COLUMNS, compare_figure, law_meta, law_notes, law_rows, sentences
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.errors import SrfError
-    from srfcli.numerics.compare import LawTask, read_study, study_law
-    from srfcli.output.tables import Table
+    from srfcli.tasks.compare import compare
 
-    largest = sorted({e for e in eps if e > 0})
-    if not largest:
-        raise SrfError("--eps 0 leaves nothing to compare", "Give an amplitude above 0: --eps 0.18.")
-    thirds = [largest[-1] / 3, 2 * largest[-1] / 3] if len(largest) == 1 else []
-    amplitudes = tuple(sorted({0.0, *thirds, *largest}))
     begun = time.perf_counter()
-    names, models, resolved = _models(laws, ageings, system)
-    goal, matches = _matches(names, models, resolved, _velocity(at), tuple(adjust.split(",")), matched)
-    window = _window(models[0], matches[0].p, goal, over)
+    sliders = _sliders(laws, ageings, system)
+    window = _window(next(iter(sliders.values())).model, over)
     warn_uncompiled("boundaries take about twice as long")
-    usable = [k for k, m in enumerate(matches) if m.status.ok]
-    tasks = [LawTask(models[k].source, models[k].key, matches[k].p, amplitudes, window) for k in usable]
-    studies: dict[int, LawStudy] = {}
-    with Progress("compare", total=len(tasks)) as progress:
-        try:
-            for place, arrays in spread.run(study_law, tasks):
-                studies[usable[place]] = read_study(arrays)
-                progress.advance(note=names[usable[place]])
-        except KeyboardInterrupt:
-            if not studies:
-                raise
-            left = [k for k in usable if k not in studies]
-            matches = [replace(m, status=Status.INTERRUPTED) if k in left else m for k, m in enumerate(matches)]
-    pairs, said = sentences(names, models, matches, studies, amplitudes, window)
-    described = {n: v for n, v in resolved[0].described().items() if n not in ("V", "W0", "eps")}
-    rows, worst = law_rows(names, matches, studies, amplitudes, largest, window)
-    notes = (*law_notes(names, models, matches, goal, window), *said)
-    meta = law_meta(names, models, matches, goal, pairs)
-    table = Table("srf.compare/1", COLUMNS, rows, f"{len(names)} laws", notes, described, meta, worst.value)
-    figure = functools.partial(
-        compare_figure, names, studies, amplitudes, window, float(matches[0].p[models[0].index("K")]), matched
-    )
-    every = tuple(law for model in models for law in model.laws)
-    emit(table, output, laws=dict.fromkeys(every), timings={"all": time.perf_counter() - begun}, figure=figure)
-    finish(Status(table.status))
+    with Progress("compare", total=len(sliders)) as progress:
+        found = compare(
+            sliders, eps=eps, at=_velocity(at), adjust=adjust.split(","), matched=matched, **window, run=spread.run,
+            progress=lambda name: progress.advance(note=name),
+        )  # fmt: skip
+    every = dict.fromkeys(law for slider in sliders.values() for law in slider.model.laws)
+    emit(found.table, output, laws=every, timings={"all": time.perf_counter() - begun}, figure=found.plot)
+    finish(found.status)
 
 
 def _velocity(text: str) -> float:
@@ -155,12 +124,11 @@ def _velocity(text: str) -> float:
     return parse_quantity(text, "um/s", name="--at")
 
 
-def _models(
-    laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, Any]
-) -> tuple[list[str], list[GeneratedModel], list[Resolved]]:
-    """Return names, models and parameters of every pair of a friction and an ageing law."""
+def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, Any]) -> dict[str, SlidingSystem]:
+    """Return a system for every pair of a friction and an ageing law, by a name that tells them apart."""
     from srfcli.errors import SrfError
     from srfcli.model import open_model
+    from srfcli.tasks.system import SlidingSystem
 
     toml = load_toml(find_toml())
     chosen = {k: choose(k, system[k], toml=toml) for k in ("interface", "loading", "inertia")}
@@ -177,7 +145,8 @@ def _models(
     models = [open_model(registry, law=law, ageing=ageing, **shared) for law, ageing in pairs]
     short = len(set(ageings)) == 1, len(set(laws)) == 1
     names = [law if short[0] else ageing if short[1] else f"{law}/{ageing}" for law, ageing in pairs]
-    return names, models, _resolved(models, system, toml)
+    resolved = _resolved(models, system, toml)
+    return {n: SlidingSystem(m, r) for n, m, r in zip(names, models, resolved, strict=True)}
 
 
 def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSettings) -> list[Resolved]:
@@ -198,53 +167,18 @@ def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSe
     ]
 
 
-def _matches(
-    names: list[str],
-    models: list[GeneratedModel],
-    resolved: list[Resolved],
-    at: float,
-    adjust: tuple[str, ...],
-    matched: bool,
-) -> tuple[Observables, list[Match]]:
-    """Return the reference's observables, and every law's parameters brought to them."""
-    from srfcli.errors import SrfError
-    from srfcli.numerics.comparematch import Match, check_adjusted, match, observe
-
-    vectors = [m.vector(r.values) for m, r in zip(models, resolved, strict=True)]
-    for model, p in zip(models, vectors, strict=True):
-        model.check_changing_load(p)
-    goal = observe(models[0], vectors[0], at)
-    if goal is None:
-        raise SrfError(
-            f"{names[0]} has no critical load at {at:g} um/s: there is nothing to bring the others to",
-            "Name another law first, or another velocity with --at.",
-        )
-    for model in models:
-        check_adjusted(model, adjust)
-    found = [Match(vectors[0], (), 0.0, Status.OK)]
-    for model, p in zip(models[1:], vectors[1:], strict=True):
-        found.append(match(model, p, goal, adjust) if matched else Match(p, (), math.nan, Status.OK))
-    return goal, found
-
-
-def _window(model: GeneratedModel, p: Any, goal: Observables, over: tuple[Range, ...]) -> Window:
-    """Return the window that --over describes; loads from half to sixteen times the critical one where it says nothing."""
+def _window(model: GeneratedModel, over: tuple[Range, ...]) -> dict[str, Any]:
+    """Return the window that --over describes, and how many points it has, as the task takes them."""
     from srfcli.cli.map_axes import read_axis
     from srfcli.cli.ranges import DEFAULT_POINTS
     from srfcli.errors import SrfError
-    from srfcli.numerics.compare import Window
 
-    K = float(p[model.index("K")])
-    parts: dict[str, Any] = {"V": (1.0, 100.0), "W0": (0.5 * goal.W0, 16.0 * goal.W0)}
+    parts: dict[str, Any] = {"points": {}}
     for given in over:
         axis = read_axis(model, given)
-        counts = {} if given.n == DEFAULT_POINTS else {"columns" if axis.name == "V" else "rows": given.n}
-        if axis.name == "V":
-            parts |= {"V": (axis.lo, axis.hi), **counts}
-        elif axis.name == "K/W0":
-            parts |= {"W0": (K / axis.hi, K / axis.lo), **counts}
-        else:
+        if axis.name not in ("V", "K/W0"):
             raise SrfError(f"--over {axis.name} is not an axis of the comparison", "Its plane is V against K/W0.")
-    if not (parts["V"][0] > 0 and parts["W0"][0] > 0):
-        raise SrfError("--over begins at 0", "The window is logarithmic: begin above 0.")
-    return Window(**parts)
+        parts["V" if axis.name == "V" else "K_over_W0"] = (axis.lo, axis.hi)
+        if given.n != DEFAULT_POINTS:
+            parts["points"]["columns" if axis.name == "V" else "rows"] = given.n
+    return parts

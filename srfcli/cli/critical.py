@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
 
 import click
 
-from srfcli.cli.boundary_rows import COLUMNS, boundary_row, worst
 from srfcli.cli.options import (
     OutputOptions,
     Range,
@@ -19,11 +17,6 @@ from srfcli.cli.options import (
     values_option,
 )
 from srfcli.laws import Parameter
-from srfcli.output.plots import titled
-from srfcli.status import Status
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 EXAMPLES = """
 srf critical --eps 0.13 --V 1,7,25
@@ -79,57 +72,19 @@ def command(
     meshes that are doubled until the error is met. Odd crossings lose stability as W0 rises, even ones regain it.
     """
     from srfcli.cli.emit import Progress, emit, finish
-    from srfcli.errors import SrfError
-    from srfcli.numerics.critical import critical_line
-    from srfcli.output.tables import Table
+    from srfcli.tasks.boundary import critical
 
-    if not 1e-12 < tol < 0.1 or not 1e-8 < resolution < 1:
-        raise SrfError(f"--tol {tol:g} or --resolution {resolution:g} is out of range", "--tol 1e-8 --resolution 1e-3")
-    model = system.model()
-    resolved = system.resolve(model.parameters)
-    model.check_changing_load(model.vector(resolved.values))
-    velocities = V or (resolved.values["V"],)
-    amplitudes = eps or (resolved.values["eps"],)
-    limits = None if window is None else _window(window).fitted(model.parameters, where=model.title)
-    lo, hi = (limits.lo, limits.hi) if limits else (None, None)
-    begun, rows, notes, statuses = time.perf_counter(), [], [], []
-    low, high = [], []
-    interrupted = False
-    with Progress("critical", total=len(velocities) * len(amplitudes)) as progress:
-        try:
-            for amplitude in amplitudes:
-                for velocity in velocities:
-                    base = model.vector({**resolved.values, "V": velocity, "eps": amplitude})
-                    line = critical_line(
-                        model, base, lo=lo, hi=hi, tol=tol, samples=samples, resolution=resolution, max_mesh=max_mesh
-                    )
-                    rows += [boundary_row(model, q, None, k) for q, k in zip(line.points, line.crossings, strict=True)]
-                    statuses += [line.status, *(q.status for q in line.points)]
-                    first, last = float(line.scans[0].values[0]), float(line.scans[-1].values[-1])
-                    low.append(first)
-                    high.append(last)
-                    place = f"eps = {amplitude:g}, V = {velocity:g} um/s"
-                    notes += [f"{place}: {note}" for note in line.notes]
-                    if not line.points:
-                        side = _side([g for scan in line.scans for g in scan.g.tolist()])
-                        notes.append(f"{place}: no crossing between W0 = {first:.4g} and {last:.4g} N; {side}")
-                    progress.advance(note=place)
-        except KeyboardInterrupt:
-            interrupted = True
-    if low:
-        span = f"{min(low):.4g} to {max(high):.4g} N" + ("" if limits else ", to where the growth rate settles")
-        notes.append(f"looked from {span}; pairs of crossings closer than {resolution:g} in ln W0 are not looked for")
-    status = Status.INTERRUPTED if interrupted else worst(statuses)
-    described = {k: v for k, v in resolved.described().items() if k not in ("W0", "V", "eps")}
-    table = Table("srf.critical/1", COLUMNS, rows, model.title, tuple(notes), described, status=status.value)
-    emit(
-        table,
-        output,
-        laws=model.laws,
-        timings={"solve": time.perf_counter() - begun},
-        figure=lambda: _figure(rows, titled(model.title, described)),
-    )
-    finish(status)
+    slider = system.slider()
+    limits = None if window is None else _window(window).fitted(slider.model.parameters, where=slider.model.title)
+    begun = time.perf_counter()
+    with Progress("critical", total=len(V or (None,)) * len(eps or (None,))) as progress:
+        found = critical(
+            slider, V=V, eps=eps, window=None if limits is None else (limits.lo, limits.hi), tol=tol, samples=samples,
+            resolution=resolution, max_mesh=max_mesh, progress=lambda place: progress.advance(note=place),
+        )  # fmt: skip
+    timings = {"solve": time.perf_counter() - begun}
+    emit(found.table, output, laws=slider.model.laws, timings=timings, figure=found.plot)
+    finish(found.status)
 
 
 def _window(text: str) -> Range:
@@ -143,31 +98,3 @@ def _window(text: str) -> Range:
     if found is None or not found.lo > 0:
         raise SrfError(f"--window {text!r} is not LOW:HIGH, two rising loads above 0", "Write --window 4:500.")
     return found
-
-
-def _side(g: object) -> str:
-    import numpy as np
-
-    values = np.asarray(g)
-    if not np.isfinite(values).all():
-        return "no sign change among the samples that were found"
-    return (
-        "stable at every load looked at"
-        if values.size and (values < 0).all()
-        else "unstable at every load looked at"
-        if values.size
-        else "no periodic state found"
-    )
-
-
-def _figure(rows: list[tuple[Any, ...]], title: str) -> Figure:
-    """Return the critical points as a diagram, the crossings of one number and amplitude joined."""
-    from srfcli.output import plots
-
-    names = [c.name for c in COLUMNS]
-    cells = [dict(zip(names, row, strict=False)) for row in rows]
-    branches = []
-    for eps, crossing in sorted({(c["eps"], c["crossing"]) for c in cells}):
-        mine = sorted((c for c in cells if (c["eps"], c["crossing"]) == (eps, crossing)), key=lambda c: c["V"])
-        branches.append({"eps": eps, "V": [c["V"] for c in mine], "K_over_W0": [c["K_over_W0"] for c in mine]})
-    return plots.stability_diagram(branches, title=title)

@@ -97,13 +97,16 @@ def _diagnose(
     if compiler() is None:
         raise SrfError("srf diagnose needs a C compiler: it fits dozens of models", GET_COMPILER)
     with Progress("diagnose") as progress:
+        searching = False
 
         def report(text: str) -> None:
-            progress.advance(note=text)
+            progress.advance(note=text, bound=search.share if searching else None)
             Session.current().detail(text)
 
         search = Search(registry, experiment, report, effects or None, options["trend"])
+        searching = True
         status = _searched(search)
+        searching = False
         report("held-out runs")
         whole = read_experiment(source, registry=registry, format=options["reader"])
         diagnosis = conclude(search, whole)

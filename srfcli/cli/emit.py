@@ -140,8 +140,18 @@ class Progress:
             self._raw.write("\r\x1b[K")  # the line was for waiting; nothing of it stays
             self._stream.flush()
 
-    def advance(self, steps: int = 1, *, note: str = "", share: float | None = None) -> None:
-        """Count `steps` more and show it, at most ten times a second; `share` of the work is done, from 0 to 1."""
+    def stage(self, label: str) -> None:
+        """Begin another stage of the same work, with a count and a time of its own, unless it is the one that runs."""
+        if label != self.label:
+            self.label, self.total, self.done, self._begun = label, None, 0, time.monotonic()
+
+    def advance(
+        self, steps: int = 1, *, note: str = "", share: float | None = None, bound: float | None = None
+    ) -> None:
+        """Count `steps` more and show it, at most ten times a second.
+
+        `share` of the work is done, from 0 to 1; `bound` is that share of the most work that there can be.
+        """
         self.done += steps
         now = time.monotonic()
         if not self._active or now - self._shown_at < 0.1:
@@ -151,17 +161,22 @@ class Progress:
         if share is None and self.total:
             share = self.done / self.total
         line = f"{self.label}: {count}  {note}".rstrip()
-        self._raw.write(f"\r\x1b[K{printable(line[:100], line=True)}{remaining(now - self._begun, share)}")
+        left = remaining(now - self._begun, share if bound is None else bound, most=bound is not None)
+        self._raw.write(f"\r\x1b[K{printable(line[:100], line=True)}{left}")
         self._stream.flush()
 
 
-def remaining(elapsed: float, share: float | None) -> str:
-    """Return how long the rest will take after `elapsed` seconds for a share of the work; how long it has been for None."""
+def remaining(elapsed: float, share: float | None, *, most: bool = False) -> str:
+    """Return how long the rest will take after `elapsed` seconds for a share of the work; how long it has been for None.
+
+    `most` says that it is a share of the most work that there can be.
+    """
     if elapsed < PATIENCE or (share is not None and share >= 1.0):
         return ""
     if share is None or share < LITTLE:
         return f"  [{duration(elapsed)} so far]"
-    return f"  [about {duration(elapsed * (1.0 / share - 1.0))} left]"
+    left = duration(elapsed * (1.0 / share - 1.0))
+    return f"  [{duration(elapsed)} so far, at most {left} more]" if most else f"  [about {left} left]"
 
 
 def duration(seconds: float) -> str:

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from srfcli.cli.options import OutputOptions, Session, SrfCommand, SystemOptions, output_options, system_options
 from srfcli.errors import SrfError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from srfcli.inference.fit import Fit, Problem
-    from srfcli.inference.profile import Interval
-    from srfcli.inference.sample import Posterior
 
 EXAMPLES = """
 srf fit EXPERIMENT                                  a folder with experiment.toml, or that file
@@ -25,6 +19,7 @@ srf fit EXPERIMENT --sample 4000 --draws draws.nc    the posterior; the draws fo
 srf fit EXPERIMENT --track smooth                   no random friction field, whatever the recording says
 srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c, sigma
 """
+USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seven runs, 63 in the other
 
 
 @click.command("fit", cls=SrfCommand, epilog=EXAMPLES)
@@ -102,85 +97,62 @@ def _refuse(options: dict[str, Any], names: tuple[str, ...], purpose: str) -> No
 
 
 def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
-    import re
     import time
-    from dataclasses import asdict, replace
 
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.cli.fit_tables import ADVICE, parameter_table, posterior_table, run_table
-    from srfcli.inference.profile import profile
-    from srfcli.inference.recordings import fit_recordings
-    from srfcli.inference.sample import sample, to_arviz
-    from srfcli.recording.experiment import read_experiment
-    from srfcli.status import Status
+    from srfcli.inference.sample import to_arviz
+    from srfcli.results.fit import ADVICE
+    from srfcli.tasks.fit import fit
+    from srfcli.tasks.recordings import read_experiment
 
     registry = system.registry()
-    experiment = read_experiment(source, registry=registry, format=options["reader"])
+    experiment = read_experiment(source, format=options["reader"], registry=registry)
     free = [n.strip() for text in options["free"] for n in text.split(",") if n.strip()] or None
-    asked = options["profile"] or options["sample"]
-    if options["track"] == "shared" and asked:
-        raise SrfError("--track shared does not go with --profile or --sample", "Leave it out, or name --track rough.")
     kept = _draws_file(options["draws"], options["sample"], output)
     warn_uncompiled("the fit has no random friction field, and takes up to 34 times as long")
-    begun, starts = time.perf_counter(), options["starts"]
-    intervals: list[Interval] = []
-    posterior: Posterior | None = None
+    begun, done = time.perf_counter(), FitShare(options["starts"])
     with Progress("fit") as progress:
 
-        def report(text: str) -> None:
-            number = re.match(
-                r"start (\d+) of", text
-            )  # of several starts those that ended tell how long the rest takes
-            progress.advance(note=text, share=(int(number[1]) - 1) / starts if number else None)
+        def report(stage: str, text: str, share: float | None) -> None:
+            progress.stage(stage)
+            progress.advance(note=text, share=done.after(text) if stage == "fit" else share)
 
-        found = fit_recordings(
-            registry, experiment, free=free, trend=options["trend"], track=options["track"], ask_shared=not asked,
-            starts=options["starts"], seed=options["seed"], progress=report,
+        found = fit(
+            experiment, free=free, trend=options["trend"], track=options["track"], starts=options["starts"],
+            profile=options["profile"], sample=options["sample"], seed=options["seed"], registry=registry, progress=report,
         )  # fmt: skip
-        problem, fit, status = found.problem, found.fit, found.status
-        try:
-            if options["profile"] and status is not Status.INTERRUPTED:
-                with Progress("profile", total=2 * len(problem.names)) as ends:
-                    for name in problem.names:
-                        intervals.append(
-                            profile(
-                                problem,
-                                fit,
-                                name,
-                                rough=found.state_space,
-                                progress=lambda text: ends.advance(note=text),
-                            )
-                        )
-            if options["sample"] and status is not Status.INTERRUPTED:
-                with Progress("sample") as drawn:
-                    posterior = sample(
-                        problem, fit, options["sample"], rough=found.state_space, seed=options["seed"],
-                        progress=lambda text, share: drawn.advance(note=text, share=share),
-                    )  # fmt: skip
-                status = Status.INTERRUPTED if posterior.interrupted else status
-        except KeyboardInterrupt:
-            status = Status.INTERRUPTED
     for run in experiment.runs:
         for notice in run.notices:
             Session.current().detail(f"{run.name}: {notice}")
-    runs = run_table(fit, experiment)
-    table = parameter_table(problem, fit, intervals, found.starts, posterior, runs, status)
-    if found.track is not None:
-        table = replace(
-            table, notes=(*table.notes, str(found.track)), meta={**table.meta, "track": asdict(found.track)}
-        )
-    if status is Status.INTERRUPTED and found.status is Status.INTERRUPTED and starts > 1:
-        note = f"interrupted: {len(found.starts)} of {starts} starts were done"
-        table = replace(table, notes=(*table.notes, note))
-    more = [runs] if posterior is None else [runs, posterior_table(problem, posterior)]
+    more = [t for t in (found.runs, found.draws) if t is not None]
     emit(
-        table, output, more=more, laws=problem.model.laws, inputs=[experiment.path, *(r.file for r in experiment.runs)],
-        seed=options["seed"], timings={"fit": time.perf_counter() - begun}, figure=_figure(problem, fit),
+        found.table, output, more=more, laws=found.found.problem.model.laws,
+        inputs=[experiment.path, *(r.file for r in experiment.runs)], seed=options["seed"],
+        timings={"fit": time.perf_counter() - begun}, figure=found.plot,
     )  # fmt: skip
-    if posterior is not None and kept is not None:
-        to_arviz(posterior).to_netcdf(str(kept))
+    if found.posterior is not None and kept is not None:
+        to_arviz(found.posterior).to_netcdf(str(kept))
         Session.current().say(f"Wrote {kept}")
-    finish(status, advice=ADVICE.get(status))
+    finish(found.status, advice=ADVICE.get(found.status))
+
+
+class FitShare:
+    """The share of a fit that is done, from 0 to 1, by the steps that were told of each of its starts.
+
+    Most fits take some thirty steps, so that many are expected at first; one that takes more has, at any step, a quarter of its
+    own before it.
+    """
+
+    def __init__(self, starts: int = 1) -> None:
+        self.starts, self.number, self.steps = starts, 1, 0
+
+    def after(self, text: str) -> float:
+        """Return the share that is done once this step was told; `start 2 of 5: ...` begins the second."""
+        told = re.match(r"start (\d+) of", text)
+        if told and int(told[1]) != self.number:
+            self.number, self.steps = int(told[1]), 0
+        self.steps += 1
+        return (self.number - 1 + self.steps / max(USUAL_STEPS, 4 / 3 * self.steps)) / self.starts
 
 
 def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> Path | None:
@@ -200,26 +172,3 @@ def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> P
     if importlib.util.find_spec("arviz") is None:
         raise SrfError("--draws needs arviz, which is not installed", 'pip install "srfcli[arviz]"')
     return place
-
-
-def _figure(problem: Problem, fit: Fit) -> Callable[[], Any]:
-    def draw() -> Any:
-        from srfcli.cli.fit_tables import unit_of
-        from srfcli.output.fits import fit_figure
-        from srfcli.output.report_text import NARROW, bracketed, unit_text
-        from srfcli.units import from_base
-
-        runs = {r.name: r for r in problem.experiment.runs}
-        rows = [(f.name, f.holdout, runs[f.name].t, runs[f.name].observed, f.prediction.y, f.white) for f in fit.runs]
-        one = next(iter(runs.values()))
-        told = []
-        for name in fit.names:
-            declared = unit_of(problem, name)
-            unit, factor = problem.experiment.shown(declared)
-            value, error = (from_base(x, declared) * factor for x in (fit.values[name], fit.stderr[name]))
-            told.append(f"{name} = {bracketed(value, error)}" + ("" if unit == "1" else f"{NARROW}{unit_text(unit)}"))
-        choice = problem.experiment.choice
-        title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
-        return fit_figure(rows, quantity=one.quantity, unit=one.unit, title=title, found=", ".join(told))
-
-    return draw

@@ -236,8 +236,7 @@ def _figure(fit: ThresholdFit, title: str) -> Figure:
     """Return the lowest chi2 so far against evaluations of the whole cost, one curve a method."""
     from srfcli.output import plots
 
-    with plots.house_style():
-        figure, (ax,) = plots.new_figure()
+    with plots.one_panel(None, title=f"{plots.name_text(str(fit.table.source))}: {title}") as (figure, ax):
         for index, m in enumerate(fit.methods):
             count = range(1, len(m.trace) + 1)
             ax.step(count, m.trace.best, where="post", color=plots.COLOURS[index], linestyle=plots.DASHES[index])
@@ -245,10 +244,5 @@ def _figure(fit: ThresholdFit, title: str) -> Figure:
         freedom = len(fit.table) - len(fit.scale)
         if freedom:
             ax.axhline(freedom, color="#555555", linestyle=plots.DOTTED, label="degrees of freedom")
-        ax.set_xscale("log")
-        ax.set_yscale("log")
-        ax.set_xlabel("evaluations of the whole cost")
-        ax.set_ylabel("lowest χ² so far")
-        ax.set_title(f"{fit.table.source}: {title}")
-        ax.legend()
+        ax.set(xscale="log", yscale="log", xlabel="evaluations of the whole cost", ylabel="lowest χ² so far")
         return figure

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import time
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from srfcli.cli.map_rows import components_table, crossing_notes, grid_table, map_figure, special_table
 from srfcli.cli.options import (
     OutputOptions,
     Range,
@@ -22,18 +19,10 @@ from srfcli.cli.options import (
     system_options,
 )
 from srfcli.cli.workers import Spread, worker_options
-from srfcli.output.plots import titled
-from srfcli.status import Status
 
 if TYPE_CHECKING:
-    from srfcli.model import GeneratedModel
-    from srfcli.numerics.atlas import Atlas
-    from srfcli.numerics.collocation import Array
-    from srfcli.numerics.map import StabilityMap
     from srfcli.numerics.mapgrid import MapGrid
-    from srfcli.numerics.special import SpecialPoint
-    from srfcli.output.tables import Table
-    from srfcli.settings import Resolved
+    from srfcli.tasks.system import SlidingSystem
 
 EXAMPLES = """
 srf map --eps 0.18 --over V=1:100:120 --over K/W0=0.005:0.03:200 --plot map.svg
@@ -107,8 +96,8 @@ def command(
     from srfcli.errors import SrfError
     from srfcli.numerics.atlas import AtlasSettings
     from srfcli.numerics.continuation import StepSettings
-    from srfcli.numerics.map import compute_map
     from srfcli.numerics.mapgrid import MapSettings
+    from srfcli.tasks.map import map_grid
 
     if not 1e-4 <= step <= 0.5 or not 1e-8 <= mesh_error <= 0.1:
         raise SrfError(
@@ -117,52 +106,39 @@ def command(
     if boundary is not None and not boundaries:
         raise SrfError("--boundary needs the boundaries that --no-boundaries leaves out", "Drop one of the two.")
     place = None if boundary is None else _boundary_output(boundary, output)
-    model = system.model()
-    resolved, grid = _resolved_grid(system, model, over, {"eps": eps, "V": V, "W0": W0})
+    slider, grid = _slider_grid(system, over, {"eps": eps, "V": V, "W0": W0})
     settings = AtlasSettings(tol=system.tolerance(tol).value, max_mesh=max_mesh, steps=StepSettings(largest=step))
     warn_uncompiled("a map takes about twice as long")
-    begun = time.perf_counter()
+    begun, mapped = time.perf_counter(), 0.0
     with Progress("map") as progress:
 
         def tiles(done: int, count: int) -> None:
+            nonlocal mapped
+            mapped = time.perf_counter() - begun
             progress.total, progress.done = count, done
             progress.advance(0, note="tiles")
 
-        found = compute_map(
-            model,
-            grid,
-            MapSettings(mesh_error=mesh_error, depth=depth),
-            run=spread.run,
-            progress=tiles,
-        )
-        progress.total = None
-        mapped = time.perf_counter() - begun
-        boundaries &= found.finished
-        atlas, special, cubic = _boundaries(model, found, settings, (boundaries, criticality), progress)
+        def then(said: str) -> None:
+            progress.total = None
+            progress.advance(0, note=said)
+
+        found = map_grid(
+            slider, grid, grid=MapSettings(mesh_error=mesh_error, depth=depth), curves=settings, boundaries=boundaries,
+            criticality=criticality, run=spread.run, tiles=tiles, progress=then,
+        )  # fmt: skip
     timings = {"map": mapped, "boundaries": time.perf_counter() - begun - mapped}
-    shown = _tables(model, found, (atlas, special, cubic), boundaries, resolved)
-    grid_rows, components, marks, points, status = shown
-    text = output.format == "text" and boundaries
-    figure = functools.partial(
-        map_figure,
-        model,
-        found,
-        atlas,
-        special,
-        cubic,
-        titled(model.title, {k: v for k, v in grid_rows.parameters.items() if k != "eps"}),
-    )
-    more = (marks,) if text and marks.rows else ()
-    emit(components if text else grid_rows, output, more=more, laws=model.laws, timings=timings, figure=figure)
+    text, laws = output.format == "text" and found.followed, slider.model.laws
+    more = (found.special_points,) if text and found.special_points.rows else ()
+    emit(found.components if text else found.table, output, more=more, laws=laws, timings=timings, figure=found.plot)
     if place is not None:
-        emit(points, place, laws=model.laws, timings=timings)
-    finish(status)
+        emit(found.boundary, place, laws=laws, timings=timings)
+    finish(found.status)
 
 
-def _resolved_grid(
-    system: SystemOptions, model: GeneratedModel, over: tuple[Range, ...], given: dict[str, str | None]
-) -> tuple[Resolved, MapGrid]:
-    """Return the parameters and the grid; raises SrfError where an axis has a value too."""
+def _slider_grid(
+    system: SystemOptions, over: tuple[Range, ...], given: dict[str, str | None]
+) -> tuple[SlidingSystem, MapGrid]:
+    """Return the system and the grid; raises SrfError where an axis has a value too."""
     from srfcli.cli.map_axes import read_grid
     from srfcli.errors import SrfError
 
@@ -172,29 +148,9 @@ def _resolved_grid(
             raise SrfError(
                 f"{name} is an axis and has a value too", f"Leave out --{name}, or take {name} out of --over."
             )
-    resolved = system.resolve(model.parameters, **given)
-    p = model.vector(resolved.values)
-    model.check_changing_load(p)
-    return resolved, read_grid(model, p, over)
-
-
-def _tables(
-    model: GeneratedModel,
-    found: StabilityMap,
-    curves: tuple[Atlas, list[list[SpecialPoint]], list[Array]],
-    boundaries: bool,
-    resolved: Resolved,
-) -> tuple[Table, Table, Table, Table, Status]:
-    """Return the grid, the components, the special points and the boundaries' points as tables, and the status of all."""
-    atlas, special, cubic = curves
-    notes, meta, status = _summary(model, found, atlas, special, boundaries)
-    moved = {found.grid.x.moved, found.grid.y.moved}
-    described = {k: v for k, v in resolved.described().items() if k not in moved}
-    common: dict[str, Any] = {"title": model.title, "notes": notes, "parameters": described, "status": status.value}
-    components, marks = components_table(model, found, atlas, special, **common), special_table(model, found, special)
-    tables = {"components": _plain(components), "special": _plain(marks)}
-    whole = replace(grid_table(model, found, **common), meta={**meta, **tables})
-    return whole, components, marks, _points_table(model, atlas, cubic, common), status
+    slider = system.slider(**given)
+    slider.model.check_changing_load(slider.vector())
+    return slider, read_grid(slider.model, slider.model.vector(slider.resolved.values), over)
 
 
 def _boundary_output(boundary: str, output: OutputOptions) -> OutputOptions:
@@ -207,90 +163,3 @@ def _boundary_output(boundary: str, output: OutputOptions) -> OutputOptions:
     if output.out is not None and place.out is not None and output.out.resolve() == place.out.resolve():
         raise SrfError(f"--out and --boundary are the same file, {boundary}", "Give them different names.")
     return place
-
-
-def _boundaries(
-    model: GeneratedModel, found: StabilityMap, settings: Any, wanted: tuple[bool, bool], progress: Any
-) -> tuple[Atlas, list[list[SpecialPoint]], list[Array]]:
-    """Return the components, the special points of each, and the cubic coefficient at each point (NaN unless wanted)."""
-    import numpy as np
-
-    from srfcli.numerics.atlas import Atlas
-    from srfcli.numerics.mapcurves import find_boundaries
-    from srfcli.numerics.neimark import branch_coefficients, criticality_points
-    from srfcli.numerics.special import special_points
-
-    if not wanted[0]:
-        return Atlas(found.grid.plane(model), [], [], []), [], []
-    *_, atlas = find_boundaries(
-        model, found, settings, progress=lambda said: progress.advance(0, note=f"boundaries: {said}")
-    )
-    special = [special_points(model, atlas.plane, b) for b in atlas.branches]
-    cubic = [np.full(len(b.points), np.nan) for b in atlas.branches]
-    for k, branch in enumerate(atlas.branches if wanted[1] else []):
-        progress.advance(0, note=f"criticality of boundary {k + 1}")
-        cubic[k] = branch_coefficients(model, branch)
-        changes = criticality_points(model, atlas.plane, branch, cubic[k])
-        special[k] = sorted([*special[k], *changes], key=lambda s: s.place)
-    return atlas, special, cubic
-
-
-def _summary(
-    model: GeneratedModel, found: StabilityMap, atlas: Atlas, special: list[list[SpecialPoint]], wanted: bool
-) -> tuple[tuple[str, ...], dict[str, Any], Status]:
-    """Return the notes, what JSON holds beside the rows, and the status of the whole."""
-    from srfcli.numerics.map import KINDS
-    from srfcli.numerics.mapcurves import map_notes, unexplained
-    from srfcli.numerics.special import crossings_at
-
-    count = found.kind.size
-    share = {name: float((found.kind == k).sum() / count) for k, name in enumerate(KINDS)}
-    meta: dict[str, Any] = {"share": share, "suspect_cells": len(found.suspect), "points_added": len(found.extra_at)}
-    status = Status.NO_CONVERGENCE if found.lost else Status.OK
-    if not found.finished:
-        left = "interrupted: what was not reached is unresolved, and no boundary was followed"
-        return (left, *map_notes(found)), meta, Status.INTERRUPTED
-    if not wanted:
-        return tuple(map_notes(found)), meta, status
-    values = found.points(model)[model.index(found.grid.x.moved), :, 0]
-    met = crossings_at(model, atlas.plane, atlas.branches, values)
-    odd = unexplained(model, found, atlas)
-    meta |= {"crossings": [len(c) for c in met], "unexplained_points": len(odd)}
-    number = len(atlas.branches)
-    notes = [f"{number} component{'' if number == 1 else 's'}; stable at {share['stable']:.1%} of the points"]
-    notes.append(crossing_notes([len(c) for c in met], found.grid.x.name))
-    if len(odd):
-        notes.append(
-            f"the curves do not account for the stability of {len(odd)} of {count} points: one is missing there"
-        )
-        status = Status.NO_CONVERGENCE
-    else:
-        notes.append(f"the curves account for the stability of all {count} points")
-    bad = sum(not s.status.ok for marks in special for s in marks)
-    if bad:
-        notes.append(f"{bad} special points could not be located; their rows say so")
-    stopped = atlas.status is Status.INTERRUPTED  # counts before what else went wrong
-    return (*notes, *atlas.notes), meta, atlas.status if stopped or status.ok else status
-
-
-def _plain(table: Table) -> list[dict[str, Any]]:
-    names = [c.name for c in table.columns]
-    return [dict(zip(names, row, strict=True)) for row in table.rows]
-
-
-def _points_table(model: GeneratedModel, atlas: Atlas, cubic: list[Array], common: dict[str, Any]) -> Table:
-    """Return the polished points of all components, as `srf continue` lists them, with the cubic coefficient."""
-    from srfcli.cli.boundary_rows import COLUMNS, boundary_row
-    from srfcli.numerics.atlas import crossing_numbers
-    from srfcli.output.tables import Column, Table
-
-    extra = tuple(a.name for a in (atlas.plane.x, atlas.plane.y) if a.name not in ("V", "W0", "eps"))
-    declared = {q.name: q for q in model.parameters}
-    rows = [
-        (*boundary_row(model, q, k, number, extra), float(d))
-        for k, (branch, numbers) in enumerate(zip(atlas.branches, crossing_numbers(model, atlas), strict=True), 1)
-        for q, number, d in zip(branch.points, numbers, cubic[k - 1], strict=True)
-    ]
-    about = "cubic coefficient of the normal form, a period; supercritical where negative, subcritical where positive"
-    columns = (*COLUMNS, *(Column(n, declared[n].unit, declared[n].about) for n in extra), Column("cubic", "1", about))
-    return Table("srf.map.boundary/1", columns, rows, **{**common, "notes": ()})

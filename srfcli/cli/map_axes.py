@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from srfcli.cli.ranges import Range, parse_over
 from srfcli.errors import SrfError
+from srfcli.results.map import ratio_powers, unit_text
 
 if TYPE_CHECKING:
     from srfcli.model import GeneratedModel
     from srfcli.numerics.collocation import Array
     from srfcli.numerics.mapgrid import MapAxis, MapGrid
 
-BASE_UNITS = ("um", "s", "N", "rad")
 COLUMNS, ROWS = 80, 120  # points of an axis for which none were given
 
 
@@ -69,55 +69,6 @@ def _ratio_factor(model: GeneratedModel, given: Range, held: str, moved: str) ->
             f"Write it in {unit_text(powers)}, or leave it out.",
         )
     return unit.factor
-
-
-def ratio_powers(model: GeneratedModel, held: str, moved: str) -> tuple[int, ...]:
-    """Return the powers of (um, s, N, rad) of the ratio of two parameters."""
-    from srfcli.units import find_unit
-
-    top, bottom = (find_unit(model.parameters[model.index(n)].unit).powers for n in (held, moved))
-    return tuple(a - b for a, b in zip(top, bottom, strict=True))
-
-
-def unit_text(powers: tuple[int, ...]) -> str:
-    """Return powers of the base units as a unit: 1/um, N s/um^2, 1."""
-
-    def side(sign: int) -> str:
-        parts = [
-            name if abs(p) == 1 else f"{name}^{abs(p)}"
-            for name, p in zip(BASE_UNITS, powers, strict=True)
-            if p * sign > 0
-        ]
-        return " ".join(parts)
-
-    top, bottom = side(1), side(-1)
-    return f"{top or '1'}/{bottom}" if bottom else top or "1"
-
-
-def axis_unit(model: GeneratedModel, axis: MapAxis) -> str:
-    """Return the unit in which an axis is shown: the parameter's declared one, um, s, N for a ratio."""
-    return (
-        unit_text(ratio_powers(model, axis.held, axis.moved))
-        if axis.held
-        else model.parameters[model.index(axis.moved)].unit
-    )
-
-
-def shown(model: GeneratedModel, axis: MapAxis, value: float) -> float:
-    """Return a quantity in the unit it is shown in."""
-    return float(value) if axis.held else model.declared(axis.moved, float(value))
-
-
-def column_name(axis: MapAxis) -> str:
-    """Return an axis' name as a column: V, K_over_W0."""
-    return f"{axis.held}_over_{axis.moved}" if axis.held else axis.moved
-
-
-def label(model: GeneratedModel, axis: MapAxis) -> str:
-    """Return an axis' label with its unit."""
-    unit = axis_unit(model, axis)
-    name = axis.name.replace("W0", "W$_0$")
-    return name if unit in ("", "1") else f"{name}  [{unit.replace('um', 'µm')}]"
 
 
 def _load_axis(model: GeneratedModel, base: Array, x: MapAxis) -> MapAxis:

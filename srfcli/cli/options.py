@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from srfcli.model import GeneratedModel
     from srfcli.registry import Registry
     from srfcli.system import System
+    from srfcli.tasks.system import SlidingSystem
 
 __all__ = [
     "OutputOptions",
@@ -118,6 +119,13 @@ class SystemOptions:
         for sentence in resolved.unused:
             Session.current().say(f"Warning: {sentence}")
         return resolved
+
+    def slider(self, **given: str | float | None) -> SlidingSystem:
+        """Return the system with its parameters, the command's own flags `given` among them as in `resolve`."""
+        from srfcli.tasks.system import SlidingSystem
+
+        model = self.model()
+        return SlidingSystem(model, self.resolve(model.parameters, **given))
 
     def say_defaults(self, resolved: Resolved, names: Iterable[str]) -> None:
         """Say on stderr which of these parameters have a value that nobody chose."""

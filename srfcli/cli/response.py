@@ -144,9 +144,9 @@ def _mean(
     """Return the table of mean frictions, its figure and its status."""
     import numpy as np
 
-    from srfcli.cli.boundary_rows import worst
     from srfcli.numerics.response import mean_friction
     from srfcli.output.tables import Table
+    from srfcli.results.boundary import worst
 
     values = np.array(swept.base_points(model.parameters, where=model.title))
     rows, statuses, curves = [], [], []

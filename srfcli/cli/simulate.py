@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +15,7 @@ from srfcli.errors import SrfError
 from srfcli.status import Status
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from srfcli.cli.simulated import Record, Work
+    from srfcli.results.simulation import Record, Work
 
 EXAMPLES = """
 srf simulate --V 8 --W0 9 --eps 0.09 --for 4 --rate 1000 --out run.csv
@@ -140,29 +138,33 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
     Drive and load are programs of pieces, or those of the runs of EXPERIMENT, a folder or its experiment.toml. Errors are
     controlled; slip velocities may fall to 1e-12 um/s and below. The records can be written as a new experiment, with noise.
     """
-    from srfcli.cli.emit import emit, finish, warn_uncompiled
-    from srfcli.cli.simulated import curves, record_table
+    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
+    from srfcli.tasks.simulate import simulate_work
 
     _check(given, experiment, output)
     warn_uncompiled("a simulation takes up to 34 times as long")
     work = _own(system, given) if experiment is None else _repeated(system, experiment, given)
     begun = time.perf_counter()
-    records, status = _simulate_all(work, given["rtol"])
-    timings = {"simulate": time.perf_counter() - begun}
-    table = record_table(work, records, status=status)
-
-    def figure() -> Figure:
-        from srfcli.output.traces import traces
-
-        return traces(curves(records), title=work.model.title)
-
+    with Progress("simulate", total=len(work.jobs)) as progress:
+        found = simulate_work(
+            work, rtol=given["rtol"], progress=lambda name, done: progress.advance(int(done), note=name)
+        )
+    timings, table = {"simulate": time.perf_counter() - begun}, found.table
     folder = given["folder"]
     if folder is not None and output.out is None and output.format == "text":
         table = dataclasses.replace(table, columns=(), rows=())  # the records are in the folder
-    emit(table, output, figure=figure, laws=work.model.laws, inputs=work.inputs, seed=work.gauge.seed, timings=timings)
+    emit(
+        table,
+        output,
+        figure=found.plot,
+        laws=work.model.laws,
+        inputs=work.inputs,
+        seed=work.gauge.seed,
+        timings=timings,
+    )
     if folder is not None:
-        _write(work, records, status, folder, given, output, timings)
-    finish(status)
+        _write(work, found.records, found.status, folder, given, output, timings)
+    finish(found.status)
 
 
 def _own(system: SystemOptions, given: dict[str, Any]) -> Work:
@@ -217,31 +219,9 @@ def _check_folder(given: dict[str, Any], experiment: Path | None, output: Output
     check_folder(folder, force=output.force)
 
 
-def _simulate_all(work: Work, rtol: float) -> tuple[list[Record], Status]:
-    """Return the records that were finished, and ok, the first failure's status, or that of an interruption."""
-    from srfcli.cli.emit import Progress
-    from srfcli.cli.simulated import Record, measure, observe, worst
-    from srfcli.numerics.integrate import simulate
-
-    records: list[Record] = []
-    with Progress("simulate", total=len(work.jobs)) as progress:
-        try:
-            for job in work.jobs:
-                progress.advance(0, note=job.name)
-                trace = simulate(
-                    work.model, job.p, drive=job.drive, load=job.load, t=job.t, start=job.start, tables=job.tables, rtol=rtol
-                )  # fmt: skip
-                observed = observe(work.model, job, trace)
-                records.append(Record(job, trace, observed, measure(work.gauge, job, observed)))
-                progress.advance()
-        except KeyboardInterrupt:
-            return records, Status.INTERRUPTED
-    return records, worst([r.trace.status for r in records])
-
-
 def _write(
     work: Work,
-    records: list[Record],
+    records: Sequence[Record],
     status: Status,
     folder: Path,
     given: dict[str, Any],

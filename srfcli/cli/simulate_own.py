@@ -20,8 +20,8 @@ from srfcli.cli.programs import (
     usual_rate,
 )
 from srfcli.cli.simulate_track import TABLES, on_track, read_track, track_parameters, track_told
-from srfcli.cli.simulated import UNITS, Job, Record, Work, read_gauge, simulated_run
 from srfcli.errors import SrfError, did_you_mean
+from srfcli.results.simulation import UNITS, Job, Record, Work, read_gauge, simulated_run
 from srfcli.units import parse_quantity
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from srfcli.cli.options import Session, SystemOptions
 from srfcli.cli.programs import start_state
 from srfcli.cli.simulate_own import bounds, parse_spread, perturbed
 from srfcli.cli.simulate_track import TABLES, on_track, read_track, track_parameters, track_told
-from srfcli.cli.simulated import UNITS, Job, Record, Work, read_gauge, simulated_run
 from srfcli.errors import SrfError, did_you_mean
+from srfcli.results.simulation import UNITS, Job, Record, Work, read_gauge, simulated_run
 
 if TYPE_CHECKING:
     from srfcli.model import GeneratedModel

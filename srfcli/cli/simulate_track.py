@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from srfcli.cli.programs import start_state
-from srfcli.cli.simulated import Job
 from srfcli.errors import SrfError
+from srfcli.results.simulation import Job
 from srfcli.units import parse_quantity
 
 if TYPE_CHECKING:

@@ -125,6 +125,11 @@ class Ledger:
         return not any(set(t.hypothesis.effects) == set(hypothesis.effects) and r == rough and t.fit.log_likelihood > above
                        for (_, r), t in self.tried.items())  # fmt: skip
 
+    @property
+    def share(self) -> float:
+        """Return the share of the search's budget that is used, from 0 to 1."""
+        return min((self.evaluations + self.follower.evaluations) / MOST_EVALUATIONS, 1.0)
+
     def spent(self) -> bool:
         """Return whether the search's budget is used up."""
         return self.evaluations + self.follower.evaluations > MOST_EVALUATIONS

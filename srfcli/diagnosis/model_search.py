@@ -227,6 +227,11 @@ class ModelSearch:
         return self.best()
 
     @property
+    def share(self) -> float:
+        """Return the share of the budget that is used, from 0 to 1."""
+        return min((time.process_time() - self.begun) / self.budget, 1.0)
+
+    @property
     def spent(self) -> bool:
         """Return whether the budget is used up."""
         return time.process_time() - self.begun > self.budget

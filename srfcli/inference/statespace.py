@@ -763,6 +763,7 @@ def as_fit(found: StateSpaceFit) -> Fit:
             RunFit(f.run.name, f.run.holdout, prediction, residual, parts, Noise(level, (), level), level, colours)
         )
     return Fit(
-        problem.names, {**problem.held, **{n: values[n] for n in problem.names}}, found.covariance[:k, :k], problem.lower, problem.upper,
+        problem.names, {**problem.held, **{n: values[n] for n in problem.names}}, found.covariance[:k, :k], problem.lower,
+        problem.upper,
         tuple(runs), found.log_likelihood, maximum.status, found.evaluations,
     )  # fmt: skip

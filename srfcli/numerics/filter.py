@@ -98,7 +98,8 @@ def kalman_filter(
     A reading is `factor` (n,) times the elongation (or the gauge's own state) plus `offset` (n,) plus gauge noise: white of
     variance `R` (n,), and processes e' = -e/tau + s sqrt(2/tau) w whose (tau, s) are the rows of `gauge` (g, 2), g <= 3.
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
-    numbers in the same k directions. After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a compiler, or for a model without a random friction field.
+    numbers in the same k directions. After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a
+    compiler, or for a model without a random friction field.
     """
     library = compiled(model)
     if library is None:

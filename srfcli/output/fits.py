@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.plots import COLOURS, house_style, name_text
+from srfcli.output.plots import COLOURS, heading, house_style, name_text, names_below
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,8 +33,8 @@ def fit_figure(rows: Sequence[FitRow], *, quantity: str, unit: str, title: str =
             cell = grid[place // columns, place % columns].subgridspec(2, 1, height_ratios=(2, 1), hspace=0.05)
             above = figure.add_subplot(cell[0])
             below = figure.add_subplot(cell[1], sharex=above)
-            dots = above.plot(t, recorded, ".", color="#777777", markersize=2.0, label="recorded", rasterized=True)
-            line = above.plot(t, predicted, color=COLOURS[0], linewidth=1.2, label="model")
+            dots = above.plot(t, recorded, ".", color="#999999", markersize=3.0, label="recorded", rasterized=True)
+            line = above.plot(t, predicted, color=COLOURS[0], linewidth=0.9, label="model")
             handles = handles or [*dots, *line]
             above.set_title(name_text(name) + (" (held out)" if holdout else ""))
             above.set_ylabel(label)
@@ -46,11 +45,9 @@ def fit_figure(rows: Sequence[FitRow], *, quantity: str, unit: str, title: str =
             for level in (-2.0, 2.0) if noise else ():
                 below.axhline(level, color="#000000", linewidth=0.7, linestyle=(0, (1, 1.5)))
             below.set_ylabel("residual\n/ noise" if noise else "residual")
-            below.set_xlabel("t  [s]")
+            below.set_xlabel("time  [s]")
             above.margins(x=0.01)
             figure.align_ylabels([above, below])
-        figure.legend(handles=handles, loc="outside lower right", ncols=2, markerscale=4, fontsize=9)
-        if title or found:
-            told = [fill(title, 52 * columns), fill(found, 62 * columns)]
-            figure.suptitle("\n".join(t for t in told if t), x=0.01, ha="left", fontsize=10)
+        names_below(figure, handles, [h.get_label() for h in handles], markerscale=3)
+        heading(figure, "\n".join(t for t in (title, found) if t))
         return figure

@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
-from srfcli.output.plots import COLOURS, DASHES, Values, _decade_ticks, house_style, new_figure
+from srfcli.output.plots import (
+    COLOURS,
+    DASHES,
+    Values,
+    _decade_ticks,
+    heading,
+    house_style,
+    names_below,
+    new_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,6 +52,7 @@ def stability_map(
     logx: bool = True,
     logy: bool = False,
     title: str = "",
+    ax: Axes | None = None,
 ) -> Figure:
     """Return a map of `growth` (nx, ny), negative where stable, over axes `x` (nx,) and `y` (ny,), both rising.
 
@@ -54,7 +64,8 @@ def stability_map(
 
     values = np.ma.masked_invalid(np.asarray(growth, float))
     with house_style():
-        figure, (ax,) = new_figure(size=(6.8, 4.8))
+        own = ax is None
+        figure, (ax,) = new_figure(size=(6.8, 4.8)) if ax is None else (cast("Figure", ax.figure), [ax])
         ax.grid(False)
         ax.set_xscale("log" if logx else "linear")
         ax.set_yscale("log" if logy else "linear")
@@ -68,8 +79,11 @@ def stability_map(
         if len(unresolved[0]):
             ax.plot(list(unresolved[0]), list(unresolved[1]), "x", color="#D00000", markersize=3, label="unresolved")
         ax.set(xlabel=xlabel, ylabel=ylabel, xlim=_ends(x), ylim=_ends(y))
-        ax.set_title(title)
-        _legend(figure, ax)
+        if own:
+            _legend(figure, ax)
+            heading(figure, title)
+        else:
+            ax.set_title(title.split("\n")[0])
         _decade_ticks(ax)
         return figure
 
@@ -101,16 +115,7 @@ def _legend(figure: Figure, ax: Axes) -> None:
     handles: list[Any] = [stable, *drawn]
     if "subcritical" in names:  # white on black in the figure, and so in the legend
         handles[1 + names.index("subcritical")] = (drawn[names.index("boundary")], drawn[names.index("subcritical")])
-    figure.legend(
-        handles,
-        ["stable", *names],
-        loc="outside lower center",
-        ncols=len(handles),
-        handlelength=2.0,
-        columnspacing=1.2,
-        handler_map={tuple: HandlerTuple(ndivide=1)},
-        fontsize=9,
-    )
+    names_below(figure, handles, ["stable", *names], handlelength=2.0, handler_map={tuple: HandlerTuple(ndivide=1)})
 
 
 def _ends(values: Values) -> tuple[float, float]:
@@ -184,10 +189,8 @@ def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title
         below.set_ylabel("phase  [deg]")
         below.yaxis.set_major_locator(MultipleLocator(90))
         below.set_xlabel(xlabel)
-        above.set_title(title)
-        figure.legend(
-            *below.get_legend_handles_labels(), loc="outside lower center", handlelength=2.8, ncols=len(parts)
-        )
+        heading(figure, title)
+        names_below(figure, *below.get_legend_handles_labels())
         below.margins(x=0.0)
         figure.align_ylabels(axes)
         _decade_ticks(below)

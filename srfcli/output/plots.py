@@ -28,9 +28,20 @@ SUFFIXES = (".png", ".svg", ".pdf")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (9, 2)), (0, (3, 1, 1, 1, 1, 1)), (0, (2, 2)))
 DOTTED = (0, (1, 1.2))  # kept for the constant load
-TITLE = ("V", "W0", "eps", "f", "K", "M")  # parameters that stand under a figure's title
-FEW_NAMES = 5  # of curves that a legend holds within the axes; more are named below them
-NAME_COLUMNS, NAME_ROW = 2, 0.2  # there, and the height of a row in inches
+FIRST = ("V", "W0", "eps", "f", "K", "M", "angle")  # of the parameters under a figure's title; the law's own follow
+# one quantity, one colour, in every figure
+QUANTITY = {"u": COLOURS[0], "v": COLOURS[1], "V": COLOURS[6], "mu": COLOURS[2], "W": COLOURS[3], "state": COLOURS[5]}
+SYMBOLS = {
+    "W0": "W$_0$", "V0": "V$_0$", "D0": "D$_0$", "mu0": "µ$_0$", "Vsat": "V$_{sat}$", "Va": "V$_a$", "Vb": "V$_b$", "eps": "ε",
+    "lambda": "λ", "alpha": "α", "phi": "φ",
+}  # fmt: skip
+HEADING, PER_INCH, LINE = 9.0, 15, 0.155  # points, characters and inches of a heading's line
+NAME, NAME_ROW, NAME_WIDTH = (
+    9.0,
+    0.19,
+    0.075,
+)  # points of a curve's name below the axes, inches of a row and of a letter
+HANDLE = 0.65  # inches beside a name
 
 STYLE: dict[str, Any] = {
     "figure.figsize": (6.0, 4.2),
@@ -102,12 +113,12 @@ def house_style() -> Iterator[None]:
         yield
 
 
-def name_text(name: str, *, narrow: bool = False) -> str:
+def name_text(name: str, *, narrow: bool = False, wide: bool = False) -> str:
     """Return a user's text so that a figure shows it as it is: a dollar sign opens no formula, a line does not break.
 
-    It is cut where it would leave the figure no room, early in one for small screens.
+    It is cut where it would leave the figure no room, early in one for small screens, late where it may be broken.
     """
-    words, most = printable(" ".join(name.split())), 18 if narrow else 48
+    words, most = printable(" ".join(name.split())), 18 if narrow else 160 if wide else 48
     return (words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$")
 
 
@@ -130,12 +141,89 @@ def figure_bytes(figure: Figure, suffix: str) -> bytes:
     return buffer.getvalue()
 
 
+def symbol_text(name: str) -> str:
+    """Return a parameter's name as it is set in a figure: W$_0$ for W0, ε for eps."""
+    return SYMBOLS.get(name) or name_text(name)
+
+
+def axis_label(name: str, unit: str) -> str:
+    """Return a parameter as the label of an axis, with its unit unless that is 1."""
+    return symbol_text(name) if unit in ("", "1") else f"{symbol_text(name)}  [{unit.replace('um', 'µm')}]"
+
+
 def titled(title: str, described: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a figure's title with the values under it that its axes do not show; `described` as a table's parameters are."""
-    shown = [(name, described[name]) for name in TITLE if isinstance(described.get(name, {}).get("value"), float)]
-    units = {name: "" if p.get("unit") == "1" else f" {str(p.get('unit')).replace('um', 'µm')}" for name, p in shown}
-    names = {"W0": "W$_0$", "eps": "ε"}
-    return "\n".join([title, ", ".join(f"{names.get(n, n)} = {p['value']:g}{units[n]}" for n, p in shown)]).strip()
+    """Return a figure's title: the laws, and under them every parameter that the axes do not show, apparatus first.
+
+    `described` is as a table's parameters are.
+    """
+    known = [name for name, p in described.items() if isinstance(p.get("value"), float | int)]
+    groups = [[n for n in FIRST if n in known], [n for n in known if n not in FIRST]]
+    lines = [", ".join(valued(n, described[n]["value"], str(described[n].get("unit"))) for n in g) for g in groups]
+    return "\n".join(line for line in [title, *lines] if line)
+
+
+def valued(name: str, value: float, unit: str) -> str:
+    """Return a parameter with its value as it is set in a figure: W$_0$ = 10 N."""
+    return f"{symbol_text(name)} = {value:.4g}{'' if unit in ('', '1') else f' {unit}'.replace('um', 'µm')}"
+
+
+def heading(figure: Figure, text: str) -> None:
+    """Set a figure's title at its upper left, each line broken between parts where it is wider than the figure.
+
+    The figure grows by what the lines take beyond the first, so that the axes stay as high as they are.
+    """
+    if not text:
+        return
+    most = int(PER_INCH * figure.get_figwidth())
+    lines = [broken for line in text.split("\n") for broken in _broken(line, most)]
+    figure.set_figheight(figure.get_figheight() + LINE * len(lines[1:]))
+    figure.suptitle("\n".join(lines), x=0.012, ha="left", fontsize=HEADING, linespacing=1.3)
+
+
+def _broken(line: str, most: int) -> list[str]:
+    lines = [""]
+    for part in line.split(", "):
+        joined = f"{lines[-1]}, {part}" if lines[-1] else part
+        if lines[-1] and len(joined.replace("$", "").replace("_", "")) > most:
+            lines[-1] += ","
+            lines.append(part)
+        else:
+            lines[-1] = joined
+    return lines
+
+
+def names_below(figure: Figure, handles: Sequence[Any], names: Sequence[str], **more: Any) -> None:
+    """Name curves below the axes, where the names cover nothing; the figure grows by their rows."""
+    if not names:
+        return
+    widest = max(len(n.replace("$", "").replace("_", "")) for n in names) * NAME_WIDTH + HANDLE
+    columns = max(1, min(len(names), int(figure.get_figwidth() / widest)))
+    figure.set_figheight(figure.get_figheight() + NAME_ROW * -(-len(names) // columns))
+    figure.legend(
+        handles, names, loc="outside lower center", ncols=columns, fontsize=NAME,
+        **{"handlelength": 2.8, "columnspacing": 1.4, **more},
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def one_panel(ax: Axes | None, *, title: str, size: tuple[float, float] | None = None) -> Iterator[tuple[Figure, Axes]]:
+    """Yield a figure of one panel to draw in, or that of `ax`; then what was drawn is titled and its curves are named.
+
+    In somebody's own axes title and names stay within them.
+    """
+    with house_style():
+        if ax is not None:
+            yield cast("Figure", ax.figure), ax
+            ax.set_title("\n".join(_broken(title.split("\n")[0], 60)), fontsize=HEADING)
+            if len(ax.get_legend_handles_labels()[1]) > 1:
+                ax.legend(loc="best", handlelength=2.8, fontsize=NAME)
+            return
+        figure, (own,) = new_figure(size=size)
+        yield figure, own
+        heading(figure, title)
+        handles, names = own.get_legend_handles_labels()
+        if len(names) > 1:
+            names_below(figure, handles, names)
 
 
 def save_figure(figure: Figure, path: Path) -> bytes:
@@ -152,21 +240,21 @@ def stability_diagram(
     title: str = "",
     xlabel: str = "V  [µm/s]",
     ylabel: str = "K/W$_0$  [1/µm]",
+    ax: Axes | None = None,
 ) -> Figure:
-    """Return the stability boundaries K/W0 (1/um) against V (um/s, logarithmic).
+    """Return the stability boundaries K/W0 (1/um) against V (um/s, logarithmic), drawn in `ax` if that is given.
 
     A branch is {eps, V, K_over_W0, component, label}, of which component and label may be missing; the branches of one
     eps share colour and line style. `hopf`, {V, K_over_W0}, is the boundary under constant load. The curves of a single
     eps are shaded where sliding is stable: at the top, and beyond every second crossing on the way down.
     """
-    with house_style():
-        figure, (ax,) = new_figure()
+    with one_panel(ax, title=title) as (figure, ax):
         ax.set_xscale("log")
         if hopf is not None:
             ax.plot(hopf["V"], _gaps(hopf["K_over_W0"]), color="#555555", linestyle=DOTTED, label="ε = 0 (Hopf)")
-        named = _draw_branches(ax, branches)
+        _draw_branches(ax, branches)
         amplitudes = {b["eps"] for b in branches}
-        _finish_axes(ax, xlabel=xlabel, ylabel=ylabel, title=title, legend=len(named) + (hopf is not None) > 1)
+        ax.set(xlabel=xlabel, ylabel=ylabel)
         _frame_curves(ax)
         if len(amplitudes) == 1 or (hopf is not None and not branches):
             curves = [(b["V"], b["K_over_W0"]) for b in branches] or [(hopf["V"], hopf["K_over_W0"])]  # type: ignore[index]
@@ -179,6 +267,40 @@ def stability_diagram(
         return figure
 
 
+def critical_points(points: Sequence[Mapping[str, Any]], *, title: str = "", ax: Axes | None = None) -> Figure:
+    """Return critical loads as marks, K/W0 (1/um) against V (um/s): full where stability is lost as W0 rises, else open.
+
+    A point is {eps, crossing, V, K_over_W0}. Crossings of one number and amplitude are joined by a thin line for the eye.
+    """
+    with one_panel(ax, title=title) as (figure, ax):
+        ax.set_xscale("log")
+        order = list(dict.fromkeys(p["eps"] for p in points))
+        for eps, crossing in sorted({(p["eps"], p["crossing"]) for p in points}):
+            mine = sorted((p for p in points if (p["eps"], p["crossing"]) == (eps, crossing)), key=lambda p: p["V"])
+            index, lost = order.index(eps), crossing % 2 == 1
+            colour = COLOURS[index % len(COLOURS)]
+            ax.plot(
+                [p["V"] for p in mine],
+                [p["K_over_W0"] for p in mine],
+                color=colour,
+                linewidth=0.7,
+                linestyle=DASHES[index % len(DASHES)],
+                marker="os^Dv<>"[index % 7],
+                markersize=5.5,
+                markerfacecolor=colour if lost else "white",
+                label=f"ε = {eps:g}: stability is {'lost' if lost else 'regained'} as W$_0$ rises"
+                if crossing < 3
+                else None,
+                clip_on=False,
+                zorder=3,
+            )
+        ax.set(xlabel="V  [µm/s]", ylabel="critical K/W$_0$  [1/µm]")
+        ax.margins(x=0.06)
+        ax.set_ylim(0.0, 1.12 * max((p["K_over_W0"] for p in points), default=1.0))
+        _decade_ticks(ax)
+        return figure
+
+
 def boundaries(
     branches: Sequence[Mapping[str, Any]],
     *,
@@ -187,20 +309,20 @@ def boundaries(
     logx: bool = True,
     logy: bool = False,
     title: str = "",
+    ax: Axes | None = None,
 ) -> Figure:
     """Return boundaries in a plane of any two parameters; branches as in `stability_diagram`, x under V, y under K_over_W0."""
-    with house_style():
-        figure, (ax,) = new_figure()
+    with one_panel(ax, title=title) as (figure, ax):
         ax.set_xscale("log" if logx else "linear")
         ax.set_yscale("log" if logy else "linear")
-        named = _draw_branches(ax, branches)
-        _finish_axes(ax, xlabel=xlabel, ylabel=ylabel, title=title, legend=len(named) > 1)
+        _draw_branches(ax, branches)
+        ax.set(xlabel=xlabel, ylabel=ylabel)
         _decade_ticks(ax)
         return figure
 
 
-def _draw_branches(ax: Axes, branches: Sequence[Mapping[str, Any]]) -> set[str]:
-    """Draw the branches, one colour and line style for each eps, and return the labels that were given."""
+def _draw_branches(ax: Axes, branches: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the branches, one colour and line style for each eps."""
     order = list(dict.fromkeys(b["eps"] for b in branches))
     named: set[str] = set()
     for branch in branches:
@@ -215,7 +337,6 @@ def _draw_branches(ax: Axes, branches: Sequence[Mapping[str, Any]]) -> set[str]:
             marker="o" if len(branch["V"]) == 1 else None,
         )
         named.add(label)
-    return named
 
 
 def _frame_curves(ax: Axes) -> None:
@@ -285,10 +406,10 @@ def lines(
     *,
     logy: bool = False,
     title: str = "",
+    ax: Axes | None = None,
 ) -> Figure:
     """Return several curves over one x; labels and units are the caller's; NaN or None leaves a gap."""
-    with house_style():
-        figure, (ax,) = new_figure()
+    with one_panel(ax, title=title) as (figure, ax):
         for index, (y, label) in enumerate(zip(ys, labels, strict=True)):
             drawn = _gaps(y)
             marker = "o" if len(drawn) == 1 else None
@@ -299,7 +420,7 @@ def lines(
         if logy:
             ax.set_yscale("log")
         ax.margins(x=0.0 if len(x) > 1 else 0.05)
-        _finish_axes(ax, xlabel=xlabel, ylabel=ylabel, title=title, legend=len(labels) > 1)
+        ax.set(xlabel=xlabel, ylabel=ylabel)
         _decade_ticks(ax)
         return figure
 
@@ -315,13 +436,13 @@ def orbit(
     title: str = "",
 ) -> Figure:
     """Return one forced period, panels over tau in periods: u (um), v (um/s, logarithmic), ages (s), mu and W (N)."""
-    panels: list[tuple[str, Values, bool]] = [("u  [µm]", u, False), ("v  [µm/s]", v, True)]
-    panels += [(f"{_greek(name)}  [s]", values, True) for name, values in states.items()]
-    panels += [("µ", mu, False), ("W  [N]", W, False)]
+    panels: list[tuple[str, Values, bool, str]] = [("u  [µm]", u, False, "u"), ("v  [µm/s]", v, True, "v")]
+    panels += [(f"{_greek(name)}  [s]", values, True, "state") for name, values in states.items()]
+    panels += [("µ", mu, False, "mu"), ("W  [N]", W, False, "W")]
     with house_style():
         figure, axes = new_figure(len(panels), size=(6.0, 1.15 * len(panels) + 0.9))
-        for index, (ax, (label, values, log)) in enumerate(zip(axes, panels, strict=True)):
-            ax.plot(_gaps(tau), _gaps(values), color=COLOURS[index % len(COLOURS)])
+        for ax, (label, values, log, quantity) in zip(axes, panels, strict=True):
+            ax.plot(_gaps(tau), _gaps(values), color=QUANTITY[quantity])
             positive = [y for y in _gaps(values) if y > 0]
             if log and positive and max(positive) > 3 * min(positive):
                 ax.set_yscale("log")
@@ -329,7 +450,9 @@ def orbit(
                 ax.ticklabel_format(axis="y", useOffset=False)
             ax.set_ylabel(label)
             ax.margins(x=0.0, y=0.12)
-        axes[0].set_title(title)
+            _decade_ticks(ax)
+        heading(figure, title)
+        axes[-1].set_xlim(0.0, 1.0)
         axes[-1].set_xlabel("time  [periods of the load]")
         figure.align_ylabels(axes)
         return figure
@@ -339,24 +462,8 @@ def _greek(name: str) -> str:
     return name.replace("phi", "φ").replace("_", " ")
 
 
-def _finish_axes(ax: Axes, *, xlabel: str, ylabel: str, title: str, legend: bool) -> None:
-    ax.set_xlabel(xlabel)
-    ax.set_ylabel(ylabel)
-    if title:
-        ax.set_title(title)
-    if not legend:
-        return
-    drawn, names = ax.get_legend_handles_labels()
-    if len(names) <= FEW_NAMES:
-        ax.legend(loc="best", handlelength=2.8)
-        return
-    figure = cast("Figure", ax.figure)  # below the axes, which stay as high as they are
-    figure.set_figheight(figure.get_figheight() + NAME_ROW * -(-len(names) // NAME_COLUMNS))
-    figure.legend(drawn, names, loc="outside lower center", ncols=NAME_COLUMNS, handlelength=2.8, fontsize=9)
-
-
 def _decade_ticks(ax: Axes) -> None:
-    """Write 1, 10, 100 rather than powers of ten on logarithmic axes, and 2 and 5 between where they span few decades."""
+    """Write 1, 10, 100 rather than powers of ten on logarithmic axes, and more between where they span few decades."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis, (low, high), scale in (
@@ -365,7 +472,9 @@ def _decade_ticks(ax: Axes) -> None:
     ):
         if scale != "log" or not 1e-4 <= low <= high <= 1e5:
             continue
-        between = (1.0, 2.0, 5.0) if high / low < 2e3 else (1.0,)
+        between = (
+            (1.0,) if high / low >= 2e3 else (1.0, 2.0, 5.0) if high / low > 8 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+        )
         axis.set_major_locator(LogLocator(subs=between))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_formatter(NullFormatter())

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.plots import COLOURS, house_style, load_matplotlib, name_text
+from srfcli.output.plots import QUANTITY, heading, house_style, load_matplotlib, name_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,7 +41,7 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
             _panel(axes, run)
             figure.align_ylabels(axes)
         if title:
-            figure.suptitle(name_text(title), x=0.01, ha="left", fontsize=11)
+            heading(figure, name_text(title, wide=True))
         _settle(figure)
         return figure
 
@@ -60,8 +60,8 @@ def _panel(axes: list[Axes], run: Mapping[str, Any]) -> None:
 
     t = np.asarray(run["t"])
     labels = (run["label"], "V\n[µm/s]", f"W\n[{run.get('load_unit', 'N')}]")
-    for axis, key, label, colour in zip(axes, ("observed", "V", "W"), labels, COLOURS, strict=False):
-        axis.plot(*_thinned(t, np.asarray(run[key])), color=colour, linewidth=0.8)
+    for axis, key, label, quantity in zip(axes, ("observed", "V", "W"), labels, "uvW", strict=True):
+        axis.plot(*_thinned(t, np.asarray(run[key])), color=QUANTITY[quantity], linewidth=0.8)
         axis.set_ylabel(label)
         axis.margins(x=0.01, y=0.08)
         for begin, end in run.get("gaps", ()):
@@ -72,7 +72,7 @@ def _panel(axes: list[Axes], run: Mapping[str, Any]) -> None:
     _imposed(axes[2], np.asarray(run["W"]), wide=False)
     marked = _mark_unused(axes[0], t, np.asarray(run["observed"]), ~np.asarray(run["used"]))
     axes[0].set_title(f"{name_text(run['name'])}{' (held out)' if run.get('holdout') else ''}{marked}")
-    axes[2].set_xlabel("t  [s]")
+    axes[2].set_xlabel("time  [s]")
     for axis in axes[:2]:
         axis.tick_params(labelbottom=False)
 

@@ -5,7 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.plots import COLOURS, DASHES, Values, house_style, load_matplotlib, name_text
+from srfcli.output.plots import (
+    DASHES,
+    QUANTITY,
+    Values,
+    _decade_ticks,
+    heading,
+    house_style,
+    load_matplotlib,
+    name_text,
+    names_below,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,12 +43,13 @@ def _one(record: Mapping[str, Any], title: str) -> Figure:
     column = [row[0] for row in axes]
     _observable(column[0], record)
     if not friction:
-        _line(column[1], record["t"], record["mu"], COLOURS[2])
+        _line(column[1], record["t"], record["mu"], QUANTITY["mu"])
         column[1].set_ylabel("µ")
     _velocities(column[-2], record)
     _load(column[-1], record)
-    column[0].set_title(name_text(title))
     column[-1].set_xlabel("time  [s]")
+    heading(figure, title)
+    _names(figure, column)
     figure.align_ylabels(column)
     return figure
 
@@ -52,8 +63,20 @@ def _several(records: Sequence[Mapping[str, Any]], title: str) -> Figure:
         row[0].set_title(name_text(record["name"]))
     for ax in axes[-1]:
         ax.set_xlabel("time  [s]")
-    figure.suptitle(name_text(title), x=0.01, ha="left", fontsize=10.5)
+    for column in zip(*axes, strict=True):
+        figure.align_ylabels(column)
+    heading(figure, title)
+    _names(figure, [ax for row in axes for ax in row])
     return figure
+
+
+def _names(figure: Figure, axes: Sequence[Axes]) -> None:
+    """Name every kind of curve once, below the panels."""
+    found: dict[str, Any] = {}
+    for ax in axes:
+        for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
+            found.setdefault(name, handle)
+    names_below(figure, list(found.values()), list(found))
 
 
 def _grid(rows: int, columns: int, *, size: tuple[float, float]) -> tuple[Figure, list[list[Axes]]]:
@@ -71,31 +94,29 @@ def _observable(ax: Axes, record: Mapping[str, Any]) -> None:
     beside = [name for name in ("recorded", "measured") if record.get(name) is not None]
     for name in beside:
         _line(ax, record["t"], record[name], RECORDED, label=name, width=2.2)
-    _line(ax, record["t"], record["observed"], COLOURS[0], label="simulated")
+    _line(ax, record["t"], record["observed"], QUANTITY["u"], label="simulated" if beside else None)
     ax.set_ylabel(LABELS[record["observable"]])
-    if beside:
-        ax.legend(loc="best", handlelength=2.0, fontsize=8)
 
 
 def _velocities(ax: Axes, record: Mapping[str, Any]) -> None:
     import numpy as np
 
     v, V = (np.where(np.asarray(record[k], float) > 0, record[k], np.nan) for k in ("v", "V"))
-    _line(ax, record["t"], v, COLOURS[1], label="slip v")
-    _line(ax, record["t"], V, COLOURS[6], label="drive V", dash=DASHES[1], width=1.1)
+    _line(ax, record["t"], v, QUANTITY["v"], label="slip velocity v")
+    _line(ax, record["t"], V, QUANTITY["V"], label="driving velocity V", dash=DASHES[1], width=1.1)
     ax.set_yscale("log")
     ax.set_ylabel("velocity  [µm/s]")
     low, high = np.nanmin(v, initial=np.inf), np.nanmax(v, initial=-np.inf)
     if high < 1.02 * low:
         ax.set_ylim(low / 2, high * 2)  # steady sliding is a level line, not the noise of integration
-    ax.legend(loc="best", handlelength=2.0, fontsize=8)
+    _decade_ticks(ax)
 
 
 def _load(ax: Axes, record: Mapping[str, Any]) -> None:
     import numpy as np
 
     W = np.asarray(record["W"], float)
-    _line(ax, record["t"], W, COLOURS[3])
+    _line(ax, record["t"], W, QUANTITY["W"])
     if np.ptp(W) < 1e-6 * W.max():
         ax.set_ylim(0.9 * W.min(), 1.1 * W.max())
     ax.set_ylabel("W  [N]")

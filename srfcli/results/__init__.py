@@ -1,0 +1,1 @@
+"""What tasks find: one frozen value each, which owns its columns, rows, notes and figure."""

@@ -1,0 +1,289 @@
+"""A fit of recordings: parameters with their errors and flags, how each run is fitted, the posterior where it was drawn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from srfcli.output.tables import Column, Table
+from srfcli.results.base import Result, own_figure
+from srfcli.status import Status
+from srfcli.units import from_base
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from srfcli.inference.fit import Fit, Problem
+    from srfcli.inference.profile import Interval
+    from srfcli.inference.recordings import RecordingFit
+    from srfcli.inference.sample import Posterior
+    from srfcli.recording.values import Experiment
+
+PARAMETERS = (
+    Column("parameter", "", "name"),
+    Column("value", "", "estimate, in the unit beside it"),
+    Column("stderr", "", "standard error; coloured noise allowed for", ".3g"),
+    Column("low", "", "lower end of the 95 % interval"),
+    Column("high", "", "upper end of the 95 % interval"),
+    Column("unit", "", "unit of all the columns before"),
+    Column("start", "", "where the fit began"),
+    Column("flag", "", "what is to be known before the value is used"),
+)
+RUNS = (
+    Column("run", "", "name"),
+    Column("role", "", "fit, or held out"),
+    Column("samples", "", "compared"),
+    Column("rms", "", "of the residual, in the unit beside it"),
+    Column("noise", "", "standard deviation of the gauge's white noise"),
+    Column("unit", "", "of the two columns before"),
+    Column("rms_over_noise", "", "1 where the model explains all but the noise", ".4g"),
+    Column("lag1", "", "correlation of neighbouring residuals", ".3g"),
+    Column("order", "", "how many times of correlation the gauge's noise has"),
+)
+POSTERIOR = (
+    Column("parameter", "", "name"),
+    Column("mean", "", "of the draws, in the unit beside them"),
+    Column("sd", "", "their standard deviation", ".3g"),
+    Column("low", "", "2.5 % of the draws are below"),
+    Column("median", "", "of the draws"),
+    Column("high", "", "97.5 % of the draws are below"),
+    Column("unit", "", "of all the columns before"),
+    Column("effective", "", "independent draws that these are worth", ".0f"),
+    Column("r_hat", "", "spread over all chains to that within them; 1 where they agree", ".4f"),
+)
+ENOUGH, MIXED = 400.0, 1.01  # independent draws and R-hat that intervals should rest on (Vehtari and others 2021)
+ADVICE = {
+    Status.NO_CONVERGENCE: "the likelihood's maximum was not reached. Try --starts 5, other start values or bounds, or hold a "
+    "parameter that is tied to another (--free).",
+    Status.INTERRUPTED: "the likeliest parameters so far are above.",
+}
+CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class FitResult(Result):
+    """The maximum-likelihood fit of a model to all recordings of an experiment.
+
+    Attributes
+    ----------
+    found : RecordingFit
+        The problem, the fit with its covariance, the random friction field, and how each start ended.
+    intervals : tuple of Interval
+        Profile-likelihood intervals of the parameters for which they were asked.
+    posterior : Posterior, optional
+        Draws of the posterior, where they were asked for.
+    asked : int
+        The number of starts that were asked for.
+    worst : Status
+        Whether the maximum was reached, INTERRUPTED where the fit was stopped.
+    """
+
+    found: RecordingFit = field(repr=False)
+    intervals: tuple[Interval, ...] = ()
+    posterior: Posterior | None = None
+    asked: int = 1
+    worst: Status = Status.OK
+
+    @property
+    def experiment(self) -> Experiment:
+        """Return the experiment whose recordings were fitted."""
+        return self.found.problem.experiment
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Return name -> estimate of the parameters, in um, s, N."""
+        return dict(self.found.fit.values)
+
+    @property
+    def stderr(self) -> dict[str, float]:
+        """Return name -> standard error, in um, s, N."""
+        return dict(self.found.fit.stderr)
+
+    @cached_property
+    def runs(self) -> Table:
+        """Return a row for each run, fitted or held out: residual, noise, and what is left of them."""
+        return run_table(self.found.fit, self.experiment)
+
+    @cached_property
+    def draws(self) -> Table | None:
+        """Return mean, spread and quantiles of the posterior draws, None where none were asked for."""
+        return None if self.posterior is None else posterior_table(self.found.problem, self.posterior)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each parameter: estimate, standard error, interval, unit, and what is to be known of it."""
+        found = self.found
+        made = parameter_table(
+            found.problem, found.fit, self.intervals, found.starts, self.posterior, self.runs, self.worst
+        )
+        if found.track is not None:
+            made = replace(
+                made, notes=(*made.notes, str(found.track)), meta={**made.meta, "track": asdict(found.track)}
+            )
+        if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
+            note = f"interrupted: {len(found.starts)} of {self.asked} starts were done"
+            made = replace(made, notes=(*made.notes, note))
+        return made
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return each run's recording and prediction above its residual."""
+        from srfcli.output.fits import fit_figure
+        from srfcli.output.plots import symbol_text
+        from srfcli.output.report_text import NARROW, bracketed, unit_text
+
+        own_figure(ax, "a fit")
+        problem, fit, experiment = self.found.problem, self.found.fit, self.experiment
+        runs = {r.name: r for r in experiment.runs}
+        rows = [(f.name, f.holdout, runs[f.name].t, runs[f.name].observed, f.prediction.y, f.white) for f in fit.runs]
+        one, told = next(iter(runs.values())), []
+        for name in fit.names:
+            declared = unit_of(problem, name)
+            unit, factor = experiment.shown(declared)
+            value, error = (from_base(x, declared) * factor for x in (fit.values[name], fit.stderr[name]))
+            shown = "" if unit == "1" else f"{NARROW}{unit_text(unit)}"
+            told.append(f"{symbol_text(name)} = {bracketed(value, error)}{shown}")
+        choice = experiment.choice
+        title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
+        return fit_figure(rows, quantity=one.quantity, unit=one.unit, title=title, found=", ".join(told))
+
+
+def parameter_table(
+    problem: Problem,
+    fit: Fit,
+    intervals: Sequence[Interval],
+    starts: Sequence[tuple[float, bool]],
+    posterior: Posterior | None,
+    runs: Table,
+    status: Status,
+) -> Table:
+    """Return the estimates as a table whose `meta` has the runs, the correlations and all that has no column."""
+    by_name = {i.name: i for i in intervals}
+    rows = []
+    for k, name in enumerate(fit.names):
+        declared = unit_of(problem, name)
+        unit, factor = problem.experiment.shown(declared)
+        value, error = fit.values[name], fit.stderr[name]
+        found = by_name.get(name)
+        ends = (value - 1.96 * error, value + 1.96 * error) if found is None else (found.low, found.high)
+        cells = [value, error, *ends]
+        *shown, start = [
+            None if c is None else from_base(c, declared) * factor for c in (*cells, float(problem.start[k]))
+        ]
+        rows.append((name, *shown, unit, start, flag(fit, k)))
+    notes = _notes(fit, intervals, starts) + ([] if posterior is None else _posterior_notes(posterior))
+    meta = {
+        "runs": [dict(zip((c.name for c in RUNS), row, strict=True)) for row in runs.rows],
+        "correlation": fit.correlation,
+        "log_likelihood": fit.log_likelihood,
+        "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
+        "evaluations": fit.evaluations,
+        "noise": {
+            f.name: {"innovation": f.noise.innovation, "coefficients": f.noise.coefficients, "colours": f.colours}
+            for f in fit.runs
+        },
+        "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in starts],
+        "posterior": None if posterior is None else _described(posterior),
+    }
+    return Table("srf.fit/1", PARAMETERS, rows, problem.experiment.title, tuple(notes), {}, meta, status=status.value)
+
+
+def posterior_table(problem: Problem, posterior: Posterior) -> Table:
+    """Return mean, spread and quantiles of each parameter, and what its draws are worth."""
+    import numpy as np
+
+    rows, draws = [], posterior.draws
+    for k, name in enumerate(posterior.names):
+        declared = unit_of(problem, name)
+        unit, factor = problem.experiment.shown(declared)
+        shown = [from_base(float(x), declared) * factor for x in (draws[:, k].mean(), draws[:, k].std(ddof=1),
+                 *np.quantile(draws[:, k], (0.025, 0.5, 0.975)))]  # fmt: skip
+        rows.append((name, *shown, unit, float(posterior.effective[k]), float(posterior.r_hat[k])))
+    return Table("srf.fit.posterior/1", POSTERIOR, rows, "posterior")
+
+
+def _described(posterior: Posterior) -> dict[str, Any]:
+    return {
+        "names": posterior.names, "draws": posterior.draws, "burn_in": posterior.burn_in, "accepted": posterior.accepted,
+        "effective": posterior.effective, "r_hat": posterior.r_hat,
+    }  # fmt: skip
+
+
+def _posterior_notes(posterior: Posterior) -> list[str]:
+    worth, worst = float(posterior.effective.min()), float(posterior.r_hat.max())
+    count, chains = posterior.draws.shape[0], posterior.chains.shape[1]
+    notes = [
+        f"posterior: {count} draws of {chains} chains after {posterior.burn_in} steps of burn-in, worth {worth:.0f} independent "
+        f"ones or more; R-hat up to {worst:.3f}; {posterior.accepted:.0%} of the proposals taken"
+    ]
+    if posterior.interrupted:
+        notes.append("posterior: interrupted; the draws so far are kept")
+    if not (worth >= ENOUGH and worst <= MIXED):
+        more = max(math.ceil(1.2 * count * ENOUGH / max(worth, 1.0) / 100) * 100, 2 * count if worst > MIXED else 0)
+        notes.append(
+            f"posterior: intervals should rest on {ENOUGH:.0f} independent draws with R-hat up to {MIXED}: --sample {more}"
+        )
+    return notes
+
+
+def run_table(fit: Fit, experiment: Experiment) -> Table:
+    """Return one row for each run, fitted or held out."""
+    from srfcli.inference.noise import lag_one
+
+    rows, units = [], {run.name: run.unit for run in experiment.runs}
+    for f in fit.runs:
+        size = sum(b - a for a, b in f.parts)
+        ratio = f.rms / f.white if f.white else None
+        rows.append(
+            (f.name, "held out" if f.holdout else "fit", size, f.rms, f.white, units[f.name], ratio,
+             lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
+        )  # fmt: skip
+    return Table("srf.fit.runs/1", RUNS, rows, "runs")
+
+
+def unit_of(problem: Problem, name: str) -> str:
+    """Return the unit that a parameter is declared in; K that of the stated stiffness, what belongs to a run 1 or s."""
+    listed = {q.name: q.unit for q in problem.experiment.parameters}
+    return listed.get(name, "1")
+
+
+def flag(fit: Fit, k: int) -> str:
+    """Return what stands against an estimate: at a bound, not determined, or tied to another parameter."""
+    import numpy as np
+
+    name = fit.names[k]
+    width = fit.upper[k] - fit.lower[k]
+    if min(fit.values[name] - fit.lower[k], fit.upper[k] - fit.values[name]) < CLOSE * width:
+        return "at its lower bound" if fit.values[name] - fit.lower[k] < CLOSE * width else "at its upper bound"
+    if fit.stderr[name] > WIDE * width / 4:
+        return "not identifiable: its error is as wide as its bounds"
+    tied = np.abs(fit.correlation[k]).copy()
+    tied[k] = 0
+    other = int(np.argmax(tied)) if tied.size > 1 else k
+    return f"tied to {fit.names[other]}: correlation {fit.correlation[k][other]:.3f}" if tied[other] > ALIKE else ""
+
+
+def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float, bool]]) -> list[str]:
+    notes = [f"rms over noise {fit.rms_over_noise():.3f} in the runs fitted"]
+    if any(f.holdout for f in fit.runs):
+        notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
+    done = [i.name for i in intervals]
+    whose = "profile likelihood" + (
+        f" of {', '.join(done)}, else 1.96 standard errors" if len(done) < len(fit.names) else ""
+    )
+    notes.append("intervals: " + (whose if intervals else "1.96 standard errors; --profile refits") + ", 95 %")
+    if len(starts) > 1:
+        notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
+    for time, size in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):
+        notes.append(
+            f"gauge noise: {size:.3g} correlated over {time:.3g} s besides white noise, or physics that is missing"
+        )
+    coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
+    if coloured:
+        notes.append(
+            f"residuals are coloured in {', '.join(coloured)}: noise of that colour, or physics that is missing"
+        )
+    return notes

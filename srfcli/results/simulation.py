@@ -1,0 +1,335 @@
+"""Simulated records: rows, sentences, curves, and the experiment that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from srfcli.output.tables import Column, Table
+from srfcli.results.base import Result, own_figure
+from srfcli.status import Status
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from srfcli.model import GeneratedModel
+    from srfcli.numerics.integrate import Trace
+    from srfcli.numerics.program import Drive, Load
+    from srfcli.recording.values import Experiment, Run
+    from srfcli.splines import Spline
+
+    Array = NDArray
+
+UNITS = {"elongation": "um", "force": "N", "friction": "1"}
+MANY_BREAKS = 50  # a recorded load has knots, not changes
+FEW_SAMPLES = 20  # show no oscillation
+STICK = 0.1  # of the driving velocity: a cycle whose slowest slip is below it sticks
+
+
+@dataclass(frozen=True)
+class Job:
+    """One record to simulate: the parameters `p` (n_parameters,), what is imposed, and what is compared or written.
+
+    `run` is the recording that it repeats, None for a record of one's own; `ripple` the frequency of a modulation in Hz;
+    `tables` are those of the model, if it has any: the track.
+    """
+
+    name: str
+    p: Array
+    drive: Drive
+    load: Load
+    t: Array
+    start: Array | None
+    observable: str
+    ripple: float | None = None
+    modulation: tuple[float, float, float] | None = None
+    run: Run | None = None
+    tables: tuple[Spline, ...] = ()
+
+
+@dataclass(frozen=True)
+class Record:
+    """A job done: its trace up to where it got, the clean observable and, where a gauge was asked for, its readings."""
+
+    job: Job
+    trace: Trace
+    observed: Array
+    measured: Array | None
+
+    @property
+    def done(self) -> int:
+        """Return the number of samples that were reached."""
+        import numpy as np
+
+        reached = np.isfinite(self.trace.x).all(axis=1)
+        return int(reached.size if reached.all() else np.argmin(reached))
+
+
+def observe(model: GeneratedModel, job: Job, trace: Trace) -> Array:
+    """Return what the apparatus would record: the spring's elongation (um), its force (N), or that over the load.
+
+    The elongation is the one that a gauge shows, where an effect stands between the two.
+    """
+    K, shown = float(job.p[model.index("K")]), model.namespace.get("OBSERVED") or "u"
+    u = trace.state(shown) if shown in model.states else trace.u
+    if job.observable == "elongation":
+        return u
+    return K * u if job.observable == "force" else K * u / trace.W
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """What stands between the slider and the file: noise, its lag-1 correlation, a step of rounding; the seed of all chance.
+
+    Both sizes are in the unit of the observable, 0 for none.
+    """
+
+    noise: float = 0.0
+    lag1: float = 0.0
+    quantum: float = 0.0
+    seed: int = 0
+
+
+def read_gauge(given: Mapping[str, Any], unit: str) -> Gauge:
+    """Return the gauge that the options ask for, sizes in `unit`; raises SrfError for what no gauge does."""
+    from srfcli.recording.synthetic import check_gauge
+    from srfcli.units import parse_quantity
+
+    texts = {name: given[name] for name in ("noise", "quantum")}
+    sizes = {n: 0.0 if text is None else parse_quantity(text, unit, name=f"--{n}") for n, text in texts.items()}
+    gauge = Gauge(sizes["noise"], given["lag1"], sizes["quantum"], given["seed"])
+    check_gauge(noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed)
+    return gauge
+
+
+def measure(gauge: Gauge, job: Job, observed: Array) -> Array | None:
+    """Return the observable through the gauge, None where it reads exactly; each run has its own noise."""
+    from srfcli.recording.synthetic import measured
+
+    if not (gauge.noise or gauge.quantum):
+        return None
+    return measured(
+        observed, noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed, stream=job.name
+    )
+
+
+@dataclass(frozen=True)
+class Work:
+    """What is to be simulated, and what is needed to tell and to write it: `experiment` makes one of the records."""
+
+    model: GeneratedModel
+    jobs: tuple[Job, ...]
+    gauge: Gauge
+    parameters: Mapping[str, Mapping[str, Any]]
+    experiment: Callable[[Sequence[Record]], Experiment]
+    inputs: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class SimulationResult(Result):
+    """Records of one slider over time.
+
+    Attributes
+    ----------
+    work : Work
+        What was to be simulated.
+    records : tuple of Record
+        What was finished: each with its trace in um, s, N and the observable.
+    worst : Status
+        The first status that is not ok, INTERRUPTED where the simulation was stopped.
+    """
+
+    work: Work = field(repr=False)
+    records: tuple[Record, ...] = field(repr=False)
+    worst: Status = Status.OK
+
+    @cached_property
+    def table(self) -> Table:
+        """Return the records one below the other, a row for each sample."""
+        return record_table(self.work, self.records, status=self.worst)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the records over time: observable, friction, velocities and load, a panel for each."""
+        from srfcli.output.plots import titled
+        from srfcli.output.traces import traces
+
+        own_figure(ax, "a simulation")
+        return traces(curves(self.records), title=titled(self.work.model.title, self.work.parameters))
+
+
+class Rows(Sequence[tuple[Any, ...]]):
+    """The rows of a table, made from arrays when they are asked for: ten million Python floats are kept nowhere."""
+
+    def __init__(self, blocks: Sequence[tuple[tuple[Any, ...], Sequence[Array]]]) -> None:
+        self._blocks = blocks  # (leading cells, columns of equal length)
+
+    def __len__(self) -> int:
+        return sum(len(columns[0]) for _, columns in self._blocks)
+
+    def __iter__(self) -> Iterator[tuple[Any, ...]]:
+        for lead, columns in self._blocks:
+            for a in range(0, len(columns[0]), 10_000):
+                for cells in zip(*(c[a : a + 10_000].tolist() for c in columns), strict=True):
+                    yield (*lead, *cells)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        i = index + len(self) if index < 0 else index
+        for lead, columns in self._blocks:
+            if 0 <= i < len(columns[0]):
+                return (*lead, *(c[i].item() for c in columns))
+            i -= len(columns[0])
+        raise IndexError(index)
+
+
+def record_table(work: Work, records: Sequence[Record], *, status: Status) -> Table:
+    """Return the records one below the other: t, V, W, u, v, the ages, mu, tau, and what was recorded or measured."""
+    model, named = work.model, any(job.run is not None for job in work.jobs)
+    gauge = any(r.measured is not None for r in records)
+    ages = [name for name in model.states if name.startswith("ln_") and name != "ln_v"]
+    columns = [Column("run", "1", "name of the run")] if named else []
+    columns += [
+        Column("t", "s", "time"),
+        Column("V", "um/s", "driving velocity"),
+        Column("W", "N", "imposed normal load"),
+        Column("u", "um", "elongation of the spring"),
+        Column("v", "um/s", "slip velocity"),
+        *(Column(name[3:], "s", "age of the contacts") for name in ages),
+        Column("mu", "1", "friction coefficient"),
+        Column("tau", "N", "friction force W mu"),
+    ]
+    units = {UNITS[job.observable] for job in work.jobs}
+    unit = units.pop() if len(units) == 1 else "um, N or 1"
+    columns += [Column("recorded", unit, "what the run's file holds")] if named else []
+    columns += [Column("measured", unit, "the simulated observable through the gauge")] if gauge else []
+    blocks = [_block(r, ages, named=named, gauge=gauge) for r in records]
+    notes = (*work.notes, *(note for r in records for note in summary(r, named=named)))
+    meta = {"samples": {r.job.name: r.done for r in records}, **work.meta}
+    return Table(
+        "srf.simulate/1", tuple(columns), Rows(blocks), model.title, notes, work.parameters, meta, status.value
+    )
+
+
+def _block(r: Record, ages: list[str], *, named: bool, gauge: bool) -> tuple[tuple[Any, ...], Sequence[Array]]:
+    import numpy as np
+
+    n, trace = r.done, r.trace
+    with np.errstate(over="ignore"):
+        states = [np.exp(trace.state(name)) for name in ages]
+    columns = [trace.t, trace.V, trace.W, trace.u, trace.v, *states, trace.mu, trace.W * trace.mu]
+    if named:
+        assert r.job.run is not None
+        columns.append(np.where(r.job.run.used, r.job.run.observed, np.nan))
+    if gauge:
+        columns.append(r.observed if r.measured is None else r.measured)
+    return ((r.job.name,) if named else ()), [c[:n] for c in columns]
+
+
+def worst(statuses: Sequence[Status]) -> Status:
+    """Return the first status that is not ok, else ok."""
+    return next((s for s in statuses if not s.ok), Status.OK)
+
+
+def summary(r: Record, *, named: bool) -> list[str]:
+    """Return sentences about one record: the range of v, stick-slip under each steady drive, distance from a recording."""
+    import numpy as np
+
+    n, trace, lead = r.done, r.trace, f"{r.job.name}: " if named else ""
+    if n == 0:
+        return [f"{lead}nothing of the record was reached: {trace.status.advice}"]
+    t, v = trace.t[:n], trace.v[:n]
+    low, high = int(np.argmin(v)), int(np.argmax(v))
+    slip = f"slip velocity from {v[low]:.3g} um/s at t = {t[low]:.6g} s to {v[high]:.3g} um/s at t = {t[high]:.6g} s"
+    sentences = [f"{lead}{slip}", *(f"{lead}{s}" for s in _oscillations(r))]
+    if n < trace.t.size:
+        sentences.append(f"{lead}stopped at t = {trace.reached:.6g} s of {trace.t[-1]:g} s: {trace.status.advice}")
+    if r.job.run is not None and (good := r.job.run.used[:n] & np.isfinite(r.job.run.observed[:n])).any():
+        rms = float(np.sqrt(np.mean((r.observed[:n] - r.job.run.observed[:n])[good] ** 2)))
+        unit = UNITS[r.job.observable]
+        sentences.append(
+            f"{lead}root mean square distance from the recording {rms:.4g}{'' if unit == '1' else f' {unit}'}"
+        )
+    return sentences
+
+
+def _oscillations(r: Record) -> list[str]:
+    """Return a sentence for each stretch of constant drive that is long enough to tell, if any oscillates."""
+    from srfcli.numerics.events import stick_slip
+
+    n, trace = r.done, r.trace
+    sentences, steady = [], 0
+    for a, b, V in _stretches(r.job, trace.t[:n]):
+        t, u, v = trace.t[a:b], trace.u[a:b], trace.v[a:b]
+        events = stick_slip(t, u, ripple=r.job.ripple)
+        if not events.sustained:
+            steady += 1
+            continue
+        later = t >= events.times[0]
+        kind = "stick-slip" if v[later].min() < STICK * V else "oscillation without stick"
+        spread = events.recurrence.std() / events.period
+        sentences.append(
+            f"{kind} at V = {V:g} um/s: {events.times.size} events from t = {events.times[0]:.6g} s, "
+            f"every {events.period:.5g} s (+- {100 * spread:.2g} %), u falls by {events.drop:.4g} um, "
+            f"v from {v[later].min():.3g} to {v[later].max():.3g} um/s"
+        )
+    return sentences or (["no stick-slip"] if steady else [])
+
+
+def _stretches(job: Job, t: Array) -> Iterator[tuple[int, int, float]]:
+    """Yield (first, end, V) of the samples between changes of drive and load where V is constant and forward."""
+    import numpy as np
+
+    changes = [*job.drive.breaks, *(job.load.breaks if len(job.load.breaks) <= MANY_BREAKS else ())]
+    cuts = np.unique([0, *np.searchsorted(t, changes), t.size]).tolist()
+    for a, b in pairwise(cuts):
+        V, rate, _ = job.drive.piece(0.5 * float(t[a] + t[b - 1]))
+        if V > 0 and not rate and b - a > FEW_SAMPLES:
+            yield a, b, V
+
+
+def curves(records: Sequence[Record]) -> list[dict[str, Any]]:
+    """Return the records as `output.traces` draws them."""
+    import numpy as np
+
+    drawn = []
+    for r in records:
+        n, trace = r.done, r.trace
+        record = {"name": r.job.name, "t": trace.t[:n], "observable": r.job.observable, "mu": trace.mu[:n]}
+        record |= {"observed": r.observed[:n], "v": trace.v[:n], "V": trace.V[:n], "W": trace.W[:n]}
+        if r.job.run is not None:
+            record["recorded"] = np.where(r.job.run.used, r.job.run.observed, np.nan)[:n]
+        elif r.measured is not None:
+            record["measured"] = r.measured[:n]
+        drawn.append(record)
+    return drawn
+
+
+def simulated_run(model: GeneratedModel, r: Record, *, quantum: float) -> Run:
+    """Return the run as a recording of the simulation; what the repeated run says beside the observable is kept."""
+    import dataclasses
+
+    import numpy as np
+
+    from srfcli.recording.values import Run
+
+    observed = r.observed if r.measured is None else r.measured
+    job, used = r.job, np.ones(observed.size, bool)
+    initial = "steady" if job.start is None else "free"  # the form has no other word for a state of one's own
+    K = float(job.p[model.index("K")])
+    if job.run is not None:
+        return dataclasses.replace(
+            job.run, observed=observed, used=used, quantum=quantum, notices=(), stiffness=K, initial=initial
+        )
+    return Run(
+        job.name, Path(f"{job.name}.csv"), False, 0.0, initial, job.t, observed, job.observable, used, job.drive,
+        job.load, K, job.modulation, quantum, (),
+    )  # fmt: skip

@@ -1,0 +1,267 @@
+"""`critical` and `continue`: the stability boundary under modulation, point by point and as curves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from srfcli.errors import SrfError
+from srfcli.numerics.atlas import Atlas, AtlasSettings, find_components
+from srfcli.numerics.critical import critical_line
+from srfcli.numerics.plane import Axis, Plane
+from srfcli.numerics.windows import LoadWindow, found_window
+from srfcli.results.boundary import BoundaryResult, CriticalResult, worst
+from srfcli.status import Status
+from srfcli.tasks.values import checked
+from srfcli.units import to_base
+
+if TYPE_CHECKING:
+    from srfcli.model import GeneratedModel
+    from srfcli.numerics.polish import BoundaryPoint
+    from srfcli.tasks.system import SlidingSystem
+
+LINES = 5  # that are followed outwards to find the loads to look between
+Values = Sequence[float] | float
+Said = Callable[[str], None]
+
+
+def critical(
+    system: SlidingSystem,
+    *,
+    V: Values | None = None,
+    eps: Values | None = None,
+    window: tuple[float, float] | None = None,
+    tol: float = 1e-8,
+    samples: int = 192,
+    resolution: float = 1e-3,
+    max_mesh: int = 512,
+    progress: Said = lambda text: None,
+) -> CriticalResult:
+    """Return every critical load at the given velocities and amplitudes, numbered from low W0.
+
+    Parameters
+    ----------
+    system : SlidingSystem
+        The slider, from `srfcli.system`.
+    V, eps : number or sequence, optional
+        Driving velocities in um/s and relative amplitudes; the system's own if left out.
+    window : (float, float), optional
+        Loads to look between, in N; else all at which a crossing can be.
+    tol : float
+        Relative error of a critical load.
+    samples : int
+        Loads looked at first, on each line.
+    resolution : float
+        Finest spacing in ln W0 where a pair of crossings could hide.
+    max_mesh : int
+        Intervals of the finest mesh.
+    progress : callable
+        Told what was done, once for each velocity and amplitude.
+
+    Returns
+    -------
+    CriticalResult
+        Ctrl-C is a status: the lines that were finished are kept.
+
+    Raises
+    ------
+    SrfError
+        For values out of bounds.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> srf.critical(srf.system(), eps=0.13, V=7).table.rows[0][6]  # doctest: +ELLIPSIS
+    10.55524...
+    """
+    if not 1e-12 < tol < 0.1 or not 1e-8 < resolution < 1:
+        raise SrfError(f"--tol {tol:g} or --resolution {resolution:g} is out of range", "--tol 1e-8 --resolution 1e-3")
+    model, own = system.model, system.resolved.values
+    model.check_changing_load(system.vector())
+    velocities = (own["V"],) if V is None else checked(model, "V", V)
+    amplitudes = (own["eps"],) if eps is None else checked(model, "eps", eps)
+    lo, hi = (None, None) if window is None else checked(model, "W0", window)
+    points: list[BoundaryPoint] = []
+    crossings: list[int] = []
+    statuses: list[Status] = []
+    notes: list[str] = []
+    low: list[float] = []
+    high: list[float] = []
+    interrupted = False
+    try:
+        for amplitude in amplitudes:
+            for velocity in velocities:
+                base = model.vector({**own, "V": velocity, "eps": amplitude})
+                line = critical_line(
+                    model, base, lo=lo, hi=hi, tol=tol, samples=samples, resolution=resolution, max_mesh=max_mesh
+                )
+                points += line.points
+                crossings += line.crossings
+                statuses += [line.status, *(q.status for q in line.points)]
+                low.append(float(line.scans[0].values[0]))
+                high.append(float(line.scans[-1].values[-1]))
+                place = f"eps = {amplitude:g}, V = {velocity:g} um/s"
+                notes += [f"{place}: {note}" for note in line.notes]
+                if not line.points:
+                    side = _side([g for scan in line.scans for g in scan.g.tolist()])
+                    notes.append(f"{place}: no crossing between W0 = {low[-1]:.4g} and {high[-1]:.4g} N; {side}")
+                progress(place)
+    except KeyboardInterrupt:
+        interrupted = True
+    if low:
+        span = f"{min(low):.4g} to {max(high):.4g} N" + ("" if window else ", to where the growth rate settles")
+        notes.append(f"looked from {span}; pairs of crossings closer than {resolution:g} in ln W0 are not looked for")
+    status = Status.INTERRUPTED if interrupted else worst(statuses)
+    return CriticalResult(system, tuple(points), tuple(crossings), tuple(notes), status)
+
+
+def _side(g: list[float]) -> str:
+    values = np.asarray(g)
+    if not np.isfinite(values).all():
+        return "no sign change among the samples that were found"
+    if not values.size:
+        return "no periodic state found"
+    return f"{'stable' if (values < 0).all() else 'unstable'} at every load looked at"
+
+
+def continue_boundary(
+    system: SlidingSystem,
+    *,
+    eps: Values | None = None,
+    over: Mapping[str, tuple[float, float]] | None = None,
+    log: Sequence[str] | None = None,
+    settings: AtlasSettings | None = None,
+    progress: Said = lambda text: None,
+) -> Iterator[BoundaryResult]:
+    """Return an iterator of the boundary under modulation as it grows, after each component; the last one is complete.
+
+    Parameters
+    ----------
+    system : SlidingSystem
+        The slider, from `srfcli.system`.
+    eps : number or sequence, optional
+        Relative amplitudes, a boundary for each; the system's own if left out, none where eps is an axis.
+    over : mapping from parameter to (low, high), optional
+        One axis, against W0, or two, in declared units; V from 1 to 100 um/s if left out.
+    log : sequence of str, optional
+        Which of the axes are logarithmic; those whose ends are positive and a decade or more apart if left out.
+    settings : AtlasSettings, optional
+        Scan lines, samples, steps, tolerance and meshes.
+    progress : callable
+        Told what is being done.
+
+    Returns
+    -------
+    iterator of BoundaryResult
+        Ctrl-C is a status: what was followed until then is yielded last.
+
+    Raises
+    ------
+    SrfError
+        For axes that span no plane, and values out of bounds.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> *_, found = srf.continue_boundary(srf.system(), eps=0.09, over={"V": (5, 20)})
+    >>> found.status.value, len(found.atlases[0].branches)
+    ('ok', 1)
+    """
+    model, settings = system.model, settings or AtlasSettings()
+    axes = _axes(model, over or {"V": (1.0, 100.0)}, log, eps is not None)
+    model.check_changing_load(system.vector())
+    own = system.resolved.values["eps"]
+    swept = "eps" in [a.name for a in axes]
+    amplitudes: tuple[float | None, ...] = (None,) if swept else (own,) if eps is None else checked(model, "eps", eps)
+    return _grown(system, axes, amplitudes, settings, progress)
+
+
+def _grown(
+    system: SlidingSystem,
+    axes: list[Axis],
+    amplitudes: Sequence[float | None],
+    settings: AtlasSettings,
+    progress: Said,
+) -> Iterator[BoundaryResult]:
+    model = system.model
+    done: list[Atlas] = []
+    try:
+        for amplitude in amplitudes:
+            plane, window = _plane(system, axes, amplitude)
+            dense = (
+                settings if window is None else replace(settings, samples=math.ceil(settings.samples * window.widening))
+            )
+            atlas: Atlas | None = None
+            for atlas in find_components(model, plane, dense, progress=progress):
+                yield BoundaryResult(system, (*done, atlas), worst([*(a.status for a in done), atlas.status]))
+            assert atlas is not None
+            if window is not None:
+                _judge_window(model, atlas, window)
+            done.append(atlas)
+            if atlas.status is Status.INTERRUPTED:
+                break
+    except KeyboardInterrupt:
+        yield BoundaryResult(system, tuple(done), Status.INTERRUPTED)
+        return
+    stopped = bool(done) and done[-1].status is Status.INTERRUPTED
+    yield BoundaryResult(system, tuple(done), Status.INTERRUPTED if stopped else worst(a.status for a in done))
+
+
+def _axes(
+    model: GeneratedModel, over: Mapping[str, tuple[float, float]], logs: Sequence[str] | None, amplitudes: bool
+) -> list[Axis]:
+    """Return the axes, one or two, x first."""
+    if len(over) > 2:
+        raise SrfError(f"{len(over)} axes are given", "A plane has two axes: V and W0.")
+    axes = []
+    for name, ends in over.items():
+        values = checked(model, name, ends)
+        if len(values) != 2 or not values[0] < values[1]:
+            raise SrfError(
+                f"{name} = {ends} is no axis", f'An axis runs from a low to a high end: {{"{name}": (1, 100)}}.'
+            )
+        unit = model.parameters[model.index(name)].unit
+        log = name in logs if logs is not None else values[1] >= 10 * values[0] > 0
+        axes.append(Axis(name, to_base(values[0], unit), to_base(values[1], unit), log))
+    if "eps" in over and amplitudes:
+        raise SrfError("eps is an axis and has values too", "Leave out --eps, or take eps out of --over.")
+    if axes[0].name == "W0":
+        if len(axes) == 1:
+            raise SrfError("--over W0 alone spans no plane", "Add the other axis: --over V=1:100.")
+        axes = axes[::-1]  # stability is followed across the load
+    return axes
+
+
+def _plane(system: SlidingSystem, axes: list[Axis], amplitude: float | None) -> tuple[Plane, LoadWindow | None]:
+    """Return the plane of one amplitude, and the loads that were found for it, if any were; eps itself may be an axis."""
+    model, x = system.model, axes[0]
+    base = model.vector(system.resolved.values | ({} if amplitude is None else {"eps": amplitude}))
+    if len(axes) == 2:
+        return Plane(base, x, axes[1]), None
+    lines: list[Any] = [base.copy() for _ in range(LINES)]
+    for line, value in zip(lines, x.samples(LINES), strict=True):
+        line[model.index(x.name)] = value
+    window = found_window(model, lines)
+    return Plane(base, x, Axis("W0", window.lo, window.hi)), window
+
+
+def _judge_window(model: GeneratedModel, atlas: Atlas, window: LoadWindow) -> None:
+    """Say in `atlas` where its curves leave the loads that were found, and what of those loads is not certain."""
+    x = atlas.plane.x.name
+    for number, branch in enumerate(atlas.branches, 1):
+        for point in (branch.points[0], branch.points[-1]):
+            W0 = point.value(model, "W0")
+            side = "above" if 0.999 * window.hi < W0 else "below" if 1.001 * window.lo > W0 else ""
+            if side:
+                at = f"{x} = {model.declared(x, point.value(model, x)):.4g}"
+                atlas.notes.append(
+                    f"component {number} goes on {side} W0 = {W0:.4g} N at {at} (--over W0=LOW:HIGH for more)"
+                )
+    if not window.certain:
+        atlas.notes.append(f"crossings below {window.lo:.4g} or above {window.hi:.4g} N are not ruled out")
+        if atlas.status is Status.OK:
+            atlas.status = Status.UNSETTLED

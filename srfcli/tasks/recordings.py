@@ -1,0 +1,47 @@
+"""Recordings, as every task on them takes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from srfcli.recording import experiment as description
+from srfcli.recording.values import Experiment
+from srfcli.registry import Registry, load_registry
+
+
+def read_experiment(
+    path: str | Path,
+    *,
+    format: str | None = None,
+    holdout: bool = True,
+    plugins: Sequence[str | Path] = (),
+    registry: Registry | None = None,
+) -> Experiment:
+    """Return an experiment: its runs, its apparatus, the model that is believed, and the parameters that are free.
+
+    Parameters
+    ----------
+    path : str or path
+        A folder with an experiment.toml, or that file.
+    format : str, optional
+        Reader of all data files; each is told from its name and content if left out.
+    holdout : bool
+        Whether runs that are held out are read, too.
+    plugins : sequence of path
+        Folders in which laws and readers are looked for, too.
+    registry : Registry, optional
+        Laws and readers, where they are at hand already.
+
+    Returns
+    -------
+    Experiment
+        All numbers in um, s, N.
+
+    Raises
+    ------
+    SrfError
+        For what is missing, contradictory or unreadable, with the file and the line or column.
+    """
+    known = registry or load_registry([Path(p) for p in plugins])
+    return description.read_experiment(Path(path), registry=known, format=format, holdout=holdout)

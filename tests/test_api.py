@@ -1,0 +1,206 @@
+"""The Python API: what the commands print is what its results hold, as table, data frame, arrays, page and figure."""
+
+from __future__ import annotations
+
+import dataclasses
+import doctest
+import importlib
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import srfcli as srf
+from srfcli.cli.main import cli
+
+FUNCTIONS = [name for name in srf.__all__ if inspect.isfunction(getattr(srf, name))]
+TASKS = sorted({inspect.getmodule(getattr(srf, name)).__name__ for name in FUNCTIONS})
+
+
+@pytest.fixture(scope="module")
+def slider() -> srf.SlidingSystem:
+    return srf.system()
+
+
+@pytest.fixture(scope="module")
+def linear(slider: srf.SlidingSystem):
+    return srf.linear(slider, over={"V": [1, 10, 100]})
+
+
+def rows_of(*arguments: str) -> list[list]:
+    done = CliRunner().invoke(cli, [*arguments, "--json"])
+    assert done.exit_code == 0, done.stderr
+    return [list(row.values()) for row in json.loads(done.stdout)["rows"]]
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_examples_are_true(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = doctest.testmod(importlib.import_module(name))
+    assert found.failed == 0
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_public_function_says_what_it_takes_and_returns(name: str) -> None:
+    function = getattr(srf, name)
+    text = inspect.getdoc(function)
+    assert text.splitlines()[0].endswith(".") and "\nParameters\n-" in text and "\nReturns\n-" in text
+    told = text.partition("\nParameters\n")[2].partition("\nReturns\n")[0]
+    for parameter in inspect.signature(function).parameters:
+        assert parameter in told, f"srf.{name} does not say what {parameter} is"
+
+
+def test_nothing_heavy_is_imported_before_it_is_used() -> None:
+    code = "import sys, srfcli; print(sorted({'numpy', 'sympy', 'scipy', 'click', 'matplotlib'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    assert set(srf.__all__) <= set(dir(srf)) and not hasattr(srf, "no_such_name")
+
+    assert inspect.isfunction(srf.system)
+
+
+def test_the_package_runs_as_a_module() -> None:
+    done = subprocess.run([sys.executable, "-m", "srfcli", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == f"srf {srf.__version__}"
+    assert (Path(srf.__file__).parent / "py.typed").exists()
+
+
+def test_commands_print_what_the_functions_return(slider: srf.SlidingSystem, linear) -> None:
+    assert [list(r) for r in linear.table.rows] == rows_of("linear", "--over", "V=1,10,100")
+    point = srf.critical(slider, V=7, eps=0.13)
+    assert [list(r) for r in point.table.rows] == rows_of("critical", "--V", "7", "--eps", "0.13")
+    *parts, boundary = srf.continue_boundary(slider, eps=0.18, over={"V": (20, 40)})
+    assert [list(r) for r in boundary.table.rows] == rows_of("continue", "--eps", "0.18", "--over", "V=20:40")
+    counts = [len(part.atlases[0].branches) for part in parts]
+    assert counts == sorted(counts) and counts[-1] == len(boundary.atlases[0].branches) > 1  # it grows
+    state = srf.floquet(slider.at(V=8, W0=9, eps=0.09))
+    assert [list(r) for r in state.table.rows] == rows_of("floquet", "--V", "8", "--W0", "9", "--eps", "0.09")
+
+
+def test_a_map_has_two_dimensions(slider: srf.SlidingSystem) -> None:
+    found = srf.map(slider.at(eps=0.18), x=("V", 10, 40, 8), y=("K/W0", 0.01, 0.025, 12))
+    options = ("--eps", "0.18", "--over", "V=10:40:8", "--over", "K/W0=0.01:0.025:12")
+    assert [list(r) for r in found.table.rows] == rows_of("map", *options)
+    assert len(found.components.rows) == 2 and found.status is srf.Status.OK
+    pytest.importorskip("xarray")
+    field = found.to_xarray()
+    assert field["growth_per_slip"].dims == ("V", "K_over_W0") and field["V"].attrs["units"] == "um/s"
+    assert (field["kind"].values == "stable").sum() == sum(row[5] == "stable" for row in found.table.rows)
+
+
+def test_a_simulation_under_modulation_ends_in_the_periodic_state(slider: srf.SlidingSystem) -> None:
+    moving = slider.at(V=8, W0=9, eps=0.09)
+    run = srf.simulate(moving, t=np.linspace(0, 6, 60_001), observable="friction")
+    last = run.records[0].trace.mu[-10_000:]  # 1 s, 120 periods
+    assert last.mean() == pytest.approx(srf.floquet(moving).state.mean_friction, rel=2e-4)
+    with pytest.raises(srf.SrfError, match="rising"):
+        srf.simulate(slider, t=[1, 0])
+    with pytest.raises(srf.SrfError, match="at rest"):
+        srf.simulate(slider, t=[0, 1], drive=[(0, 0)])
+
+
+def test_an_experiment_is_read_and_fitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = [
+        "simulate",
+        "--drive",
+        "0.5:10, 1:20",
+        "--W0",
+        "5",
+        "--rate",
+        "200",
+        "--noise",
+        "0.02",
+        "--out-dir",
+        "steps",
+    ]
+    assert CliRunner().invoke(cli, made).exit_code == 0
+    found = srf.fit(srf.read_experiment("steps"), free=["mu0", "D0"], track="smooth")
+    options = ("--free", "mu0,D0", "--track", "smooth")
+    assert [list(r) for r in found.table.rows] == rows_of("fit", "steps", *options)
+    assert found.values["D0"] == pytest.approx(0.402, abs=5 * found.stderr["D0"])
+    with pytest.raises(srf.SrfError, match="several panels"):
+        found.plot(ax=object())  # type: ignore[arg-type]
+
+
+def test_comparing_names_what_was_matched() -> None:
+    with pytest.raises(srf.SrfError, match="one law"):
+        srf.compare({"a": srf.system()})
+    laws = {name: srf.system(ageing=name) for name in ("dieterich", "ruina")}
+    small = {"columns": 6, "rows": 8}
+    found = srf.compare(laws, eps=0.13, V=(5, 40), K_over_W0=(0.006, 0.03), points=small)
+    options = ("--ageing", "dieterich", "--ageing", "ruina", "--over", "V=5:40:6", "--over", "K/W0=0.006:0.03:8")
+    assert [list(r) for r in found.table.rows] == rows_of("compare", *options, "--eps", "0.13")
+    pytest.importorskip("matplotlib")
+    named = [text.get_text() for text in found.plot().legends[0].get_texts()]
+    assert any(text.startswith("ruina, matched with") and "D$_0$ =" in text for text in named)
+
+
+def test_results_are_frozen_and_have_every_form(linear) -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        linear.over = {}
+    assert repr(linear) == "<LinearResult: srf-vsat, dieterich, elastic, vertical, inertia on; 3 rows, ok>"
+    assert "7.28316" in str(linear) and linear.parameters["K"]["value"] == 0.21
+    pandas = pytest.importorskip("pandas")
+    frame = linear.to_dataframe()
+    assert isinstance(frame, pandas.DataFrame) and frame.attrs["units"]["W0"] == "N"
+    assert frame["W0"].tolist() == [row[2] for row in linear.table.rows]
+    pytest.importorskip("xarray")
+    assert linear.to_xarray()["W0"].attrs["units"] == "N"
+
+
+def test_a_notebook_shows_a_table_and_escapes_what_it_shows(linear) -> None:
+    from srfcli.output.tables import Column, Table
+    from srfcli.results.base import SHOWN, table_html
+
+    page = linear._repr_html_()
+    assert page.count("<tr>") == 4 and "W0 [N]" in page
+    rows = [("<script>",)] * (SHOWN + 3)
+    page = table_html(Table("x/1", (Column("a<b", "", '"'),), rows, "t&t", ("n>1",)))
+    assert "<script" not in page and "3 more rows" in page and "t&amp;t" in page and "n&gt;1" in page
+
+
+def test_figures_can_share_ones_own_axes(linear) -> None:
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    ax = figure.subplots()
+    assert linear.plot(ax=ax) is figure and ax.get_xlabel() == "V  [µm/s]"
+    assert linear.plot() is not figure
+
+
+def test_values_are_checked_as_on_the_command_line(slider: srf.SlidingSystem) -> None:
+    for wrong, said in (
+        (lambda: srf.system("srf-vast"), "srf-vsat"),
+        (lambda: srf.system(Vast=1), "Vsat"),
+        (lambda: srf.system(K="3 kg"), "K"),
+        (lambda: srf.linear(slider, over={"V": [-1]}), "below its lower bound"),
+        (lambda: srf.continue_boundary(slider, over={"W0": (1, 20)}), "spans no plane"),
+        (lambda: srf.continue_boundary(slider, over={"V": (20, 1)}), "no axis"),
+        (lambda: srf.map(slider, x=("V", 1, 10, 1), y=("W0", 1, 10, 5)), "no axis"),
+        (lambda: srf.load_law("srf-vast"), "srf-vsat"),
+    ):
+        with pytest.raises(srf.SrfError) as error:
+            wrong()
+        assert said in f"{error.value.message} {error.value.hint}"
+
+
+def test_settings_of_the_folder_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "srf.toml").write_text("[parameters]\nK = 0.5\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SRF_K", "0.7")
+    assert srf.system().parameters["K"] == 0.21
+
+
+def test_the_page_on_python_is_true(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("pandas", "matplotlib"):
+        pytest.importorskip(name)
+    monkeypatch.chdir(tmp_path)
+    text = (Path(__file__).resolve().parents[1] / "docs" / "python.md").read_text(encoding="utf-8")
+    space: dict = {}
+    exec(text.partition("```python\n")[2].partition("```")[0], space)
+    assert len(space["frame"]) == 3 and space["figure"].axes
+    assert all(f"srf.{name}(" in text for name in FUNCTIONS)
