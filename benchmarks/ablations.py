@@ -28,16 +28,15 @@ import numpy as np
 from common import Report
 from marked import heading, marked, tell
 
-from srfcli.diagnosis.search import Search
-from srfcli.inference.latent import LatentFit
+from srfcli.codegen.model import Array
+from srfcli.data.values import Run
+from srfcli.diagnosis.staged_search import Search
 from srfcli.inference.noise import Noise
-from srfcli.numerics.collocation import Array
+from srfcli.inference.random_field import LatentFit
 from srfcli.parallel.pool import run_processes
-from srfcli.proof.seal import unseal
-from srfcli.recording.values import Run
-from srfcli.trial.answer import Answer, read_answers, write_answers
-from srfcli.trial.blind import Task, answer_case, diagnose_case, failed
-from srfcli.trial.rates import rate
+from srfcli.validation.generator.bank import unseal
+from srfcli.validation.trial.blind import Answer, Task, answer_case, diagnose_case, failed, read_answers, write_answers
+from srfcli.validation.trial.report import rate
 
 LIMIT = 1800.0  # s of CPU
 

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from srfcli.model import GeneratedModel, open_model
-from srfcli.numerics.compiled import _build, c_source
-from srfcli.registry import load_registry
+from srfcli.codegen.c_source import _build, c_source
+from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.laws.registry import load_registry
 
 
 def children() -> float:

@@ -23,16 +23,14 @@ import common  # before NumPy: it fixes the number of threads
 import numpy as np
 from common import Report
 
-from srfcli.model import GeneratedModel, open_model
-from srfcli.numerics import atlas as atlas_module
-from srfcli.numerics.atlas import Atlas, AtlasSettings, find_components
+from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.laws.registry import load_registry
+from srfcli.numerics import continuation as atlas_module
 from srfcli.numerics.collocation import Discretisation
-from srfcli.numerics.continuation import StepSettings
-from srfcli.numerics.critical import critical_line
+from srfcli.numerics.continuation import Atlas, AtlasSettings, StepSettings, find_components
+from srfcli.numerics.critical import critical_line, growth, robust_orbits
 from srfcli.numerics.orbit import interpolate, uniform_mesh
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.numerics.scan import growth, robust_orbits
-from srfcli.registry import load_registry
 
 AMPLITUDES = (0.13, 0.18, 0.25, 0.4)
 LO, HI = 4.0, 400.0

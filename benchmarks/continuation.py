@@ -31,12 +31,20 @@ import numpy as np
 from brute import Slider, error_of_load
 from common import Report, interleaved
 
-from srfcli.model import GeneratedModel, open_model
-from srfcli.numerics.atlas import AtlasSettings, Branch, find_components, polish_curve
-from srfcli.numerics.continuation import Curve, CurvePoint, correct, trace
+from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.laws.registry import load_registry
+from srfcli.numerics.continuation import (
+    AtlasSettings,
+    Branch,
+    Curve,
+    CurvePoint,
+    correct,
+    find_components,
+    polish_curve,
+    trace,
+)
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.registry import load_registry
 
 REPEATS = 5
 TARGET = 3.0

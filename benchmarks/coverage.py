@@ -22,13 +22,12 @@ import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
 from common import RESULTS, Report
 
+from srfcli.codegen.model import open_model
+from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
 from srfcli.inference.fit import fit, fit_problem
 from srfcli.inference.prediction import predict
-from srfcli.model import open_model
-from srfcli.numerics.load import ConstantLoad, Modulation
-from srfcli.numerics.program import Drive
-from srfcli.recording.values import Experiment, FitParameter, ModelChoice, Run
-from srfcli.registry import load_registry
+from srfcli.laws.registry import load_registry
+from srfcli.motion.imposed import ConstantLoad, Drive, Modulation
 
 TRUE = {"mu0": 0.33, "A": 0.0126, "B": 0.0246, "D0": 0.395, "Vsat": 235.0, "lambda": 0.54}
 BOUNDS = {

@@ -18,11 +18,9 @@ import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
 from common import Report
 
-from srfcli.model import GeneratedModel, open_model
-from srfcli.numerics.critical import critical_line, locate_crossings
-from srfcli.numerics.scan import scan_line
-from srfcli.numerics.windows import load_window
-from srfcli.registry import bundled_registry
+from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.laws.registry import bundled_registry
+from srfcli.numerics.critical import critical_line, load_window, locate_crossings, scan_line
 
 EPS = (0.09, 0.3, 0.5)
 V = (0.1, 1.0, 10.0, 100.0)

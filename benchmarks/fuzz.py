@@ -23,21 +23,18 @@ import numpy as np
 import sound_files
 from sound_files import SETTINGS, THRESHOLDS
 
-from srfcli.dimensions import parse_unit
-from srfcli.errors import SrfError
-from srfcli.expression import parse_expression
+from srfcli.core.errors import SrfError
+from srfcli.core.settings import load_toml, resolve
+from srfcli.core.units import parse_quantity, parse_unit
+from srfcli.core.units import parse_stated_quantity as quantity_of_file
+from srfcli.data.columns import open_source
+from srfcli.data.description import read_description
+from srfcli.data.experiment import read_experiment
 from srfcli.inference.threshold_table import is_threshold_table, read_thresholds
-from srfcli.lawfile import read_header
-from srfcli.lawtemplate import template
-from srfcli.pylaw import scan_python
-from srfcli.recording.description import read_description
-from srfcli.recording.experiment import read_experiment
-from srfcli.recording.quantities import parse_quantity as quantity_of_file
-from srfcli.recording.source import open_source
-from srfcli.registry import bundled_registry, read_law
-from srfcli.settings import load_toml, resolve
-from srfcli.trial.answer import Answer, read_answers, to_line
-from srfcli.units import parse_quantity
+from srfcli.laws.expression import parse_expression
+from srfcli.laws.law_file import read_header, template
+from srfcli.laws.registry import bundled_registry, read_law, scan_python
+from srfcli.validation.trial.blind import Answer, read_answers, to_line
 
 DATA = sound_files.recording(60)
 EXPERIMENT = sound_files.EXPERIMENT.replace("window = [0.0, 1.5]", "window = [0.0, 0.5]")

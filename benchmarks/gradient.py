@@ -31,14 +31,14 @@ from brute import Slider, steady
 from common import Report, interleaved
 from simulate import lambdified
 
-from srfcli.errors import SrfError
+from srfcli.codegen.model import open_model
+from srfcli.core.errors import SrfError
+from srfcli.data.experiment import read_experiment
+from srfcli.data.values import Run
 from srfcli.inference.fit import Problem, fit_problem
 from srfcli.inference.prediction import predict
-from srfcli.model import open_model
-from srfcli.numerics.motion import pieces
-from srfcli.recording.experiment import read_experiment
-from srfcli.recording.values import Run
-from srfcli.registry import load_registry
+from srfcli.laws.registry import load_registry
+from srfcli.motion.integrators import pieces
 
 Array = np.ndarray
 OURS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # a fit takes 1e-6

@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 from common import Report
 
-from srfcli.diagnosis.candidates import Hypothesis, applicable
-from srfcli.diagnosis.follower import COARSE, LOOSE, Follower
-from srfcli.inference import follow
+from srfcli.data.experiment import read_experiment
+from srfcli.data.values import Experiment, Run
+from srfcli.diagnosis import nudging as follow
+from srfcli.diagnosis.hypotheses import Hypothesis, applicable
+from srfcli.diagnosis.nudging import COARSE, LOOSE, Follower
 from srfcli.inference.noise import Noise
 from srfcli.inference.prediction import Hold
-from srfcli.proof.case import make_case
-from srfcli.recording.experiment import read_experiment
-from srfcli.recording.values import Experiment, Run
-from srfcli.registry import bundled_registry
+from srfcli.laws.registry import bundled_registry
+from srfcli.validation.generator.case import make_case
 
 LENGTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, None)  # slip lengths; None is free
 CONCEALED = ("log-log-coupling", "second-state", "load-transmission")

@@ -17,15 +17,13 @@ from pathlib import Path
 import numpy as np
 from common import Report
 
-from srfcli.diagnosis.candidates import Hypothesis
-from srfcli.diagnosis.search import Search
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.hypotheses import Hypothesis
+from srfcli.diagnosis.staged_search import Search, grow, whole
 from srfcli.inference.fit import Problem
-from srfcli.inference.grow import grow, whole
-from srfcli.inference.latent import LatentFit, fit_latent
-from srfcli.inference.tracks import tracks_for
-from srfcli.proof.case import make_case
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry
+from srfcli.inference.random_field import LatentFit, fit_latent, tracks_for
+from srfcli.laws.registry import bundled_registry
+from srfcli.validation.generator.case import make_case
 
 OFF = (0.02, 0.05, 0.1)
 FOUND = 5.0  # in log likelihood

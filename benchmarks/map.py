@@ -21,14 +21,14 @@ from brute import Slider, steady
 from common import Report
 from orbit import shoot
 
-from srfcli.model import GeneratedModel, open_model
+from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.laws.registry import load_registry
+from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.floquet import solve_floquet
 from srfcli.numerics.map import StabilityMap, compute_map
-from srfcli.numerics.mapcurves import find_boundaries
-from srfcli.numerics.mapgrid import MapAxis, MapGrid, MapSettings
+from srfcli.numerics.map_boundaries import find_boundaries
 from srfcli.numerics.orbit import forced_guess, solve_orbits, uniform_mesh
-from srfcli.numerics.scan import robust_orbits
-from srfcli.registry import load_registry
+from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings
 
 EPS = 0.18
 SIZES = ((30, 50), (60, 100), (120, 200), (240, 400))

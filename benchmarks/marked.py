@@ -9,12 +9,21 @@ from typing import Any
 
 from common import Report
 
-from srfcli.output.tables import cell_text
-from srfcli.trial.ablated import ablated
-from srfcli.trial.answer import Answer
-from srfcli.trial.mark import Mark, mark
-from srfcli.trial.report import by_effect, by_outside, by_strength, calibrated, confusion, cost, held, rates, sizes
-from srfcli.trial.sight import Sight
+from srfcli.results.tables import cell_text
+from srfcli.validation.trial.blind import Answer
+from srfcli.validation.trial.mark import Mark, Sight, mark
+from srfcli.validation.trial.report import (
+    ablated,
+    by_effect,
+    by_outside,
+    by_strength,
+    calibrated,
+    confusion,
+    cost,
+    held,
+    rates,
+    sizes,
+)
 
 
 def marked(truths: dict[str, Any], answers: Sequence[Answer], known: Path | None) -> list[Mark]:

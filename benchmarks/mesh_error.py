@@ -24,15 +24,13 @@ import common  # before NumPy: it fixes the number of threads
 import numpy as np
 from common import Report
 
-from srfcli.errors import SrfError
-from srfcli.model import GeneratedModel, open_model
+from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.core.errors import SrfError, Status
+from srfcli.laws.registry import load_registry
+from srfcli.numerics.boundary import along, polish
 from srfcli.numerics.collocation import mesh_error
+from srfcli.numerics.critical import load_window, scan_line
 from srfcli.numerics.orbit import interpolate, solve_orbits, uniform_mesh
-from srfcli.numerics.polish import along, polish
-from srfcli.numerics.scan import scan_line
-from srfcli.numerics.windows import load_window
-from srfcli.registry import load_registry
-from srfcli.status import Status
 
 SEED = 20
 FLOOR = 3e-10

@@ -34,11 +34,11 @@ from brute import Slider, steady
 from common import Report, interleaved, repeated
 from scipy.integrate import solve_ivp
 
-from srfcli.model import GeneratedModel, open_model
+from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.laws.registry import load_registry
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.floquet import solve_floquet
 from srfcli.numerics.orbit import forced_guess, solve_orbits, uniform_mesh
-from srfcli.registry import load_registry
 
 EPS = 0.18
 VELOCITIES = (2.0, 7.0, 20.0, 60.0)

@@ -26,12 +26,10 @@ EFFECTS = (
 
 def one(task: tuple[tuple[str, ...], float, int, bool]) -> tuple[str, str, bool, float]:
     """Return the verdict, the names, whether both are right, and the CPU it took."""
-    from srfcli.proof.draw import draw_recipe
-    from srfcli.proof.folder import case_files
-    from srfcli.proof.gauge import read_gauge
-    from srfcli.proof.motion import move
-    from srfcli.proof.track import Track
-    from srfcli.trial.blind import SEARCHES
+    from srfcli.validation.generator.case import case_files, draw_recipe, read_gauge
+    from srfcli.validation.generator.physics import Track
+    from srfcli.validation.generator.slider import move
+    from srfcli.validation.trial.blind import SEARCHES
 
     effects, amplitude, seed, staged = task
     rng = np.random.default_rng([seed, int(1e6 * amplitude), 7])

@@ -5,7 +5,7 @@
 The paper's slider, four records: stick-slip under constant load, the onset of a modulation at 120 Hz, steps of the velocity,
 and a hold of 100 s. Every method restarts where drive or load has a corner, and writes the same times.
 
-    ours        srfcli.numerics.motion.integrate: Radau IIA compiled with the model's generated rates
+    ours        srfcli.motion.integrators.integrate: Radau IIA compiled with the model's generated rates
     numbalsoda  LSODA in C++ with the paper's equations compiled by numba: nothing of Python runs between two output times
     odeint      SciPy's LSODA with the same function through Python, once a call; Jacobian compiled, too
     lambdified  solve_ivp(method="LSODA") on sympy's lambdified rates and Jacobian (modules="math": faster here than NumPy's)
@@ -33,11 +33,10 @@ import numpy as np
 from brute import Slider, steady
 from common import Report, interleaved
 
-from srfcli.model import open_model
-from srfcli.numerics.load import ConstantLoad, Load, Modulation
-from srfcli.numerics.motion import integrate, pieces
-from srfcli.numerics.program import Drive
-from srfcli.registry import load_registry
+from srfcli.codegen.model import open_model
+from srfcli.laws.registry import load_registry
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation
+from srfcli.motion.integrators import integrate, pieces
 
 Array = np.ndarray
 TOLERANCES = {

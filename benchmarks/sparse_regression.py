@@ -40,19 +40,18 @@ from marked import heading, marked, tell
 from sparse_selection import Reading, choose, remainder
 from sparse_signals import Array, Baseline, Inverse, Signals, columns, guided, signals
 
-from srfcli.diagnosis.candidates import Hypothesis
-from srfcli.diagnosis.follower import FOLLOWED, PULLS, Follower
+from srfcli.codegen.model import open_model
+from srfcli.data.experiment import read_experiment
+from srfcli.data.noise import describe_noise
+from srfcli.data.values import Run
+from srfcli.diagnosis.hypotheses import Hypothesis
+from srfcli.diagnosis.nudging import FOLLOWED, PULLS, Follower
 from srfcli.inference.fit import first_level
 from srfcli.inference.noise import Noise
-from srfcli.model import open_model
-from srfcli.proof.seal import unseal
-from srfcli.recording.experiment import read_experiment
-from srfcli.recording.noise import describe_noise
-from srfcli.recording.values import Run
-from srfcli.registry import Registry, load_registry
-from srfcli.trial.answer import FAILED, Answer, read_answers, write_answers
-from srfcli.trial.blind import failed
-from srfcli.trial.mark import Mark
+from srfcli.laws.registry import Registry, load_registry
+from srfcli.validation.generator.bank import unseal
+from srfcli.validation.trial.blind import FAILED, Answer, failed, read_answers, write_answers
+from srfcli.validation.trial.mark import Mark
 
 MARGIN, CHANCE = 1.04, 3.72  # of the remainder over that of a simulated baseline; standard errors of one in 10^4
 LEAST_NOISE = 0.005  # um

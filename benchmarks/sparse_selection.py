@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from sparse_signals import Array, Baseline, Signals, Sizes, columns
 
-from srfcli.splines import Spline
+from srfcli.codegen.splines import Spline
 
 RIDGE, MODELS, KEPT = (
     0.05,

@@ -15,9 +15,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
+from srfcli.codegen.model import GeneratedModel
+from srfcli.data.values import Experiment, Run
 from srfcli.inference.prediction import of_run, predict
-from srfcli.model import GeneratedModel
-from srfcli.recording.values import Experiment, Run
 
 Array = np.ndarray
 Sizes = Mapping[str, float]

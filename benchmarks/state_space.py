@@ -26,7 +26,7 @@ NAMES = {"mu0": "mu0", "A": "A", "B": "B", "D0": "D0", "Vsat": "Vsat", "lambda":
 
 
 def plans():
-    from srfcli.proof.protocol import Plan
+    from srfcli.validation.generator.physics import Plan
 
     return (
         Plan("steps", ((2, 5), (1, 20), (1, 50), (1, 10)), 5.0, 0.004),
@@ -38,17 +38,14 @@ def plans():
 
 def one(task: tuple[float, bool, int]) -> dict[str, object]:
     """Return what one repeat says: errors in standard errors, log likelihoods from far and from the truth, CPU."""
+    from srfcli.codegen.model import open_model
+    from srfcli.data.experiment import read_experiment
     from srfcli.inference.fit import fit_problem
-    from srfcli.inference.statespace import fit_state_space
-    from srfcli.model import open_model
-    from srfcli.proof.draw import SPREAD, Gauge
-    from srfcli.proof.folder import case_files
-    from srfcli.proof.gauge import read_gauge
-    from srfcli.proof.motion import move
-    from srfcli.proof.physics import Physics
-    from srfcli.proof.track import SMOOTH, Track
-    from srfcli.recording.experiment import read_experiment
-    from srfcli.registry import load_registry
+    from srfcli.inference.state_space import fit_state_space
+    from srfcli.laws.registry import load_registry
+    from srfcli.validation.generator.case import SPREAD, Gauge, case_files, read_gauge
+    from srfcli.validation.generator.physics import SMOOTH, Physics, Track
+    from srfcli.validation.generator.slider import move
 
     amplitude, shared, seed = task
     rng = np.random.default_rng([seed, int(1e6 * amplitude), shared])

@@ -26,9 +26,9 @@ import numpy as np
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.laws import Parameter
-from srfcli.model import open_model
-from srfcli.registry import bundled_registry
+from srfcli.codegen.model import open_model
+from srfcli.core.settings import Parameter
+from srfcli.laws.registry import bundled_registry
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from brute import Slider, shoot, steady

@@ -23,12 +23,11 @@ import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
 from common import Report, interleaved
 
+from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.inference.threshold_match import Matcher
-from srfcli.inference.threshold_scale import Scale, free_parameters, with_transmission
-from srfcli.inference.threshold_table import Thresholds
+from srfcli.inference.threshold_table import Scale, Thresholds, free_parameters, with_transmission
 from srfcli.inference.thresholds import MethodFit, fit_thresholds, generated, with_noise
-from srfcli.model import GeneratedModel, open_model
-from srfcli.registry import load_registry
+from srfcli.laws.registry import load_registry
 
 TRIAL = {"A": 0.012, "B": 0.023, "D0": 0.40, "Vsat": 280.0, "lambda": 0.62, "rho": 0.48}
 OPTIMISED = {"A": 0.0126, "B": 0.0241, "D0": 0.402, "Vsat": 256.0, "lambda": 0.56, "rho": 0.43}

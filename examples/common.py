@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from srfcli.model import GeneratedModel, open_model
-from srfcli.output.plots import save_figure
-from srfcli.registry import load_registry
+from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.laws.registry import load_registry
+from srfcli.results.plots import save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

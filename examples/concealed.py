@@ -10,9 +10,8 @@ import argparse
 import json
 from pathlib import Path
 
-from srfcli.errors import SrfError
-from srfcli.proof.case import make_case
-from srfcli.proof.effects import NAMES, OUTSIDE_NAMES
+from srfcli.core.errors import SrfError
+from srfcli.validation.generator.case import NAMES, OUTSIDE_NAMES, make_case
 
 
 def main() -> None:

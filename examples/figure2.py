@@ -12,12 +12,12 @@ import numpy as np
 from common import arguments, paper_model, progress, save
 from scipy.optimize import brentq
 
-from srfcli.model import GeneratedModel
-from srfcli.numerics.atlas import Atlas, find_components
+from srfcli.codegen.model import GeneratedModel
+from srfcli.numerics.continuation import Atlas, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.output.plots import stability_diagram
+from srfcli.results.plots import stability_diagram
 
 AMPLITUDES = (0.045, 0.09, 0.13, 0.18)
 V_RANGE, W0_RANGE = (1.0, 100.0), (4.0, 400.0)

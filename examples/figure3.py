@@ -14,12 +14,12 @@ import numpy as np
 from common import arguments, paper_model, progress, save
 from numpy.typing import NDArray
 
-from srfcli.model import GeneratedModel
+from srfcli.codegen.model import GeneratedModel
+from srfcli.motion.imposed import Drive, Modulation
+from srfcli.motion.simulate import Trace, simulate
 from srfcli.numerics.critical import critical_line
-from srfcli.numerics.integrate import Trace, simulate
 from srfcli.numerics.orbit import solve_orbits, steady_guess, uniform_mesh
-from srfcli.numerics.program import Drive, Modulation
-from srfcli.output.plots import COLOURS, house_style, new_figure
+from srfcli.results.plots import COLOURS, house_style, new_figure
 
 V, W0 = 8.0, 8.1
 AMPLITUDES = (0.0, 0.015, 0.03, 0.045)

@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 from common import arguments, paper_model, progress, save
 
-from srfcli.model import GeneratedModel
-from srfcli.numerics.atlas import Atlas, find_components
+from srfcli.codegen.model import GeneratedModel
+from srfcli.numerics.continuation import Atlas, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.output.plots import COLOURS, DASHES, house_style, new_figure
+from srfcli.results.plots import COLOURS, DASHES, house_style, new_figure
 
 VELOCITIES = (1.0, 5.0, 10.0, 30.0, 50.0)
 EPS_MAX = 0.2

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from srfcli.codegen.model import open_model
+from srfcli.data.experiment import read_experiment
 from srfcli.inference.fit import Problem, fit, fit_problem
-from srfcli.model import open_model
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import load_registry
+from srfcli.laws.registry import load_registry
 
 EXPERIMENT = """format = "srf-experiment/1"
 title = "{title}"

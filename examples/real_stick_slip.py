@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.numerics.events import StickSlip, stick_slip
-from srfcli.recording.experiment import read_experiment
-from srfcli.recording.values import Run
-from srfcli.registry import load_registry
+from srfcli.data.experiment import read_experiment
+from srfcli.data.values import Run
+from srfcli.laws.registry import load_registry
+from srfcli.motion.simulate import StickSlip, stick_slip
 
 Array = NDArray[np.float64]
 MASS, GRAVITY = 0.0307, 9.81  # kg, m/s^2

@@ -15,9 +15,14 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from srfcli.core.version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from srfcli.errors import SrfError as SrfError
-    from srfcli.status import Status as Status
+    from srfcli.codegen.slider import SlidingSystem as SlidingSystem
+    from srfcli.codegen.slider import load_law as load_law
+    from srfcli.codegen.slider import system as system
+    from srfcli.core.errors import SrfError as SrfError
+    from srfcli.core.errors import Status as Status
     from srfcli.tasks.boundary import continue_boundary as continue_boundary
     from srfcli.tasks.boundary import critical as critical
     from srfcli.tasks.compare import compare as compare
@@ -27,28 +32,24 @@ if TYPE_CHECKING:
     from srfcli.tasks.map import map as map
     from srfcli.tasks.recordings import read_experiment as read_experiment
     from srfcli.tasks.simulate import simulate as simulate
-    from srfcli.tasks.system import SlidingSystem as SlidingSystem
-    from srfcli.tasks.system import load_law as load_law
-    from srfcli.tasks.system import system as system
 
-__version__ = "0.1.0"
 
 # name: the module that has it, imported when the name is first used
 PUBLIC = {
-    "SlidingSystem": "srfcli.tasks.system",
-    "SrfError": "srfcli.errors",
-    "Status": "srfcli.status",
+    "SlidingSystem": "srfcli.codegen.slider",
+    "SrfError": "srfcli.core.errors",
+    "Status": "srfcli.core.errors",
     "continue_boundary": "srfcli.tasks.boundary",
     "critical": "srfcli.tasks.boundary",
     "floquet": "srfcli.tasks.floquet",
     "linear": "srfcli.tasks.linear",
-    "load_law": "srfcli.tasks.system",
+    "load_law": "srfcli.codegen.slider",
     "map": "srfcli.tasks.map",
     "compare": "srfcli.tasks.compare",
     "fit": "srfcli.tasks.fit",
     "read_experiment": "srfcli.tasks.recordings",
     "simulate": "srfcli.tasks.simulate",
-    "system": "srfcli.tasks.system",
+    "system": "srfcli.codegen.slider",
 }
 __all__ = sorted(PUBLIC)
 

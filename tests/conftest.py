@@ -36,8 +36,8 @@ def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def make_model() -> Callable[..., Any]:
     """`make_model(law=..., ageing=..., interface=..., loading=..., inertia=...)`: the model, built once in a session."""
-    from srfcli.model import open_model
-    from srfcli.registry import load_registry
+    from srfcli.codegen.model import open_model
+    from srfcli.laws.registry import load_registry
 
     registry = load_registry()
     built: dict[tuple[tuple[str, Any], ...], Any] = {}

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from srfcli.diagnosis.adequacy import DOUBT, alike, gauge_noise, judge_residuals
+from srfcli.data.values import Run
+from srfcli.diagnosis.goodness_of_fit import DOUBT, alike, gauge_noise, judge_residuals
 from srfcli.inference.noise import Noise
-from srfcli.numerics.load import ConstantLoad
-from srfcli.numerics.program import Drive
-from srfcli.recording.values import Run
+from srfcli.motion.imposed import ConstantLoad, Drive
 
 SIZES = (2125, 1375, 3000)
 

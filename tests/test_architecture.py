@@ -1,184 +1,181 @@
-"""The arrows of docs/architecture.md, light imports, docstrings of files, and commands that are documented."""
+"""The rules of docs/architecture.md, one test each; light imports, docstrings of files, and commands that are documented."""
 
 from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import click
 import pytest
 
-from srfcli.cli.main import cli
+from srfcli.cli.main import COMMANDS, cli
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "srfcli"
-MODULES = sorted(p for p in PACKAGE.rglob("*.py") if "data" not in p.parts)  # there lies generated text
+MAP = ROOT / "docs" / "architecture.md"
 
-# each module and what it may import of the package, also inside functions; a folder stands for all that is in it
-BASE = {"errors", "status", "reading", "atomic"}
-LAWS = BASE | {"laws", "reader"}
-LAW_FILES = LAWS | {"expression", "dimensions", "lawfile", "effectfile", "pylaw"}
-SYMBOLS = LAW_FILES | {"registry", "system", "equations", "derive", "closed_limits"}
-MAY: dict[str, set[str]] = {
-    "errors": set(),
-    "status": set(),
-    "reading": {"errors"},
-    "atomic": {"errors", "reading"},
-    "units": BASE,
-    "expression": BASE,
-    "laws": BASE | {"expression"},
-    "reader": set(),
-    "dimensions": BASE,
-    "lawfile": LAWS | {"expression", "dimensions"},
-    "effectfile": LAWS | {"expression", "dimensions", "lawfile"},
-    "lawtemplate": BASE,
-    "pylaw": LAW_FILES,
-    "prebuilt": set(),
-    "registry": LAW_FILES | {"prebuilt"},
-    "api": LAW_FILES,
-    "checking": LAW_FILES,
-    "lawcheck": LAW_FILES | {"registry", "checking", "effectcheck"},
-    "effectcheck": SYMBOLS | {"checking", "generate_motion", "model"},
-    "notation": {"expression"},
-    "staged": set(),
-    "system": LAWS | {"expression", "registry"},
-    "equations": LAWS | {"expression", "system"},
-    "derive": LAWS | {"expression", "system", "equations"},
-    "closed_limits": LAWS | {"expression", "system", "derive"},
-    "numpytext": {"expression"},
-    "generate": SYMBOLS | {"numpytext", "staged"},
-    "generate_motion": SYMBOLS | {"generate", "numpytext", "staged"},
-    "splines": set(),
-    "cache": {"errors", "reading"},
-    "model": SYMBOLS | {"generate", "generate_motion", "cache", "prebuilt", "units"},
-    "derivation": SYMBOLS | {"notation", "units"},
-    "paper_forms": SYMBOLS,
-    "paper": SYMBOLS | {"paper_forms", "units"},
-    "render": SYMBOLS | {"derivation", "notation", "numpytext", "paper"},
-    "settings": LAWS | {"units"},
-    "recording": LAW_FILES | {"registry", "units", "numerics", "splines", "system"},
-    "numerics": BASE | {"cache", "model", "numerics", "splines"},
-    "inference": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "settings", "splines", "units"},
-    "diagnosis": LAW_FILES | {"registry", "recording", "system", "model", "numerics", "inference", "splines", "units"},
-    "output": LAWS | {"output"},
-    "results": BASE | {"model", "numerics", "output", "recording", "inference", "units", "tasks", "settings"},
-    "tasks": LAWS
-    | {
-        "registry",
-        "model",
-        "numerics",
-        "recording",
-        "inference",
-        "diagnosis",
-        "results",
-        "settings",
-        "splines",
-        "units",
-    },
-    "parallel": BASE | {"cache", "output"},
-    "trial": BASE | {"registry", "recording", "diagnosis", "model", "output", "parallel", "proof"},
-    # shares no equation and no integrator with what it is to prove
-    "proof": {"errors", "output", "parallel", "reading", "atomic"},
+# a folder imports from folders before it alone
+ORDER = (
+    "core", "laws", "symbolic", "codegen", "motion", "numerics", "data", "inference", "diagnosis",
+    "parallel", "results", "tasks", "validation", "cli",
+)  # fmt: skip
+# folders that keep to fewer than stand before them
+NOTHING_BUT = {
+    "numerics": {"core", "codegen", "motion"},
+    "motion": {"core", "codegen"},
+    "parallel": {"core"},
 }
 HEAVY = {"sympy", "scipy", "numpy", "matplotlib", "pint", "numba"}
-FORBIDDEN = {
+# libraries that a folder or a file leaves to others, also inside functions
+WITHOUT = {
+    "motion": {"sympy", "click", "rich"},
     "numerics": {"sympy", "click", "rich"},
-    "output": {"sympy", "scipy", "click"},
-    "proof": {"sympy", "click", "rich"},
-    "model": {"sympy"},
-    "settings": HEAVY,
-    "registry": HEAVY,
+    "results": {"sympy", "scipy", "click"},
+    "validation/generator": {"sympy", "click", "rich"},
+    "codegen/model.py": {"sympy"},
+    "core/settings.py": HEAVY,
+    "laws/registry.py": HEAVY,
 }
+BEHIND_THE_WALL = {"core", "parallel"}  # what the generator of concealed cases may share with the rest
 
 
-def unit_of(path: Path) -> str:
-    """Return the name in MAY that a module goes by: its own, or that of its folder."""
-    parts = path.relative_to(PACKAGE).with_suffix("").parts
-    return parts[0]
+def is_typing(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
 
 
-def imports(path: Path, *, top_only: bool = False) -> Iterator[str]:
-    """Yield the dotted names that a module imports; those inside functions, too, unless `top_only`."""
+def imports(path: Path, *, top_only: bool = False, typing: bool = True) -> Iterator[str]:
+    """Yield the dotted names that a file imports; those inside functions and those for types alone, too, unless told."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    nodes = tree.body if top_only else list(ast.walk(tree))
-    for node in nodes:
+    typed = {id(n) for block in ast.walk(tree) if is_typing(block) for n in ast.walk(block)}
+    for node in tree.body if top_only else ast.walk(tree):
+        if id(node) in typed and not typing:
+            continue
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: a relative import"
-            module = node.module or ""
-            yield module
-            if module == "srfcli":
-                yield from (f"srfcli.{alias.name}" for alias in node.names)
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def typing_only(path: Path) -> set[str]:
-    """Return what a module imports under TYPE_CHECKING: no arrow at run time."""
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
-            found |= {n.module for n in ast.walk(node) if isinstance(n, ast.ImportFrom) and n.module}
+@cache
+def files() -> dict[str, Path]:
+    """Return every file of the package by its dotted name."""
+    own = [p for p in sorted(PACKAGE.rglob("*.py")) if (p.parent / "__init__.py").is_file()]  # other folders hold data
+    named = {".".join(p.relative_to(ROOT).with_suffix("").parts): p for p in own}
+    return {name.removesuffix(".__init__"): path for name, path in named.items()}
+
+
+@cache
+def arrows(*, typing: bool = True) -> dict[str, set[str]]:
+    """Return the files that each file imports, whether at its top, inside a function or for types alone."""
+    known = files()
+    found: dict[str, set[str]] = {}
+    for name, path in known.items():
+        wanted = {n if n in known else n.rpartition(".")[0] for n in imports(path, typing=typing)}
+        found[name] = (wanted & set(known)) - {name}
     return found
 
 
-def inside(path: Path) -> set[str]:
-    """Return the parts of the package that a module imports."""
-    return {name.split(".")[1] for name in set(imports(path)) - typing_only(path) if name.startswith("srfcli.")}
+def folder(name: str) -> str:
+    """Return the folder below srfcli/ that a file stands in, '' for those at the top."""
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 and (PACKAGE / parts[1]).is_dir() else ""
 
 
-def test_arrows() -> None:
-    known, wrong = {unit_of(p) for p in MODULES}, []
-    for path in MODULES:
-        unit = unit_of(path)
-        if unit in ("cli", "__init__", "__main__"):
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Return the groups of files that reach each other."""
+    left = {name: set(to) for name, to in graph.items()}
+    while free := [name for name, to in left.items() if not to & left.keys()]:  # what imports nothing that is left
+        for name in free:
+            del left[name]
+    while free := [name for name in left if not any(name in to for to in left.values())]:  # what nothing imports
+        for name in free:
+            del left[name]
+    return [sorted(left)] if left else []
+
+
+def test_no_files_import_each_other_in_a_circle() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == [["b", "c"]]
+    assert not circles(arrows())
+
+
+def test_folders_depend_one_way() -> None:
+    wrong = []
+    for name, to in arrows().items():
+        own = folder(name)
+        if not own:
             continue
-        assert unit in MAY, f"srfcli/{unit} has no line in MAY: say what it may import"
-        roots = {name.split(".")[0] for name in set(imports(path)) - typing_only(path)}
-        against = (inside(path) & known) - MAY[unit] - {unit} | roots & FORBIDDEN.get(unit, set())
-        wrong += [f"{path.relative_to(ROOT)} imports {name}" for name in sorted(against)]
+        may = NOTHING_BUT.get(own, set(ORDER[: ORDER.index(own)])) | {own, ""}
+        wrong += [f"{name} imports {other}" for other in sorted(to) if folder(other) not in may]
     assert not wrong
 
 
-def test_nobody_imports_the_command_line() -> None:
-    for path in MODULES:
-        if unit_of(path) not in ("cli", "__main__"):
-            assert not [n for n in imports(path) if n.startswith("srfcli.cli")], path
+def test_every_folder_has_its_place() -> None:
+    found = {p.name for p in PACKAGE.iterdir() if p.is_dir() and any(p.rglob("*.py")) and p.name != "plugins"}
+    assert found <= set(ORDER)
 
 
-def test_laws_import_nothing_above_them() -> None:
-    above = {"system", "derive", "generate", "model", "numerics", "output", "cli"}
-    for name in ("errors", "status", "expression", "laws", "lawfile", "dimensions", "pylaw", "registry", "api"):
-        assert not MAY[name] & above
-        assert not inside(PACKAGE / f"{name}.py") & above
+def test_no_module_stands_loose_at_the_top() -> None:
+    assert {p.name for p in PACKAGE.glob("*.py")} <= {"__init__.py", "__main__.py"}
+
+
+def test_the_generator_imports_nothing_of_the_solver() -> None:
+    """Concealed cases prove nothing if they share an equation or an integrator with what is to find them."""
+    wrong = [
+        f"{name} imports {other}"
+        for name, to in arrows().items()
+        if name.startswith("srfcli.validation.generator")
+        for other in sorted(to)
+        if folder(other) not in BEHIND_THE_WALL and not other.startswith("srfcli.validation.generator")
+    ]
+    assert not wrong
+
+
+def test_only_validation_sees_what_is_concealed() -> None:
+    for name, to in arrows().items():
+        if folder(name) not in ("validation", "cli"):
+            assert not [n for n in to if n.startswith("srfcli.validation")], name
+
+
+def test_libraries_are_left_to_those_that_need_them() -> None:
+    wrong = []
+    for place, names in WITHOUT.items():
+        where = PACKAGE / place
+        assert where.exists(), f"srfcli/{place} is gone: mend WITHOUT"
+        for path in [where] if where.is_file() else sorted(where.rglob("*.py")):
+            found = {n.split(".")[0] for n in imports(path, typing=False)} & names
+            wrong += [f"{path.relative_to(ROOT)} imports {name}" for name in sorted(found)]
+    assert not wrong
 
 
 def test_files_say_what_they_are() -> None:
-    silent = [p for p in MODULES if not ast.get_docstring(ast.parse(p.read_text(encoding="utf-8")))]
-    assert not silent
+    assert not [n for n, p in files().items() if not ast.get_docstring(ast.parse(p.read_text(encoding="utf-8")))]
 
 
 def test_command_modules_are_light() -> None:
-    for path in [*(PACKAGE / "cli").glob("*.py"), PACKAGE / "lawfile.py"]:
+    for path in [*(PACKAGE / "cli").glob("*.py"), PACKAGE / "laws" / "law_file.py"]:
         roots = {name.split(".")[0] for name in imports(path, top_only=True)}
         assert not roots & HEAVY, path
 
 
 def test_importing_the_package_does_no_work(tmp_path: Path) -> None:
-    modules = [".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for p in MODULES]
+    names = [n for n in files() if not n.endswith("__main__")]
     script = f"""
 import sys
 sys.path.insert(0, {str(ROOT)!r})
 import importlib
-for name in {modules!r}:
+for name in {names!r}:
     importlib.import_module(name)
 late = sorted({{"matplotlib", "pint", "numba", "IPython"}} & set(sys.modules))
 print(late)
 """
-    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert (done.stdout.strip(), done.stderr) == ("[]", "")  # nothing is printed, nothing heavy comes along
     assert not list(tmp_path.iterdir())
@@ -195,7 +192,7 @@ try:
 finally:
     print(sorted({HEAVY!r} & set(sys.modules)), file=sys.stderr)
 """
-    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr.strip()) == (0, "[]")
 
 
@@ -223,8 +220,6 @@ def test_every_command_is_documented(name: str, command: click.Command) -> None:
 
 @pytest.mark.parametrize(("name", "command"), list(commands()), ids=lambda v: v if isinstance(v, str) else "")
 def test_documented_options_exist(name: str, command: click.Command) -> None:
-    import re
-
     text = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
     section = text.partition(f"\n## `{name}`\n")[2].partition("\n## ")[0]
     known = {o for p in command.params for o in (*p.opts, *p.secondary_opts)} | {"--help"}
@@ -233,8 +228,6 @@ def test_documented_options_exist(name: str, command: click.Command) -> None:
 
 
 def test_the_list_of_commands_says_what_they_say() -> None:
-    from srfcli.cli.main import COMMANDS
-
     for name, (place, sentence) in COMMANDS.items():
         module, _, attribute = place.partition(":")
         command = getattr(importlib.import_module(module), attribute)
@@ -257,7 +250,21 @@ finally:
     assert (done.returncode, done.stderr.strip()) == (0, "['srfcli.cli.linear']")
 
 
-def test_the_map_names_every_module() -> None:
-    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    for name in ("errors", "status", "expression", "laws", "registry", "system", "derive", "generate", "model"):
-        assert f"`{name}.py`" in text
+def test_the_map_names_every_folder_and_only_files_that_are() -> None:
+    text = MAP.read_text(encoding="utf-8")
+    folders = {folder(name) for name in files()} - {""}
+    assert not [f for f in folders if f"`{f}/`" not in text]
+    named = set(re.findall(r"`([a-z_]+(?:/[a-z_]+)+\.(?:py|c|toml))", text))
+    assert named and not [n for n in sorted(named) if not ((PACKAGE / n).is_file() or (ROOT / n).is_file())]
+
+
+def test_the_ways_through_the_code_are_ways() -> None:
+    """Each hop of a way on the map is a function of the file that it names, and there are ten or fewer."""
+    ways = re.findall(r"^## The way of .*?(?=^## |\Z)", MAP.read_text(encoding="utf-8"), re.M | re.S)
+    assert len(ways) == 2
+    for way in ways:
+        hops = re.findall(r"^\d+\. `([\w/]+\.py)` `(\w+)`", way, re.M)
+        assert 3 < len(hops) <= 10 and len(hops) == len(re.findall(r"^\d+\. ", way, re.M))
+        for file, name in hops:
+            tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
+            assert name in {n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.ClassDef)}, (file, name)

@@ -12,17 +12,16 @@ import pytest
 import sympy as sp
 from recording_cases import write
 
+from srfcli.core.errors import SrfError
+from srfcli.data.experiment import read_experiment
+from srfcli.data.values import Experiment, FitParameter, ModelChoice
 from srfcli.diagnosis import augment as augmenting
-from srfcli.diagnosis.augment import augment
-from srfcli.diagnosis.candidates import Hypothesis
-from srfcli.diagnosis.foldlaws import Folded, fold, law_files
-from srfcli.equations import equations_of
-from srfcli.errors import SrfError
-from srfcli.laws import Effect
-from srfcli.recording.experiment import read_experiment
-from srfcli.recording.values import Experiment, FitParameter, ModelChoice
-from srfcli.registry import load_registry
-from srfcli.system import build_system
+from srfcli.diagnosis.augment import Folded, augment, fold, law_files
+from srfcli.diagnosis.hypotheses import Hypothesis
+from srfcli.laws.registry import load_registry
+from srfcli.laws.values import Effect
+from srfcli.symbolic.equations import equations_of
+from srfcli.symbolic.system import build_system
 
 REGISTRY = load_registry(user=False, entry_points=False)
 PMMA = ModelChoice("srf-vsat", "dieterich", "elastic", True)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from brute import Slider, error_of_load, hopf_load, jacobian, rates, shoot, steady
 
+from srfcli.core.errors import Status
 from srfcli.numerics.boundary import linearise_boundary
 from srfcli.numerics.collocation import Discretisation, gauss
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.orbit import interpolate, solve_orbits, steady_guess, uniform_mesh
-from srfcli.status import Status
 
 
 def loads(model, V, eps, *, lo=4.0, hi=400.0, tol=1e-9):

@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from srfcli.inference.bumps import likeliest_bump
-from srfcli.inference.latent import Point
-from srfcli.inference.tracks import Roughness, Tracks
-from srfcli.splines import Spline
+from srfcli.codegen.splines import Spline
+from srfcli.inference.random_field import Point, Roughness, Tracks, likeliest_bump
 
 LENGTH, NOISE = 40.0, 2e-4  # um, and what mu0 is known to by each of three samples per um
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from srfcli import cache
-from srfcli.cache import cache_folder, cached_source, content_key
 from srfcli.cli.main import cli
-from srfcli.model import open_model
-from srfcli.numerics.compiled import compiled, compiler
-from srfcli.registry import bundled_folder, load_registry
+from srfcli.codegen.c_source import compiled, compiler
+from srfcli.codegen.model import open_model
+from srfcli.core import cache
+from srfcli.core.cache import cache_folder, cached_source, content_key
+from srfcli.laws.registry import bundled_folder, load_registry
 
 TEXT = "value = 1\nother = 2\n"
 
@@ -116,7 +116,7 @@ def test_a_changed_law_is_derived_anew(folder: Path, tmp_path: Path) -> None:
 
 def test_a_second_start_imports_no_sympy(folder: Path) -> None:
     code = (
-        "import sys; from srfcli.model import open_model; from srfcli.registry import load_registry; "
+        "import sys; from srfcli.codegen.model import open_model; from srfcli.laws.registry import load_registry; "
         "open_model(load_registry(), inertia=False, loading='inclined'); print('sympy' in sys.modules)"
     )
     environment = {**os.environ, "SRF_CACHE": str(folder)}

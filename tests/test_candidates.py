@@ -7,18 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from srfcli.diagnosis.candidates import Hypothesis, applicable
-from srfcli.diagnosis.search import Search
+from srfcli.codegen.c_source import compiler
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.hypotheses import Hypothesis, applicable
+from srfcli.diagnosis.staged_search import Search
 from srfcli.diagnosis.verdict import judge_held
-from srfcli.numerics.compiled import compiler
-from srfcli.proof.draw import Gauge
-from srfcli.proof.folder import case_files
-from srfcli.proof.gauge import read_gauge
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry, load_registry
+from srfcli.laws.registry import bundled_registry, load_registry
+from srfcli.validation.generator.case import Gauge, case_files, read_gauge
+from srfcli.validation.generator.physics import Physics, Plan
+from srfcli.validation.generator.slider import move
 
 SHIPPED = bundled_registry()
 OF_THE_MODULATION = {"load-transmission", "load-distortion"}

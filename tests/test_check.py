@@ -15,16 +15,16 @@ import pytest
 from click.testing import CliRunner, Result
 from recording_cases import TOML, data, write
 
-from srfcli.cli.check_sentences import CAN, verdict_of
+from srfcli.cli.check import CAN, verdict_of
 from srfcli.cli.main import cli
-from srfcli.inference import reach
+from srfcli.codegen.model import open_model
+from srfcli.data.experiment import check_run, read_experiment
+from srfcli.data.values import Experiment
+from srfcli.inference import cramer_rao as reach
+from srfcli.inference.cramer_rao import Forecast, Reach, forecast, noise_of
 from srfcli.inference.fit import fit, fit_problem
 from srfcli.inference.prediction import predict
-from srfcli.inference.reach import Forecast, Reach, forecast, noise_of
-from srfcli.model import open_model
-from srfcli.recording.checks import check_run
-from srfcli.recording.experiment import Experiment, read_experiment
-from srfcli.registry import load_registry
+from srfcli.laws.registry import load_registry
 
 REGISTRY = load_registry(user=False, entry_points=False)
 
@@ -123,7 +123,7 @@ def test_a_figure_with_what_is_not_compared(suffix: str, small: Path) -> None:
 
 
 def test_the_axes_of_what_is_imposed() -> None:
-    from srfcli.output.recordings import recordings
+    from srfcli.results.figures import recordings
 
     t = np.arange(200.0)
     run = {

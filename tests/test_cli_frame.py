@@ -17,20 +17,28 @@ import pytest
 from click.testing import CliRunner, Result
 
 import srfcli
-from srfcli import settings
 from srfcli.cli import emit as emit_module
 from srfcli.cli import options as options_module
 from srfcli.cli.base import CONTEXT, SrfGroup, switches
 from srfcli.cli.emit import Progress, emit, finish, remaining
 from srfcli.cli.fit import FitShare
 from srfcli.cli.main import cli
-from srfcli.cli.options import OutputOptions, SystemOptions, output_options, over_option, system_options, values_option
-from srfcli.cli.ranges import Range, parse_over, parse_overs, parse_values
-from srfcli.errors import ExpressionError, SrfError
-from srfcli.laws import Parameter
-from srfcli.output.tables import Column, Table
-from srfcli.settings import TomlSettings, find_toml, load_toml, resolve
-from srfcli.status import Status
+from srfcli.cli.options import (
+    OutputOptions,
+    Range,
+    SystemOptions,
+    output_options,
+    over_option,
+    parse_over,
+    parse_overs,
+    parse_values,
+    system_options,
+    values_option,
+)
+from srfcli.core import settings
+from srfcli.core.errors import ExpressionError, SrfError, Status
+from srfcli.core.settings import Parameter, TomlSettings, find_toml, load_toml, resolve
+from srfcli.results.tables import Column, Table
 
 ROOT = Path(srfcli.__file__).parents[1]
 K = Parameter("K", 0.21, "N/um", 0.0, 10.0, "stiffness")
@@ -78,7 +86,7 @@ def run(system: SystemOptions, over: tuple[Range, ...], output: OutputOptions, V
 
 
 def _figure(rows: list[Any]) -> Any:
-    from srfcli.output import plots
+    from srfcli.results import plots
 
     return plots.lines([r[0] for r in rows], [[1.0 for _ in rows]], ["a"], "V", "a", True)
 
@@ -340,7 +348,7 @@ def test_config_show_tells_every_origin(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_options_repeat_what_the_system_says() -> None:
-    from srfcli.system import ANGLE, APPARATUS, LOADINGS, MASS
+    from srfcli.symbolic.system import ANGLE, APPARATUS, LOADINGS, MASS
 
     assert options_module.LOADINGS == LOADINGS
     declared = {p.name: p for p in (*APPARATUS, MASS, ANGLE)}

@@ -13,16 +13,27 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.errors import SrfError
-from srfcli.model import open_model
+from srfcli.codegen.model import open_model
+from srfcli.core.errors import SrfError, Status
+from srfcli.laws.registry import bundled_registry
 from srfcli.numerics import compare
-from srfcli.numerics.compare import LawStudy, LawTask, Window, changed_areas, contrast, read_study, study_law, turns
-from srfcli.numerics.comparematch import Match, check_adjusted, match, observe
+from srfcli.numerics.compare import (
+    LawStudy,
+    LawTask,
+    Match,
+    Window,
+    changed_areas,
+    check_adjusted,
+    contrast,
+    match,
+    observe,
+    read_study,
+    study_law,
+    turns,
+)
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
-from srfcli.registry import bundled_registry
 from srfcli.results.compare import compare_figure, highest_fold
-from srfcli.status import Status
 
 LAWS = [
     {"law": "log-log"},

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from brute import Slider, shoot
 
-from srfcli.numerics.atlas import AtlasSettings, crossing_numbers, find_components
+from srfcli.core.errors import Status
+from srfcli.numerics.continuation import AtlasSettings, crossing_numbers, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.status import Status
 
 STEEP = 0.05  # of d ln|rho| / d ln W0: below it a fold is near
 

@@ -15,13 +15,19 @@ import sympy as sp
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.closed_limits import closed_critical_load, closed_limits, common_ageing
-from srfcli.derivation import dispersion_coefficients
-from srfcli.derive import characteristic_polynomial, hurwitz_determinant, paper_coefficients
-from srfcli.expression import symbol
+from srfcli.laws.expression import symbol
+from srfcli.laws.registry import bundled_registry
 from srfcli.numerics.hopf import hopf_points
-from srfcli.registry import bundled_registry
-from srfcli.system import build_system
+from srfcli.symbolic.derivation import dispersion_coefficients
+from srfcli.symbolic.derive import (
+    characteristic_polynomial,
+    closed_critical_load,
+    closed_limits,
+    common_ageing,
+    hurwitz_determinant,
+    paper_coefficients,
+)
+from srfcli.symbolic.system import build_system
 
 REGISTRY = bundled_registry()
 K, M, W0, D0, V, kappa, mu_v, mu_phi, mu_ss = map(

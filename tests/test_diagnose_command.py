@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from srfcli.cli.diagnose_out import prediction_names
+from srfcli.cli.diagnose import prediction_names
 from srfcli.cli.main import cli
-from srfcli.diagnosis.search import Search
+from srfcli.diagnosis.staged_search import Search
 from srfcli.diagnosis.verdict import NAMED
 
 ALPHA = 0.03

@@ -7,15 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from srfcli.data.experiment import read_experiment
+from srfcli.data.values import FitParameter
 from srfcli.diagnosis.diagram import stability
+from srfcli.laws.registry import bundled_registry
 from srfcli.numerics.critical import critical_line
-from srfcli.output.report_figures import diagram_figure
-from srfcli.proof.folder import case_files
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.recording.experiment import read_experiment
-from srfcli.recording.values import FitParameter
-from srfcli.registry import bundled_registry
+from srfcli.results.report_figures import diagram_figure
+from srfcli.validation.generator.case import case_files
+from srfcli.validation.generator.physics import Physics, Plan
 
 SHIPPED = bundled_registry()
 PLANS = (

@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from srfcli.api import ExtraState, Parameter, effect
 from srfcli.cli.law import law as law_group
-from srfcli.cli.laws import laws as laws_command
-from srfcli.errors import ExpressionError, SrfError
-from srfcli.expression import parse_expression
-from srfcli.lawcheck import check_law
-from srfcli.laws import Effect
-from srfcli.lawtemplate import template
-from srfcli.model import open_model
-from srfcli.registry import bundled_registry, load_registry, read_law
+from srfcli.cli.law import laws as laws_command
+from srfcli.codegen.model import open_model
+from srfcli.core.errors import ExpressionError, SrfError
+from srfcli.laws.api import ExtraState, Parameter, effect
+from srfcli.laws.expression import parse_expression
+from srfcli.laws.law_file import template
+from srfcli.laws.registry import bundled_registry, load_registry, read_law
+from srfcli.laws.values import Effect
+from srfcli.tasks.law_check import check_law
 
 SHIPPED = bundled_registry()
 NAMES = [e.name for e in SHIPPED.entries("effect")]
@@ -45,8 +45,8 @@ def test_an_effect_of_one_s_own_works_from_a_folder(tmp_path):
     written(tmp_path, AGE_EXPONENT, "age-exponent.toml")
     script = """
 import numpy as np
-from srfcli.model import open_model
-from srfcli.registry import load_registry
+from srfcli.codegen.model import open_model
+from srfcli.laws.registry import load_registry
 registry = load_registry()
 model, plain = open_model(registry, effects=("age-exponent",)), open_model(registry)
 x = np.asarray(plain.steady(plain.vector())) + 0.1

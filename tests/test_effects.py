@@ -10,17 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from srfcli.codegen.model import open_model
+from srfcli.data.experiment import read_experiment
 from srfcli.inference.prediction import of_run, predict
-from srfcli.lawcheck import check_law
-from srfcli.model import open_model
-from srfcli.numerics.load import Modulation
-from srfcli.proof.effects import EFFECTS, OUTSIDE
-from srfcli.proof.folder import case_files
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import example_protocol
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry, load_registry
+from srfcli.laws.registry import bundled_registry, load_registry
+from srfcli.motion.imposed import Modulation
+from srfcli.tasks.law_check import check_law
+from srfcli.validation.generator.case import EFFECTS, OUTSIDE, case_files
+from srfcli.validation.generator.physics import Physics, example_protocol
+from srfcli.validation.generator.slider import move
 
 SHIPPED = bundled_registry()
 NAMES = [e.name for e in SHIPPED.entries("effect")]

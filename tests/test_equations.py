@@ -13,18 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from srfcli.checking import STEP, evaluate
-from srfcli.equations import equations_of
-from srfcli.errors import SrfError
-from srfcli.laws import Effect
-from srfcli.model import load_source
-from srfcli.numerics.compiled import compiler
-from srfcli.numerics.load import Modulation
-from srfcli.numerics.motion import integrate, integrate_lsoda
-from srfcli.numerics.program import Drive
-from srfcli.numerics.scalar import scalar_function
-from srfcli.registry import bundled_registry
-from srfcli.system import System, build_system
+from srfcli.codegen.c_source import compiler
+from srfcli.codegen.model import load_source
+from srfcli.core.errors import SrfError
+from srfcli.laws.registry import bundled_registry
+from srfcli.laws.values import Effect
+from srfcli.motion.imposed import Drive, Modulation
+from srfcli.motion.integrators import integrate, integrate_lsoda, scalar_function
+from srfcli.symbolic.equations import equations_of
+from srfcli.symbolic.system import System, build_system
+from srfcli.tasks.law_check import STEP, evaluate
 
 REGISTRY = bundled_registry()
 POINTS = 12
@@ -325,7 +323,7 @@ def test_what_cannot_be_followed_is_told(tmp_path, formulas, names, message):
 
 
 def test_a_motion_module_of_a_plain_system_is_the_whole_one_s(make_model):
-    from srfcli.generate_motion import generate_motion
+    from srfcli.codegen.numpy_source import generate_motion
 
     for names in PLAIN[:7]:
         whole, motion = make_model(**names), load_source(generate_motion(build_system(REGISTRY, **names)))

@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
-from srfcli.errors import SrfError, printable
+from srfcli.core.errors import SrfError, printable
 
 # title and clipboard of the terminal, clear screen, C1 control, overwritten line, rubbed out, turned round, unseen, no text
 EVIL = "\x1b]0;p\x07\x1b]52;c;cnVu\x07\x1b[2J\x9b31m\rgone\x08\x7f\u202egpj\u2066\u200b"
@@ -202,7 +202,7 @@ def test_of_paths_and_links() -> None:
     (folder / "their-law.toml").write_text(LAW.format(**SOUND), encoding="utf-8")
     (folder / "broken.toml").write_text("x")
     (folder / f"{EVIL}.toml").symlink_to("nowhere")
-    (folder / f"{EVIL}.py").write_text("from srfcli.api import friction_law")
+    (folder / f"{EVIL}.py").write_text("from srfcli.laws.api import friction_law")
     for more in ([], ["--json"]):
         srf("laws", "--plugins", str(folder), *more)
     srf("law", "show", "their-law", "--plugins", str(folder))

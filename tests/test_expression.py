@@ -10,9 +10,9 @@ import sympy
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from srfcli.errors import ExpressionError, SrfError
-from srfcli.expression import RESERVED, check_identifier, expm1, log1p, parse_expression, symbol
-from srfcli.lawcheck import evaluate
+from srfcli.core.errors import ExpressionError, SrfError
+from srfcli.laws.expression import RESERVED, check_identifier, expm1, log1p, parse_expression, symbol
+from srfcli.tasks.law_check import evaluate
 
 KNOWN = ["v", "phi", "A", "B", "V0", "Vsat", "D0", "lambda", "is", "beta", "gamma", "N", "S", "I", "E", "mu0"]
 s = symbol

@@ -9,17 +9,14 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from srfcli.errors import SrfError
+from srfcli.core.errors import SrfError, Status
+from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
 from srfcli.inference.fit import Interrupted, fit, fit_problem, held_fit
 from srfcli.inference.noise import Noise, estimate_noise, lag_one, log_determinant, stretches, white_level, whiten
-from srfcli.inference.nuisance import basis, own_names, own_start
-from srfcli.inference.prediction import predict
-from srfcli.inference.profile import profile
-from srfcli.inference.starts import fit_from_several
-from srfcli.numerics.load import ConstantLoad, Modulation
-from srfcli.numerics.program import Drive
-from srfcli.recording.values import Experiment, FitParameter, ModelChoice, Run
-from srfcli.status import Status
+from srfcli.inference.posterior import profile
+from srfcli.inference.prediction import basis, own_names, own_start, predict
+from srfcli.inference.recordings import fit_from_several
+from srfcli.motion.imposed import ConstantLoad, Drive, Modulation
 
 ROCK = ModelChoice("dieterich-ruina", "ruina", "rigid", False)
 ROCK_TRUE = {"mu0": 0.6, "A": 0.008, "B": 0.010, "D0": 10.0}
@@ -274,9 +271,9 @@ def test_held_out_runs_are_judged_only(rock_model):
 def test_open_case_with_nothing_concealed(shared):
     from dataclasses import asdict
 
-    from srfcli.model import open_model
-    from srfcli.recording.experiment import read_experiment
-    from srfcli.registry import load_registry
+    from srfcli.codegen.model import open_model
+    from srfcli.data.experiment import read_experiment
+    from srfcli.laws.registry import load_registry
 
     truth = __import__("json").loads((shared / "cases" / "truth.json").read_text())["open-01"]["parameters"]
     registry = load_registry()

@@ -10,14 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.numerics.compiled import compiler
-from srfcli.proof.draw import Gauge
-from srfcli.proof.folder import case_files
-from srfcli.proof.gauge import read_gauge
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.proof.track import Track
+from srfcli.codegen.c_source import compiler
+from srfcli.validation.generator.case import Gauge, case_files, read_gauge
+from srfcli.validation.generator.physics import Physics, Plan, Track
+from srfcli.validation.generator.slider import move
 
 PLANS = (
     Plan("up", ((0.6, 20), (0.6, 60)), 3.0, 0.002),

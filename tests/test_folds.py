@@ -8,14 +8,13 @@ from brute import Slider, rates
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from srfcli.numerics.atlas import AtlasSettings
-from srfcli.numerics.map import KINDS, compute_map
-from srfcli.numerics.mapcurves import find_boundaries, unexplained
-from srfcli.numerics.mapgrid import MapAxis, MapGrid, MapSettings
-from srfcli.numerics.maptile import settle
+from srfcli.numerics.continuation import AtlasSettings
+from srfcli.numerics.critical import robust_orbits
+from srfcli.numerics.map import KINDS, compute_map, settle
+from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.orbit import solve_orbits, uniform_mesh
-from srfcli.numerics.scan import robust_orbits
-from srfcli.numerics.special import special_points
+from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings
+from srfcli.numerics.special_points import special_points
 
 V, W0 = 10.0, 7.6
 

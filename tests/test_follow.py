@@ -7,20 +7,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from srfcli.diagnosis.candidates import Hypothesis
-from srfcli.diagnosis.follower import FOLLOWED, PULLS, Follower
+from srfcli.codegen.c_source import compiler
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.hypotheses import Hypothesis
+from srfcli.diagnosis.nudging import (
+    FIRM,
+    FOLLOWED,
+    PULLS,
+    Follower,
+    between_slips,
+    calmed,
+    hold_to,
+    slip_length,
+    smoothed,
+    weaker,
+)
 from srfcli.inference.fit import first_level
-from srfcli.inference.follow import FIRM, between_slips, calmed, hold_to, slip_length, smoothed, weaker
 from srfcli.inference.noise import Noise
-from srfcli.numerics.compiled import compiler
-from srfcli.proof.draw import Gauge
-from srfcli.proof.folder import case_files
-from srfcli.proof.gauge import read_gauge
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry
+from srfcli.laws.registry import bundled_registry
+from srfcli.validation.generator.case import Gauge, case_files, read_gauge
+from srfcli.validation.generator.physics import Physics, Plan
+from srfcli.validation.generator.slider import move
 
 SHIPPED = bundled_registry()
 PLANS = (

@@ -14,15 +14,15 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.model import load_source
+from srfcli.codegen.model import load_source
 
 SCRIPT = """
 import hashlib
-from srfcli import paper, render
-from srfcli.derivation import derivation
-from srfcli.generate import generate
-from srfcli.registry import bundled_registry
-from srfcli.system import build_system
+from srfcli.symbolic import paper, derivation as render
+from srfcli.symbolic.derivation import derivation
+from srfcli.codegen.numpy_source import generate
+from srfcli.laws.registry import bundled_registry
+from srfcli.symbolic.system import build_system
 
 for names in ({}, {"ageing": "kato-tullis", "interface": "rigid", "loading": "inclined"}):
     system = build_system(bundled_registry(), **names)

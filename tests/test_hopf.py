@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from srfcli.core.errors import Status
+from srfcli.motion.imposed import ConstantLoad, Drive
+from srfcli.motion.simulate import simulate
 from srfcli.numerics.hopf import critical_point, hopf_points, rest_state
-from srfcli.numerics.integrate import simulate
-from srfcli.numerics.program import ConstantLoad, Drive
-from srfcli.status import Status
 
 
 def settled_swing(model, V: float, W0: float, Omega: float, swing: float) -> float:

@@ -9,13 +9,12 @@ import pytest
 from brute import Slider, rates, steady
 from scipy.integrate import solve_ivp
 
-from srfcli.errors import SrfError
-from srfcli.numerics import motion
-from srfcli.numerics.integrate import simulate
+from srfcli.core.errors import SrfError, Status
+from srfcli.motion import integrators as motion
+from srfcli.motion.imposed import ConstantLoad, Drive, Modulation, SampledLoad
+from srfcli.motion.integrators import scalar_function, scalar_source
+from srfcli.motion.simulate import simulate
 from srfcli.numerics.orbit import solve_orbits, steady_guess, uniform_mesh
-from srfcli.numerics.program import ConstantLoad, Drive, Modulation, SampledLoad
-from srfcli.numerics.scalar import scalar_function, scalar_source
-from srfcli.status import Status
 
 
 def combinations():

@@ -20,7 +20,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
-from srfcli.numerics.compiled import compiler
+from srfcli.codegen.c_source import compiler
 
 pytestmark = [
     pytest.mark.usefixtures("empty_folder"),
@@ -170,7 +170,7 @@ def test_a_stranger_s_note_moves_nothing_else() -> None:
 
 def test_parts_of_the_living_stay() -> None:
     held, go = threading.Event(), threading.Event()
-    from srfcli.atomic import whole_folder
+    from srfcli.core.files import whole_folder
 
     def write() -> None:
         with whole_folder(Path("made"), lambda: None) as fresh:

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from srfcli.inference.latent import AMPLITUDES, LENGTHS, Point, evenness, marginal
+from srfcli.codegen.splines import Spline
+from srfcli.data.experiment import read_experiment
+from srfcli.inference.random_field import AMPLITUDES, LENGTHS, Point, Roughness, Tracks, evenness, marginal
 from srfcli.inference.recordings import fit_recordings
-from srfcli.inference.tracks import Roughness, Tracks
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import load_registry
-from srfcli.splines import Spline
+from srfcli.laws.registry import load_registry
 
 
 def test_prior_is_the_matern_covariance() -> None:

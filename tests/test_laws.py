@@ -12,17 +12,17 @@ import pytest
 import sympy
 from click.testing import CliRunner
 
-from srfcli import checking
-from srfcli.api import Check, FrictionLaw, Parameter, State, ageing_law, exp, friction_law, interface, log
 from srfcli.cli.law import law as law_group
-from srfcli.cli.laws import laws as laws_command
-from srfcli.dimensions import UNITS, dimension_of, parse_unit
-from srfcli.errors import ExpressionError, SrfError
-from srfcli.expression import log1p, parse_expression, symbol
-from srfcli.lawcheck import check_law, evaluate, reference_values, steady_age
-from srfcli.lawfile import APPARATUS, KINDS, formula_of
-from srfcli.laws import Interface
-from srfcli.registry import Entry, bundled_registry, read_law
+from srfcli.cli.law import laws as laws_command
+from srfcli.core.errors import ExpressionError, SrfError
+from srfcli.core.units import UNITS, dimension_of, parse_unit
+from srfcli.laws.api import Check, FrictionLaw, Parameter, State, ageing_law, exp, friction_law, interface, log
+from srfcli.laws.expression import log1p, parse_expression, symbol
+from srfcli.laws.law_file import APPARATUS, KINDS, formula_of
+from srfcli.laws.registry import Entry, bundled_registry, read_law
+from srfcli.laws.values import Interface
+from srfcli.tasks import law_check as checking
+from srfcli.tasks.law_check import check_law, evaluate, reference_values, steady_age
 
 SHIPPED = bundled_registry()
 FRICTION = {
@@ -128,12 +128,12 @@ def test_steady_age(name: str, y: float) -> None:
 
 
 def test_apparatus_names_are_those_of_the_system() -> None:
-    system = pytest.importorskip("srfcli.system")
+    system = pytest.importorskip("srfcli.symbolic.system")
     assert set(APPARATUS) == {p.name for p in (*system.APPARATUS, system.MASS, system.ANGLE)}
 
 
 def test_units_agree_with_those_a_user_types() -> None:
-    from srfcli.units import find_unit
+    from srfcli.core.units import find_unit
 
     for name, unit in UNITS.items():
         other = find_unit(name)

@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from srfcli.errors import SrfError
-from srfcli.numerics.events import stick_slip
-from srfcli.numerics.load import ConstantLoad, Modulation
-from srfcli.numerics.loads import LoadSteps, ModulatedLoad
+from srfcli.core.errors import SrfError
+from srfcli.motion.imposed import ConstantLoad, LoadSteps, ModulatedLoad, Modulation
+from srfcli.motion.simulate import stick_slip
 
 STEPS = LoadSteps.sequence([(2, 5, 5), (0.2, 5, 7), (0.01, 7, 9), (3.79, 3, 3)], start=-1.0, rise=0.05)
 
@@ -156,7 +155,7 @@ def test_the_ripple_of_a_modulation_is_no_event(ripple: float) -> None:
 @pytest.mark.parametrize("lag1", [0.0, 0.9])
 @pytest.mark.parametrize("quantum", [0.0, 0.05])
 def test_noise_and_rounding_are_no_events(lag1: float, quantum: float) -> None:
-    from srfcli.recording.synthetic import measured
+    from srfcli.data.noise import measured
 
     noisy = measured(sawtooth(T, 0.65, 2.5), noise=0.05, lag1=lag1, quantum=quantum, seed=3)
     found = stick_slip(T, noisy)

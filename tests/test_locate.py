@@ -8,9 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from srfcli.diagnosis.locate import Location, read_atlas
-from srfcli.diagnosis.places import Atlas, Piece, log_tail
-from srfcli.diagnosis.straight import _step, in_order
+from srfcli.diagnosis.residual_scan import Atlas, Location, Piece, _step, in_order, log_tail, read_atlas
 from srfcli.inference.noise import Noise, whiten
 
 N, STEP, FORCING = 1024, 0.002, 40.0

@@ -8,20 +8,14 @@ import numpy as np
 import pytest
 from brute import Slider, shoot, steady
 
-from srfcli.errors import SrfError
-from srfcli.numerics.atlas import AtlasSettings, find_components
-from srfcli.numerics.continuation import StepSettings
-from srfcli.numerics.critical import critical_line
-from srfcli.numerics.map import KINDS, compute_map, join_tiles, kinds, per_slip
-from srfcli.numerics.mapcurves import find_boundaries, unexplained
-from srfcli.numerics.mapgrid import MapAxis, MapGrid, MapSettings, tile_tasks
-from srfcli.numerics.maprefine import _suspects, solve_tile
-from srfcli.numerics.maptile import neighbours
+from srfcli.core.errors import SrfError, Status
+from srfcli.numerics.continuation import AtlasSettings, StepSettings, find_components
+from srfcli.numerics.critical import critical_line, robust_orbits
+from srfcli.numerics.map import KINDS, _suspects, compute_map, join_tiles, kinds, neighbours, per_slip, solve_tile
+from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.orbit import uniform_mesh
-from srfcli.numerics.plane import Axis, Plane
-from srfcli.numerics.scan import robust_orbits
-from srfcli.numerics.special import crossings_at, special_points
-from srfcli.status import Status
+from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane, tile_tasks
+from srfcli.numerics.special_points import crossings_at, special_points
 
 
 def window(model, eps, columns, rows, *, V=(1.0, 100.0), ratio=(0.0021, 0.03), **values):

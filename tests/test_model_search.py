@@ -7,20 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from srfcli.diagnosis.candidates import Hypothesis, applicable, own_parameters
-from srfcli.diagnosis.model_search import CLOSE, ModelSearch, conclude, log_evidence
-from srfcli.diagnosis.statespace_scores import Remainder, Scores
-from srfcli.inference.statespace import COLOUR, Likelihood, correlated, fit_state_space
-from srfcli.numerics.compiled import compiler
-from srfcli.proof.draw import Gauge
-from srfcli.proof.folder import case_files
-from srfcli.proof.gauge import read_gauge
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.proof.track import Track
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry
+from srfcli.codegen.c_source import compiler
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
+from srfcli.diagnosis.scores import Remainder, Scores
+from srfcli.diagnosis.search import CLOSE, ModelSearch, conclude, log_evidence
+from srfcli.inference.state_space import COLOUR, Likelihood, correlated, fit_state_space
+from srfcli.laws.registry import bundled_registry
+from srfcli.validation.generator.case import Gauge, case_files, read_gauge
+from srfcli.validation.generator.physics import Physics, Plan, Track
+from srfcli.validation.generator.slider import move
 
 SHIPPED = bundled_registry()
 PLANS = (

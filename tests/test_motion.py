@@ -12,14 +12,11 @@ import time
 import numpy as np
 import pytest
 
-from srfcli.errors import SrfError
-from srfcli.numerics import compiled as compiled_module
-from srfcli.numerics.compiled import compiled, compiler
-from srfcli.numerics.load import ConstantLoad, Modulation
-from srfcli.numerics.loads import LoadSteps
-from srfcli.numerics.motion import integrate, integrate_lsoda
-from srfcli.numerics.program import Drive
-from srfcli.status import Status
+from srfcli.codegen import c_source as compiled_module
+from srfcli.codegen.c_source import compiled, compiler
+from srfcli.core.errors import SrfError, Status
+from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps, Modulation
+from srfcli.motion.integrators import integrate, integrate_lsoda
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler on this machine")
 SYSTEMS = [
@@ -182,11 +179,11 @@ def test_what_the_equations_cannot_follow_is_said(make_model, inertia):
 
 LONG = """
 import numpy as np
-from srfcli.model import open_model
-from srfcli.numerics.load import Modulation
-from srfcli.numerics.motion import integrate, integrate_lsoda
-from srfcli.numerics.program import Drive
-from srfcli.registry import load_registry
+from srfcli.codegen.model import open_model
+from srfcli.motion.imposed import Modulation
+from srfcli.motion.integrators import integrate, integrate_lsoda
+from srfcli.motion.imposed import Drive
+from srfcli.laws.registry import load_registry
 
 model = open_model(load_registry())
 p = model.vector({"V": 8.0, "W0": 9.0})

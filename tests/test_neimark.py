@@ -5,17 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from srfcli.numerics.atlas import AtlasSettings, find_components
+from srfcli.core.errors import Status
+from srfcli.motion.imposed import Drive, Modulation
+from srfcli.motion.simulate import simulate
 from srfcli.numerics.collocation import Discretisation, condense
+from srfcli.numerics.continuation import AtlasSettings, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
-from srfcli.numerics.integrate import simulate
-from srfcli.numerics.load import Modulation
-from srfcli.numerics.neimark import branch_coefficients, critical_mode, criticality_points, cubic_coefficient
+from srfcli.numerics.normal_form import branch_coefficients, critical_mode, criticality_points, cubic_coefficient
 from srfcli.numerics.orbit import solve_orbits
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.numerics.program import Drive
-from srfcli.status import Status
 
 LAWS = [{}, {"law": "log-log"}, {"ageing": "ruina"}, {"law": "two-state"}, {"interface": "rigid"}, {"inertia": False}]
 

@@ -14,14 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from srfcli.errors import SrfError
-from srfcli.laws import Law
-from srfcli.output import plots
-from srfcli.output.files import check_target, write_atomic
-from srfcli.output.provenance import Provenance, describe, sidecar_path, write_sidecar
-from srfcli.output.records import to_csv, to_json
-from srfcli.output.tables import Column, Table, print_terminal, to_text
-from srfcli.status import Status
+from srfcli.core.errors import SrfError, Status
+from srfcli.core.files import check_target, write_atomic
+from srfcli.laws.values import Law
+from srfcli.results import plots
+from srfcli.results.provenance import Provenance, describe, sidecar_path, write_sidecar
+from srfcli.results.tables import Column, Table, print_terminal, to_csv, to_json, to_text
 
 COLUMNS = (Column("V", "um/s", "driving velocity", ".4g"), Column("W0", "N"), Column("type"), Column("status"))
 ROWS = [

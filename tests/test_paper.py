@@ -10,8 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.paper import Finding, check_equation, check_paper, paper_system, printed_statements
-from srfcli.paper_forms import FORMS
+from srfcli.symbolic.paper import FORMS, Finding, check_equation, check_paper, paper_system, printed_statements
 
 EQUATIONS = printed_statements()["equation"]
 

@@ -13,27 +13,38 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.diagnosis import parting
-from srfcli.diagnosis.candidates import Hypothesis
-from srfcli.diagnosis.parting import ENOUGH, LEAST, Design, Loss, Side, foremost, parting_experiment
-from srfcli.diagnosis.partingtext import described, sentences
-from srfcli.diagnosis.proposals import FACTOR, Proposal, draw, led_in, reach_of, run_of, vary
-from srfcli.diagnosis.search import Search
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis import design as parting
+from srfcli.diagnosis.design import (
+    ENOUGH,
+    FACTOR,
+    LEAST,
+    Design,
+    Loss,
+    Proposal,
+    Side,
+    described,
+    draw,
+    foremost,
+    led_in,
+    parting_experiment,
+    reach_of,
+    run_of,
+    sentences,
+    vary,
+)
+from srfcli.diagnosis.hypotheses import Hypothesis
+from srfcli.diagnosis.staged_search import Search
 from srfcli.diagnosis.verdict import Diagnosis, conclude
-from srfcli.inference.latent import Latent, LatentFit, fit_latent
 from srfcli.inference.prediction import run_parameters
-from srfcli.inference.tracks import Roughness, Tracks, tracks_for
-from srfcli.numerics.motion import integrate
-from srfcli.numerics.program import ConstantLoad, Drive
-from srfcli.output import report
-from srfcli.proof.draw import Gauge
-from srfcli.proof.folder import case_files
-from srfcli.proof.gauge import read_gauge
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry
+from srfcli.inference.random_field import Latent, LatentFit, Roughness, Tracks, fit_latent, tracks_for
+from srfcli.laws.registry import bundled_registry
+from srfcli.motion.imposed import ConstantLoad, Drive
+from srfcli.motion.integrators import integrate
+from srfcli.results import report
+from srfcli.validation.generator.case import Gauge, case_files, read_gauge
+from srfcli.validation.generator.physics import Physics, Plan
+from srfcli.validation.generator.slider import move
 
 SHIPPED = bundled_registry()
 RIVALS = ("linker-dieterich", "load-transmission")

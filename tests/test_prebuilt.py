@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import sympy
 
-from srfcli.model import open_model
-from srfcli.prebuilt import FOLDER, find_built
-from srfcli.registry import Registry, bundled_registry
+from srfcli.codegen.model import open_model
+from srfcli.core.cache import FOLDER, find_built
+from srfcli.laws.registry import Registry, bundled_registry
 
 ROOT = Path(__file__).resolve().parents[1]
 REPAIR = "run `python tools/prebuild.py` and commit what it writes"
@@ -33,7 +33,7 @@ def tool() -> ModuleType:
 
 
 def test_every_shipped_system_is_there_under_its_present_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("srfcli.model.cached_source", lambda key, build: pytest.fail(f"not shipped: {REPAIR}"))
+    monkeypatch.setattr("srfcli.codegen.model.cached_source", lambda key, build: pytest.fail(f"not shipped: {REPAIR}"))
     keys = {open_model(bundled_registry(), **asked).key[:16] for asked in tool().shipped_systems()}
     assert {path.stem for path in FOLDER.glob("*.py")} == keys, REPAIR
     assert (FOLDER / "headers.json").read_text(encoding="utf-8") == tool().headers_text(), REPAIR
@@ -79,7 +79,7 @@ def test_a_module_of_another_key_or_a_damaged_one_is_passed_over(
     key = open_model(bundled_registry()).key
     place = tmp_path / f"{key[:16]}.py"
     shutil.copy(FOLDER / place.name, place)
-    monkeypatch.setattr("srfcli.prebuilt.FOLDER", tmp_path)
+    monkeypatch.setattr("srfcli.core.cache.FOLDER", tmp_path)
     assert find_built(key) is not None
     assert find_built(key[:16] + "0" * 48) is None
     place.write_bytes(b"\xff\xfe")

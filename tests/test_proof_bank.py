@@ -10,18 +10,23 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from srfcli.errors import SrfError
-from srfcli.proof.bank import make_bank, plan_bank
-from srfcli.proof.case import known_physics, known_plans, known_traces, make_case
-from srfcli.proof.draw import KINDS, draw_recipe
-from srfcli.proof.effects import NAMES, OUTSIDE_NAMES
-from srfcli.proof.folder import STARTS
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.proof.seal import SEAL, check_cases, seal, unseal
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import load_registry
+from srfcli.core.errors import SrfError
+from srfcli.data.experiment import read_experiment
+from srfcli.laws.registry import load_registry
+from srfcli.validation.generator.bank import SEAL, check_cases, make_bank, plan_bank, seal, unseal
+from srfcli.validation.generator.case import (
+    KINDS,
+    NAMES,
+    OUTSIDE_NAMES,
+    STARTS,
+    draw_recipe,
+    known_physics,
+    known_plans,
+    known_traces,
+    make_case,
+)
+from srfcli.validation.generator.physics import Physics, Plan
+from srfcli.validation.generator.slider import move
 
 NOISE = float(np.hypot(0.02, 0.005 / np.sqrt(12)))  # um, of a gauge and its quanta
 LAWS = {"srf-vsat", "dieterich-ruina"}
@@ -39,7 +44,7 @@ def rms(x):
 def quick(monkeypatch):
     """Cases of two short runs, one held out."""
     plans = (SHORT[1], replace(SHORT[0], holdout=True))
-    monkeypatch.setattr("srfcli.proof.draw.draw_protocol", lambda rng: plans)
+    monkeypatch.setattr("srfcli.validation.generator.case.draw_protocol", lambda rng: plans)
 
 
 def contents(folder):
@@ -116,7 +121,7 @@ def test_recipes_draw_what_is_asked_for():
 
 
 def test_a_slider_that_cannot_be_followed_is_drawn_again_and_in_the_end_told(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr("srfcli.proof.motion.MOST_STEPS", 3)
+    monkeypatch.setattr("srfcli.validation.generator.slider.MOST_STEPS", 3)
     assert not move(Physics(), SHORT[0]).complete
     with pytest.raises(SrfError, match="none of 8 sliders"):
         make_case(tmp_path / "c", 1)

@@ -13,18 +13,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from srfcli.data.experiment import read_experiment
 from srfcli.inference.prediction import predict
-from srfcli.proof.draw import Gauge, draw_protocol
-from srfcli.proof.effects import EFFECTS, NAMES, OUTSIDE, OUTSIDE_NAMES
-from srfcli.proof.equations import ageing, at_unit_velocity, log_velocity, steady_age
-from srfcli.proof.folder import case_files
-from srfcli.proof.gauge import play, read_gauge
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan, example_protocol
-from srfcli.proof.track import SMOOTH, Track
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import load_registry
+from srfcli.laws.registry import load_registry
+from srfcli.validation.generator.case import (
+    EFFECTS,
+    NAMES,
+    OUTSIDE,
+    OUTSIDE_NAMES,
+    Gauge,
+    case_files,
+    draw_protocol,
+    play,
+    read_gauge,
+)
+from srfcli.validation.generator.physics import SMOOTH, Physics, Plan, Track, example_protocol
+from srfcli.validation.generator.slider import ageing, at_unit_velocity, log_velocity, move, steady_age
 
 NOISE = float(np.hypot(0.02, 0.005 / np.sqrt(12)))  # um, of a gauge and its quanta
 OPEN = [f"open-{n:02d}" for n in range(1, 9)]
@@ -303,12 +307,10 @@ def test_gauge_noise_is_what_it_says(lag1):
 
 
 def test_it_shares_nothing_with_what_it_proves():
-    folder = Path(__file__).resolve().parents[1] / "srfcli" / "proof"
-    generator = ("__init__", "bank", "case", "contacts", "draw", "effects", "equations", "folder", "gauge", "motion", "physics",
-                 "protocol", "seal", "track")  # fmt: skip
-    for path in [folder / f"{name}.py" for name in generator]:
+    folder = Path(__file__).resolve().parents[1] / "srfcli" / "validation" / "generator"
+    for path in sorted(folder.glob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         names = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
         names |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
-        own = {n for n in names if n.startswith("srfcli") and not n.startswith("srfcli.proof.")}
-        assert own <= {"srfcli.errors", "srfcli.output.files", "srfcli.parallel.pool", "srfcli.reading"}, path
+        own = {n for n in names if n.startswith("srfcli") and not n.startswith("srfcli.validation.generator.")}
+        assert own <= {"srfcli.core.errors", "srfcli.core.files", "srfcli.parallel.pool"}, path

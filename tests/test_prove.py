@@ -22,24 +22,29 @@ from hypothesis import strategies as st
 
 from srfcli.cli import prove as command
 from srfcli.cli.main import main
-from srfcli.errors import SrfError
+from srfcli.core.errors import SrfError
+from srfcli.laws.registry import load_registry
 from srfcli.parallel.pool import run_processes
-from srfcli.proof.bank import plan_bank
-from srfcli.proof.case import make_case
-from srfcli.proof.draw import KINDS
-from srfcli.proof.effects import NAMES, variants
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.registry import load_registry
-from srfcli.trial import mark as marking
-from srfcli.trial import report, sight
-from srfcli.trial.answer import Answer, from_line, read_answers, to_line, write_answers
-from srfcli.trial.blind import Task, answer_case, code_of, diagnose_case
-from srfcli.trial.mark import INVISIBLE, accepted, mark
-from srfcli.trial.rates import Rate, calibration, quantile
-from srfcli.trial.run import Trial, answer_all, begin, open_truths
-from srfcli.trial.sight import Sight, see, stands_out
-from srfcli.trial.sizes import SIZES, deviation
+from srfcli.validation.generator.bank import plan_bank
+from srfcli.validation.generator.case import KINDS, NAMES, make_case, variants
+from srfcli.validation.generator.physics import Physics, Plan
+from srfcli.validation.trial import mark as marking
+from srfcli.validation.trial import mark as sight
+from srfcli.validation.trial import report
+from srfcli.validation.trial.blind import (
+    Answer,
+    Task,
+    answer_case,
+    code_of,
+    diagnose_case,
+    from_line,
+    read_answers,
+    to_line,
+    write_answers,
+)
+from srfcli.validation.trial.mark import INVISIBLE, SIZES, Sight, accepted, deviation, mark, see, stands_out
+from srfcli.validation.trial.report import Rate, calibration, quantile
+from srfcli.validation.trial.run import Trial, answer_all, begin, open_truths
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = (
@@ -92,7 +97,7 @@ def peeks(folder, plugins):
 def quick(monkeypatch):
     """Cases of two short runs, one held out."""
     plans = (SHORT[1], replace(SHORT[0], holdout=True))
-    monkeypatch.setattr("srfcli.proof.draw.draw_protocol", lambda rng: plans)
+    monkeypatch.setattr("srfcli.validation.generator.case.draw_protocol", lambda rng: plans)
 
 
 def new_trial(folder, n=4, **more):
@@ -336,8 +341,7 @@ def test_tables_count_what_was_marked():
 
 
 def test_a_report_holds_everything_and_survives_json():
-    from srfcli.output.records import envelope, to_json
-    from srfcli.output.tables import to_text
+    from srfcli.results.tables import envelope, to_json, to_text
 
     table, more = report.tables(sample(), digest="ab" * 32, seed=3, of=10)
     data = json.loads(to_json(table))
@@ -558,9 +562,10 @@ def test_a_diagnosis_is_given_the_case_and_nothing_else(quick, tmp_path):
     trial = new_trial(tmp_path / "t", 1)
     (found,) = answer_all(trial, diagnose=peeks)
     assert found.not_identifiable == ("experiment.toml", "steps.csv", "wave.csv")
-    tree = ast.parse((ROOT / "srfcli" / "trial" / "blind.py").read_text())
+    tree = ast.parse((ROOT / "srfcli" / "validation" / "trial" / "blind.py").read_text())
     modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
-    assert not [m for m in modules if m.startswith("srfcli.proof") or m in ("srfcli.trial.run", "srfcli.trial.sight")]
+    forbidden = ("srfcli.validation.generator", "srfcli.validation.trial.run", "srfcli.validation.trial.mark")
+    assert not [m for m in modules if m.startswith(forbidden)]
 
 
 def test_kinds_of_a_bank():

@@ -17,12 +17,11 @@ from hypothesis import HealthCheck, Phase, example, given, settings
 from hypothesis import strategies as st
 from recording_cases import TOML, data, write
 
-from srfcli.errors import SrfError
-from srfcli.reader import Source
-from srfcli.recording.checks import check_run
-from srfcli.recording.experiment import read_experiment
-from srfcli.recording.source import open_source
-from srfcli.registry import load_registry
+from srfcli.core.errors import SrfError
+from srfcli.data.columns import open_source
+from srfcli.data.experiment import check_run, read_experiment
+from srfcli.laws.registry import load_registry
+from srfcli.laws.values import Source
 
 REGISTRY = load_registry(user=False, entry_points=False)
 NAMES = ("time", "load_point_velocity", "normal_load", "elongation")
@@ -212,7 +211,7 @@ def test_a_file_that_ends_early(kind: str, share: float, tmp_path: Path) -> None
 
 
 def test_two_readers_that_know_a_file_are_named(tmp_path: Path) -> None:
-    text = "from srfcli.api import reader\n\n\n@reader(name='{0}', sniff=lambda head: True)\ndef {0}(path):\n"
+    text = "from srfcli.laws.api import reader\n\n\n@reader(name='{0}', sniff=lambda head: True)\ndef {0}(path):\n"
     text += "    return {{'a': [1.0]}}\n"
     for name in ("first", "second"):
         (tmp_path / f"{name}.py").write_text(text.format(name), encoding="utf-8")
@@ -247,7 +246,7 @@ BAD_READERS = {
 @pytest.mark.parametrize("name", BAD_READERS)
 def test_a_reader_that_fails_is_named(name: str, tmp_path: Path) -> None:
     body, message = BAD_READERS[name]
-    text = f"from srfcli.api import reader\n\n\n@reader(name='bad', suffixes=('.bad',))\ndef bad(path):\n    {body}\n"
+    text = f"from srfcli.laws.api import reader\n\n\n@reader(name='bad', suffixes=('.bad',))\ndef bad(path):\n    {body}\n"
     (tmp_path / "bad.py").write_text(text, encoding="utf-8")
     (tmp_path / "x.bad").write_bytes(b"1")
     registry = load_registry((tmp_path,), user=False, entry_points=False)

@@ -18,10 +18,10 @@ from click.testing import CliRunner
 from recording_cases import TOML, data, write
 
 from srfcli.cli.main import cli
-from srfcli.errors import SrfError
-from srfcli.recording.description import ROLES
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import Registry, load_registry
+from srfcli.core.errors import SrfError
+from srfcli.data.description import ROLES
+from srfcli.data.experiment import read_experiment
+from srfcli.laws.registry import Registry, load_registry
 
 TABLE = Path(__file__).with_name("recording_breaches.toml")
 BREACHES = [row for rows in tomllib.loads(TABLE.read_text(encoding="utf-8")).values() for row in rows]

@@ -14,14 +14,13 @@ from recording_cases import HEADING, TOML, write
 
 import srfcli
 from srfcli.cli.main import cli
-from srfcli.errors import SrfError
-from srfcli.numerics.program import ConstantLoad
-from srfcli.recording.checks import KINDS, check_run
-from srfcli.recording.experiment import read_experiment
-from srfcli.recording.load import Place, find_modulation, load_from_column
-from srfcli.recording.noise import describe_noise
-from srfcli.recording.values import Run
-from srfcli.registry import load_registry
+from srfcli.core.errors import SrfError
+from srfcli.data.experiment import KINDS, check_run, read_experiment
+from srfcli.data.imposed import Place, find_modulation, load_from_column
+from srfcli.data.noise import describe_noise
+from srfcli.data.values import Run
+from srfcli.laws.registry import load_registry
+from srfcli.motion.imposed import ConstantLoad
 
 REGISTRY = load_registry(user=False, entry_points=False)
 N = 1200
@@ -163,7 +162,7 @@ def test_every_kind_of_notice_has_a_case() -> None:
     """KINDS is what --fail-on takes; the package makes no notice of another kind."""
     assert set(FLAWS) == set(KINDS)
     made = set()
-    for path in Path(srfcli.__file__).parent.glob("recording/*.py"):
+    for path in Path(srfcli.__file__).parent.glob("data/*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("Notice", "spots"):
                 made |= {a.value for a in node.args[:1] if isinstance(a, ast.Constant)}

@@ -10,8 +10,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import load_registry
+from srfcli.data.experiment import read_experiment
+from srfcli.laws.registry import load_registry
 
 REGISTRY = load_registry(user=False, entry_points=False)
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from srfcli.errors import SrfError
-from srfcli.registry import Registry, bundled_folder, load_registry
+from srfcli.core.errors import SrfError
+from srfcli.laws.registry import Registry, bundled_folder, load_registry
 
 AGEING = """format = "srf-law/1"
 kind = "ageing"
@@ -19,7 +19,7 @@ about = "{about}"
 rate = "1 - v*phi/D0"
 """
 PYTHON = """\
-from srfcli.api import Parameter, ageing_law
+from srfcli.laws.api import Parameter, ageing_law
 from pathlib import Path
 Path({marker!r}).write_text("imported")
 
@@ -64,10 +64,10 @@ def test_listing_imports_neither_sympy_nor_a_plugin(tmp_path: Path) -> None:
     marker = tmp_path / "marker"
     place = folder(tmp_path, "mine", slow_py=PYTHON.format(marker=str(marker), name="slow"))
     code = (
-        "import sys; from pathlib import Path; from srfcli.registry import load_registry; "
+        "import sys; from pathlib import Path; from srfcli.laws.registry import load_registry; "
         f"r = load_registry([Path({str(place)!r})]); assert any(e.name == 'slow' for e in r.entries('ageing')); "
         "assert all(r.fingerprint(e) for e in r.entries()); "
-        "print([m for m in ('sympy', 'numpy', 'scipy', 'srfcli.api') if m in sys.modules])"
+        "print([m for m in ('sympy', 'numpy', 'scipy', 'srfcli.laws.api') if m in sys.modules])"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
@@ -113,13 +113,13 @@ def test_a_broken_plugin_stops_only_its_user(tmp_path: Path) -> None:
         "broken",
         syntax_toml="kind = ",
         formula_toml=AGEING.replace("v*phi", "v*pih"),
-        unnamed_py="from srfcli.api import ageing_law\nN = 'x'\n@ageing_law(name=N)\ndef f(v): return v\n",
-        nolaw_py="from srfcli.api import log\n",
+        unnamed_py="from srfcli.laws.api import ageing_law\nN = 'x'\n@ageing_law(name=N)\ndef f(v): return v\n",
+        nolaw_py="from srfcli.laws.api import log\n",
         python_py="def f(:\n",
-        crash_py="from srfcli.api import ageing_law\n1/0\n@ageing_law(name='crash')\ndef f(v): return v\n",
-        exits_py="from srfcli.api import ageing_law\nraise SystemExit\n@ageing_law(name='exits')\ndef f(v): ...\n",
-        liar_py="from srfcli.api import ageing_law\n@ageing_law(name='liar')\ndef f(v): return v\ndel f\n",
-        wrong_py="from srfcli.api import ageing_law\n@ageing_law(name='wrong')\ndef f(v, p): return p.DO\n",
+        crash_py="from srfcli.laws.api import ageing_law\n1/0\n@ageing_law(name='crash')\ndef f(v): return v\n",
+        exits_py="from srfcli.laws.api import ageing_law\nraise SystemExit\n@ageing_law(name='exits')\ndef f(v): ...\n",
+        liar_py="from srfcli.laws.api import ageing_law\n@ageing_law(name='liar')\ndef f(v): return v\ndel f\n",
+        wrong_py="from srfcli.laws.api import ageing_law\n@ageing_law(name='wrong')\ndef f(v, p): return p.DO\n",
         helper_py="x = 1\n",
         good_toml=AGEING,
     )
@@ -228,7 +228,7 @@ def test_an_entry_point_may_be_a_folder(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("value", ["nothere.laws", "brokenpack.absent", "brokenpack.bad", "..", "brokenpack:what"])
 def test_a_broken_entry_point_is_a_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str) -> None:
-    init = "from srfcli.api import log\nraise RuntimeError\n"
+    init = "from srfcli.laws.api import log\nraise RuntimeError\n"
     package(tmp_path, monkeypatch, value, brokenpack____init___py=init, brokenpack__bad_py="def")
     registry = load_registry()
     assert [p.origin for p in registry.problems] == ["entry point stranger"]

@@ -13,16 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from srfcli.errors import SrfError
-from srfcli.output import report, report_text
-from srfcli.output.plots import figure_bytes
-from srfcli.output.report import write_report
-from srfcli.output.report_atlas import foremost, spots
-from srfcli.output.report_page import VOID, Markup, tag
-from srfcli.output.report_runs import close_up, local_rms, run_figure, trace
-from srfcli.output.report_sections import command_lines, merged
-from srfcli.output.report_text import number, percent, probability, spans, with_error
-from srfcli.registry import bundled_registry
+from srfcli.core.errors import SrfError
+from srfcli.laws.registry import bundled_registry
+from srfcli.results import report, report_text
+from srfcli.results.plots import figure_bytes
+from srfcli.results.report import write_report
+from srfcli.results.report_figures import close_up, foremost, local_rms, run_figure, spots, trace
+from srfcli.results.report_sections import VOID, Markup, command_lines, merged, tag
+from srfcli.results.report_text import number, percent, probability, spans, with_error
 
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
 NOISE = 0.02

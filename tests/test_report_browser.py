@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from test_report import made_answer, made_material
 
-from srfcli.output.report import write_report
+from srfcli.results.report import write_report
 
 BROWSER = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None

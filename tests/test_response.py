@@ -10,11 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.numerics.integrate import simulate
-from srfcli.numerics.load import Modulation
-from srfcli.numerics.program import Drive
+from srfcli.core.errors import Status
+from srfcli.motion.imposed import Drive, Modulation
+from srfcli.motion.simulate import simulate
 from srfcli.numerics.response import linear_response, mean_friction, resonance
-from srfcli.status import Status
 
 SYSTEMS = [
     {},

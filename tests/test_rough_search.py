@@ -8,25 +8,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from srfcli.diagnosis import horizons
-from srfcli.diagnosis import search as module
-from srfcli.diagnosis.candidates import Hypothesis
-from srfcli.diagnosis.horizons import Entrant
-from srfcli.diagnosis.search import Search
-from srfcli.inference import latent
-from srfcli.inference.grow import SHARES, grow, whole
-from srfcli.inference.latent import GRID, ROUGHLY, Latent, Point, fit_latent
-from srfcli.inference.tracks import USUAL, Roughness, Tracks, tracks_for
-from srfcli.numerics.compiled import compiler
-from srfcli.proof.draw import Gauge
-from srfcli.proof.folder import case_files
-from srfcli.proof.gauge import read_gauge
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.proof.track import Track
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry
+from srfcli.codegen.c_source import compiler
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis import staged_search as horizons
+from srfcli.diagnosis import staged_search as module
+from srfcli.diagnosis.hypotheses import Hypothesis
+from srfcli.diagnosis.staged_search import SHARES, Entrant, Search, grow, whole
+from srfcli.inference import random_field as latent
+from srfcli.inference.random_field import GRID, ROUGHLY, USUAL, Latent, Point, Roughness, Tracks, fit_latent, tracks_for
+from srfcli.laws.registry import bundled_registry
+from srfcli.validation.generator.case import Gauge, case_files, read_gauge
+from srfcli.validation.generator.physics import Physics, Plan, Track
+from srfcli.validation.generator.slider import move
 
 SHIPPED = bundled_registry()
 PLANS = (

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from recording_cases import write
 
 from srfcli.cli.main import cli
-from srfcli.inference.sample import Posterior, effective_size
+from srfcli.inference.posterior import Posterior, effective_size
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

@@ -7,23 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from srfcli.diagnosis.candidates import Hypothesis, applicable
-from srfcli.diagnosis.contest import contest
-from srfcli.diagnosis.doubts import alike_on_rough_tracks
-from srfcli.diagnosis.score import pair_scores, scores
-from srfcli.diagnosis.search import WORTH, Search
-from srfcli.inference.latent import fit_latent
+from srfcli.codegen.c_source import compiler
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.hypotheses import Hypothesis, applicable
+from srfcli.diagnosis.staged_score import pair_scores, scores
+from srfcli.diagnosis.staged_search import WORTH, Search, alike_on_rough_tracks, contest
 from srfcli.inference.noise import stretches, whiten
-from srfcli.inference.tracks import Roughness, Tracks, tracks_for
-from srfcli.numerics.compiled import compiler
-from srfcli.proof.draw import Gauge
-from srfcli.proof.folder import case_files
-from srfcli.proof.gauge import read_gauge
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry
+from srfcli.inference.random_field import Roughness, Tracks, fit_latent, tracks_for
+from srfcli.laws.registry import bundled_registry
+from srfcli.validation.generator.case import Gauge, case_files, read_gauge
+from srfcli.validation.generator.physics import Physics, Plan
+from srfcli.validation.generator.slider import move
 
 SHIPPED = bundled_registry()
 PLANS = (
@@ -188,7 +182,7 @@ def test_a_leader_that_is_nearly_there_is_tried_on_a_rough_track_at_once(search,
 
     Nor to a rough track before other starts were: a false minimum leaves as much.
     """
-    from srfcli.diagnosis import contest as module
+    from srfcli.diagnosis import staged_search as module
 
     base, (one, _) = search.tried["none", False], [Hypothesis((e,)) for e in effects(*PAIR)]
     near = replace(base, hypothesis=one, evidence=base.evidence + 1e6,
@@ -196,7 +190,7 @@ def test_a_leader_that_is_nearly_there_is_tried_on_a_rough_track_at_once(search,
     fine = replace(near, rough=True, adequacy=replace(near.adequacy, rms_over_noise=1.0, p_value=0.5))
     trial = Search(SHIPPED, search.experiment)
     trial.tried, trial.noise, trial.loose = {(one.name, False): near}, search.noise, {base.name: base.fit}
-    monkeypatch.setattr(module, "_released", lambda *_: near)
+    monkeypatch.setattr(module, "_release", lambda *_: near)
     monkeypatch.setattr(module, "_entry", lambda s, h, at: module.Entry(h, base.fit.point.theta, {}, 1.2))
     monkeypatch.setattr(module, "_partnered", lambda *_: pytest.fail("a partner was tried first"))
     asked = []

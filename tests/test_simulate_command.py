@@ -15,8 +15,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
-from srfcli.recording.experiment import Experiment, read_experiment
-from srfcli.registry import load_registry
+from srfcli.data.experiment import read_experiment
+from srfcli.data.values import Experiment
+from srfcli.laws.registry import load_registry
 
 SHS = ("--W0", "5", "--drive", "1:10, 100:0, 3:10")
 
@@ -266,8 +267,8 @@ def test_nothing_is_overwritten_and_no_recording_replaced(empty_folder: Path) ->
 def test_what_stops_early_is_written_as_far_as_it_went(monkeypatch: pytest.MonkeyPatch) -> None:
     import dataclasses
 
-    from srfcli.numerics import integrate
-    from srfcli.status import Status
+    from srfcli.core.errors import Status
+    from srfcli.motion import simulate as integrate
 
     real = integrate.simulate
 
@@ -283,7 +284,7 @@ def test_what_stops_early_is_written_as_far_as_it_went(monkeypatch: pytest.Monke
 
 
 def test_ctrl_c_keeps_the_runs_that_are_done(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from srfcli.numerics import integrate
+    from srfcli.motion import simulate as integrate
 
     real, calls = integrate.simulate, []
 

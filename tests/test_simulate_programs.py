@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from srfcli.cli.programs import Piece, build_drive, parse_pieces, parse_rates, sample_times, usual_rate
-from srfcli.errors import SrfError
+from srfcli.cli.simulate_records import Piece, build_drive, parse_pieces, parse_rates, sample_times, usual_rate
+from srfcli.core.errors import SrfError
 from srfcli.results.simulation import Rows
 
 
@@ -47,7 +47,7 @@ def test_rows_are_a_sequence() -> None:
 
 
 def test_a_long_record_is_drawn_from_few_points() -> None:
-    from srfcli.output.traces import envelope
+    from srfcli.results.figures import envelope
 
     t = np.linspace(0, 1, 200_001)
     y = np.sin(2 * np.pi * 5000 * t)

@@ -19,16 +19,15 @@ from hypothesis import strategies as st
 from scipy.interpolate import BSpline, PPoly
 
 from srfcli.cli.main import cli
-from srfcli.errors import SrfError
-from srfcli.numerics.compiled import compiled, compiler
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.proof.track import Track
-from srfcli.recording.experiment import Experiment, read_experiment
-from srfcli.recording.track import FINEST, KNOTS, WIDEST, RoughTrack
-from srfcli.registry import load_registry
-from srfcli.splines import Spline
+from srfcli.codegen.c_source import compiled, compiler
+from srfcli.codegen.splines import Spline
+from srfcli.core.errors import SrfError
+from srfcli.data.experiment import read_experiment
+from srfcli.data.noise import FINEST_KNOTS, KNOTS, WIDEST_KNOTS, RoughTrack
+from srfcli.data.values import Experiment
+from srfcli.laws.registry import load_registry
+from srfcli.validation.generator.physics import Physics, Plan, Track
+from srfcli.validation.generator.slider import move
 
 STEADY = ("--V", "10", "--W0", "5", "--for", "2", "--rate", "100")
 
@@ -104,7 +103,7 @@ def test_a_part_of_a_track_is_the_same_whatever_else_is_asked_for(
 ) -> None:
     track = RoughTrack(1e-3, length, seed)
     part, whole = track.spline(start, start + span), track.spline(start - more, start + span + more)
-    assert part.first <= start and part.last >= start + span and part.spacing <= min(length / 4, WIDEST)
+    assert part.first <= start and part.last >= start + span and part.spacing <= min(length / 4, WIDEST_KNOTS)
     offset = round((part.first - whole.first) / part.spacing)
     assert np.array_equal(part.numbers, whole.numbers[offset : offset + part.numbers.size])
 
@@ -116,7 +115,7 @@ def test_size_scales_and_seed_changes_a_track() -> None:
 
 
 @pytest.mark.parametrize("size, length", [(-1e-4, 1.0), (np.nan, 1.0), (np.inf, 1.0), (1e-4, -1.0), (1e-4, np.nan),
-                                          (1e-4, np.inf), (1e-4, 0.99 * FINEST * KNOTS)])  # fmt: skip
+                                          (1e-4, np.inf), (1e-4, 0.99 * FINEST_KNOTS * KNOTS)])  # fmt: skip
 def test_what_is_no_track(size: float, length: float) -> None:
     with pytest.raises(SrfError):
         RoughTrack(size, length)
@@ -278,8 +277,8 @@ def test_an_experiment_with_effects_is_simulated_as_it_is_fitted(
     """Where a run begins and how its load is modulated reach the effects, and a gauge that lags is the one that is read."""
     from dataclasses import asdict
 
+    from srfcli.codegen.model import open_model
     from srfcli.inference.prediction import predict
-    from srfcli.model import open_model
 
     shutil.copytree(shared / "cases" / "open-01", "case")
     path = Path("case/experiment.toml")

@@ -8,15 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from srfcli.errors import SrfError
+from srfcli.codegen.c_source import compiled, compiler
+from srfcli.codegen.splines import Spline, appended, tables_after
+from srfcli.core.errors import SrfError
+from srfcli.data.experiment import read_experiment
 from srfcli.inference.prediction import predict
-from srfcli.numerics.compiled import compiled, compiler
-from srfcli.numerics.load import Modulation
-from srfcli.numerics.motion import integrate, integrate_lsoda
-from srfcli.numerics.program import Drive
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import load_registry
-from srfcli.splines import Spline, appended, tables_after
+from srfcli.laws.registry import load_registry
+from srfcli.motion.imposed import Drive, Modulation
+from srfcli.motion.integrators import integrate, integrate_lsoda
 
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler on this machine")
 TABLES = (("mu", "slip"), ("mu", "time"), ("V", "stage"))

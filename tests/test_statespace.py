@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from srfcli.errors import SrfError
+from srfcli.codegen.c_source import compiler
+from srfcli.core.errors import SrfError, Status
+from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
 from srfcli.inference.fit import Interrupted, fit_problem
 from srfcli.inference.prediction import predict
-from srfcli.inference.statespace import Likelihood, as_fit, filter_run, fit_state_space, stopped
-from srfcli.numerics.compiled import compiler
-from srfcli.numerics.load import ConstantLoad, Modulation
-from srfcli.numerics.program import Drive
-from srfcli.recording.values import Experiment, FitParameter, ModelChoice, Run
-from srfcli.status import Status
+from srfcli.inference.state_space import Likelihood, as_fit, filter_run, fit_state_space, stopped
+from srfcli.motion.imposed import ConstantLoad, Drive, Modulation
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
 
@@ -279,7 +277,7 @@ def made(model, seed, amplitude, *, sd=3e-4):
     """Return two runs of steps on rock, each on a field of its own that is drawn by spectral sums, not by the model's states."""
     experiment_runs, t = [], np.linspace(0, 24, 481)
     rng = np.random.default_rng(seed)
-    from srfcli.numerics.motion import integrate
+    from srfcli.motion.integrators import integrate
 
     for k in range(2):
         drive = Drive.steps([(0.0, 3.0), (8.0, 10.0 * (k + 1)), (16.0, 3.0)])
@@ -289,13 +287,13 @@ def made(model, seed, amplitude, *, sd=3e-4):
         )  # spectrum of Matern 3/2, correlation length 3 um
         phases = rng.uniform(0, 2 * np.pi, 400)
         m = amplitude * np.sqrt(2 / 400)
-        from srfcli.splines import Spline
+        from srfcli.codegen.splines import Spline
 
         table = Spline.over(-5.0, 400.0, 0.25)
         where = table.nodes
         table = table.with_numbers(m * np.cos(np.outer(where, waves) + phases).sum(axis=1))
         p = model.vector(ROCK_VALUES | {"V": 3.0, "W0": 20.0, "K": 0.2})
-        from srfcli.splines import appended
+        from srfcli.codegen.splines import appended
 
         x0 = np.asarray(model.steady(appended(p, [table])))
         x = integrate(model, p, drive=drive, load=ConstantLoad(20.0), t=t, start=x0, tables=[table], rtol=1e-8,

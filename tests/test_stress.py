@@ -11,8 +11,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
-from srfcli.model import open_model
-from srfcli.registry import bundled_registry
+from srfcli.codegen.model import open_model
+from srfcli.laws.registry import bundled_registry
 
 pytestmark = pytest.mark.usefixtures("empty_folder")
 

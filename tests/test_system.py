@@ -10,9 +10,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from srfcli.errors import SrfError
-from srfcli.registry import bundled_registry
-from srfcli.system import build_system
+from srfcli.core.errors import SrfError
+from srfcli.laws.registry import bundled_registry
+from srfcli.symbolic.system import build_system
 
 REGISTRY = bundled_registry()
 LAWS = [e.name for e in REGISTRY.entries("friction")]

@@ -15,18 +15,23 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from srfcli.errors import SrfError
-from srfcli.inference.threshold_errors import uncertainty
-from srfcli.inference.threshold_match import FAR, Matcher
-from srfcli.inference.threshold_scale import FreeParameter, Scale, free_parameters, with_transmission
-from srfcli.inference.threshold_slopes import forced_slopes, hopf_slopes
-from srfcli.inference.threshold_table import is_threshold_table, read_thresholds, thresholds, thresholds_csv
-from srfcli.inference.thresholds import fit_thresholds, generated, with_noise
-from srfcli.laws import Parameter
+from srfcli.core.errors import SrfError, Status
+from srfcli.core.settings import Parameter
+from srfcli.inference.threshold_match import FAR, Matcher, forced_slopes, hopf_slopes
+from srfcli.inference.threshold_table import (
+    FreeParameter,
+    Scale,
+    free_parameters,
+    is_threshold_table,
+    read_thresholds,
+    thresholds,
+    thresholds_csv,
+    with_transmission,
+)
+from srfcli.inference.thresholds import fit_thresholds, generated, uncertainty, with_noise
+from srfcli.numerics.boundary import along, polish
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import hopf_points
-from srfcli.numerics.polish import along, polish
-from srfcli.status import Status
 
 TRIAL = {"A": 0.012, "B": 0.023, "D0": 0.40, "Vsat": 280.0, "lambda": 0.62, "rho": 0.48}  # the paper's Table I
 OPTIMISED = {"A": 0.0126, "B": 0.0241, "D0": 0.402, "Vsat": 256.0, "lambda": 0.56, "rho": 0.43}
@@ -396,8 +401,9 @@ def test_no_text_crashes_the_reader(tmp_path_factory: Any, text: str) -> None:
 @pytest.fixture
 def fit_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
     """`srf fit` with the options that a table of critical loads takes, in an empty folder."""
-    from srfcli.cli.fit_thresholds import fit_thresholds as run
-    from srfcli.cli.options import SrfCommand, output_options, system_options
+    from srfcli.cli.base import SrfCommand
+    from srfcli.cli.fit import fit_thresholds as run
+    from srfcli.cli.options import output_options, system_options
 
     for name in [n for n in os.environ if n.startswith("SRF_") and n not in ("SRF_CACHE", "SRF_SHARED")]:
         monkeypatch.delenv(name)

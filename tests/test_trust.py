@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
-from srfcli.lawtemplate import template
+from srfcli.laws.law_file import template
 
 CODE = "from pathlib import Path\nPath(__file__).with_name('ran').write_text('')\n"
 DATA = "time [s],load_point_velocity [um/s],normal_load [N],elongation [um]\n"

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from srfcli import units
-from srfcli.errors import SrfError
-from srfcli.registry import bundled_registry
-from srfcli.units import convert, find_unit, from_base, parse_quantity, to_base
+from srfcli.core import units
+from srfcli.core.errors import SrfError
+from srfcli.core.units import convert, find_unit, from_base, parse_quantity, to_base
+from srfcli.laws.registry import bundled_registry
 
 
 @pytest.mark.parametrize(

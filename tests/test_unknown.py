@@ -12,21 +12,24 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.diagnosis.closedform import ClosedForm, FittedTerm, with_error
-from srfcli.diagnosis.force import missing_force
-from srfcli.diagnosis.search import Search
-from srfcli.diagnosis.terms import FOLDER, explain_unknown, with_terms
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.discrepancy import (
+    FOLDER,
+    ClosedForm,
+    FittedTerm,
+    explain_unknown,
+    missing_force,
+    with_error,
+    with_terms,
+)
+from srfcli.diagnosis.staged_search import Search
 from srfcli.diagnosis.verdict import conclude
-from srfcli.effectfile import formula_text
-from srfcli.lawcheck import check_law
-from srfcli.proof.draw import Gauge
-from srfcli.proof.folder import case_files
-from srfcli.proof.gauge import read_gauge
-from srfcli.proof.motion import move
-from srfcli.proof.physics import Physics
-from srfcli.proof.protocol import Plan
-from srfcli.recording.experiment import read_experiment
-from srfcli.registry import bundled_registry, read_law
+from srfcli.laws.effect_file import formula_text
+from srfcli.laws.registry import bundled_registry, read_law
+from srfcli.tasks.law_check import check_law
+from srfcli.validation.generator.case import Gauge, case_files, read_gauge
+from srfcli.validation.generator.physics import Physics, Plan
+from srfcli.validation.generator.slider import move
 
 TERMS = sorted(FOLDER.glob("*.toml"))
 SHIPPED = bundled_registry()
@@ -164,7 +167,7 @@ def test_terms_together_are_one_effect(tmp_path):
     path.write_text(form.as_toml(name="several"))
     effect = read_law(path)
     assert "FAIL" not in {o.verdict for o in check_law(effect)}
-    from srfcli.expression import parse_expression, symbol
+    from srfcli.laws.expression import parse_expression, symbol
 
     rate = dict(effect.changes)["rate"]
     one = dict.fromkeys(("v", "phi", "D0"), 1.0) | {"W": 20.0, "rate": 0.5, "age_power": 1.3, "rate_load": 2.0}

@@ -9,16 +9,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from srfcli.core.settings import Parameter
+from srfcli.data.values import Run
 from srfcli.diagnosis import verdict as module
-from srfcli.diagnosis.candidates import neutral_values
-from srfcli.diagnosis.score import Score
+from srfcli.diagnosis.hypotheses import neutral_values
+from srfcli.diagnosis.staged_score import Score
 from srfcli.diagnosis.verdict import _noise_for, conclude, interesting, undetermined
 from srfcli.inference.noise import Noise
-from srfcli.laws import Parameter
-from srfcli.numerics.load import ConstantLoad
-from srfcli.numerics.program import Drive
-from srfcli.recording.values import Run
-from srfcli.registry import bundled_registry
+from srfcli.laws.registry import bundled_registry
+from srfcli.motion.imposed import ConstantLoad, Drive
 
 SHIPPED = bundled_registry()
 

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from brute import Slider, error_of_load, shoot
 
-from srfcli.numerics.critical import critical_line
-from srfcli.numerics.scan import scan_line
-from srfcli.numerics.windows import found_window, load_window
-from srfcli.status import Status
+from srfcli.core.errors import Status
+from srfcli.numerics.critical import critical_line, found_window, load_window, scan_line
 
 
 def test_crossings_far_above_the_load_at_rest(model):

@@ -13,15 +13,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from srfcli.errors import SrfError
-from srfcli.numerics.load import ConstantLoad, Modulation
-from srfcli.numerics.loads import LoadSteps, ModulatedLoad
-from srfcli.numerics.program import Drive
-from srfcli.recording import writing
-from srfcli.recording.experiment import Experiment, FitParameter, ModelChoice, Run, read_experiment
-from srfcli.recording.synthetic import ar1, measured, quantised
-from srfcli.recording.writing import drive_steps, shortest, write_experiment, write_folder
-from srfcli.registry import load_registry
+from srfcli.core.errors import SrfError
+from srfcli.data import writing
+from srfcli.data.experiment import read_experiment
+from srfcli.data.noise import ar1, measured, quantised
+from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
+from srfcli.data.writing import drive_steps, shortest, write_experiment, write_folder
+from srfcli.laws.registry import load_registry
+from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps, ModulatedLoad, Modulation
 
 T = np.arange(2001) / 500.0
 

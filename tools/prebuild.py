@@ -1,4 +1,4 @@
-"""Write the generated modules that the package brings along, `srfcli/data/models/`, anew: python tools/prebuild.py [FOLDER]"""
+"""Write the generated modules that the package brings along, `srfcli/codegen/models/`, anew: python tools/prebuild.py [FOLDER]"""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from typing import Any
 
 import sympy
 
-from srfcli.lawfile import read_header
-from srfcli.model import open_model
-from srfcli.prebuilt import FOLDER, MARK, header_key
-from srfcli.pylaw import scan_python
-from srfcli.registry import bundled_registry
+from srfcli.codegen.model import open_model
+from srfcli.core.cache import FOLDER, MARK, header_key
+from srfcli.laws.law_file import read_header
+from srfcli.laws.registry import bundled_registry, scan_python
 
 
 def shipped_systems() -> list[dict[str, Any]]:

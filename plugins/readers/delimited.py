@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from srfcli.api import Source, SrfError, reader
+from srfcli.laws.api import Source, SrfError, reader
 
 BLOCK = 4 * 2**20  # bytes that are parsed at a time
 LONGEST = 2**20  # bytes of a line

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from srfcli.api import Source, SrfError, reader
+from srfcli.laws.api import Source, SrfError, reader
 
 FILE_HEADER, CHANNEL_HEADER, CHANNELS = 36, 84, 32  # bytes, bytes, number
 DATA = FILE_HEADER + CHANNELS * CHANNEL_HEADER

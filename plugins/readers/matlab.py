@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from srfcli.api import Source, SrfError, reader
+from srfcli.laws.api import Source, SrfError, reader
 
 # Read here and not by scipy.io.loadmat, whose compiled code ends the process on some damaged files.
 MOST = 10_000  # columns of a matrix, and variables of a file

@@ -7,7 +7,7 @@ from typing import IO
 
 import numpy as np
 
-from srfcli.api import Source, SrfError, reader
+from srfcli.laws.api import Source, SrfError, reader
 
 ROWS = 2**18  # read at a time
 WHOLE = "Was the file copied to its end?"

@@ -18,7 +18,7 @@ from typing import Any, NoReturn, TextIO, cast
 
 import click
 
-from srfcli.errors import ExpressionError, SrfError, did_you_mean, printable
+from srfcli.core.errors import ExpressionError, SrfError, did_you_mean, printable
 
 EXIT_OK, EXIT_UNEXPECTED, EXIT_USAGE, EXIT_PARTIAL, EXIT_CONDITION, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
 STDOUT, STDERR = "standard output", "standard error"

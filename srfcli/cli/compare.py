@@ -11,24 +11,35 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
     APPARATUS,
     LOADINGS,
     OutputOptions,
-    SrfCommand,
+    Range,
+    Spread,
     check_origins,
     open_registry,
     output_options,
+    over_option,
     values_option,
+    worker_options,
 )
-from srfcli.cli.ranges import Range, over_option
-from srfcli.cli.workers import Spread, worker_options
-from srfcli.laws import Parameter
-from srfcli.settings import Resolved, Setting, TomlSettings, choose, find_toml, load_toml, parse_assignment, resolve
+from srfcli.core.settings import (
+    Parameter,
+    Resolved,
+    Setting,
+    TomlSettings,
+    choose,
+    find_toml,
+    load_toml,
+    parse_assignment,
+    resolve,
+)
 
 if TYPE_CHECKING:
-    from srfcli.model import GeneratedModel
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.model import GeneratedModel
+    from srfcli.codegen.slider import SlidingSystem
 
 EXAMPLES = """
 srf compare --law srf-vsat --law log-log --law bowden-tabor --eps 0.18 --plot laws.svg
@@ -119,16 +130,16 @@ def command(
 
 
 def _velocity(text: str) -> float:
-    from srfcli.units import parse_quantity
+    from srfcli.core.units import parse_quantity
 
     return parse_quantity(text, "um/s", name="--at")
 
 
 def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, Any]) -> dict[str, SlidingSystem]:
     """Return a system for every pair of a friction and an ageing law, by a name that tells them apart."""
-    from srfcli.errors import SrfError
-    from srfcli.model import open_model
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.model import open_model
+    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.core.errors import SrfError
 
     toml = load_toml(find_toml())
     chosen = {k: choose(k, system[k], toml=toml) for k in ("interface", "loading", "inertia")}
@@ -151,7 +162,7 @@ def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, 
 
 def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSettings) -> list[Resolved]:
     """Return every model's parameters; an assignment counts for the models that have its parameter, and one must."""
-    from srfcli.errors import SrfError, did_you_mean
+    from srfcli.core.errors import SrfError, did_you_mean
 
     flags = {n: system[f"set_{n}"] for n in APPARATUS if system[f"set_{n}"] is not None}
     for text in system["assignments"]:
@@ -169,9 +180,9 @@ def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSe
 
 def _window(model: GeneratedModel, over: tuple[Range, ...]) -> dict[str, Any]:
     """Return the window that --over describes, and how many points it has, as the task takes them."""
-    from srfcli.cli.map_axes import read_axis
-    from srfcli.cli.ranges import DEFAULT_POINTS
-    from srfcli.errors import SrfError
+    from srfcli.cli.map import read_axis
+    from srfcli.cli.options import DEFAULT_POINTS
+    from srfcli.core.errors import SrfError
 
     parts: dict[str, Any] = {"points": {}}
     for given in over:

@@ -7,8 +7,8 @@ import click
 from srfcli.cli.base import SrfGroup
 from srfcli.cli.emit import emit
 from srfcli.cli.options import OutputOptions, SystemOptions, record_options, system_options
-from srfcli.output.tables import Column, Table
-from srfcli.settings import DEFAULTS
+from srfcli.core.settings import DEFAULTS
+from srfcli.results.tables import Column, Table
 
 SCHEMA = "srf.config/1"
 COLUMNS = (

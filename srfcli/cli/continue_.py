@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
     OutputOptions,
     Range,
-    SrfCommand,
     SystemOptions,
     output_options,
     over_option,
@@ -18,10 +18,10 @@ from srfcli.cli.options import (
     system_options,
     values_option,
 )
-from srfcli.laws import Parameter
+from srfcli.core.settings import Parameter
 
 if TYPE_CHECKING:
-    from srfcli.model import GeneratedModel
+    from srfcli.codegen.model import GeneratedModel
 
 EXAMPLES = """
 srf continue --eps 0.18 --plot boundary.svg
@@ -81,9 +81,8 @@ def command(
     folds, and every point is polished until its error is met. Ctrl-C keeps what is done.
     """
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.errors import SrfError
-    from srfcli.numerics.atlas import AtlasSettings
-    from srfcli.numerics.continuation import StepSettings
+    from srfcli.core.errors import SrfError
+    from srfcli.numerics.continuation import AtlasSettings, StepSettings
     from srfcli.tasks.boundary import continue_boundary
 
     if not 1e-4 <= step <= 0.5:
@@ -123,7 +122,7 @@ def command(
 
 
 def _axis(model: GeneratedModel, given: Range) -> Range:
-    from srfcli.errors import SrfError
+    from srfcli.core.errors import SrfError
 
     fitted = given.fitted(model.parameters, where=model.title)
     if fitted.values:

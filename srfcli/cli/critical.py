@@ -6,17 +6,17 @@ import time
 
 import click
 
+from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
     OutputOptions,
     Range,
-    SrfCommand,
     SystemOptions,
     output_options,
     parse_over,
     system_options,
     values_option,
 )
-from srfcli.laws import Parameter
+from srfcli.core.settings import Parameter
 
 EXAMPLES = """
 srf critical --eps 0.13 --V 1,7,25
@@ -89,7 +89,7 @@ def command(
 
 def _window(text: str) -> Range:
     """Return the loads that LOW:HIGH spans, with or without a unit; raises SrfError that shows the form."""
-    from srfcli.errors import SrfError
+    from srfcli.core.errors import SrfError
 
     try:
         found = parse_over(f"W0={text}") if text.count(":") == 1 else None

@@ -1,4 +1,4 @@
-"""`srf derive`: what follows from a law by algebra, and the paper's equations held against it."""
+"""`srf derive` and `srf code`: what follows from a law by algebra, and the NumPy module that computes with it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from pathlib import Path
 
 import click
 
-from srfcli.cli.options import SrfCommand, SystemOptions, system_options
-from srfcli.cli.text_out import out_option, put
-from srfcli.errors import SrfError
+from srfcli.cli.base import SrfCommand
+from srfcli.cli.emit import out_option, put
+from srfcli.cli.options import SystemOptions, system_options
+from srfcli.core.errors import SrfError
+
+# `srf derive`: what follows from a law by algebra, and the paper's equations held against it.
 
 EPILOG = """
 srf derive                                       the paper's model
@@ -45,8 +48,8 @@ def command(
 
 
 def _derive(system: SystemOptions, form: str, extra: tuple[str, ...], *, plain: bool) -> str:
-    from srfcli import render
-    from srfcli.derivation import derivation
+    from srfcli.symbolic import derivation as render
+    from srfcli.symbolic.derivation import derivation
 
     chosen = system.system()
     if form == "python":
@@ -61,7 +64,8 @@ def _derive(system: SystemOptions, form: str, extra: tuple[str, ...], *, plain: 
 
 
 def _paper(form: str) -> str:
-    from srfcli import paper, render
+    from srfcli.symbolic import derivation as render
+    from srfcli.symbolic import paper
 
     if form not in ("text", "json"):
         raise SrfError(f"--check-paper has no format {form}", "Choose --format text or --format json.")
@@ -69,3 +73,22 @@ def _paper(form: str) -> str:
     if form == "json":
         return json.dumps(render.paper_document(findings), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     return render.paper_text(findings)
+
+
+# `srf code`: the NumPy module that computes everything numerical about a system.
+
+CODE_EPILOG = """
+srf code                                  the paper's model
+srf code --law log-log --out log_log.py   a module to import: needs NumPy alone
+"""
+
+
+@click.command("code", cls=SrfCommand, epilog=CODE_EPILOG)
+@system_options
+@out_option
+def code(system: SystemOptions, out: Path | None, force: bool) -> None:
+    """Print the generated NumPy module of a system: rates, Jacobians, derivatives by the parameters, characteristic polynomial.
+
+    Its functions take arrays of any leading shape, real or complex, in um, s, N; the module's PARAMETERS gives their order.
+    """
+    put(system.model().source, out, force=force)

@@ -1,4 +1,4 @@
-"""The way out of a command: a table to stdout or a file, a figure, their sidecars, progress and the exit code."""
+"""The way out of a command: a table, a text or a figure, their sidecars, progress and the exit code."""
 
 from __future__ import annotations
 
@@ -7,21 +7,24 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, EXIT_OK, EXIT_PARTIAL, Session
 from srfcli.cli.options import OutputOptions
-from srfcli.errors import SrfError, printable
-from srfcli.laws import Law
-from srfcli.output import records, tables
-from srfcli.output.provenance import Provenance, write_result
-from srfcli.output.tables import Table
-from srfcli.status import Status
+from srfcli.core.errors import SrfError, Status, printable
+from srfcli.core.files import check_target, write_atomic
+from srfcli.laws.values import Law
+from srfcli.results import tables
+from srfcli.results import tables as records
+from srfcli.results.provenance import Provenance, write_result
+from srfcli.results.tables import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+# The way out of a command: a table to stdout or a file, a figure, their sidecars, progress and the exit code.
 
 PATIENCE, LITTLE = 2.0, 0.01  # s that nobody needs an estimate for; share of the work from which one can be made
 
@@ -67,7 +70,7 @@ def emit(
     if options.plot is not None:
         if figure is None:
             raise SrfError(f"--plot {options.plot}: there is nothing to draw", "Leave --plot out.")
-        from srfcli.output.plots import figure_bytes
+        from srfcli.results.plots import figure_bytes
 
         drawn = figure() if callable(figure) else figure
         _write(options.plot, figure_bytes(drawn, options.plot.suffix), provenance, options)
@@ -94,7 +97,7 @@ def _write(path: Path, content: bytes, provenance: Provenance, options: OutputOp
 
 def warn_uncompiled(cost: str) -> None:
     """Say in one line that no C compiler was found and what that costs; nothing where there is one or SRF_CC is empty."""
-    from srfcli.numerics.compiled import GET_COMPILER, uncompiled
+    from srfcli.codegen.c_source import GET_COMPILER, uncompiled
 
     if uncompiled():
         Session.current().say(f"Warning: no C compiler was found: {cost}. Try: {GET_COMPILER}")
@@ -185,3 +188,28 @@ def duration(seconds: float) -> str:
         if seconds >= 1.5 * size:
             return f"{float(f'{seconds / size:.2g}'):g} {unit}"
     return f"{float(f'{max(seconds, 1.0):.2g}'):.0f} s"
+
+
+# The way out of a command whose result is one text: stdout or --out FILE.
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def out_option(function: F) -> F:
+    """Add --out and --force; the command gets `out`, None for stdout, and `force`."""
+    function = click.option("--force", is_flag=True, help="Overwrite an existing file.")(function)
+    return click.option("--out", metavar="FILE", callback=_place, help="Write to FILE; - is stdout.")(function)
+
+
+def _place(context: click.Context, parameter: click.Parameter, value: str | None) -> Path | None:
+    return None if value in (None, "-") else Path(str(value)).expanduser()
+
+
+def put(text: str, out: Path | None, *, force: bool) -> None:
+    """Write `text` to `out`, or to stdout where that is None; raises SrfError rather than overwrite without `force`."""
+    if out is None:
+        click.echo(text, nl=False)
+        return
+    check_target(out, force=force)
+    write_atomic(out, text)
+    Session.current().say(f"Wrote {out}")

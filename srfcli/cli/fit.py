@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from srfcli.cli.options import OutputOptions, Session, SrfCommand, SystemOptions, output_options, system_options
-from srfcli.errors import SrfError
+from srfcli.cli.base import Session, SrfCommand
+from srfcli.cli.options import OutputOptions, SystemOptions, output_options, parse_over, system_options
+from srfcli.core.errors import SrfError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from srfcli.core.settings import Parameter
+    from srfcli.inference.threshold_table import Scale
+    from srfcli.inference.thresholds import MethodFit, ThresholdFit, Trace
+    from srfcli.results.tables import Table
+
+# `srf fit`: parameters from recordings, or from a table of critical loads.
 
 EXAMPLES = """
 srf fit EXPERIMENT                                  a folder with experiment.toml, or that file
@@ -61,8 +73,7 @@ def command(source: Path, system: SystemOptions, output: OutputOptions, **option
     of the options below.
     """
     if source.suffix.lower() == ".csv":
-        from srfcli.cli.fit_thresholds import fit_thresholds
-        from srfcli.recording.draft import looks_like_recording
+        from srfcli.data.draft import looks_like_recording
 
         if looks_like_recording(source, registry=system.registry()):
             raise SrfError(
@@ -100,7 +111,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     import time
 
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.inference.sample import to_arviz
+    from srfcli.inference.posterior import to_arviz
     from srfcli.results.fit import ADVICE
     from srfcli.tasks.fit import fit
     from srfcli.tasks.recordings import read_experiment
@@ -159,7 +170,7 @@ def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> P
     """Return where the draws go; raises SrfError now for what could not be written later."""
     import importlib.util
 
-    from srfcli.output.files import check_target
+    from srfcli.core.files import check_target
 
     if name is None:
         return None
@@ -172,3 +183,234 @@ def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> P
     if importlib.util.find_spec("arviz") is None:
         raise SrfError("--draws needs arviz, which is not installed", 'pip install "srfcli[arviz]"')
     return place
+
+
+# What `srf fit` does with a table of critical loads: both methods side by side, with cost against evaluations.
+
+
+def fit_thresholds(
+    path: Path,
+    *,
+    system: SystemOptions,
+    output: OutputOptions,
+    free: Sequence[str],
+    bounds: Sequence[str] = (),
+    methods: Sequence[str] = (),
+    tol: float | None = None,
+    max_evaluations: int | None = None,
+) -> None:
+    """Fit the parameters `free` (names, also with commas) to the table at `path`, write the result, end the command.
+
+    `bounds` are NAME=LOW:HIGH, `methods` both unless named, `tol` the relative accuracy of each critical load. Starts are
+    the system's values. Exit codes: 3 where the limit of evaluations cut a method, 130 where it was interrupted.
+    """
+    from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.inference import thresholds as inference
+    from srfcli.inference.threshold_table import GIVEN, free_parameters, read_thresholds, with_transmission
+
+    table = read_thresholds(path)
+    model = system.model()
+    parameters = with_transmission(model.parameters)
+    given = next((name for name in GIVEN if name in system.flags), None)
+    if given:
+        raise SrfError(f"{given} is set, and {path.name} gives it", f"Leave --set {given} out.")
+    resolved = system.resolve(parameters)
+    scale = free_parameters(
+        parameters,
+        [name.strip() for text in free for name in text.split(",") if name.strip()],
+        start=resolved.values,
+        bounds=dict(_bounds(text, parameters) for text in bounds),
+        largest_eps=float(table.eps.max()),
+        where=model.title,
+    )
+    with Progress("fit") as progress:
+
+        def report(trace: Trace) -> None:
+            progress.advance(note=f"{trace.method}, evaluation {len(trace)}: chi2 {trace.best[-1]:.6g}")
+
+        fit = inference.fit_thresholds(
+            model,
+            table,
+            scale=scale,
+            values=resolved.values,
+            methods=methods or inference.METHODS,
+            tol=system.tolerance(tol).value,
+            max_evaluations=max_evaluations or inference.MAX_EVALUATIONS,
+            report=report,
+        )
+    described = {k: v for k, v in resolved.described().items() if k not in GIVEN}
+    loads, trace = _loads(fit), _trace(fit)
+    summary = _summary(fit)
+    emit(
+        _parameters(fit, model.title, described, [summary, trace, loads]),
+        output,
+        more=[summary, trace, loads],
+        laws=model.laws,
+        inputs=[path],
+        timings={m.method: m.cpu for m in fit.methods},
+        figure=lambda: _threshold_figure(fit, model.title),
+    )
+    for m in fit.methods:
+        Session.current().say(f"{m.method}: {m.evaluations} evaluations, {m.cpu:.1f} s of CPU")
+    finish(fit.status)
+
+
+def _bounds(text: str, parameters: Sequence[Parameter]) -> tuple[str, tuple[float, float]]:
+    """Return name and bounds in base units that NAME=LOW:HIGH states; raises SrfError that shows the form."""
+    from srfcli.core.units import to_base
+
+    try:
+        found = parse_over(text) if text.count(":") == 1 else None
+    except SrfError:
+        found = None
+    if found is None:
+        raise SrfError(f"--bounds {text!r} is not NAME=LOW:HIGH, low below high", "Write --bounds Vsat=100:1000.")
+    fitted = found.fitted(parameters)
+    return found.name, (to_base(fitted.lo, fitted.unit), to_base(fitted.hi, fitted.unit))
+
+
+def _parameters(fit: ThresholdFit, title: str, described: Mapping[str, Any], rest: Sequence[Table]) -> Table:
+    from srfcli.results.tables import Column, Table
+
+    columns = (
+        Column("method", "", "powell, or least-squares with exact derivatives"),
+        Column("parameter", "", ""),
+        Column("unit", "", "of start, value, error and bounds"),
+        Column("start", "1", "where the fit began"),
+        Column("value", "1", "where it ended", ".7g"),
+        Column("error", "1", "standard error from the given sigma, linearised", ".3g"),
+        Column("lower", "1", "bound of the search"),
+        Column("upper", "1", "bound of the search"),
+        Column("flag", "", "why an error is missing or means nothing"),
+    )
+    rows = []
+    for m in fit.methods:
+        for i, q in enumerate(fit.scale):
+            ends = [q.declared(v) for v in (q.lower, q.upper)]
+            start, value, error = (q.declared(float(v)) for v in (q.start, m.values[i], m.uncertainty.errors[i]))
+            rows.append(
+                (m.method, q.name, q.parameter.unit, start, value, error, *ends, m.uncertainty.flags[i] or "ok")
+            )
+    names = [[c.name for c in t.columns] for t in rest]
+    meta: dict[str, Any] = {
+        key: [dict(zip(n, row, strict=True)) for row in t.rows]
+        for key, t, n in zip(("methods", "trace", "loads"), rest, names, strict=True)
+    }
+    meta["information"] = {m.method: _information(fit.scale, m) for m in fit.methods}
+    notes = (*fit.table.notes, *_remarks(fit))
+    return Table(
+        "srf.fit-thresholds/1",
+        columns,
+        rows,
+        f"{fit.table.source}, {len(fit.table)} critical loads; {title}",
+        notes,
+        described,
+        meta,
+        fit.status.value,
+    )
+
+
+def _information(scale: Scale, m: MethodFit) -> dict[str, Any]:
+    """Return correlations and the information matrix's eigenvalues in the coordinates ln(value), or value/size."""
+    return {
+        "parameters": scale.names,
+        "coordinates": ["ln" if q.log else "linear" for q in scale],
+        "correlation": m.uncertainty.correlation,
+        "eigenvalues": m.uncertainty.eigenvalues,
+        "eigenvectors": m.uncertainty.combinations.T,
+    }
+
+
+def _remarks(fit: ThresholdFit) -> list[str]:
+    """Return what a reader of the parameters has to know: fit or no fit, what is least determined, how data were matched."""
+    from scipy.stats import chi2
+
+    notes, freedom = [], len(fit.table) - len(fit.scale)
+    for m in fit.methods:
+        if m.uncertainty.weakest:
+            notes.append(f"{m.method}: least determined is {m.uncertainty.weakest}")
+        chance = float(chi2.sf(m.cost, freedom)) if freedom else 1.0
+        if m.status.ok and chance < 1e-3:
+            notes.append(
+                f"{m.method}: chi2 {m.cost:.4g} on {freedom} degrees of freedom: chance {chance:.1g}; the model does not"
+                " describe the data within sigma, and the errors do not allow for that"
+            )
+        notes += [f"{m.method}: {note}" for note in m.notes]
+    return notes
+
+
+def _summary(fit: ThresholdFit) -> Table:
+    from srfcli.results.tables import Column, Table
+
+    columns = (
+        Column("method", "", ""),
+        Column("status", "", ""),
+        Column("chi2_start", "1", "sum of squared residuals in sigma at the start"),
+        Column("chi2", "1", "the same at the end"),
+        Column("freedom", "1", "critical loads less free parameters"),
+        Column("paper_cost_start", "N^2", "the paper's sum of squares at the start"),
+        Column("paper_cost", "N^2", "the same at the end"),
+        Column("evaluations", "1", "of the whole cost"),
+        Column("gradients", "1", "sets of exact derivatives that the method used"),
+        Column("surveys", "1", "lines searched in full"),
+    )
+    freedom = len(fit.table) - len(fit.scale)
+    rows = [
+        (m.method, m.status.value, m.start_cost, m.cost, freedom, *m.paper_cost, m.evaluations, m.gradients, m.surveys)
+        for m in fit.methods
+    ]
+    return Table("srf.fit-thresholds.methods/1", columns, rows, "Methods")
+
+
+def _trace(fit: ThresholdFit) -> Table:
+    from srfcli.results.tables import Column, Table
+
+    columns = (
+        Column("method", "", ""),
+        Column("evaluation", "1", "of the whole cost, counted from 1"),
+        Column("chi2", "1", "lowest so far"),
+    )
+    rows = [(m.method, i + 1, m.trace.best[i]) for m in fit.methods for i in m.trace.milestones()]
+    return Table("srf.fit-thresholds.trace/1", columns, rows, "Cost against evaluations")
+
+
+def _loads(fit: ThresholdFit) -> Table:
+    from srfcli.results.tables import Column, Table
+
+    columns = (
+        Column("method", "", ""),
+        Column("line", "1", "of the table"),
+        Column("V", "um/s", "driving velocity"),
+        Column("eps", "1", "as the table has it, before rho"),
+        Column("measured", "N", "critical load of the table"),
+        Column("sigma", "N", "its standard error"),
+        Column(
+            "W0c", "N", "nearest odd crossing of the model; where it is missing, the end that it lies beyond", ".7g"
+        ),
+        Column("residual", "1", "(W0c - measured)/sigma", ".3g"),
+        Column("next_odd", "N", "second nearest odd crossing among those looked at"),
+        Column("type", "", "hopf, ns, pd or fold; missing where the model has no such crossing"),
+    )
+    rows = []
+    for m in fit.methods:
+        kinds = [getattr(c.point, "kind", "hopf") if c is not None else "missing" for c in m.match.crossings]
+        t = fit.table
+        cells = (t.lines, t.V, t.eps, t.W0c, t.sigma, m.match.loads, m.match.residuals, m.match.rivals, kinds)
+        rows += [(m.method, *(v.item() if hasattr(v, "item") else v for v in row)) for row in zip(*cells, strict=True)]
+    return Table("srf.fit-thresholds.loads/1", columns, rows, "Critical loads")
+
+
+def _threshold_figure(fit: ThresholdFit, title: str) -> Figure:
+    """Return the lowest chi2 so far against evaluations of the whole cost, one curve a method."""
+    from srfcli.results import plots
+
+    with plots.one_panel(None, title=f"{plots.name_text(str(fit.table.source))}: {title}") as (figure, ax):
+        for index, m in enumerate(fit.methods):
+            count = range(1, len(m.trace) + 1)
+            ax.step(count, m.trace.best, where="post", color=plots.COLOURS[index], linestyle=plots.DASHES[index])
+            ax.plot(count[-1:], m.trace.best[-1:], "o", color=plots.COLOURS[index], label=m.method)
+        freedom = len(fit.table) - len(fit.scale)
+        if freedom:
+            ax.axhline(freedom, color="#555555", linestyle=plots.DOTTED, label="degrees of freedom")
+        ax.set(xscale="log", yscale="log", xlabel="evaluations of the whole cost", ylabel="lowest χ² so far")
+        return figure

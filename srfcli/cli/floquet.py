@@ -6,7 +6,8 @@ import time
 
 import click
 
-from srfcli.cli.options import OutputOptions, SrfCommand, SystemOptions, output_options, system_options
+from srfcli.cli.base import SrfCommand
+from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options
 
 EXAMPLES = """
 srf floquet --V 8 --W0 9 --eps 0.09

@@ -1,24 +1,90 @@
-"""`srf law`: show a law, write a new one, check one."""
+"""`srf laws` and `srf law`: what laws there are; show one, write a new one, check one."""
 
 from __future__ import annotations
 
 import difflib
 import json
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from srfcli.cli.base import EXIT_USAGE, SrfCommand, SrfGroup
-from srfcli.cli.laws import LAW_KIND, plugins_option
-from srfcli.errors import ExpressionError, SrfError
+from srfcli.core.errors import ExpressionError, SrfError
 
 if TYPE_CHECKING:
-    from srfcli.laws import Effect, Law
-    from srfcli.registry import Registry
+    from srfcli.laws.registry import Registry
+    from srfcli.laws.values import Effect, Law
+    from srfcli.results.tables import Table
+
+# `srf laws`: what laws there are.
+
+KINDS = ["friction", "ageing", "modifier", "interface", "effect"]
+KIND = click.Choice([*KINDS, "reader"])
+LAW_KIND = click.Choice(KINDS)
+
+plugins_option = click.option(
+    "--plugins",
+    "plugins",
+    multiple=True,
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Folder with law files of your own; may be given several times. Also SRF_PLUGINS.",
+)
 
 EPILOG = """
+srf laws                            every law, where it comes from and what it is
+srf laws --kind ageing              one kind
+srf laws --plugins .                also the laws in the current folder
+srf laws --json | jq .rows          for a program
+"""
+
+
+@click.command(cls=SrfCommand, epilog=EPILOG)
+@click.option("--kind", type=KIND, help="One kind of law only, or the readers of data files.")
+@click.option("--json", "as_json", is_flag=True, help="JSON on stdout.")
+@plugins_option
+def laws(kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
+    """List the laws that are found; none is imported for that."""
+    from srfcli.cli.options import open_registry
+    from srfcli.results.tables import print_terminal, to_json, to_text
+
+    registry = open_registry(plugins)
+    table = laws_table(registry, kind)
+    if as_json:
+        click.echo(to_json(table).rstrip("\n"))
+    elif sys.stdout.isatty():
+        print_terminal(table, sys.stdout)
+    else:
+        click.echo(to_text(table).rstrip("\n"))
+    for problem in registry.problems:
+        click.echo(f"Not listed ({problem.origin}): {problem.message}", err=True)
+
+
+def laws_table(registry: Registry, kind: str | None = None) -> Table:
+    """Return the listing as a table; a law that shares its name with another says so in the column `clash`."""
+    from srfcli.results.tables import Column, Table
+
+    columns = [Column("kind"), Column("name"), Column("origin"), Column("about"), Column("location"), Column("clash")]
+    rows: list[tuple[Any, ...]] = []
+    for e in registry.entries(kind):
+        if kind is None and e.kind == "reader":
+            continue  # not a law: listed on request
+        others = ", ".join(str(other.location) for other in registry.clashes(e))
+        rows.append((e.kind, e.name, e.origin, e.about, str(e.location), others or None))
+    if not any(row[-1] for row in rows):
+        columns, rows = columns[:-1], [row[:-1] for row in rows]
+    problems = [
+        {"name": p.name, "origin": p.origin, "location": p.location, "message": p.message} for p in registry.problems
+    ]
+    return Table("srf.laws/1", tuple(columns), rows, meta={"problems": problems})
+
+
+# `srf law`: show a law, write a new one, check one.
+
+LAW_EPILOG = """
 srf law show srf-vsat               formula, parameters, references
 srf law new my-law                  write my-law.toml, ready to be changed
 srf law check my-law.toml           does it stand up?
@@ -40,7 +106,7 @@ srf law check dieterich-cutoff
 """
 
 
-@click.group(cls=SrfGroup, epilog=EPILOG)
+@click.group(cls=SrfGroup, epilog=LAW_EPILOG)
 def law() -> None:
     """Show, write and check laws."""
 
@@ -69,11 +135,9 @@ def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) 
 @click.option("--force", is_flag=True, help="Overwrite a file, or take a name that a law already has.")
 def new(name: str, kind: str, python: bool, force: bool) -> None:
     """Write a commented law into the current folder; it passes `srf law check` as it is."""
-    from srfcli.atomic import recover
-    from srfcli.lawfile import valid_name
-    from srfcli.lawtemplate import template
-    from srfcli.output.files import write_atomic
-    from srfcli.registry import bundled_registry
+    from srfcli.core.files import recover, write_atomic
+    from srfcli.laws.law_file import template, valid_name
+    from srfcli.laws.registry import bundled_registry
 
     if not valid_name(name):
         raise SrfError(f"{name!r} is not a law name: small letters, digits and single dashes", "srf law new my-law")
@@ -108,7 +172,7 @@ def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, 
     Of an effect: parses, units, a neutral value at which the model is the baseline, derivatives.
     """
     from srfcli.cli.options import open_registry
-    from srfcli.lawcheck import Outcome, check_law
+    from srfcli.tasks.law_check import Outcome, check_law
 
     registry = open_registry(plugins)
     try:
@@ -131,8 +195,8 @@ def _is_file(name: str) -> bool:
 
 def _find(registry: Registry, name: str, kind: str | None) -> list[Law]:
     """Return the laws in a file, or those of a name in any kind, or in one kind."""
-    from srfcli.lawfile import kind_of
-    from srfcli.registry import read_file
+    from srfcli.laws.law_file import kind_of
+    from srfcli.laws.registry import read_file
 
     if name.endswith((".toml", ".py")):
         found = [one for one in read_file(Path(name)) if kind in (None, kind_of(one))]
@@ -161,8 +225,8 @@ def _nearest(registry: Registry, name: str, kind: str | None) -> str:
 
 
 def _document(one: Law) -> dict[str, Any]:
-    from srfcli.lawfile import kind_of
-    from srfcli.laws import Effect
+    from srfcli.laws.law_file import kind_of
+    from srfcli.laws.values import Effect
 
     parameters = {
         p.name: {
@@ -189,7 +253,7 @@ def _document(one: Law) -> dict[str, Any]:
 
 
 def _law_document(one: Law) -> dict[str, Any]:
-    from srfcli.lawfile import FORMULA, formula_of, kind_of
+    from srfcli.laws.law_file import FORMULA, formula_of, kind_of
 
     formula = formula_of(one)
     states = [{"name": s.name, "length": s.length, "weight": s.weight} for s in getattr(one, "states", ())]
@@ -197,7 +261,7 @@ def _law_document(one: Law) -> dict[str, Any]:
 
 
 def _effect_document(one: Effect) -> dict[str, Any]:
-    from srfcli.effectfile import formula_text
+    from srfcli.laws.effect_file import formula_text
 
     states = [
         {"name": s.name, "rate": formula_text(s.rate), "steady": formula_text(s.steady), "logarithmic": s.logarithmic}
@@ -218,8 +282,8 @@ def _effect_document(one: Effect) -> dict[str, Any]:
 
 
 def _text(one: Law) -> str:
-    from srfcli.lawfile import kind_of
-    from srfcli.laws import Effect
+    from srfcli.laws.law_file import kind_of
+    from srfcli.laws.values import Effect
 
     lines = [
         f"{one.name}  ({kind_of(one)})",
@@ -235,7 +299,7 @@ def _text(one: Law) -> str:
 
 
 def _law_lines(one: Law) -> list[str]:
-    from srfcli.lawfile import FORMULA, formula_of, kind_of
+    from srfcli.laws.law_file import FORMULA, formula_of, kind_of
 
     formula = formula_of(one)
     lines = [f"{FORMULA[kind_of(one)]} = {'rigid' if formula is None else formula}"]
@@ -243,7 +307,7 @@ def _law_lines(one: Law) -> list[str]:
 
 
 def _effect_lines(one: Effect) -> list[str]:
-    from srfcli.effectfile import formula_text, summary
+    from srfcli.laws.effect_file import formula_text, summary
 
     lines = summary(one).split("; ")
     lines += [f"{s.name} = {formula_text(s.steady)} in steady sliding" for s in one.states]

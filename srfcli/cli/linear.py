@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import click
 
+from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
     OutputOptions,
     Range,
-    SrfCommand,
     SystemOptions,
     output_options,
     over_option,

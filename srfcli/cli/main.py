@@ -11,19 +11,19 @@ from typing import Any, NoReturn
 
 import click
 
-from srfcli import __version__
 from srfcli.cli.base import CONTEXT, SrfGroup, switches
+from srfcli.core.version import __version__
 
 # command -> module:attribute and the first sentence of its help, in the order of `srf --help`, which imports none of them
 COMMANDS = {
-    "laws": ("srfcli.cli.laws:laws", "List the laws that are found; none is imported for that."),
+    "laws": ("srfcli.cli.law:laws", "List the laws that are found; none is imported for that."),
     "law": ("srfcli.cli.law:law", "Show, write and check laws."),
     "derive": (
         "srfcli.cli.derive:command",
         "Steady state, slopes, equations, dispersion relation and closed critical loads of a system, by algebra.",
     ),
     "code": (
-        "srfcli.cli.code:command",
+        "srfcli.cli.derive:code",
         "Print the generated NumPy module of a system: rates, Jacobians, derivatives by the parameters, "
         "characteristic polynomial.",
     ),
@@ -137,7 +137,9 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run `srf` with `argv`, or with the process's arguments, and exit."""
     for library in ("OPENBLAS", "MKL", "OMP"):  # all matrices here are small: threads only cost their start
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
-    gc.set_threshold(100_000, 10, 10)  # to look for cycles among what is imported, and at the end, is a sixth of a short run
+    gc.set_threshold(
+        100_000, 10, 10
+    )  # to look for cycles among what is imported, and at the end, is a sixth of a short run
     atexit.register(gc.freeze)
     cli.main(argv)
 

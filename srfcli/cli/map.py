@@ -3,26 +3,34 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
+from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
     OutputOptions,
     Range,
-    SrfCommand,
+    Spread,
     SystemOptions,
     output_options,
     over_option,
+    parse_over,
     read_output,
     system_options,
+    worker_options,
 )
-from srfcli.cli.workers import Spread, worker_options
+from srfcli.core.errors import SrfError
+from srfcli.results.map import ratio_powers, unit_text
 
 if TYPE_CHECKING:
-    from srfcli.numerics.mapgrid import MapGrid
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.model import Array, GeneratedModel
+    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.numerics.plane import MapAxis, MapGrid
+
+# `srf map`: the stability of the forced sliding state over a plane of two parameters, with every boundary on it.
 
 EXAMPLES = """
 srf map --eps 0.18 --over V=1:100:120 --over K/W0=0.005:0.03:200 --plot map.svg
@@ -93,10 +101,9 @@ def command(
     points; CSV and JSON hold the grid.
     """
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.errors import SrfError
-    from srfcli.numerics.atlas import AtlasSettings
-    from srfcli.numerics.continuation import StepSettings
-    from srfcli.numerics.mapgrid import MapSettings
+    from srfcli.core.errors import SrfError
+    from srfcli.numerics.continuation import AtlasSettings, StepSettings
+    from srfcli.numerics.plane import MapSettings
     from srfcli.tasks.map import map_grid
 
     if not 1e-4 <= step <= 0.5 or not 1e-8 <= mesh_error <= 0.1:
@@ -139,8 +146,7 @@ def _slider_grid(
     system: SystemOptions, over: tuple[Range, ...], given: dict[str, str | None]
 ) -> tuple[SlidingSystem, MapGrid]:
     """Return the system and the grid; raises SrfError where an axis has a value too."""
-    from srfcli.cli.map_axes import read_grid
-    from srfcli.errors import SrfError
+    from srfcli.core.errors import SrfError
 
     swept = {name for r in over for name in r.name.split("/")}
     for name, value in given.items():
@@ -155,7 +161,7 @@ def _slider_grid(
 
 def _boundary_output(boundary: str, output: OutputOptions) -> OutputOptions:
     """Return where the boundary's points go, checked now."""
-    from srfcli.errors import SrfError
+    from srfcli.core.errors import SrfError
 
     if boundary == "-" or Path(boundary).suffix.lower() not in (".csv", ".json"):
         raise SrfError(f"--boundary {boundary} ends in neither .csv nor .json", "--boundary boundary.csv")
@@ -163,3 +169,82 @@ def _boundary_output(boundary: str, output: OutputOptions) -> OutputOptions:
     if output.out is not None and place.out is not None and output.out.resolve() == place.out.resolve():
         raise SrfError(f"--out and --boundary are the same file, {boundary}", "Give them different names.")
     return place
+
+
+# The axes of a map from the command line: parameters, or ratios of two such as K/W0.
+
+COLUMNS, ROWS = 80, 120  # points of an axis for which none were given
+
+
+def read_grid(model: GeneratedModel, base: Array, over: tuple[Range, ...]) -> MapGrid:
+    """Return the grid that `over` spans; V from 1 to 100 um/s and a window of K/W0 stand in for an axis not given.
+
+    Raises SrfError for more than two axes, for lists of values, and for what is no parameter of the model.
+    """
+    from srfcli.numerics.plane import MapGrid, check_grid
+
+    if len(over) > 2:
+        raise SrfError(
+            f"--over is given {len(over)} times", "A map has two axes: --over V=1:100:120 --over K/W0=0.005:0.03:200."
+        )
+    ranges = over or (replace(parse_over("V=1:100"), n=COLUMNS),)
+    axes = [read_axis(model, r) for r in ranges]
+    if len(axes) == 1:
+        axes.append(_load_axis(model, base, axes[0]))
+    grid = MapGrid(base, axes[0], axes[1])
+    check_grid(model, grid)
+    return grid
+
+
+def read_axis(model: GeneratedModel, given: Range) -> MapAxis:
+    """Return the axis that a range describes, in um, s, N."""
+    from srfcli.core.units import to_base
+    from srfcli.numerics.plane import MapAxis
+
+    if given.values is not None:
+        hint = f"An axis runs from a low to a high end: --over {given.name}=1:100:60."
+        raise SrfError(f"--over {given.name} lists values", hint)
+    log = given.spacing == "log"
+    if "/" not in given.name:
+        fitted = given.fitted(model.parameters, where=model.title)
+        lo, hi = to_base(fitted.lo, fitted.unit), to_base(fitted.hi, fitted.unit)
+        return MapAxis(given.name, lo, hi, given.n, log)
+    held, moved = given.name.split("/")
+    factor = _ratio_factor(model, given, held, moved)
+    return MapAxis(moved, given.lo * factor, given.hi * factor, given.n, log, held)
+
+
+def _ratio_factor(model: GeneratedModel, given: Range, held: str, moved: str) -> float:
+    """Return what a ratio's numbers are multiplied with: they are in um, s, N unless a unit is written."""
+    from srfcli.core.units import find_unit
+
+    powers = ratio_powers(model, held, moved)
+    if not given.unit:
+        return 1.0
+    unit = find_unit(given.unit, where=f"--over {given.name}")
+    if unit.powers != powers:
+        raise SrfError(
+            f"--over {given.name}: {given.unit!r} is the wrong unit",
+            f"Write it in {unit_text(powers)}, or leave it out.",
+        )
+    return unit.factor
+
+
+def _load_axis(model: GeneratedModel, base: Array, x: MapAxis) -> MapAxis:
+    """Return K/W0 over the loads at which boundaries are expected along `x`."""
+    from srfcli.numerics.critical import found_window
+    from srfcli.numerics.plane import MapAxis
+
+    if "W0" in (x.moved, x.held):
+        raise SrfError(f"--over {x.name} alone spans no plane", "Add the other axis: --over V=1:100:80.")
+    corners = []
+    for value in x.samples()[:: max(1, (x.count - 1) // 4)]:
+        corner = base.copy()
+        corner[model.index(x.moved)] = x.parameter(model, base, value)
+        corners.append(corner)
+    window = found_window(model, corners)
+    lo, hi = window.lo, window.hi
+    if "K" in (x.moved, x.held):
+        return MapAxis("W0", lo, hi, ROWS)
+    K = float(base[model.index("K")])
+    return MapAxis("W0", K / hi, K / lo, ROWS, True, "K")

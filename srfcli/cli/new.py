@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from srfcli.cli.laws import plugins_option
-from srfcli.cli.options import Session, SrfCommand
-from srfcli.errors import SrfError
+from srfcli.cli.base import Session, SrfCommand
+from srfcli.cli.law import plugins_option
+from srfcli.core.errors import SrfError
 
 if TYPE_CHECKING:
-    from srfcli.recording.draft import Wish
-    from srfcli.registry import Registry
+    from srfcli.data.draft import Wish
+    from srfcli.laws.registry import Registry
 
 EXAMPLES = """
 srf new run1.csv --stiffness '5.4e-3 1/um'             friction per micron, as rock labs state it
@@ -68,10 +68,10 @@ def command(files: tuple[Path, ...], out: str | None, force: bool, plugins: tupl
     Columns are recognised by heading and unit; time, what was imposed and what was observed are found in the data. What no table
     says, the stiffness first of all, is asked for on a terminal and otherwise taken from the options.
     """
-    from srfcli.output.files import check_target, write_atomic
-    from srfcli.recording.draft import draft
-    from srfcli.recording.source import open_source
-    from srfcli.registry import load_registry
+    from srfcli.core.files import check_target, write_atomic
+    from srfcli.data.columns import open_source
+    from srfcli.data.draft import draft
+    from srfcli.laws.registry import load_registry
 
     place = Path("experiment.toml" if out in (None, "") else str(out)).expanduser()
     if place.is_dir():
@@ -99,7 +99,7 @@ def command(files: tuple[Path, ...], out: str | None, force: bool, plugins: tupl
 
 def _wish(files: tuple[Path, ...], options: dict[str, Any], registry: Registry) -> Wish:
     """Return what the options say; what they leave open is asked for where somebody can answer."""
-    from srfcli.recording.draft import Wish
+    from srfcli.data.draft import Wish
 
     columns = dict(_column(text) for text in options["columns"])
     drive, load, stiffness = options["drive"], options["load"], options["stiffness"]
@@ -125,8 +125,8 @@ def _asked(
     path: Path, columns: dict[str, str], options: dict[str, Any], registry: Registry
 ) -> tuple[str | None, str | None, str]:
     """Ask for what neither the first file nor the options say; answers for columns go into `columns`."""
-    from srfcli.recording.draft import Wish, missing, name_columns
-    from srfcli.recording.source import open_source
+    from srfcli.data.columns import open_source
+    from srfcli.data.draft import Wish, missing, name_columns
 
     drive, load, stiffness = options["drive"], options["load"], options["stiffness"]
     headings = open_source(path, registry=registry, format=options["reader"]).headings
@@ -161,7 +161,7 @@ def _column(text: str) -> tuple[str, str]:
 
 
 def _stiffness(text: str) -> str:
-    from srfcli.units import split_quantity
+    from srfcli.core.units import split_quantity
 
     number, unit = split_quantity(text, name="--stiffness", example="5e-3 1/um")
     if not unit:
@@ -174,7 +174,7 @@ def _stiffness(text: str) -> str:
 
 def _drive(text: str | None) -> list[tuple[float, float]] | float | None:
     """Return a drive as (duration, velocity) pairs in s and um/s, or as one velocity."""
-    from srfcli.units import parse_quantity
+    from srfcli.core.units import parse_quantity
 
     if text is None:
         return None
@@ -188,7 +188,7 @@ def _drive(text: str | None) -> list[tuple[float, float]] | float | None:
 
 
 def _window(text: str | None) -> tuple[float, float] | None:
-    from srfcli.units import parse_quantity
+    from srfcli.core.units import parse_quantity
 
     if text is None:
         return None

@@ -1,4 +1,4 @@
-"""Option decorators that commands share: which system, and where its results go.
+"""Option decorators that commands share: which system, ranges of values, workers, and where results go.
 
 @click.command("linear", cls=SrfCommand, epilog=EXAMPLES)
 @system_options
@@ -10,37 +10,205 @@ def command(system: SystemOptions, over: tuple[Range, ...], output: OutputOption
 from __future__ import annotations
 
 import functools
+import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from srfcli.cli.base import Session, SrfCommand, SrfGroup
-from srfcli.cli.ranges import Range, over_option, parse_over, parse_overs, parse_values, values_option
-from srfcli.errors import SrfError
-from srfcli.laws import Parameter
-from srfcli.output.files import check_target, is_special
-from srfcli.output.plots import check_plot
-from srfcli.settings import (
+from srfcli.core.errors import SrfError
+from srfcli.core.files import check_target, is_special
+from srfcli.core.settings import (
     DEFAULTS,
+    Parameter,
     Resolved,
     Setting,
     TomlSettings,
+    check_value,
     choose,
     find_toml,
     load_toml,
     parse_assignment,
+    require_parameter,
     resolve,
 )
+from srfcli.core.units import convert, parse_quantity, split_quantity, tidy, to_base
+from srfcli.results.plots import check_plot
 
 if TYPE_CHECKING:
-    from srfcli.model import GeneratedModel
-    from srfcli.registry import Registry
-    from srfcli.system import System
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.model import GeneratedModel
+    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.laws.registry import Registry
+    from srfcli.symbolic.system import System
+
+# Ranges and lists of values on the command line: `--over V=1:100:60:log`, `--over V=1,2,5`, `--V 1,7,25`.
+
+DEFAULT_POINTS = 60
+MAX_POINTS = 1_000_000
+FORM = "Write NAME=LOW:HIGH:POINTS[:log|lin] or NAME=a,b,c, as in V=1:100:60, V=1,2,5 or 'V=1:100 um/s:60'."
+
+
+@dataclass(frozen=True)
+class Range:
+    """The values that a parameter runs over: `values` as listed, or `n` from `lo` to `hi`, `spacing` log or lin.
+
+    Numbers are in `unit` if one was written, else in the parameter's declared unit; `fitted` makes it the declared one.
+    """
+
+    name: str
+    values: tuple[float, ...] | None = None
+    lo: float = math.nan
+    hi: float = math.nan
+    n: int = DEFAULT_POINTS
+    spacing: str = "lin"
+    unit: str = ""
+
+    def points(self) -> list[float]:
+        """Return every value, the ends exactly as given."""
+        if self.values is not None:
+            return list(self.values)
+        steps = self.n - 1
+        if self.spacing == "log":
+            ratio = math.log(self.hi / self.lo)
+            inner = [tidy(self.lo * math.exp(ratio * i / steps)) for i in range(1, steps)]
+        else:
+            inner = [tidy(self.lo + (self.hi - self.lo) * i / steps) for i in range(1, steps)]
+        return [self.lo, *inner, self.hi]
+
+    def fitted(self, parameters: Sequence[Parameter], *, where: str = "this system") -> Range:
+        """Return the range in declared units; raises SrfError for an unknown name or a value out of bounds."""
+        parameter = require_parameter(self.name, parameters, where=where)
+
+        def fit(number: float) -> float:
+            declared = convert(number, self.unit, parameter.unit, name=self.name) if self.unit else number
+            return check_value(parameter, declared)
+
+        if self.values is not None:
+            return replace(self, values=tuple(map(fit, self.values)), unit=parameter.unit)
+        return replace(self, lo=fit(self.lo), hi=fit(self.hi), unit=parameter.unit)
+
+    def base_points(self, parameters: Sequence[Parameter], *, where: str = "this system") -> list[float]:
+        """Return every value in um, s, N and radians."""
+        fitted = self.fitted(parameters, where=where)
+        return [to_base(value, fitted.unit) for value in fitted.points()]
+
+
+def parse_over(text: str) -> Range:
+    """Return the range that NAME=LOW:HIGH[:POINTS[:log|lin]] or NAME=a,b,c describes; one unit holds for all.
+
+    Spacing is logarithmic unless said where the ends are positive and a decade or more apart. Raises SrfError.
+    """
+    name, equals, body = (part.strip() for part in text.partition("="))
+    parts = name.split("/")  # K/W0 is a ratio, for the commands that take one
+    if not (equals and body and len(parts) <= 2 and all(part.isidentifier() for part in parts)):
+        raise SrfError(f"--over {text!r} is not a range", FORM)
+    if ":" not in body:
+        values, unit = _numbers(name, body.split(","), text)
+        return Range(name, values=values, unit=unit)
+    fields = [part.strip() for part in body.split(":")]
+    if len(fields) > 4:
+        raise SrfError(f"--over {text!r} has {len(fields)} fields between colons, not 2 to 4", FORM)
+    (lo, hi), unit = _numbers(name, fields[:2], text)
+    if not lo < hi:
+        raise SrfError(f"--over {text!r}: its low end {lo:g} is not below its high end {hi:g}", FORM)
+    spacing = fields[3] if len(fields) == 4 else "log" if lo > 0 and hi >= 10 * lo else "lin"
+    if spacing not in ("log", "lin"):
+        raise SrfError(f"--over {text!r}: unknown spacing {spacing!r}", "Known: lin, log")
+    if spacing == "log" and lo <= 0:
+        raise SrfError(f"--over {text!r}: a logarithmic range cannot reach {lo:g}", "Begin above 0, or end it in :lin.")
+    return Range(name, lo=lo, hi=hi, n=_count(fields, text), spacing=spacing, unit=unit)
+
+
+def _numbers(name: str, parts: Sequence[str], text: str) -> tuple[tuple[float, ...], str]:
+    pairs = []
+    for part in parts:
+        try:
+            pairs.append(split_quantity(part, name=name))
+        except SrfError as error:
+            raise SrfError(f"--over {text!r}: {part.strip()!r} is not a number", FORM) from error
+    units = sorted({unit for _, unit in pairs if unit})
+    if len(units) > 1:
+        hint = "Write the unit once, after the last number."
+        raise SrfError(f"--over {text!r} mixes the units {' and '.join(units)}", hint)
+    return tuple(number for number, _ in pairs), units[0] if units else ""
+
+
+def _count(fields: Sequence[str], text: str) -> int:
+    if len(fields) < 3:
+        return DEFAULT_POINTS
+    digits = fields[2]
+    if not (digits.isascii() and digits.isdecimal() and len(digits) < 8 and 2 <= int(digits) <= MAX_POINTS):
+        hint = f"Write a whole number from 2 to {MAX_POINTS}, as in V=1:100:60."
+        raise SrfError(f"--over {text!r}: {digits!r} is not a number of points", hint)
+    return int(digits)
+
+
+def parse_overs(texts: Sequence[str]) -> tuple[Range, ...]:
+    """Return the ranges that several --over describe; raises SrfError if two are over the same parameter."""
+    ranges = tuple(map(parse_over, texts))
+    for index, made in enumerate(ranges):
+        if made.name in {r.name for r in ranges[:index]}:
+            hint = "Give one range for each parameter, or list values: V=1,2,5."
+            raise SrfError(f"--over {made.name} is given twice", hint)
+    return ranges
+
+
+def over_option(*, default: Sequence[str] = (), help: str = "") -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add --over NAME=..., repeatable; the command gets `over`, a tuple of Range, `default` parsed if none is given."""
+    text = help or "Values to run over: NAME=LOW:HIGH[:POINTS[:log|lin]] or NAME=a,b,c; repeat for a second parameter."
+    return click.option(
+        "--over",
+        multiple=True,
+        default=list(default),
+        show_default=", ".join(default) if default else False,
+        metavar="NAME=RANGE",
+        help=text,
+        callback=lambda _context, _parameter, texts: parse_overs(texts),
+    )
+
+
+def values_option(
+    parameter: Parameter, *, default: Sequence[float] | None = None, about: str = ""
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add --NAME for a list of values, `--V 1,7,25` or repeated, with or without unit.
+
+    The command gets `NAME`, a tuple of floats in the declared unit, checked against the bounds, or None if neither
+    the option nor a `default` was given. Text and unit of the help come from `parameter`.
+    """
+    unit = "" if parameter.unit == "1" else f", in {parameter.unit}"
+    meaning = about or parameter.about or parameter.name
+    return click.option(
+        f"--{parameter.name}",
+        parameter.name,
+        multiple=True,
+        metavar="VALUES",
+        help=f"{meaning[:1].upper()}{meaning[1:]}{unit}; several as a,b,c.",
+        callback=lambda _context, _option, texts: parse_values(texts, parameter) if texts else _default(default),
+    )
+
+
+def _default(default: Sequence[float] | None) -> tuple[float, ...] | None:
+    return None if default is None else tuple(default)
+
+
+def parse_values(texts: Sequence[str], parameter: Parameter) -> tuple[float, ...]:
+    """Return the numbers in comma-separated `texts`, in the declared unit; the last one's unit holds for its list."""
+    found = []
+    for text in texts:
+        parts = [part.strip() for part in text.split(",")]
+        shared = split_quantity(parts[-1], name=parameter.name)[1]
+        for part in parts:
+            number, own = split_quantity(part, name=parameter.name)
+            written = f"{number!r} {own or shared}".strip()
+            found.append(check_value(parameter, parse_quantity(written, parameter.unit, name=parameter.name)))
+    return tuple(found)
+
+
+# Option decorators that commands share: which system, and where its results go.
 
 __all__ = [
     "OutputOptions",
@@ -95,13 +263,13 @@ class SystemOptions:
 
     def system(self) -> System:
         """Return the system that the options name."""
-        from srfcli.system import build_system
+        from srfcli.symbolic.system import build_system
 
         return build_system(self.registry(), **self._chosen())
 
     def model(self, *, tables: Sequence[tuple[str, str]] = ()) -> GeneratedModel:
         """Return the numerical model of that system, with tables if asked for; sympy runs only where the cache has none."""
-        from srfcli.model import open_model
+        from srfcli.codegen.model import open_model
 
         return open_model(self.registry(), **self._chosen(), tables=tables)
 
@@ -122,7 +290,7 @@ class SystemOptions:
 
     def slider(self, **given: str | float | None) -> SlidingSystem:
         """Return the system with its parameters, the command's own flags `given` among them as in `resolve`."""
-        from srfcli.tasks.system import SlidingSystem
+        from srfcli.codegen.slider import SlidingSystem
 
         model = self.model()
         return SlidingSystem(model, self.resolve(model.parameters, **given))
@@ -152,7 +320,7 @@ class SystemOptions:
 
 def open_registry(plugins: Sequence[Path], settings: Sequence[Setting] = ()) -> Registry:
     """Return the laws there are; Python files that flags or the environment name may run, those of files with --trust."""
-    from srfcli.registry import load_registry
+    from srfcli.laws.registry import load_registry
 
     words = [word.strip() for s in settings if _by_person(s) for word in str(s.value).split("+")]
     named = [Path(word) for word in words if word.endswith(".py")]
@@ -165,7 +333,7 @@ def _by_person(setting: Setting) -> bool:
 
 def check_origins(toml: TomlSettings, settings: Mapping[str, Setting]) -> None:
     """Raise SrfError for a Python file that srf.toml names, unless --trust is given: srf.toml may be a stranger's."""
-    from srfcli.registry import untrusted_hint
+    from srfcli.laws.registry import untrusted_hint
 
     for key, setting in settings.items():
         for word in str(setting.value).split("+"):
@@ -316,3 +484,66 @@ def read_output(
     suffix = place.suffix.lower().lstrip(".") if place is not None else ""
     format = "json" if as_json else "csv" if as_csv else suffix if suffix in FORMATS else "text"
     return OutputOptions(format, place, figure, force, provenance)
+
+
+# Options that spread a long computation: --workers, --cluster and --resume, the same path for all three.
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Where tasks are done: in this process, in `workers` others, or on a `cluster`; `resume` keeps what is finished."""
+
+    workers: int = 1
+    cluster: str | None = None
+    resume: Path | None = None
+
+    def run(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        """Yield (index, result) of every task, in any order."""
+        if self.resume is None:
+            yield from self._fresh(function, tasks)
+            return
+        from srfcli.parallel.store import Store, stored
+
+        yield from stored(self._fresh, Store(self.resume), function, tasks)
+
+    def _fresh(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        if not tasks:
+            return
+        if self.cluster is not None:
+            from srfcli.parallel.pool import run_cluster
+
+            yield from run_cluster(function, tasks, address=self.cluster)
+        elif self.workers > 1:
+            from srfcli.parallel.pool import run_processes
+
+            yield from run_processes(function, tasks, workers=self.workers)
+        else:
+            from srfcli.parallel.pool import run_here
+
+            yield from run_here(function, tasks)
+
+
+def worker_options(function: F) -> F:
+    """Add --workers, --cluster and --resume; the command gets them as `spread`, a Spread."""
+
+    @functools.wraps(function)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        workers, cluster, resume = (kwargs.pop(name) for name in ("workers", "cluster", "resume"))
+        if workers is not None and cluster is not None:
+            raise SrfError("--workers and --cluster exclude each other", "A cluster has its own number of workers.")
+        count = workers if workers else os.cpu_count() or 1 if workers == 0 else 1
+        folder = None if resume is None else Path(resume).expanduser()
+        return function(*args, spread=Spread(count, cluster, folder), **kwargs)
+
+    options = (
+        click.option(
+            "--workers",
+            type=click.IntRange(0, 4096),
+            help="Processes to use, 0 for all cores.  [default: this one only]",
+        ),
+        click.option("--cluster", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster, tcp://host:port."),
+        click.option("--resume", metavar="DIR", help="Keep finished parts in DIR, and go on from those found there."),
+    )
+    for option in reversed(options):
+        wrapper = option(wrapper)
+    return wrapper  # type: ignore[return-value]

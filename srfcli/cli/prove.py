@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from srfcli.cli.laws import plugins_option
-from srfcli.cli.options import OutputOptions, Session, SrfCommand
+from srfcli.cli.base import Session, SrfCommand
+from srfcli.cli.law import plugins_option
+from srfcli.cli.options import OutputOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from srfcli.output.tables import Table
-    from srfcli.trial.run import Trial
+    from srfcli.results.tables import Table
+    from srfcli.validation.trial.run import Trial
 
 EXAMPLES = """
 srf prove --out proof                                      ten cases: a first look, half an hour
@@ -90,8 +91,8 @@ def command(
     """
     import os
 
-    from srfcli.errors import SrfError
-    from srfcli.trial.run import Trial
+    from srfcli.core.errors import SrfError
+    from srfcli.validation.trial.run import Trial
 
     if as_json and as_csv:
         raise SrfError("--json and --csv exclude each other", "--report-only prints the other at no cost.")
@@ -128,10 +129,10 @@ def _answered(
     """Return the trial with an answer to every case; Ctrl-C ends the command, and what was answered is kept."""
     from srfcli.cli.base import EXIT_INTERRUPTED
     from srfcli.cli.emit import Progress
-    from srfcli.errors import SrfError
-    from srfcli.registry import load_registry
-    from srfcli.trial.blind import SEARCHES
-    from srfcli.trial.run import answer_all, begin
+    from srfcli.core.errors import SrfError
+    from srfcli.laws.registry import load_registry
+    from srfcli.validation.trial.blind import SEARCHES
+    from srfcli.validation.trial.run import answer_all, begin
 
     if unfinished:
         raise SrfError("--unfinished ends a trial that was begun", f"srf prove --report-only {folder} --unfinished")
@@ -163,10 +164,9 @@ def _answered(
 def _report(trial: Trial, workers: int, unfinished: bool, format: str) -> None:
     """Unseal, mark every answer, print the tables and keep them beside the answers."""
     from srfcli.cli.emit import Progress, emit
-    from srfcli.trial.mark import mark
-    from srfcli.trial.report import cases, tables
-    from srfcli.trial.run import open_truths
-    from srfcli.trial.sight import see_all
+    from srfcli.validation.trial.mark import mark, see_all
+    from srfcli.validation.trial.report import cases, tables
+    from srfcli.validation.trial.run import open_truths
 
     truths, answers = open_truths(trial, unfinished=unfinished)
     sights = {}
@@ -184,9 +184,8 @@ def _report(trial: Trial, workers: int, unfinished: bool, format: str) -> None:
 
 def _keep(trial: Trial, seed: int, table: Table, more: Sequence[Table], listed: Table) -> None:
     """Write the report beside the answers: for a reader in few digits, for a program in all, and one line per case."""
-    from srfcli.output.provenance import Provenance, write_result
-    from srfcli.output.records import to_csv, to_json
-    from srfcli.output.tables import to_text
+    from srfcli.results.provenance import Provenance, write_result
+    from srfcli.results.tables import to_csv, to_json, to_text
 
     text = "\n".join(to_text(t, full=False) for t in [table, *more])
     provenance = Provenance(Session.current().arguments, inputs=(trial.answers, trial.apart), seed=seed)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from srfcli.cli.options import Session, SrfCommand
+from srfcli.cli.base import Session, SrfCommand
 
 EXAMPLES = """
 srf fit EXPERIMENT --out results/fit.json --plot results/fit.svg
@@ -27,8 +27,8 @@ def command(folder: Path, title: str | None, out: str | None, force: bool) -> No
     Results are what `--out FILE.json` wrote; a figure of the same name beside one stands with it. A diagnosis has its own report,
     which `srf diagnose --out` writes.
     """
-    from srfcli.output.files import check_target, write_atomic
-    from srfcli.output.report_results import read_results, results_page
+    from srfcli.core.files import check_target, write_atomic
+    from srfcli.results.report import read_results, results_page
 
     results = read_results(folder)
     place = folder / "report.html" if out is None else Path(out).expanduser()

@@ -7,26 +7,26 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
     OutputOptions,
     Range,
-    SrfCommand,
     SystemOptions,
     output_options,
     over_option,
     system_options,
     values_option,
 )
-from srfcli.laws import Parameter
-from srfcli.output.plots import titled
-from srfcli.status import Status
+from srfcli.core.errors import Status
+from srfcli.core.settings import Parameter
+from srfcli.results.plots import titled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from srfcli.model import GeneratedModel
-    from srfcli.output.tables import Column, Table
-    from srfcli.settings import Resolved
+    from srfcli.codegen.model import GeneratedModel
+    from srfcli.core.settings import Resolved
+    from srfcli.results.tables import Column, Table
 
 EXAMPLES = """
 srf response --V 10 --W0 6 --over f=1:1000:200 --plot response.svg
@@ -66,7 +66,7 @@ def command(
     what the modulation takes off the mean friction force, at any amplitude.
     """
     from srfcli.cli.emit import emit, finish
-    from srfcli.errors import SrfError
+    from srfcli.core.errors import SrfError
 
     if len(over) != 1:
         raise SrfError(f"--over is given {len(over)} times", "One parameter is swept: --over f=1:1000:200.")
@@ -101,7 +101,7 @@ def _linear(model: GeneratedModel, resolved: Resolved, swept: Range) -> tuple[Ta
     import numpy as np
 
     from srfcli.numerics.response import linear_response, resonance
-    from srfcli.output.tables import Table
+    from srfcli.results.tables import Table
 
     values = np.array(swept.base_points(model.parameters, where=model.title))
     shown = [model.declared(swept.name, v) for v in values]
@@ -132,7 +132,7 @@ def _linear(model: GeneratedModel, resolved: Resolved, swept: Range) -> tuple[Ta
 
 
 def _bode(x: list[float], parts: dict[str, Any], xlabel: str, log: bool, title: str) -> Figure:
-    from srfcli.output.maps import gains
+    from srfcli.results.figures import gains
 
     labels = {"friction": "µ", "force": "µW/W$_0$", "position": "x  [µm]", "velocity": "v/V"}
     return gains(x, {labels[k]: v for k, v in parts.items()}, xlabel=xlabel.replace("um", "µm"), logx=log, title=title)
@@ -145,8 +145,8 @@ def _mean(
     import numpy as np
 
     from srfcli.numerics.response import mean_friction
-    from srfcli.output.tables import Table
     from srfcli.results.boundary import worst
+    from srfcli.results.tables import Table
 
     values = np.array(swept.base_points(model.parameters, where=model.title))
     rows, statuses, curves = [], [], []
@@ -174,7 +174,7 @@ def _mean(
     log = swept.values is None and swept.spacing == "log"
 
     def figure() -> Figure:
-        from srfcli.output import plots
+        from srfcli.results import plots
 
         label = f"{swept.name}  [{unit.replace('um', 'µm')}]"
         names = [f"ε = {eps:g}" for eps in amplitudes]
@@ -193,7 +193,7 @@ def _mean(
 
 def _mean_columns(name: str, unit: str) -> tuple[Column, ...]:
     """Return the columns of --mean."""
-    from srfcli.output.tables import Column
+    from srfcli.results.tables import Column
 
     return (
         Column("eps", "1", "modulation amplitude"),
@@ -210,7 +210,7 @@ def _mean_columns(name: str, unit: str) -> tuple[Column, ...]:
 
 def _linear_columns(name: str, unit: str) -> tuple[Column, ...]:
     """Return the columns of the transfer functions."""
-    from srfcli.output.tables import Column
+    from srfcli.results.tables import Column
 
     about = {
         "friction": ("1", "of the friction coefficient"),

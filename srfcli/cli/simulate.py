@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from srfcli.cli.options import OutputOptions, Session, SrfCommand, SystemOptions, output_options, system_options
-from srfcli.errors import SrfError
-from srfcli.status import Status
+from srfcli.cli.base import Session, SrfCommand
+from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options
+from srfcli.core.errors import SrfError, Status
 
 if TYPE_CHECKING:
     from srfcli.results.simulation import Record, Work
@@ -168,13 +168,13 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
 
 
 def _own(system: SystemOptions, given: dict[str, Any]) -> Work:
-    from srfcli.cli.simulate_own import own_record
+    from srfcli.cli.simulate_records import own_record
 
     return own_record(system, given)
 
 
 def _repeated(system: SystemOptions, experiment: Path, given: dict[str, Any]) -> Work:
-    from srfcli.cli.simulate_runs import repeated_runs
+    from srfcli.cli.simulate_records import repeated_runs
 
     return repeated_runs(system, experiment, given)
 
@@ -209,7 +209,7 @@ def _check_folder(given: dict[str, Any], experiment: Path | None, output: Output
             if given[name] != unset:
                 raise SrfError(f"{option} is about an experiment that is written", "Name its folder: --out-dir DIR.")
         return
-    from srfcli.recording.writing import check_folder
+    from srfcli.data.writing import check_folder
 
     source = experiment and (experiment if experiment.is_dir() else experiment.parent)
     if source and folder.resolve() == source.resolve():
@@ -229,8 +229,8 @@ def _write(
     timings: dict[str, float],
 ) -> None:
     """Write the experiment folder and its sidecar; an unfinished one is not written, as nothing in it would say so."""
-    from srfcli.output.provenance import Provenance, sidecar, sidecar_path
-    from srfcli.recording.writing import DESCRIPTION, write_experiment
+    from srfcli.data.writing import DESCRIPTION, write_experiment
+    from srfcli.results.provenance import Provenance, sidecar, sidecar_path
 
     session = Session.current()
     if not status.ok:

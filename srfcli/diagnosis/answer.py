@@ -7,18 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from srfcli.diagnosis.locate import Location
-from srfcli.diagnosis.parting import Parting
-from srfcli.diagnosis.partingtext import described
-from srfcli.diagnosis.places import Row
-from srfcli.diagnosis.refits import Refit
+from srfcli.codegen.model import Array
+from srfcli.core.units import find_unit, from_base, split_quantity
+from srfcli.data.values import Run
+from srfcli.diagnosis.design import Parting, described
+from srfcli.diagnosis.hypotheses import Refit
+from srfcli.diagnosis.residual_scan import Location, Row
 from srfcli.diagnosis.verdict import NOTHING, Diagnosis
-from srfcli.inference.latent import LatentFit
 from srfcli.inference.noise import stretches, whiten
 from srfcli.inference.prediction import of_run
-from srfcli.numerics.collocation import Array
-from srfcli.recording.values import Run
-from srfcli.units import find_unit, from_base, split_quantity
+from srfcli.inference.random_field import LatentFit
 
 SCHEMA = "srf.diagnose/1"
 

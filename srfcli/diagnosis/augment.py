@@ -1,27 +1,39 @@
-"""The augmented model as an experiment that every other command accepts: fitted laws, effects, the same recordings."""
+"""The augmented model as an experiment that every other command accepts: laws with the effects merged into them.
+
+An effect goes into a law where the law's language has what it names. What belongs to the apparatus, or names what laws do not
+know (position, time, the load in a friction coefficient), stays an effect beside the laws.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sympy as sp
 
-from srfcli.diagnosis.candidates import Hypothesis
-from srfcli.diagnosis.foldlaws import Folded, fold, law_files
-from srfcli.inference.latent import LatentFit
-from srfcli.laws import Effect
-from srfcli.recording.node import open_node
-from srfcli.recording.values import Experiment, FitParameter
-from srfcli.recording.writing import DESCRIPTION, KILOGRAM, shortest
-from srfcli.registry import Registry, bundled_folder
-from srfcli.system import apart
-from srfcli.units import find_unit, split_quantity
+from srfcli.core.errors import SrfError
+from srfcli.core.settings import Parameter
+from srfcli.core.units import find_unit, from_base, split_quantity
+from srfcli.data.description import open_node
+from srfcli.data.values import Experiment, FitParameter, ModelChoice
+from srfcli.data.writing import DESCRIPTION, KILOGRAM, shortest
+from srfcli.diagnosis.hypotheses import Hypothesis
+from srfcli.inference.random_field import LatentFit
+from srfcli.laws.effect_file import formula_text
+from srfcli.laws.expression import parse_expression, symbol
+from srfcli.laws.law_file import FORMAT, known_symbols
+from srfcli.laws.registry import Registry, bundled_folder
+from srfcli.laws.values import AgeingLaw, Effect, FrictionLaw, Interface, Law, State
+from srfcli.symbolic.system import apart
+
+# The augmented model as an experiment that every other command accepts: fitted laws, effects, the same recordings.
 
 LARGEST = 256 * 2**20  # bytes of recordings that are copied; larger ones stay where they are, and are named from there
 LAWS = ("friction", "ageing", "interface")
@@ -82,7 +94,7 @@ def augment(
     lines += [f"stiffness = {_value(text)}"] + ([f'mass = "{shortest(mass, KILOGRAM)!r} kg"'] if mass else [])
     lines += ["", "[model]", *(f'{"law" if kind == "friction" else kind} = "{kind}.toml"' for kind in LAWS)]
     lines += [f"inertia = {_value(inertia)}"] + ([f"effects = {_value(list(effects))}"] if effects else [])
-    lines += ["", "[parameters]", *(_parameter(q, base) for q in listed)]
+    lines += ["", "[parameters]", *(_free_parameter(q, base) for q in listed)]
     if "columns" in description:
         lines += ["", "[columns]", *(f"{_key(k)} = {_value(v)}" for k, v in description["columns"].items())]
     for run in runs:
@@ -144,7 +156,7 @@ def _runs(
     return runs, copies
 
 
-def _parameter(q: FitParameter, stiffness_unit: str) -> str:
+def _free_parameter(q: FitParameter, stiffness_unit: str) -> str:
     factor = find_unit(stiffness_unit if q.name == "K" else q.unit).factor
     cells = {"value": q.value, "lower": q.lower, "upper": q.upper}
     parts = [f"{name} = {shortest(value, factor)!r}" for name, value in cells.items() if np.isfinite(value)]
@@ -166,3 +178,167 @@ def _value(value: Any) -> str:
 
 def _key(name: str) -> str:
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _value(name)
+
+
+# Laws with effects written into them: friction, ageing and interface files that say what a fitted model says.
+
+KINDS = {"mu": "friction", "rate": "ageing", "kappa": "interface"}
+
+
+@dataclass(frozen=True)
+class Folded:
+    """The laws with what could be written into them; `left` are the effects that stay beside them, as they are registered."""
+
+    friction: FrictionLaw
+    ageing: AgeingLaw
+    interface: Interface
+    left: tuple[Effect, ...] = ()
+    changed: frozenset[str] = field(default=frozenset())
+
+    def law(self, slot: str) -> Law:
+        """Return the law that has a slot."""
+        return {"mu": self.friction, "rate": self.ageing, "kappa": self.interface}[slot]
+
+    def formula(self, slot: str) -> sp.Expr | None:
+        """Return the formula in a slot; None for a rigid interface."""
+        return {"mu": self.friction.mu, "rate": self.ageing.rate, "kappa": self.interface.kappa}[slot]
+
+
+def fold(registry: Registry, choice: ModelChoice, effects: Sequence[Effect]) -> Folded:
+    """Return the laws of `choice` with its own effects and `effects` written into them as far as that can be done exactly."""
+    chosen = {key: value for e in effects for key, value in e.settings}
+    base, modifiers = registry.ageing(choice.ageing)
+    rate = base.rate + sum((m.term for m in modifiers), sp.S.Zero)
+    ageing = replace(base, rate=rate, parameters=(*base.parameters, *(p for m in modifiers for p in m.parameters)))
+    friction = registry.get("friction", choice.law)
+    interface = registry.get("interface", str(chosen.get("interface", choice.interface)))
+    assert isinstance(friction, FrictionLaw) and isinstance(interface, Interface)
+    found = Folded(friction, ageing, interface, changed=frozenset({"ageing"} if modifiers else ()))
+    every = [*(_effect(registry, name) for name in choice.effects), *effects]
+    pairs = [(own, named) for own, named in zip(every, apart(every), strict=True) if named.changes or named.states]
+    stays: list[Effect] = []
+    for own, named in sorted(pairs, key=lambda p: all(slot != "rate" for slot, _ in p[1].changes)):
+        new = None if own.name in choice.effects else _folded(found, named, stays)
+        if new is None:
+            stays.append(named)
+            found = replace(found, left=(*found.left, own))
+        else:
+            found = new
+    order = {e.name: i for i, e in enumerate(every)}
+    return replace(found, left=tuple(sorted(found.left, key=lambda e: order[e.name])))
+
+
+def _effect(registry: Registry, name: str) -> Effect:
+    effect = registry.get("effect", name)
+    assert isinstance(effect, Effect)
+    return effect
+
+
+def _folded(laws: Folded, effect: Effect, stays: Sequence[Effect]) -> Folded | None:
+    """Return the laws with an effect, whose parameters have their final names; None where their language cannot say it."""
+    if not effect.constitutive or len(effect.changes) != 1 or effect.observed:
+        return None
+    ((slot, formula),) = effect.changes
+    before = laws.formula(slot) if slot in KINDS else None
+    if before is None or not all(_commute(slot, formula, other) for other in stays):
+        return None
+    states = _states(laws, effect)
+    if states is None:
+        return None
+    law = laws.law(slot)
+    new = formula.xreplace({symbol(slot): before})
+    parameters = (*law.parameters, *(p for p in effect.parameters if p.name not in {q.name for q in law.parameters}))
+    every = (*laws.friction.states, *states)
+    known = known_symbols(KINDS[slot], (p.name for p in parameters), every)
+    if not {str(s) for s in new.free_symbols} <= set(known) or not _sayable(new, known):
+        return None
+    changed = laws.changed | {KINDS[slot]}
+    common: dict[str, Any] = {
+        "parameters": parameters,
+        "cites": tuple(dict.fromkeys((*law.cites, *effect.cites))),
+        "checks": (),
+    }
+    common["about"] = f"{law.about.rstrip('.')}; {effect.about[:1].lower()}{effect.about[1:]}"
+    if slot == "mu":
+        return replace(laws, friction=replace(laws.friction, mu=new, states=every, **common), changed=changed)
+    if slot == "rate":
+        return replace(laws, ageing=replace(laws.ageing, rate=new, **common), changed=changed)
+    return replace(laws, interface=replace(laws.interface, kappa=new, **common), changed=changed)
+
+
+def _commute(slot: str, formula: sp.Expr, other: Effect) -> bool:
+    """Return whether a formula may act before another effect's that stays beside the laws, and so acts last."""
+    s = symbol(slot)
+    for where, later in other.changes:
+        if where == slot and sp.expand(formula.xreplace({s: later}) - later.xreplace({s: formula})) != 0:
+            return False
+    return True
+
+
+def _states(laws: Folded, effect: Effect) -> tuple[State, ...] | None:
+    """Return an effect's unknowns as states of the friction law; None unless the ageing law itself rules them."""
+    found = []
+    names = [p.name for p in effect.parameters]
+    for extra in effect.states:
+        length = next((n for n in names if sp.simplify(extra.steady - symbol(n) / symbol("v")) == 0), None)
+        weight = next((n for n in effect.sizes if n != length), None)
+        if length is None or weight is None or not extra.logarithmic:
+            return None
+        swap = {symbol("phi"): symbol(extra.name), symbol("D0"): symbol(length), symbol("B"): symbol(weight)}
+        if sp.simplify(laws.ageing.rate.subs(swap, simultaneous=True) - extra.rate) != 0:
+            return None
+        found.append(State(extra.name, length, weight))
+    return tuple(found)
+
+
+def _sayable(formula: sp.Expr, known: Sequence[str]) -> bool:
+    """Return whether a formula, written as text, is read as the same."""
+    try:
+        again = parse_expression(formula_text(formula), known)
+    except SrfError:
+        return False
+    if again == formula:
+        return True
+    at = {s: sp.Float(0.3 + 0.1 * i) for i, s in enumerate(sorted(formula.free_symbols, key=str))}
+    one, other = (complex(e.xreplace(at).evalf()) for e in (formula, again))
+    return abs(one - other) <= 1e-12 * (1 + abs(one))
+
+
+def law_files(laws: Folded, values: Mapping[str, float]) -> dict[str, str]:
+    """Return friction.toml, ageing.toml and interface.toml; `values`, in um, s, N, are their parameters' defaults."""
+    out = {}
+    for slot, kind in KINDS.items():
+        law, formula = laws.law(slot), laws.formula(slot)
+        suffix = "augmented" if kind in laws.changed else "fitted"
+        lines = [f'format = "{FORMAT}"', f'kind = "{kind}"', f"name = {_text(_name(law.name, suffix))}"]
+        lines += [f"about = {_text(law.about)}"] if law.about else []
+        lines += [f"cites = [{', '.join(map(_text, law.cites))}]"] if law.cites else []
+        lines += [f"{slot} = {_text(formula_text(formula))}"] if formula is not None else []
+        if slot == "mu" and laws.friction.states != (State(),):
+            states = (
+                f'{{ name = "{s.name}", length = "{s.length}", weight = "{s.weight}" }}' for s in laws.friction.states
+            )
+            lines.append(f"states = [{', '.join(states)}]")
+        lines += ["", "[parameters]", *(_law_parameter(p, values) for p in law.parameters)] if law.parameters else []
+        out[f"{kind}.toml"] = "\n".join(lines) + "\n"
+    return out
+
+
+def _name(name: str, suffix: str) -> str:
+    stem = name
+    for word in ("-augmented", "-fitted"):
+        stem = stem.removesuffix(word)
+    return f"{stem[:50].rstrip('-')}-{suffix}"
+
+
+def _law_parameter(p: Parameter, values: Mapping[str, float]) -> str:
+    value = from_base(values[p.name], p.unit) if p.name in values else p.default
+    value = min(max(value, p.lower), p.upper)
+    parts = [f"default = {float(value)!r}", f"unit = {_text(p.unit)}"]
+    parts += [f"{key} = {float(x)!r}" for key, x in (("lower", p.lower), ("upper", p.upper)) if math.isfinite(x)]
+    parts += [f"about = {_text(p.about)}"] if p.about else []
+    return f"{p.name} = {{ {', '.join(parts)} }}"
+
+
+def _text(value: str) -> str:
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

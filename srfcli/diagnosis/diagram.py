@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from srfcli.errors import SrfError
-from srfcli.expression import symbol
+from srfcli.codegen.model import Array, GeneratedModel, open_model
+from srfcli.core.errors import SrfError
+from srfcli.data.values import Experiment
 from srfcli.inference.prediction import stiffness_share
-from srfcli.laws import Effect
-from srfcli.model import GeneratedModel, open_model
-from srfcli.numerics.atlas import AtlasSettings, find_components
-from srfcli.numerics.collocation import Array
+from srfcli.laws.expression import symbol
+from srfcli.laws.registry import Registry
+from srfcli.laws.values import Effect
+from srfcli.numerics.continuation import AtlasSettings, find_components
+from srfcli.numerics.critical import load_window
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.numerics.windows import load_window
-from srfcli.recording.values import Experiment
-from srfcli.registry import Registry
 
 VELOCITIES = 61
 CORNERS = 5  # velocities at which the loads without modulation say where boundaries are looked for

@@ -7,20 +7,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from srfcli.diagnosis.adequacy import DOUBT, SURE, Adequacy, joined, sampled
-from srfcli.diagnosis.candidates import Excluded, Hypothesis, applicable, neutral_values, own_parameters
-from srfcli.diagnosis.follower import LOOSE, Follower
-from srfcli.diagnosis.refits import HALFWAY, NEAR, Refit, judge_fit
-from srfcli.diagnosis.score import Score
-from srfcli.diagnosis.search import CLOSE, Search
-from srfcli.inference.bumps import likeliest_bump
+from srfcli.codegen.model import Array
+from srfcli.core.units import to_base
+from srfcli.data.values import Experiment, Run
+from srfcli.diagnosis.goodness_of_fit import DOUBT, SURE, Adequacy, joined, sampled
+from srfcli.diagnosis.hypotheses import (
+    HALFWAY,
+    NEAR,
+    Excluded,
+    Hypothesis,
+    Refit,
+    applicable,
+    judge_fit,
+    neutral_values,
+    own_parameters,
+)
+from srfcli.diagnosis.nudging import LOOSE, Follower
+from srfcli.diagnosis.staged_score import Score
+from srfcli.diagnosis.staged_search import CLOSE, Search
 from srfcli.inference.fit import Problem
-from srfcli.inference.latent import fit_latent
 from srfcli.inference.noise import Noise
-from srfcli.inference.tracks import tracks_for
-from srfcli.numerics.collocation import Array
-from srfcli.recording.values import Experiment, Run
-from srfcli.units import to_base
+from srfcli.inference.random_field import fit_latent, likeliest_bump, tracks_for
 
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
 NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline

@@ -12,15 +12,31 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from srfcli.errors import SrfError, did_you_mean
-from srfcli.inference.linear import inverse, root
+from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.core.errors import SrfError, Status, did_you_mean
+from srfcli.data.values import Experiment, Run
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
-from srfcli.inference.nuisance import own_names, own_start
-from srfcli.inference.prediction import RTOL, Hold, Prediction, predict, run_parameters
-from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import Array
-from srfcli.recording.values import Experiment, Run
-from srfcli.status import Status
+from srfcli.inference.prediction import RTOL, Hold, Prediction, own_names, own_start, predict, run_parameters
+
+# Covariances from information matrices that may be nearly singular.
+
+
+def inverse(information: Array) -> Array:
+    """Return the inverse, after scaling; a direction that nothing determines gets an enormous variance, not a failure."""
+    d = np.maximum(np.sqrt(np.diag(information)), 1e-8)  # of scaled parameters: nothing that matters is so flat
+    values, vectors = np.linalg.eigh(information / np.outer(d, d))
+    inverse = (vectors / np.maximum(values, 1e-14)) @ vectors.T
+    return np.asarray(inverse / np.outer(d, d))
+
+
+def root(covariance: Array) -> Array:
+    """Return the principal directions of a covariance, one standard deviation long each, as columns."""
+    d = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(d, d))
+    return np.asarray((d[:, None] * vectors) * np.sqrt(np.maximum(values, 0.0)))
+
+
+# Maximum likelihood over all runs of an experiment together: whitened residuals, exact gradients, growing horizons.
 
 LINEAR = 0.25  # of a run's amplitude: a prediction that bends by more is not used yet
 STAGES = 12

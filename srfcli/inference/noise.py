@@ -12,7 +12,7 @@ from math import comb, sqrt
 
 import numpy as np
 
-from srfcli.numerics.collocation import Array
+from srfcli.codegen.model import Array
 
 ORDERS = 6
 UNEVEN = 1.5  # a spacing so much longer or shorter than its neighbours' ends an evenly sampled stretch

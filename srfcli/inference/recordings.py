@@ -1,23 +1,26 @@
-"""The fit of an experiment's recordings as `srf fit` makes it: which likelihood, which starts, whose random friction field."""
+"""The fit of an experiment's recordings as `srf fit` makes it: likelihood, starts, random friction field."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from typing import Any
 
-from srfcli.errors import SrfError
-from srfcli.inference.fit import Fit, Interrupted, Problem, fit_problem, held_fit
-from srfcli.inference.rough import ALIKE, SURELY, SharedFit, fit_shared, shared_field
-from srfcli.inference.starts import fit_from_several
-from srfcli.inference.statespace import StateSpaceFit, as_fit, fit_state_space, stopped
-from srfcli.model import open_model
-from srfcli.numerics.collocation import Array
-from srfcli.numerics.compiled import compiler
-from srfcli.recording.values import Experiment
-from srfcli.registry import Registry
-from srfcli.status import Status
+import numpy as np
+
+from srfcli.codegen.c_source import compiler
+from srfcli.codegen.model import Array, open_model
+from srfcli.core.errors import SrfError, Status
+from srfcli.data.values import Experiment, Run
+from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, fit, fit_problem, held_fit
+from srfcli.inference.noise import Noise, estimate_noise, stretches, white_level
+from srfcli.inference.random_field import Latent, LatentFit, Roughness, fit_latent, tracks_for
+from srfcli.inference.state_space import StateSpaceFit, as_fit, fit_state_space, stopped
+from srfcli.laws.registry import Registry
+
+# The fit of an experiment's recordings as `srf fit` makes it: which likelihood, which starts, whose random friction field.
 
 
 @dataclass(frozen=True)
@@ -133,3 +136,143 @@ def _without_compiler(
         return RecordingFit(problem, held_fit(problem, error.values), None, None, (), Status.INTERRUPTED)
     status = Status.INTERRUPTED if several.interrupted else several.best.status
     return RecordingFit(problem, several.best, None, None, tuple(several.rows), status)
+
+
+# Several starts: the file's own, and others drawn over the bounds, so that a false minimum is found out.
+
+SPREAD = 0.3  # of the way from the start value to each bound, at most
+Fitter = Callable[[Array, Callable[[str], None]], tuple[Fit, Any]]
+SAME = 0.5  # standard errors between two minima that count as one
+
+
+def start_points(problem: Problem, count: int, seed: int) -> list[Array]:
+    """Return `count` starting points (k,): the problem's own first, then a Latin hypercube about it, within the bounds."""
+    from scipy.stats import qmc
+
+    points = [problem.start]
+    if count > 1:
+        cube = 2 * qmc.LatinHypercube(d=problem.start.size, rng=np.random.default_rng(seed)).random(count - 1) - 1
+        reach = np.where(cube > 0, problem.upper - problem.start, problem.start - problem.lower)
+        points += list(problem.start + SPREAD * cube * reach)
+    return points
+
+
+@dataclass(frozen=True)
+class Several:
+    """Fits from several starts: the best with what its fitter returned beside it, and for each start that ended a row.
+
+    A row is the log likelihood, and whether that start ended in the best one's minimum. `interrupted` where not all were done.
+    """
+
+    best: Fit
+    beside: Any
+    rows: list[tuple[float, bool]]
+    interrupted: bool
+
+
+def fit_from_several(
+    problem: Problem,
+    *,
+    fitter: Fitter | None = None,
+    count: int = 1,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Several:
+    """Return the best fit over the starts, each by `fitter(start, progress)`, plain least squares if left out.
+
+    Ctrl-C ends them where one is done, and is `Interrupted` where none is.
+    """
+    fits: list[tuple[Fit, Any]] = []
+    interrupted = False
+    for number, start in enumerate(start_points(problem, count, seed), 1):
+        prefix = f"start {number} of {count}: " if count > 1 else ""
+
+        def report(text: str, prefix: str = prefix) -> None:
+            progress(prefix + text)
+
+        try:
+            fits.append((fit(problem, start=start, progress=report), None) if fitter is None else fitter(start, report))
+        except (Interrupted, KeyboardInterrupt):
+            if not fits:
+                raise
+            interrupted = True
+            break
+    best, beside = max(fits, key=lambda f: f[0].log_likelihood)
+    away = [
+        max(abs(f.values[n] - best.values[n]) / max(best.stderr[n], 1e-300) for n in problem.names) for f, _ in fits
+    ]
+    rows = [(f.log_likelihood, d < SAME) for (f, _), d in zip(fits, away, strict=True)]
+    return Several(best, beside, rows, interrupted)
+
+
+# A fit of recordings whose runs slid on one and the same rough track, which is integrated out of its errors.
+
+SURELY = 2.0  # in log likelihood, by which one track for all runs has to be likelier than one for each
+ALIKE = 0.5  # mean correlation of the fields of two runs from which one field for all is fitted
+
+
+@dataclass(frozen=True)
+class SharedFit:
+    """A fit in which all runs slid on one track, and what that is like."""
+
+    fit: Fit
+    roughness: Roughness
+
+
+def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] = lambda text: None) -> SharedFit:
+    """Return the fit in which mu0 wanders along one track that all runs share, from where another fit stands.
+
+    The problem's model has the table ("mu", "slip"). Held-out runs are judged on that track.
+    """
+    progress("one rough track for all runs")
+    theta = np.array([begun.values[name] for name in problem.names])
+    noise = {r.name: Noise(r.noise.level) for r in begun.runs if not r.holdout}
+    found = fit_latent(problem, theta, noise, tracks=tracks_for(problem.runs, shared=True))
+    runs = tuple(_judged(problem, found, name) for name in (r.name for r in begun.runs))
+    fitted = replace(
+        begun, values=problem.named(found.point.theta), covariance=found.covariance, runs=runs,
+        log_likelihood=found.log_likelihood, status=Status.OK, evaluations=begun.evaluations + found.evaluations,
+    )  # fmt: skip
+    return SharedFit(fitted, found.point.roughness)
+
+
+def shared_field(found: StateSpaceFit) -> float:
+    """Return the mean correlation of the smoothed fields of any two runs over the slip that both have; 0 where none has any."""
+    if found.smooth or len(found.likelihood.problem.runs) < 2:
+        return 0.0
+    point = found.likelihood.at(found.maximum.point.x, slopes=False, keep=True)
+    fields = {f.run.name: (f.run, f.smoothed().mean) for f in point.runs}
+    states = found.likelihood.problem.model.states
+    length = found.values["field_length"]
+    products, first, second = 0.0, 0.0, 0.0
+    for (a, x), (b, y) in combinations(fields.values(), 2):
+        s, r = slip_along(a, x, states), slip_along(b, y, states)
+        where = np.arange(max(s[0], r[0]), min(s[-1], r[-1]), 0.5 * length)
+        if where.size < 10:
+            continue
+        m, n = (np.interp(where, place, z[:, states.index("field")]) for place, z in ((s, x), (r, y)))
+        m, n = m - m.mean(), n - n.mean()
+        products, first, second = products + float(m @ n), first + float(m @ m), second + float(n @ n)
+    return products / np.sqrt(first * second) if first and second else 0.0
+
+
+def slip_along(run: Run, x: Array, states: tuple[str, ...]) -> Array:
+    """Return the slip (n,) in um along smoothed states, from the run's start on."""
+    v = np.exp(x[:, states.index("ln_v")])
+    moved = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(run.t))])
+    if "u" in states:  # exact, where stick-slip is faster than the samples
+        V, u = run.drive(run.t), x[:, states.index("u")]
+        moved = np.concatenate([[0.0], np.cumsum(0.5 * (V[1:] + V[:-1]) * np.diff(run.t))]) - (u - u[0])
+    return np.asarray(run.start + moved)
+
+
+def _judged(problem: Problem, found: LatentFit, name: str) -> RunFit:
+    run, tracks = next(r for r in problem.experiment.runs if r.name == name), found.point.tracks
+    if name not in tracks.of:
+        tracks = replace(tracks, of={**tracks.of, name: 0})
+    prediction = Latent(problem).predicted(run, found.point.theta, tracks, slopes=False)
+    residual = run.observed - prediction.y
+    parts = stretches(run.t, run.used)
+    return RunFit(
+        name, run.holdout, prediction, residual, parts, estimate_noise(residual, parts), white_level(residual, parts)
+    )

@@ -1,1 +1,1 @@
-"""Numerics on generated models: arrays in, arrays out; neither sympy nor click is imported here."""
+"""Periodic states, their stability, boundaries and maps: arrays in, arrays out; neither sympy nor click is imported here."""

@@ -1,4 +1,4 @@
-"""Points of a stability boundary: a forced periodic state one of whose multipliers lies on the unit circle.
+"""Points of a stability boundary: a multiplier on the unit circle, found to full precision.
 
 The unknowns are the state at tau = 0 and the parameters `names`; the test function is g = ln |rho| of one multiplier, so that
 Neimark-Sacker, period-doubling and fold boundaries obey one equation. The gradient of g is exact for the discretised
@@ -9,21 +9,29 @@ generated bilinear forms supply d(w . J v). The bordered system is regular at fo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from srfcli.model import GeneratedModel
+from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
+from srfcli.core.errors import Status
 from srfcli.numerics.collocation import (
-    Array,
-    ComplexArray,
     Condensed,
     Discretisation,
     condense,
+    expand,
     gauss,
+    growth_compiled,
+    join,
+    kernel,
+    mesh_error,
     running_products,
     stage_parameters,
+    wanted_mesh,
 )
-from srfcli.numerics.orbitkernel import growth_compiled, kernel
+from srfcli.numerics.orbit import interpolate, newton_step, scales, step_limit, uniform_mesh
+
+# Points of a stability boundary: a forced periodic state one of whose multipliers lies on the unit circle.
 
 Names = tuple[str, ...]
 
@@ -137,3 +145,345 @@ def slope_in_last(linear: BoundaryLinear) -> Array:
         response = np.linalg.solve(np.where(usable[..., None, None], inner, np.eye(n)), last)[..., 0]
         response = np.where(usable[..., None], response, np.nan)
     return linear.growth[..., -1] - np.einsum("...n,...n->...", linear.growth[..., :n], response)
+
+
+# Boundary points to full precision: Newton's method in one parameter, then meshes doubled until the error is met.
+
+CHUNK = 48
+LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
+FINE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
+SHALLOW = 0.02  # slopes in ln|rho| per ln(parameter) below this are computed anew
+REGULAR = (
+    0.1  # from +1: where the critical multiplier is closer, an orbit at fixed parameters is not improved by itself
+)
+CHORD_GAIN = 0.02  # a chord step is taken to leave this share of the correction, until a second one shows its own
+
+
+@dataclass(frozen=True)
+class Direction:
+    """How points may move over the parameters `names`: `vectors` (B, k, d), in the logarithm of those marked `log`.
+
+    With d > 1 the rows `across` (B, d - 1, n + d) close the system: their products with the changes of the state at tau = 0
+    and of the d distances are zero.
+    """
+
+    names: tuple[str, ...]
+    vectors: Array
+    log: tuple[bool, ...]
+    across: Array | None = None
+
+    @property
+    def distances(self) -> int:
+        """Return d, the number of distances that a point has."""
+        return int(self.vectors.shape[-1])
+
+    def part(self, index: slice | Array) -> Direction:
+        """Return the directions of a part of the batch."""
+        return Direction(self.names, self.vectors[index], self.log, None if self.across is None else self.across[index])
+
+    def rates(self, values: Array) -> Array:
+        """Return dp/d(distances) (B, k, d) at parameter `values` (k, B)."""
+        return self.vectors * np.where(np.array(self.log)[:, None], values, 1.0).T[..., None]
+
+    def moved(self, values: Array, distances: Array) -> Array:
+        """Return `values` (k, B) moved by `distances` (B, d)."""
+        shift = np.einsum("bkd,bd->kb", self.vectors, distances)
+        return np.where(
+            np.array(self.log)[:, None],
+            values * np.exp(np.where(np.array(self.log)[:, None], shift, 0)),
+            values + shift,
+        )
+
+
+def along(name: str, count: int) -> Direction:
+    """Return the direction of ln(name) for `count` points."""
+    return Direction((name,), np.ones((count, 1, 1)), (True,))
+
+
+@dataclass(frozen=True)
+class BoundaryPoint:
+    """A located point of a stability boundary; `p` in the model's order, `rho` the critical multiplier.
+
+    `name` is the parameter whose rise crosses the boundary; `error` is the estimated relative error of its value, `low` and
+    `high` bracket it, `residual` is ln |rho| at the point, `others` the largest modulus among the other multipliers, `slope`
+    is d ln|rho| / d ln(name), the other parameters fixed: where positive, stability is lost as `name` rises.
+    """
+
+    p: Array
+    name: str
+    rho: complex
+    error: float
+    low: float
+    high: float
+    residual: float
+    others: float
+    slope: float
+    status: Status
+    orbit: Discretisation
+
+    @property
+    def kind(self) -> str:
+        """Return `ns`, `pd` or `fold`: the critical multiplier off the real axis, at -1, at +1."""
+        return bifurcation_kind(self.rho)
+
+    @property
+    def theta(self) -> float:
+        """Return the angle of the critical multiplier over one forcing period, in [0, pi]."""
+        return float(abs(np.angle(self.rho)))
+
+    def value(self, model: GeneratedModel, name: str) -> float:
+        """Return parameter `name` at this point, in um, s, N."""
+        return float(self.p[model.index(name)])
+
+
+def bifurcation_kind(rho: complex) -> str:
+    """Return `ns`, `pd` or `fold` for a multiplier off the real axis, negative, positive."""
+    if abs(rho.imag) > 1e-7 * abs(rho):
+        return "ns"
+    return "pd" if rho.real < 0 else "fold"
+
+
+@dataclass
+class _Polished:
+    p: Array
+    orbit: Discretisation
+    rho: ComplexArray
+    growth: Array
+    residual: Array
+    others: Array
+    slope: Array
+    converged: Array
+
+
+_POINTWISE = ("rho", "growth", "residual", "others", "slope", "converged")
+
+
+def polish(
+    model: GeneratedModel,
+    p: Array,
+    orbit: Discretisation,
+    target: ComplexArray,
+    direction: Direction,
+    *,
+    tol: float = 1e-8,
+    max_mesh: int = 512,
+    growth: Array | None = None,
+) -> list[BoundaryPoint]:
+    """Return boundary points near `p` (n_parameters, B), moved along `direction`, each on a mesh whose error is below `tol`.
+
+    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess, `growth` (B, n+1+k) gradients of ln |rho| where
+    they are known. A point that does not converge, or whose estimated error stays above `tol` on `max_mesh` intervals,
+    says so in its status.
+    """
+    points: list[BoundaryPoint | None] = [None] * p.shape[1]
+    count = p.shape[1]
+    rows = np.full((count, orbit.x.shape[-1] + 1 + len(direction.names)), np.nan) if growth is None else growth
+    blank = (*(np.full(count, np.nan),) * 3, np.ones(count, bool))
+    waiting = [(np.arange(count), _Polished(p, orbit, target, rows, *blank), growth is not None)]
+    while waiting:
+        index, coarse, known = waiting.pop()
+        N = coarse.orbit.x.shape[-2]
+        wanted = wanted_mesh(mesh_error(model, coarse.orbit), N, tol, max_mesh)
+        for mesh in sorted(set(wanted.tolist())):  # np.unique imports numpy.ma
+            here = np.nonzero(wanted == mesh)[0]
+            part = _select(coarse, here)
+            start = part.orbit if mesh == N else interpolate(part.orbit, uniform_mesh(int(mesh)))
+            lines = direction.part(index[here])
+            fine = _newton(model, part.p, start, part.rho, lines, part.growth if known else None, tol)
+            error = mesh_error(model, fine.orbit) + np.where(fine.converged, fine.residual, 0.0)
+            _renew_gradients(model, fine, lines, tol)
+            done = (error <= tol) | ~fine.converged | (mesh >= max_mesh)
+            for j in np.nonzero(done)[0]:
+                end = int(index[here[j]])
+                points[end] = _point(model, fine, int(j), direction.names[-1], float(error[j]), tol)
+            again = np.nonzero(~done)[0]
+            if again.size:
+                waiting.append((index[here[again]], _select(fine, again), True))
+    return [q for q in points if q is not None]
+
+
+def _point(model: GeneratedModel, r: _Polished, j: int, name: str, error: float, tol: float) -> BoundaryPoint:
+    value = float(r.p[model.index(name), j])
+    status = Status.OK if error <= tol else Status.TOLERANCE
+    return BoundaryPoint(
+        p=r.p[:, j].copy(),
+        name=name,
+        rho=complex(r.rho[j]),
+        error=error,
+        low=value * (1 - error),
+        high=value * (1 + error),
+        residual=float(r.residual[j]),
+        others=float(r.others[j]),
+        slope=float(r.slope[j]),
+        status=status if r.converged[j] else Status.NO_CONVERGENCE,
+        orbit=r.orbit.part(slice(j, j + 1)),
+    )
+
+
+def _select(r: _Polished, keep: Array) -> _Polished:
+    fields = (getattr(r, k)[keep] for k in _POINTWISE)
+    return _Polished(r.p[:, keep], r.orbit.part(keep), *fields)
+
+
+def _newton(
+    model: GeneratedModel,
+    p: Array,
+    orbit: Discretisation,
+    target: ComplexArray,
+    direction: Direction,
+    growth: Array | None,
+    tol: float,
+) -> _Polished:
+    parts = []
+    for a in range(0, p.shape[1], CHUNK):
+        cut = slice(a, a + CHUNK)
+        known = None if growth is None else growth[cut]
+        parts.append(_newton_chunk(model, p[:, cut], orbit.part(cut), target[cut], direction.part(cut), known, tol))
+    if len(parts) == 1:
+        return parts[0]
+    fields = (np.concatenate([getattr(q, k) for q in parts]) for k in _POINTWISE)
+    return _Polished(np.concatenate([q.p for q in parts], axis=1), join([q.orbit for q in parts]), *fields)
+
+
+def _newton_chunk(
+    model: GeneratedModel,
+    p: Array,
+    orbit: Discretisation,
+    target: ComplexArray,
+    direction: Direction,
+    growth: Array | None,
+    tol: float,
+    *,
+    max_iterations: int = 14,
+) -> _Polished:
+    """Solve {periodicity, ln |rho| = 0} in (orbit, distance along `direction`) for a batch on one mesh.
+
+    Known gradients `growth` make chord steps, which are kept up while they gain a factor of ten each.
+    """
+    B, n = p.shape[1], orbit.x.shape[-1]
+    rows = [model.index(name) for name in direction.names]
+    r = _Polished(
+        p.copy(),
+        Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges),
+        target.astype(complex).copy(),
+        np.full((B, n + 1 + len(rows)), np.nan) if growth is None else growth.copy(),
+        np.full(B, np.inf),
+        np.full(B, np.nan),
+        np.full(B, np.nan),
+        np.zeros(B, bool),
+    )
+    before, chord = np.full(B, np.inf), np.full(B, False)
+    if growth is not None:  # not where rho = 1: at fixed parameters the orbit is singular there
+        chord = np.abs(target - 1) > REGULAR
+        _orbits_only(model, r, np.nonzero(chord)[0])
+    active = np.arange(B)
+    for _ in range(max_iterations):
+        going = []
+        for by_chord in (True, False):
+            index = active[chord[active] == by_chord]
+            if index.size:
+                going.append(_step(model, r, index, direction.part(index), rows, by_chord, before, chord, tol))
+        active = np.concatenate(going) if going else active[:0]
+        if not active.size:
+            break
+    return r
+
+
+def _orbits_only(model: GeneratedModel, r: _Polished, index: Array) -> None:
+    """Make one Newton step of the orbits `index` at fixed parameters: a gradient from elsewhere knows nothing of it."""
+    if not index.size:
+        return
+    with np.errstate(all="ignore"):
+        _, dx, dstages, finite = newton_step(model, r.p[:, index], r.orbit.part(index))
+        limit = step_limit(model, dx, dstages)
+    good = index[finite]
+    r.orbit.x[good] += limit[finite, None, None] * dx[finite]
+    r.orbit.stages[good] += limit[finite, None, None, None] * dstages[finite]
+
+
+def _step(
+    model: GeneratedModel,
+    r: _Polished,
+    index: Array,
+    direction: Direction,
+    rows: list[int],
+    by_chord: bool,
+    before: Array,
+    chord: Array,
+    tol: float,
+) -> Array:
+    """Make one Newton or chord step of the points `index` of `r`, in place, and return those that are not finished."""
+    n, part, q = r.orbit.x.shape[-1], r.orbit.part(index), r.p[:, index]
+    unit = direction.rates(q[rows])  # dp/d(distances), (B, k, d)
+    with np.errstate(all="ignore"):
+        try:
+            known = r.growth[index] if by_chord else None
+            linear = linearise_boundary(model, q, part, direction.names, r.rho[index], known)
+        except np.linalg.LinAlgError:
+            return index[:0]  # they stay marked as not converged
+        matrix, right = _bordered(linear, unit, direction.across, by_chord)
+        finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
+        matrix[~finite] = np.eye(matrix.shape[-1])
+        step = np.linalg.solve(matrix, np.where(finite[:, None], right, 0.0)[..., None])[..., 0]
+        dq = step[:, n:]
+        dq = dq * np.minimum(1.0, LARGEST_STEP / np.maximum(np.abs(dq).max(axis=1), 1e-300))[:, None]
+        dx, dstages = expand(linear.condensed, step[:, :n], np.einsum("bkd,bd->bk", unit, dq))
+        limit = step_limit(model, dx, dstages)
+        change = np.abs(dx / scales(model, q)[:, None, :]).max(axis=(-1, -2))
+    usable: Any = finite & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
+    limit = np.where(usable, limit, 0.0)
+    dq = np.where(usable[:, None], limit[:, None] * dq, 0.0)
+    r.rho[index], r.growth[index] = linear.rho, linear.growth
+    r.others[index] = _largest_other(linear.multipliers, linear.rho)
+    r.p[np.asarray(rows)[:, None], index] = direction.moved(q[rows], dq)
+    r.orbit.x[index] += np.where(usable[:, None, None], limit[:, None, None] * dx, 0.0)
+    r.orbit.stages[index] += np.where(usable[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
+    size = np.maximum(0.1 * change, np.abs(dq).max(axis=1))
+    gain = np.where(np.isfinite(before[index]), size / before[index], CHORD_GAIN)
+    left = size * np.clip(gain, size, 1.0) if by_chord else size * size  # what the step just made leaves behind
+    enough = np.maximum(0.1 * tol, 0.1 * mesh_error(model, part))  # a tenth of the mesh's own error
+    done = usable & (left < enough) & (size < 1e-3)
+    r.residual[index] = np.where(done, left, np.abs(linear.g))
+    if done.any():
+        r.slope[index] = slope_in_last(linear) * q[rows[-1]]
+    r.converged[index[done]] = True
+    before[index] = size
+    chord[index] &= gain <= 0.3  # kept up while steps gain a factor of three
+    return index[usable & ~done]
+
+
+def _renew_gradients(model: GeneratedModel, r: _Polished, direction: Direction, tol: float) -> None:
+    """Bring the multipliers and gradients up to date, in place, where a stale one would show.
+
+    That is everywhere at a tight tolerance, and beside folds, where a gradient carried along may have the wrong sign.
+    """
+    index = np.nonzero(r.converged & ((tol < FINE) | ~(np.abs(r.slope) > SHALLOW)))[0]
+    for a in range(0, len(index), CHUNK):
+        here = index[a : a + CHUNK]
+        q = r.p[:, here]
+        linear = linearise_boundary(model, q, r.orbit.part(here), direction.names, r.rho[here])
+        r.rho[here], r.growth[here] = linear.rho, linear.growth
+        r.others[here] = _largest_other(linear.multipliers, linear.rho)
+        r.slope[here] = slope_in_last(linear) * q[model.index(direction.names[-1])]
+
+
+def _bordered(linear: BoundaryLinear, unit: Array, across: Array | None, chord: bool) -> tuple[Array, Array]:
+    """Return Newton's matrix (B, n+d, n+d) and right side for dx_0 and the distances along `unit` (B, k, d)."""
+    B, _, d = unit.shape
+    n = linear.periodic.shape[-2]
+    matrix, right = np.empty((B, n + d, n + d)), np.zeros((B, n + d))
+    matrix[:, :n, :n] = linear.periodic[..., :n]
+    matrix[:, :n, n:] = linear.periodic[..., n + 1 :] @ unit
+    matrix[:, n, :n] = linear.growth[..., :n]
+    matrix[:, n, n:] = (linear.growth[..., None, n + 1 :] @ unit)[..., 0, :]
+    if across is not None:
+        matrix[:, n + 1 :] = across
+    right[:, :n] = -linear.periodic[..., n]
+    right[:, n] = -(linear.g + (0 if chord else linear.growth[..., n]))
+    return matrix, right
+
+
+def _largest_other(multipliers: ComplexArray, rho: ComplexArray) -> Array:
+    """Return the largest modulus among the multipliers other than `rho` and its conjugate."""
+    pair = np.minimum(np.abs(multipliers - rho[:, None]), np.abs(multipliers - rho.conj()[:, None]))
+    return np.where(pair < 1e-9 * np.abs(rho)[:, None], 0.0, np.abs(multipliers)).max(axis=-1)

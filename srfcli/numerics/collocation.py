@@ -1,4 +1,6 @@
-"""Gauss collocation over one forcing period, condensed interval by interval.
+"""Gauss collocation over one forcing period, condensed interval by interval, in C where that is possible.
+
+Every function takes the library of `kernel(model)`; where that is None collocation, orbit and boundary do the same in NumPy.
 
 With m Gauss points an interval's stage system is one small dense block; eliminating it leaves an affine map of the
 interval's first state, and the ordered product of these maps is the monodromy matrix (Ascher, Mattheij and Russell 1995).
@@ -7,20 +9,139 @@ Leading axes are a batch of parameter points throughout.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
+from functools import cache, lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.model import GeneratedModel
-from srfcli.numerics.gauss import STAGES, gauss
-from srfcli.numerics.orbitkernel import condense_compiled, kernel
+from srfcli.codegen.c_source import NoForm, compiler, library_of, orbit_source
+from srfcli.codegen.model import Array, GeneratedModel
 
-Array = NDArray[Any]  # real; shapes are in the docstrings
-ComplexArray = NDArray[Any]
+# The Gauss-Legendre scheme of collocation, and the bound on a Newton step: what NumPy and compiled code must share.
+
+STAGES = 4
+LOG_STEP = 3.0  # a Newton step changes no velocity or age by more than a factor e^3
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """Gauss points `nodes` in [0, 1], the inverse of the collocation matrix, and x_1 = x_0 + step . (X - x_0)."""
+
+    nodes: Array
+    inverse: Array
+    step: Array
+    weights: Array
+
+
+@lru_cache
+def gauss(m: int = STAGES) -> Scheme:
+    """Return the Gauss-Legendre scheme of `m` stages (order 2m at the mesh points)."""
+    points, weights = np.polynomial.legendre.leggauss(m)
+    nodes = (points + 1) / 2
+    powers = np.arange(1, m + 1)
+    vandermonde = nodes[:, None] ** (powers - 1)
+    integral = (nodes[:, None] ** powers / powers) @ np.linalg.inv(vandermonde)
+    inverse = np.linalg.inv(integral)
+    return Scheme(nodes, inverse, (weights / 2) @ inverse, weights / 2)
+
+
+# Newton's equations of periodic orbits in C (codegen/orbit.c), called with arrays.
+
+
+@cache
+def kernel(model: GeneratedModel) -> ctypes.CDLL | None:
+    """Return the compiled equations of this model, or None: no compiler, or a formula that has no form in C."""
+    if compiler() is None:
+        return None
+    scheme = gauss()
+    try:
+        write = partial(orbit_source, model, {"MI": scheme.inverse, "STEP": scheme.step}, LOG_STEP)
+        library = library_of(write, ["orbits", model.source, repr(scheme), repr(LOG_STEP)])
+    except NoForm:
+        return None
+    library.srf_orbits.restype = ctypes.c_int
+    library.srf_condense.restype = library.srf_growth.restype = None
+    return library
+
+
+def newton_orbits(
+    library: ctypes.CDLL,
+    frame: tuple[Array, Array],
+    p: Array,
+    x: Array,
+    stages: Array,
+    size: Array,
+    tol: float,
+    max_iterations: int,
+) -> tuple[Array, Array, int]:
+    """Bring the orbits `x` (B, N, n), `stages` (B, N, m, n) to convergence in place; monodromy, converged, most iterations.
+
+    `frame` holds the Gauss points' phases (N, m) and the steps (N,), `p` is (n_parameters, B), `size` (B, n).
+    """
+    B, N, n = x.shape
+    monodromy, converged = np.full((B, n, n), np.nan), np.zeros(B, dtype=np.uint8)
+    parameters = np.ascontiguousarray(p.T)
+    used = library.srf_orbits(
+        B, N, *map(_at, frame), _at(parameters), _at(x), _at(stages), _at(size), ctypes.c_double(tol), max_iterations,
+        _at(monodromy), _at(converged),
+    )  # fmt: skip
+    if used < 0:
+        raise MemoryError
+    return monodromy, converged.astype(bool), used
+
+
+def condense_compiled(
+    library: ctypes.CDLL, frame: tuple[Array, Array], p: Array, x: Array, stages: Array, which: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return factored blocks, their pivots, local, maps and prefix as `Condensed` holds them; NaN where a block is singular."""
+    batch, (N, m, n), k = x.shape[:-2], stages.shape[-3:], len(which)
+    B, w, size = int(np.prod(batch)), n + 1 + k, m * n
+    lu, pivots = np.empty((*batch, N, size, size)), np.empty((*batch, N, size), dtype=np.intc)
+    local, maps = np.empty((*batch, N, m, n, w)), np.empty((*batch, N, w, w))
+    prefix, good = np.empty((*batch, N + 1, w, w)), np.empty(B, dtype=np.uint8)
+    parameters = np.ascontiguousarray(p.T)
+    library.srf_condense(
+        B, N, k, _at(which), *map(_at, frame), _at(parameters), _at(x), _at(stages), _at(lu), _at(pivots), _at(local), _at(maps),
+        _at(prefix), _at(good),
+    )  # fmt: skip
+    if not good.all():
+        bad = ~good.astype(bool).reshape(batch)
+        local[bad] = maps[bad] = prefix[bad] = np.nan
+    return lu, pivots, local, maps, prefix
+
+
+def growth_compiled(
+    library: ctypes.CDLL,
+    frame: tuple[Array, Array],
+    p: Array,
+    stages: Array,
+    which: Array,
+    condensed: tuple[Array, Array, Array, Array, Array],
+    eigen: tuple[Array, Array, Array],
+) -> Array:
+    """Return the derivative of ln |rho| in (dx_0, residual, dq), (..., n+1+k); `eigen`: rho, its right and left vectors."""
+    lu, pivots, local, maps, prefix = condensed
+    N, w = stages.shape[-3], prefix.shape[-1]
+    batch = stages.shape[:-3]
+    row, parameters = np.empty((*batch, w)), np.ascontiguousarray(p.T)
+    pairs = [np.ascontiguousarray(np.asarray(e, dtype=complex)) for e in eigen]
+    library.srf_growth(
+        int(np.prod(batch)), N, len(which), _at(which), _at(frame[0]), _at(parameters), _at(stages), _at(lu), _at(pivots),
+        _at(local), _at(maps), _at(prefix), *map(_at, pairs), _at(row),
+    )  # fmt: skip
+    return row
+
+
+def _at(array: Array) -> ctypes.c_void_p:
+    assert array.flags.c_contiguous
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+# Gauss collocation over one forcing period, condensed interval by interval.
+
 COVERING = 10.0
 COVERING_RIGID = 30.0  # without the interface's compliance the slip velocity follows the load without delay
 
@@ -117,9 +238,7 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     return Condensed(lu, local, maps, prefix, pivots)
 
 
-def condense_plainly(
-    model: GeneratedModel, p: Array, orbit: Discretisation, names: tuple[str, ...] = ()
-) -> Condensed:
+def condense_plainly(model: GeneratedModel, p: Array, orbit: Discretisation, names: tuple[str, ...] = ()) -> Condensed:
     """Return what `condense` does, in NumPy, the stage matrices as they are."""
     x, X = orbit.x, orbit.stages
     m, n = X.shape[-2:]

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.model import GeneratedModel
+from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
+from srfcli.core.errors import Status
 from srfcli.numerics.collocation import (
-    Array,
-    ComplexArray,
     Discretisation,
     condense_plainly,
     gauss,
@@ -17,9 +16,8 @@ from srfcli.numerics.collocation import (
     mesh_error,
     stage_parameters,
 )
+from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.orbit import interpolate, solve_orbits, uniform_mesh
-from srfcli.numerics.scan import robust_orbits
-from srfcli.status import Status
 
 FIRST_MESH = 16
 PATIENT = 256  # intervals up to which a state that was not found is looked for on a finer mesh

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import Array
-from srfcli.status import Status
+from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.core.errors import Status
 
 WORST_RESIDUAL = 1e-9
 SCAN = np.geomspace(1e-9, 1e9, 1801)  # times K * 1 um: loads at which a non-polynomial determinant is looked at

@@ -1,18 +1,30 @@
-"""Stability maps: the leading Floquet multiplier over a grid of two parameters, put together from its tiles."""
+"""Stability maps: the leading Floquet multiplier over a grid of two parameters, tile by tile, refined where it matters.
+
+Newton's method starts from the polynomial through up to six neighbours along a row or column of the grid: most orbits then need
+a single linearisation, whose product of maps is the monodromy matrix that is wanted.
+
+In a cell whose corners agree in sign a boundary can hide only where g comes within its interpolation error of zero. That error is
+taken from second differences of the grid, and in a cell that was halved from how far its new points lie off the mean of the old.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import Array, ComplexArray, Discretisation
-from srfcli.numerics.mapgrid import MapGrid, MapSettings, TileTask, tile_tasks
-from srfcli.numerics.maprefine import solve_tile
-from srfcli.numerics.orbitkernel import kernel
+from srfcli.codegen.model import Array, ComplexArray, GeneratedModel, load_source
+from srfcli.motion.imposed import Drive, Modulation
+from srfcli.motion.simulate import simulate
+from srfcli.numerics.collocation import STAGES, Discretisation, join, kernel, mesh_error
+from srfcli.numerics.critical import robust_orbits
+from srfcli.numerics.orbit import OrbitBatch, interpolate, ordered_eigenvalues, solve_orbits, uniform_mesh
+from srfcli.numerics.plane import MapGrid, MapSettings, TileTask, tile_tasks
+
+# Stability maps: the leading Floquet multiplier over a grid of two parameters, put together from its tiles.
 
 # of a point: no orbit found; stable; unstable by a multiplier off the real axis, a negative, a positive one
 KINDS = ("unresolved", "stable", "ns", "pd", "fold")
@@ -165,8 +177,8 @@ def join_tiles(
     for task, tile in tiles:
         place = (slice(task.columns[0], task.columns[1] + 1), slice(task.rows[0], task.rows[1] + 1))
         leading[place], mesh[place] = tile["leading"], int(tile["mesh"])
-        seeds += _seeds(model, grid, tile)
-        brinks += _brinks(model, grid, tile)
+        seeds += _tile_seeds(model, grid, tile)
+        brinks += _tile_brinks(model, grid, tile)
         covered += (task.columns[1] - task.columns[0]) * (task.rows[1] - task.rows[0])
     extra_at = np.concatenate([t["extra_at"] for _, t in tiles])
     _, first = np.unique(extra_at, axis=0, return_index=True)  # tiles that meet refine their common side alike
@@ -184,12 +196,12 @@ def join_tiles(
     )
 
 
-def _brinks(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Brink]:
+def _tile_brinks(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Brink]:
     """Return the brinks of a tile, in the plane's unit coordinates."""
     ends = tile["brink_ends"]
     if not len(ends):
         return []
-    unit = grid.plane(model).coordinates(model, grid.points(model, *_quantities(grid, ends)))
+    unit = grid.plane(model).coordinates(model, grid.points(model, *_grid_quantities(grid, ends)))
     edges = np.linspace(0.0, 1.0, int(tile["mesh"]) + 1)
     return [
         Brink(
@@ -202,17 +214,17 @@ def _brinks(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Brink]:
     ]
 
 
-def _quantities(grid: MapGrid, places: Array) -> tuple[Array, Array]:
+def _grid_quantities(grid: MapGrid, places: Array) -> tuple[Array, Array]:
     """Return the quantities along x and y at places (..., 2) in grid steps."""
     return grid.x.between(places[..., 0]), grid.y.between(places[..., 1])
 
 
-def _seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
+def _tile_seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
     """Return the seeds of a tile, in the plane's unit coordinates."""
     plane, ends = grid.plane(model), tile["seed_ends"]
     if not len(ends):
         return []
-    unit = plane.coordinates(model, grid.points(model, *_quantities(grid, ends)))  # (E, 2, 2)
+    unit = plane.coordinates(model, grid.points(model, *_grid_quantities(grid, ends)))  # (E, 2, 2)
     edges = np.linspace(0.0, 1.0, int(tile["mesh"]) + 1)
     seeds = []
     for k, axis in enumerate(tile["seed_axis"].tolist()):
@@ -222,3 +234,540 @@ def _seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
         p, rho = tile["seed_p"][:, k], complex(tile["seed_rho"][k])
         seeds.append(Seed(unit[k][order], axis, bool(g[0] <= g[1]), p, rho, orbit))
     return seeds
+
+
+# One tile of a stability map: orbits on a coarse grid, the others from their neighbours, cells refined where it matters.
+
+STRIDE = 8  # orbits solved without neighbours are this many rows and columns apart
+NEIGHBOURS = 6  # through which a first guess is interpolated
+GRAIN = 4  # meshes are multiples of this many intervals
+STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # to the points beside a point, in columns and rows
+SETTLING = 1000  # periods of a simulation: just beyond a fold the motion lingers
+SETTLINGS = 32  # simulations at most in a tile,
+IN_VAIN = 3  # and in a row without a periodic state
+GOLDEN = 0.6180339887  # a share by whose multiples a list is sampled evenly
+PATIENCE = 8  # Newton steps from a neighbour's guess before an orbit is looked for anew
+
+
+@dataclass
+class Samples:
+    """Orbits at points of a tile: `at` (B, 2) in grid steps from the tile's corner, `p` (n_parameters, B), all on one mesh."""
+
+    at: Array
+    p: Array
+    orbit: Discretisation
+    multipliers: ComplexArray
+
+    @property
+    def g(self) -> Array:
+        """Return ln |leading multiplier| (B,), NaN where no orbit was found."""
+        return np.log(np.abs(self.multipliers[:, 0]))
+
+
+@lru_cache(maxsize=8)
+def tile_model(source: str, key: str) -> GeneratedModel:
+    """Return the model that a task carries, loaded once in a process."""
+    return load_source(source, key=key)
+
+
+def tile_points(task: TileTask) -> tuple[GeneratedModel, Array, Array, Array]:
+    """Return the model, the quantities along x and y of the tile, and its parameters (n_parameters, columns, rows)."""
+    model, grid = tile_model(task.source, task.key), task.grid
+    xs = grid.x.samples()[task.columns[0] : task.columns[1] + 1]
+    ys = grid.y.samples()[task.rows[0] : task.rows[1] + 1]
+    return model, xs, ys, grid.points(model, *np.meshgrid(xs, ys, indexing="ij"))
+
+
+def solve_block(task: TileTask) -> Samples:
+    """Return the orbits at all grid points of a tile, columns first."""
+    model, xs, ys, p = tile_points(task)
+    shape, settings = (len(xs), len(ys)), task.settings
+    columns, rows = (_levels(count) for count in shape)
+    first = np.ix_(columns[0], rows[0])
+    start = _coarse(model, p[:, first[0], first[1]].reshape(len(p), -1), task)
+    block = _Block.empty(model, p, start.orbit.edges)
+    block.put(columns[0], rows[0], regular(start))
+    for level in range(1, len(rows)):
+        known, new = np.concatenate(rows[:level]), rows[level]
+        block.fill(columns[0], new, block.along_rows(columns[0], known, new), settings.tol)
+    every = np.arange(shape[1])
+    for level in range(1, len(columns)):
+        known, new = np.concatenate(columns[:level]), columns[level]
+        block.fill(new, every, block.along_columns(known, new), settings.tol)
+    block.spread(settings.tol)
+    at = np.stack(np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij"), axis=-1).reshape(-1, 2)
+    flat = Discretisation(
+        block.x.reshape(-1, *block.x.shape[2:]), block.stages.reshape(-1, *block.stages.shape[2:]), block.edges
+    )
+    count = shape[0] * shape[1]
+    n = len(model.states)
+    multipliers = ordered_eigenvalues(block.monodromy.reshape(count, n, n), block.converged.reshape(count))
+    return Samples(at.astype(float), p.reshape(len(p), -1), flat, multipliers)
+
+
+def _levels(count: int) -> list[Array]:
+    """Return indices 0..count-1 in the order in which they are filled: every STRIDE-th with the last, halved until all."""
+    seen = np.zeros(count, bool)
+    levels, stride = [], STRIDE
+    while stride >= 1:
+        wanted = np.zeros(count, bool)
+        wanted[::stride] = wanted[-1] = True
+        levels.append(np.nonzero(wanted & ~seen)[0])
+        seen |= wanted
+        stride //= 2
+    return [level for level in levels if level.size]
+
+
+def _coarse(model: GeneratedModel, p: Array, task: TileTask) -> OrbitBatch:
+    """Return the orbits that have no neighbours yet, on a mesh that suits the whole tile."""
+    settings, N = task.settings, task.settings.intervals
+    batch = robust_orbits(model, p, None, uniform_mesh(N), tol=settings.tol)
+    for _ in range(4):
+        mesh = _sufficient(model, batch, task)
+        if mesh <= N:
+            break
+        N, edges = mesh, uniform_mesh(mesh)
+        usable = batch.converged.all()
+        batch = robust_orbits(model, p, interpolate(batch.orbit, edges) if usable else None, edges, tol=settings.tol)
+    return batch
+
+
+def _sufficient(model: GeneratedModel, batch: OrbitBatch, task: TileTask) -> int:
+    """Return the intervals that keep the mesh's error below the settings', twice as many where an orbit was not found."""
+    N = len(batch.orbit.edges) - 1
+    if not batch.converged.all():  # a finer mesh may find what this one could not
+        return min(2 * N, task.settings.finest)
+    ratio = float(mesh_error(model, batch.orbit).max()) / task.settings.mesh_error
+    if not ratio > 1:
+        return N
+    return min(GRAIN * int(np.ceil(N * min(1.3 * ratio, 1e4) ** 0.125 / GRAIN)), task.settings.finest)  # error as N^-8
+
+
+@dataclass
+class _Block:
+    """The orbits of a tile while it fills: arrays with the axes columns, rows, then those of Discretisation."""
+
+    model: GeneratedModel
+    p: Array
+    x: Array
+    stages: Array
+    monodromy: Array
+    converged: Array
+    edges: Array
+
+    @staticmethod
+    def empty(model: GeneratedModel, p: Array, edges: Array) -> _Block:
+        """Return a block of NaN for the parameters `p` (n_parameters, columns, rows)."""
+        shape, n, N = p.shape[1:], len(model.states), len(edges) - 1
+        return _Block(
+            model,
+            p,
+            np.full((*shape, N, n), np.nan),
+            np.full((*shape, N, STAGES, n), np.nan),
+            np.full((*shape, n, n), np.nan),
+            np.zeros(shape, bool),
+            edges,
+        )
+
+    def put(self, columns: Array, rows: Array, batch: OrbitBatch) -> None:
+        """Store a batch at the crossings of `columns` and `rows`."""
+        place, shape = np.ix_(columns, rows), (len(columns), len(rows))
+        self.x[place] = batch.orbit.x.reshape(*shape, *self.x.shape[2:])
+        self.stages[place] = batch.orbit.stages.reshape(*shape, *self.stages.shape[2:])
+        self.monodromy[place] = batch.monodromy.reshape(*shape, *self.monodromy.shape[2:])
+        self.converged[place] = batch.converged.reshape(shape)
+
+    def along_rows(self, columns: Array, known: Array, new: Array) -> Discretisation:
+        """Return guesses at rows `new` of `columns` from the rows `known`."""
+        index, weights = neighbours(np.sort(known), new)
+        x = np.einsum("rk,crkNn->crNn", weights, self.x[columns[:, None, None], index[None]])
+        stages = np.einsum("rk,crkNmn->crNmn", weights, self.stages[columns[:, None, None], index[None]])
+        return Discretisation(x.reshape(-1, *x.shape[2:]), stages.reshape(-1, *stages.shape[2:]), self.edges)
+
+    def along_columns(self, known: Array, new: Array) -> Discretisation:
+        """Return guesses at all rows of columns `new` from the columns `known`."""
+        index, weights = neighbours(np.sort(known), new)
+        x = np.einsum("ck,ckrNn->crNn", weights, self.x[index])
+        stages = np.einsum("ck,ckrNmn->crNmn", weights, self.stages[index])
+        return Discretisation(x.reshape(-1, *x.shape[2:]), stages.reshape(-1, *stages.shape[2:]), self.edges)
+
+    def fill(self, columns: Array, rows: Array, guess: Discretisation, tol: float) -> None:
+        """Solve the orbits at the crossings of `columns` and `rows` from `guess`, and store them."""
+        p = self.p[:, columns[:, None], rows[None]].reshape(len(self.p), -1)
+        self.put(columns, rows, regular_orbits(self.model, p, guess, tol))
+
+    def spread(self, tol: float) -> None:
+        """Solve the orbits that were not found from those beside them, again and again until none is added.
+
+        Steps from point to point lead round a cusp to a state that grows out of nothing else nearby. Where they lead nowhere,
+        orbits are looked for anew, and the motion is simulated at a few points until it may have settled.
+        """
+        self._spread(self.converged.copy(), tol)
+        if not self.converged.all():
+            self._spread(self._robust(tol), tol)
+        in_vain = 0
+        for attempt in range(SETTLINGS):
+            if self.converged.all() or in_vain == IN_VAIN:
+                return
+            fresh = self._settled(attempt * GOLDEN % 1, tol)
+            in_vain = 0 if fresh.any() else in_vain + 1
+            self._spread(fresh, tol)
+
+    def _robust(self, tol: float) -> Array:
+        """Look for the missing orbits without a guess, and mark those that are found."""
+        found = ~self.converged
+        c, r = np.nonzero(found)
+        self._keep(c, r, regular(robust_orbits(self.model, self.p[:, c, r], None, self.edges, tol=tol)))
+        return found & self.converged
+
+    def _settled(self, share: float, tol: float) -> Array:
+        """Mark the point, if any, at which a simulation ends in a periodic state; it begins with the state of one beside it.
+
+        Of all such points that is tried which lies a share of the way through their list.
+        """
+        found = np.zeros_like(self.converged)
+        brinks = [
+            (c, r, c - dc, r - dr)
+            for dc, dr in STEPS
+            for c, r in np.argwhere(_moved(self.converged, dc, dr) & ~self.converged).tolist()
+        ]
+        if brinks:
+            c, r, from_c, from_r = brinks[int(share * len(brinks))]
+            guess = settle(self.model, self.p[:, c, r], self.x[from_c, from_r, 0], self.edges)
+            if guess is not None:
+                self._solve(np.array([c]), np.array([r]), guess, tol)
+                found[c, r] = self.converged[c, r]
+        return found
+
+    def _spread(self, fresh: Array, tol: float) -> None:
+        """Solve the points beside `fresh` ones from these, and so on."""
+        while fresh.any() and not self.converged.all():
+            added = np.zeros_like(fresh)
+            for dc, dr in STEPS:
+                to_c, to_r = np.nonzero(_moved(fresh, dc, dr) & ~self.converged)
+                if not to_c.size:
+                    continue
+                from_c, from_r = to_c - dc, to_r - dr
+                guess = Discretisation(self.x[from_c, from_r], self.stages[from_c, from_r], self.edges)
+                self._solve(to_c, to_r, guess, tol)
+                added[to_c, to_r] = self.converged[to_c, to_r]
+            fresh = added
+
+    def _solve(self, c: Array, r: Array, guess: Discretisation, tol: float) -> None:
+        """Solve the orbits at columns `c`, rows `r` from `guess`, and keep those that are found."""
+        self._keep(c, r, regular_orbits(self.model, self.p[:, c, r], guess, tol))
+
+    def _keep(self, c: Array, r: Array, batch: OrbitBatch) -> None:
+        """Store those of a batch that were found, at columns `c`, rows `r`."""
+        good = np.nonzero(batch.converged)[0]
+        place = c[good], r[good]
+        self.x[place], self.stages[place] = batch.orbit.x[good], batch.orbit.stages[good]
+        self.monodromy[place], self.converged[place] = batch.monodromy[good], True
+
+
+def settle(model: GeneratedModel, p: Array, start: Array, edges: Array) -> Discretisation | None:
+    """Return the last of SETTLING periods of the motion that begins in the state `start` (n,), or None where it stops early."""
+    V, W0, eps, f = (float(p[model.index(name)]) for name in ("V", "W0", "eps", "f"))
+    blank = np.zeros((len(edges) - 1, STAGES, len(start)))
+    last = Discretisation(blank[:, 0], blank, edges)
+    tau = np.concatenate([edges[:-1, None], last.phases], axis=1)
+    t = np.concatenate([[0.0], (SETTLING + tau.reshape(-1)) / f])
+    trace = simulate(model, p, drive=Drive.constant(V), load=Modulation(W0, eps, f), t=t, start=start, rtol=1e-6)
+    if not trace.status.ok:
+        return None
+    x = trace.x[1:].reshape(len(edges) - 1, STAGES + 1, -1)
+    return Discretisation(x[None, :, 0], x[None, :, 1:], edges)
+
+
+def _moved(marks: Array, dc: int, dr: int) -> Array:
+    """Return the marks (columns, rows) moved by dc columns and dr rows, those beyond the edge dropped."""
+    moved = np.zeros_like(marks)
+    c, r = marks.shape
+    moved[max(dc, 0) : c + min(dc, 0), max(dr, 0) : r + min(dr, 0)] = marks[
+        max(-dc, 0) : c + min(-dc, 0), max(-dr, 0) : r + min(-dr, 0)
+    ]
+    return moved
+
+
+def regular_orbits(model: GeneratedModel, p: Array, guess: Discretisation, tol: float) -> OrbitBatch:
+    """Return the orbits at `p` from `guess`, those beyond a fold marked as not found."""
+    return regular(solve_orbits(model, p, guess, tol=tol, max_iterations=PATIENCE))
+
+
+def regular(batch: OrbitBatch) -> OrbitBatch:
+    """Return `batch` with the orbits beyond a fold marked as not found.
+
+    An odd number of multipliers beyond +1, det(1 - M) < 0, is that of a state that meets the sliding state in a fold.
+    """
+    M = batch.monodromy[batch.converged]
+    batch.converged[batch.converged] = np.linalg.det(np.eye(M.shape[-1]) - M) > 0
+    return batch
+
+
+def neighbours(known: Array, new: Array) -> tuple[Array, Array]:
+    """Return, for each position `new`, up to NEIGHBOURS of the rising positions `known` around it and their Lagrange weights."""
+    width = min(NEIGHBOURS, len(known))
+    first = np.clip(np.searchsorted(known, new) - width // 2, 0, len(known) - width)
+    index = known[first[:, None] + np.arange(width)]  # (new, width)
+    weights = np.ones(index.shape)
+    for i in range(width):
+        for j in range(width):
+            if j != i:
+                weights[:, i] *= (new - index[:, j]) / (index[:, i] - index[:, j])
+    return index, weights
+
+
+# Cells of a map tile halved where a boundary could hide in them, and every sign change that the points then show.
+
+SAFETY = 1.5  # on an interpolation error, which is itself an estimate
+SHRINKS = 0.5  # of a cell's error that its quarters keep: 0.25 where g is smooth, more where multipliers meet
+CROSSED = 0.5  # a cell that a boundary crosses is halved, too, where its error exceeds this share of the largest |g|
+JUMP = 0.5  # of a state's logarithms between neighbours: it may be another state then
+
+# in units of half a cell: its middle and the middles of its sides, and the corners whose mean foretells each
+MIDDLES = np.array([(1, 0), (1, 2), (0, 1), (2, 1), (1, 1)])
+PARENTS = ((0, 1), (2, 3), (0, 2), (1, 3), (0, 1, 2, 3))
+CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # the order of a cell's corners, and of its quarters
+SIDES = ((0, 1, 0), (2, 3, 0), (0, 2, 1), (1, 3, 1))  # two corners and the axis they lie along
+
+Between = Callable[[Array, Array], Array]  # what holds between samples i (E,) and j (E,)
+
+
+@dataclass
+class Cells:
+    """Cells of one size: lower corners `at` (C, 2) and `size` in finest steps, `error` (C,) of interpolating g in each."""
+
+    at: Array
+    size: int
+    error: Array
+
+    def corners(self) -> Array:
+        """Return the corners (C, 4, 2)."""
+        return self.at[:, None, :] + self.size * CORNERS
+
+
+@dataclass
+class Refined:
+    """The points of a tile with those added, all leaf cells, and the cells in which a boundary may still hide."""
+
+    samples: Samples
+    leaves: list[Cells] = field(default_factory=list)
+    suspect: Array = field(default_factory=lambda: np.zeros((0, 3)))  # lower corner and size, in grid steps
+
+
+class _Points:
+    """Samples found by their place; places are whole numbers of finest steps."""
+
+    def __init__(self, samples: Samples, unit: int) -> None:
+        self.samples, self.unit = samples, unit
+        self.place = {(int(a), int(b)): k for k, (a, b) in enumerate(np.rint(samples.at * unit))}
+
+    def index(self, at: Array) -> Array:
+        """Return the samples at places (..., 2)."""
+        flat = [self.place[int(a), int(b)] for a, b in at.reshape(-1, 2)]
+        return np.array(flat, dtype=int).reshape(at.shape[:-1])
+
+    def add(self, task: TileTask, model: GeneratedModel, at: Array, parents: list[Array]) -> None:
+        """Solve the orbits at places `at` (B, 2) that are not known yet, each from the mean of its parents' orbits."""
+        fresh: dict[tuple[int, int], Array] = {}
+        for (a, b), above in zip(at.tolist(), parents, strict=True):
+            if (a, b) not in self.place:
+                fresh.setdefault((a, b), above)
+        if not fresh:
+            return
+        old, places = self.samples, np.array(list(fresh)) / self.unit
+        xs, ys = _quantities(task, places)
+        p = task.grid.points(model, xs, ys)
+        x = np.stack([old.orbit.x[k].mean(axis=0) for k in fresh.values()])
+        stages = np.stack([old.orbit.stages[k].mean(axis=0) for k in fresh.values()])
+        batch = regular_orbits(model, p, Discretisation(x, stages, old.orbit.edges), task.settings.tol)
+        sources = list(fresh.values())
+        for k in range(4):  # where the mean leads nowhere, each of the parents
+            lost = np.array([b for b in np.nonzero(~batch.converged)[0] if k < len(sources[b])], dtype=int)
+            if lost.size:
+                near = old.orbit.part(np.array([sources[b][k] for b in lost]))
+                batch.replace(lost, regular_orbits(model, p[:, lost], near, task.settings.tol))
+        for key in fresh:
+            self.place[key] = len(self.place)
+        self.samples = Samples(
+            np.concatenate([old.at, places]),
+            np.concatenate([old.p, p], axis=1),
+            join([old.orbit, batch.orbit]),
+            np.concatenate([old.multipliers, batch.multipliers]),
+        )
+
+
+def _quantities(task: TileTask, at: Array) -> tuple[Array, Array]:
+    """Return the quantities along x and y at places (B, 2), in grid steps from the tile's corner."""
+    grid = task.grid
+    return grid.x.between(task.columns[0] + at[:, 0]), grid.y.between(task.rows[0] + at[:, 1])
+
+
+def refine(task: TileTask, samples: Samples) -> Refined:
+    """Return the tile with its cells halved, up to the settings' depth, where a boundary could hide in them."""
+    model = tile_points(task)[0]
+    unit = 2**task.settings.depth
+    points, result = _Points(samples, unit), Refined(samples)
+    cells = _grid_cells(task, samples, unit)
+    while True:
+        corners = points.index(cells.corners())
+        wanted = _suspects(points.samples.g[corners], cells.error)
+        result.leaves.append(Cells(cells.at[~wanted], cells.size, cells.error[~wanted]))
+        if not wanted.any():
+            break
+        if cells.size == 1:
+            last = cells.at[wanted]
+            result.leaves.append(Cells(last, 1, cells.error[wanted]))
+            result.suspect = np.concatenate([last, np.ones((len(last), 1))], axis=1) / unit
+            break
+        cells = _halved(task, model, points, Cells(cells.at[wanted], cells.size, cells.error[wanted]), corners[wanted])
+    result.samples = points.samples
+    return result
+
+
+def _grid_cells(task: TileTask, samples: Samples, unit: int) -> Cells:
+    """Return the cells of the tile's grid, with the interpolation errors that second differences show."""
+    nc, nr = task.columns[1] - task.columns[0] + 1, task.rows[1] - task.rows[0] + 1
+    g = samples.g[: nc * nr].reshape(nc, nr)
+    error = SAFETY * (_interpolation_error(g, 0) + _interpolation_error(g, 1))
+    around = np.stack([error[:-1, :-1], error[1:, :-1], error[:-1, 1:], error[1:, 1:]])
+    at = np.stack(np.meshgrid(np.arange(nc - 1), np.arange(nr - 1), indexing="ij"), axis=-1).reshape(-1, 2)
+    return Cells(at * unit, unit, around.max(axis=0).reshape(-1))
+
+
+def _interpolation_error(g: Array, axis: int) -> Array:
+    """Return an eighth of the second differences of `g` along `axis`, those of the ends from their neighbours."""
+    if g.shape[axis] < 3:
+        return np.zeros_like(g)
+    moved = np.moveaxis(g, axis, 0)
+    inner = np.abs(moved[:-2] - 2 * moved[1:-1] + moved[2:]) / 8
+    inner = np.nan_to_num(inner)  # beside a point without an orbit nothing is known
+    return np.moveaxis(np.concatenate([inner[:1], inner, inner[-1:]]), 0, axis)
+
+
+def _suspects(g: Array, error: Array) -> Array:
+    """Return for cells with corner values `g` (C, 4) whether more could hide in them than their corners show."""
+    usable = np.isfinite(g).all(axis=1)
+    positive, size = g > 0, np.abs(np.where(np.isfinite(g), g, 0.0))
+    same = positive.all(axis=1) | ~positive.any(axis=1)
+    saddle = (positive[:, 0] == positive[:, 3]) & (positive[:, 1] == positive[:, 2]) & ~same
+    hidden = same & (size.min(axis=1) < error)
+    return usable & (hidden | saddle | (~same & (error > CROSSED * size.max(axis=1))))
+
+
+def _halved(task: TileTask, model: GeneratedModel, points: _Points, cells: Cells, corners: Array) -> Cells:
+    """Return the quarters of `cells`, their new corners solved."""
+    half = cells.size // 2
+    at = cells.at[:, None, :] + half * MIDDLES  # (C, 5, 2)
+    parents = [corners[c][list(PARENTS[k])] for c in range(len(corners)) for k in range(5)]
+    points.add(task, model, at.reshape(-1, 2), parents)
+    g = points.samples.g
+    middle, old = g[points.index(at)], g[corners]
+    foretold = np.stack([old[:, list(k)].mean(axis=1) for k in PARENTS], axis=1)
+    off = np.nan_to_num(np.abs(middle - foretold))
+    sides = np.maximum(off[:, 0], off[:, 1]) + np.maximum(off[:, 2], off[:, 3])
+    error = SAFETY * SHRINKS * np.maximum(sides, off[:, 4])
+    quarters = cells.at[:, None, :] + half * CORNERS
+    return Cells(quarters.reshape(-1, 2), half, np.repeat(error, 4))
+
+
+def solve_tile(task: TileTask) -> dict[str, Array]:
+    """Return a tile as plain arrays; it depends on nothing but `task`.
+
+    `leading` (columns, rows) is the leading multiplier, NaN where no orbit was found; `mesh` the intervals; `extra_p` and
+    `extra_leading` the points added; `suspect` (S, 3) cells in which a boundary may still hide (column, row, size in grid
+    steps). Every pair of neighbours of different sign is a seed: `seed_ends` (E, 2, 2) in grid steps, `seed_axis` (E,),
+    `seed_g` (E, 2), and between them `seed_p` (n_parameters, E), `seed_rho`, `seed_x`, `seed_stages`. Every stable point beside
+    one without an orbit, or with quite another, is a brink: `brink_ends` (K, 2, 2), it and that neighbour, `brink_axis` (K,), and
+    at it `brink_rho`, `brink_x`, `brink_stages`.
+    """
+    done = refine(task, solve_block(task))
+    samples = done.samples
+    nc, nr = task.columns[1] - task.columns[0] + 1, task.rows[1] - task.rows[0] + 1
+    count, corner = nc * nr, np.array([task.columns[0], task.rows[0]])
+    leading = _upper(samples.multipliers[:, 0])
+    crossed, apart = _crossed(samples), _apart(samples, tile_points(task)[0].logarithmic)
+    sides = _sides(done, 2**task.settings.depth, lambda i, j: crossed(i, j) | apart(i, j))
+    suspect = done.suspect.copy()
+    suspect[:, :2] += corner
+    return {
+        "leading": leading[:count].reshape(nc, nr),
+        "mesh": np.array(len(samples.orbit.edges) - 1),
+        "extra_at": samples.at[count:] + corner,
+        "extra_leading": leading[count:],
+        "suspect": suspect,
+        **_seeds(task, samples, sides[crossed(sides[:, 0], sides[:, 1])], corner),
+        **_brinks(samples, sides[apart(sides[:, 0], sides[:, 1])], corner),
+    }
+
+
+def _crossed(samples: Samples) -> Between:
+    """Return the test whether, of two samples, one is stable and the other is not."""
+    g = samples.g
+    return lambda i, j: np.asarray(np.isfinite(g[i]) & np.isfinite(g[j]) & ((g[i] > 0) != (g[j] > 0)))
+
+
+def _apart(samples: Samples, logarithmic: Sequence[bool]) -> Between:
+    """Return the test whether, of two samples, one is stable and the state of the other may not be the same."""
+    g, start = samples.g, samples.orbit.x[:, 0][:, np.array(logarithmic)]
+    saddle = (g > 0) & (np.abs(np.angle(samples.multipliers[:, 0])) < 1e-7)
+
+    def apart(i: Array, j: Array) -> Array:
+        far = np.abs(start[i] - start[j]).max(axis=-1) > JUMP
+        stable, one = (g[i] < 0) & (g[j] < 0), np.fmin(g[i], g[j]) < 0
+        return np.asarray((stable & far) | (one & (np.isnan(g[i]) | np.isnan(g[j]) | saddle[i] | saddle[j])))
+
+    return apart
+
+
+def _upper(rho: Array) -> Array:
+    """Return multipliers with those below the real axis replaced by their conjugates."""
+    return rho.real + 1j * np.abs(rho.imag)
+
+
+def _seeds(task: TileTask, samples: Samples, sides: Array, corner: Array) -> dict[str, Array]:
+    """Return the sign changes on `sides` (E, 3), with an orbit and a multiplier between the two ends of each."""
+    g, (i, j, axis) = samples.g, sides.T
+    share = g[i] / np.where(g[i] == g[j], 1.0, g[i] - g[j])
+    nearer = np.where(share < 0.5, i, j)
+    blend, orbit = share[:, None, None], samples.orbit
+    at = (1 - share)[:, None] * samples.at[i] + share[:, None] * samples.at[j]
+    model = tile_points(task)[0]
+    return {
+        "seed_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
+        "seed_axis": axis,
+        "seed_g": np.stack([g[i], g[j]], axis=1),
+        "seed_p": task.grid.points(model, *_quantities(task, at)),
+        "seed_rho": _upper(samples.multipliers[nearer, 0]),
+        "seed_x": (1 - blend) * orbit.x[i] + blend * orbit.x[j],
+        "seed_stages": (1 - blend[..., None]) * orbit.stages[i] + blend[..., None] * orbit.stages[j],
+    }
+
+
+def _brinks(samples: Samples, sides: Array, corner: Array) -> dict[str, Array]:
+    """Return the stable ends of `sides` (E, 3), whose state may end before it reaches the other end, with that end."""
+    both = np.concatenate([sides, sides[:, [1, 0, 2]]])
+    i, j, axis = both[samples.g[both[:, 0]] < 0].T
+    return {
+        "brink_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
+        "brink_axis": axis,
+        "brink_rho": _upper(samples.multipliers[i, 0]),
+        "brink_x": samples.orbit.x[i],
+        "brink_stages": samples.orbit.stages[i],
+    }
+
+
+def _sides(done: Refined, unit: int, wanted: Between) -> Array:
+    """Return the `wanted` sides of leaf cells, (E, 3) in order: the samples at their two ends, and the axis they lie along."""
+    points = _Points(done.samples, unit)
+    sides: dict[tuple[int, int], int] = {}
+    for cells in done.leaves:
+        corners = points.index(cells.corners())
+        for a, b, axis in SIDES:
+            i, j = corners[:, a], corners[:, b]
+            middle = cells.corners()[:, a] + np.eye(2, dtype=int)[axis] * (cells.size // 2)
+            for k in np.nonzero(wanted(i, j))[0]:
+                split = cells.size > 1 and (int(middle[k, 0]), int(middle[k, 1])) in points.place
+                if not split:  # a finer cell next to it has the two halves
+                    sides[int(i[k]), int(j[k])] = axis
+    return np.array([(i, j, axis) for (i, j), axis in sorted(sides.items())], dtype=int).reshape(-1, 3)

@@ -8,18 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from srfcli.model import GeneratedModel
+from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.numerics.collocation import (
-    Array,
-    ComplexArray,
+    LOG_STEP,
+    STAGES,
     Condensed,
     Discretisation,
     condense,
     expand,
+    gauss,
     join,
+    kernel,
+    newton_orbits,
 )
-from srfcli.numerics.gauss import LOG_STEP, STAGES, gauss
-from srfcli.numerics.orbitkernel import kernel, newton_orbits
 
 CHUNK = 48  # parameter points solved together: their blocks fit the cache
 LARGEST_SWING = 2.0  # of a logarithm in the linear response that is a first guess

@@ -1,13 +1,21 @@
-"""A window in the plane of two parameters, mapped to the unit square in which arclength is measured."""
+"""A window in the plane of two parameters, its unit square, and the grid of a stability map on it.
+
+A tile is a block of grid points that is computed by itself, so that neither the number of workers nor their order matters.
+Tiles share their last row and column with the next one: every cell belongs to one tile.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import Array
+from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.core.errors import SrfError
+
+# A window in the plane of two parameters, mapped to the unit square in which arclength is measured.
 
 
 @dataclass(frozen=True)
@@ -73,3 +81,146 @@ class Plane:
     def rates(self, model: GeneratedModel, p: Array) -> Array:
         """Return dp/dq of the two parameters at `p` (n_parameters,), as (2,)."""
         return np.array([float(a.rate(p[model.index(a.name)])) for a in (self.x, self.y)])
+
+
+# The grid of a stability map: two axes, each a parameter or the ratio of two, and its division into tiles.
+
+
+@dataclass(frozen=True)
+class MapAxis:
+    """`count` values of a quantity from `lo` to `hi` (um, s, N), evenly spaced in its logarithm where `log`.
+
+    The quantity is the parameter `moved`, or the ratio `held`/`moved` at fixed `held` where that is not empty.
+    """
+
+    moved: str
+    lo: float
+    hi: float
+    count: int
+    log: bool = True
+    held: str = ""
+
+    @property
+    def name(self) -> str:
+        """Return the quantity's name: V, or K/W0."""
+        return f"{self.held}/{self.moved}" if self.held else self.moved
+
+    def samples(self) -> Array:
+        """Return the values of the quantity, both ends exactly, (count,)."""
+        return Axis(self.name, self.lo, self.hi, self.log).samples(self.count)
+
+    def between(self, steps: Array) -> Array:
+        """Return the quantity at places given in grid steps, whole or not."""
+        share = np.asarray(steps) / (self.count - 1)
+        inside = self.lo * (self.hi / self.lo) ** share if self.log else self.lo + share * (self.hi - self.lo)
+        return np.where(share == 1.0, self.hi, inside)
+
+    def parameter(self, model: GeneratedModel, base: Array, values: Array) -> Array:
+        """Return the moved parameter at `values` of the quantity."""
+        return base[model.index(self.held)] / values if self.held else values
+
+    def quantity(self, model: GeneratedModel, p: Array) -> Array:
+        """Return the quantity at parameter points `p` (n_parameters, ...)."""
+        moved = p[model.index(self.moved)]
+        return np.asarray(p[model.index(self.held)] / moved if self.held else moved)
+
+    def axis(self, model: GeneratedModel, base: Array) -> Axis:
+        """Return the moved parameter's own axis, on which curves are followed; a ratio's is logarithmic."""
+        if not self.held:
+            return Axis(self.moved, self.lo, self.hi, self.log)
+        held = float(base[model.index(self.held)])
+        return Axis(self.moved, held / self.hi, held / self.lo, True)
+
+
+@dataclass(frozen=True)
+class MapGrid:
+    """A map's window: the fixed parameters `base` (n_parameters,) and its two axes."""
+
+    base: Array
+    x: MapAxis
+    y: MapAxis
+
+    def plane(self, model: GeneratedModel) -> Plane:
+        """Return the plane of the two moved parameters."""
+        return Plane(self.base, self.x.axis(model, self.base), self.y.axis(model, self.base))
+
+    def points(self, model: GeneratedModel, xs: Array, ys: Array) -> Array:
+        """Return the parameters (n_parameters, ...) at quantities `xs` and `ys` of one shape."""
+        p = np.repeat(self.base[:, None], xs.size, axis=1).reshape(len(self.base), *xs.shape)
+        p[model.index(self.x.moved)] = self.x.parameter(model, self.base, xs)
+        p[model.index(self.y.moved)] = self.y.parameter(model, self.base, ys)
+        return p
+
+
+def check_grid(model: GeneratedModel, grid: MapGrid) -> None:
+    """Raise SrfError where the axes do not move two different parameters, or a ratio's fixed one is not fixed."""
+    for axis in (grid.x, grid.y):
+        for name in filter(None, (axis.moved, axis.held)):
+            model.index(name)
+        if axis.count < 2:
+            raise SrfError(
+                f"the axis {axis.name} has {axis.count} point", f"Give it two or more: {axis.name}=...:{axis.hi:g}:40."
+            )
+        if axis.held and not axis.lo > 0:
+            raise SrfError(
+                f"the ratio {axis.name} begins at {axis.lo:g}", "Begin above 0: a ratio of 0 is an infinite value."
+            )
+        if axis.held and not float(grid.base[model.index(axis.held)]) > 0:
+            raise SrfError(f"the ratio {axis.name} needs {axis.held} above 0", f"Set {axis.held} to a positive value.")
+    involved = [{a.moved, a.held} - {""} for a in (grid.x, grid.y)]
+    shared = involved[0] & involved[1]
+    if shared:
+        raise SrfError(
+            f"the axes {grid.x.name} and {grid.y.name} both involve {', '.join(sorted(shared))}",
+            "Choose axes that share no parameter; of a ratio the second parameter moves and the first is fixed.",
+        )
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """How a map is computed.
+
+    `mesh_error` is what the mesh may shift a boundary by (relative), `finest` its most intervals, `tol` the last Newton step of
+    an orbit; `depth` is how often a cell in which a boundary could hide is halved, `block` the points of a tile.
+    """
+
+    intervals: int = 12
+    mesh_error: float = 3e-4
+    finest: int = 64
+    tol: float = 1e-3
+    depth: int = 4
+    block: tuple[int, int] = (16, 48)
+
+
+@dataclass(frozen=True)
+class TileTask:
+    """All that a tile's result depends on; `index` numbers it. Columns i0..i1 and rows j0..j1 of the grid, both ends included.
+
+    The model travels as its source text, so that a worker on another machine needs nothing but the package.
+    """
+
+    index: int
+    source: str
+    key: str
+    grid: MapGrid
+    columns: tuple[int, int]
+    rows: tuple[int, int]
+    settings: MapSettings
+
+
+def tile_tasks(model: GeneratedModel, grid: MapGrid, settings: MapSettings | None = None) -> list[TileTask]:
+    """Return the tiles that cover `grid`; raises SrfError for axes that do not span a plane."""
+    check_grid(model, grid)
+    settings = settings or MapSettings()
+    columns, rows = (_blocks(a.count, b) for a, b in zip((grid.x, grid.y), settings.block, strict=True))
+    return [
+        TileTask(k, model.source, model.key, grid, c, r, settings)
+        for k, (c, r) in enumerate((c, r) for c in columns for r in rows)
+    ]
+
+
+def _blocks(count: int, block: int) -> Sequence[tuple[int, int]]:
+    """Return (first, last) of blocks of about `block` points of equal size; the last of one is the first of the next."""
+    parts = max(1, round((count - 1) / block))
+    edges = np.linspace(0, count - 1, parts + 1).round().astype(int)
+    return [(int(a), int(b)) for a, b in pairwise(edges)]

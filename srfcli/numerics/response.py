@@ -11,19 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.model import GeneratedModel
-from srfcli.numerics.collocation import (
-    Array,
-    ComplexArray,
-    Discretisation,
-    gauss,
-    mesh_error,
-    stage_parameters,
-    wanted_mesh,
-)
+from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
+from srfcli.core.errors import Status
+from srfcli.numerics.collocation import Discretisation, gauss, mesh_error, stage_parameters, wanted_mesh
+from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.orbit import OrbitBatch, interpolate, uniform_mesh
-from srfcli.numerics.scan import robust_orbits
-from srfcli.status import Status
 
 STEP = 1e-30  # of a complex step: no difference is taken
 INTERVALS = 16

@@ -17,12 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from srfcli import __version__
-from srfcli.atomic import clear
-from srfcli.cache import is_sealed, seal
-from srfcli.errors import SrfError
-from srfcli.output.files import write_atomic
-from srfcli.reading import parse_json, read_plain
+from srfcli.core.cache import is_sealed, seal
+from srfcli.core.errors import SrfError
+from srfcli.core.files import clear, parse_json, read_plain, write_atomic
+from srfcli.core.version import __version__
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -49,7 +47,8 @@ class Store:
             seal(self.run, b"")
         except (OSError, RuntimeError) as error:
             raise SrfError(
-                f"--resume {self.folder}: parts cannot be sealed: {error}", "Set XDG_STATE_HOME to a folder of your own."
+                f"--resume {self.folder}: parts cannot be sealed: {error}",
+                "Set XDG_STATE_HOME to a folder of your own.",
             ) from error
         note = self.folder / NOTE
         if self.folder.is_dir():
@@ -58,7 +57,9 @@ class Store:
             try:
                 before = parse_json(read_plain(note), note)
             except (OSError, SrfError) as error:
-                raise SrfError(f"--resume {note} cannot be read: {error}", "Name another folder, or a new one.") from error
+                raise SrfError(
+                    f"--resume {note} cannot be read: {error}", "Name another folder, or a new one."
+                ) from error
             if before != said:
                 raise SrfError(
                     f"--resume {self.folder} holds the parts of another run",
@@ -81,7 +82,17 @@ class Store:
                 return None
             with np.load(io.BytesIO(content), allow_pickle=False) as data:
                 return {name: data[name] for name in data.files}
-        except (OSError, SrfError, ValueError, EOFError, KeyError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error):
+        except (
+            OSError,
+            SrfError,
+            ValueError,
+            EOFError,
+            KeyError,
+            SyntaxError,
+            MemoryError,
+            zipfile.BadZipFile,
+            zlib.error,
+        ):
             return None
 
     def write(self, index: int, result: Arrays) -> None:

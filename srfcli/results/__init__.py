@@ -1,1 +1,1 @@
-"""What tasks find: one frozen value each, which owns its columns, rows, notes and figure."""
+"""How results are shown and kept; this package reads results and computes nothing."""

@@ -7,9 +7,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from srfcli.errors import SrfError
-from srfcli.output.tables import Table, cell_text, is_numeric, plain_value, to_text
-from srfcli.status import Status
+from srfcli.core.errors import SrfError, Status
+from srfcli.results.tables import Table, cell_text, is_numeric, plain_value, to_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

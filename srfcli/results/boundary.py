@@ -7,18 +7,18 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.tables import Column, Table
+from srfcli.core.errors import Status
 from srfcli.results.base import Result
-from srfcli.status import Status
+from srfcli.results.tables import Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from srfcli.model import GeneratedModel
-    from srfcli.numerics.atlas import Atlas
-    from srfcli.numerics.polish import BoundaryPoint
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.model import GeneratedModel
+    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.numerics.boundary import BoundaryPoint
+    from srfcli.numerics.continuation import Atlas
 
 COLUMNS = (
     Column("eps", "1", "modulation amplitude"),
@@ -110,7 +110,7 @@ class CriticalResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the critical K/W0 (1/um) against V (um/s), a mark for each crossing."""
-        from srfcli.output import plots
+        from srfcli.results import plots
 
         names = [c.name for c in COLUMNS]
         points = [dict(zip(names, row, strict=True)) for row in self.table.rows]
@@ -143,7 +143,7 @@ class BoundaryResult(Result):
     @cached_property
     def table(self) -> Table:
         """Return a row for each point, component after component."""
-        from srfcli.numerics.atlas import crossing_numbers
+        from srfcli.numerics.continuation import crossing_numbers
 
         model, rows, notes = self.system.model, [], []
         extra = tuple(n for n in self._axes if n not in ("V", "W0", "eps"))
@@ -167,7 +167,7 @@ class BoundaryResult(Result):
         import numpy as np
 
         from srfcli.numerics.hopf import critical_point
-        from srfcli.output import plots
+        from srfcli.results import plots
 
         model, title = self.system.model, plots.titled(self.table.title, self.table.parameters)
         if not self.atlases:

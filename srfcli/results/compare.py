@@ -9,18 +9,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.tables import Column, Table
+from srfcli.core.errors import Status
 from srfcli.results.base import Result
-from srfcli.status import Status
+from srfcli.results.tables import Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from srfcli.model import GeneratedModel
-    from srfcli.numerics.compare import LawStudy, Window
-    from srfcli.numerics.comparematch import Match, Observables
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.model import GeneratedModel
+    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.numerics.compare import LawStudy, Match, Observables, Window
 
 COLUMNS = (
     Column("law", "", "friction law, ageing law, or both"),
@@ -227,7 +226,7 @@ def compare_figure(
     ax: Axes | None = None,
 ) -> Figure:
     """Return the laws' boundaries at the largest amplitude over each other, each named with the parameters it was given."""
-    from srfcli.output import plots
+    from srfcli.results import plots
 
     first, K = studies[min(studies)].crossings[0][:, 0], float(matches[0].p[models[0].index("K")])
     labels = []

@@ -8,20 +8,19 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.tables import Column, Table
+from srfcli.core.errors import Status
+from srfcli.core.units import from_base
 from srfcli.results.base import Result, own_figure
-from srfcli.status import Status
-from srfcli.units import from_base
+from srfcli.results.tables import Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from srfcli.data.values import Experiment
     from srfcli.inference.fit import Fit, Problem
-    from srfcli.inference.profile import Interval
+    from srfcli.inference.posterior import Interval, Posterior
     from srfcli.inference.recordings import RecordingFit
-    from srfcli.inference.sample import Posterior
-    from srfcli.recording.values import Experiment
 
 PARAMETERS = (
     Column("parameter", "", "name"),
@@ -131,9 +130,9 @@ class FitResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return each run's recording and prediction above its residual."""
-        from srfcli.output.fits import fit_figure
-        from srfcli.output.plots import symbol_text
-        from srfcli.output.report_text import NARROW, bracketed, unit_text
+        from srfcli.results.figures import fit_figure
+        from srfcli.results.plots import symbol_text
+        from srfcli.results.report_text import NO_BREAK, bracketed, unit_text
 
         own_figure(ax, "a fit")
         problem, fit, experiment = self.found.problem, self.found.fit, self.experiment
@@ -144,7 +143,7 @@ class FitResult(Result):
             declared = unit_of(problem, name)
             unit, factor = experiment.shown(declared)
             value, error = (from_base(x, declared) * factor for x in (fit.values[name], fit.stderr[name]))
-            shown = "" if unit == "1" else f"{NARROW}{unit_text(unit)}"
+            shown = "" if unit == "1" else f"{NO_BREAK}{unit_text(unit)}"
             told.append(f"{symbol_text(name)} = {bracketed(value, error)}{shown}")
         choice = experiment.choice
         title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])

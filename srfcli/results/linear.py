@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.tables import Column, Table
 from srfcli.results.base import Result
+from srfcli.results.tables import Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.slider import SlidingSystem
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -63,7 +63,7 @@ class LinearResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the critical K/W0 (1/um) over the first parameter that was swept, a curve for each value of the others."""
-        from srfcli.output import plots
+        from srfcli.results import plots
 
         (x, values), *others = self.over.items()
         unit = {q.name: q.unit for q in self.system.model.parameters}

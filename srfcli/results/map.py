@@ -7,22 +7,21 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.tables import Column, Table
+from srfcli.core.errors import Status
 from srfcli.results.base import Result, load_xarray
 from srfcli.results.boundary import COLUMNS, boundary_row
-from srfcli.status import Status
+from srfcli.results.tables import Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from srfcli.model import GeneratedModel
-    from srfcli.numerics.atlas import Atlas, Branch
-    from srfcli.numerics.collocation import Array
+    from srfcli.codegen.model import Array, GeneratedModel
+    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.numerics.continuation import Atlas, Branch
     from srfcli.numerics.map import StabilityMap
-    from srfcli.numerics.mapgrid import MapAxis
-    from srfcli.numerics.special import SpecialPoint
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.numerics.plane import MapAxis
+    from srfcli.numerics.special_points import SpecialPoint
 
 BASE_UNITS = ("um", "s", "N", "rad")
 
@@ -113,8 +112,8 @@ class MapResult(Result):
         import numpy as np
 
         from srfcli.numerics.map import per_slip
-        from srfcli.output.maps import stability_map
-        from srfcli.output.plots import titled
+        from srfcli.results.figures import stability_map
+        from srfcli.results.plots import titled
 
         model, found, grid = self.system.model, self.found, self.found.grid
         p = found.points(model)
@@ -150,8 +149,8 @@ def _summary(
 ) -> tuple[tuple[str, ...], dict[str, Any], Status]:
     """Return the notes, what JSON holds beside the rows, and the status of the whole."""
     from srfcli.numerics.map import KINDS
-    from srfcli.numerics.mapcurves import map_notes, unexplained
-    from srfcli.numerics.special import crossings_at
+    from srfcli.numerics.map_boundaries import map_notes, unexplained
+    from srfcli.numerics.special_points import crossings_at
 
     count = found.kind.size
     share = {name: float((found.kind == k).sum() / count) for k, name in enumerate(KINDS)}
@@ -190,7 +189,7 @@ def _plain(table: Table) -> list[dict[str, Any]]:
 
 def _points_table(model: GeneratedModel, atlas: Atlas, cubic: list[Array], common: dict[str, Any]) -> Table:
     """Return the polished points of all components, as `srf continue` lists them, with the cubic coefficient."""
-    from srfcli.numerics.atlas import crossing_numbers
+    from srfcli.numerics.continuation import crossing_numbers
 
     extra = tuple(a.name for a in (atlas.plane.x, atlas.plane.y) if a.name not in ("V", "W0", "eps"))
     declared = {q.name: q for q in model.parameters}
@@ -337,7 +336,7 @@ def _curve(
 
 def ratio_powers(model: GeneratedModel, held: str, moved: str) -> tuple[int, ...]:
     """Return the powers of (um, s, N, rad) of the ratio of two parameters."""
-    from srfcli.units import find_unit
+    from srfcli.core.units import find_unit
 
     top, bottom = (find_unit(model.parameters[model.index(n)].unit).powers for n in (held, moved))
     return tuple(a - b for a, b in zip(top, bottom, strict=True))
@@ -379,7 +378,7 @@ def column_name(axis: MapAxis) -> str:
 
 def label(model: GeneratedModel, axis: MapAxis) -> str:
     """Return an axis' label with its unit."""
-    from srfcli.output.plots import axis_label, symbol_text
+    from srfcli.results.plots import axis_label, symbol_text
 
     if not axis.held:
         return axis_label(axis.moved, axis_unit(model, axis))

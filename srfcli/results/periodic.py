@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.tables import Column, Table
 from srfcli.results.base import Result, own_figure
+from srfcli.results.tables import Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.floquet import FloquetResult
-    from srfcli.tasks.system import SlidingSystem
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -90,7 +90,7 @@ class PeriodicResult(Result):
         import numpy as np
 
         from srfcli.numerics.floquet import waveforms
-        from srfcli.output import plots
+        from srfcli.results import plots
 
         own_figure(ax, "a periodic state")
         r, model = self.state, self.system.model

@@ -9,20 +9,20 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from srfcli.output.tables import Column, Table
+from srfcli.core.errors import Status
 from srfcli.results.base import Result, own_figure
-from srfcli.status import Status
+from srfcli.results.tables import Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from srfcli.model import GeneratedModel
-    from srfcli.numerics.integrate import Trace
-    from srfcli.numerics.program import Drive, Load
-    from srfcli.recording.values import Experiment, Run
-    from srfcli.splines import Spline
+    from srfcli.codegen.model import GeneratedModel
+    from srfcli.codegen.splines import Spline
+    from srfcli.data.values import Experiment, Run
+    from srfcli.motion.imposed import Drive, Load
+    from srfcli.motion.simulate import Trace
 
     Array = NDArray
 
@@ -98,8 +98,8 @@ class Gauge:
 
 def read_gauge(given: Mapping[str, Any], unit: str) -> Gauge:
     """Return the gauge that the options ask for, sizes in `unit`; raises SrfError for what no gauge does."""
-    from srfcli.recording.synthetic import check_gauge
-    from srfcli.units import parse_quantity
+    from srfcli.core.units import parse_quantity
+    from srfcli.data.noise import check_gauge
 
     texts = {name: given[name] for name in ("noise", "quantum")}
     sizes = {n: 0.0 if text is None else parse_quantity(text, unit, name=f"--{n}") for n, text in texts.items()}
@@ -110,7 +110,7 @@ def read_gauge(given: Mapping[str, Any], unit: str) -> Gauge:
 
 def measure(gauge: Gauge, job: Job, observed: Array) -> Array | None:
     """Return the observable through the gauge, None where it reads exactly; each run has its own noise."""
-    from srfcli.recording.synthetic import measured
+    from srfcli.data.noise import measured
 
     if not (gauge.noise or gauge.quantum):
         return None
@@ -158,8 +158,8 @@ class SimulationResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the records over time: observable, friction, velocities and load, a panel for each."""
-        from srfcli.output.plots import titled
-        from srfcli.output.traces import traces
+        from srfcli.results.figures import traces
+        from srfcli.results.plots import titled
 
         own_figure(ax, "a simulation")
         return traces(curves(self.records), title=titled(self.work.model.title, self.work.parameters))
@@ -263,7 +263,7 @@ def summary(r: Record, *, named: bool) -> list[str]:
 
 def _oscillations(r: Record) -> list[str]:
     """Return a sentence for each stretch of constant drive that is long enough to tell, if any oscillates."""
-    from srfcli.numerics.events import stick_slip
+    from srfcli.motion.simulate import stick_slip
 
     n, trace = r.done, r.trace
     sentences, steady = [], 0
@@ -319,7 +319,7 @@ def simulated_run(model: GeneratedModel, r: Record, *, quantum: float) -> Run:
 
     import numpy as np
 
-    from srfcli.recording.values import Run
+    from srfcli.data.values import Run
 
     observed = r.observed if r.measured is None else r.measured
     job, used = r.job, np.ones(observed.size, bool)

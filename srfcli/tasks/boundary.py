@@ -9,20 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from srfcli.errors import SrfError
-from srfcli.numerics.atlas import Atlas, AtlasSettings, find_components
-from srfcli.numerics.critical import critical_line
+from srfcli.core.errors import SrfError, Status
+from srfcli.core.units import to_base
+from srfcli.numerics.continuation import Atlas, AtlasSettings, find_components
+from srfcli.numerics.critical import LoadWindow, critical_line, found_window
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.numerics.windows import LoadWindow, found_window
 from srfcli.results.boundary import BoundaryResult, CriticalResult, worst
-from srfcli.status import Status
 from srfcli.tasks.values import checked
-from srfcli.units import to_base
 
 if TYPE_CHECKING:
-    from srfcli.model import GeneratedModel
-    from srfcli.numerics.polish import BoundaryPoint
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.model import GeneratedModel
+    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.numerics.boundary import BoundaryPoint
 
 LINES = 5  # that are followed outwards to find the loads to look between
 Values = Sequence[float] | float
@@ -46,7 +44,7 @@ def critical(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.system`.
+        The slider, from `srfcli.symbolic.system`.
     V, eps : number or sequence, optional
         Driving velocities in um/s and relative amplitudes; the system's own if left out.
     window : (float, float), optional
@@ -142,7 +140,7 @@ def continue_boundary(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.system`.
+        The slider, from `srfcli.symbolic.system`.
     eps : number or sequence, optional
         Relative amplitudes, a boundary for each; the system's own if left out, none where eps is an axis.
     over : mapping from parameter to (low, high), optional

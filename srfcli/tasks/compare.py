@@ -7,15 +7,24 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from srfcli.errors import SrfError
-from srfcli.numerics.compare import LawStudy, LawTask, Window, read_study, study_law
-from srfcli.numerics.comparematch import Match, Observables, check_adjusted, match, observe
+from srfcli.core.errors import SrfError, Status
+from srfcli.numerics.compare import (
+    LawStudy,
+    LawTask,
+    Match,
+    Observables,
+    Window,
+    check_adjusted,
+    match,
+    observe,
+    read_study,
+    study_law,
+)
 from srfcli.results.compare import ComparisonResult
-from srfcli.status import Status
 from srfcli.tasks.values import Run, here
 
 if TYPE_CHECKING:
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.slider import SlidingSystem
 
 
 def compare(
@@ -36,7 +45,7 @@ def compare(
     Parameters
     ----------
     systems : mapping from name to SlidingSystem
-        Two sliders or more, from `srfcli.system`; the first is the reference.
+        Two sliders or more, from `srfcli.symbolic.system`; the first is the reference.
     eps : number or sequence
         Relative amplitudes above 0.
     at : float

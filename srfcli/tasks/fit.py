@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from srfcli.errors import SrfError
-from srfcli.inference import profile as profiles
-from srfcli.inference import sample as sampling
+from srfcli.core.errors import SrfError, Status
+from srfcli.inference import posterior as profiles
+from srfcli.inference import posterior as sampling
 from srfcli.inference.recordings import fit_recordings
-from srfcli.registry import Registry, load_registry
+from srfcli.laws.registry import Registry, load_registry
 from srfcli.results.fit import FitResult
-from srfcli.status import Status
 
 if TYPE_CHECKING:
-    from srfcli.inference.profile import Interval
-    from srfcli.inference.sample import Posterior
-    from srfcli.recording.values import Experiment
+    from srfcli.data.values import Experiment
+    from srfcli.inference.posterior import Interval, Posterior
 
 
 def fit(

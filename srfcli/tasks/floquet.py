@@ -8,7 +8,7 @@ from srfcli.numerics.floquet import solve_floquet
 from srfcli.results.periodic import PeriodicResult
 
 if TYPE_CHECKING:
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.slider import SlidingSystem
 
 
 def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, harmonics: int = 5) -> PeriodicResult:
@@ -17,7 +17,7 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.system`.
+        The slider, from `srfcli.symbolic.system`.
     tol : float
         Error of the multipliers; the mesh is doubled until it is met.
     max_mesh : int

@@ -14,7 +14,7 @@ from srfcli.results.linear import LinearResult
 from srfcli.tasks.values import swept
 
 if TYPE_CHECKING:
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.slider import SlidingSystem
 
 VELOCITIES = tuple(np.geomspace(1.0, 100.0, 60).tolist())  # um/s
 
@@ -27,7 +27,7 @@ def linear(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.system`.
+        The slider, from `srfcli.symbolic.system`.
     over : mapping from parameter to values, optional
         Values in declared units; a grid of their products. V from 1 to 100 um/s if left out.
     all_roots : bool

@@ -7,24 +7,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from srfcli.errors import SrfError
-from srfcli.numerics.atlas import Atlas, AtlasSettings
+from srfcli.core.errors import SrfError, Status
+from srfcli.core.settings import require_parameter
+from srfcli.core.units import to_base
+from srfcli.numerics.continuation import Atlas, AtlasSettings
 from srfcli.numerics.map import StabilityMap, compute_map
-from srfcli.numerics.mapcurves import find_boundaries
-from srfcli.numerics.mapgrid import MapAxis, MapGrid, MapSettings, check_grid
-from srfcli.numerics.neimark import branch_coefficients, criticality_points
-from srfcli.numerics.special import SpecialPoint, special_points
+from srfcli.numerics.map_boundaries import find_boundaries
+from srfcli.numerics.normal_form import branch_coefficients, criticality_points
+from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings, check_grid
+from srfcli.numerics.special_points import SpecialPoint, special_points
 from srfcli.results.map import MapResult
-from srfcli.settings import require_parameter
-from srfcli.status import Status
 from srfcli.tasks.values import Run, here
-from srfcli.units import to_base
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from srfcli.model import GeneratedModel
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.model import GeneratedModel
+    from srfcli.codegen.slider import SlidingSystem
 
 
 def map(  # the command's own name
@@ -46,7 +45,7 @@ def map(  # the command's own name
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.system`.
+        The slider, from `srfcli.symbolic.system`.
     x, y : (name, low, high, points)
         The axes. A name is that of a parameter, its ends in its declared unit, or a ratio such as K/W0, in um, s, N, whose
         second part moves.

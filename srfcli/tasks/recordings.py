@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from srfcli.recording import experiment as description
-from srfcli.recording.values import Experiment
-from srfcli.registry import Registry, load_registry
+from srfcli.data import experiment as description
+from srfcli.data.values import Experiment
+from srfcli.laws.registry import Registry, load_registry
 
 
 def read_experiment(

@@ -7,19 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from srfcli.errors import SrfError
-from srfcli.numerics import integrate
-from srfcli.numerics.load import ConstantLoad, Load, Modulation
-from srfcli.numerics.loads import LoadSteps, ModulatedLoad
-from srfcli.numerics.program import Drive
+from srfcli.core.errors import SrfError, Status
+from srfcli.motion import simulate as integrate
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, ModulatedLoad, Modulation
 from srfcli.results.simulation import Gauge, Job, Record, SimulationResult, Work, measure, observe, worst
-from srfcli.status import Status
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from srfcli.recording.values import Experiment
-    from srfcli.tasks.system import SlidingSystem
+    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.data.values import Experiment
 
 OBSERVABLES = ("elongation", "force", "friction")
 RISE = 0.02  # s over which steps of the load are rounded
@@ -41,7 +38,7 @@ def simulate(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.system`; with eps above 0 the load is modulated at f.
+        The slider, from `srfcli.symbolic.system`; with eps above 0 the load is modulated at f.
     t : array (n,)
         Times of the samples in s, rising.
     drive : Drive or sequence of (time, velocity), optional

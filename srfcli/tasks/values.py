@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from srfcli.errors import SrfError
-from srfcli.model import GeneratedModel
-from srfcli.settings import check_value, require_parameter
+from srfcli.codegen.model import GeneratedModel
+from srfcli.core.errors import SrfError
+from srfcli.core.settings import check_value, require_parameter
 
 Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 

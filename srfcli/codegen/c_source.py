@@ -1,0 +1,488 @@
+"""Generated array functions as C, compiled by what C compiler there is and kept by content.
+
+The text of the generated module is the only source, as it is for `scalar`; no formula is derived or printed twice. In dual
+numbers a function carries its derivatives in several directions along (forward automatic differentiation; Griewank and Walther,
+Evaluating Derivatives, 2008).
+
+Without a compiler motion is LSODA's and orbits are NumPy's, which are slower: `compiled(model)` is then None. SRF_CC names
+the compiler; an empty SRF_CC turns compilation off.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import ctypes
+import importlib.util
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, lru_cache, singledispatch
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from srfcli.codegen.model import GeneratedModel
+from srfcli.core.cache import LARGEST, cache_folder, content_key, is_sealed, seal
+from srfcli.core.errors import SrfError
+from srfcli.core.files import read_plain
+
+# Generated array functions as C: `x[..., i]` becomes `x[i]`, `out[..., i, j] = e` one assignment to a flat array.
+
+_FUNCTIONS = {
+    name: name for name in ("cos", "cosh", "exp", "expm1", "log", "log1p", "sin", "sinh", "sqrt", "tan", "tanh")
+}
+_FUNCTIONS |= {name: f"srf_{name}" for name in ("lut", "lut1", "lut2")}
+_FUNCTIONS |= {"arctan": "atan", "arcsinh": "asinh", "lambertw": "srf_lambertw"}
+
+
+class NoForm(SrfError):
+    """A formula of a generated module that cannot be written in C."""
+
+
+_POINTERS = ("x", "p", "_w", "_a")  # arguments that are vectors
+_OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
+_PI = "3.14159265358979323846"
+
+# a table is a cubic spline with evenly spaced knots: offset of its numbers in p, first knot, spacing, how many numbers
+TABLES = """
+static int srf_cell(const double *p, int i, double x, double *share) {
+    const double *head = p + NP + 4 * i;
+    double r = (x - head[1]) / head[2], last = head[3] - 3.0;
+    if (!(r > 0.0)) r = 0.0;
+    if (r > last) r = last;
+    int j = (int)r;
+    if (j > (int)last - 1) j = (int)last - 1;
+    *share = r - j;
+    return j;
+}
+static void srf_weights(double f, double *b, double *d, double *e) {
+    double g = 1.0 - f;
+    b[0] = g * g * g / 6.0; b[3] = f * f * f / 6.0;
+    b[1] = (4.0 - 6.0 * f * f + 3.0 * f * f * f) / 6.0; b[2] = 1.0 - b[0] - b[1] - b[3];
+    d[0] = -0.5 * g * g; d[3] = 0.5 * f * f; d[1] = -2.0 * f + 1.5 * f * f; d[2] = -d[0] - d[1] - d[3];
+    e[0] = g; e[3] = f; e[1] = 3.0 * f - 2.0; e[2] = 1.0 - 3.0 * f;
+}
+static double srf_spline(const double *p, int i, double x, int order) {
+    const double *head = p + NP + 4 * i;
+    if (head[3] < 4.0) return 0.0;
+    double f, w[3][4], sum = 0.0;
+    int j = srf_cell(p, i, x, &f);
+    if (order && (x < head[1] || x > head[1] + head[2] * (head[3] - 3.0))) return 0.0;
+    srf_weights(f, w[0], w[1], w[2]);
+    for (int k = 0; k < 4; k++) sum += w[order][k] * p[(int)head[0] + j + k];
+    return order == 0 ? sum : order == 1 ? sum / head[2] : sum / (head[2] * head[2]);
+}
+static double srf_lut(const double *p, double i, double x) { return srf_spline(p, (int)i, x, 0); }
+static double srf_lut1(const double *p, double i, double x) { return srf_spline(p, (int)i, x, 1); }
+static double srf_lut2(const double *p, double i, double x) { return srf_spline(p, (int)i, x, 2); }
+"""
+
+LAMBERTW = """
+static double srf_lambertw(double x) { /* principal branch, x > -1/e */
+    double w = x < 1.0 ? x / (1.0 + x) : log(x) - log(1.0 + log(x));
+    for (int i = 0; i < 50; i++) {
+        double e = exp(w), f = w * e - x, step = f / (e * (w + 1.0) - (w + 2.0) * f / (2.0 * w + 2.0));
+        w -= step;
+        if (fabs(step) <= 1e-15 * (1.0 + fabs(w))) break;
+    }
+    return w;
+}
+"""
+
+DUAL = """
+typedef double lanes __attribute__((vector_size(8 * LANES), may_alias));
+typedef struct { double v; lanes d; } dual; /* a number and its derivatives in LANES directions */
+static inline dual srf_scaled(double v, double s, dual a) { dual r = {v, s * a.d}; return r; }
+static inline dual srf_plain(double v) { dual r = {v, (lanes){0.0}}; return r; }
+static inline dual srf_add(dual a, dual b) { dual r = {a.v + b.v, a.d + b.d}; return r; }
+static inline dual srf_sub(dual a, dual b) { dual r = {a.v - b.v, a.d - b.d}; return r; }
+static inline dual srf_mul(dual a, dual b) { dual r = {a.v * b.v, a.v * b.d + b.v * a.d}; return r; }
+static inline dual srf_div(dual a, dual b) { double i = 1.0 / b.v, q = a.v * i; dual r = {q, i * (a.d - q * b.d)}; return r; }
+static inline dual srf_add_c(dual a, double b) { a.v += b; return a; }
+static inline dual srf_mul_c(dual a, double b) { return srf_scaled(a.v * b, b, a); }
+static inline dual srf_c_div(double a, dual b) { double q = a / b.v; return srf_scaled(q, -q / b.v, b); }
+static inline dual srf_pow_c(dual a, double b) {
+    if (b == 2.0) return srf_scaled(a.v * a.v, 2.0 * a.v, a);
+    double q = pow(a.v, b - 1.0);
+    return srf_scaled(q * a.v, b * q, a);
+}
+static inline dual srf_pow(dual a, dual b) {
+    double q = pow(a.v, b.v);
+    dual r = {q, q * (b.v / a.v * a.d + log(a.v) * b.d)};
+    return r;
+}
+static inline dual srf_c_pow(double a, dual b) { double q = pow(a, b.v); return srf_scaled(q, q * log(a), b); }
+"""
+_DUAL_OPERATORS = {
+    ast.Add: "srf_add", ast.Sub: "srf_sub", ast.Mult: "srf_mul", ast.Div: "srf_div", ast.Pow: "srf_pow",
+}  # fmt: skip
+_SLOPES = {  # of f at x where f(x) = v
+    "cos": "-sin(a.v)", "cosh": "sinh(a.v)", "exp": "v", "expm1": "v + 1.0", "log": "1.0 / a.v",
+    "log1p": "1.0 / (1.0 + a.v)", "sin": "cos(a.v)", "sinh": "cosh(a.v)", "sqrt": "0.5 / v", "tan": "1.0 + v * v",
+    "tanh": "1.0 - v * v", "atan": "1.0 / (1.0 + a.v * a.v)", "asinh": "1.0 / sqrt(1.0 + a.v * a.v)",
+    "srf_lambertw": "1.0 / (exp(v) * (1.0 + v))",
+}  # fmt: skip
+
+
+def dual_arithmetic(source: str) -> str:
+    """Return the C text of dual numbers, with the functions that a generated module calls."""
+    text = DUAL
+    for name, known in _FUNCTIONS.items():
+        if known in _SLOPES and f"{name}(" in source:
+            body = f"double v = {known}(a.v); return srf_scaled(v, {_SLOPES[known]}, a);"
+            text += f"static inline dual d_{known}(dual a) {{ {body} }}\n"
+    return text
+
+
+def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str:
+    """Return function `name` of the generated module `source` as `static void label(..., out)`, its arguments as they are.
+
+    In dual numbers x, p and out are such. Entries of `out` that the formulas leave at zero are not written: the caller clears it.
+    Raises SrfError for no such function.
+    """
+    function = _functions(source).get(name)
+    if function is None:
+        raise SrfError(f"generated module has no function '{name}'")
+    arguments = [a.arg for a in function.args.args]
+    duals = {a for a in arguments if a in ("x", "p")} if dual else None
+    lines, shape = [], (1,)
+    for statement in function.body[1:]:  # the first is the docstring
+        if isinstance(statement, ast.Return):
+            if isinstance(statement.value, ast.BinOp):  # of one number: _empty(...) + it
+                lines.append(f"out[0] = {_value(statement.value.right, duals)};")
+            continue
+        assert isinstance(statement, ast.Assign)
+        target, value = statement.targets[0], statement.value
+        if isinstance(target, ast.Subscript):
+            lines.append(f"out[{_flat(target, shape)}] = {_value(value, duals)};")
+        elif isinstance(target, ast.Name) and target.id == "out":
+            assert isinstance(value, ast.Call)
+            shape = ast.literal_eval(value.args[1])
+        elif isinstance(target, ast.Name):
+            if duals is not None and _Dual(duals).moves(value):
+                duals.add(target.id)
+                lines.append(f"const dual {_safe(target.id)} = {_Dual(duals).text(value)};")
+            else:
+                lines.append(f"const double {_safe(target.id)} = {_text(value)};")
+    unused = "".join(f" (void){_safe(a)};" for a in arguments)
+    kinds = {a: "const dual *" if dual else "const double *" for a in _POINTERS}
+    declared = ", ".join(f"{kinds.get(a, 'const double ')}{_safe(a)}" for a in arguments)
+    body = "\n".join(f"    {line}" for line in lines)
+    return f"static void {label}({declared}, {'dual' if dual else 'double'} *out) {{\n   {unused}\n{body}\n}}\n"
+
+
+@lru_cache(maxsize=4)
+def _functions(source: str) -> dict[str, ast.FunctionDef]:
+    """Return the functions of a generated module, parsed once: dozens are asked for."""
+    return {d.name: d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef)}
+
+
+def _value(node: ast.AST, duals: set[str] | None) -> str:
+    if duals is None:
+        return _text(node)
+    own = _Dual(duals)
+    return own.text(node) if own.moves(node) else f"srf_plain({_text(node)})"
+
+
+class _Dual:
+    """Text of expressions in dual numbers; what depends on none of the `names` stays a plain number."""
+
+    def __init__(self, names: set[str]) -> None:
+        self.names = names
+
+    def moves(self, node: ast.AST) -> bool:
+        """Return whether an expression has derivatives."""
+        return any(isinstance(n, ast.Name) and n.id in self.names for n in ast.walk(node))
+
+    def text(self, node: ast.AST) -> str:
+        """Return an expression that moves, as C."""
+        if isinstance(node, ast.UnaryOp):
+            inner = self.text(node.operand)
+            return f"srf_mul_c({inner}, -1.0)" if isinstance(node.op, ast.USub) else inner
+        if isinstance(node, ast.BinOp):
+            return self._binary(node)
+        if isinstance(node, ast.Call):
+            assert isinstance(node.func, ast.Name)
+            if _FUNCTIONS.get(node.func.id) not in _SLOPES:
+                raise SrfError(f"function {node.func.id} of a generated module has no derivative in C")
+            return f"d_{_FUNCTIONS[node.func.id]}({self.text(node.args[0])})"
+        return _text(node)
+
+    def _binary(self, node: ast.BinOp) -> str:
+        moving = self.moves(node.left), self.moves(node.right)
+        left, right = (self.text(n) if m else _text(n) for n, m in zip((node.left, node.right), moving, strict=True))
+        kind = type(node.op)
+        if all(moving):
+            return f"{_DUAL_OPERATORS[kind]}({left}, {right})"
+        if kind is ast.Pow:
+            return f"srf_pow_c({left}, {right})" if moving[0] else f"srf_c_pow({left}, {right})"
+        if moving[0]:
+            forms = {ast.Add: "srf_add_c({}, {})", ast.Sub: "srf_add_c({}, -({}))", ast.Mult: "srf_mul_c({}, {})"}
+            return forms.get(kind, "srf_mul_c({}, 1.0 / ({}))").format(left, right)
+        if kind is ast.Sub:
+            return f"srf_add_c(srf_mul_c({right}, -1.0), {left})"
+        forms = {ast.Add: "srf_add_c({1}, {0})", ast.Mult: "srf_mul_c({1}, {0})", ast.Div: "srf_c_div({0}, {1})"}
+        return forms[kind].format(left, right)
+
+
+def _flat(target: ast.Subscript, shape: tuple[int, ...]) -> int:
+    """Return the place in a flat array that out[..., i] or out[..., i, j] names."""
+    assert isinstance(target.slice, ast.Tuple)
+    places = [ast.literal_eval(e) for e in target.slice.elts[1:]]
+    return places[0] if len(places) == 1 else places[0] * shape[1] + places[1]
+
+
+def _safe(name: str) -> str:
+    """Return a name that no keyword or macro of C shadows."""
+    return name if name in _POINTERS else f"q_{name}"
+
+
+@singledispatch
+def _text(node: ast.AST) -> str:
+    raise NoForm(f"{type(node).__name__} in a generated function has no form in C")
+
+
+@_text.register
+def _(node: ast.Constant) -> str:
+    assert isinstance(node.value, (int, float))
+    return repr(float(node.value))
+
+
+@_text.register
+def _(node: ast.Name) -> str:
+    return _PI if node.id == "pi" else _safe(node.id)
+
+
+@_text.register
+def _(node: ast.Subscript) -> str:
+    index = node.slice.elts[-1] if isinstance(node.slice, ast.Tuple) else node.slice
+    assert isinstance(node.value, ast.Name) and isinstance(index, ast.Constant) and isinstance(index.value, int)
+    return f"{node.value.id}[{index.value}]"
+
+
+@_text.register
+def _(node: ast.UnaryOp) -> str:
+    assert isinstance(node.op, (ast.USub, ast.UAdd))
+    return f"(-{_text(node.operand)})" if isinstance(node.op, ast.USub) else _text(node.operand)
+
+
+@_text.register
+def _(node: ast.BinOp) -> str:
+    left, right = _text(node.left), _text(node.right)
+    if isinstance(node.op, ast.Pow):
+        return f"pow({left}, {right})"
+    return f"({left} {_OPERATORS[type(node.op)]} {right})"
+
+
+@_text.register
+def _(node: ast.Call) -> str:
+    assert isinstance(node.func, ast.Name)
+    if node.func.id not in _FUNCTIONS:
+        raise NoForm(f"function {node.func.id} of a generated module has no form in C")
+    return f"{_FUNCTIONS[node.func.id]}({', '.join(_text(a) for a in node.args)})"
+
+
+# Integrator, filter and periodic orbits in C, compiled with a model's own rates by what C compiler there is, kept by content.
+
+FLAGS = (  # no contraction: the digits are the same whatever the processor
+    "-O3", "-std=c99", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off", "-Wno-psabi",
+)  # fmt: skip
+VECTORS = ("avx512f", "avx2")  # instruction sets that carry derivatives several at a time, the widest first
+FUNCTIONS = {"rates": "srf_rates", "rates_jacobian": "srf_jacobian", "rates_parameters": "srf_parameters"}
+DUAL_FUNCTIONS = {
+    "rates": "srf_d_rates", "rates_jacobian": "srf_d_jacobian", "field_gain": "srf_d_gain", "elongation": "srf_d_reading",
+    "elongation_gradient": "srf_d_gradient",
+}  # fmt: skip
+ORBIT_FUNCTIONS = {"cycle": "srf_cycle", "cycle_jacobian": "srf_cycle_jacobian", "cycle_bilinear": "srf_bilinear"}
+LANES = 8  # derivatives that the filter carries along at a time
+TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
+
+
+def c_source(model: GeneratedModel) -> str:
+    """Return the C text of the integrator for this model, and of the filter where it has a random friction field."""
+    head = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n"
+    tables, functions = model.namespace.get("TABLES", ()), FUNCTIONS
+    if tables:
+        head += f"#define NT {len(tables)}\n"
+        functions = FUNCTIONS | TABLE_FUNCTIONS
+    needs = (LAMBERTW if "lambertw(" in model.source else "") + (TABLES if tables else "")
+    body = "\n".join(c_function(model.source, name, label=label) for name, label in functions.items())
+    own = (files("srfcli") / "codegen" / "radau.c").read_text(encoding="utf-8")
+    return head + needs + body + own + (_filter_source(model) if "field_gain" in model.namespace else "")
+
+
+def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_step: float) -> str:
+    """Return the C text of Newton's equations of periodic orbits; `scheme` holds the arrays of the collocation."""
+    stages = len(scheme["STEP"])
+    text = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n#define MS {stages}\n"
+    text += f"#define LOG_STEP {log_step!r}\n"
+    text += f"static const int LOGS[NX] = {{{', '.join(str(int(v)) for v in model.logarithmic)}}};\n"
+    for name, array in scheme.items():
+        sizes = "".join(f"[{n}]" for n in array.shape)
+        text += f"static const double {name}{sizes} = {{{', '.join(repr(float(v)) for v in array.ravel())}}};\n"
+    text += LAMBERTW if "lambertw(" in model.source else ""
+    text += "\n".join(c_function(model.source, name, label=label) for name, label in ORBIT_FUNCTIONS.items())
+    calls = {"CYCLE_PARAMETER": "", "CYCLE_BILINEAR_PARAMETER": ""}
+    for table in calls:
+        for place, name in enumerate(model.names):
+            own = model.namespace[table][name].__name__
+            text += c_function(model.source, own, label=f"srf_{own}")
+            rest = "x, p, out" if table == "CYCLE_PARAMETER" else "x, p, _w, _a, &out"
+            calls[table] += f"    case {place}: srf_{own}(tau, {rest}); break;\n"
+    point = "int which, double tau, const double *x, const double *p"
+    forms = {
+        "CYCLE_PARAMETER": (f"static void srf_cycle_parameter({point}, double *out)", "", ""),
+        "CYCLE_BILINEAR_PARAMETER": (
+            f"static double srf_bilinear_parameter({point}, const double *_w, const double *_a)",
+            "    double out = 0.0;\n",
+            "    return out;\n",
+        ),
+    }
+    for table, (head, before, after) in forms.items():
+        text += f"{head} {{\n{before}    switch (which) {{\n{calls[table]}    }}\n{after}}}\n"
+    return text + (files("srfcli") / "codegen" / "orbit.c").read_text(encoding="utf-8")
+
+
+def _filter_source(model: GeneratedModel) -> str:
+    """Return the C text of the filter, which follows that of the integrator."""
+    gauge = model.namespace.get("OBSERVED")
+    text = f"#define LANES {LANES}\n" + dual_arithmetic(model.source)
+    text += c_function(model.source, "field_gain", label="srf_gain")
+    for name, label in DUAL_FUNCTIONS.items():
+        if gauge and name.startswith("elongation"):
+            place = model.states.index(gauge)
+            shown = f"out[{place}] = srf_plain(1.0)" if name.endswith("gradient") else f"out[0] = x[{place}]"
+            arguments = "const dual *x, double V, double W, double W_dot, const dual *p, dual *out"
+            text += (
+                f"static void {label}({arguments}) {{ (void)x; (void)V; (void)W; (void)W_dot; (void)p; {shown}; }}\n"
+            )
+        else:
+            text += c_function(model.source, name, label=label, dual=True)
+    return text + (files("srfcli") / "codegen" / "filter.c").read_text(encoding="utf-8")
+
+
+@cache
+def compiler() -> tuple[str, ...] | None:
+    """Return the command of the C compiler: SRF_CC, CC, cc, gcc, clang or the package ziglang; None where there is none."""
+    named = os.environ.get("SRF_CC")
+    if named is not None:
+        return tuple(shlex.split(named)) or None
+    for candidate in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
+        words = shlex.split(candidate)
+        if words and shutil.which(words[0]):
+            return tuple(words)
+    if importlib.util.find_spec("ziglang"):
+        return (sys.executable, "-m", "ziglang", "cc")
+    return None
+
+
+GET_COMPILER = "pip install ziglang, or install cc, gcc or clang"
+
+
+def uncompiled() -> bool:
+    """Return whether there is no C compiler though nobody asked for none (an empty SRF_CC does)."""
+    return os.environ.get("SRF_CC") is None and compiler() is None
+
+
+@cache
+def flags() -> tuple[str, ...]:
+    """Return the compiler's options: FLAGS, and the widest vectors that this processor says it has."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:
+        return FLAGS
+    known = next((line.split() for line in lines if line.startswith("flags")), [])
+    return (*FLAGS, *[f"-m{name}" for name in VECTORS if name in known][:1])
+
+
+@cache
+def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
+    """Return the compiled integrator of this model, or None where there is no compiler; SrfError where it fails on the text."""
+    if compiler() is None:
+        return None
+    library = library_of(lambda: c_source(model), ["motion", model.source])
+    library.srf_integrate.restype = ctypes.c_int
+    if hasattr(library, "srf_filter"):
+        library.srf_filter.restype = ctypes.c_int
+    return library
+
+
+@cache
+def _writers() -> str:
+    """Return the hash of all that C text is written with, besides what its caller names: the files beside this one."""
+    written = sorted(p for p in Path(__file__).parent.iterdir() if p.suffix in (".py", ".c"))
+    return content_key([path.read_text(encoding="utf-8") for path in written])
+
+
+def library_of(write: Callable[[], str], parts: Sequence[str]) -> ctypes.CDLL:
+    """Return the C text of `write` compiled and loaded, from the cache where it was built before from the same `parts`.
+
+    With this package's own files the parts determine the text, which is therefore written only where it must be compiled. Raises
+    SrfError where the compiler fails on it.
+    """
+    command = compiler()
+    assert command is not None
+    key = content_key(
+        [*parts, _writers(), " ".join(command), " ".join(flags()), platform.platform(), platform.machine()]
+    )
+    folder = cache_folder()
+    if folder is not None:
+        path = folder / f"{key}.so"
+        with contextlib.suppress(OSError):  # a cache that cannot be written, or a disk from which nothing may be run
+            return _load(path if _intact(path) else _build(command, write(), path, sealed=True))
+    try:
+        with tempfile.TemporaryDirectory(prefix="srf-", ignore_cleanup_errors=True) as scratch:
+            return _load(
+                _build(command, write(), Path(scratch) / f"{key}.so")
+            )  # it stays in memory when its file is gone
+    except OSError as error:
+        raise SrfError(
+            f"no model can be compiled in {error.filename or 'the folder of temporary files'}: {error.strerror or error}",
+            "Make room there, name another folder by TMPDIR, or turn compiling off: SRF_CC=",
+            exit_code=1,
+        ) from error
+
+
+def _build(command: tuple[str, ...], source: str, path: Path, *, sealed: bool = False) -> Path:
+    """Compile to a file beside `path`, then put it in place, sealed for a later process if it is to stay."""
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
+        text, library = Path(folder) / "model.c", Path(folder) / "model.so"
+        text.write_text(source, encoding="utf-8")
+        end = [] if sys.platform == "win32" else ["-lm"]
+        done = subprocess.run(
+            [*command, *flags(), "-o", str(library), str(text), *end],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "PYTHONSAFEPATH": "1"},  # `python -m ziglang` would look in the current folder first
+        )
+        if done.returncode:
+            first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
+            raise SrfError(f"{' '.join(command)} cannot compile a model: {first}", "SRF_CC= turns compiling off")
+        if sealed:
+            mark = Path(folder) / "model.sum"
+            mark.write_text(seal(path.name, library.read_bytes()), encoding="ascii")
+            mark.replace(path.with_suffix(".sum"))
+        library.replace(path)
+    return path
+
+
+def _intact(path: Path) -> bool:
+    """Return whether a library lies there as this user built it: to load it is to run it, and half of one ends the process."""
+    try:
+        found = read_plain(path.with_suffix(".sum"), limit=1000).decode("ascii", errors="replace")
+        return is_sealed(path.name, read_plain(path, limit=LARGEST), found)
+    except (OSError, SrfError):
+        return False
+
+
+def _load(path: Path) -> ctypes.CDLL:
+    return ctypes.CDLL(str(path))

@@ -1,0 +1,542 @@
+"""Sympy expressions to one readable NumPy module: steps, shared subexpressions, the same text every time.
+
+A derivative of a long formula written out grows out of hand (a minute to derive, megabytes to print); step by step it stays
+a small multiple of the steps.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import sympy as sp
+
+from srfcli.laws.expression import NUMPY_FUNCTIONS, NumPyText, python_name, renamed, symbol
+from srfcli.symbolic.derive import Linearisation, closed_limits, in_law_parameters, linearise
+from srfcli.symbolic.equations import Equations, equations_of, lut, lut1, tidy
+from srfcli.symbolic.system import RANDOM_FIELD, System
+
+# Formulas in steps: named intermediate values, then outputs in them; derivatives are taken step by step.
+
+LONG = 140  # operations: up to it formulas are kept whole, where common subexpressions read better
+
+Step = tuple[sp.Symbol, sp.Expr]
+
+
+@dataclass(frozen=True)
+class Staged:
+    """Outputs in terms of inputs and steps; each step is in terms of inputs and earlier steps."""
+
+    outputs: tuple[sp.Expr, ...]
+    steps: tuple[Step, ...] = ()
+    names: Iterator[sp.Symbol] = field(default_factory=lambda: sp.numbered_symbols("_s"), compare=False, repr=False)
+
+    def substituted(self, values: Mapping[sp.Expr, sp.Expr]) -> Staged:
+        """Return the same with inputs replaced; the steps keep their names."""
+        steps = tuple((s, e.subs(values)) for s, e in self.steps)
+        return Staged(tuple(e.subs(values) for e in self.outputs), steps, self.names)
+
+    def with_outputs(self, outputs: Sequence[sp.Expr]) -> Staged:
+        """Return other outputs of the same steps."""
+        return Staged(tuple(outputs), self.steps, self.names)
+
+    def derivative(self, direction: Mapping[sp.Symbol, sp.Expr]) -> Staged:
+        """Return the outputs' derivatives as the inputs change in `direction`: a rate for each input that does."""
+        rates = dict(direction)
+        added: list[Step] = []
+        for step, formula in self.steps:
+            rate = _total(formula, rates)
+            if rate != 0:
+                name = next(self.names)
+                added.append((name, rate))
+                rates[step] = name
+        return Staged(tuple(_total(e, rates) for e in self.outputs), (*self.steps, *added), self.names)
+
+    def needed(self) -> tuple[Step, ...]:
+        """Return the steps that the outputs depend on, in order."""
+        used = set().union(*(e.free_symbols for e in self.outputs))
+        kept = []
+        for step, formula in reversed(self.steps):
+            if step in used:
+                kept.append((step, formula))
+                used |= formula.free_symbols
+        return tuple(reversed(kept))
+
+
+def staged(outputs: Sequence[sp.Expr]) -> Staged:
+    """Return these formulas, whole where they are short, else cut at their common subexpressions."""
+    if sum(sp.count_ops(e) for e in outputs) <= LONG:
+        return Staged(tuple(outputs))
+    names = sp.numbered_symbols("_s")
+    steps, reduced = sp.cse(list(outputs), symbols=names, order="canonical")
+    return Staged(tuple(reduced), tuple(steps), names)
+
+
+def joined(parts: Sequence[Staged]) -> Staged:
+    """Return the outputs of all `parts`, which have grown from one, and their steps, each once."""
+    steps = dict(itertools.chain.from_iterable(p.steps for p in parts))
+    return Staged(tuple(itertools.chain.from_iterable(p.outputs for p in parts)), tuple(steps.items()), parts[0].names)
+
+
+def _total(formula: sp.Expr, rates: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+    moving = sorted(formula.free_symbols & rates.keys(), key=str)
+    return sp.Add(*(sp.diff(formula, s) * rates[s] for s in moving))
+
+
+# Sympy expressions to one readable NumPy module: original names, shared subexpressions, the same text every time.
+
+
+class Writer:
+    """Collects functions of (head, x, p) and writes each with its own common subexpressions."""
+
+    def __init__(self, system: System, equations: Equations) -> None:
+        self.system, self.equations = system, equations
+        self.parameters = [p.name for p in system.parameters]
+        self.printer = NumPyText()
+        self.parts: list[str] = []
+
+    def function(
+        self,
+        name: str,
+        doc: str,
+        outputs: Sequence[tuple[str, sp.Expr]],
+        *,
+        steps: Sequence[Step] = (),
+        head: Sequence[str] = (),
+        tail: Sequence[str] = (),
+        vectors: Sequence[str] = (),
+        shape: str = "",
+        state: bool = True,
+        dtype: str | None = None,
+    ) -> None:
+        """Write one function; `outputs` are (index text, expression), index '' returns the expression itself."""
+        outputs = [(i, e) for i, e in outputs if e != 0 or i in ("", "0")]
+        if steps:
+            kept = Staged(tuple(e for _, e in outputs), tuple(steps))
+            shared, reduced = list(kept.needed()), list(kept.outputs)
+        else:
+            shared, reduced = sp.cse([e for _, e in outputs], symbols=sp.numbered_symbols("_"), order="canonical")
+        used = {str(s) for e in [*(e for _, e in shared), *reduced] for s in e.free_symbols}
+        arguments = [
+            *head,
+            *(["x"] if state else []),
+            *tail,
+            "p",
+            *(f"_{w}" for w in vectors),
+        ]  # a law may have a parameter c
+        lines = [f"def {name}({', '.join(arguments)}):", f'    """{doc}"""']
+        lines += [f"    {line}" for line in self._unpack(used - set(tail), vectors, state)]
+        lines += [f"    {s} = {self.text(e)}" for s, e in shared]
+        like = [*head, *(["x[..., 0]"] if state else []), *tail, *(f"_{w}[..., 0]" for w in vectors)]
+        like += [] if state else ["*p[: len(PARAMETERS)]"]
+        if len(outputs) == 1 and outputs[0][0] == "":
+            value = self.printer.parenthesize(renamed(reduced[0]), 40)
+            lines.append(f"    return _empty(({', '.join(like)},), ()) + {value}")
+        else:
+            lines.append(f"    out = _empty(({', '.join(like)},), {shape})")
+            lines += [f"    out[..., {i}] = {self.text(e)}" for (i, _), e in zip(outputs, reduced, strict=True)]
+            lines.append("    return out")
+        self.parts.append("\n".join(lines))
+
+    def vector(self, name: str, doc: str, formulas: Staged, **more: Any) -> None:
+        """Write a function of one output for each unknown."""
+        self.function(name, doc, [(str(i), e) for i, e in enumerate(formulas.outputs)], steps=formulas.steps, **more)
+
+    def square(self, name: str, doc: str, formulas: Staged, **more: Any) -> None:
+        """Write a function of a square matrix of outputs, given row by row."""
+        n = len(self.equations.unknowns)
+        indexed = [(f"{k // n}, {k % n}", e) for k, e in enumerate(formulas.outputs)]
+        self.function(name, doc, indexed, steps=formulas.steps, shape=f"({n}, {n})", **more)
+
+    def text(self, expression: sp.Expr) -> str:
+        return self.printer.doprint(renamed(expression))
+
+    def _unpack(self, used: set[str], vectors: Sequence[str], state: bool) -> Iterable[str]:
+        for i, name in enumerate(self.parameters):
+            if name in used:
+                yield f"{python_name(name)} = p[{i}]"
+        if state:
+            for i, (s, log) in enumerate(zip(self.equations.unknowns, self.equations.logarithmic, strict=True)):
+                if str(s) in used:
+                    yield f"{s} = exp(x[..., {i}])" if log else f"{s} = x[..., {i}]"
+        for vector in vectors:
+            for i in range(len(self.equations.unknowns)):
+                if f"_{vector}{i}" in used:
+                    yield f"_{vector}{i} = _{vector}[..., {i}]"
+
+
+def generate(system: System) -> str:
+    """Return the source of the module that computes everything numerical about `system`."""
+    eq = equations_of(system)
+    linear = linearise(system)
+    writer = Writer(system, eq)
+    _write_statics(writer, eq, linear)
+    _write_closed(writer, system)
+    _write_rates(writer, eq)
+    _write_cycle(writer, eq)
+    body = "\n\n\n".join(writer.parts)
+    names = [f for f in NUMPY_FUNCTIONS if re.search(rf"\b{f}\b", body)]
+    return (
+        _HEAD.format(
+            title=system.title,
+            names=", ".join(names),
+            helpers="".join(h for name, h in HELPERS.items() if f"{name}(" in body),
+            states=tuple_text(eq.names),
+            logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
+            parameters=parameter_rows(system),
+            elastic=system.elastic,
+            inertia=system.inertia,
+            polynomial=linear.polynomial_degree,
+            forms=textwrap.indent("\n".join(f'"{k}": {v!r},' for k, v in linear.names.items()), "    "),
+        )
+        + body
+        + "\n\n\n"
+        + _tables(writer.parameters)
+    )
+
+
+def parameter_rows(system: System) -> str:
+    """Return the rows of PARAMETERS."""
+    return "\n".join(f"    {_parameter(p)}," for p in system.parameters)
+
+
+def _parameter(p: Any) -> str:
+    bounds = [repr(float(b)).replace("inf", 'float("inf")') for b in (p.lower, p.upper)]
+    return f"({p.name!r}, {float(p.default)!r}, {p.unit!r}, {bounds[0]}, {bounds[1]}, {p.about!r})"
+
+
+def tuple_text(names: Sequence[str]) -> str:
+    """Return the text of a tuple of names."""
+    return "(" + ", ".join(f'"{n}"' for n in names) + ",)"
+
+
+def _tables(parameters: Sequence[str]) -> str:
+    rows = "\n".join(f'    "{n}": cycle_d_{python_name(n)},' for n in parameters)
+    bilinear = "\n".join(f'    "{n}": cycle_bilinear_d_{python_name(n)},' for n in parameters)
+    return f"CYCLE_PARAMETER = {{\n{rows}\n}}\n\nCYCLE_BILINEAR_PARAMETER = {{\n{bilinear}\n}}\n"
+
+
+def _write_statics(writer: Writer, eq: Equations, linear: Linearisation) -> None:
+    n = len(eq.unknowns)
+    steady = [
+        (str(i), sp.log(e) if log else e) for i, (e, log) in enumerate(zip(eq.steady, eq.logarithmic, strict=True))
+    ]
+    writer.function("steady", "Steady sliding at V under W0.", steady, shape=f"({n},)", state=False)
+    at_rest = dict(zip(eq.unknowns, eq.steady, strict=True)) | {symbol("W"): symbol("W0")}
+    writer.function(
+        "steady_friction", "Friction coefficient in steady sliding at V.", [("", eq.mu.subs(at_rest))], state=False
+    )
+    slopes = [("0", linear.mu_v), *((str(i + 1), e) for i, e in enumerate(linear.mu_phi))]
+    writer.function(
+        "slopes",
+        "d mu/d ln v, then d mu/d ln phi for each state, in steady sliding.",
+        slopes,
+        shape=f"({len(slopes)},)",
+        state=False,
+    )
+    polynomial = [(str(i), e) for i, e in enumerate(linear.characteristic)]
+    writer.function(
+        "characteristic",
+        "Real coefficients a_0..a_n of the characteristic polynomial in s.",
+        polynomial,
+        shape=f"({len(polynomial)},)",
+        state=False,
+    )
+    if linear.hurwitz is not None:
+        writer.function(
+            "hurwitz_in_load",
+            "Coefficients, lowest first, of the last Hurwitz determinant but one in W0.",
+            [(str(i), e) for i, e in enumerate(linear.hurwitz)],
+            shape=f"({len(linear.hurwitz)},)",
+            state=False,
+        )
+
+
+def _write_closed(writer: Writer, system: System) -> None:
+    """Write the critical load and frequency that have a closed form; the functions that have none are left out."""
+    limits = closed_limits(system)
+    if limits is None:
+        return
+    ratio = sp.Function("positive_ratio")
+    omega = None if limits.omega_squared is None else sp.sqrt(ratio(*sp.fraction(limits.omega_squared, exact=True)))
+    outputs = [
+        ("closed_frequency", "Omega_c in rad/s, exact; nan where friction strengthens.", omega),
+        ("closed_load", "Critical W0 in N, exact for any kappa and M; nan where there is none.", limits.load),
+        ("limit_load", "Critical W0 in N for kappa to infinity; nan where there is none.", limits.limit_load),
+        ("quasistatic_load", "Critical W0 in N for kappa to infinity without inertia.", limits.quasistatic_load),
+    ]
+    Omega_squared = symbol("Omega_c") ** 2
+    for name, doc, value in outputs:
+        if value is None or (value.has(symbol("Omega_c")) and limits.omega_squared is None):
+            continue
+        if name != "closed_frequency":
+            if limits.omega_squared is not None:
+                value = value.subs(Omega_squared, limits.omega_squared)
+            value = ratio(*sp.fraction(value, exact=True))  # exact: exp(-V/Vc) stays above
+        writer.function(name, doc, [("", in_law_parameters(system, value))], state=False)
+
+
+def rates_functions(writer: Writer, eq: Equations) -> Staged:
+    """Write the rates under any drive and load, their derivatives, friction and elongation; return the rates."""
+    rates, inputs = staged(eq.rates), ("V", "W", "W_dot")
+    doc = "dx/dt under drive V, imposed load W and its rate W_dot."
+    writer.vector("rates", doc, rates, tail=inputs, shape=f"({len(eq.unknowns)},)")
+    writer.square("rates_jacobian", "d(rates)/dx.", _jacobian(eq, rates), tail=inputs)
+    _write_rates_by_parameters(writer, rates, inputs)
+    writer.function("friction", "Friction coefficient.", [("", eq.mu)], tail=inputs)
+    writer.function("elongation", "Spring elongation u.", [("", eq.spring)], tail=inputs)
+    return rates
+
+
+def _write_rates(writer: Writer, eq: Equations) -> None:
+    """Write what a simulator needs (any drive and load) and the multilinear forms of the normal form at rest."""
+    rates, n = rates_functions(writer, eq), range(len(eq.unknowns))
+    shape = f"({len(n)},)"
+    calm = rates.substituted({symbol("W"): symbol("W0"), symbol("W_dot"): sp.S.Zero})
+    a, b, c = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "abc")
+    second = calm.derivative(_direction(eq, a)).derivative(_direction(eq, b))
+    third = second.derivative(_direction(eq, c))
+    writer.vector(
+        "second",
+        "Second derivative of the rates at constant load, in the directions a, b.",
+        second,
+        vectors=("a", "b"),
+        shape=shape,
+    )
+    writer.vector(
+        "third",
+        "Third derivative of the rates at constant load, in the directions a, b, c.",
+        third,
+        vectors=("a", "b", "c"),
+        shape=shape,
+    )
+
+
+def _write_rates_by_parameters(writer: Writer, rates: Staged, inputs: Sequence[str]) -> None:
+    """Write d(rates)/dp, a column for each parameter, as a fit's sensitivity equations need it."""
+    columns = [rates.derivative({symbol(name): sp.S.One}) for name in writer.parameters]
+    both = joined(columns)
+    n, m = len(rates.outputs), len(columns)
+    indexed = [(f"{i}, {j}", columns[j].outputs[i]) for i in range(n) for j in range(m)]
+    doc = "d(rates)/dp, a column for each of PARAMETERS."
+    writer.function("rates_parameters", doc, indexed, steps=both.steps, tail=inputs, shape=f"({n}, {m})")
+
+
+def _direction(eq: Equations, by: Sequence[sp.Expr]) -> dict[sp.Symbol, sp.Expr]:
+    """Return the rate of each symbol in the formulas as the unknowns change by `by`: v, not ln v, stands in the formulas."""
+    return {s: s * d if log else d for s, log, d in zip(eq.unknowns, eq.logarithmic, by, strict=True)}
+
+
+def _gradient(eq: Equations, formulas: Staged) -> list[Staged]:
+    """Return the derivatives by each unknown."""
+    n = len(eq.unknowns)
+    return [
+        formulas.derivative({k: v for k, v in _direction(eq, sp.eye(n).row(j)).items() if v != 0}) for j in range(n)
+    ]
+
+
+def _jacobian(eq: Equations, formulas: Staged) -> Staged:
+    """Return the Jacobian, row by row."""
+    columns = _gradient(eq, formulas)
+    entries = [column.outputs[i] for i in range(len(eq.unknowns)) for column in columns]
+    return joined(columns).with_outputs(entries if joined(columns).steps else [tidy(e) for e in entries])
+
+
+def _write_cycle(writer: Writer, eq: Equations) -> None:
+    """Write the field over one forcing period, tau = f t in [0, 1], and what continuation differentiates."""
+    n = range(len(eq.unknowns))
+    phase, f, eps, W0 = sp.Symbol("tau"), symbol("f"), symbol("eps"), symbol("W0")
+    angle = 2 * sp.pi * phase
+    load = {symbol("W"): W0 * (1 + eps * sp.cos(angle)), symbol("W_dot"): -2 * sp.pi * f * W0 * eps * sp.sin(angle)}
+    field = staged(eq.rates).substituted(load)
+    field = field.with_outputs([e / f for e in field.outputs])
+    shape = f"({len(n)},)"
+    jacobian = _jacobian(eq, field)
+    head = ("tau",)
+    writer.vector(
+        "cycle", "dx/dtau over one forcing period, W = W0 (1 + eps cos 2 pi tau).", field, head=head, shape=shape
+    )
+    writer.square("cycle_jacobian", "d(cycle)/dx.", jacobian, head=head)
+    writer.function("cycle_friction", "Friction coefficient.", [("", eq.mu.subs(load))], head=head)
+    writer.function("cycle_load", "Normal load W.", [("", eq.load.subs(load))], head=head)
+    writer.function("cycle_elongation", "Spring elongation u.", [("", eq.spring.subs(load))], head=head)
+    w, a = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "wa")
+    entries = {(i, j): jacobian.outputs[len(n) * i + j] for i in n for j in n}
+    form = jacobian.with_outputs([sum((w[i] * entries[i, j] * a[j] for i in n for j in n), sp.S.Zero)])
+    writer.vector(
+        "cycle_bilinear",
+        "Gradient over x of w . (d(cycle)/dx) a.",
+        joined(_gradient(eq, form)),
+        head=head,
+        vectors=("w", "a"),
+        shape=shape,
+    )
+    for name in writer.parameters:
+        by = {symbol(name): sp.S.One}
+        writer.vector(
+            f"cycle_d_{python_name(name)}", f"d(cycle)/d({name}).", field.derivative(by), head=head, shape=shape
+        )
+        slope = form.derivative(by)
+        writer.function(
+            f"cycle_bilinear_d_{python_name(name)}",
+            f"d/d({name}) of w . (d(cycle)/dx) a.",
+            [("", slope.outputs[0])],
+            steps=slope.steps,
+            head=head,
+            vectors=("w", "a"),
+        )
+
+
+_LAMBERTW = '''
+
+def lambertw(x):
+    """Principal branch, real where its argument is real."""
+    from scipy.special import lambertw as complex_lambertw
+
+    value = complex_lambertw(x)
+    return value if iscomplexobj(x) else value.real
+'''
+
+_RATIO = '''
+
+def positive_ratio(above, below):
+    """above/below where that is positive, else nan."""
+    from numpy import nan, where
+
+    ratio = above/where(below == 0, nan, below)
+    return where(ratio > 0, ratio, nan)
+'''
+
+HELPERS = {"lambertw": _LAMBERTW, "positive_ratio": _RATIO}
+
+_HEAD = '''"""Generated by srf from {title}.
+
+Arrays of any leading shape, real or complex; x[..., i] are the STATES, p[i] the PARAMETERS, units um, s, N.
+"""
+
+from numpy import asarray, iscomplexobj, result_type, zeros, broadcast_shapes
+from numpy import {names}
+
+STATES = {states}
+LOGARITHMIC = {logarithmic}
+ELASTIC = {elastic}
+INERTIA = {inertia}
+HOPF_DEGREE = {polynomial}
+PARAMETERS = (
+{parameters}
+)
+NAMES = {{
+{forms}
+}}
+
+
+def _empty(like, trailing):
+    """Zeros of the shape that the arguments share, with `trailing` axes added."""
+    arrays = [a if hasattr(a, "dtype") else asarray(a) for a in like]
+    shapes = {{a.shape for a in arrays}}
+    common = shapes.pop() if len(shapes) == 1 else broadcast_shapes(*shapes)
+    return zeros(common + trailing, dtype=result_type(float, *{{a.dtype for a in arrays}}))
+{helpers}
+
+'''
+
+
+# The part of a generated module that motion in time needs, for systems with effects and tables; no stability analysis.
+
+_MOTION_HEAD = '''"""Generated by srf from {title}.
+
+Motion only. Arrays of any leading shape; x[..., i] are the STATES, p[i] the PARAMETERS, the numbers of tables after them.
+"""
+
+from numpy import asarray, iscomplexobj, result_type, zeros, broadcast_shapes
+from numpy import {names}
+{tables}
+STATES = {states}
+LOGARITHMIC = {logarithmic}
+TABLES = {arguments}
+OBSERVED = {observed!r}
+PARAMETERS = (
+{parameters}
+)
+
+
+def _empty(like, trailing):
+    """Zeros of the shape that the arguments share, with `trailing` axes added."""
+    arrays = [a if hasattr(a, "dtype") else asarray(a) for a in like]
+    shapes = {{a.shape for a in arrays}}
+    common = shapes.pop() if len(shapes) == 1 else broadcast_shapes(*shapes)
+    return zeros(common + trailing, dtype=result_type(float, *{{a.dtype for a in arrays}}))
+{helpers}
+
+'''
+
+
+def generate_motion(system: System) -> str:
+    """Return the source of a module with steady state, rates and their derivatives by state, parameters and tables."""
+    eq = equations_of(system)
+    writer = Writer(system, eq)
+    steady = [
+        (str(i), sp.log(e) if log else e) for i, (e, log) in enumerate(zip(eq.steady, eq.logarithmic, strict=True))
+    ]
+    writer.function("steady", "Steady sliding at V under W0.", steady, shape=f"({len(steady)},)", state=False)
+    rates = rates_functions(writer, eq)
+    if RANDOM_FIELD in system.effects:
+        _write_filter(writer, eq, rates)
+    if system.tables:
+        _write_tables(writer, system)
+    body = "\n\n\n".join(writer.parts)
+    observed = next((e.observed for e in system.effects if e.observed), "")
+    return (
+        _MOTION_HEAD.format(
+            title=system.title,
+            names=", ".join(f for f in NUMPY_FUNCTIONS if re.search(rf"\b{f}\b", body)),
+            tables="from srfcli.codegen.splines import tables_after\n" if system.tables else "",
+            states=tuple_text(eq.names),
+            logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
+            arguments=repr(system.tables),
+            observed=observed,
+            parameters=parameter_rows(system),
+            helpers="".join(h for name, h in HELPERS.items() if f"{name}(" in body)
+            + ("\nlut, lut1, lut2 = tables_after(len(PARAMETERS))\n" if system.tables else ""),
+        )
+        + body
+        + "\n"
+    )
+
+
+def _write_filter(writer: Writer, eq: Equations, rates: Staged) -> None:
+    """Write what a Kalman filter asks for besides: where the field's white noise enters, and the gradient of the elongation."""
+    inputs, shape = ("V", "W", "W_dot"), f"({len(eq.unknowns)},)"
+    gain = rates.derivative({symbol("field_noise"): sp.S.One})
+    writer.vector("field_gain", "d(rates)/d(field_noise).", gain, tail=inputs, shape=shape)
+    gradient = [(str(j), eq.derivative(eq.spring, j)) for j in range(len(eq.unknowns))]
+    writer.function("elongation_gradient", "d(elongation)/dx.", gradient, tail=inputs, shape=shape)
+
+
+def _write_tables(writer: Writer, system: System) -> None:
+    """Write what each table is a function of, and the slopes of the rates by its value and its first derivative."""
+    eq, inputs = equations_of(system), ("V", "W", "W_dot")
+    names = [symbol(argument) for _, argument in system.tables]
+    writer.function(
+        "table_arguments", "What each table is a function of.", [(str(i), s) for i, s in enumerate(names)],
+        tail=inputs, shape=f"({len(names)},)",
+    )  # fmt: skip
+    stand_ins = {}
+    for i, s in enumerate(names):
+        stand_ins[lut(sp.Integer(i), s)] = sp.Symbol(f"T{i}")
+        stand_ins[lut1(sp.Integer(i), s)] = sp.Symbol(f"T{i}d")
+    back = {v: k for k, v in stand_ins.items()}
+    rates = staged([e.xreplace(stand_ins) for e in eq.rates])
+    columns = []
+    for i in range(len(names)):
+        columns += [rates.derivative({sp.Symbol(f"T{i}"): sp.S.One}), rates.derivative({sp.Symbol(f"T{i}d"): sp.S.One})]
+    both = joined(columns).substituted(back)
+    n, m = len(eq.rates), len(columns)
+    place = {(i, j): both.outputs[j * n + i] for i in range(n) for j in range(m)}
+    indexed = [(f"{i}, {j}", place[i, j]) for i in range(n) for j in range(m)]
+    doc = "d(rates)/d(value of table i) in column 2 i, by its slope in column 2 i + 1."
+    writer.function("rates_tables", doc, indexed, steps=both.steps, tail=inputs, shape=f"({n}, {m})")

@@ -1,0 +1,159 @@
+"""A slider on a rough surface: its laws, its generated model and the values of its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.core.settings import DEFAULTS, Resolved, resolve
+from srfcli.laws.registry import Registry, load_registry
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from srfcli.laws.values import Law
+
+
+@dataclass(frozen=True)
+class SlidingSystem:
+    """A slider with its laws and parameters, as `srfcli.symbolic.system` makes it.
+
+    Attributes
+    ----------
+    model : GeneratedModel
+        Functions of arrays, in um, s, N.
+    resolved : Resolved
+        The value of every parameter, and where it comes from.
+    """
+
+    model: GeneratedModel = field(repr=False)
+    resolved: Resolved = field(repr=False)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Return name -> value of every parameter, in its declared unit."""
+        return dict(self.resolved.declared)
+
+    def described(self, *, without: Iterable[str] = ()) -> dict[str, dict[str, Any]]:
+        """Return name -> {value, unit, origin} of the parameters, but for those that are swept."""
+        left = set(without)
+        return {k: v for k, v in self.resolved.described().items() if k not in left}
+
+    def vector(self, **declared: float) -> NDArray[Any]:
+        """Return the parameters (n_parameters,) in um, s, N, some at other values in their declared units."""
+        from srfcli.core.units import to_base
+
+        units = {q.name: q.unit for q in self.model.parameters}
+        moved = {n: to_base(float(v), units[n]) for n, v in declared.items()}
+        return self.model.vector({**self.resolved.values, **moved})
+
+    def at(self, **parameters: float | str) -> SlidingSystem:
+        """Return the same system with other values of some parameters, as numbers in declared units or text with a unit.
+
+        Raises
+        ------
+        SrfError
+            For a name that the system does not have, a value out of bounds or a unit that does not fit.
+        """
+        kept = {n: v for n, v in self.resolved.declared.items() if self.resolved.origins[n] != "law default"}
+        flags = {**kept, **parameters}
+        return SlidingSystem(self.model, resolve(self.model.parameters, flags, env={}, where=self.model.title))
+
+    def __repr__(self) -> str:
+        return f"<SlidingSystem: {self.model.title}>"
+
+
+def system(
+    law: str = str(DEFAULTS["law"].value),
+    *,
+    ageing: str = str(DEFAULTS["ageing"].value),
+    interface: str = str(DEFAULTS["interface"].value),
+    loading: str = str(DEFAULTS["loading"].value),
+    inertia: bool = True,
+    plugins: Sequence[str | Path] = (),
+    parameters: Mapping[str, float | str] | None = None,
+    **more: float | str,
+) -> SlidingSystem:
+    """Return a slider with these laws and parameters.
+
+    Settings files and environment variables do not count: what a script says is what it computes.
+
+    Parameters
+    ----------
+    law, ageing, interface : str
+        Names of laws, or paths of their files; modifiers of the ageing law follow it after a plus sign.
+    loading : {'vertical', 'inclined'}
+        How the normal load is applied.
+    inertia : bool
+        Whether the slider's mass counts.
+    plugins : sequence of path
+        Folders in which laws are looked for, too.
+    parameters, **more : number or str
+        Values in declared units (um, s, N, kg, Hz, deg), or text with a unit; those not given are the laws' own. A name that
+        is no Python name, such as lambda, goes into `parameters`.
+
+    Returns
+    -------
+    SlidingSystem
+
+    Raises
+    ------
+    SrfError
+        For an unknown law or parameter, a value out of bounds or a unit that does not fit.
+
+    References
+    ----------
+    Cochard, Bureau and Baumberger (2003), Trans. ASME J. Appl. Mech. 70, 220: the default laws and values.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> pmma = srf.system("srf-vsat", K="210 N/mm", parameters={"lambda": 0.6})
+    >>> pmma
+    <SlidingSystem: srf-vsat, dieterich, elastic, vertical, inertia on>
+    >>> pmma.parameters["K"], pmma.at(K=0.3).parameters["K"]
+    (0.21, 0.3)
+    """
+    words = [w.strip() for text in (law, ageing, interface) for w in text.split("+")]
+    registry = load_registry([Path(p) for p in plugins], named=[Path(w) for w in words if w.endswith(".py")])
+    model = open_model(registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia)
+    given = {**(parameters or {}), **more}
+    return SlidingSystem(model, resolve(model.parameters, given, env={}, where=model.title))
+
+
+def load_law(name: str | Path, *, kind: str = "friction", plugins: Sequence[str | Path] = ()) -> Law:
+    """Return a law as a value: its formula, parameters, references and checks.
+
+    Parameters
+    ----------
+    name : str or path
+        Name of a registered law, or the path of a law's file.
+    kind : {'friction', 'ageing', 'modifier', 'interface', 'effect'}
+        Which of the kinds `srf laws` lists.
+    plugins : sequence of path
+        Folders in which laws are looked for, too.
+
+    Returns
+    -------
+    Law
+
+    Raises
+    ------
+    SrfError
+        For a name that is not registered, or a file that is no law.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> law = srf.load_law("srf-vsat")
+    >>> law.mu
+    A*log(v/V0) + B*log(1 + Vsat*phi/D0) + mu0
+    >>> [p.name for p in law.parameters]
+    ['mu0', 'A', 'B', 'D0', 'V0', 'Vsat']
+    """
+    text = str(name)
+    registry: Registry = load_registry([Path(p) for p in plugins], named=[Path(text)] if text.endswith(".py") else [])
+    return registry.get(kind, text)

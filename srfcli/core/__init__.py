@@ -1,0 +1,1 @@
+"""What everything stands on: errors, files, units, settings, the cache."""

@@ -1,0 +1,137 @@
+"""Errors that a user can act on, and numerical outcomes: what, where, what instead."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable
+from enum import Enum
+
+# Errors that a user can act on: what, where, what instead.
+
+# control characters but tab and newline, DEL and the second set, marks that are not seen or turn the line round, lone
+# surrogates (bytes of file names that are no text): what a terminal acts on, or shows as something else than it is
+_UNSEEN = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
+    "\ud800-\udfff\U000e0000-\U000e0fff]"
+)
+
+
+def printable(text: str, *, line: bool = False) -> str:
+    """Return the text with all that a terminal would act on spelt out, ESC as \\x1b; in a `line` tabs and newlines, too."""
+    if line and ("\n" in text or "\t" in text):
+        text = text.replace("\n", "\\n").replace("\t", "\\t")
+    if text.isascii() and text.replace("\n", "").replace("\t", "").isprintable():
+        return text
+    return _UNSEEN.sub(lambda found: ascii(found.group())[1:-1], text)
+
+
+def shortened(text: str, most: int = 2000) -> str:
+    """Return the text, without its middle where it is longer than `most`: a key of 100 kB is told by its ends."""
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
+
+
+def shown(value: object) -> str:
+    """Return a value as a TOML author knows it, cut where it is long."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int) and abs(value) >= 10**60:
+        return "a number of more than 60 digits"
+    try:
+        text = f'"{value}"' if isinstance(value, str) else repr(value)
+    except (ValueError, RecursionError):
+        return "a value too long to show"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+class SrfError(Exception):
+    """Misuse that stops a command: `message` says what and where, `hint` what to do instead.
+
+    `exit_code` is 2 for usage, laws and recordings; 1 for I/O.
+    """
+
+    exit_code = 2
+
+    def __init__(self, message: str, hint: str | None = None, *, exit_code: int | None = None) -> None:
+        message, hint = printable(shortened(message)), hint and printable(shortened(hint))
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+        if exit_code is not None:
+            self.exit_code = exit_code
+
+
+class ExpressionError(SrfError):
+    """An expression that cannot be a formula; `text` and `column` (0-based) place the caret."""
+
+    def __init__(self, message: str, hint: str | None = None, *, text: str = "", column: int | None = None) -> None:
+        super().__init__(message, hint)
+        self.text = text
+        self.column = column
+
+    def caret(self) -> str | None:
+        """Return the expression with a caret under the offending column, or None when it has no place."""
+        if self.column is None:
+            return None
+        text = _UNSEEN.sub(
+            "?", self.text.replace("\n", " ").replace("\t", " ")
+        )  # one sign for one, as the caret counts
+        return f"  {text}\n  {' ' * self.column}^"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return `Did you mean 'x'? Known: a, b` for a misspelt `name`; the sentence about x only if one is close."""
+    names = sorted(set(known))
+    lowered = {n.lower(): n for n in reversed(names)}
+    close = difflib.get_close_matches(name.lower(), list(lowered), n=1, cutoff=0.5)
+    squeezed = {n.lower().replace("_", "").replace("-", ""): n for n in names}
+    exact = squeezed.get(name.lower().replace("_", "").replace("-", ""))
+    guess = exact or (lowered[close[0]] if close else None)
+    tail = f"Known: {', '.join(names)}" if names else "None are known"
+    return f"Did you mean '{guess}'? {tail}" if guess else tail
+
+
+# Numerical outcomes: a failure is a value whose text is advice.
+
+
+class Status(Enum):
+    """How a numerical result ended; `advice` is a sentence with a way out."""
+
+    OK = "ok"
+    NO_CONVERGENCE = "no-convergence"
+    TOLERANCE = "tolerance-not-met"
+    MAX_STEPS = "max-steps"
+    STEP_TOO_SMALL = "step-too-small"
+    LEFT_WINDOW = "left-window"
+    CLOSED = "closed"
+    NO_HOPF = "no-hopf"
+    UNSETTLED = "window-not-settled"
+    INTEGRATION = "integration-stopped"
+    EVALUATIONS = "max-evaluations"
+    INTERRUPTED = "interrupted"
+
+    @property
+    def advice(self) -> str:
+        """Return one sentence that says what happened and what to try."""
+        return _ADVICE[self]
+
+    @property
+    def ok(self) -> bool:
+        """True where the numbers can be used as they stand."""
+        return self in (Status.OK, Status.LEFT_WINDOW, Status.CLOSED)
+
+
+_ADVICE = {
+    Status.OK: "Converged.",
+    Status.NO_CONVERGENCE: "Newton's method did not converge; start nearer, or raise --max-mesh or lower eps first.",
+    Status.TOLERANCE: "The estimated error is above the tolerance on the finest mesh allowed; raise --max-mesh.",
+    Status.MAX_STEPS: "The curve was cut at the step limit; raise --max-steps.",
+    Status.STEP_TOO_SMALL: "The step along the curve fell below its minimum; a singular point is near.",
+    Status.LEFT_WINDOW: "The curve left the window that was asked for.",
+    Status.CLOSED: "The curve returned to its start.",
+    Status.NO_HOPF: "Velocity strengthening: no Hopf bifurcation.",
+    Status.UNSETTLED: "Crossings may lie beyond the loads looked at; look there with --window LOW:HIGH or --over W0=LOW:HIGH.",
+    Status.INTEGRATION: "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
+    Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise --max-evaluations, or start nearer.",
+    Status.INTERRUPTED: "what was finished is kept.",
+}

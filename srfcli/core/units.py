@@ -1,0 +1,354 @@
+"""Units: what a user types, what a law declares and what a recording states, in um, s, N and radians.
+
+The usual units, and products and powers of them, need no library; any other is looked up in pint where that is installed.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+from srfcli.core.errors import SrfError, did_you_mean
+
+if TYPE_CHECKING:
+    import sympy
+
+# What a user types, in the unit they type it in, to um, s, N; angles to radians.
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit as a factor to the base units and its powers of (um, s, N, rad)."""
+
+    factor: float
+    powers: tuple[int, int, int, int]
+
+
+DIMENSIONLESS, LENGTH, TIME, FORCE = (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)
+STRESS, RATE, MASS, ANGLE = (-2, 0, 1, 0), (0, -1, 0, 0), (-1, 2, 1, 0), (0, 0, 0, 1)
+_TABLE = {  # factors to um, s, N, rad
+    name: Unit(factor, powers)
+    for powers, names in {
+        DIMENSIONLESS: {"1": 1.0, "%": 0.01},
+        LENGTH: {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6},
+        TIME: {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
+        RATE: {"Hz": 1.0, "kHz": 1e3},
+        FORCE: {"mN": 1e-3, "N": 1.0, "kN": 1e3, "MN": 1e6},
+        STRESS: {"Pa": 1e-12, "kPa": 1e-9, "MPa": 1e-6, "GPa": 1e-3, "bar": 1e-7},
+        MASS: {"g": 1e-9, "kg": 1e-6},  # 1 kg = 1 N s^2/m
+        ANGLE: {"rad": 1.0, "deg": math.pi / 180.0},
+    }.items()
+    for name, factor in names.items()
+}
+_SPELLED = {  # in small letters, as headings of recordings have them
+    "": "1", "-": "1", "none": "1", "dimensionless": "1", "micron": "um", "microns": "um", "micrometer": "um",
+    "micrometers": "um", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "hz": "Hz", "newton": "N", "newtons": "N",
+    "kgs": "kg", "mpa": "MPa",
+}  # fmt: skip
+SQUARE_MILLIMETRE = 1e6  # um^2: a stress is taken as the force on this area
+
+LONGEST = 200  # characters of a number with its unit
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
+# A product of names with one-digit powers: pint never sees a tower of powers that it would have to work out.
+_FACTOR = r"(?:1|[A-Za-zµ°Ωθ%_]+(?:\^-?[1-9])?)"
+_UNIT = re.compile(rf"{_FACTOR}(?:\s*[*/ ]\s*{_FACTOR})*")
+_PART = re.compile(r"\s*([*/ ]?)\s*([^\s*/^]+)(?:\^(-?\d))?")
+
+
+def to_base(value: float, unit: str) -> float:
+    """Return `value`, given in `unit`, in um, s, N and radians."""
+    return value * find_unit(unit).factor
+
+
+def from_base(value: float, unit: str) -> float:
+    """Return `value`, given in um, s, N and radians, in `unit`."""
+    return value / find_unit(unit).factor
+
+
+def parse_quantity(text: str, unit: str, *, name: str) -> float:
+    """Return the number that `text` states, in `unit`; a bare number is in that unit. `name` is for the error.
+
+    `parse_quantity("210 N/mm", "N/um", name="K")` is 0.21. Raises SrfError for no finite number or a wrong unit.
+    """
+    number, written = split_quantity(text, name=name, example=f"0.5 {unit}" if unit != "1" else "0.5")
+    return convert(number, written, unit, name=name) if written else number
+
+
+def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float, str]:
+    """Return the number and the unit that `text` states; the unit is "" for a bare number."""
+    if len(text) > LONGEST:
+        raise SrfError(f"{name}: {len(text)} characters are no number", f"Write it as in {name}='{example}'.")
+    match = _NUMBER.fullmatch(text)
+    if not match:
+        raise SrfError(
+            f"{name} = {text!r} is not a number", f"Write a number and, if you like, its unit: {name}='{example}'."
+        )
+    if re.match(r",\d", match[2]):
+        raise SrfError(
+            f"{name} = {text!r}: a decimal comma is not understood", f"Write a point: {text.replace(',', '.')}."
+        )
+    number = float(match[1])
+    if not math.isfinite(number):
+        raise SrfError(f"{name} = {text!r} is too large to be a number", "Write a finite number, as in 1e-3.")
+    return number, match[2]
+
+
+def convert(number: float, written: str, unit: str, *, name: str) -> float:
+    """Return `number`, given in `written`, in `unit`; raises SrfError if the two do not measure the same thing.
+
+    A stress counts as the force on 1 mm^2, so that 1 MPa is 1 N and 1 MPa/mm is 1e-3 N/um.
+    """
+    if written == unit:
+        return number
+    where = f"{name} = {number:g} {written}"
+    factor = factor_between(find_unit(written, where=where), find_unit(unit))
+    if factor is None:
+        expected = "a plain number" if unit == "1" else f"{unit}, or a unit of the same dimension"
+        raise SrfError(f"{where}: {written!r} is the wrong unit", f"Write {name} in {expected}.")
+    return number * factor
+
+
+def factor_between(source: Unit, target: Unit) -> float | None:
+    """Return what a number in `source` is multiplied by to be in `target`, None where they measure different things."""
+    ratio, gap = source.factor / target.factor, source.powers[0] - target.powers[0]
+    if source.powers[1:] != target.powers[1:]:
+        return None
+    if gap == 0:
+        return tidy(ratio)  # N/mm -> N/um is 1e-3, not 0.0010000000000000002
+    if source.powers[2] == 1 and gap == -2:  # a stress for a force
+        return tidy(ratio * SQUARE_MILLIMETRE)
+    if source.powers[2] == 1 and gap == 2:
+        return tidy(ratio / SQUARE_MILLIMETRE)
+    return None
+
+
+def is_stress(text: str) -> bool:
+    """Return whether a unit is one of stress, or of stress per length, and not of force."""
+    um, s, newton, _ = find_unit(text).powers
+    return newton == 1 and s == 0 and um in (-2, -3)
+
+
+def tidy(value: float) -> float:
+    """Return the number of twelve digits that `value` misses by rounding alone, else `value` itself."""
+    round_number = float(f"{value:.12g}")
+    return round_number if math.isclose(value, round_number, rel_tol=1e-14) else value
+
+
+def find_unit(text: str, *, where: str = "") -> Unit:
+    """Return the unit that `text` names; raises SrfError, beginning with `where`, if there is none."""
+    if len(text) > LONGEST:
+        raise SrfError(f"{where}: {len(text)} characters are no unit".lstrip(": "), "Write a unit as in N/um, um/s.")
+    spelled = text.strip().replace("**", "^").replace("μ", "u").replace("µ", "u")
+    spelled = _SPELLED.get(spelled.lower(), spelled)
+    if spelled in _TABLE:
+        return _TABLE[spelled]
+    prefix = f"{where}: " if where else ""
+    if not _UNIT.fullmatch(spelled):
+        raise SrfError(f"{prefix}{text!r} is not a unit", "Write a unit as in N/um, um/s or kg*m/s^2.")
+    factor, powers, over = 1.0, [0, 0, 0, 0], 1
+    for sign, word, power in _PART.findall(spelled):
+        over = -1 if sign == "/" else 1
+        known = word if word in _TABLE else _SPELLED.get(word.lower(), word)
+        if known not in _TABLE:
+            return _from_pint(spelled, prefix, word)
+        exponent = over * int(power or 1)
+        factor *= _TABLE[known].factor ** exponent
+        powers = [p + exponent * q for p, q in zip(powers, _TABLE[known].powers, strict=True)]
+    if not 1e-100 < factor < 1e100:
+        raise SrfError(f"{prefix}{text!r} is no unit of use", "Write a unit as in N/um, um/s.")
+    um, s, newton, rad = powers
+    return Unit(factor, (um, s, newton, rad))
+
+
+def _from_pint(text: str, prefix: str = "", word: str = "") -> Unit:
+    registry = _pint_registry(text, prefix, word)
+    try:
+        quantity = registry.Quantity(1.0, registry.Unit(text)).to_base_units()
+        powers = {name: float(power) for name, power in quantity.unit_items()}
+        factor = float(quantity.magnitude)
+    except Exception as error:  # pint raises its own, tokenizer and arithmetic errors for a bad unit
+        raise SrfError(f"{prefix}unknown unit {text!r}", did_you_mean(word, _TABLE)) from error
+    mass, metre = powers.pop("kilogram", 0.0), powers.pop("meter", 0.0)
+    second, radian = powers.pop("second", 0.0), powers.pop("radian", 0.0)
+    exponents = (metre - mass, second + 2 * mass, mass, radian)  # kg = 1e-6 N s^2/um
+    if powers or any(not p.is_integer() for p in exponents):
+        raise SrfError(
+            f"{prefix}{text!r} is not a mechanical unit", "Write it in um, s, N, kg, deg or products of these."
+        )
+    um, s, newton, rad = (int(p) for p in exponents)
+    if not 1e-100 < factor < 1e100 or abs(um) + abs(mass) > 20:
+        raise SrfError(f"{prefix}{text!r} is no unit of use", "Write it in um, s, N, kg or products of these.")
+    return Unit(factor * 1e6 ** (um + mass) / 1e6**mass, (um, s, newton, rad))
+
+
+def _pint_registry(text: str, prefix: str, word: str) -> Any:
+    global _REGISTRY
+    if _REGISTRY is None:
+        try:
+            import pint
+        except ImportError as error:
+            hint = f'{did_you_mean(word, _TABLE)}, products and powers of these; more with pip install "srfcli[units]"'
+            raise SrfError(f"{prefix}unknown unit {text!r}", hint) from error
+        _REGISTRY = pint.UnitRegistry()
+    return _REGISTRY
+
+
+_REGISTRY: Any = None
+
+
+# Dimensions over um, s and N: enough to see whether a law adds a length to a time.
+
+Dimension = tuple[Fraction, Fraction, Fraction]  # powers of um, s, N
+NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
+
+
+@dataclass(frozen=True)
+class LawUnit:
+    """A unit as declared: `factor` turns a number in it into um, s, N (and radians); `dimension` holds the powers."""
+
+    factor: float
+    dimension: Dimension
+
+
+def _unit(factor: float, um: int = 0, s: int = 0, newton: int = 0) -> LawUnit:
+    return LawUnit(factor, (Fraction(um), Fraction(s), Fraction(newton)))
+
+
+UNITS = {
+    "1": _unit(1.0),
+    "rad": _unit(1.0),
+    "deg": _unit(math.pi / 180),
+    "nm": _unit(1e-3, um=1),
+    "um": _unit(1.0, um=1),
+    "mm": _unit(1e3, um=1),
+    "m": _unit(1e6, um=1),
+    "ms": _unit(1e-3, s=1),
+    "s": _unit(1.0, s=1),
+    "Hz": _unit(1.0, s=-1),
+    "N": _unit(1.0, newton=1),
+    "mN": _unit(1e-3, newton=1),
+    "kN": _unit(1e3, newton=1),
+    "Pa": _unit(1e-12, um=-2, newton=1),
+    "kPa": _unit(1e-9, um=-2, newton=1),
+    "MPa": _unit(1e-6, um=-2, newton=1),
+    "kg": _unit(1e-6, um=-1, s=2, newton=1),  # 1 kg = 1 N s^2/m
+    "g": _unit(1e-9, um=-1, s=2, newton=1),
+}
+SYMBOL_UNITS = {
+    "v": "um/s",
+    "phi": "s",
+    "mu": "1",
+    "mu_dot": "1/s",
+    "W": "N",
+    "W_dot": "N/s",
+    "F_dot_over_W": "1/s",
+}
+QUANTITY_UNITS = {"mu": "1", "rate": "1", "term": "1", "kappa": "N/um"}
+
+_LAW_FACTOR = re.compile(r"([A-Za-z]+|1)(?:(?:\^|\*\*)(-?\d))?", re.ASCII)
+
+
+def parse_unit(text: str) -> LawUnit:
+    """Return the unit written as `um/s`, `1/um`, `N*s**2/um` or `N/um^2`; raises `SrfError` on anything else."""
+    if len(text) > 200:
+        raise SrfError(f"{len(text)} characters are no unit", "Write it as um/s, 1/um or N/um^2.")
+    factor, dimension = 1.0, NONE
+    parts = re.split(r"([*/])", text.strip().replace("**", "^").replace("µ", "u").replace("μ", "u"))
+    for index in range(0, len(parts), 2):
+        word = parts[index].strip()
+        match = _LAW_FACTOR.fullmatch(word)
+        if match is None or match[1] not in UNITS:
+            raise SrfError(f"unknown unit {text!r}", did_you_mean(match[1] if match else word, UNITS))
+        power = int(match[2] or 1) * (-1 if index and parts[index - 1] == "/" else 1)
+        unit = UNITS[match[1]]
+        factor *= unit.factor**power
+        dimension = multiply(dimension, unit.dimension, Fraction(power))
+        if not 1e-100 < factor < 1e100:
+            raise SrfError(f"{text!r} is no unit of use", "Write it as um/s, 1/um or N/um^2.")
+    return LawUnit(factor, dimension)
+
+
+def multiply(left: Dimension, right: Dimension, power: Fraction = Fraction(1)) -> Dimension:
+    """Return the dimension of left * right**power."""
+    return (left[0] + right[0] * power, left[1] + right[1] * power, left[2] + right[2] * power)
+
+
+def describe(dimension: Dimension) -> str:
+    """Return a dimension as text, `um/s`, `1` for none."""
+    names = ("um", "s", "N")
+    over = [n + (f"^{d}" if d != 1 else "") for n, d in zip(names, dimension, strict=True) if d > 0]
+    under = [n + (f"^{-d}" if d != -1 else "") for n, d in zip(names, dimension, strict=True) if d < 0]
+    return "/".join(["*".join(over) or "1", *under])
+
+
+def dimension_of(expr: sympy.Expr, units: dict[str, Dimension]) -> Dimension:
+    """Return the dimension of a formula whose symbols have `units`; raises `SrfError` where it adds unlike things."""
+    import sympy
+
+    if expr.is_Symbol:
+        return units[expr.name]
+    if expr.is_number:
+        return NONE
+    if isinstance(expr, sympy.Add):
+        found = [(term, dimension_of(term, units)) for term in expr.args]
+        for term, dimension in found[1:]:
+            if dimension != found[0][1]:
+                first = f"{found[0][0]} [{describe(found[0][1])}]"
+                raise SrfError(f"{first} and {term} [{describe(dimension)}] are added")
+        return found[0][1]
+    if isinstance(expr, sympy.Mul):
+        product = NONE
+        for term in expr.args:
+            product = multiply(product, dimension_of(term, units))
+        return product
+    if isinstance(expr, sympy.Pow) and expr.exp.is_Rational:
+        return multiply(NONE, dimension_of(expr.base, units), Fraction(int(expr.exp.p), int(expr.exp.q)))
+    for argument in expr.args:  # functions, and powers with an exponent that varies
+        dimension = dimension_of(argument, units)
+        if dimension != NONE:
+            name = "a power" if isinstance(expr, sympy.Pow) else expr.func.__name__
+            raise SrfError(f"{name} is taken of {argument}, which has the unit {describe(dimension)}, not 1")
+    return NONE
+
+
+# Numbers and units as an experiment's author writes them, to um, s, N.
+
+NAMES = ("um", "s", "N", "rad")
+
+
+def unit_factor(text: str, base: str) -> float:
+    """Return what a number in the unit `text` is multiplied by to be in `base`; raises SrfError for another dimension.
+
+    A stress counts as the force on 1 mm^2, so that 1 MPa is 1 N.
+    """
+    found, wanted = find_unit(text), find_unit(base)
+    factor = factor_between(found, wanted)
+    if factor is None:
+        raise SrfError(
+            f"{text!r} measures {_described(found.powers)}, not {_described(wanted.powers)}",
+            f"Give a unit of the dimension of {base!r}.",
+        )
+    return factor
+
+
+def parse_stated_quantity(text: str, base: str, *, name: str) -> float:
+    """Return the number that `text` states, in `base`; a bare number is in that unit."""
+    number, written = split_quantity(text, name=name, example=f"0.5 {base}" if base != "1" else "0.5")
+    value = number * unit_factor(written, base) if written else number
+    if not math.isfinite(value):
+        raise SrfError(f"{name} = {text!r} is too large", "Write a finite number, as in 1e-3.")
+    return value
+
+
+def same_dimension(text: str, base: str) -> bool:
+    """Return whether the unit `text` measures what `base` does; raises SrfError for no unit at all."""
+    return factor_between(find_unit(text), find_unit(base)) is not None
+
+
+def _described(powers: tuple[int, ...]) -> str:
+    over = [n + (f"^{p}" if p != 1 else "") for n, p in zip(NAMES, powers, strict=True) if p > 0]
+    under = [n + (f"^{-p}" if p != -1 else "") for n, p in zip(NAMES, powers, strict=True) if p < 0]
+    return "/".join(["*".join(over) or "1", *under])

@@ -1,0 +1,208 @@
+"""The clock of a recording: which samples can be placed in time, at which rates they were taken, and where some are missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.codegen.model import Array
+from srfcli.core.errors import SrfError
+from srfcli.data.values import Notice
+
+Mask = NDArray[np.bool_]
+
+PASSES = 60  # stamps in a row that may be wrong before a clock is held to have been set back
+MOST_WRONG, MOST_REPEATED = 0.01, 0.2  # shares of the samples
+CHANGE = 1.25  # of the sampling interval
+GAP = 2.5  # sampling intervals
+_BRIDGED = "drive and load are bridged, nothing is compared in it"
+SHORTEST = 8  # samples that make a rate
+MOST_NOTICES = 8  # of one kind before they are told together
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A stretch of even sampling: samples `first` to `last`, one every `interval` seconds."""
+
+    first: int
+    last: int
+    interval: float
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The rates of a recording in order, and the samples after which a gap begins."""
+
+    rates: tuple[Rate, ...]
+    gaps: NDArray[np.int64]
+
+
+def span(path: Path, rows: NDArray[np.int64], t: Array, first: int, last: int) -> str:
+    """Return `steps.csv: rows 120-130, t = 1.2 to 1.3 s`, for samples `first` to `last`."""
+    ends = (rows[first], rows[last])
+    at = f"row {ends[0]}" if first == last else f"rows {ends[0]}-{ends[1]}"
+    times = t[[first, last]]
+    if not np.isfinite(times).all():
+        return f"{path.name}: {at}"
+    return f"{path.name}: {at}, t = {times[0]:.7g}" + (" s" if first == last else f" to {times[1]:.7g} s")
+
+
+def runs_of(mask: Mask) -> list[tuple[int, int]]:
+    """Return first and last index of every unbroken run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
+
+
+def kept_samples(path: Path, rows: NDArray[np.int64], t: Array, hint: str | None = None) -> tuple[Mask, list[Notice]]:
+    """Return which samples have a time of their own, later than the one before, and what was wrong with the others.
+
+    Raises SrfError where the clock was set back, or where too many stamps are repeated to call the others a recording.
+    """
+    missing = np.isnan(t)
+    keep, repeated, wrong = _rising(path, rows, t, ~missing, hint)
+    notices = [
+        *spots("nan", missing, path, rows, t, "without a time, left out"),
+        *spots("repeated-time", repeated, path, rows, t, "with the time of the sample before, left out"),
+        *spots("backward-time", wrong, path, rows, t, "whose time does not fit between its neighbours', left out"),
+    ]
+    if keep.sum() < SHORTEST:
+        raise SrfError(f"{path}: {keep.sum()} usable samples", f"A recording needs {SHORTEST} or more.")
+    return keep, notices
+
+
+def spots(kind: str, mask: Mask, path: Path, rows: NDArray[np.int64], t: Array, told: str) -> list[Notice]:
+    """Return a notice for each run of True in `mask` (n,), or one for all of them where they are many."""
+    found = runs_of(mask)
+    if len(found) <= MOST_NOTICES:
+        return [Notice(kind, span(path, rows, t, a, b), f"{_count(b - a + 1, 'sample')} {told}") for a, b in found]
+    first = ", ".join(str(rows[a]) for a, _ in found[:4])
+    where = f"{path.name}: {len(found)} places, the first at rows {first}"
+    return [Notice(kind, where, f"{int(mask.sum())} samples {told}")]
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" + ("s" if number != 1 else "")
+
+
+def _rising(path: Path, rows: NDArray[np.int64], t: Array, keep: Mask, hint: str | None) -> tuple[Mask, Mask, Mask]:
+    """Return the samples that stay, those with a repeated and those with a wrong time."""
+    repeated, wrong, keep = np.zeros(t.size, bool), np.zeros(t.size, bool), keep.copy()
+    for _ in range(PASSES):
+        index = np.flatnonzero(keep)
+        steps = np.diff(t[index])
+        bad = np.flatnonzero(steps <= 0)
+        if not bad.size:
+            return keep, repeated, wrong
+        same = bad[steps[bad] == 0]
+        repeated[index[same + 1]] = True
+        back = bad[steps[bad] < 0]
+        back = back[~np.isin(back - 1, back)]  # of two in a row the first is mended first
+        usual = np.median(steps[steps > 0]) if (steps > 0).any() else 0.0
+        for i in back:
+            earlier = t[index[i - 1]] if i else np.nan
+            forward = abs(t[index[i]] - earlier - usual) > abs(t[index[i + 1]] - earlier - usual)
+            wrong[index[i] if i and t[index[i + 1]] > earlier and forward else index[i + 1]] = True
+        keep &= ~(repeated | wrong)
+        if repeated.sum() > max(3, MOST_REPEATED * t.size):
+            at = int(np.flatnonzero(repeated)[0])
+            raise SrfError(
+                f"{span(path, rows, t, at, at)}: {repeated.sum()} of {t.size} samples have the time of the one before",
+                hint or "The clock is too coarse for the sampling; give the time with more digits.",
+            )
+        if wrong.sum() > max(3, MOST_WRONG * t.size):
+            break
+    index = np.flatnonzero(np.isfinite(t))
+    at = int(index[1:][np.diff(t[index]) < 0][0])
+    raise SrfError(
+        f"{span(path, rows, t, at, at)}: the time goes back, from {t[:at][np.isfinite(t[:at])][-1]:.10g} s, and stays back",
+        hint or "Two recordings in one file? Part them, or choose one with window = [from, to].",
+    )
+
+
+def find_sampling(t: Array) -> Sampling:
+    """Return the rates at which the rising times `t` (n,) were taken, and the gaps between them."""
+    steps = np.diff(t)
+    usual = _local_median(steps)
+    level = np.log(usual)
+    jumps = np.flatnonzero(np.abs(np.diff(level)) > np.log(CHANGE)) + 1
+    bounds = [0, *jumps.tolist(), steps.size]
+    merged: list[list[int]] = []
+    for a, b in pairwise(bounds):
+        if merged and b - a < SHORTEST:  # the median passes from one rate to the next in a few samples
+            merged[-1][1] = b
+        else:
+            merged.append([a, b])
+    rates: list[Rate] = []
+    for a, b in merged:
+        interval = float(np.median(steps[a:b]))
+        if rates and abs(np.log(interval / rates[-1].interval)) <= np.log(CHANGE):
+            rates[-1] = Rate(rates[-1].first, b, float(np.median(steps[rates[-1].first : b])))
+        else:
+            rates.append(Rate(a, b, interval))
+    rates = [_trimmed(r, steps, rates[i - 1] if i else None) for i, r in enumerate(rates)]
+    rates = [
+        Rate(r.first, rates[i + 1].first if i + 1 < len(rates) else r.last, r.interval) for i, r in enumerate(rates)
+    ]
+    allowed = np.repeat([r.interval for r in rates], [r.last - r.first for r in rates])
+    allowed = np.maximum(allowed, _spread(steps))
+    edges = [r.first for r in rates[1:]]
+    beside = np.zeros(steps.size, bool)
+    for edge in edges:  # between two rates the slower one is no gap
+        beside[max(edge - SHORTEST, 0) : edge + SHORTEST] = True
+    slowest = max(r.interval for r in rates)
+    gaps = steps > np.where(beside, np.maximum(allowed, slowest), allowed) * GAP
+    return Sampling(tuple(rates), np.flatnonzero(gaps))
+
+
+def _trimmed(rate: Rate, steps: Array, before: Rate | None) -> Rate:
+    """Return the rate with its beginning where its own interval begins, which a running median misses by a few samples."""
+    if before is None:
+        return rate
+    middle = 0.5 * np.log(rate.interval / before.interval)
+    near = np.arange(max(rate.first - SHORTEST, before.first), min(rate.first + SHORTEST, rate.last))
+    new = np.abs(np.log(steps[near] / before.interval)) > abs(middle)
+    # the split that puts most of the intervals on their own side
+    score = np.cumsum(np.concatenate([[0], np.where(new, -1, 1)]))
+    return Rate(int(near[0] + int(np.argmax(score))), rate.last, rate.interval)
+
+
+def _local_median(steps: Array) -> Array:
+    from scipy.ndimage import median_filter
+
+    return np.asarray(median_filter(steps, size=min(2 * SHORTEST + 1, steps.size), mode="nearest"))
+
+
+def _spread(steps: Array) -> Array:
+    """Return an upper quintile of the intervals nearby: uneven sampling is no string of gaps."""
+    from scipy.ndimage import percentile_filter
+
+    return np.asarray(percentile_filter(steps, 80, size=min(8 * SHORTEST + 1, steps.size), mode="nearest"))
+
+
+def sampling_notices(path: Path, rows: NDArray[np.int64], t: Array, sampling: Sampling) -> list[Notice]:
+    """Return a notice for every gap and every change of the sampling rate."""
+    notices = []
+    if sampling.gaps.size > MOST_NOTICES:
+        longest = float(np.diff(t)[sampling.gaps].max())
+        first = ", ".join(str(r) for r in rows[sampling.gaps[:4]])
+        where = f"{path.name}: {sampling.gaps.size} places, the first after rows {first}"
+        notices.append(Notice("gap", where, f"gaps of up to {longest:.4g} s; {_BRIDGED}"))
+    else:
+        for gap in sampling.gaps.tolist():
+            usual = next(r.interval for r in sampling.rates if r.first <= gap < r.last)
+            what = f"{t[gap + 1] - t[gap]:.4g} s without a sample, where one comes every {usual:.4g} s; {_BRIDGED}"
+            notices.append(Notice("gap", span(path, rows, t, gap, gap + 1), what))
+    if len(sampling.rates) - 1 > MOST_NOTICES:
+        rates = [1 / r.interval for r in sampling.rates]
+        what = f"the sampling changes between {min(rates):.4g} Hz and {max(rates):.4g} Hz; each sample keeps its time"
+        notices.append(Notice("sampling-change", f"{path.name}: {len(rates) - 1} places", what))
+        return notices
+    for before, after in pairwise(sampling.rates):
+        rates = [1 / before.interval, 1 / after.interval]
+        what = f"the sampling changes from {rates[0]:.4g} Hz to {rates[1]:.4g} Hz; each sample keeps its time"
+        notices.append(Notice("sampling-change", span(path, rows, t, after.first, after.first), what))
+    return notices

@@ -1,0 +1,418 @@
+"""From a file to its columns, and from columns to the roles they play, in um, s, N."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.codegen.model import Array
+from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.files import open_plain
+from srfcli.data.description import ROLES, ColumnSpec, RunDescription, check_unit
+from srfcli.data.values import OBSERVABLES, Notice
+from srfcli.laws.registry import Entry, Registry
+from srfcli.laws.values import Reader, Source
+
+# From a file to its columns: which reader opens it, and that what the reader gives is what readers promise.
+
+SNIFFED = 4096  # bytes
+SLICE = 2**18  # rows that are taken from an array at a time
+
+
+def open_source(path: Path, *, registry: Registry, format: str | None = None) -> Source:
+    """Return the columns of a data file, by the reader called `format`, else by the one that knows the content.
+
+    Raises SrfError where the file is missing or empty, where no reader or more than one knows it, and for what readers refuse.
+    """
+    head = _head(path)
+    reader = _named(registry, format) if format else _sniffed(path, head, registry)
+    try:
+        found = reader.read(path)
+    except SrfError:
+        raise
+    except Exception as error:  # a reader is anybody's code, and the file anybody's bytes
+        raise _refusal(reader, path, error) from error
+    source = found if isinstance(found, Source) else _from_mapping(found, reader, path)
+    if not source.headings or not all(isinstance(h, str) for h in source.headings):
+        raise SrfError(f"{path}: the reader '{reader.name}' finds no columns", "Check the file, or name its kind.")
+    return Source(
+        source.headings,
+        lambda columns: _guarded(source, columns, reader, path),
+        source.rows,
+        source.whole,
+        source.remarks,
+        source.about,
+    )
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with open_plain(path) as stream:
+            head = stream.read(SNIFFED)
+    except FileNotFoundError:
+        if not path.parent.is_dir():
+            raise SrfError(f"no file {path}", f"There is no folder {path.parent}.") from None
+        names = [p.name for p in path.parent.glob("*")]
+        raise SrfError(f"no file {path}", did_you_mean(path.name, names) if names else "Its folder is empty.") from None
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    if not head:
+        raise SrfError(f"{path}: the file is empty", "A recording has a line of headings and a line for each sample.")
+    return head
+
+
+def _named(registry: Registry, name: str) -> Reader:
+    return registry.reader(registry.find("reader", name))
+
+
+def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
+    """Return the reader whose test the first bytes pass; one that has no test goes by the file's ending, and comes first."""
+    readers = [(entry, registry.reader(entry)) for entry in registry.entries("reader")]
+    by_suffix = [(e, r) for e, r in readers if r.sniff is None and path.suffix.lower() in r.suffixes]
+    found = by_suffix or [(e, r) for e, r in readers if r.sniff is not None and _passes(r, head)]
+    if len(found) > 1:  # content alone does not decide: the ending does
+        found = [(e, r) for e, r in found if path.suffix.lower() in r.suffixes] or found
+    names = ", ".join(sorted({e.name for e, _ in readers}))
+    if not found and head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise SrfError(f"{path}: UTF-16 text", "Save the file as UTF-8.")
+    if not found:
+        raise SrfError(f"{path}: no reader knows this kind of file", f'Name one with format = "...": {names}.')
+    if len(found) > 1:
+        raise SrfError(
+            f"{path}: {_listed([e for e, _ in found])} would read this file",
+            f'Choose with format = "{found[0][0].name}".',
+        )
+    return found[0][1]
+
+
+def _listed(entries: Sequence[Entry]) -> str:
+    return " and ".join(f"'{e.name}' ({e.origin})" for e in entries)
+
+
+def _passes(reader: Reader, head: bytes) -> bool:
+    assert reader.sniff is not None
+    try:
+        return bool(reader.sniff(head))
+    except Exception:  # a test that fails on strange bytes does not know the file
+        return False
+
+
+def _unreadable(path: Path, error: OSError) -> SrfError:
+    return SrfError(f"{path}: cannot be read: {error.strerror or error}", "Check path and permissions.", exit_code=1)
+
+
+def _refusal(reader: Reader, path: Path, error: Exception) -> SrfError:
+    if isinstance(error, OSError):
+        return _unreadable(path, error)
+    told = " ".join(str(error).split())[:200]
+    return SrfError(
+        f"{path}: the reader '{reader.name}' stopped: {type(error).__name__}: {told}",
+        "Check the file, or name its kind with format = ... (`srf laws --kind reader`).",
+    )
+
+
+def _from_mapping(found: object, reader: Reader, path: Path) -> Source:
+    """Return the source of a reader that gave arrays by heading."""
+    if not isinstance(found, Mapping):
+        raise SrfError(
+            f"{path}: the reader '{reader.name}' returned {type(found).__name__}, expected columns by heading",
+            'Return {"time [s]": times, ...} or a Source.',
+        )
+    arrays = {str(heading): np.asarray(values) for heading, values in found.items()}
+    for heading, values in arrays.items():
+        if values.ndim != 1:
+            raise SrfError(f"{path}: column '{heading}' has the shape {values.shape}", "Give one row of numbers each.")
+    lengths = {values.size for values in arrays.values()}
+    if len(lengths) > 1:
+        told = ", ".join(f"'{h}': {v.size}" for h, v in arrays.items())
+        raise SrfError(f"{path}: the columns differ in length: {told}", "Every column needs a value for every sample.")
+    rows = lengths.pop() if lengths else 0
+    columns = tuple(arrays.values())
+
+    def blocks(wanted: tuple[int, ...]) -> Iterator[Sequence[Any]]:
+        for at in range(0, rows, SLICE):
+            yield [columns[k][at : at + SLICE] for k in wanted]
+
+    return Source(tuple(arrays), blocks, rows)
+
+
+def _guarded(source: Source, columns: tuple[int, ...], reader: Reader, path: Path) -> Iterator[Sequence[Array]]:
+    """Yield blocks of float arrays of equal length, whatever the reader does."""
+    blocks = iter(source.blocks(columns))
+    while True:
+        try:
+            block = next(blocks, None)
+            if block is None:
+                return
+            arrays = [np.asarray(values, dtype=float) for values in block]
+            if len(arrays) != len(columns) or len({a.shape for a in arrays}) != 1 or arrays[0].ndim != 1:
+                raise ValueError(f"shapes {[a.shape for a in arrays]} for {len(columns)} columns")
+        except SrfError:
+            raise
+        except Exception as error:
+            raise _refusal(reader, path, error) from error
+        yield arrays
+
+
+# Which column plays which role, and its numbers in um, s, N, read block by block inside a window of time.
+
+LIMIT = 512 * 2**20  # bytes of needed columns that are held at a time
+HUGE = 1e30  # um, s, N: no measurement, but a gauge's word for none
+LONGEST = 500  # characters of a heading that are looked through for its unit
+_HEADING = re.compile(r"\s*(.*?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A column that plays a role: `values = (number scale + offset) factor` are in um, s, N."""
+
+    role: str
+    heading: str
+    column: int
+    unit: str
+    factor: float
+    spec: ColumnSpec
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of one run inside its window: `rows` are counted from 1 at the first sample of the file.
+
+    `first` is the time of the file's first sample, `seconds` and `arrays` are in um, s, N and may still hold NaN.
+    """
+
+    path: Path
+    first: float
+    rows: NDArray[np.int64] = field(repr=False)
+    seconds: Array = field(repr=False)
+    arrays: Mapping[str, Array] = field(repr=False)
+    channels: Mapping[str, Channel]
+    notices: tuple[Notice, ...]
+    remarks: Mapping[str, str] = field(default_factory=dict)
+
+
+def split_heading(heading: str) -> tuple[str, str | None]:
+    """Return the name and the unit of `name [unit]` or `name (unit)`; the unit is None for a bare name."""
+    match = _HEADING.fullmatch(heading) if len(heading) <= LONGEST else None
+    if match is None:
+        return heading.strip(), None
+    return match[1], match[2] if match[2] is not None else match[3]
+
+
+def read_columns(
+    run: RunDescription, source: Source, specs: Mapping[str, ColumnSpec], *, limit: int = LIMIT
+) -> Columns:
+    """Return what the run needs of its file; raises SrfError for a missing column, a wrong unit or too large a recording."""
+    finder = _Finder(run.file, source.headings, specs)
+    channels = _needed(run, finder)
+    notices = list(finder.notices)
+    _refuse_large(run, source, len(channels), limit)
+    wanted = tuple(channel.column for channel in channels)
+    kept, rows, first = _collect(run, source, channels, wanted, limit)
+    if not rows.size:
+        _nothing(run, first)
+    named = {channel.role: channel for channel in channels}
+    arrays = {channel.role: values for channel, values in zip(channels[1:], kept[1:], strict=True)}
+    remarks = {c.role: source.remarks[c.heading] for c in channels if c.heading in source.remarks}
+    return Columns(run.file, first, rows, kept[0], arrays, named, tuple(notices), remarks)
+
+
+class _Finder:
+    """The headings of a file, looked up by role."""
+
+    def __init__(self, path: Path, headings: tuple[str, ...], specs: Mapping[str, ColumnSpec]) -> None:
+        self.path, self.headings, self.specs = path, headings, specs
+        self.parts = [split_heading(h) for h in headings]
+        self.notices: list[Notice] = []
+
+    def find(self, role: str) -> Channel | None:
+        """Return the channel of a role, None where neither [columns] nor a heading has it."""
+        spec = self.specs.get(role)
+        if spec is None:
+            found = [i for i, (name, _) in enumerate(self.parts) if _plain(name) == role]
+            if not found:
+                return None
+            spec = ColumnSpec(role)
+        else:
+            found = self._named(spec)
+        if len(found) > 1:
+            raise SrfError(
+                f"{self.path}: {len(found)} columns are called '{self.parts[found[0]][0]}'",
+                f'Name the one for {role} in full: [columns] {role} = {{ name = "{self.headings[found[0]]}" }}.',
+            )
+        return self._channel(role, spec, found[0])
+
+    def _named(self, spec: ColumnSpec) -> list[int]:
+        assert spec.node is not None
+        for test in (
+            lambda i: self.headings[i] == spec.name,
+            lambda i: self.parts[i][0] == spec.name,
+            lambda i: _plain(self.parts[i][0]) == _plain(spec.name),
+        ):
+            found = [i for i in range(len(self.headings)) if test(i)]
+            if found:
+                return found
+        spec.node.fail(
+            f"{self.path} has no column '{spec.name}'", did_you_mean(spec.name, (name for name, _ in self.parts))
+        )
+
+    def _channel(self, role: str, spec: ColumnSpec, column: int) -> Channel:
+        written, heading = self.parts[column][1], self.headings[column]
+        where = f"{self.path}: column '{heading}'"
+        unit = spec.unit if spec.unit is not None else written if written is not None else ROLES[role]
+        factor = check_unit(unit, role, spec.node if spec.unit is not None else None, where)
+        if spec.unit is not None and written is not None:
+            try:
+                same = check_unit(written, role) == factor
+            except SrfError:
+                same = False
+            if not same:
+                what = f"the heading says {written!r}, [columns] says {spec.unit!r}, which counts"
+                self.notices.append(Notice("unit", where, what))
+        return Channel(role, heading, column, unit, factor, spec)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\s_\-]+", "_", name.strip().lower())
+
+
+def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
+    """Return the channels of a run, the time first."""
+    time = finder.find("time")
+    names = [name for name, _ in finder.parts]
+    if time is None:
+        raise SrfError(
+            f"{run.file}: no column 'time'; found: {', '.join(finder.headings)}",
+            f'Head it `time [s]`, or write [columns] time = {{ name = "...", unit = "s" }}. {_near(["time"], names)}'.strip(),
+        )
+    roles = (*OBSERVABLES, "shear_stress")
+    observables = [c for role in roles if (c := finder.find(role))]
+    if not observables:
+        raise SrfError(
+            f"{run.file}: none of the columns {', '.join(roles)}; found: {', '.join(finder.headings)}",
+            f"One of them is needed; [columns] can name it. {_near(roles, names)}".strip(),
+        )
+    listed = [c for c in observables if c.role in finder.specs] or observables
+    if len(observables) > 1:
+        others = ", ".join(c.role for c in observables if c is not listed[0])
+        what = f"{listed[0].role} is what is compared; the file also has {others}, left aside"
+        finder.notices.append(Notice("observable", str(run.file), what))
+    observable = listed[0] if listed[0].role in OBSERVABLES else replace(listed[0], role="force")
+    channels = [time, observable]
+    moves = finder.find("load_point_velocity")
+    if moves is None and run.drive is None:
+        moves = finder.find("load_point_displacement")
+        if moves is None:
+            raise SrfError(
+                f"{run.node.where}: the run has no drive, and {run.file} no load_point_velocity or load_point_displacement",
+                f"Write drive = [{{ duration = ..., velocity = ... }}], or name the column. {_near(list(ROLES)[1:3], names)}",
+            )
+    weights = [c for role in ("normal_load", "normal_stress") if (c := finder.find(role))]
+    if len(weights) > 1:
+        what = "normal_load is what counts; the file also has normal_stress, left aside"
+        finder.notices.append(Notice("load", str(run.file), what))
+    if not weights and run.load is None and listed[0].role != "friction":
+        raise SrfError(
+            f"{run.node.where}: the run has no load, and {run.file} no normal_load or normal_stress",
+            f'Write load = "5 N", or name the column. {_near(["normal_load", "normal_stress"], names)}'.strip(),
+        )
+    return [*channels, *([moves] if moves else []), *weights[:1]]
+
+
+def _near(roles: Iterable[str], names: list[str]) -> str:
+    """Return a question where a heading looks like a misspelt role."""
+    import difflib
+
+    for role in roles:
+        close = difflib.get_close_matches(role, [_plain(n) for n in names], n=1, cutoff=0.75)
+        if close:
+            return f"Is '{names[[_plain(n) for n in names].index(close[0])]}' the {role}?"
+    return ""
+
+
+def _refuse_large(run: RunDescription, source: Source, columns: int, limit: int) -> None:
+    """Raise SrfError where the file says that what is needed is too large."""
+    needed = (source.rows or 0) * (columns + 1) * 8
+    if needed > limit and source.whole:
+        raise SrfError(
+            f"{run.file}: {source.rows} samples of {columns} needed columns are {_megabytes(needed)}, above the limit of "
+            f"{_megabytes(limit)}, and this kind of file cannot be read in parts",
+            "Save it as CSV or NPZ, or raise the limit.",
+        )
+    if needed > limit and run.window is None:
+        _too_large(run, f"{source.rows} samples of {columns} needed columns are {_megabytes(needed)}", limit)
+    guess = (source.about or 0) * (columns + 1) * 8
+    if guess > 1.5 * limit and run.window is None:  # an estimate may be off; what is nearer is counted while it is read
+        _too_large(run, f"some {source.about:.2g} samples of {columns} needed columns are {_megabytes(guess)}", limit)
+
+
+def _too_large(run: RunDescription, what: str, limit: int) -> None:
+    size = _megabytes(run.file.stat().st_size)
+    raise SrfError(
+        f"{run.node.where}: {run.file} ({size}) is too large to hold: {what}, above the limit of {_megabytes(limit)}",
+        "Take a part with window = [from, to] in seconds, which reads only that part into memory, or raise the limit.",
+    )
+
+
+def _megabytes(count: float) -> str:
+    return f"{count / 2**20:.4g} MB"
+
+
+def _collect(
+    run: RunDescription, source: Source, channels: list[Channel], wanted: tuple[int, ...], limit: int
+) -> tuple[list[Array], NDArray[np.int64], float]:
+    """Return the columns inside the window in um, s, N, the numbers of their rows, and the first time of the file."""
+    pieces: list[list[Array]] = []
+    numbers: list[NDArray[np.int64]] = []
+    row, held, clock, first = 1, 0, 0.0, np.nan
+    low, high = run.window or (-np.inf, np.inf)
+    for block in source.blocks(wanted):
+        with np.errstate(over="ignore", invalid="ignore"):
+            arrays = [(b * c.spec.scale + c.spec.offset) * c.factor for b, c in zip(block, channels, strict=True)]
+            if channels[0].spec.integrate:
+                arrays[0] = _integrated(run.file, channels[0], arrays[0], clock, row)
+                clock = float(arrays[0][-1]) if arrays[0].size else clock
+        for values in arrays:
+            values[~(np.abs(values) < HUGE)] = np.nan
+        if np.isnan(first) and np.isfinite(arrays[0]).any():
+            first = float(arrays[0][np.isfinite(arrays[0])][0])
+        with np.errstate(invalid="ignore"):
+            inside = np.isnan(arrays[0]) | ((arrays[0] >= low) & (arrays[0] <= high))
+        held += int(inside.sum()) * (len(arrays) + 1) * 8
+        if held > limit:
+            _too_large(run, f"what is needed of it exceeds {_megabytes(held)}", limit)
+        pieces.append([values[inside] for values in arrays])
+        numbers.append(row + np.flatnonzero(inside))
+        row += inside.size
+    columns = [np.concatenate([p[k] for p in pieces]) if pieces else np.empty(0) for k in range(len(channels))]
+    known = np.flatnonzero(np.isfinite(columns[0]))
+    part = (
+        slice(known[0], known[-1] + 1) if known.size else slice(0, 0)
+    )  # what has no time belongs where its neighbours are
+    return [c[part] for c in columns], np.concatenate([np.empty(0, np.int64), *numbers])[part], first
+
+
+def _integrated(path: Path, channel: Channel, intervals: Array, clock: float, row: int) -> Array:
+    """Return times from sample intervals, the first of which ends at the first sample."""
+    bad = np.flatnonzero(~np.isfinite(intervals) | (intervals < 0))
+    if bad.size:
+        raise SrfError(
+            f"{path}, row {row + bad[0]}, column '{channel.heading}': found {intervals[bad[0]]:g} s, expected a sample interval",
+            "A missing interval makes all later times unknown.",
+        )
+    return np.asarray(clock + np.cumsum(intervals))
+
+
+def _nothing(run: RunDescription, first: float) -> None:
+    if run.window is not None and np.isfinite(first):
+        run.node.child("window").fail(
+            f"no sample of {run.file} lies in [{run.window[0]:g}, {run.window[1]:g}] s; its clock begins at {first:.10g} s",
+            "The window is in seconds of the file's own clock.",
+        )
+    raise SrfError(f"{run.file}: no samples", "A recording needs a line of numbers for each sample.")

@@ -1,0 +1,575 @@
+"""`experiment.toml` in the format `srf-experiment/1`, read without opening a data file; a breach names file, line and key."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn
+
+from srfcli.core.errors import SrfError, did_you_mean, printable, shown
+from srfcli.core.files import parse_toml, read_text, recover
+from srfcli.core.units import is_stress, parse_stated_quantity, same_dimension, split_quantity, unit_factor
+
+# `experiment.toml` in the format `srf-experiment/1`, read and validated without opening any data file.
+
+FORMAT = "srf-experiment/1"
+FILE_NAME = "experiment.toml"
+ROLES = {  # what a column may be, and the unit of a number in it where neither heading nor [columns] say
+    "time": "s",
+    "load_point_velocity": "um/s",
+    "load_point_displacement": "um",
+    "normal_load": "N",
+    "normal_stress": "MPa",
+    "elongation": "um",
+    "force": "N",
+    "shear_stress": "MPa",
+    "friction": "1",
+}
+_TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs")
+_COLUMN = ("name", "unit", "scale", "offset", "integrate")
+_RUN = ("name", "file", "format", "holdout", "window", "drive", "start", "load", "modulation", "initial")
+_RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
+
+
+@dataclass(frozen=True)
+class Apparatus:
+    """The loading stage: `stiffness` in N/um, or in 1/um where `per_load` (friction per micron), and the mass or None.
+
+    `text` states it in N/um or 1/um, `unit` is which of the two, `stated` the unit that the description has.
+    """
+
+    stiffness: float
+    per_load: bool
+    text: str
+    unit: str
+    stated: str
+    mass: float | None
+
+
+@dataclass(frozen=True)
+class ColumnSpec:
+    """Which column of a file plays a role, and how its numbers become quantities: (number scale + offset) in `unit`."""
+
+    name: str
+    unit: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+    integrate: bool = False
+    node: Node | None = field(default=None, repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class RunDescription:
+    """What the description says of one run; `drive` holds (duration, velocity) pairs, None where columns say it."""
+
+    name: str
+    file: Path
+    format: str | None
+    holdout: bool
+    window: tuple[float, float] | None
+    drive: tuple[tuple[float, float], ...] | None
+    start: float
+    load: float | None
+    modulation: tuple[float, float, float] | None
+    initial: str
+    node: Node = field(repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class Description:
+    """A whole `experiment.toml`; `model` and `parameters` are still nodes, as only the laws can judge them."""
+
+    path: Path
+    title: str
+    apparatus: Apparatus
+    model: Node
+    parameters: Node | None
+    columns: Mapping[str, ColumnSpec]
+    runs: tuple[RunDescription, ...]
+
+
+def read_description(path: Path) -> Description:
+    """Return what the experiment folder or TOML file at `path` says; raises SrfError with file and line for a breach."""
+    file = find_file(path)
+    root = open_node(file)
+    declared = root.get("format")
+    start = f'Start the file with format = "{FORMAT}".'
+    if declared is None:
+        raise SrfError(f"{file}: format: missing, expected {FORMAT!r}", start)
+    if declared.value != FORMAT:
+        declared.expected(f'"{FORMAT}"', start)
+    root.keys(_TOP)
+    title = root.get("title")
+    apparatus = root.require("apparatus", '[apparatus] with stiffness = "0.21 N/um".').table("[apparatus].")
+    parameters, columns = root.get("parameters"), root.get("columns")
+    return Description(
+        path=file,
+        title=title.text() if title else "",
+        apparatus=_apparatus(apparatus),
+        model=root.require("model", '[model] with law = "srf-vsat" and ageing = "dieterich".').table("[model]."),
+        parameters=parameters.table("[parameters].") if parameters else None,
+        columns=_columns(columns.table("[columns].")) if columns else {},
+        runs=_runs(root.require("runs", _RUNS)),
+    )
+
+
+def find_file(path: Path) -> Path:
+    """Return the TOML file that `path`, an experiment's folder or file, means."""
+    if not path.exists():
+        recover(path)  # a process that replaced it may have been killed
+    if not path.exists():
+        raise SrfError(f"no experiment {path}", f"Give a folder with an {FILE_NAME}, or the TOML file.")
+    if path.is_dir():
+        file = path / FILE_NAME
+        if not file.is_file():
+            others = sorted(p.name for p in path.glob("*.toml"))
+            hint = f"Name the file: {path / others[0]}" if others else "srf new DATA.csv writes one for recorded data."
+            raise SrfError(f"{path}: holds no {FILE_NAME}", hint)
+        return file
+    if not path.is_file():
+        raise SrfError(f"{path}: neither a folder nor a file", f"Give a folder with an {FILE_NAME}, or the TOML file.")
+    return path
+
+
+def _apparatus(node: Node) -> Apparatus:
+    node.keys(("stiffness", "mass"))
+    hint = 'Write stiffness = "0.21 N/um", "1.5 MPa/mm", or "1.0e-3 1/um" for friction per micron.'
+    stiffness = node.require("stiffness", hint)
+    if not isinstance(stiffness.value, str):
+        stiffness.expected("text with a number and its unit", hint)
+    try:
+        number, unit = split_quantity(stiffness.value, name="stiffness", example="0.21 N/um")
+        if not unit:
+            stiffness.fail(f"'{stiffness.value}' has no unit, and two are possible", hint)
+        per_load = same_dimension(unit, "1/um")
+        value = number * unit_factor(unit, "1/um" if per_load else "N/um")
+    except SrfError as error:
+        if error.message.startswith(str(node.file)):
+            raise
+        stiffness.fail(error.message, error.hint if "unknown unit" in error.message else hint)
+    if not value > 0:
+        stiffness.expected("a positive stiffness")
+    mass = node.get("mass")
+    kilograms = mass.quantity("kg") if mass else 0.0
+    if mass and kilograms < 0:
+        mass.expected('a mass of 0 or more, as "2.37 kg"')
+    base = "1/um" if per_load else "N/um"
+    text = f"{value!r} {base}" if is_stress(unit) else stiffness.value  # nothing below this knows of stresses
+    return Apparatus(value, per_load, text, base, unit, kilograms * 1e-6 if kilograms else None)
+
+
+def _columns(node: Node) -> dict[str, ColumnSpec]:
+    node.keys(ROLES)
+    specs = {}
+    for role in node.value:
+        entry = node.child(role)
+        if isinstance(entry.value, str):
+            specs[role] = ColumnSpec(entry.text(), node=entry)
+            continue
+        entry.table(f'{role} = {{ name = "...", unit = "{ROLES[role]}" }}.').keys(_COLUMN)
+        name = entry.require("name", "Give the column's heading in the data file.").text()
+        unit, scale, offset, integrate = (entry.get(key) for key in _COLUMN[1:])
+        if unit:
+            check_unit(unit.text(), role, unit)
+        if scale and scale.number() == 0:
+            scale.expected("a number other than 0")
+        if integrate and role != "time":
+            integrate.fail("only the time may be integrated, from sample intervals", "Take `integrate` away.")
+        specs[role] = ColumnSpec(
+            name,
+            unit.text() if unit else None,
+            scale.number() if scale else 1.0,
+            offset.number() if offset else 0.0,
+            integrate.boolean() if integrate else False,
+            entry,
+        )
+    return specs
+
+
+def check_unit(unit: str, role: str, node: Node | None = None, where: str = "") -> float:
+    """Return the factor from `unit` to um, s, N for a column's role; raises SrfError at `node` or `where`."""
+    base = {"um/s": "um/s", "MPa": "N"}.get(ROLES[role], ROLES[role])
+    try:
+        return unit_factor(unit, base)
+    except SrfError as error:
+        message = f"{error.message}; {role} is in {ROLES[role]} or a unit of that dimension"
+        if node is not None:
+            node.fail(message, error.hint)
+        raise SrfError(f"{where}: {message}", error.hint) from None
+
+
+def _runs(node: Node) -> tuple[RunDescription, ...]:
+    runs: list[RunDescription] = []
+    for entry in node.tables(_RUNS):
+        run = _run(entry)
+        for other in runs:
+            if other.name == run.name:
+                entry.child("name").fail(
+                    f"'{run.name}' is the name of another run, {other.node.where}", "Give each run its own name."
+                )
+        runs.append(run)
+    return tuple(runs)
+
+
+def _run(node: Node) -> RunDescription:
+    node.keys(_RUN)
+    name = node.require("name", 'Write name = "steps".')
+    if not name.text().strip():
+        name.expected("a name")
+    file = node.require("file", 'Write file = "steps.csv", relative to the experiment\'s folder.')
+    if not file.text().strip() or "\0" in file.text():
+        file.expected("the name of a data file")
+    holdout, format, start, initial = (node.get(key) for key in ("holdout", "format", "start", "initial"))
+    drive, load, window = node.get("drive"), node.get("load"), node.get("window")
+    if initial and initial.text() not in ("steady", "free"):
+        initial.expected('"steady" or "free"', did_you_mean(initial.text(), ("steady", "free")))
+    weight = load.quantity("N") if load else None
+    if load and weight is not None and not weight > 0:
+        load.expected('a load above 0, as "5 N"')
+    modulation = node.get("modulation")
+    return RunDescription(
+        name=name.text(),
+        file=node.file.parent / file.text(),
+        format=format.text() if format else None,
+        holdout=holdout.boolean() if holdout else False,
+        window=_window(window) if window else None,
+        drive=_drive(drive) if drive else None,
+        start=start.quantity("um") if start else 0.0,
+        load=weight,
+        modulation=_modulation(modulation) if modulation else None,
+        initial=initial.text() if initial else "steady",
+        node=node,
+    )
+
+
+def _window(node: Node) -> tuple[float, float]:
+    if not isinstance(node.value, list) or len(node.value) != 2:
+        node.expected("[from, to], in seconds of the file's own clock", "Write window = [0.0, 4.5].")
+    begin, end = (node.child(i).quantity("s") for i in range(2))
+    if not begin < end:
+        node.fail(f"the window [{begin:g}, {end:g}] s is empty", "Give the earlier time first.")
+    return begin, end
+
+
+def _drive(node: Node) -> tuple[tuple[float, float], ...]:
+    example = "drive = [{ duration = 2.0, velocity = 5.0 }, ...], in s and um/s."
+    steps = []
+    for step in node.tables(example):
+        step.keys(("duration", "velocity"))
+        duration = step.require("duration", "Every step of a drive has a duration in s.")
+        velocity = step.require("velocity", "Every step of a drive has a velocity in um/s.").quantity("um/s")
+        if not duration.quantity("s") > 0:
+            duration.expected("a duration above 0")
+        steps.append((duration.quantity("s"), velocity))
+    return tuple(steps)
+
+
+def _modulation(node: Node) -> tuple[float, float, float]:
+    node.table("modulation = { frequency = 120.0, amplitude = 0.09, onset = 2.0 }.")
+    node.keys(("frequency", "amplitude", "onset"))
+    frequency = node.require("frequency", "Give it in Hz: frequency = 120.0.")
+    amplitude = node.require("amplitude", "Give it relative to the mean load: amplitude = 0.09.")
+    onset = node.get("onset")
+    if not frequency.quantity("Hz") > 0:
+        frequency.expected("a frequency above 0")
+    if not 0 <= amplitude.quantity("1") < 1:
+        amplitude.expected("a relative amplitude from 0 to below 1", "At 1 the slider lifts off.")
+    return frequency.quantity("Hz"), amplitude.quantity("1"), onset.quantity("s") if onset else 0.0
+
+
+# A value in a TOML file that knows where it stands: every breach is told with file, line, key, finding and expectation.
+
+SMALLEST = 1e-30  # of a number that is not zero: powers and products of it are numbers, too
+LARGEST = 16 * 2**20  # bytes of a description
+
+
+@dataclass(frozen=True)
+class Node:
+    """One value of a TOML file, its path of keys, and the lines of all keys of the file."""
+
+    file: Path
+    value: Any
+    place: Place = ()
+    lines: dict[Place, int] = field(default_factory=dict, repr=False)
+
+    @property
+    def where(self) -> str:
+        """Return `experiment.toml, line 12: runs[0].file`, as far as it is known."""
+        return self._where(self.place)
+
+    def _where(self, place: Place) -> str:
+        line = next((self.lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in self.lines), None)
+        at = f"{self.file}, line {line}" if line else f"{self.file}"
+        return f"{at}: {_spelled(place)}" if place else at
+
+    def fail(self, message: str, hint: str | None = None) -> NoReturn:
+        """Raise SrfError that names this place."""
+        raise SrfError(printable(f"{self.where}: {message}", line=True), hint)
+
+    def expected(self, what: str, hint: str | None = None) -> NoReturn:
+        """Raise SrfError that says what was found here and what was expected."""
+        self.fail(f"found {shown(self.value)}, expected {what}", hint)
+
+    def child(self, key: str | int) -> Node:
+        """Return the value under a key, or the element at an index, which must be there."""
+        return Node(self.file, self.value[key], (*self.place, key), self.lines)
+
+    def get(self, key: str) -> Node | None:
+        """Return the value under a key, None where there is none."""
+        return self.child(key) if key in self.value else None
+
+    def require(self, key: str, hint: str) -> Node:
+        """Return the value under a key; raises SrfError where there is none."""
+        if key not in self.value:
+            raise SrfError(printable(f"{self._where((*self.place, key))}: missing", line=True), hint)
+        return self.child(key)
+
+    def keys(self, known: Iterable[str]) -> None:
+        """Raise SrfError for a key that means nothing here."""
+        for key in self.value:
+            if key not in tuple(known):
+                self.child(key).fail("unknown key", did_you_mean(key, known))
+
+    def table(self, example: str) -> Node:
+        """Return this value, which must be a table."""
+        if not isinstance(self.value, dict):
+            self.expected("a table", f"Write {example}")
+        return self
+
+    def tables(self, example: str) -> Iterator[Node]:
+        """Yield the elements of this value, which must be a list of tables, at least one."""
+        if not isinstance(self.value, list) or not self.value:
+            self.expected("tables, at least one", f"Write {example}")
+        for index in range(len(self.value)):
+            yield self.child(index).table(example)
+
+    def text(self) -> str:
+        """Return this value, which must be text."""
+        if not isinstance(self.value, str):
+            self.expected("text in quotes")
+        return self.value
+
+    def boolean(self) -> bool:
+        """Return this value, which must be true or false."""
+        if not isinstance(self.value, bool):
+            self.expected("true or false")
+        return self.value
+
+    def number(self) -> float:
+        """Return this value, which must be a finite number."""
+        if isinstance(self.value, bool) or not isinstance(self.value, int | float):
+            self.expected("a number")
+        try:
+            number = float(self.value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
+            self.expected("a finite number")
+        if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
+            self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g}")
+        return number
+
+    def quantity(self, unit: str) -> float:
+        """Return this value in `unit`: a number in that unit, or text with a unit of its dimension."""
+        if not isinstance(self.value, str):
+            if isinstance(self.value, bool) or not isinstance(self.value, int | float):
+                example = "0.5" if unit == "1" else f'0.5 or "0.5 {unit}"'
+                self.expected(f"a number in {unit}" if unit != "1" else "a number", f"Write {example}.")
+            return self.number()
+        try:
+            name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
+            number = parse_stated_quantity(self.value, unit, name=name)
+            if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
+                self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g} {unit}")
+            return number
+        except SrfError as error:
+            self.fail(error.message, error.hint)
+
+
+def open_node(path: Path) -> Node:
+    """Return the table of a TOML file with the lines of its keys; raises SrfError where it is none."""
+    try:
+        text = read_text(path, limit=LARGEST).replace("\r\n", "\n")
+    except OSError as error:
+        raise SrfError(
+            f"{path}: cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1
+        ) from None
+    try:
+        table = parse_toml(text, path)
+    except SrfError as error:
+        if path.suffix.lower() != ".toml":
+            raise SrfError(
+                f"{path}: a data file, not the description of an experiment",
+                f"`srf new {path}` writes an experiment.toml for it.",
+            ) from None
+        raise SrfError(error.message, error.hint or 'Text goes in quotes: law = "srf-vsat".') from None
+    return Node(path, table, (), key_lines(text))
+
+
+def _spelled(place: Place) -> str:
+    out = ""
+    for key in place:
+        out += f"[{key}]" if isinstance(key, int) else f".{key}" if out else key
+    return out
+
+
+# Where in a TOML text each key and each element stands: `tomllib` gives values without lines.
+
+Place = tuple[str | int, ...]
+
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+_SCALAR = re.compile(r"[^,\]}#\n]+")
+_BLANK = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
+
+
+def key_lines(text: str) -> dict[Place, int]:
+    """Return the line (from 1) of every key and array element, by its path, in a text that `tomllib` accepts.
+
+    `("runs", 0, "file")` is where the first run names its file, `("runs", 0)` the line of its header.
+    """
+    scanner = _Scanner(text)
+    with contextlib.suppress(RecursionError, IndexError):  # nested beyond reason: what was found so far has lines
+        scanner.document()
+    return scanner.lines
+
+
+class _Scanner:
+    """A cursor over TOML that is known to be well formed, so that it need not check anything."""
+
+    def __init__(self, text: str) -> None:
+        self.text, self.at = text, 0
+        self.starts = [0, *(m.end() for m in re.finditer("\n", text))]
+        self.lines: dict[Place, int] = {}
+        self.counts: dict[Place, int] = {}  # headers seen of each array of tables
+
+    def note(self, place: Place) -> None:
+        self.lines.setdefault(place, bisect_right(self.starts, self.at))
+
+    def blank(self) -> None:
+        match = _BLANK.match(self.text, self.at)
+        assert match is not None
+        self.at = match.end()
+
+    def spaces(self) -> None:
+        while self.text[self.at : self.at + 1] in (" ", "\t"):
+            self.at += 1
+
+    def document(self) -> None:
+        table: Place = ()
+        while True:
+            self.blank()
+            if self.at >= len(self.text):
+                return
+            if self.text[self.at] == "[":
+                table = self.header()
+            else:
+                self.pair(table)
+
+    def header(self) -> Place:
+        double = self.text.startswith("[[", self.at)
+        self.at += 2 if double else 1
+        keys = self.keys()
+        place: Place = ()
+        for index, key in enumerate(keys):
+            place = (*place, key)
+            last = index == len(keys) - 1
+            if double and last:
+                self.counts[place] = self.counts.get(place, 0) + 1
+            self.note(place)
+            if place in self.counts:
+                place = (*place, self.counts[place] - 1)
+                self.note(place)
+        self.at += 2 if double else 1
+        return place
+
+    def keys(self) -> tuple[str, ...]:
+        found = []
+        while True:
+            self.spaces()
+            if self.text[self.at] in "\"'":
+                found.append(self.string())
+            else:
+                match = _BARE.match(self.text, self.at)
+                assert match is not None
+                found.append(match[0])
+                self.at = match.end()
+            self.spaces()
+            if self.text[self.at] != ".":
+                return tuple(found)
+            self.at += 1
+
+    def pair(self, table: Place) -> None:
+        start, place = self.at, table
+        keys = self.keys()
+        after, self.at = self.at, start
+        for key in keys:
+            place = (*place, key)
+            self.note(place)
+        self.at = after + 1  # the equals sign
+        self.value(place)
+
+    def value(self, place: Place) -> None:
+        self.spaces()
+        opening = self.text[self.at]
+        if opening in "\"'":
+            self.string()
+        elif opening == "[":
+            self.array(place)
+        elif opening == "{":
+            self.inline(place)
+        else:
+            match = _SCALAR.match(self.text, self.at)
+            assert match is not None
+            self.at = match.end()
+
+    def array(self, place: Place) -> None:
+        self.at += 1
+        index = 0
+        while True:
+            self.blank()
+            if self.text[self.at] == "]":
+                self.at += 1
+                return
+            if self.text[self.at] == ",":
+                self.at += 1
+                continue
+            self.note((*place, index))
+            self.value((*place, index))
+            index += 1
+
+    def inline(self, place: Place) -> None:
+        self.at += 1
+        while True:
+            self.blank()
+            if self.text[self.at] == "}":
+                self.at += 1
+                return
+            if self.text[self.at] == ",":
+                self.at += 1
+                continue
+            self.pair(place)
+
+    def string(self) -> str:
+        """Pass a string and return what stands between its quotes; escapes in a key are left as they are."""
+        quote = self.text[self.at]
+        if self.text.startswith(3 * quote, self.at):
+            return self.long_string(quote)
+        start = self.at = self.at + 1
+        while self.text[self.at] != quote:
+            self.at += 2 if quote == '"' and self.text[self.at] == "\\" else 1
+        self.at += 1
+        return self.text[start : self.at - 1]
+
+    def long_string(self, quote: str) -> str:
+        start = self.at = self.at + 3
+        while not self.text.startswith(3 * quote, self.at):
+            self.at += 2 if quote == '"' and self.text[self.at] == "\\" else 1
+        while self.text[self.at + 3 : self.at + 4] == quote:  # up to two quotes may stand before the closing three
+            self.at += 1
+        self.at += 3
+        return self.text[start : self.at - 3]

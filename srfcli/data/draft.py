@@ -1,0 +1,465 @@
+"""A first `experiment.toml` from data files: which column plays which role, what was imposed, start values, and why."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.settings import Parameter
+from srfcli.core.units import find_unit, is_stress, split_quantity
+from srfcli.data.columns import open_source, split_heading
+from srfcli.data.description import ROLES, check_unit, read_description
+from srfcli.data.experiment import read_choice, read_experiment, read_parameters
+from srfcli.data.imposed import find_modulation
+from srfcli.data.values import Run
+from srfcli.laws.registry import Registry
+
+KINDS = ("steps", "shs", "oscillation")
+NAMED = {  # role -> what headings call it, in small letters without their unit; the first that a file has is taken
+    "time": ("time", "t", "elapsed_time", "elapsed", "test_time", "run_time"),
+    "load_point_velocity": (
+        "load_point_velocity", "lp_velocity", "lp_vel", "v_lp", "loading_velocity", "drive_velocity", "velocity", "vel", "v",
+        "loading_rate", "slip_rate",
+    ),
+    "load_point_displacement": (
+        "load_point_displacement", "lp_displacement", "lp_disp", "lpdisp", "load_point", "ram_displacement", "disp", "displ",
+        "displacement", "shear_displacement", "x_lp", "slip", "stage", "stage_position",
+    ),
+    "normal_stress": (
+        "normal_stress", "effective_normal_stress", "norm_stress", "sigma_n", "sigman", "sig_n", "sigma", "sn", "ns",
+    ),
+    "normal_load": ("normal_load", "normal_force", "fn", "f_n", "norm_force", "load", "n", "w"),
+    "elongation": ("elongation", "spring_elongation", "deflection", "spring_deflection", "u"),
+    "force": ("force", "shear_force", "friction_force", "tangential_force", "shear_load", "spring_force", "fs", "ft", "f"),
+    "shear_stress": ("shear_stress", "shear", "tau", "ss"),
+    "friction": (
+        "friction", "friction_coefficient", "coefficient_of_friction", "friction_coeff", "apparent_friction", "mu", "cof",
+        "fnorm",
+    ),
+}  # fmt: skip
+SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
+    "s": "s", "sec": "s", "ms": "ms", "min": "min", "um": "um", "microns": "um", "micron": "um", "mm": "mm", "m": "m",
+    "um_s": "um/s", "mm_s": "mm/s", "um/s": "um/s", "mm/s": "mm/s", "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "pa": "Pa",
+    "n": "N", "kn": "kN",
+}  # fmt: skip
+STRESSES = {"normal_load": "normal_stress", "force": "shear_stress"}
+FORCES = {stress: force for force, stress in STRESSES.items()}
+OBSERVABLES = ("elongation", "force", "shear_stress", "friction")
+STILL, HELD = (
+    1e-3,
+    0.05,
+)  # of the fastest velocity, below which nothing slides; of the slowest sliding, below which is a hold
+SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps
+LETTERS = "A is a, B is b, D0 is Dc (or L), mu is tau/sigma, W is sigma, K is k; a stress in MPa counts as the force on 1 mm^2"
+ROCK = {  # start values and bounds of A, B and D0 that hold most velocity steps on rock and gouge
+    "A": (0.01, 0.0005, 0.05),
+    "B": (0.01, 0.0002, 0.05),
+    "D0": (10.0, 0.5, 500.0),
+}
+FACTOR = 5.0  # from another law's defaults to its bounds
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the user says of data files: texts as experiment.toml has them, None or empty where nothing is said.
+
+    `columns` maps a role to a heading, or to `heading [unit]`; `drive` holds (duration, velocity) pairs or one velocity in um/s.
+    """
+
+    stiffness: str
+    kind: str | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    drive: Sequence[tuple[float, float]] | float | None = None
+    load: str | None = None
+    mass: str | None = None
+    window: tuple[float, float] | None = None
+    law: str = "dieterich-ruina"
+    ageing: str | None = None
+    interface: str = "rigid"
+    title: str = ""
+    reader: str | None = None
+    holdout: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Named:
+    """A column of a file that was taken for a role: its heading, its unit, and whether experiment.toml has to say so."""
+
+    role: str
+    heading: str
+    unit: str
+    said: bool
+
+
+@dataclass(frozen=True)
+class Draft:
+    """The text of an experiment.toml, the roles of the columns, and sentences on what was decided and why."""
+
+    text: str
+    columns: tuple[Named, ...]
+    kind: str
+    remarks: tuple[str, ...]
+
+
+def name_columns(headings: Sequence[str], wish: Mapping[str, str], *, path: Path, per_load: bool) -> tuple[Named, ...]:
+    """Return the columns of a file that play a role; `wish` names some of them, `per_load` prefers friction to a force.
+
+    Raises SrfError for a column that the file has not, or a unit of the wrong dimension.
+    """
+    found: dict[str, Named] = {}
+    for role, text in wish.items():
+        if role not in ROLES:
+            raise SrfError(f"--column {role}: no such role", did_you_mean(role, ROLES))
+        found[role] = _wished(role, text, headings, path)
+    taken = {named.heading for named in found.values()}
+    for role, names in NAMED.items():
+        if role in found:
+            continue
+        known = {_spelled(h)[0]: h for h in reversed(headings) if h not in taken}
+        heading = next((known[name] for name in names if name in known), None)
+        if heading is None:
+            continue
+        name, unit = _spelled(heading)
+        actual = _by_unit(role, unit)
+        if actual is None or actual in found:
+            continue
+        found[actual] = Named(
+            actual, heading, unit or ROLES[actual], name != actual or split_heading(heading)[1] is None
+        )
+        taken.add(heading)
+    seen = [role for role in (OBSERVABLES if not per_load else OBSERVABLES[::-1]) if role in found]
+    asked = [role for role in seen if role in wish]
+    left = set(seen) - set((asked or seen)[:1])
+    left |= {"load_point_displacement"} if "load_point_velocity" in found else set()
+    left |= {"normal_stress"} if {"normal_stress", "normal_load"} <= set(found) else set()
+    return tuple(replace(n, said=n.said or len(seen) > 1) for role, n in found.items() if role not in left)
+
+
+def _wished(role: str, text: str, headings: Sequence[str], path: Path) -> Named:
+    name, unit = (text, None) if text in headings else split_heading(text)
+    heading = next((h for h in headings if name in (h, split_heading(h)[0])), None)
+    if heading is None:
+        raise SrfError(f"{path} has no column '{name}'", did_you_mean(name, headings))
+    found = unit or _spelled(heading)[1] or ROLES[role]
+    check_unit(found, role, where=f"--column {role}")
+    return Named(role, heading, found, True)
+
+
+def _spelled(heading: str) -> tuple[str, str | None]:
+    """Return a heading's name in small letters and its unit, from brackets or a suffix; None where it has none."""
+    name, unit = split_heading(heading)
+    plain = re.sub(r"[^a-z0-9/]+", "_", name.strip().lower()).strip("_")
+    if unit is not None:
+        return plain.replace("/", "_"), unit
+    for suffix in sorted(SUFFIXES, key=len, reverse=True):
+        if plain.endswith("_" + suffix):
+            return plain.removesuffix("_" + suffix), SUFFIXES[suffix]
+    return plain.replace("/", "_"), None
+
+
+def _by_unit(role: str, unit: str | None) -> str | None:
+    """Return the role that a column with this unit plays, None where the unit fits no such role."""
+    if unit is None:
+        return role
+    try:
+        stress = is_stress(unit)
+    except SrfError:
+        return None
+    role = STRESSES.get(role, role) if stress else FORCES.get(role, role) if find_unit(unit).powers[2] else role
+    try:
+        check_unit(unit, role)
+    except SrfError:
+        return None
+    return role
+
+
+def missing(columns: Sequence[Named], wish: Wish, path: Path, headings: Sequence[str]) -> list[tuple[str, str]]:
+    """Return what a recording needs and is neither in the file nor said: the option that says it, and a sentence."""
+    roles = {named.role for named in columns}
+    listed = ", ".join(f"'{h}'" for h in headings)
+    lacks = []
+    if "time" not in roles:
+        lacks.append(("--column time=HEADING", f"{path}: which column is the time? It has {listed}"))
+    if not roles & set(OBSERVABLES):
+        what = "friction, shear stress, force or elongation of the spring"
+        lacks.append(("--column shear_stress=HEADING", f"{path}: which column is {what}? It has {listed}"))
+    if wish.drive is None and not roles & {"load_point_velocity", "load_point_displacement"}:
+        lacks.append(("--drive VELOCITY", f"{path}: no column has the load point's velocity or displacement"))
+    if wish.load is None and not roles & {"normal_load", "normal_stress", "friction"}:
+        lacks.append(("--load '5 N'", f"{path}: no column has the normal load or stress"))
+    return lacks
+
+
+def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry) -> Draft:
+    """Return an experiment.toml for these files, to stand in `folder`; every value in it has been read once.
+
+    Raises SrfError for what the files do not say and `wish` neither, and for all that reading an experiment refuses.
+    """
+    unit = split_quantity(wish.stiffness, name="--stiffness", example="5e-3 1/um")[1]
+    per_load = bool(unit) and find_unit(unit).powers == (-1, 0, 0, 0)
+    named: tuple[Named, ...] = ()
+    remarks: list[str] = []
+    for path in files:
+        headings = open_source(path, registry=registry, format=wish.reader).headings
+        own = name_columns(headings, wish.columns, path=path, per_load=per_load)
+        lacks = missing(own, wish, path, headings)
+        if lacks:
+            raise SrfError(lacks[0][1], " ".join(f"Say it with {option}." for option, _ in lacks))
+        if named and [(n.role, n.heading, n.unit) for n in own] != [(n.role, n.heading, n.unit) for n in named]:
+            raise SrfError(
+                f"{path}: its columns are not those of {files[0]}", "Files of one experiment have the same headings."
+            )
+        named = own
+        aside = [h for h in headings if h not in {n.heading for n in own}]
+        if aside and path == files[0]:
+            remarks.append(f"left aside: {', '.join(aside)}")
+    names = _run_names(files)
+    for name in wish.holdout:
+        if name not in names:
+            raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, names))
+    sketch = _Sketch(tuple(files), names, folder, wish, named)
+    runs, free = _read(sketch, registry)
+    kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs)
+    remarks.append(f"kind of experiment: {kind}, {why}")
+    if free:
+        remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(free)}")
+    sketch = replace(
+        sketch, kind=kind, why=why, free=free, modulations=_modulations(runs) if kind == "oscillation" else {},
+        durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
+    )  # fmt: skip
+    text = sketch.text(_parameters(sketch, runs, registry))
+    _check(text, registry)
+    return Draft(text, named, kind, tuple(remarks))
+
+
+def _run_names(files: Sequence[Path]) -> list[str]:
+    names: list[str] = []
+    for path in files:
+        stem, number = path.stem, 2
+        name = stem
+        while name in names:
+            name, number = f"{stem}-{number}", number + 1
+        names.append(name)
+    return names
+
+
+@dataclass(frozen=True)
+class _Sketch:
+    """All that an experiment.toml is written from."""
+
+    files: tuple[Path, ...]
+    names: list[str]
+    folder: Path
+    wish: Wish
+    columns: tuple[Named, ...]
+    kind: str = "steps"
+    why: str = ""
+    free: tuple[str, ...] = ()
+    modulations: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    durations: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def ageing(self) -> str:
+        """Return the ageing law: that of the wish, else Dieterich's, with Linker's term where the load oscillates."""
+        return self.wish.ageing or ("dieterich+linker-dieterich" if self.kind == "oscillation" else "dieterich")
+
+    def text(self, parameters: Sequence[str], *, absolute: bool = False) -> str:
+        """Return the whole file."""
+        wish = self.wish
+        lines = ['format = "srf-experiment/1"', f"title = {_quoted(wish.title or ', '.join(self.names))}"]
+        lines += ["", f"# Letters: {LETTERS}.", "", "[apparatus]"]
+        lines += [
+            f"stiffness = {_quoted(wish.stiffness)}   # of the machine: N/um, MPa/mm, or 1/um for friction per micron"
+        ]
+        if wish.mass:
+            lines += [f"mass = {_quoted(wish.mass)}"]
+        else:
+            lines += ['# mass = "2.37 kg"   # of the slider; without it the slider is quasi-static']
+        lines += [
+            "",
+            "[model]   # `srf laws` lists the laws",
+            f"law = {_quoted(wish.law)}",
+            f"ageing = {_quoted(self.ageing)}",
+        ]
+        if not wish.ageing:
+            lines[-1] += '   # ageing law; "ruina" is the slip law'
+        lines += [f"interface = {_quoted(wish.interface)}", f"inertia = {'true' if wish.mass else 'false'}"]
+        if parameters:
+            lines += ["", "[parameters]   # start values and bounds of what is fitted; a wide bound costs little"]
+            lines += parameters
+        said = [n for n in self.columns if n.said]
+        if said:
+            lines += ["", "[columns]   # what the headings of the data files mean"]
+            lines += [f"{n.role} = {{ name = {_quoted(split_heading(n.heading)[0] if self._alone(n) else n.heading)}, "
+                      f"unit = {_quoted(n.unit)} }}" for n in said]  # fmt: skip
+        if self.kind in KINDS and self.why:
+            lines += ["", f"# The runs, of kind {self.kind}: {self.why}."]
+        for path, name in zip(self.files, self.names, strict=True):
+            lines += ["", "[[runs]]", *self._run(path, name, absolute=absolute)]
+        return "\n".join(lines) + "\n"
+
+    def _alone(self, named: Named) -> bool:
+        """Return whether a column's bare name is that of no other."""
+        return [split_heading(n.heading)[0] for n in self.columns].count(split_heading(named.heading)[0]) == 1
+
+    def _run(self, path: Path, name: str, *, absolute: bool) -> list[str]:
+        wish, place = self.wish, path.resolve()
+        home = self.folder.resolve()
+        inside = home in place.parents and not absolute
+        lines = [
+            f"name = {_quoted(name)}",
+            f"file = {_quoted(place.relative_to(home).as_posix() if inside else str(place))}",
+        ]
+        if wish.reader:
+            lines.append(f"format = {_quoted(wish.reader)}")
+        lines.append(f"holdout = {'true' if name in wish.holdout else 'false'}   # true: never fitted, judges the fit")
+        if wish.window:
+            lines.append(f"window = [{wish.window[0]!r}, {wish.window[1]!r}]   # s of the file's clock")
+        elif not absolute:
+            lines.append("# window = [0.0, 100.0]   # only this part of the recording, s of the file's clock")
+        if isinstance(wish.drive, float):
+            length = self.durations.get(name, 1e9)
+            lines.append(f"drive = [{{ duration = {length!r}, velocity = {wish.drive!r} }}]   # s, um/s")
+        elif wish.drive:
+            steps = ", ".join(f"{{ duration = {d!r}, velocity = {v!r} }}" for d, v in wish.drive)
+            lines.append(f"drive = [{steps}]   # s, um/s")
+        if wish.load:
+            lines.append(f"load = {_quoted(wish.load)}")
+        if name in self.free:
+            lines.append('initial = "free"   # the state at the first sample is estimated, not steady sliding')
+        if name in self.modulations:
+            f, eps, onset = self.modulations[name]
+            lines.append(
+                f"modulation = {{ frequency = {f!r}, amplitude = {eps!r}, onset = {onset!r} }}"
+                "   # Hz, of the mean load, s; found in the column, which counts"
+            )
+        return lines
+
+
+def _read(sketch: _Sketch, registry: Registry) -> tuple[list[Run], tuple[str, ...]]:
+    """Return the runs as an experiment reads them, and those that have to begin from a free state."""
+    free: tuple[str, ...] = ()
+    while True:
+        text = replace(sketch, free=free).text((), absolute=True)
+        with tempfile.TemporaryDirectory() as home:
+            file = Path(home) / "experiment.toml"
+            file.write_text(text, encoding="utf-8")
+            try:
+                return list(read_experiment(file, registry=registry).runs), free
+            except SrfError as error:
+                still = [n for n in sketch.names if n not in free]
+                if "the drive begins with" in error.message and still:
+                    index = re.search(r"runs\[(\d+)\]", error.message)
+                    name = sketch.names[int(index[1])] if index else still[0]
+                    if name not in free:
+                        free = (*free, name)
+                        continue
+                apart = "no contact" in error.message or "the load is" in error.message
+                hint = "Take the part in contact: --window FROM,TO in seconds." if apart else error.hint
+                raise SrfError(re.sub(rf"{re.escape(str(file))}(, line \d+)?: ", "", error.message), hint) from None
+
+
+def _check(text: str, registry: Registry) -> None:
+    """Raise SrfError where a description, its model or its parameters are none."""
+    with tempfile.TemporaryDirectory() as home:
+        file = Path(home) / "experiment.toml"
+        file.write_text(text, encoding="utf-8")
+        described = read_description(file)
+        choice, known = read_choice(described.model, described.apparatus, registry)
+        read_parameters(described.parameters, known, choice)
+
+
+def _kind(runs: Sequence[Run]) -> tuple[str, str]:
+    """Return what kind of experiment the runs are, and the reason."""
+    if _modulations(runs):
+        name, (f, eps, _) = next(iter(_modulations(runs).items()))
+        return "oscillation", f"as the load of {name} oscillates by {100 * eps:.3g} % at {f:.4g} Hz"
+    for run in runs:
+        V = np.abs(run.drive(run.t))
+        sliding = STILL * float(V.max()) < V
+        held = HELD * float(V[sliding].min()) > V
+        if held[int(np.argmax(sliding)) :].any() and _levels(V[sliding]) < SEVERAL:
+            return "shs", f"as the drive of {run.name} holds for {float(np.mean(held)):.0%} of the time"
+    ranges = [np.abs(run.drive(run.t)) for run in runs]
+    low, high = min(float(V.min()) for V in ranges), max(float(V.max()) for V in ranges)
+    return "steps", f"as the drive goes from {low:.3g} to {high:.3g} um/s" if high > low else f"at {low:.3g} um/s"
+
+
+def _levels(V: np.ndarray) -> int:
+    """Return at how many velocities a run slides for a noticeable part of its time, those within a third of another as one."""
+    _, counts = np.unique(np.round(np.log(V) / np.log(4 / 3)), return_counts=True)
+    return int(np.sum(counts > 0.02 * V.size))
+
+
+def _modulations(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
+    found = {}
+    for run in runs:
+        W = run.load(run.t)[0]
+        one = find_modulation(run.t, W) if np.ptp(W) > 0 else None
+        if one is not None:
+            onset = one.onset if math.isfinite(one.onset) else float(run.t[0])
+            found[run.name] = (float(f"{one.frequency:.6g}"), float(f"{one.amplitude:.4g}"), float(f"{onset:.6g}"))
+    return found
+
+
+def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> list[str]:
+    """Return the lines of [parameters]: start values from the data where they tell, else those of rock, else the law's own."""
+    wish = sketch.wish
+    law = registry.get("friction", wish.law)
+    base, modifiers = registry.ageing(sketch.ageing)
+    surface = registry.get("interface", wish.interface)
+    listed: list[Parameter] = [p for each in (law, base, *modifiers, surface) for p in each.parameters]
+    V = float(np.median([abs(run.drive(run.t[:1])[0]) or 1.0 for run in runs]))
+    mu = float(np.median(np.concatenate([_friction(run)[run.used] for run in runs])))
+    lines = []
+    for p in listed:
+        about = f"   # {p.about}" if p.about else ""
+        if p.name == "V0":
+            lines.append(f"V0 = {{ value = {_short(V)}, fixed = true }}{about}")
+        elif p.name == "mu0":
+            low, high = sorted((_short(0.6 * mu), _short(1.4 * mu)))
+            lines.append(f"mu0 = {{ value = {_short(mu)}, lower = {low}, upper = {high} }}   # median of the recording")
+        elif p.name in ROCK and wish.law == "dieterich-ruina":
+            value, low, high = ROCK[p.name]
+            lines.append(f"{p.name} = {{ value = {value}, lower = {low}, upper = {high} }}{about}")
+        else:
+            low, high = max(p.lower, _short(p.default / FACTOR)), min(p.upper, _short(p.default * FACTOR))
+            held = ", fixed = true" if not low < high else f", lower = {low}, upper = {high}"
+            lines.append(f"{p.name} = {{ value = {p.default!r}{held} }}{about}")
+    number, unit = split_quantity(wish.stiffness, name="--stiffness")
+    pair = f'lower = "{_short(number / 2)} {unit}", upper = "{_short(2 * number)} {unit}"'
+    lines.append(f'# K = {{ value = "{wish.stiffness}", {pair} }}   # take the # away to fit the stiffness, too')
+    return lines
+
+
+def _friction(run: Run) -> np.ndarray:
+    """Return what is recorded as a friction coefficient (n,)."""
+    W = run.load(run.t)[0]
+    factor = {"elongation": run.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[run.observable]
+    return np.asarray(run.observed * factor)
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.3g}")
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def looks_like_recording(path: Path, *, registry: Registry) -> bool:
+    """Return whether a file is a recording: it has a time and something that was observed."""
+    try:
+        headings = open_source(path, registry=registry).headings
+    except SrfError:
+        return False
+    roles = {n.role for n in name_columns(headings, {}, path=path, per_load=False)}
+    return "time" in roles and bool(roles & set(OBSERVABLES))

@@ -1,0 +1,496 @@
+"""An experiment, read and validated: the public door to recordings."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.codegen.model import Array
+from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.settings import Parameter
+from srfcli.core.units import is_stress, split_quantity, to_base
+from srfcli.data.clock import Mask, Rate, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
+from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
+from srfcli.data.description import Apparatus, ColumnSpec, Node, RunDescription, read_description
+from srfcli.data.imposed import (
+    DIFFERS,
+    Found,
+    Place,
+    check_start,
+    declared_drive,
+    drive_differs,
+    drive_from_column,
+    find_modulation,
+    load_from_column,
+    modulation_notices,
+)
+from srfcli.data.noise import (
+    Noise,
+    describe_noise,
+    observable_jumps,
+    quantisation,
+    rejoined,
+    saturation,
+    spikes,
+    white_level,
+)
+from srfcli.data.values import OBSERVABLES, Experiment, FitParameter, ModelChoice, Notice, Run
+from srfcli.laws.registry import Registry
+from srfcli.laws.values import Effect
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation
+
+# An experiment, read and validated: the public door to recordings.
+
+__all__ = ["Array", "Experiment", "FitParameter", "ModelChoice", "Notice", "Run", "read_experiment"]
+
+
+def read_experiment(
+    path: Path,
+    *,
+    registry: Registry,
+    format: str | None = None,
+    holdout: bool = True,
+    limit: int = LIMIT,
+) -> Experiment:
+    """Return the experiment in the folder or TOML file `path`, every value checked, in um, s, N.
+
+    `format` names the reader of all data files; `holdout=False` leaves held-out runs out and their files unopened; `limit` is
+    how many bytes of needed columns one run may hold. A breach raises SrfError with file, line or column, what was found and
+    what was expected; what is odd but can be handled is in the notices.
+    """
+    described = read_description(Path(path))
+    choice, known = read_choice(described.model, described.apparatus, registry)
+    parameters, notices = read_parameters(described.parameters, known, choice)
+
+    def read(run: RunDescription) -> Run:
+        return read_run(run, described.apparatus, described.columns, registry=registry, format=format, limit=limit)
+
+    runs = tuple(read(run) for run in described.runs if holdout or not run.holdout)
+    return Experiment(
+        described.path,
+        described.title,
+        choice,
+        described.apparatus.mass,
+        described.apparatus.text,
+        parameters,
+        runs,
+        notices,
+        described.apparatus.stated,
+    )
+
+
+# The model of an experiment and its parameters, judged by the laws themselves.
+
+_ENTRY = ("value", "lower", "upper", "fixed")
+_IMPOSED = {
+    "V": "The drive of each run says it.",
+    "W0": "The load of each run says it.",
+    "eps": "The load of each run says it.",
+    "f": "The load of each run says it.",
+    "angle": "Experiments have the load imposed vertically.",
+}
+
+
+def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[ModelChoice, tuple[Parameter, ...]]:
+    """Return the chosen model and all parameters that its laws and the apparatus have, in declared units."""
+    node.keys(("law", "ageing", "interface", "inertia", "effects"))
+    law = node.require("law", 'Name a friction law: law = "srf-vsat"; `srf laws` lists them.')
+    ageing = node.require("ageing", 'Name an ageing law: ageing = "dieterich"; `srf laws` lists them.')
+    interface, inertia = node.get("interface"), node.get("inertia")
+    names = [_place(law.text(), node), "+".join(_place(word, node) for word in ageing.text().split("+"))]
+    surface = _place(interface.text(), node) if interface else "elastic"
+    parameters: list[Parameter] = []
+    try:
+        parameters += registry.get("friction", names[0]).parameters
+    except SrfError as error:
+        law.fail(error.message, error.hint)
+    try:
+        base, modifiers = registry.ageing(names[1])
+        parameters += [p for each in (base, *modifiers) for p in each.parameters]
+    except SrfError as error:
+        ageing.fail(error.message, error.hint)
+    try:
+        parameters += registry.get("interface", surface).parameters
+    except SrfError as error:
+        (interface or node).fail(error.message, error.hint)
+    moving = apparatus.mass is not None
+    if inertia and inertia.boolean() and not moving:
+        inertia.fail("inertia without a mass", 'Give [apparatus] mass = "2.37 kg", or inertia = false.')
+    heavy = inertia.boolean() if inertia else moving
+    parameters.append(Parameter("K", apparatus.stiffness, apparatus.unit, 0.0, math.inf, "stiffness"))
+    if heavy and apparatus.mass is not None:
+        parameters.append(Parameter("M", apparatus.mass * 1e6, "kg", 0.0, math.inf, "mass"))
+    effects = node.get("effects")
+    added, own = read_effects(effects, registry) if effects else ((), ())
+    return ModelChoice(names[0], names[1], surface, heavy, added), (*parameters, *own)
+
+
+def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple[Parameter, ...]]:
+    """Return the effects that a model has besides its laws, as `open_model` names them, and their parameters."""
+    from srfcli.symbolic.system import apart  # only for a description that has effects
+
+    if not isinstance(node.value, list):
+        node.expected(
+            "a list of effects", 'Write effects = ["load-transmission"]; `srf laws --kind effect` lists them.'
+        )
+    names, found = [], []
+    for index in range(len(node.value)):
+        entry = node.child(index)
+        name = _place(entry.text(), node)
+        if name in names:
+            entry.fail(f"'{name}' is named twice", "Once is enough.")
+        try:
+            effect = registry.get("effect", name)
+        except SrfError as error:
+            entry.fail(error.message, error.hint)
+        assert isinstance(effect, Effect)
+        if effect.settings or effect.frees:
+            instead = [f"{key} = {str(value).lower()} in [model]" for key, value in effect.settings]
+            instead += [
+                {"K": "another stiffness in [apparatus]", "M": "a mass in [apparatus]"}.get(n, n) for n in effect.frees
+            ]
+            entry.fail(
+                f"'{effect.name}' only replaces what the description says itself", f"Write {', '.join(instead)}."
+            )
+        names.append(name)
+        found.append(effect)
+    return tuple(names), tuple(p for effect in apart(found) for p in effect.parameters)
+
+
+def _place(name: str, node: Node) -> str:
+    """Return a law's name; that of a file is relative to the description."""
+    word = name.strip()
+    if not word.endswith((".toml", ".py")) or Path(word).is_absolute():
+        return word
+    return str(node.file.parent / word)
+
+
+def read_parameters(
+    node: Node | None, known: tuple[Parameter, ...], choice: ModelChoice
+) -> tuple[tuple[FitParameter, ...], tuple[Notice, ...]]:
+    """Return the listed parameters in um, s, N, and what is odd about them."""
+    if node is None:
+        return (), ()
+    declared = {p.name: p for p in known}
+    found, notices = [], []
+    for name in node.value:
+        entry = node.child(name)
+        if name not in declared:
+            _unknown(entry, name, declared, choice)
+        parameter = _parameter(entry, declared[name])
+        own = to_base(declared[name].default, declared[name].unit)
+        if name in ("K", "M") and not math.isclose(parameter.value, own, rel_tol=1e-9):
+            what = f"{name} starts from another value than [apparatus] gives; a simulation uses the apparatus"
+            notices.append(Notice("start-value", entry.where, what))
+        found.append(parameter)
+    return tuple(found), tuple(notices)
+
+
+def _unknown(entry: Node, name: str, declared: dict[str, Parameter], choice: ModelChoice) -> None:
+    laws = f"{choice.law}, {choice.ageing}, {choice.interface}"
+    if name == "M":
+        entry.fail("there is no mass to fit", "Give [apparatus] a mass, and inertia = true.")
+    entry.fail(f"unknown parameter '{name}' of {laws}", _IMPOSED.get(name) or did_you_mean(name, declared))
+
+
+def _parameter(entry: Node, parameter: Parameter) -> FitParameter:
+    entry.table(f"{parameter.name} = {{ value = {parameter.default:g}, lower = ..., upper = ... }}.").keys(_ENTRY)
+    fixed = entry.get("fixed")
+    held = fixed.boolean() if fixed else False
+    numbers = {
+        key: entry.child(key).quantity(parameter.unit) if key in entry.value else default
+        for key, default in (("value", parameter.default), ("lower", parameter.lower), ("upper", parameter.upper))
+    }
+    value, lower, upper = numbers["value"], numbers["lower"], numbers["upper"]
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    for key in ("lower", "upper", "value"):
+        if key in entry.value and not parameter.lower <= numbers[key] <= parameter.upper:
+            entry.child(key).fail(
+                f"{numbers[key]:g}{unit} is outside the bounds of the law's own parameter {parameter.name}",
+                f"Choose it from {parameter.lower:g} to {parameter.upper:g}{unit}.",
+            )
+    if not lower < upper:
+        key = "lower" if "lower" in entry.value else "upper"
+        entry.child(key).fail(
+            f"lower = {lower:g}{unit} is not below upper = {upper:g}{unit}", "Give two bounds that rise."
+        )
+    if not lower <= value <= upper:
+        (entry.child("value") if "value" in entry.value else entry).fail(
+            f"value = {value:g}{unit} is outside its bounds [{lower:g}, {upper:g}]{unit}", "Change it or the bounds."
+        )
+    factor = to_base(1.0, parameter.unit)
+    return FitParameter(parameter.name, value * factor, lower * factor, upper * factor, held, parameter.unit)
+
+
+# One recording, from its description and its file to a run that can be compared with a simulation.
+
+FORCES = ("force", "normal_load", "normal_stress")
+
+
+def read_run(
+    run: RunDescription,
+    apparatus: Apparatus,
+    specs: Mapping[str, ColumnSpec],
+    *,
+    registry: Registry,
+    format: str | None = None,
+    limit: int = LIMIT,
+) -> Run:
+    """Return the run in a description's data file; raises SrfError for what cannot be used."""
+    try:
+        source = open_source(run.file, registry=registry, format=format or run.format)
+    except SrfError as error:
+        if error.message.startswith("no file"):
+            run.node.child("file").fail(error.message, error.hint)
+        if error.message.startswith("unknown reader") and not format:
+            run.node.child("format").fail(error.message, error.hint)
+        raise
+    columns = read_columns(run, source, specs, limit=limit)
+    keep, notices = kept_samples(run.file, columns.rows, columns.seconds, columns.remarks.get("time"))
+    t, rows = columns.seconds[keep], columns.rows[keep]
+    arrays = {role: values[keep] for role, values in columns.arrays.items()}
+    notices = [*columns.notices, *notices, *sampling_notices(run.file, rows, t, find_sampling(t))]
+    drive, told = _drive(run, columns, t, arrays)
+    load, weighed = _load(run, columns, rows, t, arrays)
+    check_start(run, drive, float(t[0]))
+    role = next(r for r in OBSERVABLES if r in arrays)
+    at_start = load.rest(float(t[0]))
+    stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
+    rise = np.abs(drive(t)) * {"elongation": 1.0, "force": stiffness, "friction": stiffness / at_start}[role]
+    place = Place(run.file, columns.channels[role].heading, rows, t)
+    units = _units(run, columns, apparatus)
+    if len(set(units.values())) > 1:
+        named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())
+        notices.append(Notice("unit", run.file.name, f"{named}: a stress counts as the force on 1 mm^2"))
+    observed, used, quantum, flaws = clean_observable(place, arrays[role], rise=rise, load=load)
+    return Run(
+        name=run.name,
+        file=run.file,
+        holdout=run.holdout,
+        start=run.start,
+        initial=run.initial,
+        t=t,
+        observed=observed,
+        observable=role,
+        used=used,
+        drive=drive,
+        load=load,
+        stiffness=stiffness,
+        modulation=run.modulation,
+        quantum=quantum,
+        notices=(*notices, *told, *weighed, *flaws),
+        stress=any(units.values()),
+    )
+
+
+def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[str, bool]:
+    """Return for each force of the run, by name, whether it is stated as a stress."""
+    found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in FORCES}
+    if run.load is not None and isinstance(text := run.node.child("load").value, str):
+        found["load"] = is_stress(split_quantity(text, name="load")[1] or "N")
+    if not apparatus.per_load:
+        found["the stiffness"] = is_stress(apparatus.stated)
+    return found
+
+
+def _drive(run: RunDescription, columns: Columns, t: Array, arrays: dict[str, Array]) -> tuple[Drive, list[Notice]]:
+    role = next((r for r in ("load_point_velocity", "load_point_displacement") if r in arrays), "")
+    where = f"{run.file.name}: column '{columns.channels[role].heading}'" if role else ""
+    if run.drive is None:
+        return drive_from_column(role, t, arrays[role], where)
+    drive = declared_drive(run, columns, t)
+    return drive, drive_differs(drive, t, arrays[role], where) if role else []
+
+
+def _load(
+    run: RunDescription, columns: Columns, rows: NDArray[np.int64], t: Array, arrays: dict[str, Array]
+) -> tuple[Load, list[Notice]]:
+    role = next((r for r in ("normal_load", "normal_stress") if r in arrays), None)
+    if role is None:
+        W0 = 1.0 if run.load is None else run.load
+        if run.modulation is None:
+            return ConstantLoad(W0), []
+        f, eps, onset = run.modulation
+        return Modulation(W0, eps, f, onset), []
+    place = Place(run.file, columns.channels[role].heading, rows, t)
+    load, notices = load_from_column(place, arrays[role])
+    first = load.rest(float(t[0]))
+    if run.load is not None and abs(run.load - first) > DIFFERS * first:
+        run.node.child("load").fail(
+            f"the load is {run.load:g} N, but {place.column} begins with {first:g} N", "Take one of the two away."
+        )
+    if run.modulation is not None:
+        notices += modulation_notices(place, run.modulation, arrays[role])
+    return load, notices
+
+
+# The recorded observable: which of its samples can be compared with a simulation, and what is wrong with the others.
+
+CALM = 1e-3  # relative change of the load between samples within which a jump of the observable is none of the load's
+COARSE = 0.5  # quantisation step over white noise from which it is told
+
+
+def clean_observable(place: Place, x: Array, *, rise: Array, load: Load) -> tuple[Array, Mask, float, list[Notice]]:
+    """Return the observable (n,), which samples are to be compared, its quantisation step, and what was found.
+
+    `rise` (n,) is the fastest rise per second that the drive allows. Level jumps of the transducer are taken out; empty cells,
+    spikes, saturated samples and those beside a jump are not to be compared. Raises SrfError where nothing is left.
+    """
+    t, path, rows = place.t, place.path, place.rows
+    known = np.isfinite(x)
+    if known.sum() < 8:
+        raise SrfError(
+            f"{path.name}: column '{place.heading}' has {int(known.sum())} numbers in {x.size} samples",
+            "A recording needs 8 or more.",
+        )
+    notices = spots("nan", ~known, path, rows, t, f"without a number in '{place.heading}', not compared")
+    filled = np.interp(t, t[known], x[known])
+    quantum = quantisation(filled[known])
+    clipped = saturation(filled)
+    if clipped.any():
+        edge = float(filled[np.flatnonzero(clipped)[0]])
+        told = f"at the extreme value {edge:.6g} of '{place.heading}': saturated, not compared"
+        notices += spots("saturation", clipped, path, rows, t, told)
+    steps = np.append(np.diff(t), t[-1] - t[-2])
+    spiky = spikes(filled, quantum, rise * steps) & ~clipped
+    notices += spots("spike", spiky, path, rows, t, f"standing out in '{place.heading}', not compared")
+    calm = np.interp(t, t[~spiky], filled[~spiky])
+    level, beside, told_jumps = _without_jumps(place, calm, rise, load, quantum)
+    observed = np.where(spiky, filled + level - calm, level)
+    white = white_level(calm)
+    if quantum > COARSE * white > 0:
+        what = f"steps of {quantum:.4g}, {quantum / white:.2g} times the white noise, which they add to"
+        notices.append(Notice("quantisation", f"{path.name}: column '{place.heading}'", what))
+    used = known & ~clipped & ~spiky & ~beside
+    if used.sum() < 8:
+        raise SrfError(
+            f"{path.name}: column '{place.heading}': {int(used.sum())} samples can be compared", "8 are needed."
+        )
+    return observed, used, quantum, [*notices, *told_jumps]
+
+
+def _without_jumps(place: Place, x: Array, rise: Array, load: Load, quantum: float) -> tuple[Array, Mask, list[Notice]]:
+    W, _ = load(place.t)
+    change = np.abs(np.diff(W, prepend=W[0])) / W
+    jumps = observable_jumps(x, place.t, rise, change < CALM, quantum)
+    level, beside = rejoined(x, jumps)
+    notices = []
+    for jump in jumps:
+        where = span(place.path, place.rows, place.t, jump.at, jump.at + 1)
+        done = "a transducer set anew; what follows is moved back by that much"
+        if not jump.certain:
+            done = "faster than the drive moves, but too little to be sure of a transducer set anew; left as it is"
+        what = f"'{place.heading}' jumps by {jump.size:.4g}: {done}, and the two samples are not compared"
+        notices.append(Notice("reset", where, what))
+    return level, beside, notices
+
+
+# What a recording is like: sampling, flaws, noise, and the history of drive and load, as found in the data.
+
+KINDS = {  # of notices, as --fail-on takes them
+    "gap": "samples are missing",
+    "sampling-change": "the sampling rate changes",
+    "nan": "empty cells or NaN",
+    "repeated-time": "two samples at one time",
+    "backward-time": "time stamps that go back",
+    "spike": "single samples that stand out",
+    "reset": "a transducer was set anew",
+    "saturation": "samples at the end of the gauge's range",
+    "quantisation": "steps of the gauge that are not small against its noise",
+    "load-constant": "a load that varies no more than its noise",
+    "load-smoothed": "a load that was smoothed",
+    "modulation-differs": "the load is not modulated as declared",
+    "drive-differs": "the column of velocities is not the declared drive",
+    "drive-segmented": "a drive found in noisy velocities",
+    "drive-fitted": "a drive found in displacements",
+    "unit": "a heading and [columns] differ in unit",
+    "observable": "more than one observable in the file",
+    "load": "more than one load in the file",
+    "start-value": "a start value that is not the apparatus'",
+}
+
+
+@dataclass(frozen=True)
+class LoadHistory:
+    """The load over a run: mean, smallest and largest W (N), the largest |d ln W/dt| (1/s), and a modulation if there is one."""
+
+    mean: float
+    lowest: float
+    highest: float
+    rate: float
+    modulation: Found | None
+
+
+@dataclass(frozen=True)
+class RunCheck:
+    """What was found in one run; `noise` is that of the longest evenly sampled stretch, `noises` those of all long ones.
+
+    `friction_noise` is the noise of a sample in units of the friction coefficient. `drive` holds (from s, um/s, um/s^2).
+    """
+
+    run: Run
+    sampling: Sampling
+    noise: Noise
+    noises: tuple[tuple[Rate, Noise], ...]
+    friction_noise: float
+    drive: tuple[tuple[float, float, float], ...]
+    slowest: float
+    fastest: float
+    load: LoadHistory
+
+    def count(self, kind: str) -> int:
+        """Return how many notices of a kind the run has."""
+        return Counter(n.kind for n in self.run.notices)[kind]
+
+    @property
+    def spikes(self) -> int:
+        """Return how many samples of the observable stand out and are not compared."""
+        told = (n.what for n in self.run.notices if n.kind == "spike" and n.what.endswith("not compared"))
+        return sum(int(what.split()[0]) for what in told)  # the notice begins with their number
+
+
+def check_run(run: Run) -> RunCheck:
+    """Return what can be said of a recording without simulating anything."""
+    sampling = find_sampling(run.t)
+    load = load_history(run.load, run.t)
+    x = np.interp(run.t, run.t[run.used], run.observed[run.used])
+    noises = []
+    for rate in sampling.rates:
+        if rate.last - rate.first >= 128:
+            cycles = load.modulation.frequency * rate.interval if load.modulation else None
+            noises.append((rate, describe_noise(x[rate.first : rate.last], cycles)))
+    longest = _longest(sampling)
+    noise = next((n for r, n in noises if r is longest), None) or describe_noise(x[longest.first : longest.last + 1])
+    size = noise.total if math.isfinite(noise.total) else noise.white
+    pieces, slowest, fastest = _drive_pieces(run.drive, run.t)
+    factor = {"elongation": run.stiffness / load.mean, "force": 1 / load.mean, "friction": 1.0}[run.observable]
+    return RunCheck(run, sampling, noise, tuple(noises), size * factor, pieces, slowest, fastest, load)
+
+
+def _longest(sampling: Sampling) -> Rate:
+    return max(sampling.rates, key=lambda r: r.last - r.first)
+
+
+def _drive_pieces(drive: Drive, t: Array) -> tuple[tuple[tuple[float, float, float], ...], float, float]:
+    """Return the pieces of the drive during the run, and its smallest and largest velocity."""
+    starts = [float(t[0]), *(b for b in drive.breaks if t[0] < b < t[-1])]
+    pieces, values = [], []
+    for begin, end in zip(starts, [*starts[1:], float(t[-1])], strict=True):
+        V, rate, since = drive.piece(begin)
+        pieces.append((begin, V + rate * (begin - since), rate))
+        values += [V + rate * (begin - since), V + rate * (end - since)]
+    return tuple(pieces), min(values), max(values)
+
+
+def load_history(load: Load, t: Array) -> LoadHistory:
+    """Return mean, range, rate and modulation of a load over the times `t`."""
+    W, W_dot = load(t)
+    return LoadHistory(
+        float(W.mean()), float(W.min()), float(W.max()), float(np.abs(W_dot / W).max()), find_modulation(t, W)
+    )

@@ -1,0 +1,737 @@
+"""What was imposed in a run: driving velocity and normal load, from columns or from the description."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+
+from srfcli.codegen.model import Array
+from srfcli.core.errors import SrfError
+from srfcli.data.clock import kept_samples, span, spots
+from srfcli.data.columns import LIMIT, Columns, open_source, split_heading
+from srfcli.data.description import ROLES, RunDescription, check_unit
+from srfcli.data.noise import quantisation, saturation, spikes, white_level
+from srfcli.data.values import Notice
+from srfcli.laws.registry import Registry
+from srfcli.laws.values import Source
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
+
+# The driving velocity of a run: from its description, from a column of velocities, or from one of displacements.
+
+DIFFERS = 0.05  # relative difference from a column that is told
+
+
+def declared_drive(run: RunDescription, columns: Columns, t: Array) -> Drive:
+    """Return the drive that the description lists, which begins at the first sample of the file."""
+    assert run.drive is not None
+    ends = columns.first + np.cumsum([duration for duration, _ in run.drive])
+    interval = float(np.median(np.diff(t)))
+    if ends[-1] < t[-1] - 1.5 * interval:
+        run.node.child("drive").fail(
+            f"the drive lasts {ends[-1] - columns.first:.7g} s, the recording {t[-1] - columns.first:.7g} s",
+            "Let the durations add up to the recording, or end it with window = [from, to].",
+        )
+    starts = [columns.first, *ends[:-1].tolist()]
+    return Drive.steps(list(zip(starts, (v for _, v in run.drive), strict=True)))
+
+
+def check_start(run: RunDescription, drive: Drive, begin: float) -> None:
+    """Raise SrfError where a run that is to begin in steady sliding is not driven forward at first."""
+    V, rate, since = drive.piece(begin)
+    if run.initial == "steady" and not V + rate * (begin - since) > 0:
+        where = run.node.child("drive").where if run.drive is not None else run.node.where
+        raise SrfError(
+            f"{where}: the drive begins with {V:g} um/s, so that there is no steady sliding to begin with",
+            'Write initial = "free": the initial state is then estimated. Or take a window that begins in sliding.',
+        )
+
+
+def drive_differs(drive: Drive, t: Array, V: Array, where: str) -> list[Notice]:
+    """Return a notice where a column of velocities is not what the declared drive says, beyond the moments of its steps."""
+    known = np.isfinite(V)
+    told = drive(t)
+    scale = max(float(np.abs(told).max()), 1e-12)
+    off = known & (np.abs(V - told) > DIFFERS * np.maximum(np.abs(told), 1e-3 * scale))
+    if off.sum() <= max(2 * len(drive.times), 0.02 * t.size):
+        return []
+    at = int(np.argmax(off))
+    what = (
+        f"{int(off.sum())} of {t.size} velocities differ from the declared drive by more than 5 %, the first {V[at]:.5g} "
+        f"against {told[at]:.5g} um/s at t = {t[at]:.6g} s; the declared drive counts"
+    )
+    return [Notice("drive-differs", where, what)]
+
+
+def drive_from_column(role: str, t: Array, values: Array, where: str) -> tuple[Drive, list[Notice]]:
+    """Return the drive in the column of that role, and how it was found."""
+    return (drive_from_velocity if role == "load_point_velocity" else drive_from_displacement)(t, values, where)
+
+
+def drive_from_velocity(t: Array, V: Array, where: str) -> tuple[Drive, list[Notice]]:
+    """Return the drive in a column of velocities: steps where it is constant between changes, else straight pieces.
+
+    A sample's velocity holds from its time to the next, so that a column written from displacements keeps them.
+    """
+    known = np.isfinite(V)
+    if not known.any():
+        raise SrfError(f"{where}: no velocity in it", "Give the run a drive, or the column its numbers.")
+    notices = []
+    if not known.all():
+        what = f"{int((~known).sum())} samples without a velocity; the one before holds on"
+        notices.append(Notice("nan", where, what))
+    t, V = t[known], V[known]
+    changes = np.flatnonzero(np.diff(V) != 0) + 1
+    if changes.size <= max(20, V.size // 20):
+        return Drive.steps([(t[0], V[0]), *((t[i], V[i]) for i in changes)]), notices
+    noise = float(np.median(local_noise(V)))
+    span = float(np.ptp(V))
+    if noise < 1e-5 * span:
+        return _straight_velocities(t, V, 1e-5 * span), notices
+    drive, number = _segmented(t, V)
+    what = f"the velocities are noisy (standard deviation {noise:.3g} um/s); {number} constant or straight pieces describe them"
+    return drive, [*notices, Notice("drive-segmented", where, what)]
+
+
+def _straight_velocities(t: Array, V: Array, rounding: float) -> Drive:
+    """Return mean velocities from sample to sample as ramps where they change evenly, else one by one."""
+    slopes = np.diff(V) / np.diff(t)
+    times, velocities, rates = [], [], []
+    i, n = 0, V.size
+    while i < n:
+        j = i + 1
+        while j < n - 1 and abs(slopes[j] - slopes[i]) * (t[j + 1] - t[i]) <= 4 * rounding:
+            j += 1
+        if j < n and j - i >= 3:
+            rate = float((V[j] - V[i]) / (t[j] - t[i]))
+            times.append(t[i])
+            velocities.append(V[i] - rate * (t[i + 1] - t[i]) / 2)  # the mean over an interval is that of its middle
+            rates.append(rate)
+            i = j
+        else:
+            times.append(t[i])
+            velocities.append(V[i])
+            rates.append(0.0)
+            i += 1
+    return Drive(tuple(map(float, times)), tuple(map(float, velocities)), tuple(rates))
+
+
+def _segmented(t: Array, V: Array) -> tuple[Drive, int]:
+    """Return straight pieces of a noisy velocity, constant where a slope is not needed, and their number."""
+    sigma = coloured_noise(t, V)
+    penalty = 3 * np.log(V.size)
+    breaks = split(t, V, sigma, straight=True, penalty=penalty)
+    pieces = [_piece(t[a:b], V[a:b], sigma[a:b], penalty) for a, b in pairwise([0, *breaks, V.size])]
+    times = [t[0], *(t[b] for b in breaks)]
+    return Drive(tuple(map(float, times)), tuple(v for v, _ in pieces), tuple(s for _, s in pieces)), len(pieces)
+
+
+def _piece(t: Array, V: Array, sigma: Array, penalty: float) -> tuple[float, float]:
+    w = 1 / sigma**2
+    mean, middle = float(np.average(V, weights=w)), float(np.average(t, weights=w))
+    spread = float((w * (t - middle) ** 2).sum())
+    slope = float((w * (t - middle) * (V - mean)).sum()) / spread
+    if slope**2 * spread < penalty / 3:
+        return mean, 0.0
+    return mean + slope * (float(t[0]) - middle), slope
+
+
+def drive_from_displacement(t: Array, X: Array, where: str) -> tuple[Drive, list[Notice]]:
+    """Return the drive in a column of displacements: the slopes of a continuous line of straight pieces through it."""
+    known = np.isfinite(X)
+    if known.sum() < 8:
+        raise SrfError(f"{where}: {int(known.sum())} displacements in it", "Give the run a drive.")
+    notices = []
+    if not known.all():
+        notices.append(
+            Notice("nan", where, f"{int((~known).sum())} samples without a displacement; a line bridges them")
+        )
+    line = corners(t[known], X[known])
+    for at, size in line.jumps:
+        what = (
+            f"the displacement jumps by {size:.4g} um after t = {t[known][at]:.7g} s: its transducer's doing, taken out"
+        )
+        notices.append(Notice("reset", where, what))
+    slopes = np.diff(line.heights) / np.diff(line.knots)
+    drive = Drive.steps(list(zip([float(t[0]), *line.knots[1:-1].tolist()], slopes.tolist(), strict=True)))
+    told = ", ".join(f"{v:.5g}" for v in slopes[:12]) + (", ..." if slopes.size > 12 else "")
+    what = (
+        f"a continuous line of {_count(slopes.size)}, {told} um/s, fitted through the displacements, "
+        f"from which they differ by {line.misfit:.3g} um (rms)"
+    )
+    return drive, [*notices, Notice("drive-fitted", where, what)]
+
+
+def _count(number: int) -> str:
+    return f"{number} straight piece" + ("s" if number != 1 else "")
+
+
+# Straight pieces in a noisy record, as many as the record supports and no more (Bayesian information criterion).
+
+FEWEST = 5  # samples of a piece
+ROUNDS = 40  # of the search for the places of the corners
+STRETCH = 128  # samples over which noise has its colour
+BURST = 100  # samples for which a gauge may go astray
+AROUND = 15  # stretches that share their colour
+NEAR = 200  # samples on each side by which a jump is told from a corner
+EVEN = 1e-5  # of the largest noise: what is quieter would be lost in the rounding of the running sums
+LEAST = 1e-100  # um or um/s: what is squared must not vanish
+WOBBLE = 0.02  # relative change of slope that is none
+
+
+@dataclass(frozen=True)
+class Line:
+    """A continuous line: `heights` at the rising `knots` (k,), its rms misfit, and the (sample before, size) of level jumps."""
+
+    knots: Array
+    heights: Array
+    misfit: float
+    jumps: tuple[tuple[int, float], ...]
+
+
+def local_noise(x: Array, width: int = 101) -> Array:
+    """Return the standard deviation of white noise near each sample of x (n,), from its third differences."""
+    from scipy.ndimage import median_filter
+
+    if x.size < 8:
+        return np.full(x.size, max(float(np.std(x)), LEAST) if np.ptp(x) else 1.0)
+    third = np.abs(np.diff(x, 3)) / np.sqrt(20.0)  # the sum of the squared weights 1, 3, 3, 1
+    level = median_filter(third, size=min(width, third.size), mode="reflect") / 0.6745  # the end is not its last sample
+    padded = np.concatenate([[level[0]], level, [level[-1]] * 2])
+    overall = float(np.median(third)) / 0.6745
+    span = float(np.ptp(x)) or 1.0
+    return np.maximum(padded, max(0.05 * overall, 1e-9 * span, LEAST))
+
+
+def split(t: Array, x: Array, sigma: Array, *, straight: bool, penalty: float) -> list[int]:
+    """Return the indices at which pieces of x begin, other than the first: lines where `straight`, else constants.
+
+    A piece is split where that lowers the weighted sum of squares by more than `penalty`.
+    """
+    sums = _Sums(t - t[0], x - x[0], sigma, straight)
+    found: list[int] = []
+    waiting = [(0, t.size)]
+    while waiting:
+        a, b = waiting.pop()
+        place, gain = sums.best(a, b)
+        if place and gain > penalty:
+            found.append(place)
+            waiting += [(a, place), (place, b)]
+    return sorted(found)
+
+
+class _Sums:
+    """Running weighted sums, from which the misfit of any piece follows at once."""
+
+    def __init__(self, t: Array, x: Array, sigma: Array, straight: bool) -> None:
+        w = 1.0 / np.maximum(sigma, EVEN * float(sigma.max())) ** 2
+        self.straight = straight
+        columns = [w, w * t, w * t * t, w * x, w * t * x, w * x * x]
+        self.sums = [np.concatenate([[0.0], np.cumsum(c)]) for c in columns]
+
+    def misfit(self, a: NDArray[np.int64] | int, b: NDArray[np.int64] | int) -> Array:
+        """Return the weighted sum of squares about the best line or constant through samples a to b - 1."""
+        w, wt, wtt, wx, wtx, wxx = (s[b] - s[a] for s in self.sums)
+        total = wxx - wx * wx / w
+        if self.straight:
+            spread = wtt - wt * wt / w
+            cross = wtx - wt * wx / w
+            total = total - np.divide(cross * cross, spread, out=np.zeros_like(total), where=spread > 0)
+        return np.asarray(np.maximum(total, 0.0))
+
+    def best(self, a: int, b: int) -> tuple[int, float]:
+        """Return where samples a to b - 1 are best split, and by how much that lowers the misfit; 0 for nowhere."""
+        if b - a < 2 * FEWEST:
+            return 0, 0.0
+        places = np.arange(a + FEWEST, b - FEWEST + 1)
+        left = self.misfit(np.full(places.size, a), places)
+        right = self.misfit(places, np.full(places.size, b))
+        gain = self.misfit(np.array([a]), np.array([b]))[0] - left - right
+        at = int(np.argmax(gain))
+        return int(places[at]), float(gain[at])
+
+
+def coloured_noise(t: Array, x: Array) -> Array:
+    """Return the standard deviation near each sample of the white noise that misfits a line by as much as the noise in x (n,).
+
+    The noise is what parabolas over 128 samples leave, in the upper quartile of fifteen stretches: bursts of a gauge count, and
+    corners are in few of them.
+    """
+    from scipy.ndimage import percentile_filter
+
+    sigma = local_noise(x)
+    length = min(STRETCH, x.size)
+    starts = np.arange(0, x.size - length + 1, length)
+    found = np.empty(starts.size)
+    for k, at in enumerate(starts.tolist()):
+        part = slice(at, at + length)
+        place = (t[part] - t[part].mean()) / max(float(np.ptp(t[part])), 1e-300)
+        basis = np.linalg.qr(np.vander(place, 3))[0]
+        rest = x[part] - x[part].mean()
+        z = (rest - basis @ (basis.T @ rest)) / sigma[part]
+        power = float(z @ z)
+        rho = min(max(float(z[1:] @ z[:-1]) / power, 0.0), 0.98) if power > 0 else 0.0
+        found[k] = power / max(length - 3, 1) * (1 + rho) / (1 - rho)
+    if found.size >= AROUND:
+        near = percentile_filter(found, 75, size=AROUND, mode="reflect")
+    else:
+        near = np.full(found.size, np.median(found))
+    stretch = np.minimum(np.arange(x.size) // length, near.size - 1)
+    return np.asarray(sigma * np.sqrt(np.maximum(near[stretch], 1.0)))
+
+
+def corners(t: Array, x: Array) -> Line:
+    """Return the continuous line of straight pieces that x (n,) over t supports, once the level jumps are taken out of x.
+
+    The number of pieces follows from BIC, in which the noise counts with the colour that it has over 128 samples; their places
+    follow from least squares. A change of slope by less than 2 % is the wobble of a servo, and is not followed.
+    """
+    sigma = coloured_noise(t, x)
+    penalty, jumps = 3 * np.log(t.size), []
+    for _ in range(4):
+        breaks = split(t, x, sigma, straight=True, penalty=penalty)
+        found = _jumps(t, x, sigma, breaks, penalty)
+        for at, size in found:
+            x[at + 1 :] -= size
+        jumps += found
+        if not found:
+            break
+    knots = np.concatenate([t[:1], _places(t, x, breaks), t[-1:]])
+    for _ in range(3):
+        knots = _pruned(t, x, sigma, knots, penalty)
+        knots, heights = _polished(t, x, sigma, knots)
+        calm = _without_bursts(t, sigma, knots, heights)
+        if calm.size == knots.size:
+            break
+        knots, heights = _polished(t, x, sigma, calm)
+    knots = _pruned(t, x, sigma, knots, penalty)
+    knots, heights = _polished(t, x, sigma, knots)
+    misfit = float(np.sqrt(np.mean((x - np.interp(t, knots, heights)) ** 2)))
+    return Line(knots, heights, misfit, tuple(sorted(jumps)))
+
+
+def _without_bursts(t: Array, sigma: Array, knots: Array, heights: Array) -> Array:
+    """Return the knots without those of pieces, a hundred samples or fewer in all, after which the line goes on as before.
+
+    A hold is none of them: after it the line is late.
+    """
+    slopes = np.diff(heights) / np.diff(knots)
+    places = np.searchsorted(t, knots)
+    keep = np.ones(knots.size, bool)
+    for i in range(1, knots.size - 2):
+        for j in range(i + 1, min(i + 6, knots.size - 1)):
+            before, after = slopes[i - 1], slopes[j]
+            if places[j] - places[i] > BURST or abs(after - before) > 0.1 * max(abs(before), abs(after)):
+                continue
+            late = heights[j] - heights[i] - 0.5 * (before + after) * (knots[j] - knots[i])
+            if abs(late) < 6 * sigma[min(places[i], sigma.size - 1)]:
+                keep[i : j + 1] = False
+    return knots[keep]
+
+
+def _jumps(t: Array, x: Array, sigma: Array, breaks: list[int], penalty: float) -> list[tuple[int, float]]:
+    """Return (sample before, size) of the breaks where two lines fit so much better than a bent one that the level jumps.
+
+    Breaks a few samples apart are one jump, with samples on its way.
+    """
+    groups: list[list[int]] = []
+    for at in breaks:
+        if groups and at - groups[-1][-1] < 2 * FEWEST:
+            groups[-1].append(at)
+        else:
+            groups.append([at])
+    found = []
+    for k, group in enumerate(groups):
+        first, last = group[0], group[-1]
+        a = max(groups[k - 1][-1] if k else 0, first - NEAR)
+        b = min(groups[k + 1][0] if k + 1 < len(groups) else t.size, last + NEAR)
+        if min(first - a, b - last) < 2 * FEWEST:
+            continue
+        at = first - 1 + int(np.argmax(np.abs(np.diff(x[first - 1 : last + 1]))))
+        middle = 0.5 * (t[at] + t[at + 1])
+        near = np.r_[a:first, last:b]
+        lines = [np.polyfit(t[i:j] - middle, x[i:j], 1, w=1 / sigma[i:j]) for i, j in ((a, first), (last, b))]
+        fits = np.concatenate([np.polyval(lines[0], t[a:first] - middle), np.polyval(lines[1], t[last:b] - middle)])
+        apart = float((((x[near] - fits) / sigma[near]) ** 2).sum())
+        bent = _polished(t[near], x[near], sigma[near], np.array([t[a], middle, t[b - 1]]))
+        together = float((((x[near] - np.interp(t[near], *bent)) / sigma[near]) ** 2).sum())
+        alike = abs(lines[1][0] - lines[0][0]) < 0.2 * max(abs(lines[0][0]), abs(lines[1][0]))
+        if together - apart > penalty and alike:  # the motion goes on as before
+            found.append((at, float(lines[1][1] - lines[0][1])))
+    return found
+
+
+def _places(t: Array, x: Array, breaks: list[int]) -> Array:
+    """Return where neighbouring lines meet, or the break itself where they meet elsewhere."""
+    edges = [0, *breaks, t.size]
+    lines = [np.polyfit(t[a:b] - t[a], x[a:b], 1) for a, b in pairwise(edges)]
+    found: list[float] = []
+    for k, at in enumerate(breaks):
+        (s0, c0), (s1, c1) = lines[k], lines[k + 1]
+        level = c0 + s0 * (t[edges[k + 1]] - t[edges[k]])
+        meet = t[at] + ((level - c1) / (s1 - s0) if s1 != s0 else 0.0)
+        low, high = (found[-1] if found else t[0]), t[edges[k + 2] - 1]
+        found.append(float(meet if low < meet < high else t[at]))
+    return np.unique(found)
+
+
+def _pruned(t: Array, x: Array, sigma: Array, knots: Array, penalty: float) -> Array:
+    """Return the knots that the line needs: what a split into independent pieces found may be none."""
+    costs = [_cost_without(t, x, sigma, knots, k) for k in range(1, knots.size - 1)]
+    while costs:
+        weakest = int(np.argmin(costs))
+        if costs[weakest] > penalty * 2 / 3:
+            break
+        knots = np.delete(knots, weakest + 1)
+        del costs[weakest]
+        for k in range(max(weakest - 2, 0), min(weakest + 2, len(costs))):
+            costs[k] = _cost_without(t, x, sigma, knots, k + 1)
+    return knots
+
+
+def _cost_without(t: Array, x: Array, sigma: Array, knots: Array, k: int) -> float:
+    """Return by how much the misfit rises without knot k, judged by the samples of the two pieces on each side of it.
+
+    It is 0 where the slope hardly changes at the knot, or a piece beside it holds fewer than five samples.
+    """
+    low, high = max(k - 2, 0), min(k + 2, knots.size - 1)
+    a, b = np.searchsorted(t, [knots[low], knots[high]])
+    near = slice(int(a), max(int(b) + 1, int(a) + 2))
+    kept = knots[low : high + 1]
+    inside = np.diff(np.searchsorted(t, knots[k - 1 : k + 2]))
+    if inside.min() < FEWEST:
+        return 0.0
+    slopes = np.diff(_heights(t[near], x[near], sigma[near], kept)) / np.diff(kept)
+    before, after = slopes[k - low - 1], slopes[k - low]
+    if abs(after - before) < WOBBLE * max(abs(before), abs(after)):
+        return 0.0
+    return _misfit(t[near], x[near], sigma[near], np.delete(kept, k - low)) - _misfit(
+        t[near], x[near], sigma[near], kept
+    )
+
+
+def _misfit(t: Array, x: Array, sigma: Array, knots: Array) -> float:
+    heights = _heights(t, x, sigma, knots)
+    return float((((x - np.interp(t, knots, heights)) / sigma) ** 2).sum())
+
+
+def _heights(t: Array, x: Array, sigma: Array, knots: Array) -> Array:
+    """Return the least-squares heights of a continuous line over these knots: a tridiagonal system."""
+    j = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
+    share = (t - knots[j]) / np.diff(knots)[j]
+    weight = 1 / sigma**2
+
+    def total(values: Array) -> Array:
+        return np.asarray(np.bincount(j, weights=values * weight, minlength=knots.size - 1), dtype=float)
+
+    band = np.zeros((2, knots.size))
+    band[1, :-1] += total((1 - share) ** 2)
+    band[1, 1:] += total(share**2)
+    band[0, 1:] = total(share * (1 - share))
+    band[1] += 1e-9 * max(float(band[1].max()), 1e-300)  # a piece may lie between two samples
+    level = float(x.mean())
+    right = np.zeros(knots.size)
+    right[:-1] += total((1 - share) * (x - level))
+    right[1:] += total(share * (x - level))
+    return np.asarray(level + solveh_banded(band, right))
+
+
+def _polished(t: Array, x: Array, sigma: Array, knots: Array) -> tuple[Array, Array]:
+    """Return the knots moved to their least-squares places, and the heights there: damped Gauss-Newton on both."""
+    heights = _heights(t, x, sigma, knots)
+    misfit, damping = _misfit(t, x, sigma, knots), 1e-3
+    for _ in range(ROUNDS if knots.size > 2 else 0):
+        move = _step(t, x, sigma, knots, heights, damping)
+        gaps = np.diff(knots)
+        room = 0.4 * np.minimum(gaps[:-1], gaps[1:])
+        trial = knots.copy()
+        trial[1:-1] += np.clip(move[1:-1], -room, room)
+        found = _misfit(t, x, sigma, trial)
+        if found < misfit:
+            done = misfit - found < 1e-7 * misfit
+            knots, heights, misfit, damping = trial, _heights(t, x, sigma, trial), found, damping / 4
+            if done:
+                break
+        elif damping > 1e6:
+            break
+        else:
+            damping *= 8
+    return knots, heights
+
+
+def _step(t: Array, x: Array, sigma: Array, knots: Array, heights: Array, damping: float) -> Array:
+    """Return by how much the knots are to be moved: normal equations in (place, height) of each knot, four diagonals wide."""
+    j = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
+    gaps = np.diff(knots)
+    slope = (np.diff(heights) / gaps)[j]
+    share = (t - knots[j]) / gaps[j]
+    rest = (x - np.interp(t, knots, heights)) / sigma
+    columns = [-slope * (1 - share) / sigma, (1 - share) / sigma, -slope * share / sigma, share / sigma]
+    n = 2 * knots.size
+    band, right = np.zeros((4, n)), np.zeros(n)
+    for p in range(4):
+        right[p : p + n - 2 : 2] += np.bincount(j, weights=columns[p] * rest, minlength=knots.size - 1)
+        for q in range(p, 4):
+            both = np.bincount(j, weights=columns[p] * columns[q], minlength=knots.size - 1)
+            band[3 - (q - p), q : q + n - 2 : 2] += both
+    scale = np.sqrt(np.maximum(band[3], 1e-300))  # places and heights differ in size by orders
+    for d in range(4):
+        band[3 - d, d:] /= scale[d:] * scale[: n - d]
+    right /= scale
+    band[3] = 1 + damping + 1e-12
+    for fixed in (0, n - 2):  # the ends stay
+        right[fixed] = 0.0
+        band[3, fixed] = 1e12
+    return np.asarray((solveh_banded(band, right) / scale)[::2])
+
+
+# The normal load of a run: from its column, made as smooth as its noise demands, or the constant of its description.
+
+NEGLIGIBLE = 1e-5  # of the range: noise that an interpolation may keep
+BLOCKS = 16  # in which a constant load has one mean
+ACCIDENTS = 5  # spikes that a load may have, and one more in 500 samples; so many more are what was imposed
+NOTHING = 1e-15  # N: no contact
+SMALLEST = 5e-4  # relative amplitude of a modulation: a servo wobbles by less
+
+
+@dataclass(frozen=True)
+class Place:
+    """The column of loads in its file, for notices and errors."""
+
+    path: Path
+    heading: str
+    rows: NDArray[np.int64]
+    t: Array
+
+    @property
+    def column(self) -> str:
+        return f"{self.path.name}: column '{self.heading}'"
+
+
+def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
+    """Return the load in a column W (n,) in N, and what was done to it.
+
+    Empty cells and spikes are bridged. A load that varies no more than its noise is constant; noise that would show in dW/dt is
+    smoothed away. Raises SrfError for a load that is missing, not positive or saturated.
+    """
+    t, path, rows = place.t, place.path, place.rows
+    known = np.isfinite(W)
+    if not known.any():
+        raise SrfError(f"{place.column}: no number in it", 'Give the run load = "5 N", or the column its numbers.')
+    notices = spots("nan", ~known, path, rows, t, f"without a number in '{place.heading}'; the load is bridged")
+    filled = np.interp(t, t[known], W[known])
+    clipped = saturation(filled, fewest=4)  # one such plateau may be the load that was set
+    if clipped.any():
+        first, last = np.flatnonzero(clipped)[[0, -1]]
+        raise SrfError(
+            f"{span(path, rows, t, first, last)}, column '{place.heading}': {int(clipped.sum())} samples sit at the extreme "
+            f"value {filled[first]:.6g} N: the gauge is saturated, the load unknown",
+            "Take a window without this part.",
+        )
+    least = 2e-3 * float(np.median(np.abs(filled)))
+    bad = spikes(filled, min(quantisation(filled), least), least=least)  # a spike on a constant is a lattice of its own
+    if bad.sum() > ACCIDENTS + W.size // 500:  # a modulation that begins in mid-record looks like this
+        bad[:] = False
+    notices += spots("spike", bad, path, rows, t, f"standing out in '{place.heading}'; the load is bridged")
+    good = known & ~bad
+    filled = np.interp(t, t[good], filled[good])
+    if filled.min() < NOTHING:
+        at = int(filled.argmin())
+        raise SrfError(
+            f"{span(path, rows, t, at, at)}, column '{place.heading}': the load is {filled[at]:.6g} N",
+            "The slider must stay in contact: zero the gauge ([columns] offset), or take a window without this part.",
+        )
+    load, told = _smooth(place, filled)
+    return load, [*notices, *told]
+
+
+def _smooth(place: Place, W: Array) -> tuple[Load, list[Notice]]:
+    if np.ptp(W) == 0 or W.size < 4:
+        return ConstantLoad(float(W[0])), []
+    noise = white_level(W)
+    mean = float(W.mean())
+    if noise and is_constant(W, noise):
+        what = f"constant to its noise of {noise / mean:.2g} of {mean:.6g} N: taken as constant"
+        return ConstantLoad(mean), [Notice("load-constant", place.column, what)]
+    if noise <= NEGLIGIBLE * float(np.ptp(W)):
+        return SampledLoad(place.t, W), []
+    load = SampledLoad(place.t, W, noise=noise)
+    steps = np.diff(load.knots)
+    what = (
+        f"noise of {noise:.3g} N ({noise / mean:.2g} of the load), which dW/dt would amplify: smoothed by a spline with knots "
+        f"{steps.min():.3g} to {steps.max():.3g} s apart"
+    )
+    return load, [Notice("load-smoothed", place.column, what)]
+
+
+def is_constant(W: Array, noise: float) -> bool:
+    """Return whether the loads W (n,) spread about one mean as white noise of this size does, in all and in blocks."""
+    if W.std() > 1.5 * noise:
+        return False
+    count = min(BLOCKS, W.size // 8)
+    if count < 2:
+        return True
+    blocks = np.array_split(W, count)
+    scores = np.array([(b.mean() - W.mean()) * np.sqrt(b.size) / noise for b in blocks])
+    return bool((scores**2).sum() < count + 4 * np.sqrt(2 * count))
+
+
+@dataclass(frozen=True)
+class Found:
+    """A modulation found in a load: frequency (Hz), amplitude over the mean load, and when half of it is reached (s), or -inf."""
+
+    frequency: float
+    amplitude: float
+    onset: float
+
+
+def find_modulation(t: Array, W: Array) -> Found | None:
+    """Return the modulation in the loads W (n,) at evenly spaced times, None where no line stands out of the spectrum.
+
+    Frequency and amplitude are a least-squares fit of three harmonics to the later half of where it is on; the onset is where
+    the envelope, the mean over a period, passes half its height.
+    """
+    n = W.size
+    if n < 64 or np.ptp(W) == 0:
+        return None
+    dt = float(np.median(np.diff(t)))
+    even = np.arange(t[0], t[-1], dt)
+    if even.size > 4 * n:
+        return None
+    values = np.interp(even, t, W)
+    tail = values[-max(even.size // 3, 64) :]  # whatever the onset, it is on at the end
+    tail_times = even[-tail.size :]
+    line = _line(tail - tail.mean(), dt)
+    if line is None:
+        return None
+    frequency, amplitude = _refined(tail_times, tail, line)
+    mean = float(tail.mean())
+    if amplitude < SMALLEST * mean:
+        return None
+    return Found(frequency, amplitude / mean, _onset(even, values, frequency, amplitude))
+
+
+def _line(x: Array, dt: float) -> float | None:
+    """Return the frequency of the strongest line, None where it holds less than half of what moves about a parabola."""
+    place = np.linspace(-1, 1, x.size)
+    basis = np.linalg.qr(np.vander(place, 3))[0]
+    x = x - basis @ (basis.T @ x)
+    power = np.abs(np.fft.rfft(x * np.hanning(x.size))) ** 2
+    at = int(np.argmax(power[3:])) + 3 if power.size > 4 else 0
+    if at < 4 or power[max(at - 2, 0) : at + 3].sum() < 0.5 * power[1:].sum():
+        return None
+    return at / (x.size * dt)
+
+
+def _refined(t: Array, x: Array, frequency: float) -> tuple[float, float]:
+    """Return frequency and amplitude by Gauss-Newton on a cosine with two overtones."""
+    s = t - 0.5 * (t[0] + t[-1])
+    amplitude = 0.0
+    for _ in range(8):
+        angle = 2 * np.pi * frequency * s
+        waves = [f(k * angle) for k in (1, 2, 3) for f in (np.cos, np.sin)]
+        design = np.column_stack([np.ones_like(s), s / s[-1], *waves])
+        solution = np.linalg.lstsq(design, x, rcond=None)[0]
+        c, d = solution[2], solution[3]
+        amplitude = float(np.hypot(c, d))
+        if amplitude == 0:
+            break
+        slope = 2 * np.pi * s * (d * np.cos(angle) - c * np.sin(angle))
+        rest = x - design @ solution
+        wide = np.column_stack([design, slope])
+        step = float(np.linalg.lstsq(wide, rest, rcond=None)[0][-1])
+        step = float(np.clip(step, -0.3 / np.ptp(s), 0.3 / np.ptp(s)))
+        frequency += step
+        if abs(step) < 1e-9 * frequency:
+            break
+    return frequency, amplitude
+
+
+def _onset(t: Array, x: Array, frequency: float, amplitude: float) -> float:
+    period = max(round(1 / (frequency * (t[1] - t[0]))), 1)
+    turned = (x - x.mean()) * np.exp(-2j * np.pi * frequency * t)
+    envelope = 2 * np.abs(np.convolve(turned, np.ones(period) / period, mode="same")) / amplitude
+    above = envelope[period:-period] if envelope.size > 4 * period else envelope
+    times = t[period:-period] if envelope.size > 4 * period else t
+    if above[: max(period, 2)].min() > 0.5:
+        return -np.inf
+    return float(times[int(np.argmax(above > 0.5))])
+
+
+def modulation_notices(place: Place, declared: tuple[float, float, float], W: Array) -> list[Notice]:
+    """Return a notice where the declared frequency or amplitude is not what the column has."""
+    found = find_modulation(place.t, W)
+    f, eps, _ = declared
+    if found is None:
+        what = f"a modulation of {eps:.4g} at {f:.6g} Hz is declared, but the column shows none; the column counts"
+        return [] if eps == 0 else [Notice("modulation-differs", place.column, what)]
+    told = []
+    if abs(found.frequency - f) > DIFFERS * f:
+        told.append(f"frequency declared {f:.6g} Hz, found {found.frequency:.6g} Hz")
+    if abs(found.amplitude - eps) > DIFFERS * eps:
+        told.append(f"relative amplitude declared {eps:.4g}, found {found.amplitude:.4g}")
+    if not told:
+        return []
+    return [Notice("modulation-differs", place.column, "; ".join(told) + "; the column counts")]
+
+
+# A recorded normal load alone, without the rest of a recording.
+
+LOADS = ("normal_load", "normal_stress")
+
+
+def read_load(
+    path: Path, *, registry: Registry, format: str | None = None, limit: int = LIMIT
+) -> tuple[Load, Array, tuple[Notice, ...]]:
+    """Return the load in the columns `time` and `normal_load` (or `normal_stress`) of a data file, its times (n,) in s, and
+    what was found in the data. Units are those of the headings, else s, N and MPa. `format` names the file's reader.
+
+    Raises SrfError for a missing column, fewer than four samples, and more than `limit` bytes.
+    """
+    source = open_source(path, registry=registry, format=format)
+    columns, heading = _find(path, source)
+    t, W = _read(path, source, columns, limit)
+    rows = np.arange(1, t.size + 1)
+    keep, notices = kept_samples(path, rows, t)
+    place = Place(path, heading, rows[keep], t[keep])
+    load, told = load_from_column(place, W[keep])
+    return load, place.t, (*notices, *told)
+
+
+def _find(path: Path, source: Source) -> tuple[tuple[tuple[int, float], ...], str]:
+    """Return (column, factor to base units) of the times and of the loads, and the heading of the loads."""
+    parts = [split_heading(h) for h in source.headings]
+    names = [name.strip().lower().replace(" ", "_") for name, _ in parts]
+    role = next((r for r in LOADS if r in names), None)
+    if "time" not in names or role is None:
+        missing = "time" if "time" not in names else " or ".join(LOADS)
+        raise SrfError(
+            f"{path}: no column {missing}; found: {', '.join(source.headings)}",
+            "Head the columns time [s],normal_load [N].",
+        )
+    found = []
+    for name in ("time", role):
+        column = names.index(name)
+        unit = parts[column][1]
+        where = f"{path}: column '{source.headings[column]}'"
+        found.append((column, check_unit(ROLES[name] if unit is None else unit, name, None, where)))
+    return tuple(found), source.headings[names.index(role)]
+
+
+def _read(path: Path, source: Source, columns: tuple[tuple[int, float], ...], limit: int) -> tuple[Array, Array]:
+    blocks: list[Array] = []
+    held = 0
+    for block in source.blocks(tuple(column for column, _ in columns)):
+        part = np.array([np.asarray(b, float) * factor for b, (_, factor) in zip(block, columns, strict=True)])
+        held += part.nbytes
+        if held > limit:
+            raise SrfError(
+                f"{path}: more than {limit / 2**20:g} MB of loads", "Cut the file to the times that are needed."
+            )
+        blocks.append(part)
+    t, W = np.concatenate(blocks, axis=1) if blocks else np.empty((2, 0))
+    return t, W

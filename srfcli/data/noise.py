@@ -1,0 +1,462 @@
+"""Noise and flaws of a channel: found in a recording, or made for a simulated one."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass
+from decimal import Decimal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.codegen.model import Array
+from srfcli.codegen.splines import Spline
+from srfcli.core.errors import SrfError
+from srfcli.data.clock import Mask, runs_of
+
+# The noise of a channel: its white level from the spectrum's floor, its colour from what a smooth trend leaves.
+
+SEGMENT = 256  # samples of a periodogram
+WILD, ROUNDS = 3.0, 4  # standard deviations of a stretch's mean square, and how often the calm ones are chosen anew
+LEAST = 0.2  # share of the noise that a trend may leave: what is slower is signal
+TREND = 64  # samples over which a parabola is the trend
+
+
+@dataclass(frozen=True)
+class Noise:
+    """`white` is the standard deviation that the spectrum's upper half gives white noise, `total` that about the trend.
+
+    `lag1` is the correlation of neighbouring samples about the trend; `samples` is how many it was found from.
+    """
+
+    white: float
+    total: float
+    lag1: float
+    samples: int
+
+
+def white_level(x: Array) -> float:
+    """Return the standard deviation of white noise whose floor the spectrum of x (n,) shows above half the Nyquist frequency.
+
+    The median over frequencies and stretches: lines, events and a slow signal do not raise it. Coloured noise counts as signal.
+    """
+    length = min(SEGMENT, 2 ** int(np.log2(max(x.size, 1))))
+    if length < 16:
+        third = np.diff(x, 3) if x.size > 3 else np.zeros(1)
+        return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
+    starts = np.unique(np.linspace(0, x.size - length, min(2 * x.size // length, 400)).astype(int))
+    pieces = np.stack([x[a : a + length] for a in starts.tolist()])
+    place = np.linspace(-1.0, 1.0, length)
+    pieces = pieces - pieces.mean(axis=1, keepdims=True)
+    pieces = pieces - (pieces @ place / (place @ place))[:, None] * place
+    angle = 2 * np.pi * (np.arange(length) + 0.5) / length
+    window = 0.35875 - 0.48829 * np.cos(angle) + 0.14128 * np.cos(2 * angle) - 0.01168 * np.cos(3 * angle)
+    power = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2 / (window @ window)
+    upper = power[:, length // 4 : length // 2]
+    return float(np.sqrt(np.median(np.median(upper, axis=1)) / np.log(2)))
+
+
+def describe_noise(x: Array, cycles: float | None = None) -> Noise:
+    """Return level and colour of the noise in x (n,), evenly sampled, about a parabola over each 64 samples.
+
+    `cycles`, in periods per sample, is a modulation whose first three harmonics are taken out, too. Stretches in which the
+    signal bends faster than that, as at stick-slip events, are left out: what counts are the calmest quarter of the stretches,
+    the level corrected for the choice, and then all that are no wilder than noise like theirs can be.
+    """
+    length = min(TREND, x.size)
+    if length < 32:
+        return Noise(white_level(x), float("nan"), float("nan"), 0)
+    count = x.size // length
+    pieces = x[: count * length].reshape(count, length)
+    basis = _trend(length, cycles)
+    rest = pieces - (pieces @ basis) @ basis.T
+    lags, freedom = _lags(basis), length - basis.shape[1]
+    power = (rest**2).sum(axis=1) / freedom
+    calm = np.argsort(power)[: max(count // 4, 1)]
+    rho = _lag1(rest[calm], lags)
+    # the mean of a normal variate's lowest quarter is 1.27 below its own
+    level = float(power[calm].mean()) / max(1.0 - (1.27 * _spread(rho, freedom) if count > 4 else 0.0), 0.3)
+    for _ in range(ROUNDS if count > 4 else 0):
+        calm = np.flatnonzero(power <= level * (1 + WILD * _spread(rho, freedom)))
+        rho, level = _lag1(rest[calm], lags), float(power[calm].mean())
+    return Noise(white_level(x), float(np.sqrt(level / _left(rho, lags, freedom))), rho, int(calm.size) * length)
+
+
+def _spread(rho: float, freedom: int) -> float:
+    """Return the relative standard deviation of the mean square of so many samples of AR(1) noise."""
+    colour = (1 + rho**2) / (1 - rho**2) if np.isfinite(rho) else 1.0
+    return float(np.sqrt(2 * colour / freedom))
+
+
+def _trend(length: int, cycles: float | None) -> Array:
+    """Return an orthonormal basis (length, k) of parabolas and, of a modulation, what of its harmonics can be seen."""
+    columns = [np.linspace(-1.0, 1.0, length) ** k for k in range(3)]
+    if cycles is not None and cycles * length > 1:
+        for harmonic in range(1, 4):
+            if harmonic * cycles < 0.45:
+                angle = 2 * np.pi * harmonic * cycles * np.arange(length)
+                columns += [np.cos(angle), np.sin(angle)]
+    return np.asarray(np.linalg.qr(np.column_stack(columns))[0])
+
+
+def _lags(basis: Array) -> tuple[Array, Array]:
+    """Return a and b (n,): AR(1) noise of variance 1 and correlation rho has, about the trend, the power sum(a rho^d).
+
+    And sum(b rho^d) is the sum of the products of its neighbouring samples.
+    """
+    n = basis.shape[0]
+    P = np.eye(n) - basis @ basis.T
+    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n))).ravel()
+    a, b = (np.bincount(apart, weights=M.ravel()) for M in (P, P[:-1].T @ P[1:]))
+    return np.asarray(a), np.asarray(b)
+
+
+def _lag1(rest: Array, lags: tuple[Array, Array]) -> float:
+    """Return the rho of an AR(1) noise whose residuals about the trend have the lag-1 correlation found in `rest`."""
+    power = float((rest**2).sum())
+    if power == 0:
+        return float("nan")
+    found = float((rest[:, 1:] * rest[:, :-1]).sum()) / power
+    rhos = np.linspace(-0.95, 0.99, 98)
+    powers = rhos[:, None] ** np.arange(rest.shape[1])
+    return float(np.interp(found, (powers @ lags[1]) / (powers @ lags[0]), rhos))  # the trend takes some of it away
+
+
+def _left(rho: float, lags: tuple[Array, Array], freedom: int) -> float:
+    """Return the share of AR(1) noise's variance that the trend leaves, over the share of white noise's."""
+    if not np.isfinite(rho):
+        return 1.0
+    return max(float(rho ** np.arange(lags[0].size) @ lags[0]) / freedom, LEAST)
+
+
+# Flaws of a channel: spikes, level jumps of a transducer, saturation, and the step of its quantisation.
+
+WIDEST_SPIKE = 3  # samples of a spike
+BESIDE = 5  # samples before and after that tell the level
+FACTOR = 8.0  # robust standard deviations
+FEW = 0.02  # share of samples that move: below it they are the accidents of a constant, and not its noise
+SATURATED = 10  # samples in a row at the extreme value
+LARGE = 0.05  # share of the level from which a jump is a transducer's for certain
+MOST_RESETS = 5  # more jumps than this are what the recording is about
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A level jump of a transducer: `size` is added between samples `at` and `at` + 1; `certain` if nothing else can be."""
+
+    at: int
+    size: float
+    certain: bool = True
+
+
+def quantisation(x: Array) -> float:
+    """Return the step of the lattice that the values x (n,) lie on, 0 where they lie on none that n samples could show."""
+    values = np.unique(x)
+    if values.size < 2 or values.size > 0.95 * x.size:
+        return 0.0
+    steps = np.diff(values)
+    rounding = 4e-7 * max(abs(values[0]), abs(values[-1]))  # of numbers that once had 24 bits
+    steps = steps[steps > rounding]
+    if not steps.size:
+        return 0.0
+    smallest = float(steps.min())
+    near = steps[steps < 1.5 * smallest]
+    quantum = float(near.mean())
+    for _ in range(3):  # the wider steps are multiples, which tell the step more exactly
+        wide = steps[steps < 200 * quantum]
+        counts = np.round(wide / quantum)
+        quantum = float(wide.sum() / counts.sum())
+    off = np.abs(steps - np.round(steps / quantum) * quantum)
+    return quantum if (off <= 0.05 * quantum + 2 * rounding).all() else 0.0
+
+
+def local_scale(x: Array, m: Array, width: int = 101) -> Array:
+    """Return a robust standard deviation of x about its running median m near each sample."""
+    from scipy.ndimage import median_filter
+
+    rest = np.abs(x - m)
+    near = median_filter(rest, size=min(width, x.size), mode="nearest")
+    moving = rest[rest > 0]
+    overall = float(np.median(moving)) if moving.size > FEW * x.size else 0.0
+    return np.asarray(2.0 * np.maximum(near, 0.5 * overall))  # the running median follows the noise by a quarter
+
+
+def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: float = 0.0) -> Mask:
+    """Return which samples of x (n,) stand out from both sides for up to three samples and then are back where they were.
+
+    A slip event or any other step is none: the level after it is another. `rise` (n,), if given, is the largest rise from
+    each sample to the next that the drive allows: what goes up at that pace is reloading, and no spike. None is smaller
+    than `least`.
+    """
+    from scipy.ndimage import median_filter
+
+    found = np.zeros(x.size, bool)
+    if x.size < 4 * BESIDE:
+        return found
+    m = median_filter(x, size=BESIDE, mode="nearest")
+    scale = local_scale(x, m)
+    for width in range(1, WIDEST_SPIKE + 1):
+        first = np.arange(BESIDE, x.size - BESIDE - width + 1)
+        before, after = m[first - 3], m[first + width + 2]
+        group = np.stack([x[first + k] for k in range(width)])
+        above = group.min(axis=0) - np.maximum(before, after)
+        below = np.minimum(before, after) - group.max(axis=0)
+        size = np.maximum(above, below)
+        threshold = np.maximum(FACTOR * np.maximum(scale[first - 3], scale[first + width + 2]) + 2 * quantum, least)
+        if rise is not None:  # from the median before, three samples back, to the median after
+            threshold = np.maximum(threshold, 3 * (width + 5) * rise[first])
+        hit = (size > threshold) & (np.abs(after - before) < 0.5 * size)
+        for k in range(width):
+            found[first[hit] + k] = True
+    return found
+
+
+def saturation(x: Array, *, fewest: int = 1) -> Mask:
+    """Return which samples sit at the channel's largest or smallest value because the channel was clipped there.
+
+    A clipped signal enters and leaves the extreme with a slope that would have taken it further, and stays for ten samples or
+    more, longer than it stays at any other value; at `fewest` places or more.
+    """
+    found = np.zeros(x.size, bool)
+    if x.size < 4 * SATURATED or np.ptp(x) == 0:
+        return found
+    stays = [(a - 1, b) for a, b in runs_of(np.concatenate([[False], x[1:] == x[:-1]]))]
+    low, high = x.min(), x.max()
+    other = max((b - a + 1 for a, b in stays if low < x[a] < high), default=1)
+    for sign, extreme in ((-1.0, low), (1.0, high)):
+        cut = [(a, b) for a, b in stays if x[a] == extreme and b - a + 1 >= SATURATED // 2 and _cut_off(sign * x, a, b)]
+        if len(cut) >= fewest and max(b - a + 1 for a, b in cut) >= max(SATURATED, 4 * other):
+            for a, b in cut:
+                found[a : b + 1] = True
+    return found
+
+
+def _cut_off(x: Array, a: int, b: int) -> bool:
+    """Return whether samples a to b, at the maximum of x, are entered and left with a slope that points beyond."""
+    ends = []
+    if a >= 3:
+        ends.append((x[a - 1] - x[a - 3]) / 2 > 0.6 * (x[a] - x[a - 1]))
+        ends.append(x[a] - x[a - 3] > 1e-3 * np.ptp(x))
+    if b + 3 < x.size:
+        ends.append((x[b + 1] - x[b + 3]) / 2 > 0.6 * (x[b] - x[b + 1]))
+        ends.append(x[b] - x[b + 3] > 1e-3 * np.ptp(x))
+    return bool(ends) and all(ends)
+
+
+def observable_jumps(x: Array, t: Array, rate: Array, steady: Mask, quantum: float = 0.0) -> list[Jump]:
+    """Return the level jumps of an observable that no slider can make, at most five.
+
+    `rate` (n,) is the fastest rise that the drive allows, per second; `steady` (n,) says where the load does not change. A
+    jump up is one that outruns the drive; a jump down is one after which the level goes on as flat as before, where a slip
+    would be followed by reloading.
+    """
+    jumps = _level_jumps(x, quantum)
+    found = []
+    for jump in jumps:
+        i = jump.at
+        if not steady[max(i - 2, 0) : i + 4].all():
+            continue
+        allowed = float(rate[max(i - 20, 0) : i + 22].max() * (t[i + 1] - t[i]))
+        certain = abs(jump.size) > max(20 * allowed, LARGE * float(np.median(np.abs(x))))
+        if jump.size > 3 * allowed or (jump.size < 0 and _goes_on(x, t, i, float(rate[i]), abs(jump.size))):
+            found.append(Jump(i, jump.size, certain))
+    return found if len(jumps) <= MOST_RESETS else []
+
+
+def _level_jumps(x: Array, quantum: float) -> list[Jump]:
+    """Return the steps between two samples that exceed the noise, and all that happens nearby, by far."""
+    from scipy.ndimage import median_filter
+
+    if x.size < 8 * BESIDE:
+        return []
+    d = np.diff(x)
+    m = median_filter(d, size=21, mode="nearest")
+    rest = np.abs(d - m)
+    scale = np.maximum(median_filter(rest, size=min(201, d.size), mode="nearest") / 0.6745, 0.3 * _typical(rest))
+    before, after = _levels(x)
+    size = after - before
+    candidates = np.flatnonzero(
+        (rest > 20 * scale + 4 * quantum) & (np.abs(size) > 0.7 * np.abs(d)) & (np.sign(size) == np.sign(d))
+    )
+    candidates = candidates[(candidates >= BESIDE) & (candidates < x.size - BESIDE - 1)]
+    neighbours = np.stack([np.abs(np.roll(d, k)) for k in (-2, -1, 1, 2)]).max(axis=0)
+    return [Jump(int(i), float(d[i] - m[i])) for i in candidates if neighbours[i] < 0.2 * abs(d[i])]
+
+
+def _typical(rest: Array) -> float:
+    moving = rest[rest > 0]
+    return float(np.median(moving)) / 0.6745 if moving.size else 0.0
+
+
+def _levels(x: Array) -> tuple[Array, Array]:
+    """Return the medians of the five samples up to each one but the last, and of the five after it."""
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, BESIDE, mode="edge"), BESIDE)
+    medians = np.median(windows, axis=1)
+    return medians[1 : x.size], medians[BESIDE + 1 : x.size + BESIDE]
+
+
+def _goes_on(x: Array, t: Array, i: int, rate: float, size: float) -> bool:
+    """Return whether the level is as flat after the step as before it, for the twenty samples on each side."""
+    left, right = slice(max(i - 19, 0), i + 1), slice(i + 1, i + 21)
+    if min(x[left].size, x[right].size) < 10:
+        return False
+    slopes = [float(np.polyfit(t[s] - t[i], x[s], 1)[0]) for s in (left, right)]
+    spread = float(t[right][-1] - t[i])
+    return all(abs(s) < 0.3 * rate for s in slopes) and abs(slopes[1] - slopes[0]) * spread < 0.2 * size
+
+
+def rejoined(x: Array, jumps: list[Jump]) -> tuple[Array, NDArray[np.bool_]]:
+    """Return x with its certain jumps taken out, and the samples on each side of one, whose level is uncertain."""
+    out, beside = x.copy(), np.zeros(x.size, bool)
+    for jump in jumps:
+        out[jump.at + 1 :] -= jump.size if jump.certain else 0.0
+        beside[max(jump.at, 0) : jump.at + 2] = True
+    return out, beside
+
+
+# What a gauge would make of a simulated record: noise of a given size and colour, and steps of a given height.
+
+
+def measured(
+    values: Array, *, noise: float = 0.0, lag1: float = 0.0, quantum: float = 0.0, seed: int = 0, stream: str = ""
+) -> Array:
+    """Return `values` (n,) with stationary noise of standard deviation `noise` and lag-1 correlation `lag1`, then rounded to
+    multiples of `quantum`; both in the unit of the values, 0 for none.
+
+    The noise depends on `seed` and `stream` alone: a run's own name as stream keeps it the same whatever else is simulated.
+    Raises SrfError for a negative size, |lag1| >= 1, a lag without noise or a negative seed.
+    """
+    check_gauge(noise=noise, lag1=lag1, quantum=quantum, seed=seed)
+    out = np.array(values, dtype=float)
+    if noise:
+        out += noise * ar1(out.size, lag1, rng=generator(seed, stream))
+    return quantised(out, quantum) if quantum else out
+
+
+def check_gauge(*, noise: float, lag1: float, quantum: float, seed: int) -> None:
+    """Raise SrfError for what no gauge does."""
+    for name, value in (("noise", noise), ("quantum", quantum)):
+        if not (math.isfinite(value) and value >= 0):
+            raise SrfError(f"{name} = {value:g} is not a size", f"give {name} as 0 or more")
+    if not abs(lag1) < 1:
+        raise SrfError(f"lag1 = {lag1:g} is not the correlation of a stationary noise", "give -1 < lag1 < 1, as 0.8")
+    if lag1 and not noise:
+        raise SrfError(f"lag1 = {lag1:g} colours a noise of size 0", "give noise its standard deviation, too")
+    if seed < 0:
+        raise SrfError(f"seed = {seed} is negative", "give a whole number from 0 on")
+
+
+def generator(seed: int, stream: str) -> np.random.Generator:
+    """Return the random numbers that belong to a seed and a name."""
+    return np.random.default_rng([seed, zlib.crc32(stream.encode("utf-8"))])
+
+
+def ar1(n: int, lag1: float, *, rng: np.random.Generator) -> Array:
+    """Return `n` samples of unit variance, each correlated with its predecessor by `lag1`, from the stationary state on."""
+    from scipy.signal import lfilter
+
+    white = rng.standard_normal(n)
+    if not lag1:
+        return white
+    innovation = math.sqrt(1 - lag1 * lag1)
+    if n:
+        white[0] /= innovation  # the first sample has no predecessor and the same variance
+    return np.asarray(lfilter([innovation], [1.0, -lag1], white), dtype=float)
+
+
+def quantised(values: Array, quantum: float) -> Array:
+    """Return the nearest multiples of `quantum`, with no more digits than it has: 18.665, not 18.665000000000003."""
+    exponent = Decimal(repr(float(quantum))).normalize().as_tuple().exponent
+    assert isinstance(exponent, int)  # a finite number has one
+    return np.asarray(np.round(np.round(values / quantum) * quantum, max(-exponent, 0)), dtype=float)
+
+
+# A rough track to simulate on: mu0 wanders along it by a Gaussian random function of slip position, fixed by a seed.
+
+KNOTS = 8  # to a correlation length: halfway between two of them the variance falls short by 4e-4
+WIDEST_KNOTS, FINEST_KNOTS = (
+    0.8,
+    0.01,
+)  # um between knots; a fit's are as wide, and contacts are a tenth of a micron or more
+MOST = 2_000_000  # knots between position 0 and the far end of a record
+ECHO = 32  # knots over which a spline's numbers feel a value: sqrt(3) - 2 to this power is below the last bit
+
+
+@dataclass(frozen=True)
+class RoughTrack:
+    """mu0's deviation at slip position x (um): Gaussian, of standard deviation `size` and correlation length `length` (um).
+
+    Values at a distance d are correlated by (1 + r) exp(-r), r = sqrt(3) d/length (Matern, 3/2), as `srf fit --track rough` has
+    it. `seed` fixes the function on the whole line: it does not depend on which part of it is asked for.
+    """
+
+    size: float
+    length: float
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.size) and self.size >= 0):
+            raise SrfError(f"a roughness of {self.size:g} is not a size", "give it as 0 or more, as 3e-4")
+        shortest = KNOTS * FINEST_KNOTS
+        if not (math.isfinite(self.length) and self.length >= shortest * (1 - 1e-12)):
+            raise SrfError(
+                f"a roughness length of {self.length:g} um is finer than knots {FINEST_KNOTS:g} um apart can show",
+                f"give {shortest:g} um or more",
+            )
+
+    @property
+    def spacing(self) -> float:
+        """Return the distance between knots in um; one of them lies at position 0."""
+        return min(self.length / KNOTS, WIDEST_KNOTS)
+
+    def spline(self, low: float, high: float) -> Spline:
+        """Return the function on [low, high] (um) as a cubic spline through its values at the knots.
+
+        Raises SrfError where that takes more knots than there is room for.
+        """
+        h, most = self.spacing, MOST - 2 * ECHO
+        if not max(abs(low), abs(high)) < most * h:
+            raise SrfError(
+                f"a track to position {max(abs(low), abs(high)):g} um, in steps of {h:g} um, has more than {most} knots",
+                "shorten the record, or give a longer roughness length",
+            )
+        first, last = math.floor(low / h), math.ceil(high / h)
+        last = max(last, first + 1)
+        values = self._values(first - 1 - ECHO, last + 1 + ECHO)
+        count = last - first + 3
+        # the numbers whose weighted means 1/6, 4/6, 1/6 are the values; summed so that no bit depends on the window
+        pole, numbers = math.sqrt(3) - 2, np.zeros(count)
+        for j in range(-ECHO, ECHO + 1):
+            numbers += math.sqrt(3) * pole ** abs(j) * values[ECHO + j : ECHO + j + count]
+        return Spline(first * h, h, self.size * numbers)
+
+    def _values(self, first: int, last: int) -> Array:
+        """Return the function of unit size at the knots first, ..., last, where first <= last."""
+        root, onwards, backwards = generator(self.seed, "rough track").spawn(3)
+        value, slope = root.standard_normal(2)
+        right = self._walk(value, value + slope, max(last, 0), onwards)
+        left = self._walk(value, value - slope, max(-first, 0), backwards)
+        line = np.concatenate([left[::-1], [value], right])
+        return np.asarray(line[first + left.size : last + left.size + 1])
+
+    def _walk(self, value: float, state: float, count: int, rng: np.random.Generator) -> Array:
+        """Return the next `count` values beside `value`, exactly distributed; `state` is value + length/sqrt(3) slope.
+
+        That sum is a Markov process by itself, of first order, and drives the value as another: two recursions.
+        """
+        from scipy.signal import lfilter
+        from scipy.special import gammainc
+
+        if not count:
+            return np.zeros(0)
+        a = math.sqrt(3) * self.spacing / self.length
+        carry = math.exp(-a)
+        # covariance of what a step adds to state and value; incomplete gamma functions, as 1 - exp(-2a)(1 + ...) cancels
+        one, two, three = (float(gammainc(k, 2 * a)) for k in (1, 2, 3))
+        spread = math.sqrt(2 * one)
+        shared, own = two / spread, math.sqrt(three - two * two / (2 * one))
+        draws = rng.standard_normal((count, 2))
+        states = lfilter([1.0], [1.0, -carry], spread * draws[:, 0], zi=[carry * state])[0]
+        pushed = carry * a * np.concatenate([[state], states[:-1]]) + shared * draws[:, 0] + own * draws[:, 1]
+        return np.asarray(lfilter([1.0], [1.0, -carry], pushed, zi=[carry * value])[0])

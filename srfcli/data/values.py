@@ -1,0 +1,132 @@
+"""What an experiment is once it has been read: frozen values in um, s, N."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.codegen.model import Array
+from srfcli.core.units import factor_between, find_unit
+from srfcli.motion.imposed import Drive, Load
+
+OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something that was found in the data: its kind, the place, and one sentence on what it is and what was done."""
+
+    kind: str
+    where: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {self.where}: {self.what}"
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """The names that `open_model` takes: friction law, ageing law with modifiers, interface, whether mass counts, effects."""
+
+    law: str
+    ageing: str
+    interface: str
+    inertia: bool
+    effects: tuple[str, ...] = ()
+
+    def plus(self, effects: Iterable[str]) -> ModelChoice:
+        """Return the choice with these effects besides."""
+        return replace(self, effects=(*self.effects, *effects))
+
+
+@dataclass(frozen=True)
+class FitParameter:
+    """A parameter's start value and bounds in um, s, N; `unit` is the one it is declared in."""
+
+    name: str
+    value: float
+    lower: float
+    upper: float
+    fixed: bool
+    unit: str
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording: times (n,) in s that rise strictly, the observable (n,) in um, N or 1, and what was imposed.
+
+    `observed` is finite everywhere; where `used` is False it is a placeholder and a notice says why. `drive` and `load` hold
+    on all of [t[0], t[-1]]. `start` is the place on the track in um, `initial` "steady" or "free", `stiffness` K in N/um,
+    `modulation` the declared frequency (Hz), relative amplitude and onset (s), `quantum` the quantisation step, or 0.
+    `stress` where stresses were recorded: a stress counts as the force on 1 mm^2, so that what is in N is in MPa.
+    """
+
+    name: str
+    file: Path
+    holdout: bool
+    start: float
+    initial: str
+    t: Array = field(repr=False)
+    observed: Array = field(repr=False)
+    observable: str
+    used: NDArray[np.bool_] = field(repr=False)
+    drive: Drive = field(repr=False)
+    load: Load = field(repr=False)
+    stiffness: float
+    modulation: tuple[float, float, float] | None
+    quantum: float
+    notices: tuple[Notice, ...]
+    stress: bool = False
+
+    @property
+    def unit(self) -> str:
+        """Return the unit of the observable as it is shown: um, N, MPa or 1."""
+        return shown_unit(OBSERVABLES[self.observable], stress=self.stress)
+
+    @property
+    def load_unit(self) -> str:
+        """Return the unit of the load as it is shown: N or MPa."""
+        return shown_unit("N", stress=self.stress)
+
+    @property
+    def quantity(self) -> str:
+        """Return what is observed, in words: spring elongation, force, shear stress or friction coefficient."""
+        names = {"elongation": "elongation", "force": "shear stress" if self.stress else "force"}
+        return names.get(self.observable, "friction coefficient")
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Runs under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider."""
+
+    path: Path
+    title: str
+    choice: ModelChoice
+    mass: float | None
+    stiffness_text: str
+    parameters: tuple[FitParameter, ...]
+    runs: tuple[Run, ...]
+    notices: tuple[Notice, ...]
+    stiffness_unit: str = ""
+
+    @property
+    def stress(self) -> bool:
+        """Return whether stresses were recorded, so that forces are shown in MPa."""
+        return any(run.stress for run in self.runs)
+
+    def shown(self, unit: str) -> tuple[str, float]:
+        """Return the unit that a quantity declared in `unit` is shown in, and the factor to it: a stiffness as it was stated."""
+        if self.stiffness_unit and unit in ("N/um", "1/um"):
+            factor = factor_between(find_unit(unit), find_unit(self.stiffness_unit))
+            if factor is not None:
+                return self.stiffness_unit, factor
+        return shown_unit(unit, stress=self.stress), 1.0
+
+
+def shown_unit(unit: str, *, stress: bool) -> str:
+    """Return a unit of N as one of MPa where stresses were recorded."""
+    return unit.replace("N", "MPa") if stress and unit in ("N", "N/um", "N/s") else unit

@@ -1,0 +1,236 @@
+"""An experiment as a folder: `experiment.toml` and one CSV file per run, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from srfcli.core.errors import SrfError
+from srfcli.core.files import SIDECAR, clear, parse_toml, read_text, recover, whole_folder
+from srfcli.core.units import find_unit
+from srfcli.data.description import LARGEST
+from srfcli.data.values import OBSERVABLES, Experiment, FitParameter, Run
+from srfcli.motion.imposed import Drive
+
+DESCRIPTION = "experiment.toml"
+KILOGRAM = 1e-6  # N s^2/um
+
+
+def write_experiment(
+    experiment: Experiment, folder: Path, *, force: bool = False, sidecar: Callable[[bytes], str] | None = None
+) -> tuple[Path, ...]:
+    """Write `experiment` to `folder`, so that `read_experiment` finds its values again, and return the files.
+
+    Times, loads and observables keep every digit. A drive of steps is written as a list, any other as the mean velocity from
+    each sample to the next, which keeps the displacement at every sample. With `force` an experiment that is there already is
+    replaced, but nothing else is.
+    `sidecar` makes that of the description from its content. Raises SrfError for what cannot be written; the folder is whole or
+    absent.
+    """
+    files = experiment_files(experiment)
+    beside = {} if sidecar is None else {DESCRIPTION + SIDECAR: sidecar(files[DESCRIPTION].encode("utf-8"))}
+    return write_folder(files | beside, folder, force=force)[: len(files)]
+
+
+def experiment_files(experiment: Experiment) -> dict[str, str]:
+    """Return the files of an experiment folder, name -> text."""
+    if not experiment.runs:
+        raise SrfError("an experiment without runs cannot be written", "give it one run or more")
+    names = _file_names([run.name for run in experiment.runs])
+    return {
+        DESCRIPTION: _description(experiment, names),
+        **{name: run_csv(run) for name, run in zip(names, experiment.runs, strict=True)},
+    }
+
+
+def check_folder(folder: Path, *, force: bool) -> None:
+    """Raise SrfError now if an experiment could not be written to `folder` later."""
+    recover(folder)
+    parent = Path(os.path.realpath(folder)).parent
+    if not parent.is_dir():
+        raise SrfError(f"{folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
+    if not os.access(parent, os.W_OK):
+        raise SrfError(f"{folder}: the directory {parent} is not writable", "Name a folder elsewhere.", exit_code=1)
+    if not os.path.lexists(folder):
+        return
+    if not folder.is_dir() or folder.is_symlink():
+        raise SrfError(f"{folder} exists and is not a folder", "Name another folder.")
+    clear(folder)
+    strangers = sorted(p.name for p in folder.iterdir() if p.name not in _own_files(folder))
+    if strangers:
+        raise SrfError(
+            f"{folder} holds {strangers[0]!r}, which is no part of an experiment", "It is never replaced; name another."
+        )
+    if not force and any(folder.iterdir()):
+        raise SrfError(f"{folder} exists already", "Replace the experiment with --force, or name another folder.")
+
+
+def _own_files(folder: Path) -> set[str]:
+    """Return the names that belong to the experiment in `folder`: the description, the files of its runs, sidecars."""
+    try:
+        data = parse_toml(read_text(folder / DESCRIPTION, limit=LARGEST), folder)
+    except (OSError, SrfError):
+        return set()
+    if not str(data.get("format", "")).startswith("srf-experiment/"):
+        return set()
+    runs = data.get("runs")
+    listed = [run.get("file") for run in runs if isinstance(run, dict)] if isinstance(runs, list) else []
+    names = {DESCRIPTION, *(name for name in listed if isinstance(name, str))}
+    return names | {name + SIDECAR for name in names}
+
+
+def write_folder(files: Mapping[str, str], folder: Path, *, force: bool = False) -> tuple[Path, ...]:
+    """Write text files, name -> text, as the whole content of `folder`: beside its place first, then moved there."""
+    check_folder(folder, force=force)
+    with whole_folder(folder, lambda: check_folder(folder, force=force)) as fresh:
+        for name, text in files.items():
+            with (fresh / name).open("w", encoding="utf-8", newline="\n") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+    return tuple(folder / name for name in files)
+
+
+def run_csv(run: Run) -> str:
+    """Return the recording of one run as CSV: time, load-point velocity, normal load and the observable, in full precision.
+
+    A sample that is not to be compared becomes an empty cell.
+    """
+    if run.observable not in OBSERVABLES:
+        raise SrfError(f"run {run.name!r} records {run.observable!r}", f"known: {', '.join(OBSERVABLES)}")
+    W, _ = run.load(run.t)
+    columns = (run.t, _velocity_column(run.drive, run.t), W)
+    texts = [map(repr, column.tolist()) for column in columns]
+    seen = (repr(u) if used else "" for u, used in zip(run.observed.tolist(), run.used.tolist(), strict=True))
+    weight, force = ("normal_stress [MPa]", "shear_stress [MPa]") if run.stress else ("normal_load [N]", "force [N]")
+    observable = {"elongation": "elongation [um]", "force": force, "friction": "friction [1]"}[run.observable]
+    header = f"time [s],load_point_velocity [um/s],{weight},{observable}"
+    return "\n".join([header, *map(",".join, zip(*texts, seen, strict=True))]) + "\n"
+
+
+def _velocity_column(drive: Drive, t: np.ndarray) -> np.ndarray:
+    if not any(drive.accelerations):
+        return drive(t)
+    slipped = _displacement(drive, t)
+    mean = np.diff(slipped) / np.diff(t)
+    return np.append(mean, drive(t[-1:]))
+
+
+def _displacement(drive: Drive, t: np.ndarray) -> np.ndarray:
+    """Return the load point's displacement since t[0] at the times `t`, exactly: V is linear between the drive's breaks."""
+    inside = [b for b in drive.breaks if t[0] < b < t[-1]]
+    edges = np.array([t[0], *inside, t[-1]])
+    starts = [drive.piece(float(a)) for a in edges[:-1]]
+    V = np.array([v + rate * (a - since) for (v, rate, since), a in zip(starts, edges[:-1], strict=True)])
+    rates = np.array([rate for _, rate, _ in starts])
+    widths = np.diff(edges)
+    reached = np.concatenate(([0.0], np.cumsum(V * widths + 0.5 * rates * widths**2)))
+    i = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(V) - 1)
+    h = t - edges[i]
+    return np.asarray(reached[i] + h * (V[i] + 0.5 * rates[i] * h))
+
+
+def _description(experiment: Experiment, files: list[str]) -> str:
+    choice = experiment.choice
+    lines = ['format = "srf-experiment/1"', f"title = {_text(experiment.title)}", "", "[apparatus]"]
+    lines.append(f"stiffness = {_text(experiment.stiffness_text)}")
+    if experiment.mass:
+        lines.append(f"mass = {_text(f'{shortest(experiment.mass, KILOGRAM)!r} kg')}")
+    lines += ["", "[model]", f"law = {_text(choice.law)}", f"ageing = {_text(choice.ageing)}"]
+    lines += [f"interface = {_text(choice.interface)}", f"inertia = {_truth(choice.inertia)}"]
+    if choice.effects:
+        lines.append(f"effects = [{', '.join(map(_text, choice.effects))}]")
+    if experiment.parameters:
+        lines += ["", "[parameters]", *map(_parameter_line, experiment.parameters)]
+    for run, file in zip(experiment.runs, files, strict=True):
+        lines += ["", "[[runs]]", *_run_lines(run, file)]
+    return "\n".join(lines) + "\n"
+
+
+def _parameter_line(p: FitParameter) -> str:
+    factor = find_unit(p.unit).factor
+    cells = {"value": p.value, "lower": p.lower, "upper": p.upper}
+    parts = [f"{name} = {shortest(value, factor)!r}" for name, value in cells.items() if np.isfinite(value)]
+    return f"{_key(p.name)} = {{ {', '.join([*parts, *(['fixed = true'] if p.fixed else [])])} }}"
+
+
+def _run_lines(run: Run, file: str) -> list[str]:
+    lines = [f"name = {_text(run.name)}", f"file = {_text(file)}", f"holdout = {_truth(run.holdout)}"]
+    if run.start:
+        lines.append(f"start = {float(run.start)!r}")
+    if run.initial != "steady":
+        lines.append(f"initial = {_text(run.initial)}")
+    if not any(run.drive.accelerations):
+        steps = [f"{{ duration = {d!r}, velocity = {V!r} }}" for d, V in drive_steps(run.drive, run.t)]
+        lines.append(f"drive = [{', '.join(steps)}]")
+    if run.modulation is not None:
+        f, eps, onset = map(float, run.modulation)
+        lines.append(f"modulation = {{ frequency = {f!r}, amplitude = {eps!r}, onset = {onset!r} }}")
+    return lines
+
+
+def drive_steps(drive: Drive, t: np.ndarray) -> list[tuple[float, float]]:
+    """Return a drive of constant pieces over [t[0], t[-1]] as (duration, velocity), the form of experiment.toml."""
+    start, end = float(t[0]), float(t[-1])
+    edges = [start, *(b for b in drive.breaks if start < b < end), end]
+    steps, reached = [], start
+    for a, b in pairwise(edges):
+        duration = _plain(b - reached)
+        if b == end:
+            while reached + duration < end:  # rounding must not leave the last sample without a drive
+                duration = float(np.nextafter(duration, np.inf))
+        steps.append((duration, float(drive.piece(0.5 * (a + b))[0])))
+        reached += duration
+    return steps
+
+
+def stiffness_text(K: float) -> str:
+    """Return a stiffness in N/um as experiment.toml says it."""
+    return f"{shortest(K, 1.0)!r} N/um"
+
+
+def _plain(value: float) -> float:
+    """Return the number of twelve digits that `value` misses by rounding alone, else `value` itself."""
+    return shortest(value, 1.0, slack=1e-13)
+
+
+def shortest(value: float, factor: float, *, slack: float = 0.0) -> float:
+    """Return the number of fewest digits that times `factor` is `value`, to the last bit or to `slack` relative."""
+    for digits in range(12, 18):
+        number = float(f"{value / factor:.{digits}g}")
+        if abs(number * factor - value) <= slack * abs(value):
+            return number
+    return value / factor
+
+
+def _file_names(runs: list[str]) -> list[str]:
+    """Return one plain file name per run, none twice even where case does not count."""
+    names: list[str] = []
+    for run in runs:
+        stem = re.sub(r"[^\w.-]+", "-", run, flags=re.ASCII).strip("-.") or "run"
+        name, number = f"{stem}.csv", 2
+        while name.lower() in (other.lower() for other in names):
+            name, number = f"{stem}-{number}.csv", number + 1
+        names.append(name)
+    return names
+
+
+def _text(value: str) -> str:
+    return json.dumps(value, ensure_ascii=False).replace(
+        "\x7f", "\\u007f"
+    )  # TOML's basic strings are JSON's, but for DEL
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _text(name)
+
+
+def _truth(value: Any) -> str:
+    return "true" if value else "false"

@@ -1,0 +1,752 @@
+"""The discriminating design: the run that would tell apart hypotheses which explain a recording equally well.
+
+Of many runs that the apparatus can make, each fitted model says what it would see. What counts is the part of their difference
+that no refit could absorb: with d the whitened difference, X the whitened derivatives by all that is free in the wrong model and
+Q what the recordings so far say of that, the log likelihood that the wrong model loses is on average
+
+    gain = min over z of (|d - X z|^2 + z' Q z) / 2 = d' (1 + X Q^-1 X')^-1 d / 2,
+
+lambda (1 - rho^2) / 2 in the words of experimental design. It is taken for the worse of the two ways round, the best runs are
+found by it, and theirs is found again with the motion itself in place of its derivatives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from srfcli.codegen.model import Array
+from srfcli.data.values import Experiment, Run
+from srfcli.data.writing import DESCRIPTION, experiment_files, run_csv
+from srfcli.diagnosis.augment import augment
+from srfcli.diagnosis.hypotheses import Refit
+from srfcli.diagnosis.verdict import Diagnosis
+from srfcli.inference.noise import Noise, stretches, whiten
+from srfcli.inference.prediction import basis, of_run, run_parameters, stiffness_share
+from srfcli.inference.random_field import Latent, Tracks, solve_scaled, tracks_for
+from srfcli.laws.registry import Registry
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
+
+# The experiment that would part hypotheses which explain a recording equally well.
+
+ENOUGH = 12.0  # of log likelihood: hypotheses so far apart are told apart
+LEAST = 3.0  # below which a run is not worth making
+MOST = 3  # hypotheses that are to be parted
+DRAWN, VARIED = 60, 16  # runs that are tried, and variations of the best of them
+LOOKED, ROUGH_LOOKED = 36, 12  # of these, how many with derivatives, at most
+CONFIRMED = 3  # of the best, how many with the motion itself
+ROUNDS = 10  # of Gauss and Newton
+GROWS = 0.1  # e-foldings in a run that leave sliding as steady as it was
+REPEATS = 100  # of a run that nobody will go beyond
+UNITS = {"elongation": "um", "force": "N", "friction": "1"}
+PARTS = 60  # of a run, in which it is found how much of it suffices
+
+
+@dataclass(frozen=True)
+class Parting:
+    """The run that parts hypotheses best: `proposal`, the same as a `run`, and the `gain` in log likelihood to be expected.
+
+    `gains` has what the others lose by the name of the true one, the gain is the least of them. `seconds` of such a recording
+    gain 12, in `repeats` of the run, or None where no number of them does. The two of `pair`, which are parted least, differ
+    most at `at` s, the wrong one refitted: the first is `peak` above the second, in the observable's `unit`, `peak_um` of the
+    spring's elongation. `noise` is the gauge's level, `predicted` (n,) what each shows, `tried` how many runs were looked at.
+    """
+
+    names: tuple[str, ...]
+    proposal: Proposal
+    run: Run = field(repr=False)
+    gain: float
+    gains: Mapping[str, float]
+    seconds: float | None
+    repeats: int | None
+    pair: tuple[str, str]
+    at: float
+    peak: float
+    peak_um: float
+    unit: str
+    noise: float
+    predicted: Mapping[str, Array] = field(repr=False)
+    tried: int = 0
+
+    @property
+    def parts(self) -> bool:
+        """Return whether the run is worth making."""
+        return self.gain >= LEAST
+
+
+@dataclass(frozen=True)
+class Side:
+    """A fitted hypothesis that is to predict a run: with `prior` precision (k, k) over its scaled parameters.
+
+    Where all runs slid on one track, the prior goes on with the track's numbers and `shared` holds; on a track of its own a run
+    adds numbers that nothing is known of but their roughness.
+    """
+
+    refit: Refit
+    latent: Latent
+    prior: Array
+    shared: bool
+
+    @classmethod
+    def of(cls, refit: Refit) -> Side:
+        """Return the side of a hypothesis."""
+        problem, point = refit.fit.problem, refit.fit.point
+        latent, n = Latent(problem), point.theta.size
+        rough = bool(point.tracks.splines) and point.roughness.amplitude > 0
+        if not rough:
+            return cls(refit, latent, point.N[:n, :n], False)
+        inverse = np.linalg.inv(point.tracks.root(point.roughness))
+        whole = point.N.copy()
+        whole[n:, n:] += inverse.T @ inverse
+        if point.tracks.shared:
+            return cls(refit, latent, whole, True)
+        own = whole[:n, :n] - whole[:n, n:] @ np.linalg.solve(whole[n:, n:], whole[n:, :n])
+        return cls(refit, latent, own, False)
+
+    @property
+    def name(self) -> str:
+        """Return the hypothesis' name."""
+        return self.refit.name
+
+    @property
+    def rough(self) -> bool:
+        """Return whether a track's numbers are estimated with the parameters."""
+        return self.refit.fit.point.roughness.amplitude > 0 and bool(self.refit.fit.point.tracks.splines)
+
+    def track(self, run: Run) -> Tracks:
+        """Return the track on which a run would slide: the known one, a new one, or none."""
+        if not self.rough:
+            return Tracks((), {})
+        if self.shared:
+            return replace(self.refit.fit.point.tracks, of={run.name: 0})
+        return tracks_for([run], shared=False)
+
+    def precision(self, run: Run) -> Array:
+        """Return what is known beforehand of all that is free in a run (k, k): parameters, track, trend."""
+        Q = self.prior
+        if self.rough and not self.shared:
+            inverse = np.linalg.inv(self.track(run).root(self.refit.fit.point.roughness))
+            Q = block_diag(Q, inverse.T @ inverse)
+        return block_diag(Q, [[0.0]]) if self.latent.problem.trend else Q
+
+    def steady(self, run: Run) -> bool:
+        """Return whether the sliding with which a run begins is stable: no apparatus begins with any other."""
+        problem = self.latent.problem
+        p = run_parameters(problem.model, problem.experiment, run, self.refit.fit.values)
+        V, W = float(run.drive(run.t[:1])[0]), run.load.rest(float(run.t[0]))
+        J = np.asarray(problem.model.rates_jacobian(np.asarray(problem.model.steady(p)), V, W, 0.0, p), dtype=float)
+        return bool(np.linalg.eigvals(J).real.max() * float(np.ptp(run.t)) < GROWS)
+
+    def predicted(self, run: Run, z: Array | None = None, *, slopes: bool = False) -> tuple[Array, Array] | None:
+        """Return what the hypothesis foretells, (n,) and its derivatives (n, k) by `z`, steps from the fit; None if it fails."""
+        problem, theta = self.latent.problem, self.refit.fit.point.theta
+        tracks, trend, n = self.track(run), problem.trend, theta.size
+        if z is not None:
+            theta = np.clip(theta + z[:n] * self.latent.scale, problem.lower, problem.upper)
+            if tracks.splines:
+                tracks = tracks.with_numbers(tracks.numbers + z[n : n + tracks.numbers.size])
+        found = self.latent.predicted(run, theta, tracks, slopes=slopes)
+        y, J = found.y, found.J.copy()
+        if not (found.status.ok and np.isfinite(y).all() and np.isfinite(J).all()):
+            return None
+        if slopes:
+            J[:, :n] *= self.latent.scale
+        if trend:
+            line = basis(run, trend)
+            y = y + (line * z[-1] if z is not None else 0.0)
+            J = np.column_stack([J, line]) if slopes else J
+        return y, J
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What a wrong model loses: `w` (n,) and `X` (n, k) whitened, `Q`; `left` (n,) what is left of the difference, unwhitened."""
+
+    w: Array
+    X: Array
+    Q: Array
+    left: Array
+
+    def gain(self, *, samples: int | None = None, times: float = 1.0) -> float:
+        """Return the log likelihood lost in the first `samples`, in a run made `times` times."""
+        w, X = self.w[:samples], self.X[:samples]
+        b = times * (X.T @ w)
+        return 0.5 * max(times * float(w @ w) - float(b @ solve_scaled(times * (X.T @ X) + self.Q, b)), 0.0)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A run as the hypotheses foretell it: `y` (n,) by name; `bound` no gain exceeds, `gain` at first order where known."""
+
+    proposal: Proposal
+    run: Run
+    y: dict[str, Array]
+    bound: float
+    gain: float = 0.0
+
+
+def parting_experiment(registry: Registry, diagnosis: Diagnosis, *, seed: int = 0) -> Parting | None:
+    """Return the run that would part what a diagnosis found equally good; None where there is nothing to part.
+
+    Looked for are runs with the apparatus' own velocities, loads and modulations, and up to twice beyond them.
+    """
+    sides = foremost(diagnosis)
+    if diagnosis.verdict != "ambiguous" or len(sides) < 2:
+        return None
+    return Design(diagnosis.experiment, diagnosis.noise, sides, seed).best()
+
+
+def foremost(diagnosis: Diagnosis) -> tuple[Side, ...]:
+    """Return the hypotheses that are to be parted: the best of each name, three at most."""
+    best: dict[frozenset[str], Refit] = {}
+    for refit in diagnosis.close:
+        best.setdefault(frozenset(refit.hypothesis.reported), refit)
+    return tuple(Side.of(r) for r in list(best.values())[:MOST])
+
+
+class Design:
+    """The search for a run among those that an apparatus can make."""
+
+    def __init__(self, experiment: Experiment, noise: Mapping[str, Noise], sides: Sequence[Side], seed: int) -> None:
+        self.experiment, self.noise, self.sides = experiment, noise, tuple(sides)
+        self.reach: Reach = reach_of(experiment)
+        self.rng = np.random.default_rng(seed)
+        self.tried = 0
+
+    def best(self) -> Parting | None:
+        """Return the best run, None where no model can be followed through any."""
+        looked = self.look(draw(self.reach, DRAWN, self.rng), LOOKED)
+        if not looked:
+            return None
+        near = vary(looked[0].proposal, self.reach, VARIED, self.rng)
+        looked = sorted([*looked, *self.look(near, VARIED, above=looked[0].gain)], key=lambda t: -t.gain)
+        best: Parting | None = None
+        for trial in looked[:CONFIRMED]:
+            found = self.judge(trial)
+            if found is not None and (best is None or found.gain > best.gain):
+                best = found
+        return best and replace(best, tried=self.tried)
+
+    def look(self, proposals: Sequence[Proposal], most: int, *, above: float = -1.0) -> list[Trial]:
+        """Return runs with their gains at first order, the best first; those that cannot be best are left out."""
+        self.tried += len(proposals)
+        trials = [t for t in map(self.foretell, proposals) if t is not None]
+        by_kind: dict[str, list[Trial]] = {}
+        for trial in sorted(trials, key=lambda t: -t.bound):
+            by_kind.setdefault(trial.proposal.kind, []).append(trial)
+        if any(s.rough for s in self.sides):
+            most = min(most, ROUGH_LOOKED)
+        found: list[Trial] = []
+        while any(by_kind.values()) and len(found) < most:
+            for queue in by_kind.values():  # stick-slip has the largest differences, and absorbs most of them
+                if queue and (trial := queue.pop(0)).bound > above and len(found) < most:
+                    trial = replace(trial, gain=self.gain(trial))
+                    above = max(above, trial.gain)
+                    found.append(trial)
+        return sorted(found, key=lambda t: -t.gain)
+
+    def foretell(self, proposal: Proposal) -> Trial | None:
+        """Return a run as all hypotheses foretell it, None where it cannot begin or one cannot be followed."""
+        begun = self.begun(proposal)
+        if begun is None:
+            return None
+        proposal, run = begun
+        y = {}
+        for side in self.sides:
+            found = side.predicted(run)
+            if found is None:
+                return None
+            y[side.name] = found[0]
+        parted = [0.5 * float(np.sum(self.whitened(run, y[a.name] - y[b.name]) ** 2)) for a, b in self.pairs()]
+        return Trial(proposal, run, y, min(parted))
+
+    def begun(self, proposal: Proposal) -> tuple[Proposal, Run] | None:
+        """Return a run that begins in stable sliding, whichever hypothesis is true: as it is, or led in."""
+        for tried in (proposal, led_in(proposal, self.reach)):
+            if tried is not None:
+                run = run_of(tried, self.experiment)
+                if all(side.steady(run) for side in self.sides):
+                    return tried, run
+        return None
+
+    def pairs(self) -> list[tuple[Side, Side]]:
+        """Return every pair of a true and a wrong hypothesis."""
+        return list(permutations(self.sides, 2))
+
+    def whitened(self, run: Run, columns: Array) -> Array:
+        """Return columns over a run's samples (n,) or (n, k) as its gauge's noise weighs them."""
+        return whiten(self.noise[self.like(run)], columns, stretches(run.t, run.used))
+
+    def like(self, run: Run) -> str:
+        """Return the name of the recorded run that has a run's gauge and sampling; of any, if its own was not fitted."""
+        name = (self.reach.modulated if run.modulation else self.reach.plain).name
+        return name if name in self.noise else next(iter(self.noise))
+
+    def gain(self, trial: Trial) -> float:
+        """Return the gain at first order: that of the least parted pair, the worse way round."""
+        slopes = {}
+        for side in self.sides:
+            found = side.predicted(trial.run, slopes=True)
+            if found is None:
+                return 0.0
+            slopes[side.name] = (self.whitened(trial.run, found[1]), side.precision(trial.run))
+        least = np.inf
+        for true, wrong in self.pairs():
+            difference = trial.y[true.name] - trial.y[wrong.name]
+            w = self.whitened(trial.run, difference)
+            least = min(least, Loss(w, *slopes[wrong.name], difference).gain())
+        return least
+
+    def judge(self, trial: Trial) -> Parting | None:
+        """Return what a run is worth, every wrong model refitted by the motion itself."""
+        losses: dict[tuple[str, str], Loss] = {}
+        for true, wrong in self.pairs():
+            lost = self.refitted(trial.run, wrong, trial.y[true.name])
+            if lost is None:
+                return None
+            losses[true.name, wrong.name] = lost
+        worth = {pair: lost.gain() for pair, lost in losses.items()}
+        true_name, wrong_name = min(worth, key=lambda pair: worth[pair])
+        seconds, repeats = _enough(list(losses.values()), trial)
+        names, run = tuple(s.name for s in self.sides), trial.run
+        first, second = sorted((true_name, wrong_name), key=names.index)
+        left = losses[true_name, wrong_name].left * (1.0 if true_name == first else -1.0)
+        at = int(np.argmax(np.abs(left)))
+        scale = {"elongation": 1.0, "force": 1 / run.stiffness, "friction": run.load(run.t)[0][at] / run.stiffness}
+        return Parting(
+            names, trial.proposal, run, worth[true_name, wrong_name],
+            {a: min(g for (true, _), g in worth.items() if true == a) for a in names}, seconds, repeats, (first, second),
+            float(run.t[at]), float(left[at]), abs(float(left[at] * scale[run.observable])), UNITS[run.observable],
+            self.noise[self.like(run)].level, trial.y,
+        )  # fmt: skip
+
+    def refitted(self, run: Run, wrong: Side, y: Array) -> Loss | None:
+        """Return what a wrong model loses once it was fitted to what the true one shows, and to all that it is known from."""
+        Q = wrong.precision(run)
+        z, damping = np.zeros(Q.shape[0]), 0.0
+        current = self.at(run, wrong, y, z)
+        if current is None:
+            return None
+        r, X = current
+        for _ in range(ROUNDS):
+            A, b = X.T @ X + Q, X.T @ r[0] - Q @ z
+            A[np.diag_indices_from(A)] *= 1 + damping
+            step = solve_scaled(A, b)
+            if float(b @ step) < 0.02 * (1 + float(r[0] @ r[0] + z @ Q @ z)) and not damping:
+                break
+            trial = self.at(run, wrong, y, z + step)
+            if trial is not None and _cost(trial[0][0], z + step, Q) < _cost(r[0], z, Q):
+                (r, X), z = trial, z + step
+                damping = 0.0 if damping < 1e-3 else damping / 10
+            elif damping > 1e4:
+                break
+            else:
+                damping = max(10 * damping, 1e-2)
+        return Loss(r[0] + X @ z, X, Q, r[1])
+
+    def at(self, run: Run, wrong: Side, y: Array, z: Array) -> tuple[tuple[Array, Array], Array] | None:
+        """Return the difference left at `z`, whitened and not (n,), and the whitened derivatives there (n, k)."""
+        found = wrong.predicted(run, z, slopes=True)
+        if found is None:
+            return None
+        return (self.whitened(run, y - found[0]), y - found[0]), self.whitened(run, found[1])
+
+
+def _cost(r: Array, z: Array, Q: Array) -> float:
+    return float(r @ r + z @ Q @ z)
+
+
+def _enough(losses: Sequence[Loss], trial: Trial) -> tuple[float | None, int | None]:
+    """Return how many seconds of a run gain enough, and how many repeats of it; None where none do."""
+    n = trial.run.t.size
+    if min(x.gain() for x in losses) >= ENOUGH:
+        for k in np.unique(np.linspace(0, n, PARTS + 1).astype(int)[1:]).tolist():
+            if min(x.gain(samples=k) for x in losses) >= ENOUGH:
+                return float(trial.run.t[k - 1] - trial.run.t[0]), 1
+    low, high = 1, REPEATS
+    if min(x.gain(times=high) for x in losses) < ENOUGH:
+        return None, None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if min(x.gain(times=middle) for x in losses) >= ENOUGH else (middle, high)
+    return high * trial.proposal.duration, high
+
+
+# Runs that an apparatus could still make: drives and loads drawn around those that it has shown.
+
+FACTOR = 2.0  # beyond what was shown
+FINEST = 8.0  # samples of a period: a load is not known from fewer
+VARIES = 0.01  # of the load, from where on a run is one with load steps
+MANY = 12  # velocities of a recorded drive that stand for all of them
+MOST_EPS = 0.9
+LEAD = 0.1  # of a run, in which it begins fast; the same of its way
+UNKNOWN = 1.0  # N: what stands for a load that no recording tells
+NAME = "parting"
+STEPS, HOLD, LOAD, WAVE = "velocity steps", "slide-hold-slide", "load steps", "modulation"
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A run that is not recorded yet: drive as (s, um/s), load W0 (N), its steps (s, N), a modulation with its onset (s).
+
+    `rise` is the time scale (s) of the tanh that steps and switches on; `like` the run whose gauge and sampling it has.
+    """
+
+    kind: str
+    drive: tuple[tuple[float, float], ...]
+    W0: float
+    like: str
+    interval: float
+    rise: float
+    steps: tuple[tuple[float, float], ...] = ()
+    eps: float = 0.0
+    f: float = 0.0
+    onset: float = 0.0
+
+    @property
+    def duration(self) -> float:
+        """Return how long it lasts, in s."""
+        return sum(d for d, _ in self.drive)
+
+    def times(self) -> Array:
+        """Return its sample times (n,) in s."""
+        return np.arange(max(math.ceil(self.duration / self.interval - 1e-9), 2)) * self.interval
+
+    def loads(self, t: Array) -> Array:
+        """Return the load (n,) in N at these times."""
+        W = np.full(t.size, self.W0)
+        for at, jump in self.steps:
+            W += 0.5 * jump * (1 + np.tanh((t - at) / self.rise))
+        if self.eps:
+            envelope = 0.5 * (1 + np.tanh((t - self.onset) / self.rise))
+            W += self.eps * self.W0 * envelope * np.cos(2 * np.pi * self.f * t)
+        return W
+
+    def changes(self) -> list[tuple[float, str]]:
+        """Return when (s) something is changed, and what, in order of time."""
+        found, t = [], 0.0
+        for (d, V), (_, after) in zip(self.drive, self.drive[1:], strict=False):
+            t += d
+            verb = "the stage stops" if after == 0 else f"the drive changes from {V:g} to {after:g} um/s"
+            found.append((t, verb if V else f"the stage moves again, at {after:g} um/s"))
+        W = self.W0
+        for at, jump in self.steps:
+            found.append((at, f"the load changes from {W:.4g} to {W + jump:.4g} N"))
+            W += jump
+        if self.eps:
+            found.append((self.onset, "the modulation is switched on"))
+        return sorted(found)
+
+    def text(self) -> str:
+        """Return what is to be done, in words: drive; load."""
+        drive = ", then ".join(f"{d:g} s at {V:g} um/s" if V else f"{d:g} s at rest" for d, V in self.drive)
+        load = f"{self.W0:g} N"
+        for at, jump in self.steps:
+            load += f", {'up' if jump > 0 else 'down'} by {abs(jump):g} N at {at:g} s"
+        if self.eps:
+            load += f", from {self.onset:g} s on modulated by {100 * self.eps:g} % at {self.f:g} Hz"
+        return f"{drive}; load {load}"
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What an experiment's runs have shown that its apparatus can do; `travel` (um) is the longest way of one run.
+
+    Velocities in um/s, loads in N, `eps` and `jumps` relative to the load, frequencies in Hz, time scales in s.
+    """
+
+    V: tuple[float, ...]
+    W0: tuple[float, ...]
+    eps: tuple[float, ...]
+    f: tuple[float, ...]
+    jumps: tuple[float, ...]
+    onset: float
+    switch: float
+    rise: float
+    travel: float
+    plain: Run = field(repr=False)
+    modulated: Run = field(repr=False)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Return what can be done: a load that was never changed is not going to be."""
+        return (STEPS, HOLD, *((LOAD,) if self.jumps else ()), *((WAVE,) if self.eps else ()))
+
+
+def reach_of(experiment: Experiment) -> Reach:
+    """Return what the runs of an experiment, held-out ones too, have shown."""
+    waves = {r.name: of_run(r) for r in experiment.runs}
+    modulated = [r for r in experiment.runs if waves[r.name]["modulated"]]
+    plain = [r for r in experiment.runs if not waves[r.name]["modulated"]]
+    jumps, rises = [], []
+    for run in plain:
+        W, rate = run.load(run.t)
+        if np.ptp(W) > VARIES * W.mean():
+            jumps.append(float(np.ptp(W) / W[0]))
+            rises.append(float(np.ptp(W) / (2 * max(np.abs(rate).max(), 1e-12))))
+    shown = [waves[r.name] for r in modulated]
+    begun = [(w["onset0"] - r.t[0]) / np.ptp(r.t) for w, r in zip(shown, modulated, strict=True)]
+    late = [b for b in begun if 0 < b < 1]
+    return Reach(
+        _velocities(experiment.runs),
+        tuple(r.load.rest(float(r.t[0])) for r in experiment.runs),
+        tuple(_digits(w["eps"]) for w in shown), tuple(_digits(w["f"]) for w in shown), tuple(map(_digits, jumps)),
+        float(np.median(late)) if late else 0.25,
+        _digits(float(np.median([w["rise0"] for w in shown]))) if shown else 0.02,
+        _digits(float(np.median(rises))) if rises else 0.05,
+        max(float(np.sum(np.abs(r.drive(r.t[:-1])) * np.diff(r.t))) for r in experiment.runs),
+        _typical(plain or modulated), _typical(modulated or plain),
+    )  # fmt: skip
+
+
+def _velocities(runs: Sequence[Run]) -> tuple[float, ...]:
+    """Return the velocities of driving that runs have shown, in um/s."""
+    found: set[float] = set()
+    for run in runs:
+        if len(run.drive.velocities) <= MANY and not any(run.drive.accelerations):
+            found |= {float(f"{V:.3g}") for V in run.drive(run.t).tolist() if V > 0}
+        else:
+            V = run.drive(run.t)
+            V = V[V > 0]
+            shares = np.linspace(0.05, 0.95, MANY)
+            found |= {float(f"{x:.3g}") for x in np.quantile(V, shares).tolist()} if V.size else set()
+    return tuple(sorted(found))
+
+
+def _typical(runs: Sequence[Run]) -> Run:
+    """Return the run of median length; a fitted one, whose noise is known, where there is one."""
+    fitted = [r for r in runs if not r.holdout] or list(runs)
+    return sorted(fitted, key=lambda r: float(np.ptp(r.t)))[len(fitted) // 2]
+
+
+def draw(reach: Reach, number: int, rng: np.random.Generator) -> list[Proposal]:
+    """Return so many runs, every kind in turn."""
+    kinds = reach.kinds
+    return [_drawn(reach, kinds[i % len(kinds)], rng) for i in range(number)]
+
+
+def led_in(proposal: Proposal, reach: Reach) -> Proposal | None:
+    """Return the run with a fast beginning, as sliding that is not stable has to begin; None where there is no room for it."""
+    (length, V), *rest = proposal.drive
+    fastest = max(reach.V)
+    lead = _digits(LEAD * min(proposal.duration, reach.travel / fastest))
+    if fastest <= V or length <= 2 * lead:
+        return None
+    return replace(proposal, drive=((lead, fastest), (_digits(length - lead), V), *rest))
+
+
+def vary(proposal: Proposal, reach: Reach, number: int, rng: np.random.Generator) -> list[Proposal]:
+    """Return so many runs near another."""
+    found = []
+    for _ in range(number):
+        like = reach.modulated if proposal.eps else reach.plain
+        load = float(np.exp(0.3 * rng.standard_normal()))
+        factors = {V: float(np.exp(0.3 * rng.standard_normal())) for _, V in proposal.drive}
+        V = [_within(V * factors[V], reach.V) if V else 0.0 for _, V in proposal.drive]
+        W0 = _within(proposal.W0 * load, reach.W0) if set(reach.W0) != {UNKNOWN} else UNKNOWN
+        jump = float(np.exp(0.3 * rng.standard_normal())) * W0 / proposal.W0
+        eps, f = proposal.eps, proposal.f
+        if eps:
+            eps = min(_within(eps * np.exp(0.3 * rng.standard_normal()), reach.eps), MOST_EPS)
+            f = _frequency(f * np.exp(0.3 * rng.standard_normal()), reach, proposal.interval)
+        shares = [d / proposal.duration for d, _ in proposal.drive]
+        drive = _timed(V, shares, float(np.ptp(like.t)), reach.travel)
+        length = sum(d for d, _ in drive) / proposal.duration
+        steps = tuple((_digits(at * length), _digits(j * jump)) for at, j in proposal.steps)
+        found.append(
+            replace(proposal, drive=drive, W0=W0, steps=_allowed(W0, steps, reach), eps=eps, f=f,
+                    onset=_digits(proposal.onset * length))
+        )  # fmt: skip
+    return found
+
+
+def _drawn(reach: Reach, kind: str, rng: np.random.Generator) -> Proposal:
+    def near(values: Sequence[float]) -> float:
+        factor = float(np.exp(rng.uniform(-1, 1) * math.log(FACTOR)))
+        return _within(values[int(rng.integers(len(values)))] * factor, values)
+
+    like = reach.modulated if kind == WAVE else reach.plain
+    interval, span = _digits(float(np.median(np.diff(like.t))), 9), float(np.ptp(like.t))
+    V, other, third = near(reach.V), near(reach.V), near(reach.V)
+    W0 = near(reach.W0) if set(reach.W0) != {UNKNOWN} else UNKNOWN
+    rise = reach.switch if kind == WAVE else reach.rise
+    if kind == STEPS:
+        drive = _timed([V, other, V, third], [0.25] * 4, span, reach.travel)
+        return Proposal(kind, drive, W0, like.name, interval, rise)
+    if kind == HOLD:
+        drive = _timed([V, 0.0, V], [0.2, rng.uniform(0.3, 0.6), 0.2], span, reach.travel)
+        return Proposal(kind, drive, W0, like.name, interval, rise)
+    if kind == LOAD:
+        drive = _timed([V], [1.0], span, reach.travel)
+        jump = _digits(near(reach.jumps) * W0 * (1 if rng.uniform() < 0.6 else -1))
+        length = sum(d for d, _ in drive)
+        steps = ((_digits(0.3 * length), jump), (_digits(0.65 * length), -jump))
+        return Proposal(kind, drive, W0, like.name, interval, rise, _allowed(W0, steps, reach))
+    stepped = rng.uniform() < 0.4
+    drive = _timed([V, other], [0.6, 0.4], span, reach.travel) if stepped else _timed([V], [1.0], span, reach.travel)
+    onset = _digits(min(reach.onset, 0.5) * sum(d for d, _ in drive))
+    eps = min(near(reach.eps), MOST_EPS)
+    return Proposal(
+        kind, drive, W0, like.name, interval, rise, (), eps, _frequency(near(reach.f), reach, interval), onset
+    )
+
+
+def _timed(V: Sequence[float], shares: Sequence[float], span: float, travel: float) -> tuple[tuple[float, float], ...]:
+    """Return (duration, velocity) of pieces that last `span` s together, less where the track would be too short."""
+    total, travel = sum(shares), (1 - LEAD) * travel
+    lengths = [span * s / total for s in shares]
+    way = sum(d * v for d, v in zip(lengths, V, strict=True))
+    if way > travel:  # the fast pieces are made shorter, each to its share of the way
+        lengths = [min(d, travel * s / total / v) if v else d for d, s, v in zip(lengths, shares, V, strict=True)]
+    return tuple((_digits(d), v) for d, v in zip(lengths, V, strict=True))
+
+
+def _allowed(W0: float, steps: tuple[tuple[float, float], ...], reach: Reach) -> tuple[tuple[float, float], ...]:
+    """Return steps that keep the load within what was shown, times two."""
+    low, high = min(reach.W0) / FACTOR, FACTOR * max(reach.W0)
+    size = max((abs(j) for _, j in steps), default=0.0)
+    if not size:
+        return steps
+    room = high - W0 if steps[0][1] > 0 else W0 - low
+    shrunk = min(1.0, max(room, 0.1 * W0) / size)
+    return tuple((at, _digits(j * shrunk)) for at, j in steps)
+
+
+def _frequency(value: float, reach: Reach, interval: float) -> float:
+    return _digits(min(_within(value, reach.f), 1 / (FINEST * interval)))
+
+
+def _within(value: float, shown: Sequence[float]) -> float:
+    """Return a value, with two digits, no further than a factor of two outside what was shown."""
+    return _digits(float(np.clip(_digits(float(value), 2), min(shown) / FACTOR, max(shown) * FACTOR)))
+
+
+def _digits(value: float, digits: int = 3) -> float:
+    return float(f"{value:.{digits}g}")
+
+
+def run_of(proposal: Proposal, experiment: Experiment) -> Run:
+    """Return the run as if it had been recorded, with a gauge that reads zero; it estimates nothing of its own."""
+    like = next(r for r in experiment.runs if r.name == proposal.like)
+    t = proposal.times()
+    begins = np.concatenate([[0.0], np.cumsum([d for d, _ in proposal.drive])[:-1]])
+    drive = Drive.steps(list(zip(begins.tolist(), (V for _, V in proposal.drive), strict=True)))
+    load: Load = ConstantLoad(proposal.W0)
+    if proposal.steps or proposal.eps:
+        load = SampledLoad(t, proposal.loads(t))
+    modulation = (proposal.f, proposal.eps, proposal.onset) if proposal.eps else None
+    run = Run(
+        NAME, Path(f"{NAME}.csv"), True, like.start, "steady", t, np.zeros(t.size), like.observable,
+        np.ones(t.size, dtype=bool), drive, load, like.stiffness, modulation, 0.0, (),
+    )  # fmt: skip
+    share = stiffness_share(experiment, run) / stiffness_share(experiment, like)
+    return replace(run, stiffness=like.stiffness * share)
+
+
+# What is told of the run that would part hypotheses: sentences, plain data, and an experiment for what each foretells.
+
+FOLDER = "parting"
+RUNS, COLUMNS = "\n[[runs]]\n", "\n[columns]\n"
+
+
+def sentences(found: Parting) -> list[str]:
+    """Return what is to be done, what it is worth, and what to look for; or that nothing parts these hypotheses."""
+    names, run = _listed([_name(n) for n in found.names]), found.proposal
+    if not found.parts:
+        return [
+            f"Nothing within this apparatus' reach parts {names}: of {found.tried} runs that were tried, the best would gain "
+            f"{found.gain:.2g} in log likelihood, and {ENOUGH:g} are wanted. For this apparatus they are one class."
+        ]
+    return [
+        f"What would part {names} is {run.kind}: {run.text()}; sampled at {1 / run.interval:.4g} Hz.",
+        f"Whichever of them is true, the others then lose at least {found.gain:.3g} in log likelihood, refitted to all runs. "
+        + _long(found),
+        _look(found),
+    ]
+
+
+def _long(found: Parting) -> str:
+    if found.seconds is None or found.repeats is None:
+        return f"No number of repeats of this run gains {ENOUGH:g}: its parameters would have to be known better first."
+    if found.repeats > 1:
+        return f"{ENOUGH:g} are gained in {found.repeats} such runs, {found.seconds:.3g} s in all."
+    return f"{ENOUGH:g} are gained in the first {found.seconds:.3g} s of it."
+
+
+def _look(found: Parting) -> str:
+    """Return where to look, and for how much."""
+    first, second = map(_name, found.pair)
+    before = [(t, what) for t, what in found.proposal.changes() if t <= found.at]
+    since = f", {found.at - before[-1][0]:.2g} s after {before[-1][1]}" if before else ""
+    size = f"{abs(found.peak):.2g}{'' if found.unit == '1' else f' {found.unit}'}"
+    um = "" if found.unit == "um" else f" ({found.peak_um:.2g} um of the spring's elongation)"
+    word = "above" if found.peak > 0 else "below"
+    faint = ", less than the noise of one sample: a fit sees it" if abs(found.peak) < found.noise else ""
+    return f"They differ most {found.at:.3g} s into it{since}: {first} is then {size}{um} {word} {second}{faint}."
+
+
+def _name(name: str) -> str:
+    return "the baseline" if name == "none" else name
+
+
+def _listed(names: list[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def described(found: Parting, experiment: Experiment) -> dict[str, Any]:
+    """Return the value of the answer's key `experiment`."""
+    return {
+        "hypotheses": list(found.names),
+        "parts": found.parts,
+        "sentences": sentences(found),
+        "gain": found.gain,
+        "gains": dict(found.gains),
+        "seconds": found.seconds,
+        "repeats": found.repeats,
+        "duration": found.proposal.duration,
+        "look": {
+            "at": found.at,
+            "difference": found.peak,
+            "unit": found.unit,
+            "um": found.peak_um,
+            "of": list(found.pair),
+        },
+        "run": run_text(found, experiment),
+        "tried": found.tried,
+    }
+
+
+def run_text(found: Parting, experiment: Experiment) -> str:
+    """Return the run as experiment.toml describes one; its file has times and load, and what a hypothesis foretells."""
+    run = replace(found.run, holdout=False)
+    description = experiment_files(replace(experiment, runs=(run,)))[DESCRIPTION]
+    load = found.proposal.text().partition("; load ")[2]
+    return f"[[runs]]\n# load {load}, as the file has it\n{description.rpartition(RUNS)[2]}"
+
+
+def parting_files(
+    registry: Registry, diagnosis: Diagnosis, found: Parting, *, folder: Path, reader: str | None = None
+) -> dict[str, str]:
+    """Return, by place in `folder`, an experiment for each hypothesis whose one run is the proposed one as it foretells it."""
+    files: dict[str, str] = {}
+    run = replace(found.run, holdout=False)
+    text = run_text(found, diagnosis.experiment)
+    for refit in diagnosis.close:
+        place = f"{FOLDER}/{refit.name}"
+        if refit.name not in found.predicted or f"{place}/{DESCRIPTION}" in files:
+            continue
+        made = augment(
+            registry, diagnosis.experiment, refit.hypothesis, refit.fit, folder=folder / place, reader=reader
+        )
+        head = made.files[DESCRIPTION].partition(RUNS)[0].partition(COLUMNS)[0]
+        files |= {f"{place}/{name}": content for name, content in made.files.items()}
+        files[f"{place}/{DESCRIPTION}"] = f"{head.rstrip()}\n\n{text}"
+        files[f"{place}/{run.file.name}"] = run_csv(replace(run, observed=found.predicted[refit.name]))
+    return files

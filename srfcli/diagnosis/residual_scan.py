@@ -1,0 +1,716 @@
+"""Where recording and baseline differ: local statistics of a residual over runs, times, phases, frequencies and states.
+
+Least squares spreads a misfit over all that its parameters reach. Two other choices leave it where it is: the parameters that a
+better model has, and those under which as many samples as possible are in order (a Cauchy likelihood, in which a sample that is
+far off counts little).
+
+With whitened residuals r, columns X of parameters and track, and the track's prior precision Q, what no parameter and no track
+explains is M r, M = 1 - X (X'X + Q)^-1 X'. For local columns B, (B'M r)' (B'M B)^-1 (B'M r) is chi-squared under noise, whatever
+the true parameters are; so, nearly, is the sum of squares of M r over a set of samples, with tr(M) over the set for its degrees
+of freedom. The smallest p-value of all of them is judged by its own distribution, simulated through the same projection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.special import gammaincc, gammaln
+
+from srfcli.codegen.model import Array
+from srfcli.data.values import Run
+from srfcli.inference.noise import Noise, stretches, whiten
+from srfcli.inference.prediction import Prediction, of_run
+from srfcli.inference.random_field import Latent, LatentFit, Point
+from srfcli.motion.simulate import stick_slip
+
+# Where recording and baseline part: runs and times, phases of forcing and stick-slip, frequencies, quantities of state.
+
+LEVEL = 0.01  # p-value, adjusted for all that was looked at, from which a place stands out
+DRAWS = 200
+LARGE = 10.0  # standard deviations of the noise beyond which a residual counts no more, where times are told
+RUN_CELLS, HELD = 64, 0.8  # of a run, and the share of its excess that its windows must hold
+OWN = ("run", "window")  # axes along a run's time
+MOST = 5  # windows and lines that are named
+PROMINENT, BESIDE, FAINT = (
+    4.0,
+    15,
+    0.01,
+)  # of a line: times its neighbours' median, how many neighbours, share of the strongest
+EVENTS = 3  # stick-slip events from which there is a cycle
+
+
+@dataclass(frozen=True)
+class RunPlace:
+    """A run that stands out: its share of the excess misfit, and the times, on its own clock, that hold most of it."""
+
+    name: str
+    share: float
+    windows: tuple[tuple[float, float], ...]
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where the misfit is: `forcing_phase` in rad (of a cosine of the load), `coordinate` the name and the share it explains."""
+
+    runs: tuple[RunPlace, ...]
+    forcing_phase: tuple[float, float] | None
+    frequencies: tuple[float, ...]
+    coordinate: tuple[str, float] | None
+    p_value: float
+    atlas: tuple[Row, ...] = field(default=(), repr=False)
+
+    def described(self) -> dict[str, object]:
+        """Return the object that `srf.diagnose/1` has under location."""
+        return {
+            "runs": [
+                {"name": r.name, "share": r.share, "windows": [list(w) for w in r.windows], "p_value": r.p_value}
+                for r in self.runs
+            ],
+            "forcing_phase": None if self.forcing_phase is None else list(self.forcing_phase),
+            "frequencies_hz": list(self.frequencies),
+            "coordinate": None if self.coordinate is None else {"name": self.coordinate[0], "r2": self.coordinate[1]},
+        }
+
+
+def locate(
+    fitted: LatentFit, noise: Mapping[str, Noise], *, last: LatentFit | None = None, draws: int = DRAWS, seed: int = 0
+) -> Location:
+    """Return where the recordings part from a fit, with error control over everything that is looked at.
+
+    `draws` recordings with nothing but noise (and the track) are simulated through the same projection. A fit that is far off has
+    bent its parameters, and its misfit is everywhere; once it is sure that there is one, the places are those of the same model
+    with parameters that leave as much as possible in order (see `unbent`), `last` being the better model. Phases, lines and
+    quantities are looked for as long as each run is followed: once cycles are lost, a residual says nothing of them.
+    """
+    forcing = {r.name: of_run(r)["f"] for r in fitted.problem.runs if of_run(r)["modulated"]}
+    precision, root, at = _prior(fitted)
+    pieces = pieces_of(fitted, noise)
+    atlas = Atlas(pieces, precision, root=root)
+    M = atlas.projected([p.white for p in pieces], at=at)
+    found = read_atlas(atlas, M, atlas.null(draws, seed=seed), forcing)
+    if found.p_value >= LEVEL:
+        return found
+    straight = unbent(fitted, noise, last)
+    pieces, prior = pieces_of(straight, noise), _prior(straight)[0]
+    whole, begun = (_read_kept(some, prior, forcing, draws, seed) for some in (pieces, [p.followed() for p in pieces]))
+    told = begun.coordinate or found.coordinate
+    rows = [r for r in whole.atlas if r.axis in OWN] + [r for r in begun.atlas if r.axis not in OWN]
+    return replace(begun, runs=whole.runs, coordinate=told, p_value=found.p_value, atlas=tuple(rows))
+
+
+def _read_kept(pieces: Sequence[Piece], prior: Array, forcing: Mapping[str, float], draws: int, seed: int) -> Location:
+    """Return what stands out of residuals as they are."""
+    atlas = Atlas(pieces, prior, kept=True)
+    return read_atlas(atlas, atlas.projected([p.white for p in pieces]), atlas.null(draws, seed=seed), forcing)
+
+
+def _prior(fitted: LatentFit) -> tuple[Array, Array | None, Array]:
+    """Return precision (k, k) and root (k, j) of the track's prior among all columns, and the columns' own values (k,)."""
+    point, n = fitted.point, fitted.point.theta.size
+    k = n + point.tracks.numbers.size
+    precision, at = np.zeros((k, k)), np.zeros(k)
+    if not point.tracks.splines:
+        return precision, None, at
+    L = point.tracks.root(point.roughness if point.roughness.amplitude else replace(point.roughness, amplitude=1e-9))
+    inverse = np.linalg.inv(L)
+    precision[n:, n:], at[n:] = inverse.T @ inverse, point.tracks.numbers
+    return precision, np.vstack([np.zeros((n, L.shape[1])), L]), at
+
+
+def read_atlas(atlas: Atlas, M: Sequence[Array], null: Array, forcing: Mapping[str, float]) -> Location:
+    """Return what stands out of projected residuals M (n,) by run; `forcing` is the modulation's frequency (Hz) by run."""
+    rows = atlas.rows(M, null)
+    excess = {p.name: float(m @ m - spare.sum()) for p, m, spare in zip(atlas.pieces, M, atlas.spare, strict=True)}
+    whole = sum(max(e, 0.0) for e in excess.values())
+    runs = []
+    for piece, m, spare in zip(atlas.pieces, M, atlas.spare, strict=True):
+        own = [r for r in rows if r.run == piece.name and r.axis in (*OWN, "frequency")]
+        best = min(own, key=lambda r: r.log_p)
+        if best.p_value < LEVEL:
+            share = max(excess[piece.name], 0.0) / whole if whole > 0 else 0.0
+            runs.append(RunPlace(piece.name, share, _windows(piece, m, spare, own), best.p_value))
+    return Location(
+        tuple(sorted(runs, key=lambda r: (-r.share, r.p_value))),
+        _phase([r for r in rows if r.axis == "forcing" and r.kind == "mean"]),
+        _lines(rows, atlas, forcing),
+        _coordinate(rows, atlas, M),
+        min(r.p_value for r in rows),
+        _kept(rows),
+    )
+
+
+def _windows(piece: Piece, m: Array, spare: Array, rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
+    """Return the shortest stretches that hold most of a run's excess; the slow shapes that stand out where power does not."""
+    powerful = [r for r in rows if r.kind == "power" and r.p_value < LEVEL]
+    if powerful:
+        return _dense(piece, m, spare)
+    found: list[tuple[float, float]] = []
+    slow = [r for r in rows if r.axis in OWN and r.kind == "shape" and r.p_value < LEVEL]
+    for row in sorted(slow, key=lambda r: r.log_p):
+        if all(row.high < a or row.low > b for a, b in found):
+            found.append((row.low, row.high))
+    return tuple(sorted(found[:MOST]))
+
+
+def _dense(piece: Piece, m: Array, spare: Array) -> tuple[tuple[float, float], ...]:
+    edges = np.linspace(0, m.size, min(RUN_CELLS, max(m.size // 16, 1)) + 1).astype(int)
+    power = np.minimum(m**2, LARGE**2)  # a lost cycle is a misfit as any other
+    excess = np.array([float(np.sum(power[a:b] - spare[a:b])) for a, b in pairwise(edges.tolist())])
+    order = np.argsort(-excess)
+    reached = np.cumsum(excess[order])
+    count = int(np.searchsorted(reached, HELD * reached.max())) + 1
+    taken = np.zeros(excess.size, dtype=bool)
+    taken[order[:count]] = True
+    closed = taken.copy()
+    closed[1:-1] |= taken[:-2] & taken[2:]  # a single cell between two that count is no gap
+    steps = np.diff(np.concatenate([[0], closed.astype(int), [0]]))
+    spans = list(zip(np.nonzero(steps > 0)[0].tolist(), np.nonzero(steps < 0)[0].tolist(), strict=True))
+    best = sorted(spans, key=lambda s: -float(excess[s[0] : s[1]].sum()))[:MOST]
+    return tuple(sorted((float(piece.t[edges[a]]), float(piece.t[edges[b] - 1])) for a, b in best))
+
+
+def _phase(rows: Sequence[Row]) -> tuple[float, float] | None:
+    """Return the stretch of the forcing's period, in rad, whose bins stand out with one sign, about the strongest."""
+    if not rows or min(r.p_value for r in rows) >= LEVEL:
+        return None
+    z = [r.z or 0.0 for r in rows]
+    top = int(np.argmax(np.abs(z)))
+
+    def alike(i: int) -> bool:
+        row = rows[i % len(rows)]
+        return row.p_value < LEVEL and (row.z or 0.0) * z[top] > 0 and abs(row.z or 0.0) > 0.5 * abs(z[top])
+
+    first = last = top
+    while last - first < len(rows) - 1 and alike(first - 1):
+        first -= 1
+    while last - first < len(rows) - 1 and alike(last + 1):
+        last += 1
+    if last - first >= len(rows) - 2:
+        return None  # it is everywhere
+    turn = 2 * np.pi
+    low = rows[first % len(rows)].low * turn
+    high = rows[last % len(rows)].high * turn
+    return (low, high if high > low else high + turn)
+
+
+def _lines(rows: Sequence[Row], atlas: Atlas, forcing: Mapping[str, float]) -> tuple[float, ...]:
+    """Return the frequencies of narrow peaks: the forcing's harmonics, where no other is nearer, then others, strongest first."""
+    peaks: list[tuple[bool, float, float, float]] = []  # harmonic or not, statistic, frequency, width
+    for piece in atlas.pieces:
+        own = [r for r in rows if r.run == piece.name and r.kind == "line"]
+        S = np.array([r.statistic for r in own])
+        base = forcing.get(piece.name)
+        for i, row in enumerate(own):
+            if i < 3 or row.p_value >= LEVEL or not _peaked(S, i):
+                continue
+            f, width = 0.5 * (row.low + row.high), row.high - row.low
+            order = round(f / base) if base else 0
+            harmonic = bool(base and order > 0 and abs(f - base * order) <= 1.5 * width)
+            peaks.append((harmonic, float(S[i]), base * order if base and harmonic else f, width))
+    strongest = max((strength for _, strength, _, _ in peaks), default=0.0)
+    found: list[tuple[float, float]] = []
+    for harmonic, strength, f, width in sorted(peaks, reverse=True):
+        seen = harmonic or strength >= FAINT * strongest
+        if seen and all(abs(f - g) > 1.5 * max(width, w) for g, w in found):
+            found.append((f, width))
+    return tuple(f for f, _ in found[:MOST])
+
+
+def _peaked(S: Array, i: int) -> bool:
+    """Return whether a line stands above all beside it, and clearly above what is a little further away."""
+    beside = np.concatenate([S[max(i - BESIDE, 0) : max(i - 2, 0)], S[i + 3 : i + BESIDE + 1]])
+    return bool(S[i] >= S[max(i - 3, 0) : i + 4].max() and S[i] >= PROMINENT * np.median(beside))
+
+
+def _coordinate(rows: Sequence[Row], atlas: Atlas, M: Sequence[Array]) -> tuple[str, float] | None:
+    """Return the quantity a smooth function of which explains most of the excess misfit, with that share."""
+    smooth = [r for r in rows if r.run == "" and r.kind == "shape" and r.p_value < LEVEL]
+    left = sum(float(m @ m) for m in M) - sum(float(s.sum()) for s in atlas.spare)
+    if not smooth or left <= 0:
+        return None
+    best = max(smooth, key=lambda r: r.statistic - r.freedom)
+    return best.axis, float(np.clip((best.statistic - best.freedom) / left, 0.0, 1.0))
+
+
+def _kept(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Return the atlas without the lines of the spectra in which nothing is."""
+    return tuple(r for r in rows if r.kind != "line" or r.p_value < LEVEL)
+
+
+# A fit's runs as pieces of an atlas: residuals and columns, whitened, with what their samples can be sorted by.
+
+LOST, LEAST = 0.3, 30.0  # of the record's standard deviation, and at least so many of the noise's: a cycle is lost
+
+
+def pieces_of(fitted: LatentFit, noise: Mapping[str, Noise]) -> list[Piece]:
+    """Return each fitted run's residual and columns, whitened, with what its samples can be sorted by."""
+    problem, point = fitted.problem, fitted.point
+    n = point.theta.size
+    scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
+    found = []
+    for run in problem.runs:
+        p = point.predictions[run.name]
+        difference = run.observed - p.y
+        good = run.used & np.isfinite(difference) & np.isfinite(p.J).all(axis=1)
+        spans = stretches(run.t, good)
+        index = np.concatenate([np.arange(a, b) for a, b in spans]) if spans else np.zeros(0, dtype=int)
+        ends = np.cumsum([0, *(b - a for a, b in spans)]).tolist()
+        J = p.J.copy()
+        J[:, :n] *= scale
+        white = whiten(noise[run.name], np.column_stack([difference, J]), spans)
+        track = point.tracks.columns(run) if run.name in point.tracks.of else range(0)
+        places = np.array([*range(n), *(n + i for i in track)], dtype=int)
+        sorted_by = {name: x[index] for name, x in _coordinates(fitted, run, p).items()}
+        forcing, cycle = _forcing(run), _cycle(run)
+        parts = tuple(pairwise(ends))
+        columns = (white[:, 0], white[:, 1:], places, noise[run.name], parts)
+        known = {k: x for k, x in sorted_by.items() if np.isfinite(x).all()}
+        forcing, cycle = (None if x is None else x[index] for x in (forcing, cycle))
+        slips = LOST * float(np.std(run.observed[run.used])) / noise[run.name].innovation
+        lost = np.inf if cycle is None else max(slips, LEAST)  # steady sliding has no cycle to lose
+        found.append(Piece(run.name, run.t[index], *columns, known, forcing, cycle, lost))
+    return found
+
+
+def _coordinates(fitted: LatentFit, run: Run, p: Prediction) -> dict[str, Array]:
+    """Return the quantities that the misfit may go with, each (n,), as the fit has them."""
+    model = fitted.problem.model
+    W, W_dot = run.load(run.t)
+    found = {"W": W, "dlnW/dt": W_dot / W, "time": run.t}
+    for state, name in (("ln_v", "v"), ("ln_phi", "phi")):
+        if state in model.states:
+            found[name] = p.x[:, model.states.index(state)]  # their logarithms: it is the same order
+    V = run.drive(run.t)
+    moved = np.concatenate([[0.0], np.cumsum(0.5 * (V[1:] + V[:-1]) * np.diff(run.t))])
+    u = p.y * {"elongation": 1.0, "force": 1 / run.stiffness, "friction": W / run.stiffness}[run.observable]
+    found["position"] = run.start + moved - (u - u[0])
+    return found
+
+
+def _forcing(run: Run) -> Array | None:
+    """Return the phase of the load's modulation, from 0 to 1, while it is on."""
+    m = of_run(run)
+    if not m["modulated"]:
+        return None
+    phase = np.mod(m["f"] * run.t + m["psi"] / (2 * np.pi), 1.0)
+    return np.where(run.t > m["onset0"] + m["rise0"], phase, np.nan)
+
+
+def _cycle(run: Run) -> Array | None:
+    """Return the phase of stick-slip, 0 at one event and 1 at the next, between recorded events."""
+    m = of_run(run)
+    events = stick_slip(run.t, run.observed, ripple=m["f"] if m["modulated"] else None).times
+    if events.size < EVENTS:
+        return None
+    phase = np.interp(run.t, events, np.arange(events.size, dtype=float), left=np.nan, right=np.nan)
+    return np.asarray(np.mod(phase, 1.0))
+
+
+# A model's parameters where they are not bent by what the model misses.
+
+WIDTH = 3.0  # standard deviations of the noise beyond which a sample counts less and less
+ROUNDS, SHARES, SOLVES = 4, (1.0, 0.3, 0.1), 12
+CELL, CALM = 64, 4.0  # samples of a cell, and standard deviations of its power up to which it is in order
+CLEAN = 0.1  # share of the recordings that a better model's parameters must leave in order to be taken
+
+
+def unbent(fitted: LatentFit, noise: Mapping[str, Noise], last: LatentFit | None) -> LatentFit:
+    """Return a fit with straightened parameters, its track as it was; `last` is a fit of a model that has what this one misses.
+
+    The better model's parameters are taken where they leave a tenth of the recordings in order, else the most orderly ones.
+    """
+    latent, theta = Latent(fitted.problem), fitted.point.theta
+
+    def at(values: Array) -> LatentFit:
+        point = fitted.point
+        return replace(fitted, point=latent.at(values, point.tracks, noise, point.roughness))
+
+    starts = [fitted]
+    if last is not None:
+        known = last.values
+        moved = np.array([known.get(n, v) for n, v in zip(fitted.problem.names, theta.tolist(), strict=True)])
+        other = at(np.clip(moved, fitted.problem.lower, fitted.problem.upper))
+        if in_order(pieces_of(other, noise)) >= CLEAN:
+            return other
+        starts.append(other)
+    return min((_orderly(latent, start, noise) for start in starts), key=lambda f: _cost(f, noise))
+
+
+def in_order(pieces: Sequence[Piece]) -> float:
+    """Return the share of all cells in which there is no more than noise."""
+    fine = []
+    for p in pieces:
+        for part in np.array_split(p.white, max(p.white.size // CELL, 1)):
+            fine.append(float(part @ part) < part.size + CALM * np.sqrt(2 * part.size))
+    return float(np.mean(fine)) if fine else 0.0
+
+
+def _cost(fitted: LatentFit, noise: Mapping[str, Noise]) -> float:
+    """Return minus the log of the Cauchy likelihood; a sample that is not predicted counts as one far off."""
+    total = 0.0
+    sizes = {r.name: int(r.used.sum()) for r in fitted.problem.runs}
+    for p in pieces_of(fitted, noise):
+        total += float(np.sum(np.log1p((p.white / WIDTH) ** 2))) + (sizes[p.name] - p.white.size) * np.log1p(1e8)
+    return total
+
+
+def _orderly(latent: Latent, fitted: LatentFit, noise: Mapping[str, Noise]) -> LatentFit:
+    """Return the fit after steps in the parameters that lower the Cauchy cost."""
+    problem, best, cost = fitted.problem, fitted, _cost(fitted, noise)
+    for _ in range(ROUNDS):
+        step, before = _step(pieces_of(best, noise), best.point.theta.size) * latent.scale, cost
+        for share in SHARES:
+            theta = np.clip(best.point.theta + share * step, problem.lower, problem.upper)
+            point: Point = latent.at(theta, best.point.tracks, noise, best.point.roughness)
+            trial = replace(best, point=point)
+            found = _cost(trial, noise)
+            if found < cost:
+                best, cost = trial, found
+                break
+        if before - cost < 1e-3 * before:
+            break
+    return best
+
+
+def _step(pieces: Sequence[Piece], n: int) -> Array:
+    """Return the change of the scaled parameters (n,) that minimises the Cauchy cost of the linearised residuals."""
+    r = np.concatenate([p.white for p in pieces])
+    X = np.concatenate([p.X[:, :n] for p in pieces])
+    step = np.zeros(n)
+    for _ in range(SOLVES):
+        w = 1 / (1 + ((r - X @ step) / WIDTH) ** 2)
+        A = X.T @ (X * w[:, None])
+        d = np.sqrt(np.maximum(np.diag(A), 1e-300))
+        step = np.linalg.lstsq(A / np.outer(d, d), (X.T @ (w * r)) / d, rcond=1e-12)[0] / d
+    return np.asarray(step)
+
+
+# Local statistics of a residual, all under one null: windows, bins, lines and smooth functions that may stand out.
+
+WAVES, SHORTEST, HALVINGS = 4, 24, 5  # cosines over a window, samples of the shortest, how often a run is halved
+BINS = 12
+NUMBERS_AT_ONCE = 4_000_000  # numbers of simulated residuals held at a time
+OFF = 1.08  # factor by which a run's own noise level may differ from the assumed variance and count as noise
+ABSORBED = 1e-4  # share of a column's squares below which what is left of it is rounding
+LINES = 64  # samples from which a spectrum is looked at
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One run: whitened residual (n,) and columns X (n, k) at `places` among all, what its samples can be sorted by.
+
+    `parts` are its evenly sampled stretches [a, b); `coordinates`, `forcing` and `cycle` (phases from 0 to 1, NaN where there is
+    none) have n values each. `lost` is the residual beyond which the run is no longer followed.
+    """
+
+    name: str
+    t: Array
+    white: Array
+    X: Array = field(repr=False)
+    places: Array
+    noise: Noise
+    parts: tuple[tuple[int, int], ...]
+    coordinates: Mapping[str, Array] = field(default_factory=dict, repr=False)
+    forcing: Array | None = field(default=None, repr=False)
+    cycle: Array | None = field(default=None, repr=False)
+    lost: float = np.inf
+
+    def followed(self) -> Piece:
+        """Return the run up to where the residual first exceeds `lost`; at least a few samples."""
+        far = np.abs(self.white) > self.lost
+        n = max(int(np.argmax(far)) if far.any() else far.size, min(SHORTEST, far.size))
+        parts = tuple((a, min(b, n)) for a, b in self.parts if a < n)
+        sorted_by = {k: x[:n] for k, x in self.coordinates.items()}
+        forcing, cycle = (None if x is None else x[:n] for x in (self.forcing, self.cycle))
+        return replace(
+            self, t=self.t[:n], white=self.white[:n], X=self.X[:n], parts=parts, coordinates=sorted_by, forcing=forcing,
+            cycle=cycle,
+        )  # fmt: skip
+
+    def whitened(self, columns: Array) -> Array:
+        """Return columns (n, q) filtered as the residual is."""
+        return whiten(self.noise, columns, list(self.parts))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One place of the atlas: `statistic` with its degrees of `freedom`, the signed `z` of a single column, and p-values.
+
+    `axis` is what samples were sorted by, `run` a name or nothing for all together, [low, high] the place; `kind` is mean, power,
+    shape or line. `p_value` is adjusted for all that was looked at, `log_p` is the natural logarithm of the unadjusted one.
+    """
+
+    axis: str
+    run: str
+    kind: str
+    low: float
+    high: float
+    statistic: float
+    freedom: float
+    z: float | None
+    log_p: float
+    p_value: float
+
+    def described(self) -> dict[str, object]:
+        """Return the row as plain data."""
+        return {k: getattr(self, k) for k in self.__dataclass_fields__}
+
+
+@dataclass(frozen=True)
+class _Item:
+    """Statistics of one kind over the same samples: columns of B in `groups`, one statistic each, or sums of squares over H."""
+
+    axis: str
+    run: str
+    kind: str
+    spans: tuple[tuple[float, float], ...]
+    parts: tuple[tuple[int, slice, Array], ...]
+    groups: tuple[tuple[int, int], ...] = ()
+    roots: tuple[Array, ...] = ()
+    freedom: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def log_tail(x: Array, freedom: Array | float) -> Array:
+    """Return ln P(chi-squared > x), also where the probability itself would vanish."""
+    x, half = np.asarray(x, dtype=float), np.asarray(freedom, dtype=float) / 2
+    with np.errstate(divide="ignore"):
+        near = np.log(gammaincc(half, x / 2))
+    if np.isfinite(near).all():
+        return np.asarray(near)
+    with np.errstate(all="ignore"):
+        far = (half - 1) * np.log(x / 2) - x / 2 - gammaln(half) - np.log1p(-np.minimum((2 * half - 2) / x, 0.9))
+    return np.where(np.isfinite(near), near, np.minimum(far, 0.0))
+
+
+class Atlas:
+    """All places of some runs, and the projection that goes with them."""
+
+    def __init__(
+        self, pieces: Sequence[Piece], precision: Array, *, root: Array | None = None, kept: bool = False
+    ) -> None:
+        """Take runs, the prior precision (k, k) of the columns and, of a track that is drawn in simulations, its root (k, j).
+
+        Where residuals are `kept` as they are, as their parameters come from elsewhere, nothing is projected; what is then
+        uncertain of the parameters counts as noise.
+        """
+        self.pieces, self.root, self.precision, self.kept = tuple(pieces), root, precision, kept
+        k = precision.shape[0]
+        A = precision.copy()
+        for p in self.pieces:
+            A[np.ix_(p.places, p.places)] += p.X.T @ p.X
+        d = np.sqrt(np.maximum(np.diag(A), 1e-300))
+        self.inverse = (np.linalg.pinv(A / np.outer(d, d), rcond=1e-13, hermitian=True) / np.outer(d, d)) if k else A
+        if kept:
+            values, vectors = np.linalg.eigh(self.inverse)
+            self.root = vectors * np.sqrt(np.maximum(values, 0.0))
+            self.inverse = -self.inverse
+        self.spare = [1 - np.einsum("ij,jk,ik->i", p.X, self._block(p, p), p.X, optimize=True) for p in self.pieces]
+        self.spectra = [self._spectrum(i) for i in range(len(self.pieces))]
+        self.items = [*self._windows(), *self._bins()]
+        self.count = sum(i.freedom.size for i in self.items) + sum(s[1].size for s in self.spectra)
+
+    def _block(self, a: Piece, b: Piece) -> Array:
+        return np.asarray(self.inverse[np.ix_(a.places, b.places)])
+
+    def projected(self, residuals: Sequence[Array], *, at: Array | None = None) -> list[Array]:
+        """Return M r by run, r (n,) or (n, d); `at` (k,) are the values at which the residuals' own prior is centred."""
+        if self.kept:
+            return [self._levelled(r) for r in residuals]
+        b = -(self.precision @ at) if at is not None else np.zeros(self.precision.shape[0])
+        b = np.repeat(b[:, None], residuals[0].shape[1], axis=1) if residuals[0].ndim > 1 else b
+        for p, r in zip(self.pieces, residuals, strict=True):
+            b[p.places] += p.X.T @ r
+        step = self.inverse @ b
+        return [self._levelled(r - p.X @ step[p.places]) for p, r in zip(self.pieces, residuals, strict=True)]
+
+    @staticmethod
+    def _levelled(r: Array) -> Array:
+        """Return a residual over its own noise level, as far as that may differ from what was assumed."""
+        level = np.median(r**2, axis=0) / 0.4549
+        return np.asarray(r / np.sqrt(np.clip(level, 1 / OFF, OFF)))
+
+    def null(self, draws: int, *, seed: int) -> Array:
+        """Return the smallest ln p of each of `draws` simulated recordings (draws,), sorted."""
+        rng = np.random.default_rng(seed)
+        found: list[float] = []
+        size = sum(p.white.size for p in self.pieces)
+        at_once = int(np.clip(NUMBERS_AT_ONCE // max(size, 1), 1, draws))
+        while len(found) < draws:
+            d = min(at_once, draws - len(found))
+            noise = [rng.standard_normal((p.white.size, d)) for p in self.pieces]
+            if self.root is not None:
+                track = self.root @ rng.standard_normal((self.root.shape[1], d))
+                noise = [e + p.X @ track[p.places] for p, e in zip(self.pieces, noise, strict=True)]
+            M = self.projected(noise)
+            smallest = np.zeros(d)
+            for _, _, _, log_p in self._evaluated(M):
+                smallest = np.minimum(smallest, log_p.min(axis=0))
+            found += smallest.tolist()
+        return np.sort(np.array(found))
+
+    def rows(self, M: Sequence[Array], null: Array) -> list[Row]:
+        """Return every place of projected residuals M (n,) by run, with p-values adjusted by `null` for all of them."""
+        found = []
+        for item, statistic, z, log_p in self._evaluated([m[:, None] for m in M]):
+            adjusted = self.adjusted(log_p[:, 0], null)
+            for k, (low, high) in enumerate(item.spans):
+                own_z = None if z is None else float(z[k, 0])
+                found.append(
+                    Row(item.axis, item.run, item.kind, low, high, float(statistic[k, 0]), float(item.freedom[k]), own_z,
+                        float(log_p[k, 0]), float(adjusted[k]))
+                )  # fmt: skip
+        return found
+
+    def adjusted(self, log_p: Array, null: Array) -> Array:
+        """Return p-values for all places together: as often as simulations have it, beyond them by Bonferroni's bound."""
+        below = np.searchsorted(null, log_p, side="right")
+        simulated = (below + 1) / (null.size + 1)
+        bound = np.exp(np.maximum(log_p, -690.0)) * self.count
+        return np.where(below > 0, simulated, np.minimum(simulated, bound))
+
+    def _evaluated(self, M: Sequence[Array]) -> Iterator[tuple[_Item, Array, Array | None, Array]]:
+        """Yield (item, statistic (m, d), signed z or None, ln p (m, d)) of projected residuals (n, d) by run."""
+        for item in self.items:
+            if item.kind == "power":
+                S = np.sum([B.T @ M[i][s] ** 2 for i, s, B in item.parts], axis=0)
+                yield item, S, None, log_tail(S, item.freedom[:, None])
+                continue
+            U = np.sum([B.T @ M[i][s] for i, s, B in item.parts], axis=0)
+            rows, signs = [], []
+            for (a, b), root in zip(item.groups, item.roots, strict=True):
+                z = root @ U[a:b]
+                rows.append((z**2).sum(axis=0))
+                signs.append(z[0])
+            S = np.array(rows)
+            single = all(b - a == 1 for a, b in item.groups)
+            yield item, S, np.array(signs) if single else None, log_tail(S, item.freedom[:, None])
+        for i, (item, f, whole, (cc, cs, ss)) in enumerate(self.spectra):
+            if f.size:
+                F = np.fft.rfft(M[i][whole] * _taper(whole.stop - whole.start), axis=0)[1 : f.size + 1]
+                c, s = F.real, -F.imag
+                S = (ss[:, None] * c**2 - 2 * cs[:, None] * c * s + cc[:, None] * s**2) / (cc * ss - cs**2)[:, None]
+                yield item, S, None, -0.5 * S
+
+    def _spectrum(self, i: int) -> tuple[_Item, Array, slice, tuple[Array, Array, Array]]:
+        """Return the lines of a run's longest even stretch: frequencies (m,) and the elements of B'M B for cosine and sine."""
+        p = self.pieces[i]
+        a, b = max(p.parts, key=lambda q: q[1] - q[0], default=(0, 0))
+        n, none = b - a, np.zeros(0)
+        if n < LINES:
+            return _Item("frequency", p.name, "line", (), ()), none, slice(0, 0), (none, none, none)
+        step = float(np.median(np.diff(p.t[a:b])))
+        m = (n - 1) // 2
+        f = np.arange(1, m + 1) / (n * step)
+        F = np.fft.rfft(p.X[a:b] * _taper(n), axis=0)[1 : m + 1]
+        c, s, block = F.real, -F.imag, self._block(p, p)
+        cc, cs, ss = (np.einsum("ij,ij->i", x @ block, y) for x, y in ((c, c), (c, s), (s, s)))
+        half = 0.5 / (n * step)
+        item = _Item(
+            "frequency", p.name, "line", tuple((x - half, x + half) for x in f.tolist()), (), freedom=np.full(m, 2.0)
+        )
+        floor = 1e-3 * n  # a line that parameters absorb altogether has no statistic
+        return item, f, slice(a, b), (np.maximum(n / 2 - cc, floor), -cs, np.maximum(n / 2 - ss, floor))
+
+    def _windows(self) -> list[_Item]:
+        """Return windows of each run: the whole, halves and so on, half overlapping; slow shapes in them, and power."""
+        found = []
+        for i, p in enumerate(self.pieces):
+            n = p.white.size
+            for halving in range(HALVINGS + 1):
+                length = n >> halving
+                if length < (SHORTEST if halving else 1):
+                    break
+                starts = np.unique(np.linspace(0, n - length, 2 ** (halving + 1) - 1).astype(int))
+                for a in starts.tolist():
+                    where, span = slice(a, a + length), ((float(p.t[a]), float(p.t[a + length - 1])),)
+                    waves = np.cos(np.pi * np.outer((np.arange(length) + 0.5) / length, np.arange(min(WAVES, length))))
+                    axis = "window" if halving else "run"
+                    found.append(self._linear(axis, p.name, "shape", span, [(i, where, waves)], [(0, waves.shape[1])]))
+                    found.append(self._power(axis, p.name, span, [(i, where, np.ones((length, 1)))]))
+        return found
+
+    def _bins(self) -> list[_Item]:
+        found = []
+        for axis in ("forcing", "cycle"):
+            have = [(i, x) for i, p in enumerate(self.pieces) if (x := getattr(p, axis)) is not None]
+            sets = [have] if axis == "forcing" else [[one] for one in have]  # each run has a cycle of its own
+            for chosen in sets:
+                if chosen and any(np.isfinite(x).any() for _, x in chosen):
+                    name = self.pieces[chosen[0][0]].name if axis == "cycle" else ""
+                    found += self._binned(axis, name, chosen, np.linspace(0.0, 1.0, BINS + 1))
+        names = dict.fromkeys(name for p in self.pieces for name in p.coordinates)
+        for name in names:
+            chosen = [(i, p.coordinates[name]) for i, p in enumerate(self.pieces) if name in p.coordinates]
+            every = np.concatenate([x for _, x in chosen])
+            edges = np.unique(np.quantile(every, np.linspace(0.0, 1.0, BINS + 1)))
+            edges = edges[np.concatenate([[True], np.diff(edges) > 1e-9 * max(float(np.ptp(every)), 1e-300)])]
+            if edges.size > 2:
+                found += [*self._binned(name, "", chosen, edges), self._smooth(name, chosen, edges)]
+        return found
+
+    def _binned(self, axis: str, run: str, chosen: Sequence[tuple[int, Array]], edges: Array) -> list[_Item]:
+        """Return mean and power in the bins between `edges`, over all chosen runs together."""
+        m = edges.size - 1
+        parts = []
+        for i, x in chosen:
+            bin_of = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, m - 1)
+            parts.append((i, slice(None), (bin_of[:, None] == np.arange(m)) & np.isfinite(x)[:, None]))
+        filled = np.nonzero(sum(H.sum(axis=0) for _, _, H in parts) >= 8)[0]
+        spans = tuple((float(edges[k]), float(edges[k + 1])) for k in filled)
+        if not spans:
+            return []
+        parts = [(i, s, H[:, filled].astype(float)) for i, s, H in parts]
+        singles = [(k, k + 1) for k in range(len(spans))]
+        means = parts
+        if axis in ("forcing", "cycle"):  # what is the same at every phase has nothing to do with it
+            means = [(i, s, H - H.mean(axis=0) * (H.sum(axis=1, keepdims=True) > 0) * (H.shape[0] / max(H.sum(), 1.0)))
+                     for i, s, H in parts]  # fmt: skip
+        return [self._linear(axis, run, "mean", spans, means, singles), self._power(axis, run, spans, parts)]
+
+    def _smooth(self, axis: str, chosen: Sequence[tuple[int, Array]], knots: Array) -> _Item:
+        """Return the one statistic of any function that is linear between `knots`."""
+        eye = np.eye(knots.size)
+        parts = [(i, slice(None), np.column_stack([np.interp(x, knots, row) for row in eye])) for i, x in chosen]
+        return self._linear(axis, "", "shape", ((float(knots[0]), float(knots[-1])),), parts, [(0, knots.size)])
+
+    def _linear(self, axis: str, run: str, kind: str, spans: tuple[tuple[float, float], ...],
+                parts: Sequence[tuple[int, slice, Array]], groups: Sequence[tuple[int, int]]) -> _Item:  # fmt: skip
+        """Return the statistics of groups of columns, with the roots of (B'M B)^-1."""
+        q, k = parts[0][2].shape[1], self.precision.shape[0]
+        white, C, G = [], np.zeros((q, k)), np.zeros((q, q))
+        for i, s, B in parts:
+            p = self.pieces[i]
+            full = np.zeros((p.white.size, B.shape[1]))
+            full[s] = B
+            B = p.whitened(full)[s] if p.noise.order or p.noise.pieces else B / p.noise.innovation
+            white.append((i, s, B))
+            C[:, p.places] += B.T @ p.X[s]
+            G += B.T @ B
+        scale = np.sqrt(np.maximum(np.diag(G), 1e-300))  # before parameters and track absorb what they can
+        G = (G - C @ self.inverse @ C.T) / np.outer(scale, scale)
+        roots = [_inverse_root(G[a:b, a:b], scale[a:b]) for a, b in groups]
+        ranks = np.array([rank for _, rank in roots], dtype=float)
+        return _Item(axis, run, kind, spans, tuple(white), tuple(groups), tuple(root for root, _ in roots), ranks)
+
+    def _power(
+        self, axis: str, run: str, spans: tuple[tuple[float, float], ...], parts: Sequence[tuple[int, slice, Array]]
+    ) -> _Item:
+        freedom = sum(B.T @ self.spare[i][s] for i, s, B in parts)
+        return _Item(axis, run, "power", spans, tuple(parts), freedom=np.maximum(np.asarray(freedom), 1e-6))
+
+
+def _taper(n: int) -> Array:
+    """Return Hann's window (n, 1), of mean square 1: a slow misfit is not to leak over the lines of the forcing."""
+    return np.asarray(np.sqrt(8 / 3) * np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2)[:, None]
+
+
+def _inverse_root(G: Array, scale: Array) -> tuple[Array, int]:
+    """Return R with R'R the pseudo-inverse of G * scale * scale, and its rank; directions that are absorbed do not count."""
+    values, vectors = np.linalg.eigh(G)
+    good = values > ABSORBED
+    root = np.where(good, 1 / np.sqrt(np.maximum(values, ABSORBED)), 0.0)[:, None] * vectors.T / scale
+    return np.asarray(root * (np.sign(root[0, 0]) or 1.0) if G.shape[0] == 1 else root), max(int(good.sum()), 1)

@@ -1,0 +1,447 @@
+"""What each effect could still explain beyond a state-space fit, at first order: Rao's score test by the filter's derivatives.
+
+Each effect has a column, the derivative of the standardised innovations and of their variances by its size at the neutral value.
+Projected off those of everything that was fitted, parameters, field and gauge noise, it gives the gain in log likelihood that a
+refit should bring and the size to expect. Effects that are functions of slip, time or stage position, of which many inner values
+are tried, are carried through the filter's own transitions instead.
+Rao 1948; de Jong and Penzer, JASA 93 (1998).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from srfcli.codegen.model import Array, GeneratedModel, open_model
+from srfcli.core.errors import SrfError
+from srfcli.core.units import split_quantity, to_base
+from srfcli.data.values import Experiment, Run
+from srfcli.diagnosis.hypotheses import Excluded, inner_grid, neutral_values, own_parameters
+from srfcli.diagnosis.sensitivities import Shape, along_table
+from srfcli.inference.recordings import slip_along
+from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns, filter_run
+from srfcli.laws.registry import Registry
+from srfcli.laws.values import Effect
+
+NODES, MOST_NODES = 0.4, 400  # of a shared field: correlation lengths between them; how many
+FINE = 20  # points between samples at which a function of slip or stage is averaged
+
+
+@dataclass(frozen=True)
+class Score:
+    """One effect's score: `gain` in log likelihood at first order, the `values` expected of its parameters there.
+
+    `size` and `stderr` are those of its first parameter, `detectable` the size that would gain 12 in log likelihood, `surviving`
+    the share of the effect's squared signal that what was fitted cannot absorb.
+    """
+
+    effect: Effect
+    gain: float
+    values: dict[str, float]
+    size: float
+    stderr: float
+    detectable: float
+    surviving: float
+    direction: Array = field(repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class PairScore:
+    """What two effects could explain together at first order, and the values expected of their parameters."""
+
+    effects: tuple[Effect, Effect]
+    gain: float
+    values: tuple[dict[str, float], dict[str, float]]
+
+
+@dataclass(frozen=True)
+class _Column:
+    """Columns (2 m, q) of an effect by the size called `name`, at given inner values; names are the effect's own."""
+
+    effect: Effect
+    name: str
+    inner: dict[str, float]
+    columns: Array
+
+
+@dataclass(frozen=True)
+class SharedField:
+    """A random friction field that all runs share, at first order: `gain` in log marginal likelihood at its best `amplitude`.
+
+    In directions `u` (2 m, q) it absorbs the parts `absorbed` (q,) of what is left, `left` (q,).
+    """
+
+    u: Array = field(repr=False)
+    absorbed: Array = field(repr=False)
+    left: Array = field(repr=False)
+    gain: float
+    amplitude: float = 0.0
+
+
+class Remainder:
+    """What a fit leaves, `left` (2 m,): standardised innovations and their squares, projected off what was fitted.
+
+    `rest` (2 m,) is the same before that, `base` (2 m, p) are orthonormal directions of what was fitted.
+    """
+
+    def __init__(self, fitted: StateSpaceFit) -> None:
+        self.fitted, point = fitted, fitted.maximum.point
+        self.rest = np.concatenate([_stacked(f.white, (f.white**2 - 1) / np.sqrt(2)) for f in point.runs])
+        base = np.zeros((self.rest.size, len(fitted.likelihood.names)))
+        at = 0
+        for f in point.runs:
+            block = _stacked(*_whitened(f))
+            base[at : at + len(block), [fitted.likelihood.names.index(n) for n in f.names]] = block
+            at += len(block)
+        size = np.linalg.norm(base, axis=0)
+        base = base[:, size > 0] / size[size > 0]
+        u, s, _ = np.linalg.svd(base, full_matrices=False)
+        self.base = u[:, s > 1e-7 * s[0]]
+        self.left = self.free(self.rest)
+
+    def free(self, columns: Array) -> Array:
+        """Return columns (2 m, k) projected off what was fitted."""
+        return np.asarray(columns - self.base @ (self.base.T @ columns))
+
+    @cached_property
+    def runs(self) -> tuple[Filtered, ...]:
+        """Return the runs filtered once more, with what the smoother needs."""
+        return self.fitted.likelihood.at(self.fitted.maximum.point.x, slopes=False, keep=True).runs
+
+    @cached_property
+    def shared(self) -> SharedField:
+        """Return the field that all runs share, of the correlation length that each run's own has."""
+        if self.fitted.smooth or len(self.fitted.likelihood.problem.runs) < 2:
+            return SharedField(np.zeros((self.left.size, 0)), np.zeros(0), np.zeros(0), 0.0)
+        values, states = self.fitted.values, self.fitted.likelihood.problem.model.states
+        slips = [slip_along(f.run, f.found.kept.mean, states) for f in self.runs if f.found.kept]
+        first, last = min(s.min() for s in slips), max(s.max() for s in slips)
+        count = int(np.clip(np.ceil((last - first) / (NODES * values["field_length"])) + 1, 2, MOST_NODES))
+        nodes = np.linspace(first, last, count)
+        r = np.sqrt(3) * np.abs(nodes[:, None] - nodes) / values["field_length"]
+        root = np.linalg.cholesky((1 + r) * np.exp(-r) + 1e-9 * np.eye(count))
+        hat = Shape("slip", lambda s, k: np.interp(s, nodes, np.arange(count) == k), ("node",))
+        columns = np.concatenate([_carried(f, self.fitted, [(hat, [k]) for k in range(count)]) for f in self.runs])
+        u, size, _ = np.linalg.svd(self.free(columns @ root), full_matrices=False)
+        left = u.T @ self.left
+        best = SharedField(u, np.zeros(count), left, 0.0)
+        for amplitude in values["field_amplitude"] * np.geomspace(0.01, 3.0, 30):
+            power = (amplitude * size) ** 2
+            gain = 0.5 * float(np.sum(left**2 * power / (1 + power) - np.log1p(power)))
+            if gain > best.gain:
+                best = SharedField(u, power / (1 + power), left, gain, float(amplitude))
+        return best
+
+
+class Scores:
+    """The scores around a fit, of a model that has the effects `present`; `excluded` are those that cannot join it."""
+
+    def __init__(
+        self,
+        registry: Registry,
+        experiment: Experiment,
+        remainder: Remainder,
+        present: Sequence[Effect],
+        candidates: Sequence[Effect],
+    ) -> None:
+        self.registry, self.experiment, self.present = registry, experiment, tuple(present)
+        self.remainder, self.fitted = remainder, remainder.fitted
+        self.excluded: list[Excluded] = []
+        self.shared = self.remainder.shared
+        self.columns = self._all(candidates)
+        self.singles = self._singles()
+
+    def _all(self, candidates: Sequence[Effect]) -> list[_Column]:
+        shapes = {e.name: shape for e in candidates if (shape := along_table(e)) is not None}
+        found: list[_Column] = []
+        regular = [e for e in candidates if e.sizes and not e.settings and not e.observed and e.name not in shapes]
+        found += self._plain([e for e in regular if not e.scans])
+        for effect in (e for e in regular if e.scans):
+            found += self._scanned(effect)
+        along = [e for e in candidates if e.name in shapes]
+        if along:
+            found += self._along(along, shapes)
+        found += [c for e in candidates if "K" in e.frees for c in self._freed(e)]
+        found += [_Column(e, e.sizes[0], {}, self._lagging()) for e in candidates if e.observed]
+        return found
+
+    def _model(self, added: Sequence[Effect]) -> GeneratedModel:
+        names = (e.name for e in (*self.present, *added))
+        return open_model(self.registry, **asdict(self.experiment.choice.plus(names)), random_field=True)
+
+    def _neutral(self, model: GeneratedModel, added: Sequence[Effect]) -> dict[str, float]:
+        values = dict(self.fitted.values)
+        for effect in self.present:  # names change where two effects have a parameter of the same name
+            for long, p in own_parameters(effect, model).items():
+                if long not in values and p.name in values:
+                    values[long] = values[p.name]
+        for effect in added:
+            neutral = neutral_values(effect)
+            for long, p in own_parameters(effect, model).items():
+                values[long] = neutral.get(p.name, to_base(p.default, p.unit))
+        return values
+
+    def _run_columns(self, model: GeneratedModel, values: Mapping[str, float], by: Sequence[str]) -> Array:
+        """Return the columns (2 m, k) by parameters of a larger model, at values where it is the fitted one."""
+        likelihood = self.fitted.likelihood
+
+        def block(run: Run) -> Array:
+            local = {own: values[n] for own, n in likelihood.gauge(run).items()}
+            found = filter_run(
+                model,
+                self.experiment,
+                run,
+                {**values, **local},
+                by=by,
+                trend=likelihood.problem.trend,
+                rtol=likelihood.rtol,
+            )
+            return _stacked(*_whitened(found))
+
+        return np.concatenate(likelihood.over_runs(block))
+
+    def _plain(self, effects: Sequence[Effect]) -> list[_Column]:
+        """Return the columns of effects without inner parameters, all from one model where they go together."""
+        if not effects:
+            return []
+        try:
+            model = self._model(effects)
+        except SrfError as error:
+            if len(effects) == 1:
+                self.excluded.append(Excluded(effects[0].reported, error.message))
+                return []
+            half = len(effects) // 2
+            return self._plain(effects[:half]) + self._plain(effects[half:])
+        sizes = [(e, long) for e in effects for long, p in own_parameters(e, model).items() if p.name in e.sizes]
+        columns = self._run_columns(model, self._neutral(model, effects), [long for _, long in sizes])
+        return [_Column(e, e.sizes[0], {}, columns[:, [j]]) for j, (e, _) in enumerate(sizes)]
+
+    def _scanned(self, effect: Effect) -> list[_Column]:
+        try:
+            model = self._model([effect])
+        except SrfError as error:
+            self.excluded.append(Excluded(effect.reported, error.message))
+            return []
+        longs = {p.name: long for long, p in own_parameters(effect, model).items()}
+        base, found = self._neutral(model, [effect]), []
+        for group in _phases(inner_grid(effect)):
+            parts = []
+            for inner in group:
+                values = base | {longs[n]: v for n, v in inner.items()}
+                parts.append(self._run_columns(model, values, [longs[effect.sizes[0]]]))
+            found.append(_Column(effect, effect.sizes[0], group[0], np.concatenate(parts, axis=1)))
+        return found
+
+    def _freed(self, effect: Effect) -> list[_Column]:
+        columns = self._run_columns(self.fitted.likelihood.problem.model, self.fitted.values, ["K"])
+        return [_Column(effect, "K", {}, columns)]
+
+    def _lagging(self) -> Array:
+        """Return the column of a gauge that follows late: of first order in the delay, it shows less by what u gained in it."""
+        blocks = [_carried(f, self.fitted, (), late=True) for f in self.remainder.runs]
+        return np.concatenate(blocks)
+
+    def _along(self, effects: Sequence[Effect], shapes: Mapping[str, Shape]) -> list[_Column]:
+        """Return the columns of effects that are functions of slip, time or stage position, for all inner values."""
+        wanted = [(e, group) for e in effects for group in _phases(inner_grid(e))]
+        blocks = []
+        for f in self.remainder.runs:
+            functions = [
+                (shapes[e.name], [inner.get(n, 0.0) for n in shapes[e.name].inner])
+                for e, group in wanted
+                for inner in group
+            ]
+            blocks.append(_carried(f, self.fitted, functions))
+        every = np.concatenate(blocks)
+        found, at = [], 0
+        for effect, group in wanted:
+            found.append(_Column(effect, effect.sizes[0], group[0], every[:, at : at + len(group)]))
+            at += len(group)
+        return found
+
+    def _judge(self, columns: Array) -> tuple[float, Array, Array, Array]:
+        """Return gain, sizes, their covariance and the free columns."""
+        free = self.remainder.free(columns)
+        gram, g = free.T @ free, free.T @ self.remainder.left
+        plain = self._solved(gram, g)
+        if not self.shared.gain:
+            return (*plain, free)
+        along = self.shared.u.T @ free
+        kept = along * self.shared.absorbed[:, None]
+        beside = self._solved(gram - along.T @ kept, g - kept.T @ self.shared.left)
+        gain = max(plain[0] - self.shared.gain, beside[0])
+        return (gain, *(beside if gain == beside[0] else plain)[1:], free)
+
+    def _solved(self, gram: Array, g: Array) -> tuple[float, Array, Array]:
+        d = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        values, vectors = np.linalg.eigh(gram / np.outer(d, d))
+        keep = values > 1e-9 * max(values[-1], 1e-300)
+        inverse = (vectors[:, keep] / values[keep]) @ vectors[:, keep].T / np.outer(d, d)
+        size = inverse @ g
+        return 0.5 * float(g @ size), size, inverse
+
+    def _singles(self) -> list[Score]:
+        best: dict[str, Score] = {}
+        for column in self.columns:
+            whole = float(np.sum(column.columns**2))
+            if not whole > 0 or not np.isfinite(whole):
+                continue  # it does nothing here
+            gain, size, covariance, free = self._judge(column.columns)
+            effect = column.effect
+            if not self._possible(column, size):
+                gain = 0.0
+            if effect.reported in best and best[effect.reported].gain >= gain:
+                continue
+            error = float(np.sqrt(max(covariance[0, 0], 0.0)))
+            values = self._expected(column, size)
+            direction = free @ size
+            norm = float(np.linalg.norm(direction))
+            best[effect.reported] = Score(
+                effect, gain, values, float(size[0]), error, error * np.sqrt(24.0), float(np.sum(free**2)) / whole,
+                direction / norm if norm > 0 else direction,
+            )  # fmt: skip
+        return sorted(best.values(), key=lambda s: -s.gain)
+
+    def _possible(self, column: _Column, size: Array) -> bool:
+        """Return whether the expected size lies on a side of the neutral value on which there is any."""
+        p = next((p for p in column.effect.parameters if p.name == column.name), None)
+        if p is None or size.size > 1:
+            return True
+        neutral = neutral_values(column.effect)[column.name]
+        low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
+        return not ((size[0] < 0 and neutral <= low) or (size[0] > 0 and neutral >= high))
+
+    def _expected(self, column: _Column, size: Array) -> dict[str, float]:
+        """Return what is expected of an effect's parameters, within their bounds; two phases are one amplitude and its phase."""
+        effect, inner = column.effect, dict(column.inner)
+        if "K" in effect.frees:
+            stated = self.fitted.likelihood.problem.experiment
+            value, unit = split_quantity(stated.stiffness_text, name="stiffness")
+            K = to_base(value, unit)
+            return {"K": float(np.clip(K + size[0], 0.3 * K, 3 * K))}
+        p = next(p for p in effect.parameters if p.name == column.name)
+        value, low, high = float(size[0]), to_base(p.lower, p.unit), to_base(p.upper, p.unit)
+        if size.size == 2:
+            value, inner["phase"] = float(np.hypot(*size)), float(np.arctan2(size[1], size[0]))
+        return inner | {column.name: float(np.clip(neutral_values(effect)[column.name] + value, low, high))}
+
+    def pairs(self, most: int) -> list[PairScore]:
+        """Return what any two of the foremost effects could explain together, largest gain first."""
+        chosen: dict[str, list[tuple[float, _Column]]] = {}
+        for column in self.columns:
+            if np.isfinite(column.columns).all() and np.any(column.columns):
+                chosen.setdefault(column.effect.reported, []).append((self._judge(column.columns)[0], column))
+        foremost = [max(found, key=lambda f: f[0])[1] for found in chosen.values()]
+        found = []
+        for a, b in combinations(foremost, 2):
+            gain, size, _, _ = self._judge(np.concatenate([a.columns, b.columns], axis=1))
+            cut = a.columns.shape[1]
+            if not (self._possible(a, size[:cut]) and self._possible(b, size[cut:])):
+                continue
+            values = (self._expected(a, size[:cut]), self._expected(b, size[cut:]))
+            found.append(PairScore((a.effect, b.effect), gain, values))
+        return sorted(found, key=lambda p: -p.gain)[:most]
+
+
+def _stacked(innovations: Array, variances: Array) -> Array:
+    return np.concatenate([innovations, variances])
+
+
+def _whitened(f: Filtered) -> tuple[Array, Array]:
+    """Return the derivatives (m, k) whose product with [white, (white^2 - 1)/sqrt 2] is the score."""
+    used = f.run.used
+    S = f.found.S[used]
+    return -f.found.nu_d[used] / np.sqrt(S)[:, None], f.found.S_d[used] / S[:, None] / np.sqrt(2)
+
+
+def _phases(grid: Sequence[dict[str, float]]) -> list[list[dict[str, float]]]:
+    """Return inner values in groups that differ by their phase alone."""
+    groups: dict[tuple[float, ...], list[dict[str, float]]] = {}
+    for inner in grid:
+        groups.setdefault(tuple(v for n, v in inner.items() if n != "phase"), []).append(inner)
+    return list(groups.values())
+
+
+def _carried(
+    f: Filtered, fitted: StateSpaceFit, functions: Sequence[tuple[Shape, Sequence[float]]], *, late: bool = False
+) -> Array:
+    """Return the columns (2 m, q) of functions of slip or time that add to mu, or of the stage that multiply V, by 1 + g.
+
+    With `late` a column is added for a gauge that shows the elongation of a moment before.
+    """
+    run, kept, problem = f.run, f.found.kept, fitted.likelihood.problem
+    assert kept is not None
+    model, states = problem.model, list(problem.model.states)
+    n, a = kept.mean.shape
+    slip = slip_along(run, kept.mean, model.states)
+    steps = np.linspace(0.0, 1.0, FINE, endpoint=False) + 0.5 / FINE
+    fine_t = (run.t[:-1, None] + np.diff(run.t)[:, None] * steps).ravel()
+    V = run.drive(fine_t)
+    stage = np.concatenate([[0.0], np.cumsum(V * np.repeat(np.diff(run.t) / FINE, FINE))])
+    inputs, shown = np.zeros((n, a, len(functions) + late)), np.zeros(n)
+    if late:
+        shown = -_elongation_rate(run, kept.mean, model, fitted)
+    at, slope = states.index("field"), states.index("field_slope")
+    rate = np.sqrt(3) / fitted.values["field_length"]
+    start: Array | None = None
+    by_V = None
+    for j, (shape, inner) in enumerate(functions):
+        if shape.argument in ("slip", "time"):
+            x = slip if shape.argument == "slip" else run.t
+            g = np.broadcast_to(np.asarray(shape.g(x, *inner), dtype=float), x.shape)
+            inputs[1:, at, j] = np.diff(g)
+            inputs[1:, slope, j] = 0.5 * (g[1:] + g[:-1]) * rate * np.diff(slip)
+            if start is None:
+                start = field_columns(fitted.likelihood, run, fitted.values)
+            inputs[0, : len(states), j] = start * g[0]
+        else:
+            middle = 0.5 * (stage[1:] + stage[:-1])
+            moved = V * np.broadcast_to(np.asarray(shape.g(middle, *inner), dtype=float), middle.shape)
+            total = (moved.reshape(-1, FINE) * (np.diff(run.t) / FINE)[:, None]).sum(axis=1)
+            if by_V is None:
+                by_V = _rates_by_V(model, fitted, run, kept.mean[:, : len(states)])
+            inputs[1:, : len(states), j] = 0.5 * (by_V[1:] + by_V[:-1]) * total[:, None]
+    c, out = np.zeros((a, inputs.shape[2])), np.zeros((n, inputs.shape[2]))
+    for k in range(n):
+        c = kept.transition[k] @ c + inputs[k] if k else inputs[0].copy()
+        seen = kept.gradient[k] @ c
+        if late:
+            seen[-1] += shown[k]
+        out[k] = seen
+        if run.used[k]:
+            c -= np.outer(kept.covariance[k] @ kept.gradient[k] / f.found.S[k], seen)
+    used = run.used
+    white = out[used] / np.sqrt(f.found.S[used])[:, None]
+    return _stacked(white, np.zeros_like(white))
+
+
+def _elongation_rate(run: Run, x: Array, model: GeneratedModel, fitted: StateSpaceFit) -> Array:
+    """Return how fast the reading's elongation changes (n,), along the states expected, in the observable's unit."""
+    from srfcli.inference.prediction import run_parameters
+
+    states = list(model.states)
+    p = run_parameters(model, fitted.likelihood.problem.experiment, run, fitted.values)
+    W, W_dot = run.load(run.t)
+    V = run.drive(run.t)
+    if "u" in states:
+        slipping = x[:, states.index("z")] if "z" in states else np.exp(x[:, states.index("ln_v")])
+        rate = V - slipping
+    else:
+        rate = np.gradient(np.asarray(model.elongation(x[:, : len(states)], V, W, W_dot, p)), run.t)
+    K = p[model.index("K")]
+    return np.asarray(
+        rate if run.observable == "elongation" else rate * K / (W if run.observable == "friction" else 1.0)
+    )
+
+
+def _rates_by_V(model: GeneratedModel, fitted: StateSpaceFit, run: Run, x: Array) -> Array:
+    from srfcli.inference.prediction import run_parameters
+
+    p = run_parameters(model, fitted.likelihood.problem.experiment, run, fitted.values)
+    W, W_dot = run.load(run.t)
+    V = run.drive(run.t) + 1e-30j
+    return np.asarray(model.rates(x.astype(complex), V, W, W_dot, p)).imag / 1e-30

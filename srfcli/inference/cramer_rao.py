@@ -1,0 +1,267 @@
+"""How well the runs of an experiment could tell what a varying load may show, before anything has been fitted.
+
+Asked for are alpha (Linker and Dieterich: a change of load changes the age), the interface's lambda, and the exponent n with
+which its stiffness grows with the load. Each run is simulated with its own drive and load at the experiment's start values,
+alpha = 0 and n = 1; the derivatives of the observable, whitened with the noise that was found, give the Fisher information. An
+error is the Cramer-Rao bound with the experiment's free parameters unknown within their bounds: a fit of these recordings by this
+model cannot do better. A rough track, or start values that are far off, make it worse.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.codegen.model import Array, GeneratedModel, open_model
+from srfcli.core.errors import SrfError, Status
+from srfcli.core.units import to_base
+from srfcli.data.clock import Mask
+from srfcli.data.experiment import RunCheck
+from srfcli.data.values import Experiment, ModelChoice
+from srfcli.inference.prediction import own_names, own_start, predict, run_parameters
+from srfcli.laws.registry import Registry
+
+MODIFIER = "linker-dieterich"
+ASKED = ("alpha", "lambda", "n")
+SIZES = {
+    "alpha": 0.2,
+    "lambda": 0.1,
+    "n": 0.1,
+}  # that one would want to see: of rock's alpha, of lambda's own value, of n
+FAR = 3.0  # root mean square of simulation minus recording over the recording's own spread, from which it is another motion
+LONGEST = 20_000  # samples of a run that are simulated; of more, evenly chosen pairs stand for the others
+UNKNOWN = 100.0  # an error beyond this tells nothing: alpha and n are of order 1, lambda counts relative to itself
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Smallest errors of alpha, lambda (relative) and n, by these names, from one run or several: inf where nothing is told.
+
+    What the model does not have is missing. `peaks` are the largest changes that SIZES make and nothing else can, over the
+    noise of a sample. `variation` is the range of ln W; `misfit` is simulation minus recording over the recording's spread (rms);
+    `status` and `reached` (s) say how far the simulation went.
+    """
+
+    name: str
+    holdout: bool
+    variation: float
+    errors: Mapping[str, float]
+    peaks: Mapping[str, float]
+    misfit: float = 0.0
+    status: Status = Status.OK
+    reached: float = math.inf
+
+    @property
+    def believed(self) -> bool:
+        """Return whether the simulation resembles the recording enough to speak for it."""
+        return self.misfit <= FAR
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """A `Reach` for each run, one for all that are fitted and believed (None for fewer than two), and what else is unknown."""
+
+    runs: tuple[Reach, ...]
+    together: Reach | None
+    free: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Question:
+    """The experiment's model with alpha and n in it, values in um, s, N, and where in it is what.
+
+    `asked` gives the model's parameter for a name of ASKED, `free` those that are unknown beside, `widths` their ranges.
+    """
+
+    model: GeneratedModel
+    experiment: Experiment
+    values: Mapping[str, float]
+    asked: Mapping[str, str]
+    free: tuple[str, ...]
+    widths: Mapping[str, float]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return all parameters by which derivatives are taken."""
+        return tuple(dict.fromkeys([*self.asked.values(), *self.free]))
+
+
+def forecast(
+    experiment: Experiment,
+    checks: Sequence[RunCheck],
+    *,
+    registry: Registry,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Forecast:
+    """Return what these runs of an experiment could tell at best; raises SrfError where its model cannot be built."""
+    question = _question(experiment, checks, registry)
+    runs, fitted = [], []
+    for check in checks:
+        progress(check.run.name)
+        told = _simulated(question, check)
+        errors, peaks = _errors(question, [told])
+        name, holdout = check.run.name, check.run.holdout
+        one = Reach(name, holdout, _variation([check]), errors, peaks, told.misfit, told.status, told.reached)
+        runs.append(one)
+        if one.believed and not holdout:
+            fitted.append((check, told))
+    free = tuple(q.name for q in experiment.parameters if not q.fixed)
+    if len(fitted) < 2:
+        return Forecast(tuple(runs), None, free)
+    errors, peaks = _errors(question, [told for _, told in fitted])
+    together = Reach("all fitted runs", False, _variation([check for check, _ in fitted]), errors, peaks)
+    return Forecast(tuple(runs), together, free)
+
+
+def _variation(checks: Sequence[RunCheck]) -> float:
+    return math.log(max(c.load.highest for c in checks) / min(c.load.lowest for c in checks))
+
+
+def _question(experiment: Experiment, checks: Sequence[RunCheck], registry: Registry) -> _Question:
+    choice, listed = experiment.choice, {q.name: q for q in experiment.parameters}
+    values, spelled = {}, {}
+    if choice.interface == "elastic":  # W/lambda is kappa0 (W/Wref)^n at n = 1
+        length = listed["lambda"].value if "lambda" in listed else _default(registry, "elastic", "lambda")
+        Wref = float(np.mean([c.load.mean for c in checks]))
+        choice, spelled = replace(choice, interface="power"), {"lambda": "kappa0"}
+        values = {"kappa0": Wref / length, "Wref": Wref, "n": 1.0}
+    model = _with_memory(choice, registry)
+    asked = {"alpha": "alpha"} if "alpha" in model.names else {}
+    if asked and "alpha" not in listed:
+        values["alpha"] = 0.0
+    elastic = next((n for n in ("lambda", "kappa0") if n in model.names), None)
+    asked |= {"lambda": elastic} if elastic else {}
+    asked |= {"n": "n"} if choice.interface == "power" else {}
+    widths = {spelled.get(q.name, q.name): _width(q.lower, q.upper, q.value) for q in listed.values()}
+    if "lambda" in spelled and "lambda" in listed:
+        widths["kappa0"] *= values["kappa0"] / listed["lambda"].value  # the same, relative to the value
+    free = tuple(spelled.get(q.name, q.name) for q in listed.values() if not q.fixed)
+    return _Question(model, experiment, values, asked, tuple(n for n in free if n in model.names), widths)
+
+
+def _default(registry: Registry, interface: str, name: str) -> float:
+    return next(to_base(p.default, p.unit) for p in registry.get("interface", interface).parameters if p.name == name)
+
+
+def _width(lower: float, upper: float, value: float) -> float:
+    return upper - lower if math.isfinite(upper - lower) else 100 * max(abs(value), 1e-9)
+
+
+def _with_memory(choice: ModelChoice, registry: Registry) -> GeneratedModel:
+    """Return the model with Linker and Dieterich's term, or without where its laws do not take it."""
+    if MODIFIER not in choice.ageing.split("+"):
+        try:
+            return open_model(registry, **asdict(replace(choice, ageing=f"{choice.ageing}+{MODIFIER}")))
+        except SrfError:  # the friction law has no B, or another modifier an alpha of its own
+            pass
+    return open_model(registry, **asdict(choice))
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What a simulated run tells: Fisher information F (k, k), and the observable's derivatives Z (m, k) over the noise.
+
+    A free initial state is unknown, too, and what it takes away is subtracted from both.
+    """
+
+    F: Array
+    Z: Array
+    misfit: float
+    status: Status
+    reached: float
+
+
+def _simulated(question: _Question, check: RunCheck) -> _Told:
+    model, run = question.model, check.run
+    chosen, weight = _chosen(run.t.size)
+    short = replace(run, t=run.t[chosen], observed=run.observed[chosen], used=run.used[chosen])
+    values, own = dict(question.values), own_names(model, short, None)
+    p, ranges = run_parameters(model, question.experiment, short, values), []
+    for name in own:
+        values[name], low, high = own_start(model, short, p, name)
+        ranges.append(_width(low, high, values[name]))
+    found = predict(model, question.experiment, short, values, by=(*question.names, *own))
+    sigma, rho = (x[chosen] for x in noise_of(check))
+    seen = short.used & (short.t <= found.reached) & np.isfinite(found.J).all(axis=1)
+    Z = np.where(seen[:, None], found.J, 0.0) / sigma[:, None]
+    J = innovations(Z, chosen, seen, rho, weight=weight)
+    Z, F, k = Z[seen], J.T @ J, len(question.names)
+    if own:
+        inner = F[k:, k:] + np.diag([12 / w**2 for w in ranges])
+        taken = np.linalg.solve(inner, F[k:, :k])
+        F, Z = F[:k, :k] - F[:k, k:] @ taken, Z[:, :k] - Z[:, k:] @ taken
+    rest = found.y[seen] - short.observed[seen]
+    spread = max(float(np.std(short.observed[seen])), 10 * float(sigma.mean())) if seen.any() else 1.0
+    misfit = float(np.sqrt(np.mean(rest**2))) / spread if seen.any() else math.inf
+    return _Told(F, Z, misfit, found.status, float(found.reached))
+
+
+def noise_of(check: RunCheck) -> tuple[Array, Array]:
+    """Return standard deviation and lag-1 correlation of the noise at each sample (n,) of a run, by its sampling rates."""
+    run = check.run
+    least = max(run.quantum / math.sqrt(12), 1e-9 * float(np.ptp(run.observed)), 1e-300)
+    sigma, rho = np.empty(run.t.size), np.empty(run.t.size)
+    for begin, noise in [(0, check.noise), *((r.first, n) for r, n in check.noises)]:
+        sigma[begin:] = max(noise.total if math.isfinite(noise.total) else noise.white, least)
+        rho[begin:] = min(max(noise.lag1, 0.0), 0.98) if math.isfinite(noise.lag1) else 0.0
+    return sigma, rho
+
+
+def _chosen(size: int) -> tuple[NDArray[np.int64], float]:
+    """Return which samples of a run are simulated, and how many each stands for: all, or pairs of neighbours of a long one."""
+    if size <= LONGEST:
+        return np.arange(size), 1.0
+    step = -(-2 * size // LONGEST)
+    first = np.arange(0, size - 1, step)
+    return np.column_stack([first, first + 1]).ravel(), float(step)
+
+
+def innovations(Z: Array, chosen: NDArray[np.int64], used: Mask, rho: Array, *, weight: float) -> Array:
+    """Return what each sample adds to those before it: derivatives Z (n, k) over AR(1) noise, whitened.
+
+    `chosen` are the samples' places in the run. Where they are pairs, only a pair's second sample counts, `weight` times.
+    """
+    linked = np.r_[False, (np.diff(chosen) == 1) & used[1:] & used[:-1]]
+    share = np.where(linked, rho, 0.0)[:, None]
+    out = (Z - share * np.roll(Z, 1, axis=0)) / np.sqrt(1 - share**2)
+    return np.asarray(math.sqrt(weight) * out[linked if weight > 1 else used])
+
+
+def _errors(question: _Question, told: Sequence[_Told]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return errors and peaks of all that is asked for, from these runs together."""
+    errors, peaks, F = {}, {}, sum((t.F for t in told), np.zeros((len(question.names),) * 2))
+    for asked, column in question.asked.items():
+        at = question.names.index(column)
+        rest = [i for i, n in enumerate(question.names) if n in question.free and n != column]
+        error, alone = _error(F, at, rest, np.array([question.widths[question.names[i]] for i in rest]))
+        unit = _value(question, column) if asked == "lambda" else 1.0
+        errors[asked] = error / unit if error / unit < UNKNOWN else math.inf
+        peaks[asked] = (
+            SIZES[asked] * unit * max((float(np.abs(t.Z @ alone).max(initial=0.0)) for t in told), default=0.0)
+        )
+    return errors, peaks
+
+
+def _value(question: _Question, name: str) -> float:
+    run = question.experiment.runs[0]
+    return float(run_parameters(question.model, question.experiment, run, question.values)[question.model.index(name)])
+
+
+def _error(F: Array, at: int, rest: list[int], widths: Array) -> tuple[float, Array]:
+    """Return the smallest error of parameter `at` where those in `rest` are unknown within ranges of these widths (uniform).
+
+    And the direction (k,) in which it moves with what of its effect the others cannot take up.
+    """
+    scale = widths / math.sqrt(12)
+    inner = F[np.ix_(rest, rest)] * np.outer(scale, scale) + np.eye(len(rest))
+    taken = np.linalg.solve(inner, F[at, rest] * scale)
+    left = float(F[at, at] - (F[at, rest] * scale) @ taken)
+    alone = np.zeros(F.shape[0])
+    alone[at], alone[rest] = 1.0, -taken * scale
+    if not left > 1e-10 * F[at, at]:  # the difference of two sums, to rounding
+        return math.inf, np.zeros(F.shape[0])
+    return 1 / math.sqrt(left), alone

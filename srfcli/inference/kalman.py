@@ -1,0 +1,173 @@
+"""The Kalman filter of one run on a random friction field, and its smoother; exact derivatives of all that the filter returns.
+
+The extended filter in continuous time with samples (Jazwinski 1970): the mean follows the model's own integrator, the covariance
+the exact derivative of each of its steps. The smoother runs backward over what the filter kept (de Jong, Biometrika 76, 1989).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.codegen.c_source import LANES, compiled
+from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.core.errors import SrfError
+from srfcli.motion.imposed import Drive, Load
+from srfcli.motion.integrators import doubles, imposed_arguments, interruptible, rtol_of_estimate
+
+STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
+GAUGE_PROCESSES = 3  # of coloured gauge noise, at most
+
+
+@dataclass(frozen=True)
+class Dual:
+    """Numbers `v` (...) with their derivatives `d` (..., k) in k directions."""
+
+    v: Array
+    d: Array
+
+    @classmethod
+    def plain(cls, v: Array, k: int) -> Dual:
+        """Return numbers that depend on nothing."""
+        v = np.asarray(v, dtype=float)
+        return cls(v, np.zeros((*v.shape, k)))
+
+    def packed(self, first: int) -> Array:
+        """Return (..., 1 + LANES): the numbers and as many derivatives as the filter takes at a time, from the first on."""
+        out = np.zeros((*self.v.shape, 1 + LANES))
+        out[..., 0] = self.v
+        some = self.d[..., first : first + LANES]
+        out[..., 1 : 1 + some.shape[-1]] = some
+        return out
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What the smoother needs, before each sample is used: mean (n, a), covariance, transition since the last sample (n, a, a).
+
+    a is the number of states with those of the gauge noise after them; `gradient` (n, a) is that of the reading.
+    """
+
+    mean: Array
+    covariance: Array
+    transition: Array
+    gradient: Array
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Innovations `nu` (n,), their variances `S` (n,), and the derivatives of both (n, k); NaN after `reached` samples."""
+
+    nu: Array
+    S: Array
+    nu_d: Array
+    S_d: Array
+    reached: int
+    steps: int
+    kept: Kept | None
+
+
+def kalman_filter(
+    model: GeneratedModel,
+    p: Dual,
+    *,
+    drive: Drive,
+    load: Load,
+    t: Array,
+    observed: Array,
+    used: NDArray[np.bool_],
+    start: Dual,
+    covariance: Dual,
+    gauge: Dual,
+    factor: Dual,
+    offset: Dual,
+    R: Dual,
+    rtol: float = 1e-6,
+    atol: Array,
+    keep: bool = False,
+    most: int | None = None,
+) -> Innovations:
+    """Return the innovations of the readings `observed` (n,) at the rising times `t` (s), of which those `used` are taken up.
+
+    A reading is `factor` (n,) times the elongation (or the gauge's own state) plus `offset` (n,) plus gauge noise: white of
+    variance `R` (n,), and processes e' = -e/tau + s sqrt(2/tau) w whose (tau, s) are the rows of `gauge` (g, 2), g <= 3.
+    `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
+    numbers in the same k directions. After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a
+    compiler, or for a model without a random friction field.
+    """
+    library = compiled(model)
+    if library is None:
+        raise SrfError("the Kalman filter needs a C compiler", "Install one, or the package ziglang.")
+    if not hasattr(library, "srf_filter"):
+        raise SrfError(f"{model.title} has no random friction field", "open_model(..., random_field=True)")
+    n, k, states = t.size, p.d.shape[-1], len(model.states)
+    wide = states + GAUGE_PROCESSES
+    nu, S = np.full(n, np.nan), np.full(n, np.nan)
+    nu_d, S_d = np.full((n, k), np.nan), np.full((n, k), np.nan)
+    shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide)) if keep else ((1,),) * 4
+    arrays = [np.full(shape, np.nan) for shape in shapes]
+    stats, stop, reached = np.zeros(2), ctypes.c_int(0), n
+    imposed, use = imposed_arguments(t, drive, load), np.ascontiguousarray(used, dtype=np.uint8)
+    size, most = rtol_of_estimate(rtol), STEPS_A_SAMPLE * (n + 1000) if most is None else most
+    allowed = np.asarray(atol) * size / rtol
+    for first in range(0, max(k, 1), LANES):
+        own_nu, own_S = np.full((n, LANES), np.nan), np.full((n, LANES), np.nan)
+        keeping = keep and first == 0
+        arguments = (
+            *imposed, doubles(p.packed(first)), doubles(start.packed(first)), doubles(covariance.packed(first)),
+            gauge.v.shape[0], doubles(gauge.packed(first)), int(k > 0), ctypes.c_double(size), doubles(allowed),
+            ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(most), n,
+            doubles(t), doubles(observed), ctypes.c_void_p(use.ctypes.data), doubles(factor.packed(first)),
+            doubles(offset.packed(first)), doubles(R.packed(first)), int(keeping), doubles(nu), doubles(S), doubles(own_nu),
+            doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),
+        )  # fmt: skip
+        reached = min(reached, interruptible(lambda arguments=arguments: library.srf_filter(*arguments), stop))  # type: ignore[misc]
+        count = min(LANES, k - first)
+        nu_d[:, first : first + count], S_d[:, first : first + count] = own_nu[:, :count], own_S[:, :count]
+    kept = None
+    if keep:
+        a = states + gauge.v.shape[0]
+        mean, P, T, H = arrays
+        kept = Kept(mean[:, :a], P[:, :a, :a], T[:, :a, :a], H[:, :a])
+    return Innovations(nu, S, nu_d, S_d, reached, int(stats[0]), kept)
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Mean (n, a) and covariance (n, a, a) of states and gauge noise at each sample, given all samples of the run.
+
+    `r` (n, a) and `N` (n, a, a) are the smoother's own: the score of the log likelihood by a shift of the state just after the
+    sample before, and its variance.
+    """
+
+    mean: Array
+    covariance: Array
+    r: Array
+    N: Array
+
+
+def smooth(found: Innovations, used: NDArray[np.bool_]) -> Smoothed:
+    """Return the fixed-interval smoother of what the filter kept."""
+    kept = found.kept
+    if kept is None:
+        raise SrfError("the filter kept nothing to smooth", "kalman_filter(..., keep=True)")
+    n, a = kept.mean.shape
+    r, N = np.zeros(a), np.zeros((a, a))
+    mean, P = kept.mean.copy(), kept.covariance.copy()
+    scores, information = np.zeros((n, a)), np.zeros((n, a, a))
+    for k in range(n - 1, -1, -1):
+        if used[k] and k < found.reached:
+            H, S = kept.gradient[k], found.S[k]
+            gain = kept.covariance[k] @ H / S
+            through = np.eye(a) - np.outer(gain, H)
+            r = H * (found.nu[k] / S) + through.T @ r
+            N = np.outer(H, H) / S + through.T @ N @ through
+        scores[k], information[k] = r, N
+        mean[k] += kept.covariance[k] @ r
+        P[k] -= kept.covariance[k] @ N @ kept.covariance[k]
+        r, N = kept.transition[k].T @ r, kept.transition[k].T @ N @ kept.transition[k]
+    return Smoothed(mean, P, scores, information)

@@ -1,0 +1,775 @@
+"""Maximum likelihood for recordings under a model with a random friction field along slip and coloured gauge noise.
+
+Friction is m(s) more than the laws say: a stationary Gaussian process along slip s, Matern 3/2, of amplitude a and correlation
+length l. A Kalman filter follows slider and field together, so that the likelihood of all readings is the product of what each is
+expected to be given those before it. With a = 0 that is the likelihood of the free-running model.
+
+The field's amplitude is a homotopy: with a wide field the filter stays with the recording whatever the parameters are, and the
+likelihood has one maximum where that of the free-running model, whose cycles fall out of step, has many. So the fit begins with
+a wide field, and then estimates it with everything else, by Fisher scoring on exact derivatives.
+Kristensen, Madsen and Jorgensen, Automatica 40 (2004); Hartikainen and Sarkka 2010; Durbin and Koopman 2012.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import TypeVar
+
+import numpy as np
+from scipy.signal import lfilter
+
+from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.core.errors import Status
+from srfcli.data.values import Experiment, Run
+from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
+from srfcli.inference.kalman import GAUGE_PROCESSES, Dual, Innovations, Smoothed, kalman_filter, smooth
+from srfcli.inference.noise import Noise, stretches
+from srfcli.inference.prediction import TINY, Prediction, basis, run_parameters, start_state, stiffness_share
+
+T = TypeVar("T")
+RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
+FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
+FIELD = ("field_amplitude", "field_length")
+# A fit begins with the likeliest of nine fields: amplitudes over the friction of the recordings, lengths over that of PIECES
+WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
+SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
+FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
+BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
+SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
+NEEDED = 2.0  # gain in log likelihood that keeps a field: without one that is there, errors are too small
+CLOSE_CALL = 50.0  # in log likelihood, by which a fit that was broken off early may be behind and still be finished
+HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters, when one is not worth a fit
+PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
+STEPS = 40  # of Fisher scoring
+PATIENCE = 5  # times the steps of integration of the point before, after which a trial is given up
+CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
+COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
+TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
+COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
+DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """One run filtered: what the innovations say of the parameters `names`.
+
+    `nu`, `S` (m,) are innovations and their variances at the samples used, `nu_d`, `S_d` (m, k) their derivatives.
+    """
+
+    run: Run
+    names: tuple[str, ...]
+    found: Innovations = field(repr=False)
+
+    @property
+    def whole(self) -> bool:
+        """Return whether the motion was followed to the last sample, and every variance is one."""
+        f = self.found
+        return f.reached == self.run.t.size and bool(np.isfinite(f.nu).all() and (f.S > 0).all())
+
+    @property
+    def white(self) -> Array:
+        """Return the innovations over their standard deviations (m,): white noise of variance 1 under the right model."""
+        used = self.run.used
+        return np.asarray(self.found.nu[used] / np.sqrt(self.found.S[used]))
+
+    @property
+    def log_likelihood(self) -> float:
+        """Return the log likelihood of the readings used; minus infinity where the motion could not be followed."""
+        if not self.whole:
+            return -np.inf
+        S, white = self.found.S[self.run.used], self.white
+        return -0.5 * float(np.sum(white**2) + np.sum(np.log(2 * np.pi * S)))
+
+    @property
+    def score(self) -> Array:
+        """Return the gradient of the log likelihood (k,), exact."""
+        used, f = self.run.used, self.found
+        nu, S, nu_d, S_d = f.nu[used], f.S[used], f.nu_d[used], f.S_d[used]
+        return np.asarray(-(nu / S) @ nu_d + 0.5 * ((nu**2 / S - 1) / S) @ S_d)
+
+    @property
+    def information(self) -> Array:
+        """Return Fisher's information (k, k), from the derivatives of innovations and variances."""
+        used, f = self.run.used, self.found
+        S = f.S[used]
+        a, b = f.nu_d[used] / np.sqrt(S)[:, None], f.S_d[used] / S[:, None]
+        return np.asarray(a.T @ a + 0.5 * b.T @ b)
+
+    def smoothed(self) -> Smoothed:
+        """Return states and field given all readings of the run; it was filtered with `keep`."""
+        return smooth(self.found, self.run.used)
+
+
+def filter_run(
+    model: GeneratedModel,
+    experiment: Experiment,
+    run: Run,
+    values: Mapping[str, float],
+    *,
+    by: Sequence[str] = (),
+    trend: str | None = None,
+    rtol: float = RTOL,
+    keep: bool = False,
+    most: int | None = None,
+) -> Filtered:
+    """Return `run` filtered under `values` (um, s, N), with derivatives by the parameters `by`.
+
+    `values` hold those of the model, field_amplitude and field_length among them, `gauge_white`, the standard deviation of white
+    gauge noise in the observable's unit, `gauge_colour1` and `gauge_time1` (s) of an exponentially correlated part, and so on up
+    to 3 of these, and what belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. After `most` steps it is given up.
+    """
+    k, n = len(by), run.t.size
+    p = run_parameters(model, experiment, run, values)
+    d = np.zeros((p.size, k))
+    share = stiffness_share(experiment, run)
+    for j, name in enumerate(by):
+        if name in model.names:
+            d[model.index(name), j] = share if name == "K" else 1.0
+    start, P0 = _belief(model, run, p, values, by, share)
+    K, W = Dual(p[[model.index("K")]], d[[model.index("K")]]), run.load(run.t)[0]
+    over = np.ones(n) if run.observable == "force" else 1 / W
+    factor = Dual.plain(np.ones(n), k) if run.observable == "elongation" else Dual(over * K.v, over[:, None] * K.d)
+    offset = Dual.plain(np.zeros(n), k)
+    if trend:
+        along, name = basis(run, trend), f"{run.name}.trend"
+        offset = Dual(values.get(name, 0.0) * along, np.outer(along, [float(b == name) for b in by]))
+    sd = values["gauge_white"]
+    R = Dual(np.full(n, sd**2 + run.quantum**2 / 12), np.outer(np.ones(n), [2 * sd * (b == "gauge_white") for b in by]))
+    own = [gauge_process(j) for j in range(1, GAUGE_PROCESSES + 1) if gauge_process(j)[0] in values]
+    gauge = Dual(
+        np.array([[values[name] for name in pair] for pair in own]).reshape(len(own), 2),
+        np.array([[[float(b == name) for b in by] for name in pair] for pair in own]).reshape(len(own), 2, k),
+    )
+    size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
+    fine = np.array([max(values["field_amplitude"], 1e-3) if s.startswith("field") else 1.0 for s in model.states])
+    found = kalman_filter(
+        model, Dual(p, d), drive=run.drive, load=run.load, t=run.t, observed=run.observed, used=run.used, start=start,
+        covariance=P0, gauge=gauge, factor=factor, offset=offset, R=R, rtol=rtol, atol=rtol * size * fine, keep=keep,
+        most=most,
+    )  # fmt: skip
+    return Filtered(run, tuple(by), found)
+
+
+def field_columns(likelihood: Likelihood, run: Run, values: Mapping[str, float]) -> Array:
+    """Return how the state at the first sample (n,) answers to a field of 1 there."""
+    problem = likelihood.problem
+    model = problem.model
+    p = run_parameters(model, problem.experiment, run, {**values, "field_amplitude": 1.0})
+    x0, _ = start_state(model, run, p, values, [])
+    return _field_columns(model, run, p, x0)[:, 0]
+
+
+def gauge_process(number: int) -> tuple[str, str]:
+    """Return the names of correlation time (s) and standard deviation of a process of coloured gauge noise; the first is 1."""
+    return f"gauge_time{number}", f"gauge_colour{number}"
+
+
+def _belief(
+    model: GeneratedModel, run: Run, p: Array, values: Mapping[str, float], by: Sequence[str], share: float
+) -> tuple[Dual, Dual]:
+    """Return mean (n,) and covariance (n, n) of the state at the first sample, where the field is what it is anywhere."""
+    names = [b for b in by if b in model.names or b.startswith(f"{run.name}.")]
+    x0, S0 = start_state(model, run, p, values, names)
+    columns = _field_columns(model, run, p, x0)
+    d, P_d = np.zeros((x0.size, len(by))), np.zeros((x0.size, x0.size, len(by)))
+    for j, name in enumerate(names):
+        unit = share if name == "K" else 1.0
+        at, column = by.index(name), S0[:, j] * unit
+        d[:, at] = column
+        step = DIFFERENCE * max(
+            abs(values.get(name, 0.0)), abs(float(p[model.index(name)])) if name in model.names else 1e-3, 1e-12
+        )
+        sides = []
+        for sign in (1, -1):
+            q, own = p.copy(), dict(values)
+            if name in model.names:
+                q[model.index(name)] += sign * step
+            else:
+                own[name] = own[name] + sign * step
+            sides.append(_field_columns(model, run, q, start_state(model, run, q, own, [])[0]))
+        C_d = (sides[0] - sides[1]) / (2 * step) * unit
+        P_d[:, :, at] = C_d @ columns.T + columns @ C_d.T
+    return Dual(x0, d), Dual(columns @ columns.T, P_d)
+
+
+def _field_columns(model: GeneratedModel, run: Run, p: Array, x0: Array) -> Array:
+    """Return how the start (n,) answers to the field's two standard normal values there, (n, 2)."""
+    states, out = list(model.states), np.zeros((x0.size, 2))
+    for j, name in enumerate(("field_start", "field_slope_start")):
+        if run.initial != "free":
+            q = p.astype(complex)
+            q[model.index(name)] += 1j * TINY
+            out[:, j] = np.asarray(model.steady(q)).imag / TINY
+            continue
+        place = states.index(name.removesuffix("_start"))
+        out[place, j] = p[model.index("field_amplitude")]
+        t0 = float(run.t[0])
+        V, W = float(run.drive(run.t[:1])[0]), run.load.rest(t0)
+        moved = []
+        for i in (place, states.index("ln_v")):
+            x = x0.astype(complex)
+            x[i] += 1j * TINY
+            moved.append(float(np.asarray(model.friction(x, V, W, 0.0, p)).imag) / TINY)
+        out[states.index("ln_v"), j] = -out[place, j] * moved[0] / moved[1]  # friction there is what the start says
+        if "z" in states:
+            out[states.index("z"), j] = np.exp(x0[states.index("ln_v")]) * out[states.index("ln_v"), j]
+    return out
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where a likelihood was evaluated: `x` (k,) in its own coordinates, values by name, derivatives by x, runs filtered."""
+
+    x: Array
+    values: dict[str, float] = field(repr=False)
+    log_likelihood: float
+    score: Array = field(repr=False)
+    information: Array = field(repr=False)
+    runs: tuple[Filtered, ...] = field(repr=False)
+
+    @property
+    def rms(self) -> float:
+        """Return the root mean square of all standardised innovations: 1 under the right model."""
+        white = np.concatenate([f.white for f in self.runs])
+        return float(np.sqrt(np.mean(white**2)))
+
+
+class Likelihood:
+    """The log likelihood of a problem's runs; its model has a random friction field.
+
+    Coordinates x are the problem's parameters, then field_amplitude and field_length unless the track is `smooth`, gauge_white,
+    and correlation time and standard deviation of each of the gauge's coloured `processes`; those with a positive lower bound by
+    their logarithms, in which friction laws are nearly linear. Runs of another observable or sampling rate have a gauge noise of
+    their own; their names then end in `[kind]`.
+    """
+
+    def __init__(
+        self, problem: Problem, *, smooth: bool = False, processes: int = 0, rtol: float = RTOL, threads: int = 1
+    ) -> None:
+        self.problem, self.smooth, self.processes = problem, smooth, processes
+        self.rtol = FREE_RUNNING * rtol if smooth else rtol
+        self.threads, self.evaluations = threads, 0
+        self.best: Point | None = None  # the likeliest with slopes so far
+        scales = _scales(problem.runs)
+        gauge = ["gauge_white", *(n for j in range(processes) for n in gauge_process(j + 1))]
+        kinds = {run.name: _kind(run) for run in problem.runs}
+        several = len(set(kinds.values())) > 1
+        self.own = {name: {g: f"{g}[{kind}]" if several else g for g in gauge} for name, kind in kinds.items()}
+        wanted = [*(() if smooth else FIELD), *dict.fromkeys(n for own in self.own.values() for n in own.values())]
+        own = [(n, *scales[n.partition("[")[0].rstrip("123")]) for n in wanted]
+        self.names = (*problem.names, *(row[0] for row in own))
+        rows = [*zip(problem.start, problem.lower, problem.upper, strict=True), *(row[1:] for row in own)]
+        self.logarithmic = np.array([low > 0 for _, low, _ in rows])
+        self.start, self.lower, self.upper = (
+            np.array([np.log(v) if log else v for v, log in zip(column, self.logarithmic, strict=True)])
+            for column in zip(*rows, strict=True)
+        )
+
+    @property
+    def samples(self) -> int:
+        """Return the number of readings used."""
+        return sum(int(run.used.sum()) for run in self.problem.runs)
+
+    def values(self, x: Array) -> dict[str, float]:
+        """Return parameters by name in um, s, N."""
+        plain = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x)
+        found = self.problem.named(plain[: len(self.problem.names)]) | dict(
+            zip(self.names, plain.tolist(), strict=True)
+        )
+        return found | ({"field_amplitude": 0.0, "field_length": 1.0} if self.smooth else {})
+
+    def unit(self, x: Array) -> Array:
+        """Return the derivatives (k,) of the parameters by x."""
+        return np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), 1.0)
+
+    def coordinates(self, values: Mapping[str, float]) -> Array:
+        """Return x for values by name; those left out are the start's. Within the bounds."""
+        x = self.start.copy()
+        for i, name in enumerate(self.names):
+            if name in values:
+                x[i] = np.log(max(values[name], 1e-300)) if self.logarithmic[i] else values[name]
+        return np.clip(x, self.lower, self.upper)
+
+    def gauge(self, run: Run) -> dict[str, str]:
+        """Return the names of a run's gauge noise as they are here, by those that `filter_run` has for them."""
+        if run.name in self.own:
+            return self.own[run.name]
+        near = [r for r in self.problem.runs if r.observable == run.observable] or list(self.problem.runs)
+        step = np.log(_spacing(run))
+        return self.own[
+            min(near, key=lambda r: abs(np.log(_spacing(r)) - step)).name
+        ]  # held out: that sampled most alike
+
+    def filtered(
+        self,
+        run: Run,
+        values: Mapping[str, float],
+        *,
+        slopes: bool = False,
+        keep: bool = False,
+        most: int | None = None,
+    ) -> Filtered:
+        """Return one run filtered under values by name, with derivatives by the names that it depends on."""
+        gauge, problem = self.gauge(run), self.problem
+        back = {name: local for local, name in gauge.items()}
+        own = [
+            n for n in self.names if n in back or (("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
+        ]
+        found = filter_run(
+            problem.model, problem.experiment, run, {**values, **{local: values[n] for local, n in gauge.items()}},
+            by=[back.get(n, n) for n in own] if slopes else (), trend=None if run.holdout else problem.trend, rtol=self.rtol,
+            keep=keep, most=most,
+        )  # fmt: skip
+        return replace(found, names=tuple(own) if slopes else ())
+
+    def over_runs(self, work: Callable[[Run], T]) -> list[T]:
+        """Return what `work` makes of each run, on several threads where that was asked for."""
+        if self.threads > 1 and len(self.problem.runs) > 1:
+            with ThreadPoolExecutor(self.threads) as pool:
+                return list(pool.map(work, self.problem.runs))
+        return [work(run) for run in self.problem.runs]
+
+    def at(self, x: Array, *, slopes: bool = True, keep: bool = False, like: Point | None = None) -> Point:
+        """Return log likelihood, score and information at x (k,); -inf where a run takes PATIENCE times the steps of `like`."""
+        values, k = self.values(x), len(self.names)
+        self.evaluations += 1
+        most = {f.run.name: PATIENCE * f.found.steps for f in like.runs} if like else {}
+
+        def one(run: Run) -> Filtered:
+            return self.filtered(run, values, slopes=slopes, keep=keep, most=most.get(run.name))
+
+        runs = tuple(self.over_runs(one))
+        total = float(sum(f.log_likelihood for f in runs))
+        score, information = np.zeros(k), np.zeros((k, k))
+        if slopes and np.isfinite(total):
+            unit = self.unit(x)
+            for f in runs:
+                at = [self.names.index(n) for n in f.names]
+                score[at] += f.score * unit[at]
+                information[np.ix_(at, at)] += f.information * np.outer(unit[at], unit[at])
+        point = Point(x, values, total, score, information, runs)
+        if slopes and (self.best is None or total > self.best.log_likelihood):
+            self.best = point
+        return point
+
+
+def _scales(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
+    """Return start value and bounds of the parameters of field and gauge, from the recordings."""
+    friction = max(float(np.median([typical_friction(r) for r in runs])), 1e-6)
+    slid = max(float(np.sum(np.abs(r.drive(r.t[1:])) * np.diff(r.t))) for r in runs)
+    level = float(np.median([first_level(r) for r in runs]))
+    spacing = float(np.median([_spacing(r) for r in runs]))
+    longest = max(float(r.t[-1] - r.t[0]) for r in runs)
+    length = max(slid, 1e-6) / PIECES
+    return {
+        "field_amplitude": (WIDE[0] * friction, SMALL * friction, 0.3 * friction),
+        "field_length": (length, length / 100, 10 * length),
+        "gauge_white": (level, level / 30, 100 * level),
+        "gauge_colour": (level, level / 100, 100 * level),
+        "gauge_time": (10 * spacing, spacing, longest),
+    }
+
+
+def _spacing(run: Run) -> float:
+    return float(np.median(np.diff(run.t)))
+
+
+def _kind(run: Run) -> str:
+    """Return what runs that share a gauge noise have in common: the observable, and the sampling to two digits."""
+    return f"{run.observable}, {_spacing(run):.2g} s"
+
+
+def typical_friction(run: Run) -> float:
+    """Return the typical friction coefficient of a recording."""
+    observed, W = run.observed[run.used], run.load(run.t)[0][run.used]
+    over = W if run.observable == "friction" else run.stiffness if run.observable == "elongation" else 1.0
+    return float(np.median(np.abs(observed * over / W)))
+
+
+@dataclass(frozen=True)
+class Maximum:
+    """Where Fisher scoring ended: the point, how far the maximum may still be in standard errors, the status, covariance by x."""
+
+    point: Point
+    away: float
+    status: Status
+    covariance: Array = field(repr=False)
+
+
+def maximise(
+    likelihood: Likelihood,
+    x: Array,
+    *,
+    held: Sequence[str] = (),
+    steps: int = STEPS,
+    close: float = CONVERGED,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Maximum:
+    """Return the maximum from x (k,), by Fisher scoring with Levenberg's damping; parameters `held` stay where they are.
+
+    It ends within `close` standard errors of the maximum, by the score, or where two steps running each gain less than a quarter
+    of what that distance is worth. Parameters that a step would push out stay at their
+    bounds. A likelihood that cannot be evaluated at x is a status.
+    """
+    free = np.array([n not in held for n in likelihood.names])
+    point, damping = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper)), 1e-3
+    if not np.isfinite(point.log_likelihood):
+        return Maximum(point, np.inf, Status.INTEGRATION, np.full((x.size, x.size), np.nan))
+    away, sure, slow = np.inf, True, 0
+    for _ in range(steps):
+        low, high = point.x <= likelihood.lower, point.x >= likelihood.upper
+        moving = np.nonzero(free & ~(low & (point.score < 0)) & ~(high & (point.score > 0)))[0]
+        g, I = point.score[moving], point.information[np.ix_(moving, moving)]
+        d = np.sqrt(np.maximum(np.diag(I), 1e-300))
+        scaled = I / np.outer(d, d)
+        away = np.sqrt(max(float(g @ inverse(I) @ g), 0.0)) if moving.size else 0.0
+        progress(f"log likelihood {point.log_likelihood:.1f}, {away:.2g} standard errors from the maximum")
+        if away < close or slow == 2:
+            break
+        while damping < 1e8:
+            x = point.x.copy()
+            move = np.linalg.solve(scaled + damping * np.eye(moving.size), g / d) / d
+            move = np.where(likelihood.logarithmic[moving], np.clip(move, -1.5, 1.5), move)
+            x[moving] += move
+            trial = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper), slopes=sure, like=point)
+            gain = trial.log_likelihood - point.log_likelihood
+            if gain > 0:
+                share = gain / max(float(g @ move - 0.5 * move @ I @ move), 1e-300)  # of what the model of it promised
+                damping = max(damping * (0.1 if share > 0.5 else 1.0 if share > 0.25 else 2.0), 1e-9)
+                point, sure = trial if sure else likelihood.at(trial.x), share > 0.25
+                slow = slow + 1 if gain < close**2 / 8 else 0
+                break
+            damping, sure = (
+                max(10 * damping, 1e-3),
+                False,
+            )  # what may fail is tried without derivatives: a quarter of the work
+        else:
+            break
+    at_bound = ((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0))
+    covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound)[0]
+    covariance[np.ix_(inner, inner)] = inverse(point.information[np.ix_(inner, inner)])
+    return Maximum(point, away, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE, covariance)
+
+
+@dataclass(frozen=True)
+class StateSpaceFit:
+    """A fit of all runs together: its likelihood, the maximum there, and how many times all runs were filtered."""
+
+    likelihood: Likelihood
+    maximum: Maximum
+    evaluations: int
+
+    @property
+    def smooth(self) -> bool:
+        """Return whether no random friction field is needed."""
+        return self.likelihood.smooth
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Return all parameters by name, those of field and gauge too, in um, s, N."""
+        return self.maximum.point.values
+
+    @property
+    def covariance(self) -> Array:
+        """Return the covariance (k, k) of all parameters, in um, s, N; zero for one at a bound."""
+        unit = self.likelihood.unit(self.maximum.point.x)
+        return np.asarray(self.maximum.covariance * np.outer(unit, unit))
+
+    @property
+    def log_likelihood(self) -> float:
+        """Return the log likelihood at the maximum."""
+        return self.maximum.point.log_likelihood
+
+    @property
+    def criterion(self) -> float:
+        """Return the log likelihood less half of ln n for each parameter (Schwarz 1978)."""
+        return self.log_likelihood - 0.5 * np.log(self.likelihood.samples) * len(self.likelihood.names)
+
+
+def fit_state_space(
+    problem: Problem,
+    *,
+    start: Mapping[str, float] | None = None,
+    smooth: bool | None = None,
+    processes: int | None = None,
+    thorough: bool = True,
+    close: float = CONVERGED,
+    threads: int = 1,
+    rtol: float = RTOL,
+    progress: Callable[[str], None] = lambda text: None,
+) -> StateSpaceFit:
+    """Return the maximum-likelihood fit of parameters, random friction field and gauge noise, `close` standard errors or nearer.
+
+    From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
+    `smooth` says whether there is no field; left out, there is one where it gains 2 in log likelihood. `processes` says how many
+    of coloured noise the gauge has; left out, Schwarz's criterion decides, early and, if the fit is to be `thorough`, again at
+    the maximum. The status is that of the last maximisation.
+    """
+    tried: list[Likelihood] = []
+
+    def likelihood(smooth: bool, processes: int) -> Likelihood:
+        tried.append(Likelihood(problem, smooth=smooth, processes=processes, rtol=rtol, threads=threads))
+        return tried[-1]
+
+    try:
+        return _fitted(likelihood, start or {}, smooth, processes, thorough, close, progress)
+    except KeyboardInterrupt as error:
+        last = next((own.best for own in reversed(tried) if own.best is not None), None)
+        raise Interrupted(last.values if last else problem.named(problem.start)) from error
+
+
+def stopped(problem: Problem, values: Mapping[str, float], *, threads: int = 1) -> StateSpaceFit:
+    """Return the state of a fit that was stopped: its parameters, with errors as if they were the maximum."""
+    smooth, processes = (
+        not values.get("field_amplitude"),
+        sum(any(n.startswith(f"gauge_colour{j}") for n in values) for j in (1, 2, 3)),
+    )
+    likelihood = Likelihood(problem, smooth=smooth, processes=processes, threads=threads)
+    point = likelihood.at(likelihood.coordinates(values))
+    return StateSpaceFit(likelihood, Maximum(point, np.inf, Status.INTERRUPTED, inverse(point.information)), 1)
+
+
+def _fitted(
+    likelihood: Callable[[bool, int], Likelihood],
+    start: Mapping[str, float],
+    smooth: bool | None,
+    processes: int | None,
+    thorough: bool,
+    close: float,
+    progress: Callable[[str], None],
+) -> StateSpaceFit:
+    wide = likelihood(False, processes or 0)
+    found = maximise(wide, _widest(wide, start, progress), steps=8, close=1.0, progress=progress)
+    best = StateSpaceFit(wide, found, wide.evaluations)
+    if found.status is Status.INTEGRATION:
+        return best
+    # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
+    best = _with_colour(best, likelihood, progress) if processes is None else best
+    best = _with_or_without(best, smooth, likelihood, close, progress)
+    if thorough and processes is None:
+        wider = _with_colour(best, likelihood, progress)
+        if wider.likelihood.processes > best.likelihood.processes:
+            return _with_or_without(wider, smooth, likelihood, close, progress)
+        best = wider
+        if smooth is None and not best.smooth and not best.likelihood.processes:  # colour in place of the field?
+            other = _coloured(best, likelihood(True, 1), progress)
+            if other.criterion > best.criterion - CLOSE_CALL:
+                own = maximise(other.likelihood, other.maximum.point.x, close=close, progress=progress)
+                other = StateSpaceFit(other.likelihood, own, other.likelihood.evaluations)
+            better, worse = (other, best) if other.criterion > best.criterion else (best, other)
+            best = _counted(better, worse.evaluations)
+    return best
+
+
+def _with_colour(
+    best: StateSpaceFit, likelihood: Callable[[bool, int], Likelihood], progress: Callable[[str], None]
+) -> StateSpaceFit:
+    """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants."""
+    while best.likelihood.processes < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
+        wider = _coloured(best, likelihood(best.smooth, best.likelihood.processes + 1), progress)
+        if wider.criterion < best.criterion:
+            return _counted(best, wider.evaluations)
+        best = _counted(wider, best.evaluations)
+    return best
+
+
+def correlated(point: Point) -> float:
+    """Return how far the innovations are correlated with exponential means of those before, in standard deviations, at most.
+
+    That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of a run.
+    """
+    worst, longest = 0.0, max(f.white.size for f in point.runs)
+    for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
+        product, square = 0.0, 0.0
+        for f in point.runs:
+            white = np.clip(f.white, -5.0, 5.0)
+            before = lfilter([0.0, 1.0], [1.0, -np.exp(-1.0 / span)], white)
+            product, square = product + float(white @ before), square + float(before @ before)
+        worst = max(worst, abs(product) / np.sqrt(square) if square else 0.0)
+    return worst
+
+
+def _with_or_without(
+    begun: StateSpaceFit,
+    smooth: bool | None,
+    likelihood: Callable[[bool, int], Likelihood],
+    close: float,
+    progress: Callable[[str], None],
+) -> StateSpaceFit:
+    """Return the fit from where one begun stands, with a field or without, as `smooth` says or the likelihood."""
+    rough, count = begun.likelihood, begun.evaluations
+    if rough.smooth:
+        own = maximise(rough, begun.maximum.point.x, close=close, progress=progress)
+        return StateSpaceFit(rough, own, rough.evaluations)
+    plain = likelihood(True, rough.processes)
+    at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
+    faint = rough.lower[at] + np.log(FAINT / SMALL)
+
+    def bare(steps: int) -> StateSpaceFit:
+        progress("without a field")
+        values = plain.coordinates(found.point.values)
+        own = maximise(plain, values, steps=steps, close=close, progress=progress)
+        return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
+
+    tried: StateSpaceFit | None = None
+    elsewhere = False  # a field finer than the samples, or one that is slow, may be a maximum of its own
+    while rough.evaluations - before < STEPS:
+        last = found.point.x
+        found = maximise(rough, last, steps=3, close=close, progress=progress)
+        if found.away < close or np.array_equal(found.point.x, last):
+            other = None if elsewhere else _small_field(rough, found.point)
+            if other is None:
+                break
+            elsewhere, found = True, replace(found, point=other)
+            continue
+        if found.point.x[at] < last[at] - SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
+            found = replace(found, point=_shrunk(rough, found.point, at))
+        if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
+            tried = bare(BARE_STEPS)
+            if tried.log_likelihood > found.point.log_likelihood and tried.maximum.away < close:
+                small = _small_field(rough, tried.maximum.point)
+                if small is None:
+                    return tried
+                found = replace(found, point=small)
+    best = StateSpaceFit(rough, found, count + rough.evaluations - before + plain.evaluations)
+    if smooth is False:
+        return best
+    lost = found.point.log_likelihood - HOPELESS
+    if smooth or (
+        tried is None and plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood > lost
+    ):
+        tried = bare(STEPS)
+    if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
+        return best
+    if tried.maximum.away < close:
+        return tried
+    own = maximise(plain, tried.maximum.point.x, close=close, progress=progress)
+    return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
+
+
+def _small_field(rough: Likelihood, bare: Point) -> Point | None:
+    """Return the likeliest of a few small fields beside a fit without one or with another, None where none gains enough."""
+    best: tuple[float, Array] | None = None
+    for share in (0.03, 0.1, 0.3, 1.0):
+        for short in SHORT:
+            x = _under_field(rough, rough.coordinates(bare.values), share * FAINT, short)
+            found = rough.at(x, slopes=False).log_likelihood
+            if found > bare.log_likelihood + NEEDED and (best is None or found > best[0]):
+                best = found, x
+    return None if best is None else rough.at(best[1])
+
+
+def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
+    """Return the point with the likeliest of ever smaller amplitudes of the field, the other parameters as they are."""
+    best, x = (point.log_likelihood, point.x), point.x.copy()
+    while x[at] > rough.lower[at]:
+        x[at] = max(x[at] - SHRINKS, rough.lower[at])
+        found = rough.at(x, slopes=False).log_likelihood
+        if found < best[0]:
+            break
+        best = found, x.copy()
+    return point if best[1] is point.x else rough.at(best[1])
+
+
+def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str], None]) -> StateSpaceFit:
+    """Return the fit with one more process of gauge noise, from the likeliest correlation time and share of each kind of run."""
+    time, size = gauge_process(wider.processes)
+    kinds = {
+        own[time]: [wider.names.index(own[name]) for name in ("gauge_white", time, size)] for own in wider.own.values()
+    }
+    wide, x = wider.upper - wider.lower, wider.coordinates(fitted.values)
+    best = -np.inf
+    for base in _slow_fields(wider, x):
+        likeliest: dict[str, tuple[float, Array]] = {}  # each kind of run has its own noise
+        for share, part in product(TIMES, COLOURED):
+            trial = base.copy()
+            for white, at, colour in kinds.values():
+                trial[at] = wider.lower[at] + share * wide[at]
+                trial[white], trial[colour] = base[white] + 0.5 * np.log([1 - part, part])
+            trial = np.clip(trial, wider.lower, wider.upper)
+            found = dict.fromkeys(kinds, 0.0)
+            for f in wider.at(trial, slopes=False).runs:
+                found[wider.own[f.run.name][time]] += f.log_likelihood
+            for kind, likelihood in found.items():
+                if kind not in likeliest or likelihood > likeliest[kind][0]:
+                    likeliest[kind] = likelihood, trial[kinds[kind]]
+        total = sum(likelihood for likelihood, _ in likeliest.values())
+        if total > best:
+            best, x = total, base
+            for kind, (_, noise) in likeliest.items():
+                x[kinds[kind]] = noise
+    progress(f"coloured gauge noise: {wider.processes}")
+    maximum = maximise(wider, x, steps=20, close=1.0, progress=progress)
+    return StateSpaceFit(wider, maximum, wider.evaluations)
+
+
+def _slow_fields(wider: Likelihood, x: Array) -> Iterator[Array]:
+    """Yield x, and x with a field that is too slow to have taken up what is the gauge's."""
+    yield x.copy()
+    if wider.smooth:
+        return
+    for share in (0.1, 1.0):
+        yield _under_field(wider, x, share * FAINT, 1.0)
+
+
+def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Array:
+    """Return x under a field of amplitude `wide` over the friction of the recordings, its length `short` times the start's."""
+    amplitude, length = (rough.names.index(n) for n in FIELD)
+    found = x.copy()
+    found[amplitude], found[length] = rough.lower[amplitude] + np.log(wide / SMALL), rough.start[length] + np.log(short)
+    return found
+
+
+def _counted(fitted: StateSpaceFit, more: int) -> StateSpaceFit:
+    return StateSpaceFit(fitted.likelihood, fitted.maximum, fitted.evaluations + more)
+
+
+def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Array:
+    """Return x at `start` under the likeliest of a few wide fields: there the filter stays with the recording."""
+    x = rough.coordinates(start)
+    if "field_amplitude" in start:
+        return x
+    amplitude, length = (rough.names.index(n) for n in FIELD)
+    best = (-np.inf, x)
+    for wide in WIDE:
+        for short in SHORT:
+            trial = _under_field(rough, x, wide, short)
+            found = rough.at(trial, slopes=False).log_likelihood
+            progress(
+                f"field of {np.exp(trial[amplitude]):.2g} over {np.exp(trial[length]):.2g} um: log likelihood {found:.1f}"
+            )
+            if found > best[0]:
+                best = found, trial
+    return best[1]
+
+
+def as_fit(found: StateSpaceFit) -> Fit:
+    """Return a state-space fit as other fits are: predictions are those of each reading from the ones before it.
+
+    Residuals are innovations over their own standard deviation, in units of the gauge's white noise. Runs held out are filtered
+    with what was found.
+    """
+    likelihood, maximum = found.likelihood, found.maximum
+    problem, values, k = likelihood.problem, found.values, len(likelihood.problem.names)
+    held = [likelihood.filtered(run, values) for run in problem.experiment.runs if run.holdout]
+    pairs, runs = [gauge_process(j + 1) for j in range(likelihood.processes)], []
+    for f in (*maximum.point.runs, *held):
+        gauge = likelihood.gauge(f.run)
+        colours = tuple((values[gauge[time]], values[gauge[size]]) for time, size in pairs)
+        level = float(np.hypot(values[gauge["gauge_white"]], f.run.quantum / np.sqrt(12)))
+        with np.errstate(invalid="ignore"):
+            residual = f.found.nu / np.sqrt(f.found.S) * level
+        y = f.run.observed - f.found.nu
+        parts = stretches(f.run.t, f.run.used & np.isfinite(residual))
+        prediction = Prediction(y, np.zeros((y.size, 0)), np.zeros((y.size, 0)), Status.OK, float(f.run.t[-1]))
+        runs.append(
+            RunFit(f.run.name, f.run.holdout, prediction, residual, parts, Noise(level, (), level), level, colours)
+        )
+    return Fit(
+        problem.names, {**problem.held, **{n: values[n] for n in problem.names}}, found.covariance[:k, :k], problem.lower,
+        problem.upper,
+        tuple(runs), found.log_likelihood, maximum.status, found.evaluations,
+    )  # fmt: skip

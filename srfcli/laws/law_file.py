@@ -1,0 +1,530 @@
+"""Law files: TOML in the format `srf-law/1` to law values, and the commented files that `srf law new` writes."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from srfcli.core.errors import ExpressionError, SrfError, did_you_mean
+from srfcli.core.files import parse_toml, read_text
+from srfcli.core.settings import Parameter
+from srfcli.core.units import QUANTITY_UNITS, parse_unit
+from srfcli.laws.values import AgeingLaw, AgeingModifier, Check, Effect, FrictionLaw, Interface, Law, Reader, State
+
+if TYPE_CHECKING:
+    import sympy
+
+# Law files: TOML in the format `srf-law/1` to law values; a breach names file, key, what was found and expected.
+
+FORMAT = "srf-law/1"
+KINDS = ("friction", "ageing", "modifier", "interface")
+PLUGIN_KINDS = (*KINDS, "effect", "reader")
+FORMULA = {"friction": "mu", "ageing": "rate", "modifier": "term", "interface": "kappa"}  # also the checked quantity
+COMMON = ("mu0", "A", "B", "D0", "V0")  # friction parameters that an ageing law may name
+AGEING_SYMBOLS = ("v", "phi", "mu", "mu_dot", "W", "W_dot", "F_dot_over_W")
+APPARATUS = ("V", "W0", "eps", "f", "K", "M", "angle")  # of the system, which would take a law's parameter for its own
+# names that mean something in every law or system; a parameter cannot take them
+VARIABLES = (*AGEING_SYMBOLS, *APPARATUS, "kappa", "rate", "term", "u", "z")
+LAW_CLASSES: dict[str, type[Law]] = {
+    "friction": FrictionLaw,
+    "ageing": AgeingLaw,
+    "modifier": AgeingModifier,
+    "interface": Interface,
+}
+LAW_NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*", re.ASCII)
+
+_COMMON_KEYS = ("format", "kind", "name", "about", "cites", "parameters", "checks")
+_PARAMETER_KEYS = ("default", "unit", "lower", "upper", "bounds", "about")
+_CHECK_KEYS = ("quantity", "at", "value", "rtol")
+_STATE_KEYS = ("name", "length", "weight")
+
+
+def kind_of(law: Law | Reader) -> str:
+    """Return 'friction', 'ageing', 'modifier', 'interface', 'effect' or, of what reads files, 'reader'."""
+    if isinstance(law, Reader):
+        return "reader"
+    if isinstance(law, Effect):
+        return "effect"
+    return next(kind for kind, cls in LAW_CLASSES.items() if isinstance(law, cls))
+
+
+def formula_of(law: Law) -> sympy.Expr | None:
+    """Return the one formula of a law: mu, rate, term or kappa (None for a rigid interface)."""
+    return getattr(law, FORMULA[kind_of(law)])
+
+
+def known_symbols(kind: str, parameters: Iterable[str], states: Iterable[State] = (State(),)) -> tuple[str, ...]:
+    """Return the names that the formula of a law of `kind` may hold."""
+    match kind:
+        case "friction":
+            return ("v", *(state.name for state in states), *parameters)
+        case "interface":
+            return ("W", *parameters)
+    return (*AGEING_SYMBOLS, *COMMON, *parameters)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the table in a TOML file; raises `SrfError` with the place where it is not TOML."""
+    try:
+        return parse_toml(read_text(path, what="a law"), path)
+    except SrfError as error:
+        raise SrfError(error.message, error.hint or 'Text goes in quotes: mu = "mu0 + A*log(v/V0)".') from None
+    except OSError as error:
+        raise SrfError(f"{path}: cannot be read: {error.strerror}", "Check path and permissions.") from None
+
+
+def read_header(path: Path) -> tuple[str, str, str]:
+    """Return kind, name and about of a law file without reading its formula."""
+    reader = LawReader(path, read_toml(path))
+    return reader.kind(), reader.name(), reader.text("about")
+
+
+def valid_name(name: object) -> bool:
+    """True for a kebab-case law name of at most 64 letters."""
+    return isinstance(name, str) and len(name) <= 64 and LAW_NAME.fullmatch(name) is not None
+
+
+def check_parameters(parameters: Iterable[Parameter], *, kind: str, states: Iterable[State] = ()) -> None:
+    """Raise `SrfError` for a name, default, bound or unit that no law may have."""
+    from srfcli.laws.expression import check_identifier
+
+    names: set[str] = set()
+    taken = {*VARIABLES, *(state.name for state in states)}
+    if kind in ("ageing", "modifier"):
+        taken |= set(COMMON)  # they come from the friction law, and one default is enough
+    for p in parameters:
+        check_identifier(p.name, "parameter", taken=taken | names)
+        names.add(p.name)
+        if not math.isfinite(p.default):
+            raise SrfError(f"parameter '{p.name}': the default is {p.default}", "Give a finite number.")
+        if not p.lower <= p.default <= p.upper:
+            raise SrfError(
+                f"parameter '{p.name}': the default {p.default:g} is outside its bounds [{p.lower:g}, {p.upper:g}]",
+                "Change the default or the bounds.",
+            )
+        try:
+            parse_unit(p.unit)
+        except SrfError as error:
+            raise SrfError(f"parameter '{p.name}': {error.message}", error.hint) from None
+
+
+def check_states(states: Iterable[State], parameters: Iterable[Parameter]) -> None:
+    """Raise `SrfError` unless each state has its own name and names parameters for its length and weight."""
+    from srfcli.laws.expression import check_identifier
+
+    names = {p.name for p in parameters}
+    seen: set[str] = set()
+    for state in states:
+        check_identifier(state.name, "state", taken=seen | (set(VARIABLES) - {"phi"}))
+        seen.add(state.name)
+        for role in ("length", "weight"):
+            value = getattr(state, role)
+            if value not in names:
+                raise SrfError(
+                    f"state '{state.name}': {role} '{value}' is not a parameter of this law", did_you_mean(value, names)
+                )
+
+
+def check_uses(law: Law) -> None:
+    """Raise `SrfError` for a friction law without v or without one of its states."""
+    if not isinstance(law, FrictionLaw):
+        return
+    used = {s.name for s in law.mu.free_symbols}
+    for name in ("v", *(state.name for state in law.states)):
+        if name not in used:
+            raise SrfError(f"mu does not depend on '{name}'", "A friction law depends on v and on each of its states.")
+
+
+class LawReader:
+    """One TOML table on its way to a law."""
+
+    def __init__(self, path: Path, table: dict[str, Any]) -> None:
+        self.path, self.table = path, table
+
+    def fail(self, key: str, message: str, hint: str | None = None) -> NoReturn:
+        raise SrfError(f"{self.path}: {key}: {message}", hint)
+
+    def keys(self, where: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
+        for key in table:
+            if key not in tuple(known):
+                at = f"{where}.{key}" if where else key
+                self.fail(at, "unknown key", did_you_mean(key, known))
+
+    def text(self, key: str, default: str = "") -> str:
+        value = self.table.get(key, default)
+        if not isinstance(value, str):
+            self.fail(key, f"found {_shown(value)}, expected text in quotes")
+        return value
+
+    def number(self, where: str, value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            self.fail(where, f"found {_shown(value)}, expected a number")
+        try:
+            return float(value)
+        except OverflowError:
+            self.fail(where, f"found {_shown(value)}, which is too large", "Write it as in 1e300, or inf.")
+
+    def kind(self) -> str:
+        found = self.table.get("format")
+        if found != FORMAT:
+            said = "nothing" if found is None else _shown(found)
+            self.fail("format", f"found {said}, expected {FORMAT!r}", f'Start the file with format = "{FORMAT}".')
+        kind = self.table.get("kind")
+        known = (*KINDS, "effect")
+        if kind not in known:
+            said = "nothing" if kind is None else _shown(kind)
+            self.fail("kind", f"found {said}, expected one of {', '.join(known)}", did_you_mean(str(kind), known))
+        return kind
+
+    def name(self) -> str:
+        name = self.text("name", self.path.stem)
+        if not valid_name(name):
+            self.fail("name", f"found {_shown(name)}, expected small letters, digits and single dashes", "Like my-law.")
+        return name
+
+    def law(self) -> Law:
+        kind, key = self.kind(), FORMULA[self.kind()]
+        self.keys("", self.table, (*_COMMON_KEYS, key, *(("states",) if kind == "friction" else ())))
+        common: dict[str, Any] = {
+            "name": self.name(),
+            "about": self.text("about"),
+            "cites": self.cites(),
+            "parameters": self.parameters(),
+            "source": str(self.path),
+        }
+        if kind == "friction":
+            common["states"] = self.states()
+        states = common.get("states", ())
+        try:
+            check_parameters(common["parameters"], kind=kind, states=states)
+            check_states(states, common["parameters"])
+        except SrfError as error:
+            raise SrfError(f"{self.path}: {error.message}", error.hint) from None
+        names = known_symbols(kind, (p.name for p in common["parameters"]), states)
+        common["checks"] = self.checks(key, names)
+        common[key] = self.formula(key, kind, names)
+        law = LAW_CLASSES[kind](**common)
+        try:
+            check_uses(law)
+        except SrfError as error:
+            raise SrfError(f"{self.path}: {error.message}", error.hint) from None
+        return law
+
+    def formula(self, key: str, kind: str, names: tuple[str, ...]) -> sympy.Expr | None:
+        from srfcli.laws.expression import parse_expression
+
+        if key not in self.table:
+            if kind == "interface":
+                return None  # rigid
+            hint = f'Give the formula as text: {key} = "...".'
+            if key in self.table.get("parameters", {}):
+                hint = "It stands below [parameters]; move it above the first [table]."
+            self.fail(key, "missing", hint)
+        try:
+            return parse_expression(self.text(key), names)
+        except ExpressionError as error:
+            message = f"{self.path}: {key}: {error.message}"
+            raise ExpressionError(message, error.hint, text=error.text, column=error.column) from None
+
+    def cites(self) -> tuple[str, ...]:
+        cites = self.table.get("cites", [])
+        if not isinstance(cites, list) or not all(isinstance(c, str) for c in cites):
+            self.fail("cites", f"found {_shown(cites)}, expected a list of texts")
+        return tuple(cites)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        table = self.table.get("parameters", {})
+        if not isinstance(table, dict):
+            self.fail("parameters", f"found {_shown(table)}, expected a table", "Write [parameters].")
+        return tuple(self.parameter(name, entry) for name, entry in table.items())
+
+    def parameter(self, name: str, entry: object) -> Parameter:
+        where = f"parameters.{name}"
+        if not isinstance(entry, dict):
+            if name in (*_COMMON_KEYS, *FORMULA.values(), "states"):
+                self.fail(where, "this key stands below [parameters]", "Move it above the first [table].")
+            self.fail(
+                where, f"found {_shown(entry)}, expected a table", f'Write {name} = {{ default = 1.0, unit = "1" }}.'
+            )
+        self.keys(where, entry, _PARAMETER_KEYS)
+        if "default" not in entry:
+            self.fail(f"{where}.default", "missing", "Every parameter has a default.")
+        for key in ("unit", "about"):
+            if not isinstance(entry.get(key, ""), str):
+                self.fail(f"{where}.{key}", f"found {_shown(entry[key])}, expected text in quotes")
+        lower, upper = self.bounds(where, entry)
+        default = self.number(f"{where}.default", entry["default"])
+        return Parameter(name, default, entry.get("unit", "1"), lower, upper, entry.get("about", ""))
+
+    def bounds(self, where: str, entry: Mapping[str, Any]) -> tuple[float, float]:
+        if "bounds" not in entry:
+            lower = self.number(f"{where}.lower", entry.get("lower", -math.inf))
+            return lower, self.number(f"{where}.upper", entry.get("upper", math.inf))
+        bounds = entry["bounds"]
+        if "lower" in entry or "upper" in entry:
+            self.fail(f"{where}.bounds", "given together with lower or upper", "Keep one of the two forms.")
+        if not isinstance(bounds, list) or len(bounds) != 2:
+            self.fail(
+                f"{where}.bounds", f"found {_shown(bounds)}, expected [lower, upper]", "inf and -inf are numbers."
+            )
+        return self.number(f"{where}.bounds", bounds[0]), self.number(f"{where}.bounds", bounds[1])
+
+    def states(self) -> tuple[State, ...]:
+        entries = self.table.get("states", [{}])
+        if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+            self.fail("states", f'found {_shown(entries)}, expected [{{ name = "phi", length = "D0", weight = "B" }}]')
+        states = []
+        for number, entry in enumerate(entries):
+            where = f"states[{number}]"
+            self.keys(where, entry, _STATE_KEYS)
+            if not all(isinstance(value, str) for value in entry.values()):
+                self.fail(where, f"found {_shown(entry)}, expected texts for name, length and weight")
+            states.append(State(**entry))
+        return tuple(states)
+
+    def checks(self, quantity: str, names: tuple[str, ...]) -> tuple[Check, ...]:
+        entries = self.table.get("checks", [])
+        if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
+            self.fail("checks", f"found {_shown(entries)}, expected tables", "Write [[checks]] with two brackets.")
+        return tuple(self.check(f"checks[{i}]", entry, quantity, names) for i, entry in enumerate(entries))
+
+    def check(self, where: str, entry: Mapping[str, Any], quantity: str, names: tuple[str, ...]) -> Check:
+        self.keys(where, entry, _CHECK_KEYS)
+        for key in ("at", "value"):
+            if key not in entry:
+                self.fail(f"{where}.{key}", "missing")
+        if entry.get("quantity", quantity) != quantity:
+            found = _shown(entry["quantity"])
+            self.fail(f"{where}.quantity", f"found {found}, expected {quantity!r}", did_you_mean(found, QUANTITY_UNITS))
+        if not isinstance(entry["at"], dict):
+            self.fail(f"{where}.at", f"found {_shown(entry['at'])}, expected {{ v = 1.0, ... }}")
+        self.keys(f"{where}.at", entry["at"], names)
+        at = tuple((name, self.number(f"{where}.at.{name}", value)) for name, value in entry["at"].items())
+        value = self.number(f"{where}.value", entry["value"])
+        rtol = self.number(f"{where}.rtol", entry.get("rtol", Check.rtol))
+        return Check(quantity, at, value, rtol)
+
+
+def _shown(value: object) -> str:
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):
+        return "a value too long to show"
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+# The files that `srf law new` writes: each a whole, commented law that passes `srf law check` as it stands.
+
+TOML = {
+    "friction": """\
+format = "srf-law/1"
+kind = "friction"
+name = "$name"
+about = "One line for `srf laws`"
+cites = ["Author, Title, Journal volume, page (year)"]
+
+# mu is a formula in v (um/s), phi (s) and the parameters below: + - * / **, brackets,
+# exp log log1p expm1 sqrt sinh cosh tanh asinh atan lambertw.
+mu = "mu0 + A*log(v/V0) + B*log(1 + Vsat*phi/D0)"
+
+# Each state has a slip length and a weight in mu. For a second one, uncomment, declare B2 and D2, use phi2 in mu.
+# states = [
+#   { name = "phi", length = "D0", weight = "B" },
+#   { name = "phi2", length = "D2", weight = "B2" },
+# ]
+
+# Every parameter has a default; unit, bounds and about help whoever uses it. Ageing laws may name mu0, A, B, D0, V0.
+[parameters]
+mu0 = { default = 0.33, unit = "1", about = "friction coefficient at v = V0 of fresh contacts" }
+A = { default = 0.0126, unit = "1", bounds = [0.0, 1.0], about = "direct effect of velocity" }
+B = { default = 0.0241, unit = "1", bounds = [0.0, 1.0], about = "effect of age" }
+D0 = { default = 0.402, unit = "um", lower = 1e-6, about = "slip length over which contacts are renewed" }
+V0 = { default = 1.0, unit = "um/s", lower = 1e-12, about = "reference velocity" }
+Vsat = { default = 256.0, unit = "um/s", lower = 0.0, about = "velocity beyond which age no longer counts" }
+
+# A value worked out by hand: `srf law check` compares.
+[[checks]]
+quantity = "mu"
+at = { v = 1.0, phi = 0.0, D0 = 0.5, mu0 = 0.3 }
+value = 0.3
+""",
+    "ageing": """\
+format = "srf-law/1"
+kind = "ageing"
+name = "$name"
+about = "One line for `srf laws`"
+cites = ["Author, Title, Journal volume, page (year)"]
+
+# d(phi)/dt is a formula in v (um/s), phi (s), mu, mu_dot, W (N), W_dot, F_dot_over_W, in the friction law's
+# mu0, A, B, D0, V0 and in the parameters below. It must fall through zero at one phi for every v.
+rate = "1 - (v*phi/D0)**n"
+
+[parameters]
+n = { default = 1.0, unit = "1", bounds = [0.1, 10.0], about = "sharpness of renewal" }
+
+# A value worked out by hand: `srf law check` compares.
+[[checks]]
+quantity = "rate"
+at = { v = 2.0, phi = 0.1, D0 = 0.4, n = 2.0 }
+value = 0.75
+""",
+    "modifier": """\
+format = "srf-law/1"
+kind = "modifier"
+name = "$name"
+about = "One line for `srf laws`"
+cites = ["Author, Title, Journal volume, page (year)"]
+
+# A term that is added to the rate of an ageing law, as in --ageing dieterich+$name. Same names as in an ageing law.
+term = "-alpha*phi*W_dot/W"
+
+[parameters]
+alpha = { default = 0.2, unit = "1", bounds = [0.0, 1.0], about = "weight of the load's rate" }
+
+# A value worked out by hand: `srf law check` compares.
+[[checks]]
+quantity = "term"
+at = { phi = 2.0, W = 10.0, W_dot = -5.0, alpha = 0.3 }
+value = 0.3
+""",
+    "interface": """\
+format = "srf-law/1"
+kind = "interface"
+name = "$name"
+about = "One line for `srf laws`"
+cites = ["Author, Title, Journal volume, page (year)"]
+
+# The shear stiffness in N/um, a formula in W (N) and the parameters below. Without this line the interface is rigid.
+kappa = "W/lambda"
+
+[parameters]
+lambda = { default = 0.56, unit = "um", lower = 1e-6, about = "elastic length" }
+
+# A value worked out by hand: `srf law check` compares.
+[[checks]]
+quantity = "kappa"
+at = { W = 10.0, lambda = 0.5 }
+value = 20.0
+""",
+    "effect": """\
+format = "srf-law/1"
+kind = "effect"
+name = "$name"
+about = "One line for `srf laws`"
+cites = ["Author, Title, Journal volume, page (year)"]
+
+# An effect is physics that a baseline may lack. Give a formula for one or more of
+#   mu     friction coefficient
+#   rate   of ageing, d(phi)/dt
+#   kappa  shear stiffness of the interface, N/um
+#   W      load on the asperities, N
+#   force  on the slider along the track, N, with the drive
+#   V      velocity of the stage, um/s
+# in which the slot's own name is what was there before. A formula may hold v, phi, mu, mu_dot, W, W_dot, F_dot_over_W,
+# the friction law's mu0, A, B, D0, V0, slip (um from where the track begins), stage (um), time (s), u (um), W0, K, V,
+# of a modulated load theta (its phase), envelope (0 to 1), eps, f, modulated (1 or 0), and the parameters below.
+rate = "rate + v*phi/D0 - (v*phi/D0)**n"
+
+# `neutral` is the value at which the model is the baseline. Any other parameter is an inner one, which shows only where
+# the size is not neutral: a diagnosis tries `scan` values of it. Bounds are those of a fit.
+[parameters]
+n = { default = 1.2, neutral = 1.0, unit = "1", bounds = [0.3, 3.0], about = "sharpness of renewal" }
+
+# Numbers with a unit, which are never fitted.
+# [constants]
+# Wref = { value = 7.0, unit = "N", about = "reference load" }
+""",
+}
+
+_HEAD = '''\
+"""One line about this plugin."""
+
+from srfcli.laws.api import $imports
+
+'''
+
+PYTHON = {
+    "friction": _HEAD.replace("$imports", "Check, Parameter, friction_law, log")
+    + '''
+@friction_law(
+    name="$name",
+    about="One line for `srf laws`",
+    cites=["Author, Title, Journal volume, page (year)"],
+    parameters=[
+        Parameter("mu0", 0.33, about="friction coefficient at v = V0 of fresh contacts"),
+        Parameter("A", 0.0126, lower=0.0, upper=1.0, about="direct effect of velocity"),
+        Parameter("B", 0.0241, lower=0.0, upper=1.0, about="effect of age"),
+        Parameter("D0", 0.402, "um", lower=1e-6, about="slip length over which contacts are renewed"),
+        Parameter("V0", 1.0, "um/s", lower=1e-12, about="reference velocity"),
+        Parameter("Vsat", 256.0, "um/s", lower=0.0, about="velocity beyond which age no longer counts"),
+    ],
+    checks=[Check("mu", (("v", 1.0), ("phi", 0.0), ("D0", 0.5), ("mu0", 0.3)), 0.3)],
+)
+def $function(v, phi, p):
+    """Called once, with symbols: v in um/s, phi in s, p holds the parameters."""
+    return p.mu0 + p.A * log(v / p.V0) + p.B * log(1 + p.Vsat * phi / p.D0)
+''',
+    "ageing": _HEAD.replace("$imports", "Check, Parameter, ageing_law")
+    + '''
+@ageing_law(
+    name="$name",
+    about="One line for `srf laws`",
+    cites=["Author, Title, Journal volume, page (year)"],
+    parameters=[Parameter("n", 1.0, lower=0.1, upper=10.0, about="sharpness of renewal")],
+    checks=[Check("rate", (("v", 2.0), ("phi", 0.1), ("D0", 0.4), ("n", 2.0)), 0.75)],
+)
+def $function(v, phi, p):
+    """Called once, with symbols; may also take mu, mu_dot, W, W_dot, F_dot_over_W. p has mu0, A, B, D0, V0 too."""
+    return 1 - (v * phi / p.D0) ** p.n
+''',
+    "modifier": _HEAD.replace("$imports", "Check, Parameter, modifier")
+    + '''
+@modifier(
+    name="$name",
+    about="One line for `srf laws`",
+    cites=["Author, Title, Journal volume, page (year)"],
+    parameters=[Parameter("alpha", 0.2, lower=0.0, upper=1.0, about="weight of the load's rate")],
+    checks=[Check("term", (("phi", 2.0), ("W", 10.0), ("W_dot", -5.0), ("alpha", 0.3)), 0.3)],
+)
+def $function(phi, W, W_dot, p):
+    """Called once, with symbols; the term is added to the rate of the ageing law it is combined with."""
+    return -p.alpha * phi * W_dot / W
+''',
+    "interface": _HEAD.replace("$imports", "Check, Parameter, interface")
+    + '''
+@interface(
+    name="$name",
+    about="One line for `srf laws`",
+    cites=["Author, Title, Journal volume, page (year)"],
+    parameters=[Parameter("lambda", 0.56, "um", lower=1e-6, about="elastic length")],
+    checks=[Check("kappa", (("W", 10.0), ("lambda", 0.5)), 20.0)],
+)
+def $function(W, p):
+    """Called once, with symbols: W in N; the stiffness is in N/um. p["lambda"], since lambda is a Python keyword."""
+    return W / p["lambda"]
+''',
+    "effect": _HEAD.replace("$imports", "Parameter, effect")
+    + '''
+@effect(
+    name="$name",
+    about="One line for `srf laws`",
+    cites=["Author, Title, Journal volume, page (year)"],
+    parameters=[Parameter("n", 1.2, lower=0.3, upper=3.0, about="sharpness of renewal")],
+    neutral={"n": 1.0},
+)
+def $function(rate, v, phi, p):
+    """Called once, with symbols; what is returned for mu, rate, kappa, W, force or V takes the place of what was there."""
+    worn = v * phi / p.D0
+    return {"rate": rate + worn - worn**p.n}
+''',
+}
+
+
+def template(kind: str, name: str, *, python: bool) -> str:
+    """Return the text of a new law file."""
+    function = "law_" + name.replace("-", "_")  # a law's name may begin with a digit or be a keyword
+    return Template((PYTHON if python else TOML)[kind]).substitute(name=name, function=function)

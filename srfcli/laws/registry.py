@@ -1,0 +1,475 @@
+"""Names of laws to files and entry points; Python plugins are read before they are run."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import hashlib
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+from srfcli.core.cache import header_key, known_headers
+from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.files import check_plain, read_plain
+from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, read_header, read_toml, valid_name
+from srfcli.laws.values import AgeingLaw, AgeingModifier, Law, Reader
+
+# Names of laws to files and entry points: a listing imports nothing, a broken plugin stops nobody but its user.
+
+GROUP = "srf.laws"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A law that can be loaded: what it is called, what it is and where it comes from."""
+
+    name: str
+    kind: str
+    origin: str
+    location: Path
+    about: str = ""
+    module: str | None = field(default=None, repr=False)  # how an entry point imports it
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A source that could not be listed: `name` is what its user would probably ask for."""
+
+    name: str
+    origin: str
+    location: str
+    message: str
+    hint: str | None = None
+
+
+class Registry:
+    """The laws that were found, by kind and name; a law is loaded when it is first asked for, and then kept."""
+
+    def __init__(
+        self,
+        entries: Sequence[Entry],
+        problems: Sequence[Problem] = (),
+        *,
+        named: Sequence[Path] = (),
+        trust: bool = False,
+    ) -> None:
+        self._entries = tuple(sorted(entries, key=lambda e: (PLUGIN_KINDS.index(e.kind), e.name, str(e.location))))
+        self.problems = tuple(problems)
+        self._trust = trust
+        self._own = {_resolved(path) for path in (*named, *(e.location for e in self._entries))}
+        self._loaded: dict[Entry, Law] = {}
+        self._readers: dict[Entry, Reader] = {}
+
+    def entries(self, kind: str | None = None) -> tuple[Entry, ...]:
+        """Return all entries, or those of one kind, sorted by kind and name; clashing ones are all there."""
+        if kind is not None and kind not in PLUGIN_KINDS:
+            raise SrfError(f"unknown kind '{kind}'", did_you_mean(kind, PLUGIN_KINDS))
+        return tuple(e for e in self._entries if kind in (None, e.kind))
+
+    def clashes(self, entry: Entry) -> tuple[Entry, ...]:
+        """Return the other entries of the same kind and name."""
+        return tuple(e for e in self._entries if e != entry and (e.kind, e.name) == (entry.kind, entry.name))
+
+    def find(self, kind: str, name: str) -> Entry:
+        """Return the one entry of that kind and name; raises `SrfError` where there is none, or more than one."""
+        found = [e for e in self.entries(kind) if e.name == name]
+        what = kind if kind == "reader" else f"{kind} law"
+        if len(found) == 1:
+            return found[0]
+        if found:
+            places = " and ".join(f"{e.location} ({e.origin})" for e in found)
+            raise SrfError(f"two {what}s are called '{name}': {places}", "Rename one or take its folder away.")
+        for problem in self.problems:
+            if problem.name == name:
+                raise SrfError(problem.message, problem.hint)
+        others = [e.kind for e in self._entries if e.name == name]
+        known = did_you_mean(name, (e.name for e in self.entries(kind)))
+        hint = f"'{name}' is of kind {others[0]}. Known: {known.rpartition('Known: ')[2]}" if others else known
+        raise SrfError(f"unknown {what} '{name}'", hint)
+
+    def get(self, kind: str, name: str) -> Law:
+        """Return the law of that kind and name, or in the file of that name where it ends in .toml or .py."""
+        if name.endswith((".toml", ".py")):
+            self.check_trusted(name)
+            return one_law(Path(name), kind)
+        return self.load(self.find(kind, name))
+
+    def check_trusted(self, name: str) -> None:
+        """Raise `SrfError` for a Python file that only a file names: to read its law would be to run it.
+
+        What a person named (`named`, `plugins`) or installed may run, and with `trust` anything may.
+        """
+        if name.endswith(".py") and not self._trust and _resolved(Path(name)) not in self._own:
+            raise SrfError(f"'{name}' is Python code, which a file may not have run", untrusted_hint(name))
+
+    def load(self, entry: Entry) -> Law:
+        """Return the law of an entry, imported or parsed at the first call."""
+        if entry not in self._loaded:
+            if entry.location.suffix == ".toml":
+                self._loaded[entry] = read_law(entry.location)
+            else:
+                self._loaded[entry] = find_law(entry.location, entry.module, entry.kind, entry.name)
+        return self._loaded[entry]
+
+    def reader(self, entry: Entry) -> Reader:
+        """Return the reader of an entry, imported at the first call."""
+        if entry not in self._readers:
+            self._readers[entry] = find_reader(entry.location, entry.module, entry.name)
+        return self._readers[entry]
+
+    def ageing(self, spelling: str) -> tuple[AgeingLaw, tuple[AgeingModifier, ...]]:
+        """Return the ageing law and the modifiers of a spelling such as `dieterich+linker-dieterich`."""
+        first, *rest = (word.strip() for word in spelling.split("+"))
+        if not first or not all(rest):
+            raise SrfError(f"ageing law '{spelling}' has an empty part", "Write dieterich+linker-dieterich.")
+        if len(set(rest)) != len(rest):
+            raise SrfError(
+                f"ageing law '{spelling}' names a modifier twice", "Change the modifier's parameter instead."
+            )
+        law = self.get("ageing", first)
+        modifiers = tuple(self.get("modifier", word) for word in rest)
+        assert isinstance(law, AgeingLaw)
+        own = {p.name for p in law.parameters}
+        for m in modifiers:
+            assert isinstance(m, AgeingModifier)
+            for p in m.parameters:
+                if p.name in own:
+                    raise SrfError(
+                        f"'{spelling}' has two parameters called '{p.name}'", f"Rename the one of '{m.name}'."
+                    )
+                own.add(p.name)
+        return law, modifiers  # type: ignore[return-value]
+
+    def fingerprint(self, entry: Entry) -> str:
+        """Return the sha256 of the file that holds a law."""
+        return hashlib.sha256(read_plain(entry.location)).hexdigest()
+
+
+def _resolved(path: Path) -> Path:
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError, ValueError):  # a link to itself, a zero byte: nothing that could be run
+        return path
+
+
+def untrusted_hint(name: str) -> str:
+    """Return what a person does who has read a Python file that a file names."""
+    return f"Once you have read it, give --plugins {Path(name).parent} or --trust"
+
+
+def load_registry(
+    plugins: Sequence[Path] = (),
+    *,
+    user: bool = True,
+    entry_points: bool = True,
+    named: Sequence[Path] = (),
+    trust: bool = False,
+) -> Registry:
+    """Return the laws of the bundled folder, entry points, the user's data folder, SRF_PLUGINS and `plugins`.
+
+    A law that an experiment names by the path of a Python file runs only where the file is one of these or in `named`, or
+    with `trust`. A folder in `plugins` or SRF_PLUGINS that does not exist raises `SrfError`; every other fault becomes a
+    `Problem`.
+    """
+    collect = _Collector()
+    collect.folder("bundled", bundled_folder())
+    if entry_points:
+        for point in importlib.metadata.entry_points(group=GROUP):
+            collect.entry_point(point)
+    if user and user_folder().is_dir():
+        collect.folder("user", user_folder())
+    asked = [(p, "--plugins") for p in plugins]
+    asked += [(Path(p), "SRF_PLUGINS") for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
+    for path, origin in asked:
+        path = path.expanduser()
+        if not path.exists():
+            raise SrfError(f"{origin}: no folder {path}", "Give a folder that holds law files.")
+        collect.folder(origin, path)
+    return Registry(collect.entries, collect.problems, named=named, trust=trust)
+
+
+@functools.cache
+def bundled_registry() -> Registry:
+    """Return the shipped laws alone."""
+    collect = _Collector()
+    collect.folder("bundled", bundled_folder())
+    return Registry(collect.entries, collect.problems)
+
+
+def bundled_folder() -> Path:
+    """Return the folder of shipped laws: inside the wheel, else beside the package in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "plugins"
+    return inside if inside.is_dir() else package.parent / "plugins"
+
+
+def user_folder() -> Path:
+    """Return the folder of the user's own laws, which need not exist."""
+    if os.environ.get("SRF_DATA"):
+        return Path(os.environ["SRF_DATA"])
+    base = Path(os.environ.get("XDG_DATA_HOME", ""))
+    if not base.is_absolute():  # as the specification of these folders says; it would be one in the current folder
+        base = Path.home() / ".local" / "share"
+    return base / "srf" / "plugins"
+
+
+def read_law(path: Path) -> Law:
+    """Return the law, or the effect, in a TOML file; its `kind` says which reader it needs."""
+    table = read_toml(path)
+    if table.get("kind") == "effect":
+        from srfcli.laws.effect_file import EffectReader  # imports sympy
+
+        return EffectReader(path, table).effect()
+    return LawReader(path, table).law()
+
+
+def read_file(path: Path) -> tuple[Law, ...]:
+    """Return the laws in one file, TOML or Python; a Python file is run."""
+    if not path.is_file():
+        raise SrfError(f"no file {path}", "Give the path of a .toml or .py file.")
+    if path.suffix == ".toml":
+        return (read_law(path),)
+    if path.suffix != ".py":
+        raise SrfError(f"{path}: neither .toml nor .py", "Laws are written as TOML or Python.")
+    laws = tuple(laws_in(load_module(path, None)))
+    if not laws:
+        raise SrfError(f"{path}: holds no law", f"Decorate a function with @friction_law(...) from {API}.")
+    return laws
+
+
+def one_law(path: Path, kind: str) -> Law:
+    """Return the single law of `kind` in a file."""
+    found = [law for law in read_file(path) if kind_of(law) == kind]
+    if len(found) != 1:
+        raise SrfError(f"{path}: holds {len(found)} laws of kind {kind}, expected one")
+    return found[0]
+
+
+class _Collector:
+    """Entries and problems, gathered source by source; a file that is reached twice counts once."""
+
+    def __init__(self) -> None:
+        self.entries: list[Entry] = []
+        self.problems: list[Problem] = []
+        self.seen: set[Path] = set()
+
+    def folder(self, origin: str, folder: Path) -> None:
+        for path in _law_files(folder):
+            self.file(origin, path)
+
+    def file(self, origin: str, path: Path, module: str | None = None, only: str | None = None) -> None:
+        place = _resolved(path)
+        if place in self.seen:
+            return
+        self.seen.add(place)
+        self.guard(path.stem, origin, path, lambda: self.add(origin, path, module, only))
+
+    def add(self, origin: str, path: Path, module: str | None, only: str | None) -> None:
+        found = _known(path) or ([read_header(path)] if path.suffix == ".toml" else scan_python(path))
+        if only is not None:
+            found = [entry for entry in found if entry[1] == only.replace("_", "-")]
+        self.entries += [Entry(name, kind, origin, path, about, module) for kind, name, about in found]
+
+    def entry_point(self, point: importlib.metadata.EntryPoint) -> None:
+        origin = f"entry point {point.name}"
+        self.guard(point.name, origin, point.value, lambda: self.add_point(origin, point))
+
+    def add_point(self, origin: str, point: importlib.metadata.EntryPoint) -> None:
+        place = _without_import(point.module)
+        if place.is_dir() and (not (place / "__init__.py").is_file() or _has_laws(place)):
+            self.folder(origin, place)
+        else:
+            source = place / "__init__.py" if place.is_dir() else place
+            self.file(origin, source, point.module, point.attr or None)
+
+    def guard(self, name: str, origin: str, where: object, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except SrfError as error:
+            self.problems.append(Problem(name, origin, str(where), error.message, error.hint))
+        except Exception as error:  # a foreign source may fail in any way; its user is told, the others go on
+            message = f"{where}: {type(error).__name__}: {error}"
+            self.problems.append(Problem(name, origin, str(where), message))
+
+
+def _law_files(folder: Path) -> Iterator[Path]:
+    """Yield the law files of a folder and of its subfolders friction, ageing, modifier, interface and readers."""
+    if folder.is_file():
+        yield folder
+        return
+    for place in (folder, *(folder / kind for kind in (*PLUGIN_KINDS, "readers"))):
+        if place.is_dir():
+            yield from sorted(
+                p for p in place.iterdir() if p.suffix in (".toml", ".py") and not p.name.startswith(("_", "."))
+            )
+
+
+def _known(path: Path) -> list[tuple[str, str, str]] | None:
+    """Return what the package already knows of a file of this name and content, None where that is nothing."""
+    try:
+        return known_headers().get(header_key(path, read_plain(path)))
+    except (OSError, SrfError):  # its reader says what is wrong
+        return None
+
+
+def _has_laws(place: Path) -> bool:
+    return place.is_dir() and any(path.suffix == ".toml" for path in _law_files(place))
+
+
+def _without_import(module: str) -> Path:
+    """Return the file or folder of a module; only the finder of its top-level package is asked, nothing is imported."""
+    top, *rest = module.split(".")
+    spec = importlib.util.find_spec(top)
+    if spec is None:
+        raise SrfError(f"entry point names the module {module}, which is not installed")
+    roots = [Path(p) for p in spec.submodule_search_locations or ()]
+    if not rest:
+        return roots[0] if roots else Path(str(spec.origin))
+    for root in roots:
+        place = root.joinpath(*rest)
+        for candidate in (place, place.with_suffix(".py")):
+            if candidate.is_dir() or candidate.is_file():
+                return candidate
+    raise SrfError(f"entry point names {module}, which is not in the package {top}")
+
+
+# Python plugins: found by reading the source, imported only when one of their laws is used.
+
+API = "srfcli.laws.api"  # what a plugin imports its decorators from
+DECORATORS = {
+    "friction_law": "friction",
+    "ageing_law": "ageing",
+    "modifier": "modifier",
+    "interface": "interface",
+    "effect": "effect",
+    "reader": "reader",
+}
+
+
+def scan_python(path: Path) -> list[tuple[str, str, str]]:
+    """Return (kind, name, about) of each decorated law in a Python file, which is read but not run.
+
+    A file that imports API and shows no law, and a decorator whose name is not written out, raise `SrfError`.
+    """
+    try:
+        tree = ast.parse(read_plain(path, what="a law"), filename=str(path))
+    except SyntaxError as error:
+        raise SrfError(f"{path}: not Python: {error.msg}, line {error.lineno}") from None
+    except (OSError, ValueError, RecursionError, MemoryError) as error:
+        raise SrfError(f"{path}: cannot be read: {error}") from None
+    aliases, imports_api = _decorator_names(tree)
+    found = []
+    for node in tree.body:
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        for decorator in node.decorator_list:
+            kind = aliases.get(_called(decorator))
+            if kind:
+                found.append((kind, *_name_and_about(path, node, decorator)))
+    if imports_api and not found:
+        raise SrfError(f"{path}: imports {API} but no law is found", "Decorate a function at the top level.")
+    return found
+
+
+def load_module(location: Path, module: str | None) -> ModuleType:
+    """Import a plugin, by module name where an entry point gave one, else from its file; any failure is `SrfError`."""
+    try:
+        if module:
+            return importlib.import_module(module)
+        check_plain(location)
+        return _from_file(location)
+    except SrfError as error:
+        raise SrfError(f"{location}: {error.message}", error.hint) from error
+    except (Exception, SystemExit) as error:
+        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(location)]
+        at = f", line {lines[-1]}" if lines else ""
+        raise SrfError(
+            f"{location}{at}: {type(error).__name__}: {error}", "Mend the plugin or leave it out."
+        ) from error
+
+
+def laws_in(module: ModuleType) -> Iterator[Law]:
+    """Yield the law values among a module's attributes."""
+    return (value for value in vars(module).values() if isinstance(value, Law))
+
+
+def find_law(location: Path, module: str | None, kind: str, name: str) -> Law:
+    """Return the law of that kind and name from a plugin, imported now."""
+    for law in laws_in(load_module(location, module)):
+        if kind_of(law) == kind and law.name == name:
+            return law
+    raise SrfError(f"{location}: once imported, there is no {kind} law '{name}' in it")
+
+
+def find_reader(location: Path, module: str | None, name: str) -> Reader:
+    """Return the reader of that name from a plugin, imported now."""
+    for value in vars(load_module(location, module)).values():
+        if isinstance(value, Reader) and value.name == name:
+            return value
+    raise SrfError(f"{location}: once imported, there is no reader '{name}' in it")
+
+
+def _from_file(path: Path) -> ModuleType:
+    # a name of its own, so that a plugin called numpy.py shadows nothing
+    name = f"srf_plugin_{path.stem}_{hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise SrfError(f"{path}: cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _decorator_names(tree: ast.Module) -> tuple[dict[str, str], bool]:
+    """Return the local names of the decorators, dotted where all of api is imported, and whether it is imported."""
+    package, _, module = API.rpartition(".")
+    aliases: dict[str, str] = {}
+    imports_api = False
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module == API:
+            imports_api = True
+            for item in node.names:
+                if item.name in DECORATORS:
+                    aliases[item.asname or item.name] = DECORATORS[item.name]
+        elif isinstance(node, ast.ImportFrom) and node.module == package:
+            prefixes = [item.asname or item.name for item in node.names if item.name == module]
+            imports_api = imports_api or bool(prefixes)
+            aliases |= {f"{prefix}.{name}": kind for prefix in prefixes for name, kind in DECORATORS.items()}
+        elif isinstance(node, ast.Import):
+            prefixes = [item.asname or item.name for item in node.names if item.name == API]
+            imports_api = imports_api or bool(prefixes)
+            aliases |= {f"{prefix}.{name}": kind for prefix in prefixes for name, kind in DECORATORS.items()}
+    return aliases, imports_api
+
+
+def _called(decorator: ast.expr) -> str:
+    return ast.unparse(decorator.func if isinstance(decorator, ast.Call) else decorator)
+
+
+def _name_and_about(path: Path, node: ast.FunctionDef, decorator: ast.expr) -> tuple[str, str]:
+    words = {k.arg: k.value for k in decorator.keywords} if isinstance(decorator, ast.Call) else {}
+    name, about = node.name.replace("_", "-"), (ast.get_docstring(node) or "").split("\n")[0]
+    if "name" in words:
+        value = words["name"]
+        if not isinstance(value, ast.Constant) or not valid_name(value.value):
+            raise SrfError(
+                f"{path}, line {value.lineno}: name={ast.unparse(value)} is not a kebab-case name in quotes",
+                'The listing reads the file without running it: write name="my-law".',
+            )
+        name = str(value.value)
+    if isinstance(words.get("about"), ast.Constant):
+        about = str(words["about"].value)  # type: ignore[attr-defined]
+    return name, about

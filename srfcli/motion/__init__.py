@@ -1,0 +1,1 @@
+"""What is imposed on a slider, and its motion in time."""

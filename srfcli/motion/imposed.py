@@ -1,0 +1,720 @@
+"""What the experimenter imposes: the driving velocity V(t) and the normal load W(t), piece by smooth piece; um, s, N.
+
+Evenly sampled stretches carry a spline of degree 7: at eight samples per period of a modulation it errs by 3e-7 of the
+amplitude, where a cubic errs by 4e-4 and its derivative by a percent. At jumps and corners such a spline would ring; the few
+intervals there, gaps and changes of the sampling rate are bridged by monotone cubics. A load with measurement noise is smoothed,
+as dW/dt enters laws.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.codegen.model import Array
+from srfcli.core.errors import SrfError
+
+if TYPE_CHECKING:
+    from scipy.interpolate import BSpline
+
+# The imposed normal load: constant, modulated, or any other; um, s, N.
+
+LoadPiece = Callable[[float], tuple[float, float]]
+PIECES = 16  # polynomials per period of a modulation: degree 7 then errs by 4e-13 of its amplitude
+DEGREE = 7
+
+
+class Load(abc.ABC):
+    """The imposed normal load and its rate, smooth between `breaks`; no step is longer than `longest_step` seconds."""
+
+    breaks: tuple[float, ...] = ()
+    longest_step: float = math.inf
+
+    @abc.abstractmethod
+    def piece(self, t: float) -> LoadPiece:
+        """Return W and dW/dt as a function of one time, valid on the smooth piece that holds at `t`."""
+
+    @abc.abstractmethod
+    def rest(self, t: float) -> float:
+        """Return the load under which sliding at time `t` is steady when nothing is modulated."""
+
+    def check(self, start: float, end: float) -> None:  # noqa: B027
+        """Raise SrfError where the load is not known on all of [start, end]."""
+
+    @abc.abstractmethod
+    def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
+        """Return W on [start, end] as polynomials, to 1e-11 of W: knots (k + 1,) and coefficients (k, degree + 1).
+
+        On [knots[i], knots[i + 1]] W is the sum of coefficients[i, j] (t - knots[i])^j; every break inside is a knot.
+        """
+
+    def __call__(self, t: Array) -> tuple[Array, Array]:
+        """Return W and dW/dt at the times `t`, as arrays."""
+        bounds = np.array(self.breaks, dtype=float)
+        t = np.asarray(t, dtype=float)
+        piece = np.searchsorted(bounds, t, side="right")
+        out = np.empty((2, t.size))
+        for k in np.unique(piece):
+            members = np.nonzero(piece == k)[0]
+            function = self.piece(float(t[members[0]]))
+            out[:, members] = np.array([function(s) for s in t[members].tolist()]).T
+        return out[0], out[1]
+
+
+@dataclass(frozen=True)
+class ConstantLoad(Load):
+    """A load that does not change."""
+
+    W0: float
+
+    def __post_init__(self) -> None:
+        _check_positive("W0", self.W0)
+
+    def piece(self, t: float) -> LoadPiece:
+        W0 = self.W0
+        return lambda s: (W0, 0.0)
+
+    def rest(self, t: float) -> float:
+        return self.W0
+
+    def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
+        _check_interval(start, end)
+        return np.array([start, end]), np.array([[self.W0]])
+
+    def __call__(self, t: Array) -> tuple[Array, Array]:
+        return np.full(np.size(t), self.W0), np.zeros(np.size(t))
+
+
+@dataclass(frozen=True)
+class Modulation(Load):
+    """W = W0 (1 + eps s(t) cos(2 pi f t + phase)), where s rises smoothly from 0 to 1 over `rise` seconds from `onset` on.
+
+    Without `onset` the modulation has always been there. The switch-on has two continuous derivatives: a jump of the load
+    would move the slider across an interface whose stiffness does not follow the load.
+    """
+
+    W0: float
+    eps: float
+    f: float
+    onset: float = -math.inf
+    rise: float | None = None  # five periods
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_positive("W0", self.W0)
+        _check_positive("f", self.f)
+        if not 0 <= self.eps < 1:
+            raise SrfError(f"eps = {self.eps:g} lifts the slider off", "give 0 <= eps < 1")
+        if self.rise is not None:
+            _check_positive("rise", self.rise)
+
+    @property
+    def full(self) -> float:
+        """Return the time from which the modulation has its full amplitude."""
+        return self.onset + (5 / self.f if self.rise is None else self.rise)
+
+    @property
+    def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
+        return (self.onset, self.full) if math.isfinite(self.onset) else ()
+
+    @property
+    def longest_step(self) -> float:  # type: ignore[override]
+        return 0.25 / self.f if self.eps else math.inf  # a longer one could jump over whole periods of a quiet start
+
+    def piece(self, t: float) -> LoadPiece:
+        W0, omega, phase, cos, sin = self.W0, 2 * math.pi * self.f, self.phase, math.cos, math.sin
+        amplitude, onset = self.eps * self.W0, self.onset
+        if t < onset or not self.eps:
+            return lambda s: (W0, 0.0)
+
+        def whole(s: float) -> tuple[float, float]:
+            angle = omega * s + phase
+            return W0 + amplitude * cos(angle), -amplitude * omega * sin(angle)
+
+        if t >= self.full:
+            return whole
+        length = self.full - onset
+
+        def rising(s: float) -> tuple[float, float]:
+            r = (s - onset) / length
+            share, rate = r * r * r * (10 - 15 * r + 6 * r * r), 30 * r * r * (1 - r) * (1 - r) / length
+            W, W_dot = whole(s)
+            return W0 + share * (W - W0), share * W_dot + rate * (W - W0)
+
+        return rising
+
+    def rest(self, t: float) -> float:
+        return self.W0
+
+    def _on_piece(self, t: Array, at: float) -> Array:
+        """Return W at many times by the formula that holds at `at`: a record has tens of thousands of knots."""
+        if at < self.onset or not self.eps:
+            return np.full(t.shape, self.W0)
+        wave = self.eps * self.W0 * np.cos(2 * math.pi * self.f * t + self.phase)
+        if at < self.full:
+            r = (t - self.onset) / (self.full - self.onset)
+            wave *= r * r * r * (10 - 15 * r + 6 * r * r)
+        return self.W0 + wave
+
+    def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
+        _check_interval(start, end)
+        inside = [b for b in self.breaks if start < b < end]
+        knots, rows = [np.array([start])], []
+        for a, b in pairwise([start, *inside, end]):
+            edges = np.array([a, b])
+            middle = 0.5 * (a + b)
+            if self.eps and middle >= self.onset:
+                length = 1 / self.f if middle >= self.full else min(1 / self.f, self.full - self.onset)
+                edges = np.linspace(a, b, math.ceil((b - a) * PIECES / length) + 1)
+            rows.append(fit_polynomials(partial(self._on_piece, at=middle), edges))
+            knots.append(edges[1:])
+        return np.concatenate(knots), np.concatenate(rows)
+
+
+def fit_polynomials(function: Callable[[Array], Array], edges: Array) -> Array:
+    """Return the polynomials of degree 7 through W at the Chebyshev-Lobatto points of each interval, (k, 8), lowest first.
+
+    They meet at the edges, and are written in the time since the interval's start.
+    """
+    shares, to_powers = _interpolation()
+    widths = np.diff(edges)
+    times = edges[:-1, None] + widths[:, None] * shares
+    times[:, -1] = edges[1:]
+    values = function(times)
+    offset = values[:, :1]
+    powers = (values - offset) @ to_powers
+    powers[:, 0] += offset[:, 0]
+    return powers / widths[:, None] ** np.arange(DEGREE + 1)
+
+
+@cache
+def _interpolation() -> tuple[Array, Array]:
+    """Return the points in [0, 1], rising, and the matrix that turns values there into coefficients of powers."""
+    shares = 0.5 - 0.5 * np.cos(np.pi * np.arange(DEGREE + 1) / DEGREE)
+    series = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * shares - 1, DEGREE))
+    to_powers = np.array([_shifted_chebyshev(j) for j in range(DEGREE + 1)])  # row j: T_j(2 r - 1) in powers of r
+    return shares, (series.T @ to_powers)
+
+
+def _shifted_chebyshev(degree: int) -> Array:
+    basis = np.polynomial.chebyshev.Chebyshev.basis(degree, domain=[0.0, 1.0])
+    powers = basis.convert(kind=np.polynomial.Polynomial, domain=[-1.0, 1.0], window=[-1.0, 1.0]).coef
+    return np.pad(np.round(powers), (0, DEGREE + 1 - powers.size))  # whole numbers
+
+
+def _check_interval(start: float, end: float) -> None:
+    if not (math.isfinite(start) and math.isfinite(end) and start < end):
+        raise SrfError(f"a load is asked for from {start:g} to {end:g} s", "give two finite times that rise")
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise SrfError(f"{name} = {value:g} is not a positive number")
+
+
+# A measured load as piecewise polynomials; um, s, N.
+
+UNEVEN = 1.6  # ratio of an interval to its neighbours' median at which a stretch ends
+SHORTEST = 16  # samples of a stretch that carries the spline
+REACH = 4  # samples on each side from which a sample is foretold
+ROUGH = 0.02  # share of the local range by which a sample may differ from what its neighbours foretell
+FAINT = 1e-4  # share of the whole range below which nothing is a corner
+MOSTLY = 0.3  # share of rough samples at which a load is coarsely sampled rather than cornered
+SPACINGS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # samples between the knots of a smoothing spline
+BLOCK = 32  # samples over which the smoothness may vary
+
+
+class SampledLoad(Load):
+    """The measured load `W` (N) at `times` (s, rising, four or more); `noise` (N) is its measurement error, 0 to interpolate.
+
+    `knots` (k + 1,) and `coefficients` (k, 8), lowest power first in the time since the knot, are what it consists of.
+    """
+
+    def __init__(self, times: Array, W: Array, *, noise: float = 0.0) -> None:
+        t, values = np.asarray(times, dtype=float), np.asarray(W, dtype=float)
+        if t.ndim != 1 or t.shape != values.shape or t.size < 4:
+            raise SrfError("a sampled load needs four times or more, and as many loads as times")
+        if not (np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()):
+            raise SrfError("a sampled load needs finite loads at rising times", "drop gaps and repeated times first")
+        if values.min() <= 0:
+            raise SrfError(
+                f"the load is {values.min():g} N at t = {t[values.argmin()]:g} s", "the slider must stay in contact"
+            )
+        self.times, self.W, self.noise = t, values, float(noise)
+        self.knots, self.coefficients, self.breaks = _build(t, values, self.noise)
+        self._check_contact()
+        self.longest_step = float(4 * np.median(np.diff(self.knots)))
+        self._knots, self._rows = self.knots.tolist(), self.coefficients.tolist()
+
+    def _check_contact(self) -> None:
+        """Raise SrfError where the load between two positive samples is not positive."""
+        half = 0.5 * np.diff(self.knots)
+        middles = (self.coefficients * half[:, None] ** np.arange(DEGREE + 1)).sum(axis=1)
+        if middles.min() <= 0:
+            at = self.knots[int(middles.argmin())]
+            raise SrfError(
+                f"the load between its samples falls to {middles.min():g} N near t = {at:g} s", "sample it finer"
+            )
+
+    def check(self, start: float, end: float) -> None:
+        if start < self._knots[0] or end > self._knots[-1]:
+            raise SrfError(
+                f"the load is known from {self._knots[0]:g} to {self._knots[-1]:g} s, not over all of {start:g} to {end:g} s",
+                "simulate within the times of the load's samples",
+            )
+
+    def piece(self, t: float) -> LoadPiece:
+        knots, rows, last = self._knots, self._rows, len(self._knots) - 2
+
+        def spline(s: float) -> tuple[float, float]:
+            i = min(max(bisect_right(knots, s) - 1, 0), last)
+            h, W, rate = s - knots[i], 0.0, 0.0
+            for c in reversed(rows[i]):
+                rate = rate * h + W
+                W = W * h + c
+            return W, rate
+
+        return spline
+
+    def rest(self, t: float) -> float:
+        return self.piece(t)(t)[0]
+
+    def __call__(self, t: Array) -> tuple[Array, Array]:
+        t = np.asarray(t, dtype=float)
+        i = np.clip(np.searchsorted(self.knots, t, side="right") - 1, 0, len(self._rows) - 1)
+        h, W, rate = t - self.knots[i], np.zeros(t.shape), np.zeros(t.shape)
+        for c in self.coefficients.T[::-1]:
+            rate = rate * h + W
+            W = W * h + c[i]
+        return W, rate
+
+    def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
+        self.check(start, end)
+        if not start < end:
+            raise SrfError(f"a load is asked for from {start:g} to {end:g} s", "give two times that rise")
+        first = min(max(bisect_right(self._knots, start) - 1, 0), len(self._rows) - 1)
+        last = int(np.searchsorted(self.knots, end, side="left"))
+        knots, rows = self.knots[first : last + 1].copy(), self.coefficients[first:last].copy()
+        rows[0] = shift_polynomial(rows[0], start - knots[0])
+        knots[0], knots[-1] = start, end
+        return knots, rows
+
+
+def shift_polynomial(row: Array, by: float) -> Array:
+    """Return the coefficients, lowest power first, of p(x + by)."""
+    out = row.copy()
+    for k in range(row.size - 1):  # Horner's scheme, once per power
+        for j in range(row.size - 2, k - 1, -1):
+            out[j] += by * out[j + 1]
+    return out
+
+
+def _build(t: Array, W: Array, noise: float) -> tuple[Array, Array, tuple[float, ...]]:
+    """Return knots, coefficients and the times where the kind of piece changes."""
+    stretches = _stretches(t, W, noise)
+    if not stretches:
+        return (*_bridge(t, W, 0, t.size - 1, None, None), ())
+    fits = [_spline(t[a : b + 1], W[a : b + 1], noise) for a, b in stretches]
+    knots, rows, at = [t[:1]], [], 0
+    for k, ((a, b), (fit_knots, fit_rows)) in enumerate(zip(stretches, fits, strict=True)):
+        if at < a:
+            before = fits[k - 1] if k else None
+            bridge_knots, bridge_rows = _bridge(t, W, at, a, before, fits[k])
+            knots.append(bridge_knots[1:])
+            rows.append(bridge_rows)
+        knots.append(fit_knots[1:])
+        rows.append(fit_rows)
+        at = b
+    if at < t.size - 1:
+        bridge_knots, bridge_rows = _bridge(t, W, at, t.size - 1, fits[-1], None)
+        knots.append(bridge_knots[1:])
+        rows.append(bridge_rows)
+    edges = {float(t[i]) for pair in stretches for i in pair if 0 < i < t.size - 1}
+    return np.concatenate(knots), np.concatenate(rows), tuple(sorted(edges))
+
+
+def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
+    """Return first and last sample of the stretches that carry a spline: evenly sampled, without jump or corner inside."""
+    steps = np.diff(t)
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(steps, 2, mode="edge"), 5), axis=1)
+    even = np.abs(np.log(steps / usual)) < np.log(UNEVEN)
+    change = np.abs(np.diff(np.log(steps))) > np.log(
+        UNEVEN
+    )  # between two rates a sample ends one stretch, begins the next
+    found = []
+    for a, b in _runs(even):
+        cuts = [a, *(a + 1 + np.flatnonzero(change[a:b])).tolist(), b + 1]
+        found += [(c, d) for c, d in pairwise(cuts) if d - c >= SHORTEST - 1]
+    total = float(np.ptp(W))
+    smooth = []
+    for a, b in found:
+        rough = _rough(W[a : b + 1], total, noise)
+        if rough.mean() > MOSTLY:
+            rough[:] = False
+        calm = ~(rough[1:] | rough[:-1])  # intervals between two samples that their neighbours foretell
+        smooth += [(a + c, a + d + 1) for c, d in _runs(calm) if d - c >= SHORTEST - 2]
+    return smooth
+
+
+def _rough(W: Array, total: float, noise: float) -> NDArray[np.bool_]:
+    """Return which samples of an even stretch the polynomial through their eight neighbours does not foretell."""
+    from numpy.lib.stride_tricks import sliding_window_view
+
+    weights = np.array([-1, 8, -28, 56, -70, 56, -28, 8, -1]) / 70.0  # the eighth difference, 1 at the sample itself
+    windows = sliding_window_view(W, 2 * REACH + 1)
+    error = np.abs(windows @ weights)
+    rough = np.zeros(W.size, bool)
+    rough[REACH:-REACH] = error > np.maximum(ROUGH * np.ptp(windows, axis=1), max(FAINT * total, 8 * noise))
+    return rough
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
+
+
+def _spline(t: Array, W: Array, noise: float) -> tuple[Array, Array]:
+    """Return knots and coefficients of the spline through, or with noise along, an even stretch."""
+    from scipy.interpolate import PPoly, make_interp_spline
+
+    unit = (t[-1] - t[0]) / (t.size - 1)
+    x, level = (t - t[0]) / unit, float(W.mean())
+    spline = _smoothing(x, W - level, noise) if noise else make_interp_spline(x, W - level, k=DEGREE)
+    pieces = PPoly.from_spline(spline)
+    inside = np.diff(pieces.x) > 0
+    rows = pieces.c.T[inside][:, ::-1] / unit ** np.arange(DEGREE + 1)
+    rows[:, 0] += level
+    knots = t[0] + unit * np.append(pieces.x[:-1][inside], pieces.x[-1])
+    knots[0], knots[-1] = t[0], t[-1]
+    return knots, np.ascontiguousarray(rows)
+
+
+def _smoothing(x: Array, y: Array, noise: float) -> BSpline:
+    """Return the least-squares spline with as many knots as generalised cross-validation wants, more or fewer where need be."""
+    n = x.size
+    edges = np.arange(0, n, BLOCK)
+    spacings = [m for m in SPACINGS if m <= max(n // 4, 2)]
+    squares = [(y - _least_squares(x, y, x[4 * m : n - 4 * m : m])(x)) ** 2 for m in spacings]
+    overall = int(np.argmin([q.sum() / (1 - 1 / m) ** 2 for q, m in zip(squares, spacings, strict=True)]))
+    padded = [np.pad(np.add.reduceat(q, edges), 1) for q in squares]
+    misfit = np.array([q[:-2] + q[1:-1] + q[2:] for q in padded]) / noise**2  # of a block and its neighbours
+    chosen = _spacings(misfit, np.array(spacings, float), 3.0 * BLOCK, overall)
+    places: list[int] = []
+    index = 0
+    while True:
+        ahead = min(index + BLOCK // 2, n - 1) // BLOCK
+        need = spacings[min(int(chosen[index // BLOCK]), int(chosen[ahead]))]
+        index += 4 * need if not places else need  # as at a not-a-knot end: more pieces there would follow the noise
+        if n - 1 - index < 4 * need:
+            break
+        places.append(index)
+    return _least_squares(x, y, x[places])
+
+
+def _spacings(misfit: Array, spacings: Array, samples: float, overall: int) -> NDArray[np.int64]:
+    """Return which spacing each block takes: `overall`, unless a finer one is needed there or a coarser one does."""
+    chosen = np.zeros(misfit.shape[1], np.int64)
+    for k in range(
+        1, spacings.size
+    ):  # spacing k will do where no finer one lowers the misfit by more than chance would
+        freedom = samples * (1 / spacings[:k] - 1 / spacings[k])
+        excess = (misfit[k] - misfit[:k] - freedom[:, None]) / np.sqrt(2 * freedom)[:, None]
+        chosen[(excess < (3.0 if k <= overall else 1.0)).all(axis=0)] = k
+    return chosen
+
+
+def _least_squares(x: Array, y: Array, inner: Array) -> BSpline:
+    """Return the least-squares spline with these inner knots, by its banded normal equations."""
+    from scipy.interpolate import BSpline
+    from scipy.linalg import solveh_banded
+
+    knots = np.concatenate([np.full(DEGREE + 1, x[0]), inner, np.full(DEGREE + 1, x[-1])])
+    design = BSpline.design_matrix(x, knots, DEGREE)
+    squares = (design.T @ design).todia()
+    band = np.zeros((DEGREE + 1, knots.size - DEGREE - 1))
+    for offset, values in zip(squares.offsets, squares.data, strict=True):
+        if offset >= 0:
+            band[DEGREE - offset, offset : values.size] = values[offset:]
+    return BSpline(knots, solveh_banded(band, design.T @ y), DEGREE)
+
+
+def _bridge(
+    t: Array, W: Array, first: int, last: int, before: tuple[Array, Array] | None, after: tuple[Array, Array] | None
+) -> tuple[Array, Array]:
+    """Return monotone cubics through samples `first` to `last` that continue the splines before and after."""
+    from scipy.interpolate import PchipInterpolator
+
+    low, high = max(first - 1, 0), min(last + 2, t.size)  # a sample more on each side tells the slope at the ends
+    x, y = t[first : last + 1], W[first : last + 1].copy()
+    wide = W[low:high].copy()
+    if before is not None:
+        y[0] = wide[first - low] = _end(before)[0]
+    if after is not None:
+        y[-1] = wide[last - low] = after[1][0, 0]
+    slopes = PchipInterpolator(t[low:high], wide).derivative()(x) if high - low > 1 else np.zeros(x.size)
+    secants = np.diff(y) / np.diff(x)
+    for place, fit in ((0, before), (-1, after)):
+        if fit is not None:
+            slope = _end(fit)[1] if place == 0 else fit[1][0, 1]
+            if slope * secants[place] >= 0 and abs(slope) <= 3 * abs(secants[place]):  # stays monotone
+                slopes[place] = slope
+    h = np.diff(x)
+    rows = np.zeros((h.size, DEGREE + 1))
+    rows[:, 0], rows[:, 1] = y[:-1], slopes[:-1]
+    rows[:, 2] = (3 * secants - 2 * slopes[:-1] - slopes[1:]) / h
+    rows[:, 3] = (slopes[:-1] + slopes[1:] - 2 * secants) / h**2
+    return x, rows
+
+
+def _end(fit: tuple[Array, Array]) -> tuple[float, float]:
+    """Return value and slope at the last knot."""
+    knots, rows = fit
+    h, value, slope = float(knots[-1] - knots[-2]), 0.0, 0.0
+    for c in reversed(rows[-1].tolist()):
+        slope = slope * h + value
+        value = value * h + c
+    return value, slope
+
+
+# Normal loads composed of pieces: steps, holds and ramps with rounded corners, and a modulation on top of any load.
+
+RAMP_DEGREE = 6  # of a rounded ramp: the integral of the fifth-degree step
+NEAR = 1e-4  # corners closer than this share of the rise are one: W is then off by 1e-11 of the step
+
+
+@dataclass(frozen=True)
+class LoadSteps(Load):
+    """Straight pieces of load, joined smoothly: piece i runs from `first[i]` to `last[i]` (N) over edges[i] to edges[i + 1] (s).
+
+    Jumps and corners are rounded over the `rise` seconds after each edge by the same quintic step, so that W has two
+    continuous derivatives and never leaves the range of the pieces: an elastic interface cannot follow a jump of the load.
+    Before the first edge and after the last the load is constant. A ramp is thereby late by half the rise.
+    """
+
+    edges: tuple[float, ...]
+    first: tuple[float, ...]
+    last: tuple[float, ...]
+    rise: float
+
+    def __post_init__(self) -> None:
+        if not len(self.edges) - 1 == len(self.first) == len(self.last) >= 1:
+            raise SrfError("a load of pieces needs a first and a last value for each, and one edge more")
+        if not all(map(math.isfinite, self.edges)) or any(b <= a for a, b in pairwise(self.edges)):
+            raise SrfError("the edges of a load of pieces must rise", "give each piece a duration above 0")
+        if not all(math.isfinite(W) and W > 0 for W in (*self.first, *self.last)):
+            low = min((*self.first, *self.last))
+            raise SrfError(f"a load of {low:g} N lifts the slider off", "give loads above 0")
+        if not (math.isfinite(self.rise) and self.rise > 0):
+            raise SrfError(
+                f"a rise of {self.rise:g} s is not a positive time", "20 ms is long beside the slider's bounce"
+            )
+
+    @classmethod
+    def sequence(cls, pieces: Sequence[tuple[float, float, float]], *, start: float = 0.0, rise: float) -> LoadSteps:
+        """Return the load of pieces (duration in s, first and last load in N), one after another from `start` on."""
+        durations, first, last = (tuple(map(float, column)) for column in zip(*pieces, strict=True))
+        edges = start + np.concatenate(([0.0], np.cumsum(durations)))
+        return cls(tuple(edges.tolist()), first, last, float(rise))
+
+    @cached_property
+    def corners(self) -> tuple[tuple[float, float, float], ...]:
+        """Return (time, jump of W, jump of dW/dt) for each edge where there is one."""
+        rates = [
+            (b - a) / (t1 - t0) for a, b, (t0, t1) in zip(self.first, self.last, pairwise(self.edges), strict=True)
+        ]
+        before = zip((self.first[0], *self.last), (0.0, *rates), strict=True)
+        after = zip((*self.first, self.last[-1]), (*rates, 0.0), strict=True)
+        found = [(t, W1 - W0, s1 - s0) for t, (W0, s0), (W1, s1) in zip(self.edges, before, after, strict=True)]
+        return tuple(corner for corner in found if corner[1] or corner[2])
+
+    @cached_property
+    def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
+        times = sorted({t + shift for t, _, _ in self.corners for shift in (0.0, self.rise)})
+        kept: list[float] = []
+        for t in times:
+            if not kept or t - kept[-1] > NEAR * self.rise:
+                kept.append(t)
+        return tuple(kept)
+
+    def piece(self, t: float) -> LoadPiece:
+        i = bisect_right(self.breaks, t)
+        knot = self.breaks[i - 1] if i else t
+        a, b, c, d, e, f, g = self._expanded(knot, self._inside(i)).tolist()
+
+        def polynomial(s: float) -> tuple[float, float]:
+            h = s - knot
+            W = a + h * (b + h * (c + h * (d + h * (e + h * (f + h * g)))))
+            return W, b + h * (2 * c + h * (3 * d + h * (4 * e + h * (5 * f + h * 6 * g))))
+
+        return polynomial
+
+    def rest(self, t: float) -> float:
+        return self.piece(t)(t)[0]
+
+    def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
+        """Return knots (k + 1,) and coefficients (k, 7), lowest power first in t - knots[i]: W on [start, end], exactly."""
+        inner = [b for b in self.breaks if start < b < end]
+        knots = np.array([start, *inner, end])
+        rows = [self._expanded(a, 0.5 * (a + b)) for a, b in pairwise(knots.tolist())]
+        return knots, np.array(rows)
+
+    def _inside(self, i: int) -> float:
+        """Return a time inside the smooth piece number `i`, which ends at breaks[i]."""
+        breaks = self.breaks
+        if not breaks:
+            return 0.0
+        if i == 0:
+            return breaks[0] - 1.0
+        return breaks[-1] + 1.0 if i == len(breaks) else 0.5 * (breaks[i - 1] + breaks[i])
+
+    def _expanded(self, knot: float, inside: float) -> Array:
+        """Return the coefficients about `knot` of the polynomial that holds at `inside`, (7,)."""
+        powers = self.rise ** -np.arange(RAMP_DEGREE + 1.0)
+        total = np.zeros(RAMP_DEGREE + 1)
+        total[0] = self.first[0]
+        for t, jump, bend in self.corners:
+            share, x = (inside - t) / self.rise, (knot - t) / self.rise
+            if share <= 0:
+                continue
+            if share < 1:
+                total += (jump * _shifted(_STEP, x) + bend * self.rise * _shifted(_RAMP, x)) * powers
+            else:
+                total[0] += jump + bend * (knot - t - 0.5 * self.rise)
+                total[1] += bend
+        return total
+
+
+_STEP = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0, 0.0])  # from 0 to 1 on [0, 1], two derivatives vanish at both ends
+_RAMP = np.array([0.0, 0.0, 0.0, 0.0, 2.5, -3.0, 1.0])  # its integral, which ends at 1/2
+
+
+@dataclass(frozen=True)
+class ModulatedLoad(Load):
+    """A load times 1 + eps s(t) cos(2 pi f t + phase): `shape` is a Modulation of unit load, relative to `base` at each time."""
+
+    base: Load
+    shape: Modulation
+
+    def __post_init__(self) -> None:
+        if self.shape.W0 != 1.0:
+            raise SrfError(f"the shape of a modulation has W0 = 1, not {self.shape.W0:g}", "Modulation(1.0, eps, f)")
+
+    @property
+    def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
+        return tuple(sorted({*self.base.breaks, *self.shape.breaks}))
+
+    @property
+    def longest_step(self) -> float:  # type: ignore[override]
+        return min(self.base.longest_step, self.shape.longest_step)
+
+    def check(self, start: float, end: float) -> None:
+        self.base.check(start, end)
+
+    def piece(self, t: float) -> LoadPiece:
+        base, shape = self.base.piece(t), self.shape.piece(t)
+
+        def product(s: float) -> tuple[float, float]:
+            (W, W_dot), (m, m_dot) = base(s), shape(s)
+            return W * m, W_dot * m + W * m_dot
+
+        return product
+
+    def rest(self, t: float) -> float:
+        return self.base.rest(t)
+
+    def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
+        """Return knots (k + 1,) and coefficients (k, degree + 1) of the product of both factors' polynomials."""
+        factors = (self.base.polynomials(start, end), self.shape.polynomials(start, end))
+        knots = np.unique(np.concatenate([factors[0][0], factors[1][0]]))
+        left, right = (_about(knots[:-1], 0.5 * (knots[:-1] + knots[1:]), *factor) for factor in factors)
+        product = np.zeros((left.shape[0], left.shape[1] + right.shape[1] - 1))
+        for j in range(right.shape[1]):
+            product[:, j : j + left.shape[1]] += left * right[:, j : j + 1]
+        return knots, product
+
+
+def _about(places: Array, inside: Array, knots: Array, coefficients: Array) -> Array:
+    """Return, about each of `places`, the coefficients of the piece that holds at `inside`; (places, degree + 1)."""
+    i = np.clip(np.searchsorted(knots, inside, side="right") - 1, 0, len(coefficients) - 1)
+    return _shifted(coefficients[i], places - knots[i])
+
+
+def _shifted(coefficients: Array, by: Array | float) -> Array:
+    """Return the coefficients, lowest power first along the last axis, of p(x + by)."""
+    out = coefficients.copy()
+    n = out.shape[-1]
+    for k in range(n - 1):  # Horner's scheme, once per power
+        for j in range(n - 2, k - 1, -1):
+            out[..., j] += by * out[..., j + 1]
+    return out
+
+
+# What the experimenter imposes: the driving velocity V(t) and the normal load W(t), piece by smooth piece; um, s, N.
+
+__all__ = ["ConstantLoad", "Drive", "Load", "LoadPiece", "Modulation", "SampledLoad"]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Velocity of the spring's far end: from `times[i]` on it is velocities[i] + accelerations[i] (t - times[i]).
+
+    The first piece also holds before times[0]. Jumps of V are allowed, V may be zero or negative.
+    """
+
+    times: tuple[float, ...]
+    velocities: tuple[float, ...]
+    accelerations: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not len(self.times) == len(self.velocities) == len(self.accelerations) >= 1:
+            raise SrfError("a drive needs as many times as velocities and accelerations, and at least one")
+        if not all(map(math.isfinite, (*self.times, *self.velocities, *self.accelerations))):
+            raise SrfError("a drive's times, velocities and accelerations must be finite")
+        if any(b <= a for a, b in zip(self.times, self.times[1:], strict=False)):
+            raise SrfError("the times of a drive must rise", "give each change of velocity its own, later time")
+
+    @classmethod
+    def constant(cls, V: float) -> Drive:
+        """Return one velocity for all times."""
+        return cls((0.0,), (float(V),), (0.0,))
+
+    @classmethod
+    def steps(cls, changes: Sequence[tuple[float, float]]) -> Drive:
+        """Return a velocity that jumps to V at t, for each (t, V); the first holds before its time too."""
+        times, velocities = zip(*changes, strict=True)
+        return cls(tuple(map(float, times)), tuple(map(float, velocities)), (0.0,) * len(times))
+
+    @classmethod
+    def ramps(cls, points: Sequence[tuple[float, float]]) -> Drive:
+        """Return straight lines through (t, V), constant before the first point and after the last."""
+        t, V = (np.array(column, dtype=float) for column in zip(*points, strict=True))
+        if (np.diff(t) <= 0).any():
+            raise SrfError("the times of a drive must rise", "give a jump as two points a moment apart, or use steps")
+        slopes = [*(np.diff(V) / np.diff(t)).tolist(), 0.0]
+        before = float(np.nextafter(t[0], -np.inf))
+        return cls((before, *t.tolist()), (float(V[0]), *V.tolist()), (0.0, *slopes))
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        """Return the times at which V or its slope may jump."""
+        return self.times[1:]
+
+    def piece(self, t: float) -> tuple[float, float, float]:
+        """Return (V, acceleration, reference time) of the piece that holds at `t`."""
+        i = max(bisect_right(self.times, t) - 1, 0)
+        return self.velocities[i], self.accelerations[i], self.times[i]
+
+    def __call__(self, t: Array) -> Array:
+        """Return V at the times `t`."""
+        i = np.maximum(np.searchsorted(self.times, t, side="right") - 1, 0)
+        times, V, rate = (np.array(a) for a in (self.times, self.velocities, self.accelerations))
+        return np.where(rate[i] == 0.0, V[i], V[i] + rate[i] * (np.asarray(t) - times[i]))

@@ -1,0 +1,389 @@
+"""States over time and their derivatives: Radau IIA compiled where that is possible, else LSODA.
+
+The sensitivities solve S' = f_x S + f_p. The compiled integrator differentiates its own discrete solution, so that a gradient
+belongs to the very number it is the gradient of; LSODA carries S along as further unknowns.
+
+The text of the generated module is the only source: `x[..., i]` becomes `x[i]`, `out[..., i] = e` an entry of a tuple, and
+whatever depends on the parameters alone is computed once, when they are bound.
+"""
+
+from __future__ import annotations
+
+import ast
+import ctypes
+import math
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.codegen.c_source import compiled
+from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.codegen.splines import Spline, appended, tables_after
+from srfcli.core.errors import SrfError, Status
+from srfcli.motion.imposed import Drive, Load
+
+# States over time, and their derivatives by parameters and by the initial state: compiled where that is possible, else LSODA.
+
+PATIENCE = 0.1  # s between looks for a signal where waiting for a thread cannot be interrupted (Windows)
+MAX_STEPS = 20_000_000  # of the compiled integrator, in all; a hundred times an hour of modulation
+MAX_LSODA_STEPS = 200_000  # between two output times
+S_SHARE = (
+    100.0  # sensitivities are solved so much less closely than states; left out of the control altogether, they diverge
+)
+BEYOND = 1e100  # a rate where the formula overflows: the step is then rejected and cut
+
+Rates = Callable[[float, Array], object]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """States `x` (times, n) and `S` (times, n, k), their derivatives by the k quantities asked for; NaN after `reached` s."""
+
+    x: Array
+    S: Array
+    status: Status
+    reached: float
+    steps: int
+
+
+def integrate(
+    model: GeneratedModel,
+    p: Array,
+    *,
+    drive: Drive,
+    load: Load,
+    t: Array,
+    start: Array,
+    by: Sequence[int] = (),
+    S0: Array | None = None,
+    tables: Sequence[Spline] = (),
+    by_tables: Sequence[int] = (),
+    rtol: float = 1e-8,
+    atol: Array,
+) -> Motion:
+    """Return the motion from `start` (n,) at t[0] (s) to the rising times `t`, with the model's parameters `p` (n_parameters,).
+
+    `by` are places in `p`, or -1 for a direction of the initial state alone; S0 (n, k) is the derivative of `start`, zero if left
+    out. A model with tables takes them in order; S then ends with a column for each number of the tables in `by_tables`, which
+    rises. `atol` (n,). Errors are local, per step; those of S are held to some tens of times the bound on x.
+    """
+    library = compiled(model)
+    count = len(by) + sum(tables[i].numbers.size for i in by_tables)
+    S0 = np.zeros((start.size, count)) if S0 is None else np.ascontiguousarray(S0, dtype=float)
+    missing = len(model.namespace.get("TABLES", ())) - len(tables)
+    p = appended(np.asarray(p, dtype=float), [*tables, *[Spline.none()] * missing]) if tables or missing else p
+    if library is None:
+        if by_tables:
+            raise SrfError("derivatives by a table's numbers need a C compiler", "install one, or the package ziglang")
+        return integrate_lsoda(model, p, drive, load, t, start, by, S0, rtol, atol)
+    own, columns = len(by), np.full(max(len(tables), 1), -1, dtype=np.intc)
+    for i in by_tables:
+        columns[i], own = own, own + tables[i].numbers.size
+    return _integrate_compiled(library, p, drive, load, t, start, by, columns, S0, rtol, atol)
+
+
+def pieces(t: Array, drive: Drive, load: Load) -> Iterator[tuple[float, float]]:
+    """Yield the intervals between output's ends and the breaks of drive and load."""
+    inside = (b for b in (*drive.breaks, *load.breaks) if t[0] < b < t[-1])
+    yield from pairwise(np.unique([t[0], *inside, t[-1]]).tolist())
+
+
+def _integrate_compiled(
+    library: ctypes.CDLL,
+    p: Array,
+    drive: Drive,
+    load: Load,
+    t: Array,
+    start: Array,
+    by: Sequence[int],
+    columns: NDArray[np.intc],
+    S0: Array,
+    rtol: float,
+    atol: Array,
+) -> Motion:
+    n, k = start.size, S0.shape[1]
+    x, S = np.full((t.size, n), np.nan), np.full((t.size, n, k), np.nan)
+    stats, stop = np.zeros(4), ctypes.c_int(0)
+    arguments = (
+        *imposed_arguments(t, drive, load), doubles(np.asarray(p, dtype=float)), doubles(np.asarray(start, dtype=float)), k,
+        len(by), integers(columns), integers(np.array(by or [-1], dtype=np.intc)), doubles(sensitivity_scale(p, by)), doubles(S0),
+        ctypes.c_double(rtol_of_estimate(rtol)),
+        doubles(np.asarray(atol) * rtol_of_estimate(rtol) / rtol),
+        ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(MAX_STEPS),
+        t.size, doubles(np.asarray(t, dtype=float)), doubles(x), doubles(S), doubles(stats), ctypes.byref(stop),
+    )  # fmt: skip
+    filled = interruptible(lambda: library.srf_integrate(*arguments), stop)
+    status = Status.OK if filled == t.size else Status.INTEGRATION
+    return Motion(x, S, status, float(stats[3]), int(stats[0]))
+
+
+def imposed_arguments(t: Array, drive: Drive, load: Load) -> tuple[Any, ...]:
+    """Return what compiled code is told of drive and load between the first and the last of the times `t`."""
+    segments = list(pieces(t, drive, load))
+    edges = np.array([segments[0][0], *(b for _, b in segments)])
+    knots, coefficients = load.polynomials(float(edges[0]), float(edges[-1]))
+    places = np.clip(np.searchsorted(knots, edges + 1e-12 * np.abs(edges).max(), side="right") - 1, 0, len(knots) - 2)
+    low = places[:-1]
+    high = np.clip(
+        np.searchsorted(knots, edges[1:] - 1e-12 * np.abs(edges).max(), side="left"), low + 1, len(knots) - 1
+    )
+    ranges = np.column_stack([low, high]).astype(np.intc)
+    middle = np.array([drive.piece(0.5 * (a + b)) for a, b in segments], dtype=float)
+    count, degree = len(knots), coefficients.shape[1] - 1
+    return (
+        len(segments),
+        doubles(edges),
+        doubles(middle),
+        integers(ranges),
+        count,
+        degree,
+        doubles(knots),
+        doubles(coefficients),
+    )
+
+
+def interruptible(call: Callable[[], int], stop: ctypes.c_int) -> int:
+    """Return call(), which ends early once `stop` is set: by whatever a signal's handler raises, Ctrl-C as a rule.
+
+    Python's handlers run in the main thread alone, and only between its own instructions: compiled code there would hold them up.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return call()
+    answer: list[int] = []
+    worker = threading.Thread(target=lambda: answer.append(call()), daemon=True)
+    worker.start()
+    try:
+        while worker.is_alive():
+            worker.join(PATIENCE)
+    except BaseException:
+        stop.value = 1
+        worker.join()  # the arrays it writes into are still its own
+        raise
+    return answer[0]
+
+
+def sensitivity_scale(p: Array, by: Sequence[int]) -> Array:
+    """Return, for each derivative, the unit of its absolute error: 1 over the parameter's size, 1 for an initial state."""
+    return np.array([1.0 if i < 0 else 1.0 / max(abs(float(p[i])), 1e-12) for i in by] or [1.0])
+
+
+def rtol_of_estimate(rtol: float) -> float:
+    """Return the bound on the embedded estimate, which is of order 3 where the method is of order 5 (Hairer and Wanner, IV.8)."""
+    return 0.1 * rtol ** (2 / 3)
+
+
+def doubles(array: Array) -> ctypes.c_void_p:
+    array = (
+        array if array.flags.c_contiguous and array.dtype == np.float64 else np.ascontiguousarray(array, dtype=float)
+    )
+    pointer = ctypes.c_void_p(array.ctypes.data)
+    pointer.array = array  # type: ignore[attr-defined]  # keeps it alive through the call
+    return pointer
+
+
+def integers(array: Array) -> ctypes.c_void_p:
+    array = np.ascontiguousarray(array, dtype=np.intc)
+    pointer = ctypes.c_void_p(array.ctypes.data)
+    pointer.array = array  # type: ignore[attr-defined]
+    return pointer
+
+
+def integrate_lsoda(
+    model: GeneratedModel,
+    p: Array,
+    drive: Drive,
+    load: Load,
+    t: Array,
+    start: Array,
+    by: Sequence[int],
+    S0: Array,
+    rtol: float,
+    atol: Array,
+) -> Motion:
+    """Return what `integrate` returns, by LSODA; S is carried along as n k further unknowns."""
+    n, k = start.size, len(by)
+    y = np.full((t.size, n * (1 + k)), np.nan)
+    y[0] = state = np.concatenate([start, S0.ravel()])
+    loose = S_SHARE * rtol
+    tolerance = np.concatenate([atol, (S_SHARE * np.outer(atol, sensitivity_scale(p, by)[:k])).ravel()])
+    relative = np.concatenate([np.full(n, rtol), np.full(n * k, loose)])
+    system = _Rates(model, p, by)
+    status, reached, steps = Status.OK, float(t[0]), 0
+    for a, b in pieces(t, drive, load):
+        f, df = system.on_piece(drive, load, 0.5 * (a + b))
+        wanted = np.nonzero((t > a) & (t <= b))[0]
+        times = np.unique([a, *t[wanted], b])
+        found, good, count = _march(f, df if not k else None, state, times, relative, tolerance, load.longest_step)
+        steps += count
+        places = np.searchsorted(times, t[wanted])
+        y[wanted[places < good]] = found[places[places < good]]
+        reached, state = float(times[good - 1]), found[-1]
+        if good < times.size:
+            status = Status.INTEGRATION
+            break
+    return Motion(y[:, :n], y[:, n:].reshape(t.size, n, k), status, reached, steps)
+
+
+class _Rates:
+    """Rates of the state and of its sensitivities as functions of (t, y) on one smooth piece."""
+
+    def __init__(self, model: GeneratedModel, p: Array, by: Sequence[int]) -> None:
+        self.n, self.k = len(model.states), len(by)
+        self.rates, self.jacobian = (scalar_function(model, name, p) for name in ("rates", "rates_jacobian"))
+        self.by = np.array(by, dtype=int)
+        self.parameters = scalar_function(model, "rates_parameters", p) if self.k else None
+
+    def on_piece(self, drive: Drive, load: Load, within: float) -> tuple[Rates, Rates]:
+        """Return the rates and the Jacobian of the state, as functions of (t, y), where the piece at `within` holds."""
+        W_at = load.piece(within)
+        V0, acceleration, since = drive.piece(within)
+        n, k = self.n, self.k
+
+        def inputs(t: float) -> tuple[float, float, float]:
+            return (V0 + acceleration * (t - since) if acceleration else V0, *W_at(t))
+
+        def rates(t: float, y: Array) -> object:
+            try:
+                return self.rates(y.tolist(), *inputs(t))
+            except (ArithmeticError, ValueError):
+                return np.full(n, BEYOND)
+
+        def jacobian(t: float, y: Array) -> object:
+            try:
+                return self.jacobian(y.tolist(), *inputs(t))
+            except (ArithmeticError, ValueError):
+                return np.full((n, n), BEYOND)
+
+        def augmented(t: float, y: Array) -> object:
+            x, given = y[:n].tolist(), inputs(t)
+            try:
+                direct = np.array(self.parameters(x, *given))[:, self.by] * (self.by >= 0)  # type: ignore[misc]
+                S_rate = np.array(self.jacobian(x, *given)) @ y[n:].reshape(n, k) + direct
+                return np.concatenate([self.rates(x, *given), S_rate.ravel()])
+            except (ArithmeticError, ValueError):
+                return np.full(n * (1 + k), BEYOND)
+
+        return (augmented if k else rates), jacobian
+
+
+def _march(
+    f: Rates, df: Rates | None, start: Array, times: Array, rtol: Array, atol: Array, longest: float
+) -> tuple[Array, int, int]:
+    """Return the unknowns (times, n), how many times were reached, and the number of steps."""
+    from scipy.integrate import ODEintWarning, odeint
+
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", ODEintWarning)  # told by the status instead
+        y, info = odeint(
+            f, start, times, Dfun=df, tfirst=True, rtol=rtol, atol=atol, tcrit=[times[-1]],
+            hmax=longest if math.isfinite(longest) else 0.0, mxstep=MAX_LSODA_STEPS, full_output=True,
+        )  # fmt: skip
+    steps = int(info["nst"][-1])
+    if info["message"] == "Integration successful.":
+        finite = np.isfinite(y).all(axis=1)
+        return y, times.size if finite.all() else int(np.argmin(finite)), steps
+    # LSODA's own clock `tcur` stands still at the output interval it failed in; what lies beyond is not filled
+    failed = np.nonzero(info["tcur"] < times[1:])[0]
+    return y, int(failed[0]) + 1 if failed.size else 1, steps
+
+
+# Generated array functions turned into functions of one state: Python floats and `math`, an order of magnitude faster there.
+
+_ALIASES = {"arctan": math.atan, "arcsinh": math.asinh}
+_MATH = ("cos", "cosh", "exp", "expm1", "log", "log1p", "pi", "sin", "sinh", "sqrt", "tan", "tanh")
+
+ScalarFunction = Callable[..., Any]
+
+
+def scalar_function(model: GeneratedModel, name: str, p: Any) -> ScalarFunction:
+    """Return generated function `name`, parameters `p` bound, as a function of one state and of what follows the state.
+
+    The state is a sequence of floats; a vector comes back as a tuple, a matrix as a tuple of rows. Overflow and logarithms
+    of nothing raise, as `math` does.
+    """
+    return _factory(model.source, name, len(model.names))([float(value) for value in p])
+
+
+@lru_cache(maxsize=64)
+def _factory(source: str, name: str, n: int) -> Callable[[list[float]], ScalarFunction]:
+    namespace: dict[str, Any] = {f: getattr(math, f) for f in _MATH} | _ALIASES | {"lambertw": _lambertw}
+    namespace |= dict(zip(("lut", "lut1", "lut2"), tables_after(n), strict=True))
+    exec(compile(scalar_source(source, name), f"<scalar {name}>", "exec"), namespace)
+    return namespace["bind"]
+
+
+def _lambertw(x: float) -> float:
+    from scipy.special import lambertw
+
+    return float(lambertw(x).real)
+
+
+def scalar_source(source: str, name: str) -> str:
+    """Return the text of `bind(p)`, which returns the scalar form of function `name` of a generated module."""
+    function = next((d for d in ast.parse(source).body if isinstance(d, ast.FunctionDef) and d.name == name), None)
+    if function is None:
+        raise SrfError(f"generated module has no function '{name}'")
+    once: list[str] = []
+    inside: list[str] = []
+    cells: dict[Any, str] = {}
+    shape: tuple[int, ...] = ()
+    fixed = set(_MATH) | set(_ALIASES) | {"lambertw", "p"}
+    result = ""
+    for statement in function.body[1:]:  # the first is the docstring
+        statement = _OneState().visit(statement)
+        if isinstance(statement, ast.Return):
+            result = _returned(statement, cells, shape)
+            continue
+        assert isinstance(statement, ast.Assign)
+        target, value = statement.targets[0], statement.value
+        if isinstance(target, ast.Subscript):
+            cells[ast.literal_eval(target.slice)] = ast.unparse(value)
+        elif isinstance(target, ast.Name) and target.id == "out":
+            assert isinstance(value, ast.Call)
+            shape = ast.literal_eval(value.args[1])
+        elif isinstance(target, ast.Name):
+            constant = all(n.id in fixed for n in ast.walk(value) if isinstance(n, ast.Name))
+            (once if constant else inside).append(ast.unparse(statement))
+            if constant:
+                fixed.add(target.id)
+    arguments = ", ".join(a.arg for a in function.args.args if a.arg != "p")
+    lines = [
+        *once,
+        f"def {name}({arguments}):",
+        *(f"    {line}" for line in inside),
+        f"    return {result}",
+        f"return {name}",
+    ]
+    return "def bind(p):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
+
+
+def _returned(statement: ast.Return, cells: dict[Any, str], shape: tuple[int, ...]) -> str:
+    value = statement.value
+    if isinstance(value, ast.BinOp):  # _empty(...) + expression: only arrays need the first term
+        return ast.unparse(value.right)
+    if len(shape) == 1:
+        return _tuple([cells.get(i, "0.0") for i in range(shape[0])])
+    return _tuple([_tuple([cells.get((i, j), "0.0") for j in range(shape[1])]) for i in range(shape[0])])
+
+
+def _tuple(entries: list[str]) -> str:
+    return f"({', '.join(entries)},)"
+
+
+class _OneState(ast.NodeTransformer):
+    """Removes the ellipsis from every index: a[..., i, j] becomes a[i, j]."""
+
+    def visit_Subscript(self, node: ast.Subscript) -> ast.AST:
+        self.generic_visit(node)
+        index = node.slice
+        if isinstance(index, ast.Tuple) and isinstance(index.elts[0], ast.Constant) and index.elts[0].value is Ellipsis:
+            rest = index.elts[1:]
+            node.slice = rest[0] if len(rest) == 1 else ast.Tuple(rest, ast.Load())
+        return node

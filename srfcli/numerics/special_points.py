@@ -1,0 +1,259 @@
+"""Points of a stability boundary where something changes: folds and cusps of the curve, resonances, zeros of a caller's function.
+
+Between two neighbouring points of a polished branch a test function of opposite signs is brought to zero by the Illinois method,
+each trial corrected onto the boundary on the hyperplane across the chord, which joins the points in parameters and state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.core.errors import Status
+from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind
+from srfcli.numerics.collocation import Discretisation, mesh_error
+from srfcli.numerics.continuation import Branch, CurvePoint, correct, metric
+from srfcli.numerics.orbit import interpolate
+from srfcli.numerics.plane import Plane
+
+CLOSE = 1e-8  # of the chord: where the search for a zero ends
+MEETING = 0.05  # of Re(rho) from +1 or -1: a Neimark-Sacker boundary that ends so near ends in a strong resonance
+CUSPED = 1e-3  # of the tangent in the plane beside a cusp: what is left of it at the cusp
+INSIDE = 1 - 1e-9  # of the window: its far edge as seen from within
+RESONANCES = {"1:3": 2 * np.pi / 3, "1:4": np.pi / 2}
+STRONG = {"fold": "1:1", "pd": "1:2"}  # where a pair of multipliers meets on the real axis
+
+Test = Callable[[CurvePoint], float]
+
+
+@dataclass(frozen=True)
+class SpecialPoint:
+    """A located point: `what` is `fold` (with `axis`, the parameter that turns round), `cusp`, `1:1` to `1:4`, or the caller's.
+
+    `place` counts along the branch, 3.5 between its points 3 and 4; `error` is the estimated relative error of the parameters.
+    """
+
+    what: str
+    axis: str
+    place: float
+    p: Array
+    rho: complex
+    error: float
+    status: Status
+
+    @property
+    def theta(self) -> float:
+        """Return the angle of the critical multiplier over one forcing period, in [0, pi]."""
+        return float(abs(np.angle(self.rho)))
+
+
+def special_points(model: GeneratedModel, plane: Plane, branch: Branch) -> list[SpecialPoint]:
+    """Return the folds in either parameter, the cusps and the resonances 1:1 to 1:4 of a branch, in their order along it.
+
+    1:1 and 1:2 are where a Neimark-Sacker boundary goes over into one of multipliers at +1 or -1, or ends; the error of an end
+    is the distance over which the multiplier was extrapolated. Cusps are looked for where a multiplier is +1: the folds of two
+    pairs of periodic states meet in them, and the other boundaries have none in general.
+    """
+    found = [*_turns(model, plane, branch), *_resonances(model, plane, branch), *_strong(model, plane, branch)]
+    found += _strong_ends(model, branch)
+    return sorted(found, key=lambda s: s.place)
+
+
+def crossings_at(
+    model: GeneratedModel, plane: Plane, branches: Sequence[Branch], values: Array, *, folds: bool = True
+) -> list[list[float]]:
+    """Return for each value of the plane's x parameter the values of y, rising, at which a boundary is crossed there.
+
+    Without `folds` those where a multiplier is +1 are left out.
+    """
+    lines = [plane.coordinates(model, np.stack([pt.p for pt in b.points], axis=1)) for b in branches]
+    for line, branch in zip(lines, branches, strict=True):
+        line[[not folds and pt.kind == "fold" for pt in branch.points]] = np.nan
+    heights = polyline_heights(lines, np.asarray(plane.x.unit(values)))
+    return [np.asarray(plane.y.value(np.array(h))).reshape(-1).tolist() for h in heights]
+
+
+def polyline_heights(lines: Sequence[Array], at: Array) -> list[list[float]]:
+    """Return for each unit coordinate `at` the heights, rising, at which polylines (points, 2) in unit coordinates pass it."""
+    out: list[list[float]] = []
+    for x in np.minimum(at, INSIDE):  # a curve ends on the window's edge, not beyond
+        heights: list[float] = []
+        for q in lines:
+            a, b = q[:-1], q[1:]
+            for k in np.nonzero((a[:, 0] <= x) != (b[:, 0] <= x))[0]:
+                share = (x - a[k, 0]) / (b[k, 0] - a[k, 0])
+                heights.append(float(a[k, 1] + share * (b[k, 1] - a[k, 1])))
+        out.append(sorted(heights))
+    return out
+
+
+def _turns(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[SpecialPoint]:
+    """Yield the cusps, and the points at which one of the two parameters turns round."""
+    q = plane.coordinates(model, np.stack([pt.p for pt in branch.points], axis=1))
+    steps = np.diff(q, axis=0)
+    back = steps[:-1] * steps[1:] < 0  # (steps - 1, 2)
+    for k in np.nonzero(back.any(axis=1))[0]:
+        between = int(k), int(k) + 2
+        turned = (steps[k] * steps[k + 1]).sum() < 0 and branch.points[k + 1].kind == "fold"
+        cusp = _cusp(model, plane, branch, between, steps[k] / np.linalg.norm(steps[k])) if turned else None
+        if cusp is not None:
+            yield cusp
+            continue
+        for axis in np.nonzero(back[k])[0]:
+
+            def turning(point: CurvePoint, axis: int = int(axis)) -> float:
+                return float(point.tangent_q[axis] / np.linalg.norm(point.tangent_q))
+
+            yield locate(model, plane, branch, between, turning, what="fold", axis=plane.names[axis])
+
+
+def _cusp(
+    model: GeneratedModel, plane: Plane, branch: Branch, between: tuple[int, int], forward: Array
+) -> SpecialPoint | None:
+    """Return the cusp between two points of a branch, where the tangent has no part in the plane, or None."""
+    left: dict[float, float] = {}  # of the tangent's length in the plane, by its part along `forward`
+
+    def along(point: CurvePoint) -> float:
+        part = float(point.tangent_q @ forward)
+        left[part] = float(np.linalg.norm(point.tangent_q))
+        return part
+
+    found = locate(model, plane, branch, between, along, what="cusp")
+    return found if left and left[min(left, key=abs)] < CUSPED * max(left.values()) else None
+
+
+def _resonances(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[SpecialPoint]:
+    """Yield where the multiplier of a Neimark-Sacker boundary is a third or fourth root of one."""
+    points = branch.points
+    for name, angle in RESONANCES.items():
+        for k, (a, b) in enumerate(pairwise(points)):
+            if a.kind == b.kind == "ns" and (a.theta - angle) * (b.theta - angle) < 0:
+
+                def off(point: CurvePoint, angle: float = angle) -> float:
+                    return float(abs(np.angle(point.rho))) - angle
+
+                yield locate(model, plane, branch, (k, k + 1), off, what=name)
+
+
+def _strong(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[SpecialPoint]:
+    """Yield where a Neimark-Sacker boundary goes over into a fold or period-doubling one."""
+    for k, (a, b) in enumerate(pairwise(branch.points)):
+        kinds = {a.kind, b.kind}
+        if len(kinds) == 2 and "ns" in kinds:
+
+            def side(point: CurvePoint) -> float:
+                return 1.0 if bifurcation_kind(point.rho) == "ns" else -1.0
+
+            what = STRONG[next(iter(kinds - {"ns"}))]
+            yield locate(model, plane, branch, (k, k + 1), side, what=what)
+
+
+def _strong_ends(model: GeneratedModel, branch: Branch) -> Iterator[SpecialPoint]:
+    """Yield where a Neimark-Sacker boundary ends as its multipliers meet: Re(rho), smooth there, extrapolated to +1 or -1."""
+    points = branch.points
+    for (near, before), place, end in (
+        ((points[0], points[1]), 0.0, branch.start),
+        ((points[-1], points[-2]), float(len(points) - 1), branch.end),
+    ):
+        goal = 1.0 if near.rho.real > 0 else -1.0
+        left, gone = goal - near.rho.real, near.rho.real - before.rho.real
+        meets = near.kind == before.kind == "ns" and abs(left) < MEETING and left * gone > 0
+        if end in (Status.LEFT_WINDOW, Status.CLOSED) or not meets:
+            continue
+        share = left / gone
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where((near.p > 0) & (before.p > 0), near.p / before.p, 1.0)
+        p = np.where(ratio != 1.0, near.p * ratio**share, near.p + share * (near.p - before.p))
+        error = float(np.abs(np.log(ratio) * share).max()) + near.error
+        status = Status.OK if share < 3 else Status.NO_CONVERGENCE
+        yield SpecialPoint("1:1" if goal > 0 else "1:2", "", place, p, complex(goal), error, status)
+
+
+def locate(
+    model: GeneratedModel,
+    plane: Plane,
+    branch: Branch,
+    between: tuple[int, int],
+    test: Test,
+    *,
+    what: str,
+    axis: str = "",
+    max_iterations: int = 40,
+) -> SpecialPoint:
+    """Return the zero of `test` between two points of a branch; where it is not met, the nearest point with its status."""
+    ends = branch.points[between[0]], branch.points[between[1]]
+    low, high = 0.0, 1.0
+    a, b = (_on_chord(model, plane, ends, s) for s in (low, high))
+    best = min(((s, c) for s, c in ((low, a), (high, b)) if c is not None), key=lambda t: abs(test(t[1])), default=None)
+    if a is None or b is None or test(a) * test(b) > 0 or best is None:
+        return _special(model, branch, between, what, axis, best, Status.NO_CONVERGENCE)
+    fa, fb, status = test(a), test(b), Status.NO_CONVERGENCE
+    for count in range(max_iterations):
+        share = 0.5 if abs(fa) == abs(fb) or count % 8 == 7 else fa / (fa - fb)
+        s = low + float(np.clip(share, 1e-3, 1 - 1e-3)) * (high - low)
+        point = _on_chord(model, plane, ends, s)
+        if point is None:
+            break
+        value = test(point)
+        best = (s, point)
+        if value * fa > 0:
+            low, fa, fb = s, value, fb / 2
+        else:
+            high, fb, fa = s, value, fa / 2
+        if high - low < CLOSE or abs(value) < 1e-9:
+            status = Status.OK
+            break
+    return _special(model, branch, between, what, axis, best, status, width=high - low)
+
+
+def _special(
+    model: GeneratedModel,
+    branch: Branch,
+    between: tuple[int, int],
+    what: str,
+    axis: str,
+    best: tuple[float, CurvePoint] | None,
+    status: Status,
+    *,
+    width: float = 1.0,
+) -> SpecialPoint:
+    """Return what was located; without any point, the branch's own next to it."""
+    if best is None:
+        near = branch.points[between[0]]
+        return SpecialPoint(what, axis, float(between[0]), near.p, near.rho, np.inf, status)
+    s, point = best
+    place = between[0] + s * (between[1] - between[0])
+    error = float(mesh_error(model, point.orbit))
+    if status is not Status.OK:
+        error += width
+    return SpecialPoint(what, axis, place, point.p, point.rho, error, status)
+
+
+def _on_chord(
+    model: GeneratedModel, plane: Plane, ends: tuple[BoundaryPoint, BoundaryPoint], s: float
+) -> CurvePoint | None:
+    """Return the boundary point on the hyperplane across the chord between two points, a share `s` along it, or None."""
+    a, b = ends
+    q = [plane.coordinates(model, e.p) for e in ends]
+    edges = max((e.orbit.edges for e in ends), key=len)
+    orbits = [interpolate(_single(e.orbit), edges) for e in ends]
+    blend = Discretisation(
+        (1 - s) * orbits[0].x + s * orbits[1].x, (1 - s) * orbits[0].stages + s * orbits[1].stages, edges
+    )
+    rho = a.rho if s < 0.5 else b.rho
+    chord = q[1] - q[0]
+    across = metric(model, a.p, blend.x[0], orbits[1].x[0] - orbits[0].x[0])
+    point = correct(model, plane, q[0] + s * chord, blend, rho, chord, across, tol=1e-6)
+    if point is not None:  # again from there: the tangent is that of the place a correction starts at
+        point = correct(model, plane, point.q, point.orbit, point.rho, chord, across, tol=1e-6)
+    if point is not None and point.tangent_q @ chord + point.tangent_orbit.x[0] @ across < 0:
+        point.tangent_q = -point.tangent_q  # so that a test function of the tangent is continuous
+    return point
+
+
+def _single(orbit: Discretisation) -> Discretisation:
+    return Discretisation(orbit.x[0], orbit.stages[0], orbit.edges)

@@ -1,0 +1,730 @@
+"""Figures of a diagnosis' report: runs and residuals, the scan of places, what was found."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srfcli.results.figures import _imposed, _settle, _thinned
+from srfcli.results.plots import (
+    COLOURS,
+    DASHES,
+    DOTTED,
+    _decade_ticks,
+    _gaps,
+    house_style,
+    load_matplotlib,
+    name_text,
+    new_figure,
+)
+from srfcli.results.report_text import NO_BREAK, finite, number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Figures of where simulation and recording part: all runs at a glance, and each run with its residual before and after.
+
+Array = NDArray[np.float64]
+
+OBSERVED, BEFORE, AFTER, GUILTY = "#333333", "#D55E00", "#0072B2", "#E69F00"
+BLOCKS, LEAST = 60, 24  # pieces of a run whose residual is judged, samples that make a piece
+COLUMNS = 360  # in which a residual is drawn by its extremes
+DOTS = 700  # samples that are drawn one by one
+CLOSE_UP, FEWEST = 7, 80  # periods of what is missing that a close-up shows, samples at least
+MOST, SHORT = 0.6, 0.12  # of the misfit, in a part of the run so short that it deserves a close-up
+PEAK = 0.3  # of a residual's power in one line, from which it has a period
+FAINT = 2.0  # of the noise's variance: less than that needs no close-up
+ZOOM = 0.3  # of a run: a close-up of more would show nothing new
+VARIES = 1e-3  # relative variation of a load from which it is worth a panel
+LABELS = {"elongation": "elongation  [µm]", "force": "force  [N]", "friction": "friction coefficient"}
+NARROW_FIGURE = 4.3  # inches: a figure for a small screen, whose text keeps its size there
+GAP = 5.0  # usual steps in time after which a record has a gap
+SAME = 1e-9  # of the noise: predictions that differ by less are one
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One run as it is drawn: arrays (n,) of the samples that are compared, residuals `before`, `after` over the noise."""
+
+    name: str
+    holdout: bool
+    label: str
+    t: Array = field(repr=False)
+    observed: Array = field(repr=False)
+    baseline: Array = field(repr=False)
+    augmented: Array = field(repr=False)
+    noise: float
+    V: Array = field(repr=False)
+    W: Array = field(repr=False)
+    windows: tuple[tuple[float, float], ...]
+    load_unit: str = "N"
+
+    @property
+    def before(self) -> Array:
+        """Return the baseline's residual over the noise."""
+        return np.asarray((self.observed - self.baseline) / self.noise)
+
+    @property
+    def after(self) -> Array:
+        """Return the augmented model's residual over the noise."""
+        return np.asarray((self.observed - self.augmented) / self.noise)
+
+    @property
+    def same(self) -> bool:
+        """True where the augmented model is the baseline."""
+        return bool(np.allclose(self.before, self.after, rtol=0.0, atol=SAME))
+
+    def heights(self) -> tuple[float, ...]:
+        """Return for each window how far its residual is above noise, from 0 to 1 for the worst."""
+        over = []
+        for a, b in self.windows:
+            z = self.before[(self.t >= a) & (self.t <= b)]
+            over.append(max(float(np.mean(z**2)) - 1.0, 0.0) if z.size else 0.0)
+        most = max(over, default=0.0)
+        return tuple(x / most if most > 0 else 1.0 for x in over)
+
+    @property
+    def worst(self) -> tuple[float, float] | None:
+        """Return the window that is shaded darkest: where a sample is furthest from what the baseline explains."""
+        return max(zip(self.heights(), self.windows, strict=True))[1] if self.windows else None
+
+
+def trace(run: Mapping[str, Any]) -> Trace:
+    """Return a run of the material, without the samples that are not compared or at which a model has no value."""
+    arrays = {k: np.asarray(run[k], dtype=float) for k in ("t", "observed", "baseline", "augmented", "V", "W")}
+    t = arrays["t"]
+    good = np.asarray(run.get("used", np.ones(t.shape, dtype=bool)), dtype=bool).copy()
+    for values in arrays.values():
+        good &= np.isfinite(values)
+    windows = tuple((float(a), float(b)) for a, b in run.get("windows", ()))
+    noise = float(run.get("noise_level") or 0.0)
+    kept = {k: values[good] for k, values in arrays.items()}
+    return Trace(
+        str(run["name"]),
+        bool(run.get("holdout")),
+        str(run.get("label") or LABELS.get(str(run.get("observable")), "observed  [µm]")),
+        **kept,
+        noise=noise if noise > 0 else max(float(np.std(kept["observed"])) * 1e-3, 1e-12) if kept["t"].size else 1.0,
+        windows=windows,
+        load_unit=str(run.get("load_unit") or "N"),
+    )
+
+
+def rms_over_noise(z: Array) -> float:
+    """Return the root mean square of a residual that is in units of the noise; NaN of none."""
+    return float(np.sqrt(np.mean(z**2))) if z.size else float("nan")
+
+
+def local_rms(t: Array, z: Array) -> tuple[Array, Array]:
+    """Return the borders (k + 1,) of pieces of a run in s and the rms (k,) of the residual in each."""
+    pieces = np.array_split(np.arange(t.size), max(min(BLOCKS, t.size // LEAST), 1))
+    borders = [t[p[0]] for p in pieces if p.size] + [t[-1]]
+    return np.asarray(borders), np.asarray([rms_over_noise(z[p]) for p in pieces if p.size])
+
+
+def overview(traces: Sequence[Trace], *, narrow: bool = False) -> Figure:
+    """Return all runs as strips over their own clocks, dark where the residual exceeds the noise, before and after.
+
+    `narrow` sets the two models below each other, for a small screen.
+    """
+    load_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    both = not all(x.same for x in traces)
+    local = [(x, local_rms(x.t, x.before), local_rms(x.t, x.after)) for x in traces if x.t.size > 1]
+    top = max((float(np.max(r)) for _, *two in local for _, r in two), default=1.0)
+    with house_style():
+        count = 2 if both else 1
+        lines = count if narrow else 1
+        figure = Figure(figsize=(NARROW_FIGURE if narrow else 9.6, lines * (0.36 * len(local) + 0.7) + 0.8))
+        FigureCanvasAgg(figure)
+        axes = figure.subplots(lines, count // lines, sharex=True, sharey=True, squeeze=False).ravel()
+        for k, (axis, title) in enumerate(zip(axes, ("baseline", "augmented model"), strict=False)):
+            for row, (one, *found) in enumerate(local):
+                borders, values = found[k]
+                shade = axis.pcolormesh(
+                    borders,
+                    [row - 0.36, row + 0.36],
+                    np.maximum(values, 1.0)[None, :],
+                    norm=LogNorm(1.0, max(3.0, top)),
+                    cmap="YlOrRd",
+                    rasterized=True,
+                )
+                axis.plot([borders[0], borders[-1]], [row + 0.40] * 2, color="#999999", linewidth=0.7)
+                if k == 0 and one.worst is not None:
+                    axis.plot(one.worst, [row - 0.42] * 2, color="#000000", linewidth=2.0, solid_capstyle="butt")
+            axis.set_title(title)
+            axis.set_xlabel("t  [s]" if not narrow or axis is axes[-1] else "")
+            axis.grid(False)
+        held = "\n(held out)" if narrow else " (held out)"
+        names = [name_text(x.name, narrow=narrow) + (held if x.holdout else "") for x, *_ in local]
+        axes[0].set_yticks(range(len(names)), names)
+        axes[0].set_ylim(len(names) - 0.4, -0.6)
+        bar = figure.colorbar(
+            shade, ax=list(axes), pad=0.02, aspect=30 if narrow else 14, location="bottom" if narrow else "right"
+        )
+        bar.set_label("residual / noise")
+        _plain_log(bar.ax.xaxis if narrow else bar.ax.yaxis, max(3.0, top), most=5 if narrow else 8)
+        _settle(figure)
+        return figure
+
+
+def _plain_log(axis: Any, top: float, *, most: int) -> None:
+    """Write 1, 2, 5, 10 on a logarithmic axis, or 1, 10, 100 where those are more than `most`."""
+    from matplotlib.ticker import NullLocator
+
+    places = [m * 10.0**d for d in range(9) for m in (1, 2, 5) if m * 10.0**d <= top * 1.001]
+    places = places if len(places) <= most else places[::3]
+    axis.set_ticks(places, [f"{p:g}" for p in places])
+    axis.set_minor_locator(NullLocator())
+
+
+def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
+    """Return a run: recording and both simulations, the residuals in units of noise, local rms, what was imposed; a close-up.
+
+    `narrow` leaves the close-up out and gives the legend a row of its own, for a small screen.
+    """
+    load_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    imposed = [k for k in ("V", "W") if np.ptp(getattr(one, k)) > VARIES * float(np.abs(getattr(one, k)).max())]
+    piece = None if narrow else close_up(one)
+    heights = [3.0, 2.2, 1.1, *[0.75] * len(imposed)]
+    with house_style():
+        figure = Figure(figsize=(NARROW_FIGURE if narrow else 10.4 if piece else 9.0, 0.72 * sum(heights) + 1.1))
+        FigureCanvasAgg(figure)
+        widths = (1.75, 1.0) if piece else (1.0,)
+        grid = figure.add_gridspec(len(heights), len(widths), height_ratios=heights, width_ratios=widths)
+        axes = _column(figure, grid, 0, [slice(i, i + 1) for i in range(len(heights))])
+        _shade(axes, one)
+        _whole(axes, one, narrow=narrow)
+        for axis, key in zip(axes[3:], imposed, strict=True):
+            _imposed_panel(axis, one, key, slice(None))
+        _end_column(axes)
+        if piece:
+            last = len(heights) - ("W" in imposed)
+            near = _column(figure, grid, 1, (slice(0, 1), slice(1, last), slice(last, None))[: 2 + ("W" in imposed)])
+            _near(near, one, piece)
+            for axis in near[2:]:
+                _imposed_panel(axis, one, "W", piece)
+            _end_column(near)
+            axes[0].axvspan(one.t[piece][0], one.t[piece][-1], ymin=0.0, ymax=0.03, color="#000000", linewidth=0)
+        _settle(figure)
+        return figure
+
+
+def _column(figure: Figure, grid: Any, column: int, rows: Sequence[slice]) -> list[Axes]:
+    axes = [figure.add_subplot(grid[rows[0], column])]
+    return axes + [figure.add_subplot(grid[place, column], sharex=axes[0]) for place in rows[1:]]
+
+
+def _end_column(axes: Sequence[Axes]) -> None:
+    for axis in axes[:-1]:
+        axis.tick_params(labelbottom=False)
+    axes[-1].set_xlabel("t  [s]")
+    axes[-1].figure.align_ylabels(axes)
+
+
+def _shade(axes: Sequence[Axes], one: Trace) -> None:
+    """Shade the windows that stand out, the more the worse, and name the worst."""
+    step = 2.0 * float(np.median(np.diff(one.t))) if one.t.size > 1 else 0.0
+    starts = sorted(a for a, _ in one.windows)
+    for (a, b), height in zip(one.windows, one.heights(), strict=True):
+        end = next((s for s in starts if 0 < s - b <= step), b)  # no light line between windows that adjoin
+        for axis in axes:
+            axis.axvspan(a, end, color=GUILTY, alpha=0.06 + 0.26 * height, linewidth=0)
+    if one.worst is not None:
+        middle = 0.5 * sum(one.worst)
+        axes[1].annotate(
+            "worst here", (middle, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
+            ha="center", va="bottom", color="#7A4A00", fontsize=8.5,
+        )  # fmt: skip
+
+
+def _whole(axes: Sequence[Axes], one: Trace, *, narrow: bool = False) -> None:
+    """Draw the whole run on the first three axes."""
+    title = name_text(one.name, narrow=narrow) + (" (held out)" if one.holdout else "")
+    above, below, local = axes[:3]
+    _models(above, one, slice(None))
+    above.set_title(title, pad=22 if narrow else None)
+    above.legend(
+        loc="lower left" if narrow else "lower right", bbox_to_anchor=(-0.02 if narrow else 1.0, 0.99), ncols=3, fontsize=8.5,
+        handlelength=1.4 if narrow else 2.4, borderaxespad=0.0, columnspacing=1.0,
+    )  # fmt: skip
+    _residual(below, one)
+    sets = [(one.before, BEFORE, "-"), (one.after, AFTER, (0, (4, 1.2)))]
+    for z, colour, dash in [(one.before, AFTER, "-")] if one.same else sets:
+        borders, values = local_rms(one.t, z)
+        local.stairs(values, borders, baseline=None, color=colour, linestyle=dash, linewidth=1.4)
+    local.axhline(1.0, color="#777777", linewidth=0.8)
+    local.set_yscale("log")
+    low, high = local.get_ylim()
+    local.set_ylim(min(low, 0.7), max(high, 2.0))
+    _plain_log(local.yaxis, local.get_ylim()[1], most=4)
+    local.set_ylabel("local rms\n/ noise")
+    margin = 0.01 * float(np.ptp(one.t))
+    above.set_xlim(one.t[0] - margin, one.t[-1] + margin)
+
+
+def _models(axis: Axes, one: Trace, part: slice) -> None:
+    """Draw recording and simulations over a part of the run: dots where they are few, lines by extremes where not."""
+    t = one.t[part]
+    few = t.size <= DOTS
+    for a, b in _pieces(t):
+        mark = "recorded" if a == 0 else None
+        if few:
+            axis.plot(t[a:b], one.observed[part][a:b], ".", color=OBSERVED, markersize=2.6, label=mark)
+        else:
+            axis.plot(*_thinned(t[a:b], one.observed[part][a:b]), color=OBSERVED, linewidth=0.9, alpha=0.75, label=mark)
+    drawn = [(one.baseline, BEFORE, "baseline", "-"), (one.augmented, AFTER, "augmented model", (0, (4, 1.2)))]
+    if one.same:
+        drawn = [(one.baseline, AFTER, "baseline", "-")]
+    for values, colour, label, dash in drawn:
+        for a, b in _pieces(t):
+            shown = label if a == 0 else None
+            axis.plot(*_thinned(t[a:b], values[part][a:b]), color=colour, linewidth=1.1, linestyle=dash, label=shown)
+    axis.set_ylabel(name_text(one.label))
+    axis.ticklabel_format(axis="y", useOffset=False)
+    axis.margins(y=0.14)
+
+
+def _residual(axis: Axes, one: Trace) -> None:
+    """Draw both residuals over the whole run as bands between their extremes, and where noise would stay."""
+    sets = [(one.before, BEFORE, 0.55), (one.after, AFTER, 0.75)]
+    for z, colour, alpha in [(one.before, AFTER, 0.75)] if one.same else sets:
+        for a, b in _pieces(one.t):
+            if b - a < 4 * COLUMNS:
+                axis.plot(one.t[a:b], z[a:b], color=colour, linewidth=0.6, alpha=alpha)
+                continue
+            edges = np.unique(np.linspace(a, b, COLUMNS + 1).astype(int)[:-1])
+            low, high = np.minimum.reduceat(z[:b], edges), np.maximum.reduceat(z[:b], edges)
+            axis.fill_between(one.t[edges], low, high, color=colour, alpha=alpha, linewidth=0.3)
+    _noise_band(axis)
+    axis.set_ylabel("residual\n/ noise")
+
+
+def _noise_band(axis: Axes) -> None:
+    for level in (-2.0, 2.0):
+        axis.axhline(level, color="#000000", linewidth=0.7, linestyle=(0, (1, 1.5)))
+    axis.margins(y=0.08)
+
+
+def _imposed_panel(axis: Axes, one: Trace, key: str, part: slice) -> None:
+    axis.plot(*_thinned(one.t[part], getattr(one, key)[part]), color="#555555", linewidth=0.8)
+    _imposed(axis, getattr(one, key)[part], wide=key == "V")
+    if axis.get_yscale() == "log":  # decades would fall outside so low a panel
+        ends = sorted({float(f"{x:.3g}") for x in (getattr(one, key)[part].min(), getattr(one, key)[part].max())})
+        axis.set_yticks(ends, [f"{x:g}" for x in ends])
+        axis.set_yticks([], minor=True)
+    axis.set_ylabel(f"W\n[{one.load_unit}]" if key == "W" else "V\n[µm/s]")
+
+
+def _near(axes: Sequence[Axes], one: Trace, part: slice) -> None:
+    """Draw the close-up on the first two axes."""
+    _models(axes[0], one, part)
+    axes[0].set_title("close-up")
+    axes[0].margins(x=0.02)
+    shown = ((one.after, AFTER, "o"),) if one.same else ((one.before, BEFORE, "o"), (one.after, AFTER, "x"))
+    for z, colour, marker in shown:
+        axes[1].plot(one.t[part], z[part], color=colour, linewidth=0.7, alpha=0.8)
+        if one.t[part].size <= DOTS // 3:
+            axes[1].plot(one.t[part], z[part], marker, color=colour, markersize=2.4, linestyle="none")
+    _noise_band(axes[1])
+
+
+def close_up(one: Trace) -> slice | None:
+    """Return the samples of a close-up: a short stretch that holds most of the misfit, or some periods of a fast one."""
+    n = one.t.size
+    if n < 2 * FEWEST:
+        return None
+    over = np.maximum(_smooth(one.before**2, max(n // 200, 5)) - 1.0, 0.0)
+    if float(over.max()) < FAINT or not over.any():
+        return None
+    sums = np.concatenate([[0.0], np.cumsum(over)])
+    ends = np.searchsorted(sums, sums[:-1] + MOST * sums[-1])  # the shortest stretch that holds most of it
+    lengths = np.where(ends <= n, ends - np.arange(n), n)
+    a = int(np.argmin(lengths))
+    size = int(lengths[a])
+    if size <= SHORT * n:
+        return _around(a + size // 2, max(3 * size, FEWEST), n)
+    power = over if one.worst is None else np.where((one.t >= one.worst[0]) & (one.t <= one.worst[1]), over, 0.0)
+    middle = int(np.argmax(_smooth(power, FEWEST)))
+    near = _around(middle, 1024, n)
+    z = one.before[near] - one.before[near].mean()
+    spectrum = np.abs(np.fft.rfft(z * np.hanning(z.size))) ** 2
+    peak = int(np.argmax(spectrum[1:])) + 1
+    length = max(CLOSE_UP * z.size // peak, FEWEST)
+    tall = float(spectrum[max(peak - 2, 1) : peak + 3].sum()) > PEAK * float(spectrum[1:].sum())
+    return _around(middle, length, n) if tall and float(np.var(z)) > FAINT and length <= ZOOM * n else None
+
+
+def _smooth(values: Array, size: int) -> Array:
+    """Return running means over `size` samples, fewer at the ends."""
+    weights = np.convolve(np.ones(values.size), np.ones(size), mode="same")
+    return np.asarray(np.convolve(values, np.ones(size), mode="same") / weights)
+
+
+def _around(middle: int, length: int, n: int) -> slice:
+    length = min(length, n)
+    start = int(np.clip(middle - length // 2, 0, n - length))
+    return slice(start, start + length)
+
+
+def _pieces(t: Array) -> list[tuple[int, int]]:
+    """Return the stretches of a record without gaps, as pairs of indices."""
+    if t.size < 2:
+        return [(0, t.size)]
+    steps = np.diff(t)
+    borders = [0, *(np.flatnonzero(steps > GAP * float(np.median(steps))) + 1).tolist(), t.size]
+    return [(a, b) for a, b in itertools.pairwise(borders) if b > a]
+
+
+# The atlas of places at which a misfit was looked for: its rows in one form, a figure of them, the foremost in words.
+
+BINS = 3  # of an axis, from which it has a panel of its own
+BARS = 12  # in a panel of names
+FINEST = 240  # columns in which a spectrum is drawn by its maxima
+LEVEL = 0.01  # of the p-value adjusted for all that was looked at
+WIDE_AXIS = 100.0  # ratio from which an axis is logarithmic
+APART = ("run", "window")  # axes that the figures of the runs show
+
+# name: what it is in words, its unit
+AXES: dict[str, tuple[str, str]] = {
+    "run": ("run as a whole", "s"),
+    "window": ("time window", "s"),
+    "time": ("time", "s"),
+    "forcing": ("phase of the forcing", "of a period"),
+    "cycle": ("phase of stick-slip", "of a period"),
+    "frequency": ("frequency", "Hz"),
+    "v": ("slip velocity v", "µm/s"),
+    "phi": ("age φ", "s"),
+    "W": ("load W", "N"),
+    "dlnW/dt": ("rate of the load d ln W/dt", "1/s"),
+    "position": ("place on the track", "µm"),
+    "slip": ("slip", "µm"),
+}
+ROUNDING = 1e-9  # of an interval's other end: an end below is zero
+
+
+@dataclass(frozen=True)
+class Spot:
+    """One place: an interval `low` to `high` of an axis or, where these are NaN, a `name`; `height` is how far it stands out.
+
+    `height` is minus the decimal logarithm of the unadjusted p-value where that is known, else the size of the statistic.
+    """
+
+    axis: str
+    run: str
+    kind: str
+    low: float
+    high: float
+    name: str
+    height: float
+    p_value: float | None
+
+    @property
+    def sure(self) -> bool:
+        """True where noise does not do this, all that was looked at being allowed for."""
+        return self.p_value is not None and self.p_value < LEVEL
+
+    @property
+    def place(self) -> str:
+        """Return the place in words, with its unit."""
+        if self.name:
+            return self.name
+        unit = AXES.get(self.axis, ("", ""))[1]
+        tail = f"{NO_BREAK}{unit}" if unit else ""
+        if self.axis == "frequency" or self.low == self.high:
+            return f"{number(0.5 * (self.low + self.high))}{tail}"
+        least = ROUNDING * max(abs(self.low), abs(self.high))
+        low, high = (0.0 if abs(end) < least else end for end in (self.low, self.high))
+        return f"{number(low)} to {number(high)}{tail}"
+
+
+def spots(rows: Sequence[Mapping[str, Any]]) -> list[Spot]:
+    """Return the rows of the atlas, what stands out most first; a row has low and high, or `bin`: an interval or a name."""
+    found = []
+    for row in rows:
+        log_p, statistic, p = row.get("log_p"), row.get("statistic"), row.get("p_value")
+        if not finite(log_p) and not finite(statistic):
+            continue
+        height = -float(log_p) / math.log(10) if finite(log_p) else abs(float(statistic or 0.0))
+        place = row.get("bin") if "low" not in row else [row["low"], row["high"]]
+        low, high, name = _place(place)
+        found.append(
+            Spot(str(row.get("axis", "")), str(row.get("run") or ""), str(row.get("kind", "")), low, high, name, height,
+                 float(p) if p is not None and finite(p) else None)
+        )  # fmt: skip
+    return sorted(found, key=lambda s: -s.height)
+
+
+def _place(value: Any) -> tuple[float, float, str]:
+    if isinstance(value, list | tuple) and len(value) == 2 and all(finite(v) for v in value):
+        return float(value[0]), float(value[1]), ""
+    return (float(value), float(value), "") if finite(value) else (math.nan, math.nan, str(value))
+
+
+def axis_text(axis: str) -> str:
+    """Return what an axis of the atlas is, in words."""
+    return AXES.get(axis, (axis, ""))[0]
+
+
+def foremost(found: Sequence[Spot], *, each: int = 2, most: int = 12) -> list[Spot]:
+    """Return what stands out most, `each` of an axis at most."""
+    kept: list[Spot] = []
+    for spot in found:
+        if sum(k.axis == spot.axis for k in kept) < each and len(kept) < most:
+            kept.append(spot)
+    return kept
+
+
+def atlas_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
+    """Return a panel for each axis of the atlas with several bins, but runs and windows in time; None where there is none."""
+    load_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    by_axis: dict[str, list[Spot]] = {}
+    for spot in spots(rows):
+        if spot.axis not in APART and spot.kind != "shape":
+            by_axis.setdefault(spot.axis, []).append(spot)
+    shown = {k: v for k, v in by_axis.items() if len({(s.low, s.high, s.name) for s in v}) >= BINS}
+    if not shown:
+        return None
+    columns = 1 if narrow else min(3, len(shown))
+    lines = math.ceil(len(shown) / columns)
+    label = "−log$_{10}$ p" if any(finite(r.get("log_p")) for r in rows) else "|statistic|"
+    with house_style():
+        figure = Figure(figsize=(NARROW_FIGURE if narrow else 3.5 * columns + 0.2, 2.3 * lines + 0.2))
+        FigureCanvasAgg(figure)
+        panels = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
+        for k, (axis, (name, found)) in enumerate(zip(panels, shown.items(), strict=False)):
+            about, unit = AXES.get(name, (name_text(name, narrow=narrow), ""))
+            axis.set_title(about + (f"  [{unit}]" if unit else ""), fontsize=9.5)
+            if math.isfinite(found[0].low):
+                _bins(axis, found)
+                axis.set_ylabel(label if k % columns == 0 else "")
+            else:
+                _names(axis, found, narrow=narrow)
+                axis.set_xlabel(label)
+        for axis in panels[len(shown) :]:
+            axis.set_axis_off()
+        _settle(figure)
+        return figure
+
+
+def _bins(axis: Axes, found: Sequence[Spot]) -> None:
+    """Draw bins along an axis, each at the largest height of any run and kind: grey what noise may do, the largest darkest."""
+    highest: dict[tuple[float, float], Spot] = {}
+    for spot in found:  # largest first
+        highest.setdefault((spot.low, spot.high), spot)
+    bins = list(highest.values())
+    positive = min(s.low for s in bins) > 0
+    log = positive and max(s.high for s in bins) > WIDE_AXIS * min(s.high for s in bins)
+    if len(bins) > FINEST:
+        bins = _columns(bins, log)
+    for spot in bins:
+        colour, alpha = (BEFORE if spot.sure else "#AAAAAA"), (1.0 if spot is bins[0] else 0.5)
+        if spot.high > spot.low:
+            axis.bar(spot.low, spot.height, spot.high - spot.low, align="edge", color=colour, alpha=alpha, linewidth=0)
+        else:
+            axis.vlines(spot.low, 0, spot.height, color=colour, alpha=alpha, linewidth=1.6)
+    if log:
+        axis.set_xscale("log")
+        _decade_ticks(axis)
+    axis.margins(x=0.01)
+    axis.locator_params(axis="y", nbins=4)
+
+
+def _columns(bins: Sequence[Spot], log: bool) -> list[Spot]:
+    """Return many bins as few columns, each as high as the highest in it, largest first."""
+    low, high = min(s.low for s in bins), max(s.high for s in bins)
+    edges = np.geomspace(low, high, FINEST + 1) if log else np.linspace(low, high, FINEST + 1)
+    highest: dict[int, Spot] = {}
+    for spot in bins:
+        k = int(np.clip(np.searchsorted(edges, 0.5 * (spot.low + spot.high), side="right") - 1, 0, FINEST - 1))
+        highest.setdefault(k, spot)
+    return [
+        Spot(s.axis, s.run, s.kind, float(edges[k]), float(edges[k + 1]), s.name, s.height, s.p_value)
+        for k, s in highest.items()
+    ]
+
+
+def _names(axis: Axes, found: Sequence[Spot], *, narrow: bool) -> None:
+    highest: dict[str, Spot] = {}
+    for spot in found:
+        highest.setdefault(name_text(spot.name, narrow=narrow), spot)
+    shown = list(highest.items())[:BARS][::-1]
+    colours = [BEFORE if s.sure else "#AAAAAA" for _, s in shown]
+    axis.barh([k for k, _ in shown], [s.height for _, s in shown], color=colours)
+    axis.tick_params(axis="y", labelsize=8.5)
+
+
+# Figures of what was found: how far parameters had been bent, a missing force, a stability diagram.
+
+PIECES = 40  # in which a force is averaged along a quantity of state
+STATES = (("v", "slip velocity v  [µm/s]", True), ("phi", "age φ  [s]", True), ("W", "load W  [N]", False))
+WIDE_QUANTITY = 10.0  # ratio from which a quantity has a logarithmic axis
+
+
+def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
+    """Return how far each parameter of the baseline had been bent, in its own standard errors; None where none is known."""
+    rows = [p for p in parameters if finite(p.get("shift_sigma"))][::-1]
+    if not rows:
+        return None
+    shifts = [float(p["shift_sigma"]) for p in rows]
+    size = max(abs(s) for s in shifts)
+    with house_style():
+        figure, (axis,) = new_figure(size=(NARROW_FIGURE if narrow else 6.6, 0.32 * len(rows) + 1.0))
+        axis.axvspan(-2, 2, color="#DDDDDD", linewidth=0)
+        axis.axvline(0, color="#777777", linewidth=0.8)
+        for k, shift in enumerate(shifts):
+            axis.plot([0, shift], [k, k], color=BEFORE, linewidth=1.6)
+            axis.plot(shift, k, "o", color=BEFORE, markersize=5)
+        axis.set_yticks(range(len(rows)), [name_text(str(p["name"]), narrow=narrow) for p in rows])
+        axis.set_ylim(-0.6, len(rows) - 0.4)
+        if size > 30:
+            axis.set_xscale("symlog", linthresh=3.0)
+            ticks = [t for t in (-1000, -100, -30, -10, -3, 0, 3, 10, 30, 100, 1000) if abs(t) < 2 * size]
+            axis.set_xticks(ticks, [f"{t}".replace("-", "−") for t in ticks])
+            axis.set_xticks([], minor=True)
+            axis.set_xlim(
+                *(1.6 * (end if abs(end) > 3.0 else 3.0 * side) for end, side in ((min(shifts), -1), (max(shifts), 1)))
+            )
+        axis.set_xlabel("baseline less augmented model  [standard errors]")
+        axis.grid(axis="y", visible=False)
+        _settle(figure)
+        return figure
+
+
+def force_figure(name: str, force: Mapping[str, Any], *, unit: str = "N", narrow: bool = False) -> Figure:
+    """Return a run's missing force (n,) over time with its band, above the load and the slip velocity where they are known."""
+    t = np.asarray(force["t"], dtype=float)
+    imposed = [(k, label) for k, label in (("v", "v\n[µm/s]"), ("W", "W\n[N]")) if force.get(k) is not None]
+    with house_style():
+        figure, axes = new_figure(1 + len(imposed), size=(NARROW_FIGURE if narrow else 9.0, 2.6 + 1.0 * len(imposed)))
+        values, band = np.asarray(force["force"], dtype=float), force.get("band")
+        if band is not None:
+            low, high = _limits(values, np.asarray(band, dtype=float))
+            axes[0].fill_between(t, low, high, color=AFTER, alpha=0.22, linewidth=0, label="95 % band")
+        axes[0].plot(*_thinned(t, values), color=AFTER, linewidth=1.2, label="missing force")
+        axes[0].axhline(0, color="#777777", linewidth=0.8)
+        axes[0].set_title(name_text(name, narrow=narrow), pad=22 if narrow else None)
+        axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=2, fontsize=8.5, borderaxespad=0.0)
+        axes[0].set_ylabel(f"missing force\n[{unit}]" if unit != "1" else "missing friction\ncoefficient")
+        for axis, (key, label) in zip(axes[1:], imposed, strict=True):
+            known = np.asarray(force[key], dtype=float)
+            axis.plot(*_thinned(t, known), color="#555555", linewidth=0.8)
+            axis.set_ylabel(label)
+            if key == "v" and known.min() > 0 and known.max() > WIDE_QUANTITY * known.min():
+                axis.set_yscale("log")
+                _decade_ticks(axis)
+        axes[-1].set_xlabel("t  [s]")
+        axes[-1].set_xlim(t[0] - 0.01 * np.ptp(t), t[-1] + 0.01 * np.ptp(t))
+        figure.align_ylabels(axes)
+        _settle(figure)
+        return figure
+
+
+def _limits(values: Any, band: Any) -> tuple[Any, Any]:
+    """Return lower and upper limit from a band given as a half width (n,), or as limits (2, n) or (n, 2)."""
+    if band.ndim < 2:
+        return values - band, values + band
+    return (band[0], band[1]) if band.shape[0] == 2 else (band[:, 0], band[:, 1])
+
+
+def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, unit: str = "N", narrow: bool = False) -> Figure | None:
+    """Return the missing force of all runs against slip velocity, age and load, averaged in pieces; None without a state."""
+    load_matplotlib()
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    shown = [s for s in STATES if any(f.get(s[0]) is not None and np.ptp(f[s[0]]) > 0 for f in forces.values())]
+    if not shown:
+        return None
+    with house_style():
+        lines = len(shown) if narrow else 1
+        figure = Figure(figsize=(NARROW_FIGURE if narrow else 3.2 * len(shown) + 0.4, 0.5 + 2.6 * lines))
+        FigureCanvasAgg(figure)
+        axes = figure.subplots(lines, len(shown) // lines, sharey=True, squeeze=False).ravel()
+        for axis, (key, label, wide) in zip(axes, shown, strict=True):
+            spans = [np.asarray(f[key], dtype=float) for f in forces.values() if f.get(key) is not None]
+            low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
+            log = wide and low > 0 and high > WIDE_QUANTITY * low
+            for index, (name, force) in enumerate(forces.items()):
+                if force.get(key) is not None:
+                    _by_state(axis, np.asarray(force[key], dtype=float), np.asarray(force["force"], dtype=float), log,
+                              name_text(name, narrow=narrow), index)  # fmt: skip
+            axis.axhline(0, color="#777777", linewidth=0.8)
+            axis.set_xlabel(label)
+            if log:
+                axis.set_xscale("log")
+                _decade_ticks(axis)
+        axes[0].set_ylabel(f"missing force  [{unit}]" if unit != "1" else "missing friction coefficient")
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
+        _settle(figure)
+        return figure
+
+
+def _by_state(axis: Axes, x: Any, y: Any, log: bool, label: str, index: int) -> None:
+    """Draw samples faintly and their averages along the quantity of state."""
+    colour = COLOURS[index % len(COLOURS)]
+    every = max(x.size // 1500, 1)
+    axis.plot(x[::every], y[::every], ".", color=colour, markersize=1.2, alpha=0.25, rasterized=True)
+    scale = np.log(x) if log else x
+    edges = np.linspace(scale.min(), scale.max(), PIECES + 1)
+    place = np.clip(np.digitize(scale, edges) - 1, 0, PIECES - 1)
+    count = np.bincount(place, minlength=PIECES)
+    kept = count >= max(3, x.size // 2000)
+    middle = 0.5 * (edges[1:] + edges[:-1])[kept]
+    mean = np.bincount(place, weights=y, minlength=PIECES)[kept] / count[kept]
+    axis.plot(np.exp(middle) if log else middle, mean, color=colour, linestyle=DASHES[index % len(DASHES)], label=label)
+
+
+def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figure | None:
+    """Return the stability boundary W0 (N) against V (um/s) of baseline and augmented model; keys V, W0_baseline, W0_augmented.
+
+    `V_augmented` where the second has velocities of its own, `W0_hopf` under constant load, None or NaN for gaps.
+    """
+    curves = [("W0_baseline", "baseline", BEFORE, "-"), ("W0_augmented", "augmented model", AFTER, (0, (5, 1.5)))]
+    curves += [("W0_hopf_baseline", "baseline, constant load", BEFORE, DOTTED)]
+    curves += [("W0_hopf_augmented", "augmented model, constant load", AFTER, DOTTED)]
+    drawn = [c for c in curves if diagram.get(c[0]) is not None and np.isfinite(_gaps(diagram[c[0]])).any()]
+    if not drawn or diagram.get("V") is None:
+        return None
+    with house_style():
+        figure, (axis,) = new_figure(size=(NARROW_FIGURE, 4.6) if narrow else (6.4, 4.2))
+        for key, label, colour, dash in drawn:
+            own = diagram.get(key.replace("W0", "V"))
+            V = diagram["V"] if own is None else own
+            axis.plot(_gaps(V), _gaps(diagram[key]), color=colour, linestyle=dash, label=label)
+        axis.set_xscale("log")
+        marks = [(float(V), float(W)) for V, W in diagram.get("marks") or () if V > 0 and W > 0]
+        if marks:
+            axis.plot(
+                *zip(*marks, strict=True), "+", color="#000000", markersize=9, markeredgewidth=1.6, linestyle="none",
+                label="your runs", zorder=5, clip_on=False,
+            )  # fmt: skip
+        axis.margins(x=0.0 if not marks else 0.02)
+        heights = np.concatenate([*(_gaps(diagram[c[0]]) for c in drawn), [W for _, W in marks]])
+        if np.nanmax(heights) > WIDE_QUANTITY * np.nanmin(heights) > 0:
+            axis.set_yscale("log")
+        axis.set_xlabel("V  [µm/s]")
+        axis.set_ylabel(f"critical load W$_0$  [{diagram.get('load_unit', 'N')}]")
+        legend = axis.legend(
+            loc="best", handlelength=2.8, title="sliding is steady below the first boundary", alignment="left"
+        )
+        legend.get_title().set_color("#555555")
+        _decade_ticks(axis)
+        _settle(figure)
+        return figure

@@ -1,0 +1,326 @@
+"""Numbers and sentences of the diagnosis' report: sensible digits, declared units, the verdict in plain words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeGuard
+
+SMALLEST_P = 1e-290
+NO_BREAK = "\u00a0"  # between a number and its unit no line breaks
+PLAIN = (1e-4, 1e6)  # between these a number is written without a power of ten
+SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+
+
+def finite(value: Any) -> TypeGuard[float]:
+    """Return whether `value` is a number that is neither infinite nor NaN."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """Return a number with so many significant digits, or a dash where there is none."""
+    if not finite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    rounded = float(f"{value:.{digits}g}")
+    power = math.floor(math.log10(abs(rounded)))
+    if not PLAIN[0] <= abs(rounded) < PLAIN[1]:
+        return _minus(f"{rounded / 10.0**power:.{digits - 1}f}" + f"·10{str(power).translate(SUPERSCRIPT)}")
+    return _minus(f"{rounded:.{max(digits - 1 - power, 0)}f}")
+
+
+def with_error(value: Any, error: Any) -> str:
+    """Return `value ± error` with two digits of the error, the value to the same place."""
+    if not finite(value):
+        return "–"
+    if not finite(error) or error <= 0:
+        return number(value, 4)
+    place = math.floor(math.log10(float(f"{error:.1e}"))) - 1  # of the error's second digit
+    size = max(abs(value), error)
+    if PLAIN[0] <= size < PLAIN[1] or (abs(value) < error and error >= 1e-6):
+        decimals = max(-place, 0)
+        return _minus(f"{round(value, -place):.{decimals}f} ± {round(error, -place):.{decimals}f}")
+    power = math.floor(math.log10(size))
+    decimals = max(power - place, 0)
+    scaled = f"({value / 10.0**power:.{decimals}f} ± {error / 10.0**power:.{decimals}f})"
+    return _minus(f"{scaled}·10{str(power).translate(SUPERSCRIPT)}")
+
+
+def probability(value: Any) -> str:
+    """Return a p-value: three decimals where it is large, one digit and a power of ten where it is not."""
+    if not finite(value):
+        return "–"
+    if value < SMALLEST_P:
+        return "< 10⁻²⁹⁰"
+    return f"{value:.3f}" if value >= 0.001 else number(value, 1)
+
+
+def percent(share: Any) -> str:
+    """Return a share as a percentage, with more digits near 0 and 100 %."""
+    if not finite(share):
+        return "–"
+    value = 100.0 * share
+    if 0 < value < 0.01:
+        return f"< 0.01{NO_BREAK}%"
+    if value == 0 or abs(value) >= 10:
+        return f"{_minus(f'{value:.0f}' if value <= 99.5 or value == 100 else f'{value:.1f}')}{NO_BREAK}%"
+    return f"{number(value, 2 if abs(value) >= 1 else 1)}{NO_BREAK}%"
+
+
+def rms(value: Any) -> str:
+    """Return a residual in units of the noise: two decimals, fewer where it is large."""
+    if not finite(value):
+        return "–"
+    return f"{value:.2f}" if value < 9.995 else number(value, 3)
+
+
+def unit_text(unit: Any) -> str:
+    """Return a unit as it is printed, nothing for 1."""
+    return "" if unit in (None, "", "1") else str(unit).replace("um", "µm")
+
+
+def spans(windows: Sequence[Sequence[float]], most: int = 4) -> str:
+    """Return intervals of time in words, the first `most` of them."""
+    shown = [f"{number(a)} to {number(b)}{NO_BREAK}s" for a, b in windows[:most]]
+    more = len(windows) - len(shown)
+    return joined([*shown, f"{more} more"] if more > 0 else shown)
+
+
+def joined(words: Sequence[str], last: str = "and") -> str:
+    """Return words as a list in a sentence."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}" if words else ""
+
+
+REMEDIES = {  # what is wrong, and what to do; {value} is the size with its error, {number} the size, {stated} what was stated
+    "stiffness-error": (
+        "stated stiffness {stated}; the recordings want {value}",
+        'set stiffness = "{number}" in [apparatus], and calibrate the machine',
+    ),
+    "inertia": (
+        "the slider's mass counts, and the model has none; the recordings want {value}",
+        'set mass = "{number}" and inertia = true',
+    ),
+    "interface-compliance": (
+        "the interface is elastic, and the model has it rigid: elastic length {value}",
+        'set interface = "elastic" with lambda = {number}',
+    ),
+    "linker-dieterich": (
+        "a change of the load changes the age of contacts: {value}",
+        'add "+linker-dieterich" to the name of the ageing law, with alpha = {number}',
+    ),
+    "stiffness-exponent": (
+        "the interface stiffens with a power of the load: {value}",
+        'set interface = "power" with n = {number}',
+    ),
+    "age-saturation": (
+        "young contacts do not weaken as a bare logarithm of age has it: {value}",
+        "use a law with a short-age cut-off, as srf-vsat",
+    ),
+    "log-log-coupling": ("velocity and age strengthen each other: {value}", 'use law = "log-log"'),
+    "slip-evolution": (
+        "contacts change with slip more than with time: {value}",
+        'use ageing = "ruina" where the share is 1, the augmented model where it is less',
+    ),
+    "second-state": ("friction has a second state: {value}", 'use law = "two-state"'),
+    "viscous-drag": (
+        "a drag grows with velocity: {value}",
+        "add it to the law, and look for a fluid or a guide that rubs",
+    ),
+    "adhesion-offset": (
+        "friction does not vanish with the load: {value}",
+        "zero the load cell, weigh what rests on the slider, or use the augmented model",
+    ),
+    "load-transmission": (
+        "asperities feel only a part of the imposed modulation: {value} times it",
+        "record the load at the interface, or multiply the modulation by {number}",
+    ),
+    "load-distortion": (
+        "a second harmonic of the load reaches the interface and not the load cell: {value}",
+        "look at the load beside the interface, and use the augmented model until then",
+    ),
+    "tangential-crosstalk": (
+        "the load pushes along the sliding direction: {value}",
+        "realign the load, or subtract {number} times (W - W0) from the force",
+    ),
+    "track-topography": (
+        "friction repeats along the track: {value}",
+        "use another track, or the augmented model, which has it",
+    ),
+    "friction-drift": (
+        "friction drifts in time: {value}",
+        "run in longer, or take a window before it sets in",
+    ),
+    "friction-drift-slip": ("friction drifts with slip: {value}", "run in longer, or fit with --trend slip"),
+    "drive-ripple": (
+        "the stage's velocity ripples with its position: {value}",
+        "measure the stage's own motion, and give it as load_point_displacement",
+    ),
+    "sensor-lag": (
+        "the gauge lags behind: {value}",
+        "undo its filter of first order in the recording, or take a faster gauge",
+    ),
+}
+
+
+def verdict_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    """Return what is wrong and how much, in one sentence that needs no other."""
+    effects = [str(e) for e in answer.get("effects", ())]
+    verdict = answer.get("verdict")
+    if verdict == "none":
+        return "Nothing is missing: the model explains the recordings down to the noise."
+    if verdict == "identified":
+        return " ".join(_capital(_wrong(e, answer, material)) + "." for e in effects)
+    if verdict == "ambiguous":
+        return f"Something is missing, and these recordings cannot tell which of {joined(effects, 'or')} it is."
+    if verdict == "unknown":
+        return "Something is missing that no registered effect explains."
+    if verdict == "inconclusive":
+        return "Nothing has to be added, but this experiment could not have seen most effects of a size that matters."
+    return f"The verdict is {verdict}."
+
+
+def remedy(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    """Return what to do about it, in a sentence or two."""
+    effects, verdict = [str(e) for e in answer.get("effects", ())], answer.get("verdict")
+    if verdict == "none":
+        return "Go on with the parameters below; a fit with held-out runs shows how far they carry."
+    if verdict == "identified":
+        told = [_filled(REMEDIES[e][1], e, answer, material) for e in effects if e in REMEDIES]
+        rest = "go on with the augmented model in the folder beside this page, which has it"
+        return _capital("; ".join([*told, rest])) + "."
+    if verdict == "ambiguous":
+        if material.get("parting"):
+            return "Make the experiment described below: the candidates foretell different records of it."
+        return "Vary in another run what these runs have in common: the load, the velocity or the stiffness."
+    if verdict == "unknown":
+        form = (material.get("force") or {}).get("form")
+        tail = f" Its best closed form so far is {form}." if form else ""
+        return f"Look at the missing force below, against time and against the state, for what it goes with.{tail}"
+    return "Vary the load, or record more or with less noise: the sizes that could have been seen are listed below."
+
+
+def gain_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    """Return what is gained by the better model, and on what that rests."""
+    verdict = answer.get("verdict")
+    if verdict in ("none", "inconclusive"):
+        return f"With the model as it is{_level(answer, 'baseline')}." if _level(answer, "baseline") else ""
+    ranked = [r for r in material.get("ranked", ()) if finite(r.get("evidence"))]
+    zero = next((r["evidence"] for r in ranked if r.get("name") == "none"), None)
+    name = "+".join(sorted(str(e) for e in answer.get("effects", ())))
+    own = next((r["evidence"] for r in ranked if "+".join(sorted(str(r["name"]).split("+"))) == name), None)
+    best = own if own is not None else max((r["evidence"] for r in ranked), default=None)
+    parts = [f"{'With the best that was tried, ' if verdict in ('unknown', 'ambiguous') else ''}{_fell(answer)}"]
+    if verdict == "identified" and zero is not None and best is not None and best > zero:
+        parts.append(f"the log evidence rises by {number(best - zero)}")
+    sure = (answer.get("confidence") or {}).get(name)
+    if verdict == "identified" and finite(sure):
+        parts.append(f"confidence {percent(sure)}")
+    runs = len([r for r in material.get("runs", ()) if not r.get("holdout")])
+    located = [r for r in (answer.get("location") or {}).get("runs", ()) if finite(r.get("share"))]
+    rests = f"It rests on {runs} fitted run{'s' if runs != 1 else ''}" if runs else ""
+    if rests and located:
+        worst = max(located, key=lambda r: r["share"])
+        rests += f", most on “{worst['name']}” ({percent(worst['share'])} of what noise does not explain)"
+    return _capital("; ".join(parts)) + "." + (f" {rests}." if rests else "")
+
+
+def _wrong(effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    if effect in REMEDIES:
+        return _filled(REMEDIES[effect][0], effect, answer, material)
+    sizes = _sizes(effect, material)
+    about = _about(effect, material)
+    return f"the model lacks {effect}{f' ({about})' if about else ''}" + (f": {sizes}" if sizes else "")
+
+
+def _filled(text: str, effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    row = next(iter(_rows(effect, material)), {})
+    unit = unit_text(row.get("unit"))
+    value = bracketed(row.get("augmented"), row.get("augmented_stderr"))
+    tail = f"{NO_BREAK}{unit}" if unit else ""
+    sizes = (
+        _sizes(effect, material)
+        if effect not in ("stiffness-error", "inertia", "load-transmission")
+        else f"{value}{tail}"
+    )
+    plain = f"{number(row.get('augmented'), 4)}{tail}"
+    return text.format(
+        value=sizes or "its size is below", number=plain, stated=material.get("stated", {}).get("stiffness", "–")
+    )
+
+
+def _rows(effect: str, material: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the parameters that an effect has and the baseline has not."""
+    names = [str(n) for n in (material.get("own") or {}).get(effect, ())]
+    rows = [p for p in material.get("parameters", ()) if p.get("name") in names] if names else []
+    return rows or [
+        p for p in material.get("parameters", ()) if p.get("baseline") is None and finite(p.get("augmented"))
+    ]
+
+
+def _sizes(effect: str, material: Mapping[str, Any]) -> str:
+    told = []
+    for p in _rows(effect, material):
+        unit = unit_text(p.get("unit"))
+        told.append(
+            f"{p['name']} = {bracketed(p.get('augmented'), p.get('augmented_stderr'))}"
+            + (f"{NO_BREAK}{unit}" if unit else "")
+        )
+    return joined(told)
+
+
+def bracketed(value: Any, error: Any) -> str:
+    """Return `0.00653(5)`: a value to the last digit of its error, which stands in brackets with one digit, two below 3."""
+    if not finite(value):
+        return "–"
+    if not finite(error) or error <= 0:
+        return number(value, 4)
+    digits = 2 if int(f"{error:.0e}"[0]) < 3 else 1
+    place = math.floor(math.log10(float(f"{error:.{digits - 1}e}"))) - digits + 1
+    size = max(abs(value), error)
+    power = 0 if PLAIN[0] <= size < PLAIN[1] else math.floor(math.log10(size))
+    decimals = max(power - place, 0)
+    shown = round(error / 10.0 ** min(place, power)) if place <= power else round(error)
+    if place > 0 and power == 0:
+        shown = round(error / 10.0**place) * 10**place
+    text = f"{value / 10.0**power:.{decimals}f}({shown})"
+    return _minus(text + (f"·10{str(power).translate(SUPERSCRIPT)}" if power else ""))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _about(effect: str, material: Mapping[str, Any]) -> str:
+    text = str(material.get("about", {}).get(effect, "")).rstrip(".")
+    return text[:1].lower() + text[1:] if text[1:2].islower() else text
+
+
+def _level(answer: Mapping[str, Any], key: str) -> str:
+    fit, held = (rms_of(answer, key, part) for part in ("fit", "holdout"))
+    if fit is None:
+        return ""
+    held_out = f", {rms(held)} times in the held-out ones" if held is not None else ""
+    return f" residuals are {rms(fit)} times the noise in the fitted runs{held_out}"
+
+
+def _fell(answer: Mapping[str, Any]) -> str:
+    before, after = rms_of(answer, "baseline", "fit"), rms_of(answer, "augmented", "fit")
+    if before is None or after is None:
+        return "the residuals change as shown below"
+    text = f"residuals fall from {rms(before)} to {rms(after)} times the noise in the fitted runs"
+    held = rms_of(answer, "baseline", "holdout"), rms_of(answer, "augmented", "holdout")
+    if held[0] is None or held[1] is None:
+        return text
+    verb = "from" if held[1] <= held[0] else "rise from"
+    return f"{text}, and {verb} {rms(held[0])} to {rms(held[1])} times in runs that the fit never saw"
+
+
+def rms_of(answer: Mapping[str, Any], model: str, part: str) -> float | None:
+    """Return rms over noise of "baseline" or "augmented" in "fit" or "holdout", None where the answer has none."""
+    value = ((answer.get(model) or {}).get(part) or {}).get("rms_over_noise")
+    return float(value) if finite(value) else None
+
+
+def _minus(text: str) -> str:
+    return text.replace("-", "−")

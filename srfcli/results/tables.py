@@ -1,0 +1,219 @@
+"""A result as a table for a reader, and as CSV or JSON for programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import numbers
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, Any, TextIO
+
+from srfcli.core.errors import printable
+from srfcli.core.version import __version__
+
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
+
+# A result as a table, and its form for a reader: aligned plain text, or rich on a terminal.
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: its bare name as programs read it, its unit, its meaning and its format on a terminal."""
+
+    name: str
+    unit: str = "1"
+    about: str = ""
+    format: str = ".6g"
+
+    @property
+    def heading(self) -> str:
+        """Return the name with its unit, unless that is 1."""
+        return printable(self.name if self.unit in ("", "1") else f"{self.name} [{self.unit}]", line=True)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A result: rows of cells under columns, with all that is needed to read it years later.
+
+    `schema` is "srf.linear/1" or the like; `parameters` is name -> {value, unit, origin}, see `Resolved.described`;
+    `status` is a `Status` value, the worst one of the rows; `notes` are sentences shown below the table.
+    A cell is a number, text, a truth value, an enumeration member (its value counts) or None where there is nothing.
+    """
+
+    schema: str
+    columns: tuple[Column, ...]
+    rows: Sequence[Sequence[Any]]
+    title: str = ""
+    notes: tuple[str, ...] = ()
+    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    status: str = "ok"
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(f"a row of {len(row)} cells under {len(self.columns)} columns in {self.schema}")
+
+
+def plain_value(value: Any) -> Any:
+    """Return `value` as Python's own numbers, text, lists and dicts; NaN and infinities become None."""
+    if isinstance(value, Enum):
+        return plain_value(value.value)
+    if value is None or isinstance(value, str | bool):
+        return value
+    if isinstance(value, numbers.Integral):
+        return int(value)
+    if isinstance(value, numbers.Real):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, numbers.Complex):
+        return {"re": plain_value(complex(value).real), "im": plain_value(complex(value).imag)}
+    if isinstance(value, Mapping):
+        return {str(k): plain_value(v) for k, v in value.items()}
+    if type(value).__module__ == "numpy":  # arrays and numpy.bool, without importing numpy to ask
+        return plain_value(value.tolist())
+    if isinstance(value, Sequence | set | frozenset):
+        items = sorted(value) if isinstance(value, set | frozenset) else value
+        return [plain_value(v) for v in items]
+    return str(value)
+
+
+def cell_text(value: Any, format: str | None = None) -> str:
+    """Return one cell as text: with twelve digits, or in `format`; "-" for nothing, "inf" for an infinity."""
+    if isinstance(value, float) and math.isinf(value):
+        return str(float(value))
+    simple = plain_value(value)
+    if simple is None:
+        return "-"
+    if isinstance(simple, bool):
+        return "yes" if simple else "no"
+    if isinstance(simple, float):
+        return format_number(simple, format) if format else repr(float(f"{simple:.12g}"))
+    return printable(" ".join(str(simple).split()))
+
+
+def format_number(value: float, format: str) -> str:
+    """Return `value` in `format`; a format for something else than a number shows it in full."""
+    try:
+        return f"{value:{format}}"
+    except ValueError:
+        return repr(value)
+
+
+def to_text(table: Table, *, full: bool = True) -> str:
+    """Return the table as aligned plain text, as wide as it is; `full` shows twelve digits, else the columns' formats."""
+    cells = [
+        [cell_text(v, None if full else c.format) for v, c in zip(row, table.columns, strict=True)]
+        for row in table.rows
+    ]
+    headings = [c.heading for c in table.columns]
+    widths = [max(len(line[i]) for line in [headings, *cells]) for i in range(len(headings))]
+    right = [is_numeric(table, i) for i in range(len(headings))]
+    lines = [printable(table.title)] if table.title else []
+    for line in [headings, *cells] if headings else []:
+        padded = (t.rjust(w) if r else t.ljust(w) for t, w, r in zip(line, widths, right, strict=True))
+        lines.append("  ".join(padded).rstrip())
+    return "\n".join([*lines, *(f"Note: {printable(note, line=True)}" for note in table.notes)]) + "\n"
+
+
+def is_numeric(table: Table, index: int) -> bool:
+    """Return whether column `index` holds numbers, and so is set flush right."""
+    values = [row[index] for row in table.rows if row[index] is not None]
+    return bool(values) and all(isinstance(v, numbers.Number) and not isinstance(v, bool) for v in values)
+
+
+def print_terminal(table: Table, stream: TextIO) -> None:
+    """Print the table with rich; as plain text where it is wider than the terminal, so that nothing is cut."""
+    from rich.console import Console
+    from rich.text import Text
+
+    text = to_text(table, full=False)
+    stream = getattr(stream, "unescaped", stream)  # rich's own colours are meant; every text is made printable before
+    console = Console(file=stream, highlight=False, soft_wrap=True)
+    rule = 3 * len(table.columns)
+    body = text.splitlines()[: len(table.rows) + 2]
+    if max(map(len, body), default=0) + rule > console.width:
+        stream.write(text)
+        return
+    if table.title:
+        console.print(Text(printable(table.title), style="bold"))
+    if table.columns:
+        console.print(_rich_table(table))
+    for note in table.notes:
+        console.print(Text.assemble(("Note: ", "bold"), printable(note, line=True)))
+
+
+def _rich_table(table: Table) -> RichTable:
+    from rich import box
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    made = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
+    for index, column in enumerate(table.columns):
+        made.add_column(Text(column.heading), justify="right" if is_numeric(table, index) else "left", no_wrap=True)
+    for row in table.rows:
+        # Text, not str: rich would read square brackets in a cell as markup
+        made.add_row(*(Text(cell_text(v, c.format)) for v, c in zip(row, table.columns, strict=True)))
+    return made
+
+
+# A result as a record for programs: CSV by bare column names, and JSON in an envelope.
+
+
+def to_csv(table: Table) -> str:
+    """Return the rows as CSV in full precision; an empty cell stands for nothing, NaN or an infinity."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow([printable(c.name) for c in table.columns])
+    for row in table.rows:
+        writer.writerow([_csv_cell(v) for v in row])
+    return buffer.getvalue()
+
+
+def _csv_cell(value: Any) -> str:
+    if type(value) is float:  # nearly all cells of long records
+        return repr(value) if math.isfinite(value) else ""
+    simple = plain_value(value)
+    if simple is None:
+        return ""
+    if isinstance(simple, bool):
+        return "true" if simple else "false"
+    return repr(simple) if isinstance(simple, float) else printable(str(simple))
+
+
+def json_text(data: Any, *, indent: int | None = None) -> str:
+    """Return plain data as JSON that a terminal shows as it is: what it would act on is spelt \\u001b."""
+    text = json.dumps(data, indent=indent, ensure_ascii=False, allow_nan=False)
+    if printable(text) == text:
+        return text
+    return "".join(c if c == "\n" or printable(c) == c else json.dumps(c)[1:-1] for c in text)
+
+
+def envelope(table: Table) -> dict[str, Any]:
+    """Return the table as plain data, each row as name -> value, with its schema, parameters and status."""
+    names = [c.name for c in table.columns]
+    return {
+        "schema": table.schema,
+        "version": __version__,
+        "title": table.title,
+        "status": table.status,
+        "parameters": plain_value(table.parameters),
+        "columns": {c.name: {"unit": c.unit, "about": c.about} for c in table.columns},
+        "rows": [dict(zip(names, map(plain_value, row), strict=True)) for row in table.rows],
+        "notes": list(table.notes),
+        **({"meta": plain_value(table.meta)} if table.meta else {}),
+    }
+
+
+def to_json(table: Table) -> str:
+    """Return the envelope as JSON text, one row a line; NaN and infinities are null."""
+    data = envelope(table)
+    rows = data.pop("rows")
+    text = json_text(data, indent=2)
+    lines = ",\n".join("    " + json_text(row) for row in rows)
+    block = f"[\n{lines}\n  ]" if rows else "[]"
+    return f'{text[: text.rindex("}")].rstrip()},\n  "rows": {block}\n}}\n'

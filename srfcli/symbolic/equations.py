@@ -1,0 +1,481 @@
+"""The first-order equations of a system: the laws' rates, the force balance and the slip relation, solved for the derivatives."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import lru_cache
+
+import sympy as sp
+from sympy.solvers.solveset import NonlinearError
+
+from srfcli.core.errors import SrfError
+from srfcli.laws.expression import symbol
+from srfcli.laws.values import ExtraState
+from srfcli.symbolic.system import FOLLOWED, System, state_rate
+
+AUXILIARY = {"slip": "v", "stage": "V", "time": "1"}  # unknowns that an effect may name, um, um, s, and their rates
+MAX_CANCEL = 80  # operations: beyond it a common denominator takes a minute to find and shortens nothing
+
+
+@dataclass(frozen=True)
+class Equations:
+    """x' = rates(x, t): `unknowns` are the symbols that stand in the formulas (v, not ln v), `logarithmic` says which.
+
+    `load` is W as a function of the imposed load `W` and its rate `W_dot`; `spring` is the elongation u, an unknown or a formula.
+    """
+
+    names: tuple[str, ...]
+    unknowns: tuple[sp.Symbol, ...]
+    logarithmic: tuple[bool, ...]
+    rates: tuple[sp.Expr, ...]
+    spring: sp.Expr
+    load: sp.Expr
+    mu: sp.Expr
+    steady: tuple[sp.Expr, ...]
+
+    def derivative(self, expression: sp.Expr, index: int) -> sp.Expr:
+        """Return d(expression)/d(unknown), by the logarithm where the unknown is logarithmic."""
+        s = self.unknowns[index]
+        d = sp.diff(expression, s)
+        return s * d if self.logarithmic[index] else d
+
+
+class lut(sp.Function):
+    """lut(i, x): the i-th table, a cubic spline of x whose numbers follow the parameters."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return the slope by x."""
+        return lut1(*self.args)
+
+
+class lut1(sp.Function):
+    """The first derivative of a table."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return the slope by x."""
+        return lut2(*self.args)
+
+
+class lut2(sp.Function):
+    """The second derivative of a table."""
+
+    nargs = 2
+
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
+        """Return no slope: it is asked for in the Jacobian's column of time alone, which meets a sensitivity that is none."""
+        return sp.S.Zero
+
+
+@lru_cache(maxsize=32)
+def steady_states(system: System) -> tuple[sp.Expr, ...]:
+    """Return each state variable in steady sliding at velocity v, as a formula in v.
+
+    Raises SrfError where no closed form is found; laws with phi = y D0/v, y a constant or a Lambert function, have one.
+    """
+    v = symbol("v")
+    still = {symbol(n): sp.S.Zero for n in ("mu_dot", "W_dot", "F_dot_over_W")}
+    found = []
+    for state in system.friction.states:
+        rate = state_rate(system, state).subs(still)
+        length, phi = symbol(state.length), symbol(state.name)
+        y = sp.Symbol("y", positive=True)
+        reduced = sp.expand_log(sp.simplify(rate.subs(phi, y * length / v)), force=True)
+        found.append(_steady_root(reduced, y, system.ageing.name) * length / v)
+    return tuple(found)
+
+
+def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
+    for guess in (sp.S.One, sp.S(2)):
+        if sp.simplify(reduced.subs(y, guess)) == 0:
+            return guess
+    try:
+        roots = [r for r in sp.solve(reduced, y) if not r.has(sp.I)]
+    except NotImplementedError:
+        roots = []
+    if not roots:
+        raise SrfError(
+            f"no closed form for the steady state of ageing law '{name}' was found",
+            "write the rate in terms of v*phi/D0 so that it vanishes at a constant, as 1 - v*phi/D0 does",
+        )
+    return roots[0]
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What the equations are made of once every effect has had its say; formulas in the symbols of laws and effects."""
+
+    mu: sp.Expr
+    kappa: sp.Expr | None
+    W: sp.Expr
+    force: sp.Expr
+    V: sp.Expr
+
+    def formulas(self) -> tuple[sp.Expr, ...]:
+        """Return all of them."""
+        return tuple(f for f in (self.mu, self.kappa, self.W, self.force, self.V) if f is not None)
+
+
+def parts_of(system: System) -> Parts:
+    """Return friction coefficient, contact stiffness, load on the asperities, extra force and stage velocity of `system`.
+
+    Each effect's formula takes the place of what was there before; the tables come last.
+    """
+    found = {"mu": system.friction.mu, "W": symbol("W"), "force": sp.S.Zero, "V": symbol("V")}
+    if system.interface.kappa is not None:
+        found["kappa"] = system.interface.kappa
+    for effect in system.effects:
+        for slot, formula in effect.changes:
+            if slot == "rate":
+                continue
+            if slot not in found:
+                raise SrfError(f"effect '{effect.name}' changes {slot}, which {system.title} does not have")
+            found[slot] = formula.xreplace({symbol(slot): found[slot]})
+    for number, (slot, argument) in enumerate(system.tables):
+        value = lut(sp.Integer(number), symbol(argument))
+        if slot in FOLLOWED:
+            found["force"] -= symbol("hold") * behind_the_gauge(system, value / FOLLOWED[slot])
+            continue
+        found[slot] = found[slot] * (1 + value) if slot == "V" else found[slot] + value
+    return Parts(**{slot: _modulated(f) for slot, f in found.items()}, **({} if "kappa" in found else {"kappa": None}))
+
+
+def behind_the_gauge(system: System, shown: sp.Expr) -> sp.Expr:
+    """Return the elongation at which the gauge shows `shown`, a function of time; `shown` itself where that has no one answer."""
+    gauge = next((e for effect in system.effects for e in effect.states if e.name == effect.observed), None)
+    if gauge is None:
+        return shown
+    rate = sp.diff(shown, symbol("time")) - gauge.rate.subs(symbol(gauge.name), shown)
+    return sp.solve(rate, symbol("u"))[0] if sp.Poly(rate, symbol("u")).degree() == 1 else shown
+
+
+def check_slots(system: System, parts: Parts) -> None:
+    """Raise SrfError for what cannot be differentiated along the motion: a load or a stiffness that depends on v or the ages."""
+    moving = {"v", "mu", *(state.name for state in system.friction.states)}
+    refused = {
+        "mu": {"V"},
+        "kappa": moving | {"V"},
+        "W": moving | {"V"},
+        "force": {"V"} if system.inertia else moving | {"V"},
+    }
+    for slot, names in refused.items():
+        formula = getattr(parts, slot)
+        found = sorted(names & {str(x) for x in formula.free_symbols}) if formula is not None else []
+        if found:
+            raise SrfError(
+                f"{slot} of {system.title} depends on {found[0]}", f"{slot} may not hold {', '.join(sorted(names))}"
+            )
+
+
+def _modulated(formula: sp.Expr) -> sp.Expr:
+    """Return a formula with the modulation's angle and envelope written in the clock and in the run's own parameters."""
+    s, t = symbol, symbol("time")
+    envelope = (1 + sp.tanh((t - s("onset0")) / s("rise0"))) / 2  # of its switch-on
+    return formula.subs({s("theta"): 2 * sp.pi * s("f") * t + s("psi"), s("envelope"): envelope})
+
+
+def auxiliary(system: System, parts: Parts) -> tuple[str, ...]:
+    """Return which of slip, stage and time the equations need as unknowns."""
+    formulas = [*parts.formulas(), *(e.rate for e in system.extra_states)]
+    formulas += [f for e in system.effects for slot, f in e.changes if slot == "rate"]
+    used = {str(x) for f in formulas for x in _modulated(f).free_symbols}
+    return tuple(a for a in AUXILIARY if a in used)
+
+
+@lru_cache(maxsize=32)
+def equations_of(system: System) -> Equations:
+    """Return x' = f(x, t) of `system`, solved for the derivatives.
+
+    The slip relation d(W mu/kappa)/dt = z - v, the force balance and the ageing laws are linear in the unknown derivatives
+    as long as each law is linear in mu_dot, W_dot and F_dot_over_W; otherwise SrfError.
+    """
+    return _Builder(system).equations()
+
+
+class _Builder:
+    """The balance of one system with stand-ins for what is long, and their meanings."""
+
+    def __init__(self, system: System) -> None:
+        self.system, self.parts = system, parts_of(system)
+        check_slots(system, self.parts)
+        self.aux = auxiliary(system, self.parts)
+        self.phis = [symbol(state.name) for state in system.friction.states]
+        self.steady = steady_states(system)
+        self.mu, self.load, self.V = sp.Symbol("mu_"), sp.Symbol("load_"), sp.Symbol("V_")
+        self.m_v, self.m_W, self.m_t = sp.symbols("mu_v_ mu_W_ mu_t_")
+        self.m_phi = sp.symbols(f"mu_phi0:{len(self.phis)}")
+        self.slip, self.slip_W, self.slip_t = sp.Symbol("S_"), sp.Symbol("S_W_"), sp.S.Zero
+        self.imposed = sp.Symbol("Wi_")
+        if self.parts.kappa is not None and {str(x) for x in self.parts.kappa.free_symbols} & {
+            str(n) for n, _ in self.along()
+        }:
+            self.slip_t = sp.Symbol("S_t_")
+        self.force, self.force_dot, self.W_dot = sp.symbols("F_ F_dot_ We_dot_")
+        held = any(slot in FOLLOWED for slot, _ in system.tables)
+        # stiffness of the spring to the stage, and of the one to where the slider was recorded
+        self.K = symbol("K") + symbol("hold") if held else symbol("K")
+        self.tangent = sp.tan(symbol("angle")) if system.loading == "inclined" else sp.S.Zero
+
+    def equations(self) -> Equations:
+        system, s, aux = self.system, symbol, self.aux
+        solution, u_rate = self.solved()
+        meaning = self.meaning()
+        mu_ss, K, V = self.mu_ss(), self.K, s("V")
+        z_rate = (K * s("u") - self.load * self.mu + self.force) / s("M")
+        names, unknowns, rates = list(system.states), [s("v"), *self.phis], []
+        if system.inertia:
+            rates = [u_rate, z_rate] if system.elastic else [u_rate]
+            unknowns = [s("u"), s("z"), *unknowns] if system.elastic else [s("u"), *unknowns]
+        rates += [solution[r] for r in (self.d_ln_v, *self.d_ln_phi)]
+        spring = s("u") if system.inertia else (self.load * self.mu - self.force) / K
+        at_drive = [e.subs(s("v"), V) for e in (s("v"), *self.steady)]
+        u_rest = (self.load_at_rest(mu_ss) * mu_ss - self.parts.force) / K
+        resting = [u_rest, V][: len(unknowns) - len(at_drive)]
+        steady = [self.settled(e, u_rest, mu_ss) for e in (*resting, *at_drive)]
+        for extra in system.extra_states:
+            names.append(f"ln_{extra.name}" if extra.logarithmic else extra.name)
+            unknowns.append(s(extra.name))
+            rate = self.extra_rate(extra)
+            rates.append(rate / s(extra.name) if extra.logarithmic else rate)
+            steady.append(self.settled(extra.steady, u_rest, mu_ss))
+        for name in aux:
+            names.append(name)
+            unknowns.append(s(name))
+            rates.append(self.aux_rate(name))
+            steady.append(self.settled(s(name), u_rest, mu_ss))
+        meaning = [*([] if system.inertia else [(s("u"), spring)]), *meaning]  # it is made of what follows
+        filled = [_modulated(r.subs(meaning)) for r in rates]
+        self.check_known(filled, {*map(str, unknowns), "V", "W", "W_dot"})
+        self.check_known(steady, set())
+        return Equations(
+            names=tuple(names),
+            unknowns=tuple(unknowns),
+            logarithmic=tuple(n.startswith("ln_") for n in names),
+            rates=tuple(filled),
+            spring=spring.subs(meaning) if not system.inertia else spring,
+            load=self.total_load(),
+            mu=self.parts.mu,
+            steady=tuple(steady),
+        )
+
+    def settled(self, formula: sp.Expr, u_rest: sp.Expr, mu_ss: sp.Expr) -> sp.Expr:
+        """Return the value of a formula where a run begins: in steady sliding at V under W0, with elongation `u_rest`."""
+        s = symbol
+        own = {s(e.name): e.steady for e in self.system.extra_states}
+        at_rest = {
+            s("W"): s("W0"),
+            s("W_dot"): sp.S.Zero,
+            s("slip"): s("start"),
+            s("time"): s("begin"),
+            s("stage"): sp.S.Zero,
+        }
+        found = formula.subs(own).subs(s("u"), u_rest).subs(own).subs(s("mu"), mu_ss)
+        return found.subs(s("v"), s("V")).subs(at_rest)
+
+    def check_known(self, formulas: list[sp.Expr], known: set[str]) -> None:
+        """Raise SrfError where a name is left that has no value at this place of the equations."""
+        system = self.system
+        left = sorted({str(x) for f in formulas for x in f.free_symbols} - known - {p.name for p in system.parameters})
+        if left and system.effects:
+            raise SrfError(
+                f"'{left[0]}' has no value where an effect uses it, in {system.title}",
+                "mu_dot and F_dot_over_W are known in `rate` alone, u in `rate`, `kappa` and the rates of an effect's own states",
+            )
+
+    def extra_rate(self, extra: ExtraState) -> sp.Expr:
+        """Return the rate of an effect's own unknown; W in it is the imposed load, also where W elsewhere is that felt."""
+        return extra.rate.subs({symbol("mu"): self.mu, symbol("W"): self.imposed})
+
+    def along(self) -> list[tuple[sp.Symbol, sp.Expr]]:
+        """Return the unknowns beside v and the ages that a formula may hold, and their rates."""
+        s, system = symbol, self.system
+        found = [(s(a), self.aux_rate(a)) for a in self.aux] + [
+            (s(e.name), self.extra_rate(e)) for e in system.extra_states
+        ]
+        if system.inertia:
+            found.append((s("u"), self.V - (s("z") if system.elastic else s("v"))))
+        return found
+
+    def aux_rate(self, name: str) -> sp.Expr:
+        return sp.S.One if name == "time" else symbol(AUXILIARY[name])
+
+    def mu_ss(self) -> sp.Expr:
+        """Return the friction coefficient in steady sliding at V; under W0 where it depends on the load."""
+        s = symbol
+        extra = {s(e.name): e.steady for e in self.system.extra_states}
+        mu = self.parts.mu.subs(extra).subs(dict(zip(self.phis, self.steady, strict=True))).subs(s("v"), s("V"))
+        return mu.subs(s("W"), self.parts.W) if self.system.effects else mu
+
+    def load_at_rest(self, mu_ss: sp.Expr) -> sp.Expr:
+        """Return the asperities' load in steady sliding; W0 itself where nothing changes it, as under inclined loading."""
+        return self.parts.W if self.system.effects else symbol("W0")
+
+    def total_load(self) -> sp.Expr:
+        """Return the load on the asperities in the imposed load and the unknowns."""
+        s, tangent = symbol, self.tangent
+        if self.system.loading != "inclined":
+            return self.parts.W
+        if self.system.effects:
+            raise SrfError("effects are for vertical loading", "leave the effect or the inclination out")
+        shift = tangent * s("W0") * self.mu_ss()
+        if self.system.inertia:
+            return s("W") + tangent * s("K") * s("u") - shift
+        return (s("W") - shift) / (1 - tangent * self.system.friction.mu)
+
+    def solved(self) -> tuple[dict[sp.Symbol, sp.Expr], sp.Expr]:
+        """Return the unknown derivatives, and u', in stand-ins."""
+        system, s = self.system, symbol
+        v, M, u, z = s("v"), s("M"), s("u"), s("z")
+        self.d_ln_v, mu_dot, W_rate, x_rate = sp.symbols("d_ln_v mu_dot_ W_rate_ x_rate_")
+        self.d_ln_phi = sp.symbols(f"d_ln_phi0:{len(self.phis)}")
+        mu, load, V = self.mu, self.load, self.V
+        u_rate = V - (z if system.elastic else v) if system.inertia else V - (x_rate if system.elastic else v)
+        ages = sum(a * b for a, b in zip(self.m_phi, self.d_ln_phi, strict=True))
+        balance = [
+            mu_dot - self.m_v * self.d_ln_v - ages - self.m_W * W_rate - self.m_t,
+            W_rate - self.W_dot - self.tangent * s("K") * u_rate,
+        ]
+        stand_ins = {
+            s("mu"): mu,
+            s("mu_dot"): mu_dot,
+            s("W"): load,
+            s("W_dot"): W_rate,
+            s("F_dot_over_W"): mu_dot + mu * W_rate / load,
+        }
+        for state, rate in zip(system.friction.states, self.d_ln_phi, strict=True):
+            balance.append(s(state.name) * rate - state_rate(system, state).subs(stand_ins, simultaneous=True))
+        wanted = [self.d_ln_v, mu_dot, W_rate, *self.d_ln_phi]
+        if system.elastic:
+            stretched = self.slip * mu_dot + mu * self.slip_W * W_rate + mu * self.slip_t
+            balance.append(stretched - ((z if system.inertia else x_rate) - v))
+        if system.inertia and not system.elastic:
+            balance.append(M * v * self.d_ln_v - (self.K * u - load * mu + self.force))
+        if not system.inertia:
+            balance.append(self.K * u_rate - load * mu_dot - mu * W_rate + self.force_dot)
+            if system.elastic:
+                wanted.append(x_rate)
+        return solve_linear(balance, wanted, system), u_rate
+
+    def meaning(self) -> list[tuple[sp.Expr, sp.Expr]]:
+        """Return what the stand-ins stand for, in an order in which one pass resolves them."""
+        s, parts = symbol, self.parts
+        kappa, load, mu = parts.kappa, self.load, parts.mu
+        S = sp.simplify(s("W") / kappa) if kappa is not None else sp.S.Zero
+        W = s("W")
+        on_load = (lambda e: e.subs(W, load)) if mu.has(W) or S.has(W) else (lambda e: e)
+        explicit, imposed, pushed, stretched = (
+            sum((sp.diff(part, name) * rate for name, rate in self.along()), sp.S.Zero)
+            for part in (mu, parts.W, parts.force, S)
+        )
+        imposed += sp.diff(parts.W, W) * s("W_dot")
+        pushed += sp.diff(parts.force, W) * s("W_dot")
+        v = s("v")
+        return [
+            *([(self.slip_t, on_load(stretched))] if self.slip_t else []),
+            (self.slip, on_load(S)),
+            (self.slip_W, on_load(sp.diff(S, W))),
+            (self.m_v, on_load(tidy(v * sp.diff(mu, v)))),
+            *((m, on_load(tidy(p * sp.diff(mu, p)))) for m, p in zip(self.m_phi, self.phis, strict=True)),
+            (self.m_W, on_load(sp.diff(mu, W))),
+            (self.m_t, on_load(explicit)),
+            (self.mu, on_load(mu)),
+            (self.force, parts.force),
+            (self.force_dot, pushed),
+            (self.W_dot, imposed),
+            (self.V, parts.V),
+            (load, self.total_load()),
+            (self.imposed, W),
+        ]
+
+
+def solve_linear(balance: list[sp.Expr], wanted: list[sp.Symbol], system: System) -> dict[sp.Symbol, sp.Expr]:
+    try:
+        matrix, right = sp.linear_eq_to_matrix(balance, wanted)
+    except NonlinearError as error:
+        raise SrfError(
+            f"ageing law '{system.ageing.name}' is not linear in mu_dot, W_dot or F_dot_over_W",
+            "write the coupling to the rates of friction and load as a factor times mu_dot, W_dot or F_dot_over_W",
+        ) from error
+    solved = _eliminated(matrix, right, system)
+    if solved is None:
+        raise SrfError(
+            f"the equations of {system.title} do not determine the motion", "check the laws with `srf law check`"
+        )
+    return dict(zip(wanted, [tidy(e) for e in solved], strict=True))
+
+
+def _eliminated(matrix: sp.Matrix, right: sp.Matrix, system: System) -> list[sp.Expr] | None:
+    """Solve a square linear system by elimination, None where it has no one solution.
+
+    The pivot is never a factor that a parameter at 0 makes vanish where another will do: with c = 0 in (c/B) phi F_dot_over_W
+    the equations are those without the term, and near 0 no figures are lost. Of the others the one that fills least is taken.
+    """
+    vanishing = [symbol(p.name) for p in system.parameters if p.lower <= 0 <= p.upper]
+
+    def weak(entry: sp.Expr) -> bool:
+        return any(entry.has(x) and entry.subs(x, 0) == 0 for x in vanishing)
+
+    if matrix.shape[0] != matrix.shape[1]:
+        return None
+    rows = [{j: e for j, e in enumerate(matrix.row(i)) if e != 0} for i in range(matrix.shape[0])]
+    values, order = list(right), []
+    left = set(range(len(rows)))
+    while left:
+        used = Counter(j for i in left for j in rows[i])
+        entries = [(i, j, e) for i in sorted(left) for j, e in rows[i].items()]
+        if not entries or any(not rows[i] for i in left):
+            return None
+        i, j, pivot = min(
+            entries,
+            key=lambda x: (
+                weak(x[2]), (len(rows[x[0]]) - 1) * (used[x[1]] - 1), not x[2].is_number, sp.count_ops(x[2]), x[0], x[1]
+            ),
+        )  # fmt: skip
+        left.remove(i)
+        order.append((i, j, pivot))
+        for k in left:
+            if (entry := rows[k].pop(j, None)) is None:
+                continue
+            factor = entry / pivot
+            values[k] -= factor * values[i]
+            for m, other in rows[i].items():
+                if m != j and (new := rows[k].pop(m, sp.S.Zero) - factor * other) and sp.expand(new) != 0:
+                    rows[k][m] = new
+    found: dict[int, sp.Expr] = {}
+    for i, j, pivot in reversed(order):
+        found[j] = (values[i] - sum((e * found[m] for m, e in rows[i].items() if m != j), sp.S.Zero)) / pivot
+    return [found[j] for j in range(len(rows))]
+
+
+def tidy(expression: sp.Expr) -> sp.Expr:
+    """Return the shortest of a few equal forms of `expression`."""
+    forms = [expression, sp.factor_terms(expression)]
+    if sp.count_ops(expression) <= MAX_CANCEL:
+        shielded, back = shield(expression)
+        forms.append(sp.cancel(shielded).xreplace(back))
+    return min(forms, key=lambda e: (sp.count_ops(e), str(e)))
+
+
+def settle(expression: sp.Expr) -> sp.Expr:
+    """Return `expression` simplified, but for Lambert functions: there sympy trades exp(-v/Vc) for exp(v/Vc), which overflows."""
+    return expression if expression.has(sp.LambertW) else sp.simplify(expression)
+
+
+def shield(expression: sp.Basic) -> tuple[sp.Basic, dict[sp.Symbol, sp.Expr]]:
+    """Return `expression` with its transcendental parts replaced by symbols, and what puts them back.
+
+    Algebra on exp(-V/Vc) otherwise turns it into exp(V/Vc), which overflows.
+    """
+    kinds = (sp.exp, sp.LambertW)
+    atoms = sorted(expression.atoms(*kinds), key=lambda e: (-sp.count_ops(e), str(e)))
+    back: dict[sp.Symbol, sp.Expr] = {}
+    for atom in atoms:  # longest first: an inner one then lives on inside what its outer one puts back
+        name = sp.Symbol(f"shield{len(back)}", positive=True)
+        replaced = expression.xreplace({atom: name})
+        if replaced != expression:
+            back[name], expression = atom, replaced
+    return expression, back

@@ -1,0 +1,628 @@
+"""What `srf law check` asks of a law or an effect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+import sympy
+from scipy.optimize import brentq
+from scipy.special import lambertw
+
+from srfcli.codegen.model import Array, GeneratedModel, load_source
+from srfcli.codegen.numpy_source import generate_motion
+from srfcli.core.errors import SrfError
+from srfcli.core.settings import Parameter
+from srfcli.core.units import QUANTITY_UNITS, SYMBOL_UNITS, Dimension, describe, dimension_of, parse_unit
+from srfcli.laws.effect_file import summary
+from srfcli.laws.expression import expm1, log1p, symbol
+from srfcli.laws.law_file import COMMON, FORMULA, formula_of, kind_of
+from srfcli.laws.registry import Registry, bundled_registry
+from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, FrictionLaw, Interface, Law, State
+from srfcli.symbolic.system import System, build_system, with_effects
+
+# What `srf law check` asks of a law: units, steady state, mu_v > 0, derivatives, worked values.
+
+REFERENCE = "srf-vsat"  # the friction law whose parameters stand in where an ageing law is checked by itself
+VELOCITIES = np.logspace(-3, 3, 7)  # um/s
+LOADS = np.logspace(-1, 3, 9)  # N
+DERIVATIVE_RTOL = 1e-9
+
+
+def check_law(law: Law) -> list[Outcome]:
+    """Return the outcome of every check of a law or an effect; the shipped laws are what it is combined with."""
+    registry = bundled_registry()
+    if isinstance(law, Effect):
+        return check_effect(law, registry)
+    steps: list[tuple[str, Callable[[Law, Registry], str]]] = [
+        ("parameters", check_parameters_used),
+        ("units", check_units),
+        ("steady state", check_steady_state),
+        ("mu_v > 0", check_direct_effect),
+        ("derivatives", check_derivatives),
+        ("worked values", check_worked_values),
+    ]
+    first = Outcome("parses", "ok", f"{kind_of(law)} law {law.name}: {FORMULA[kind_of(law)]} = {formula_of(law)}")
+    return [first, *run_checks([(name, partial(step, law, registry)) for name, step in steps])]
+
+
+def steady_age(rate: sympy.Expr, v: float, length: float, values: Values) -> float | None:
+    """Return the attracting phi > 0 where a rate vanishes at velocity v and constant load, or None if there is none.
+
+    Looked for between exp(-14) and exp(14) times length/v.
+    """
+    still = {"mu": 0.5, "mu_dot": 0.0, "W": 10.0, "W_dot": 0.0, "F_dot_over_W": 0.0}
+
+    def at(y: Any) -> Any:
+        return evaluate(rate, {**values, **still, "v": v, "phi": np.exp(y) * length / v}) + 0.0 * y
+
+    grid = np.linspace(-14.03, 13.97, 113)  # off the round numbers, so that no zero falls on a node
+    found = at(grid)
+    falls = np.flatnonzero((found[:-1] > 0) & (found[1:] < 0))
+    if len(falls) == 0:
+        return None
+    return float(np.exp(brentq(at, grid[falls[0]], grid[falls[0] + 1], xtol=1e-13)) * length / v)
+
+
+def check_parameters_used(law: Law, registry: Registry) -> str:
+    """Raise `SrfError` for a parameter that neither the formula nor a state uses."""
+    formula = formula_of(law)
+    used = {s.name for s in formula.free_symbols} if formula is not None else set()
+    if isinstance(law, FrictionLaw):
+        used |= {name for state in law.states for name in (state.length, state.weight)} | set(COMMON)
+    idle = [p.name for p in law.parameters if p.name not in used]
+    if idle:
+        raise SrfError(f"declared and not used: {', '.join(idle)}", "Remove them or mend the formula.")
+    return f"{len(law.parameters)}, all used"
+
+
+def check_units(law: Law, registry: Registry) -> str:
+    """Raise `SrfError` where a formula adds unlike things, takes log of a length or has the wrong dimension."""
+    formula, quantity = formula_of(law), FORMULA[kind_of(law)]
+    if formula is None:
+        raise Skipped("a rigid interface has no formula")
+    states = law.states if isinstance(law, FrictionLaw) else ()
+    units = {name: parse_unit(unit).dimension for name, unit in SYMBOL_UNITS.items()}
+    units |= {state.name: units["phi"] for state in states}
+    units |= {p.name: parse_unit(p.unit).dimension for p in _parameters(law, registry)}
+    for state in states:
+        _expect(units[state.length], "um", f"length '{state.length}' of state '{state.name}'")
+        _expect(units[state.weight], "1", f"weight '{state.weight}' of state '{state.name}'")
+    unit = QUANTITY_UNITS[quantity]
+    _expect(dimension_of(formula, units), unit, quantity)
+    return f"{quantity} is in {unit}"
+
+
+def check_steady_state(law: Law, registry: Registry) -> str:
+    """Raise `SrfError` where an age has no steady value, mu is not finite there or kappa is not positive."""
+    if isinstance(law, Interface):
+        return _check_stiffness(law)
+    if isinstance(law, FrictionLaw):
+        values = reference_values(law.parameters)
+        names = []
+        for ageing in _ageing_laws(registry):
+            for v in VELOCITIES:
+                _finite(law, evaluate(law.mu, {**values, **_steady(law, ageing, v), "v": v}), v, ageing)
+            names.append(ageing.name)
+        return f"mu is finite from {VELOCITIES[0]:g} to {VELOCITIES[-1]:g} um/s with {', '.join(names)}"
+    rate = law.rate if isinstance(law, AgeingLaw) else formula_of(law) + _ageing(registry, "dieterich").rate
+    values = reference_values(_parameters(law, registry))
+    found = []
+    for v in VELOCITIES:
+        phi = steady_age(rate, v, values["D0"], values)
+        if phi is None:
+            raise SrfError(
+                f"phi has no attracting steady value at v = {v:g} um/s", "The rate must fall through 0 at one."
+            )
+        found.append(phi * v / values["D0"])
+    return f"phi v/D0 = {min(found):.6g} to {max(found):.6g} from {VELOCITIES[0]:g} to {VELOCITIES[-1]:g} um/s"
+
+
+def check_direct_effect(law: Law, registry: Registry) -> str:
+    """Raise `SrfError` where mu does not rise with v at fixed age, at a steady state."""
+    if not isinstance(law, FrictionLaw):
+        raise Skipped("only a friction law has mu")
+    slope = sympy.diff(law.mu, symbol("v"))
+    values = reference_values(law.parameters)
+    found = []
+    for ageing in _ageing_laws(registry):
+        for v in VELOCITIES:
+            value = v * evaluate(slope, {**values, **_steady(law, ageing, v), "v": v})
+            if not value > 0:
+                raise SrfError(
+                    f"v mu_v = {value:.6g} at v = {v:g} um/s in steady sliding with {ageing.name}",
+                    "Without mu_v > 0 the slip velocity is not determined; change the formula or the defaults.",
+                )
+            found.append(value)
+    return f"v mu_v = {min(found):.6g} to {max(found):.6g} in steady sliding"
+
+
+def check_derivatives(law: Law, registry: Registry) -> str:
+    """Raise `SrfError` where a first derivative by sympy differs from complex-step differentiation."""
+    formula = formula_of(law)
+    if formula is None:
+        raise Skipped("a rigid interface has no formula")
+    names = sorted(s.name for s in formula.free_symbols)
+    points = _sample(law, registry)
+    worst = 0.0
+    for name in names:
+        derivative = sympy.diff(formula, symbol(name))
+        exact = np.array([evaluate(derivative, point) for point in points], dtype=float)
+        stepped = np.array([_complex_step(formula, name, point) for point in points])
+        scale = np.max(np.abs(exact)) or 1.0
+        error = float(np.max(np.abs(exact - stepped)) / scale)
+        if not error < DERIVATIVE_RTOL:
+            raise SrfError(f"d/d{name} = {derivative} differs from the complex step by {error:.2g} of its size")
+        worst = max(worst, error)
+    return f"by {', '.join(names)}: complex step agrees to {worst:.1e} at {len(points)} points"
+
+
+def check_worked_values(law: Law, registry: Registry) -> str:
+    """Raise `SrfError` where a worked value is not met."""
+    formula = formula_of(law)
+    if not law.checks:
+        raise Skipped("the law gives none; add [[checks]]")
+    if formula is None:
+        raise SrfError("a rigid interface has no formula to check")
+    units = {p.name: parse_unit(p.unit).factor for p in _parameters(law, registry)}
+    for number, check in enumerate(law.checks):
+        values = reference_values(_parameters(law, registry))
+        values |= {name: value * units.get(name, 1.0) for name, value in check.at}
+        missing = sorted({s.name for s in formula.free_symbols} - set(values))
+        if missing:
+            raise SrfError(f"checks[{number}]: no value for '{missing[0]}'", "Add it to the table 'at'.")
+        found = float(evaluate(formula, values))
+        if not abs(found - check.value) <= check.rtol * abs(check.value):
+            raise SrfError(f"checks[{number}]: {check.quantity} = {found!r}, expected {check.value!r}")
+    return f"{len(law.checks)} met"
+
+
+def _check_stiffness(law: Interface) -> str:
+    if law.kappa is None:
+        raise Skipped("a rigid interface has no stiffness")
+    found = [float(evaluate(law.kappa, {**reference_values(law.parameters), "W": W})) for W in LOADS]
+    for W, kappa in zip(LOADS, found, strict=True):
+        if not (np.isfinite(kappa) and kappa > 0):
+            raise SrfError(f"kappa = {kappa:g} N/um at W = {W:g} N", "A stiffness is positive and finite.")
+    return f"kappa = {min(found):.6g} to {max(found):.6g} N/um from {LOADS[0]:g} to {LOADS[-1]:g} N"
+
+
+def _parameters(law: Law, registry: Registry) -> tuple[Parameter, ...]:
+    """Return a law's parameters, and for an ageing law or modifier the friction parameters that it may name."""
+    if not isinstance(law, AgeingLaw | AgeingModifier):
+        return law.parameters
+    reference = registry.get("friction", REFERENCE).parameters
+    return (*(p for p in reference if p.name in COMMON), *law.parameters)
+
+
+def _ageing_laws(registry: Registry) -> list[AgeingLaw]:
+    return [_ageing(registry, entry.name) for entry in registry.entries("ageing")]
+
+
+def _ageing(registry: Registry, name: str) -> AgeingLaw:
+    law = registry.get("ageing", name)
+    assert isinstance(law, AgeingLaw)
+    return law
+
+
+def _steady(law: FrictionLaw, ageing: AgeingLaw, v: float) -> dict[str, float]:
+    """Return each state of a friction law in steady sliding."""
+    own = reference_values(law.parameters)
+    return {state.name: _steady_of(state, ageing, v, own) for state in law.states}
+
+
+def _steady_of(state: State, ageing: AgeingLaw, v: float, own: Mapping[str, float]) -> float:
+    values = {**own, **reference_values(ageing.parameters), "D0": own[state.length], "B": own[state.weight]}
+    missing = sorted({s.name for s in ageing.rate.free_symbols & {symbol(n) for n in COMMON}} - set(values))
+    if missing:
+        raise SrfError(f"ageing law '{ageing.name}' needs '{missing[0]}', which the friction law lacks")
+    phi = steady_age(ageing.rate, v, own[state.length], values)
+    if phi is None:
+        raise SrfError(f"state '{state.name}' has no steady value at v = {v:g} um/s with {ageing.name}")
+    return phi
+
+
+def _finite(law: FrictionLaw, value: float, v: float, ageing: AgeingLaw) -> None:
+    if not np.isfinite(value):
+        raise SrfError(f"mu = {value} at v = {v:g} um/s in steady sliding with {ageing.name}")
+
+
+def _expect(found: Dimension, unit: str, what: str) -> None:
+    if found != parse_unit(unit).dimension:
+        raise SrfError(f"{what} is in {describe(found)}, expected {unit}", "Look at the units under [parameters].")
+
+
+def _sample(law: Law, registry: Registry) -> list[dict[str, float]]:
+    """Return points off any steady state at which derivatives are compared."""
+    base = reference_values(_parameters(law, registry))
+    length = base.get("D0", 1.0)
+    points = []
+    for number, v in enumerate(VELOCITIES):
+        stretch = (0.3, 1.7, 0.8)[number % 3]
+        point = {**base, "v": v, "mu": 0.4, "mu_dot": 0.02, "W": 3.0 + number, "W_dot": -1.5, "F_dot_over_W": 0.03}
+        states = law.states if isinstance(law, FrictionLaw) else (State(),)
+        for state in states:
+            point[state.name] = stretch * base.get(state.length, length) / v
+        points.append(point)
+    return points
+
+
+def _complex_step(formula: sympy.Expr, name: str, point: Mapping[str, float]) -> float:
+    size = STEP * max(1.0, abs(point[name]))
+    moved = {**point, name: complex(point[name], size)}
+    return float(np.imag(evaluate(formula, moved)) / size)
+
+
+# What `srf law check` asks of an effect: units, a neutral value at which the model is its baseline, derivatives.
+
+SLOT_UNITS = {"mu": "1", "rate": "1", "kappa": "N/um", "W": "N", "force": "N", "V": "um/s"}
+PLACE_UNITS = {"slip": "um", "stage": "um", "time": "s", "theta": "1", "envelope": "1", "u": "um"}
+MOVING = {"slip", "stage", "time", "theta", "envelope"}  # an effect of these is steady nowhere
+POINTS = 24
+RTOL = 1e-9
+
+
+def check_effect(effect: Effect, registry: Registry) -> list[Outcome]:
+    """Return the outcome of every check of an effect; the shipped laws are the baseline that it is nested in."""
+    check = _Check(effect, registry)
+    steps = [
+        ("parameters", check.parameters_used),
+        ("units", check.units),
+        ("baseline", check.baseline_found),
+        ("neutral", check.neutral),
+        ("acts", check.acts),
+        ("steady start", check.steady_start),
+        ("derivatives", check.derivatives),
+    ]
+    return [Outcome("parses", "ok", f"effect {effect.name}: {summary(effect)}"), *run_checks(steps)]
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Random states x (POINTS, n) and what is imposed on them; the same for a model with an effect and for one without."""
+
+    x: Array
+    V: Array
+    W: Array
+    W_dot: Array
+
+    def rates(self, model: GeneratedModel, p: Array) -> Array:
+        return np.asarray(model.rates(self.x[:, : len(model.states)], self.V, self.W, self.W_dot, p))
+
+
+class _Check:
+    """One effect with a baseline that it can be added to."""
+
+    def __init__(self, effect: Effect, registry: Registry) -> None:
+        self.effect, self.registry = effect, registry
+
+    # ---- formulas alone
+
+    def parameters_used(self) -> str:
+        formulas = [*(f for _, f in self.effect.written or self.effect.changes)]
+        formulas += [f for s in self.effect.states for f in (s.rate, s.steady)]
+        used = {str(s) for f in formulas for s in f.free_symbols}
+        if self.effect.settings:
+            used |= {p.name for name in self._own_interface() for p in name.parameters}
+        constants = {c.name for c in self.effect.constants}
+        idle = [n for n in (*(p.name for p in self.effect.parameters), *constants) if n not in used]
+        if idle:
+            raise SrfError(f"declared and not used: {', '.join(idle)}", "Remove them or mend the formula.")
+        sizes = ", ".join(f"{name} = {value:g}" for name, value in self.effect.neutral)
+        return f"{len(self.effect.parameters)}, all used" + (f"; the baseline has {sizes}" if sizes else "")
+
+    def _own_interface(self) -> list[Interface]:
+        name = dict(self.effect.settings).get("interface")
+        law = self.registry.get("interface", name) if isinstance(name, str) else None
+        return [law] if isinstance(law, Interface) else []
+
+    def units(self) -> str:
+        formulas = self.effect.written or self.effect.changes
+        if not (formulas or self.effect.states):
+            raise Skipped("there is no formula")
+        units = self._symbol_units()
+        for state in self.effect.states:
+            units[state.name] = dimension_of(state.steady, units)
+        for state in self.effect.states:
+            found = dimension_of(state.rate, units)
+            own = units[state.name]
+            _expect_in_effect(found, (own[0], own[1] - 1, own[2]), f"rate of {state.name}")
+        for slot, formula in formulas:
+            _expect_in_effect(dimension_of(formula, units), parse_unit(SLOT_UNITS[slot]).dimension, slot)
+        if self.effect.observed:
+            _expect_in_effect(
+                units[self.effect.observed], parse_unit("um").dimension, f"observed '{self.effect.observed}'"
+            )
+        return ", ".join([*(f"{slot} is in {SLOT_UNITS[slot]}" for slot, _ in formulas),
+                          *(f"{s.name} in {describe(units[s.name])}" for s in self.effect.states)])  # fmt: skip
+
+    def _symbol_units(self) -> dict[str, Dimension]:
+        """Return the dimension of every name, those of the baseline's parameters among them."""
+        units = {n: parse_unit(u).dimension for n, u in {**SYMBOL_UNITS, **SLOT_UNITS, **PLACE_UNITS}.items()}
+        declared = (*self.base.parameters, *self.system.parameters, *self.effect.parameters, *self.effect.constants)
+        return units | {p.name: parse_unit(p.unit).dimension for p in declared}
+
+    # ---- with a baseline
+
+    @cached_property
+    def base(self) -> System:
+        """The first of the shipped systems that has what the effect needs and lacks what it lacks."""
+        effect, names = self.effect, self.registry
+        own = {p.name for p in effect.parameters}
+        laws = sorted(
+            (e.name for e in names.entries("friction")), key=lambda n: (n != "srf-vsat", n != "dieterich-ruina")
+        )
+        ageing = sorted((e.name for e in names.entries("ageing")), key=lambda n: n != "dieterich")
+        surfaces = sorted((e.name for e in names.entries("interface")), key=lambda n: (n != "elastic", n != "rigid"))
+        for rate, law, surface, inertia in product(ageing, laws, surfaces, (True, False)):
+            system = build_system(names, law=law, ageing=rate, interface=surface, inertia=inertia)
+            declared = {p.name for p in system.parameters}
+            if set(effect.needs) <= declared and not declared & {*effect.lacks, *(own if not effect.settings else ())}:
+                return system
+        raise SrfError(
+            f"no shipped model has {', '.join(effect.needs) or 'any parameters'} and lacks "
+            f"{', '.join([*effect.lacks, *sorted(own)])}",
+            "Look at needs and lacks, and at names of parameters that a law has already.",
+        )
+
+    @cached_property
+    def system(self) -> System:
+        chosen = dict(self.effect.settings)
+        base = self.base
+        if chosen:
+            base = build_system(
+                self.registry, law=base.friction.name, ageing=base.ageing.name,
+                interface=str(chosen.get("interface", base.interface.name)),
+                inertia=bool(chosen.get("inertia", base.inertia)),
+            )  # fmt: skip
+        return with_effects(base, (self.effect,))
+
+    @cached_property
+    def model(self) -> GeneratedModel:
+        return load_source(generate_motion(self.system))
+
+    @cached_property
+    def plain(self) -> GeneratedModel:
+        return load_source(generate_motion(self.base))
+
+    def baseline_found(self) -> str:
+        missing = [n for n in self.effect.frees if n not in self.model.names]
+        if missing:
+            raise SrfError(
+                f"frees '{missing[0]}', which the model does not have", f"It has {', '.join(self.model.names)}."
+            )
+        added = self.model.states[len(self.plain.states) :] if not self.effect.settings else ()
+        return self.base.title + (f"; unknowns added: {', '.join(added)}" if added else "")
+
+    def neutral(self) -> str:
+        if self.effect.settings:
+            raise Skipped(f"the baseline is another system: {self.base.title}")
+        points, values = self._points(), self._neutral_values()
+        ours = points.rates(self.model, self._vector(values))[:, : len(self.plain.states)]
+        theirs = points.rates(self.plain, self.plain.vector(self._values(self.plain)))
+        worst = _difference(ours, theirs)
+        steady = np.asarray(self.model.steady(self._vector(values)))[: len(self.plain.states)]
+        start = _difference(steady, np.asarray(self.plain.steady(self.plain.vector(self._values(self.plain)))))
+        told = ", ".join(f"{n} = {v:g}" for n, v in self.effect.neutral) or "any value"
+        if not max(worst, start) < RTOL:
+            where, size = ("the rates", worst) if not worst < RTOL else ("steady sliding", start)
+            raise SrfError(
+                f"at {told} {where} differ from the baseline's by {size:.2g} of their size",
+                "The effect must vanish there.",
+            )
+        return f"at {told} rates and steady sliding are the baseline's{_to(max(worst, start))}"
+
+    def acts(self) -> str:
+        """Raise SrfError where nothing changes at the default values."""
+        if self.effect.settings or self.effect.frees or self.effect.observed:
+            raise Skipped("it is what is fitted or observed that changes")
+        points, own = self._points(), len(self.plain.states)
+        away = points.rates(self.model, self._vector())[:, :own]
+        at = points.rates(self.model, self._vector(self._neutral_values()))[:, :own]
+        moved = np.max(np.abs(away - at) / np.maximum(np.max(np.abs(at), axis=0), 1e-300))
+        if not np.isfinite(away).all():
+            raise SrfError("the rates are not finite at the default values", "Look at the formula and the defaults.")
+        if moved < 1e-12:
+            raise SrfError(
+                "at the default values the effect changes nothing", "Give the size a default off its neutral value."
+            )
+        return f"at the default values a rate moves by up to {moved:.2g} of the largest"
+
+    def steady_start(self) -> str:
+        formulas = [*(f for _, f in self.effect.changes), *(f for s in self.effect.states for f in (s.rate, s.steady))]
+        used = {str(s) for f in formulas for s in f.free_symbols} & MOVING
+        if used:
+            raise Skipped(f"with {', '.join(sorted(used))} in the formula nothing is steady")
+        values = self._values(self.model)
+        x = np.asarray(self.model.steady(self._vector()))
+        rates = np.asarray(self.model.rates(x, values["V"], values["W0"], 0.0, self._vector()))
+        scale = np.max(np.abs(self._points().rates(self.model, self._vector())), axis=0)
+        worst = float(np.max(np.abs(rates) / np.maximum(scale, 1e-300)))
+        if not worst < 1e-8:
+            name = self.model.states[int(np.argmax(np.abs(rates) / np.maximum(scale, 1e-300)))]
+            raise SrfError(
+                f"in steady sliding under W0 {name} moves, by {worst:.2g} of its usual rate",
+                "A formula of an effect must not lean on W_dot or mu_dot at rest; look at `steady` of its states.",
+            )
+        return f"nothing moves at V under W0{_to(worst, ' but for', ' of the usual rates')}"
+
+    def derivatives(self) -> str:
+        points, model, p = self._points(), self.model, self._vector()
+        x = points.x[:, : len(model.states)]
+        given = (points.V, points.W, points.W_dot)
+        exact = (model.rates_jacobian(x, *given, p), model.rates_parameters(x, *given, p))
+        stepped = (_stepped_states(model, points, p), _stepped_parameters(model, points, p))
+        worst = 0.0
+        for found, expected, names in zip(exact, stepped, (model.states, model.names), strict=True):
+            for j, name in enumerate(names):
+                error = _difference(np.asarray(found)[:, :, j], expected[:, :, j])
+                if not error < RTOL:
+                    raise SrfError(f"d(rates)/d({name}) differs from the complex step by {error:.2g} of its size")
+                worst = max(worst, error)
+        counted = f"{len(model.states)} unknowns and {len(model.names)} parameters"
+        return f"by {counted}: complex step agrees{_to(worst)}"
+
+    # ---- numbers
+
+    def _values(self, model: GeneratedModel) -> dict[str, float]:
+        run = {"V": 9.0, "W0": 6.0, "eps": 0.1, "f": 110.0, "psi": 0.4, "onset0": 0.5, "rise0": 0.3, "modulated": 1.0}
+        return {n: v for n, v in run.items() if n in model.names}
+
+    def _neutral_values(self) -> dict[str, float]:
+        units = {p.name: parse_unit(p.unit).factor for p in self.effect.parameters}
+        return {n: v * units[n] for n, v in self.effect.neutral}
+
+    def _vector(self, values: Mapping[str, float] | None = None) -> Array:
+        """Return p with the effect's defaults, the sizes' at the values given; a default that is neutral moves off."""
+        return self.model.vector({**self._values(self.model), **(values or {})})
+
+    def _points(self) -> _Points:
+        """Return states around steady sliding, in which places and clock are anywhere in a run."""
+        rng = np.random.default_rng(20)
+        x = np.asarray(self.model.steady(self._vector()))
+        spread = {"slip": 40.0, "stage": 40.0, "time": 1.5}
+        columns = []
+        for name, log, at in zip(self.model.states, self.model.logarithmic, x, strict=True):
+            r = rng.standard_normal(POINTS)
+            at = at if np.isfinite(at) else 1.0
+            columns.append(
+                spread[name] * rng.uniform(size=POINTS)
+                if name in spread
+                else at + 0.5 * r
+                if log
+                else at * (1 + 0.1 * r)
+            )
+        V, W = 9.0 * np.exp(0.3 * rng.standard_normal(POINTS)), 6.0 * (1 + 0.1 * rng.standard_normal(POINTS))
+        return _Points(np.column_stack(columns), V, W, 300.0 * rng.standard_normal(POINTS))
+
+
+def _stepped_states(model: GeneratedModel, points: _Points, p: Array) -> Array:
+    """Return d(rates)/dx (POINTS, n, n) by complex steps."""
+    x = points.x[:, : len(model.states)].astype(complex)
+    columns = []
+    for j in range(x.shape[1]):
+        moved = x.copy()
+        moved[:, j] += 1j * STEP
+        columns.append(np.asarray(model.rates(moved, points.V, points.W, points.W_dot, p)).imag / STEP)
+    return np.stack(columns, axis=-1)
+
+
+def _stepped_parameters(model: GeneratedModel, points: _Points, p: Array) -> Array:
+    """Return d(rates)/dp (POINTS, n, parameters) by complex steps; V is what is imposed, not what p says."""
+    x = points.x[:, : len(model.states)].astype(complex)
+    columns = []
+    for j, name in enumerate(model.names):
+        q, V = p.astype(complex), points.V.astype(complex)
+        if name == "V":
+            V += 1j * STEP
+        else:
+            q[j] += 1j * STEP
+        columns.append(np.asarray(model.rates(x, V, points.W, points.W_dot, q)).imag / STEP)
+    return np.stack(columns, axis=-1)
+
+
+def _difference(found: Array, expected: Array) -> float:
+    """Return the largest difference over the largest size in its column, infinite where a number is not one."""
+    if not (np.isfinite(found).all() and np.isfinite(expected).all()):
+        return float("inf")
+    scale = np.max(np.abs(np.atleast_2d(expected)), axis=0)
+    return float(np.max(np.abs(found - expected) / np.where(scale > 0, scale, 1.0), initial=0.0))
+
+
+def _to(size: float, before: str = " to", after: str = "") -> str:
+    """Return how far something is off as words, none where it is not."""
+    return f"{before} {size:.0e}{after}" if size else ""
+
+
+def _expect_in_effect(found: Dimension, wanted: Dimension, what: str) -> None:
+    if found != wanted:
+        raise SrfError(
+            f"{what} is in {describe(found)}, expected {describe(wanted)}", "Look at the units under [parameters]."
+        )
+
+
+# What checks of laws and of effects share: outcomes, and the numbers of formulas.
+
+STEP = 1e-30  # complex step: no difference is taken, so it may be this small
+Values = Mapping[str, Any]
+
+
+def _lambertw(value: Any) -> Any:
+    found = lambertw(value)  # complex also where the argument is real
+    return found if np.iscomplexobj(value) else found.real
+
+
+NUMPY: dict[Any, Callable[[Any], Any]] = {
+    sympy.exp: np.exp,
+    sympy.log: np.log,
+    log1p: np.log1p,
+    expm1: np.expm1,
+    sympy.sin: np.sin,
+    sympy.cos: np.cos,
+    sympy.sinh: np.sinh,
+    sympy.cosh: np.cosh,
+    sympy.tanh: np.tanh,
+    sympy.asinh: np.arcsinh,
+    sympy.atan: np.arctan,
+    sympy.LambertW: _lambertw,
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of one check: `verdict` is ok, FAIL or skipped, `text` says what was found or why it was skipped."""
+
+    check: str
+    verdict: str
+    text: str
+
+
+class Skipped(Exception):
+    """A check that does not apply; the text says why."""
+
+
+def run_checks(steps: Sequence[tuple[str, Callable[[], str]]]) -> list[Outcome]:
+    """Return the outcome of each named check, a function that returns what it found and raises SrfError or Skipped."""
+    outcomes = []
+    for name, step in steps:
+        try:
+            with np.errstate(all="ignore"):  # a formula outside its range shows as nan, and is reported as such
+                outcomes.append(Outcome(name, "ok", step()))
+        except Skipped as reason:
+            outcomes.append(Outcome(name, "skipped", str(reason)))
+        except SrfError as error:
+            text = error.message + (f". {error.hint}" if error.hint else "")
+            outcomes.append(Outcome(name, "FAIL", text))
+        except (ArithmeticError, ValueError, TypeError) as error:  # numbers of a formula far outside floating point
+            outcomes.append(Outcome(name, "FAIL", f"the formula cannot be computed: {error}"))
+    return outcomes
+
+
+def evaluate(expr: sympy.Expr, values: Values) -> Any:
+    """Return the number of a formula at `values`, walking its tree: independent of sympy's derivatives and printers."""
+    if expr.is_Symbol:
+        return values[expr.name]
+    if expr.is_Rational:
+        return int(expr.p) / int(expr.q)
+    if isinstance(expr, sympy.NumberSymbol):
+        return float(expr)
+    arguments = [evaluate(a, values) for a in expr.args]
+    if isinstance(expr, sympy.Add):
+        return sum(arguments[1:], start=arguments[0])
+    if isinstance(expr, sympy.Mul):
+        product = arguments[0]
+        for factor in arguments[1:]:
+            product = product * factor
+        return product
+    if isinstance(expr, sympy.Pow):
+        return np.power(arguments[0], arguments[1])
+    return NUMPY[expr.func](arguments[0])
+
+
+def reference_values(parameters: Iterable[Parameter]) -> dict[str, float]:
+    """Return the defaults of parameters in um, s, N."""
+    return {p.name: p.default * parse_unit(p.unit).factor for p in parameters}

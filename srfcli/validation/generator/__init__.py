@@ -1,0 +1,1 @@
+"""Concealed experiments: their own equations, their own solver, nothing shared with the fitter."""

@@ -1,0 +1,484 @@
+"""Concealed cases: drawn from a seed, simulated, written as an experiment's folder, the truth kept apart."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.files import write_atomic
+from srfcli.validation.generator.physics import SMOOTH, Physics, Plan, Track
+from srfcli.validation.generator.slider import Trace, move
+
+# What can be concealed: each effect, how strong it is drawn, and what the baseline is that lacks it.
+
+TURN = (0.0, 2 * math.pi)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One concealed piece of physics: `varies`, a field of Physics, departs from `neutral` by `weak` to `strong`.
+
+    The sign is drawn from `signs`, and `beside` evenly between bounds; `absent` are the fields of a baseline that has none of it.
+    `listed` says whether a diagnosis may name it, `resembles` which names come close where it may not.
+    """
+
+    name: str
+    varies: str
+    weak: float
+    strong: float
+    signs: tuple[int, ...] = (1,)
+    neutral: float = 0.0
+    beside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    absent: Mapping[str, bool] = field(default_factory=dict)
+    scale: float = 1.0  # the field is neutral + scale * sign * size
+    listed: bool = True
+    resembles: tuple[str, ...] = ()
+
+    def added(self, p: Physics, rng: np.random.Generator, size: float) -> Physics:
+        """Return `p` with this effect, its strength `size` of the way from weak to strong, on a logarithmic scale."""
+        strength = self.weak * (self.strong / self.weak) ** size
+        sign = self.signs[int(rng.integers(len(self.signs)))]
+        drawn = {name: float(rng.uniform(*bounds)) for name, bounds in self.beside.items()}
+        changes: dict[str, Any] = {**drawn, self.varies: self.neutral + self.scale * sign * strength}
+        if self.varies == "Vsat":
+            changes["Vsat"] = 1 / strength  # the cut-off is absent at 1/Vsat = 0
+        return replace(p, **changes)
+
+    def removed(self, p: Physics) -> Physics:
+        """Return `p` without this effect: the baseline's own physics."""
+        if not self.absent:
+            changes: dict[str, Any] = {self.varies: self.neutral}
+            return replace(p, **changes)
+        changes = dict(self.absent)
+        if self.varies == "Vsat":
+            changes["mu0"] = p.mu0 + p.B * math.log(p.Vsat / p.V0)  # B ln(1 + Vsat phi/D0) at long ages
+        return replace(p, **changes)
+
+
+BOTH = (1, -1)
+EFFECTS: tuple[Effect, ...] = (
+    Effect("linker-dieterich", "alpha", 0.001, 0.03),
+    Effect("interface-compliance", "lam", 0.1, 0.9, absent={"rigid": True}),
+    Effect("stiffness-exponent", "n_kappa", 0.08, 0.7, BOTH, neutral=1.0),
+    Effect("age-saturation", "Vsat", 1 / 3000, 1 / 100, absent={"bare": True}),
+    Effect("log-log-coupling", "C", 5e-5, 1.5e-3, BOTH),
+    Effect("slip-evolution", "slip_share", 0.03, 1.0),
+    Effect("second-state", "B2", 3e-4, 8e-3, beside={"D2": (2.0, 12.0)}),
+    Effect("viscous-drag", "drag", 5e-6, 3e-4),
+    Effect("adhesion-offset", "Wa", 0.02, 0.6),
+    Effect("load-transmission", "rho", 0.01, 0.7, (-1,), neutral=1.0),
+    Effect("load-distortion", "distortion", 0.02, 0.4, beside={"distortion_phase": TURN}),
+    Effect("tangential-crosstalk", "cross", 0.001, 0.03, BOTH),
+    Effect("track-topography", "topo", 2e-4, 2e-3, beside={"topo_L": (6.0, 40.0), "topo_phase": TURN}),
+    Effect("friction-drift", "drift_t", 1e-4, 2.5e-3, BOTH, beside={"drift_t0": (0.0, 1.5)}),
+    Effect("friction-drift", "drift_x", 1e-5, 2.5e-4, BOTH, beside={"drift_x0": (0.0, 15.0)}),
+    Effect("drive-ripple", "ripple", 0.01, 0.15, beside={"ripple_p": (4.0, 25.0), "ripple_phase": TURN}),
+    Effect("sensor-lag", "lag", 5e-4, 0.02),
+    Effect("stiffness-error", "ratio", 0.03, 0.3, BOTH, neutral=1.0),
+    Effect("inertia", "M", 0.2, 4.0, scale=1e-6, absent={"massless": True}),  # kg
+)
+OUTSIDE: tuple[Effect, ...] = (
+    Effect("age-exponent", "p_age", 0.15, 1.0, neutral=1.0, listed=False, resembles=("slip-evolution",)),
+    Effect(
+        "track-bump", "bump", 8e-4, 8e-3, BOTH, beside={"bump_x": (8.0, 35.0), "bump_w": (0.5, 3.0)}, listed=False,
+        resembles=("track-topography",),
+    ),
+    Effect(
+        "load-memory", "memory", 0.1, 1.0, beside={"memory_tau": (0.001, 0.2)}, listed=False,
+        resembles=("load-transmission", "linker-dieterich"),
+    ),
+    Effect("speed-dependent-length", "D_power", 0.04, 0.4, BOTH, listed=False, resembles=("slip-evolution",)),
+    Effect("load-dependent-friction", "W_power", 0.004, 0.08, BOTH, listed=False, resembles=("adhesion-offset",)),
+    Effect("age-limit", "age_rate", 0.05, 2.0, listed=False, resembles=("age-saturation",)),
+    Effect("interface-damping", "eta", 5e-4, 0.02, listed=False),
+    Effect("drive-lag", "drive_tau", 0.005, 0.15, listed=False, resembles=("sensor-lag",)),
+    Effect("gauge-backlash", "backlash", 0.015, 0.2, listed=False, resembles=("sensor-lag",)),
+)  # fmt: skip
+NAMES = tuple(dict.fromkeys(e.name for e in EFFECTS))
+OUTSIDE_NAMES = tuple(e.name for e in OUTSIDE)
+
+
+def variants(name: str) -> tuple[Effect, ...]:
+    """Return the effects of this name; SrfError for one that is not known."""
+    found = tuple(e for e in (*EFFECTS, *OUTSIDE) if e.name == name)
+    if not found:
+        raise SrfError(f"unknown effect '{name}'", did_you_mean(name, (*NAMES, *OUTSIDE_NAMES)))
+    return found
+
+
+# What a case is made of, drawn from its seed: laws around those of the examples, effects, protocol, track and gauge.
+
+KINDS = ("none", "single", "pair", "outside")
+SHARES = (0.25, 0.4, 0.15, 0.2)  # of the kinds, where none is asked for
+SPREAD = {"A": 0.05, "B": 0.05, "D0": 0.05, "lam": 0.05, "Vsat": 0.13, "mu0": 0.01}  # relative standard deviations
+ODD = ("rigid", "massless", "bare")  # baselines other than the usual one
+ODD_SHARE = 0.15  # of the cases where no effect decides it: else an odd baseline would give the answer away
+USUAL_ONLY = {
+    "stiffness-exponent",
+    "log-log-coupling",
+    "interface-damping",
+    "interface-compliance",
+    "inertia",
+    "age-saturation",
+}
+ROUGH_SHARE, WHITE_SHARE = 0.4, 0.6
+ROUGHNESS, CORRELATION = (5e-5, 4e-4), (3.0, 30.0)  # of mu0; um
+SIGMA, QUANTUM, REDDEST = 0.02, 0.005, 0.85
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """The noise of a gauge: standard deviation and quantum in um, correlation of neighbouring samples."""
+
+    sigma: float = SIGMA
+    lag1: float = 0.0
+    quantum: float = QUANTUM
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A case before anything moves: the truth `physics`, the `baseline` that is stated, the plans of its runs, its gauge."""
+
+    effects: tuple[Effect, ...]
+    sizes: tuple[float, ...]
+    physics: Physics
+    baseline: Physics
+    plans: tuple[Plan, ...]
+    gauge: Gauge
+
+
+def draw_recipe(
+    rng: np.random.Generator,
+    *,
+    kind: str | None = None,
+    effects: Sequence[str] | None = None,
+    size: float | None = None,
+    rough: bool | float | None = None,
+) -> Recipe:
+    """Return the case that `rng` gives; what is asked for is not drawn.
+
+    `size` from 0 to 1 is how strong the effects are, `rough` whether the track is, or the standard deviation of its mu0.
+    """
+    chosen = _chosen(rng, kind, effects)
+    drawn = rng.uniform(0, 1, size=len(chosen)).tolist()
+    sizes = tuple(drawn if size is None else [_within(size)] * len(chosen))
+    physics = _laws(rng, chosen)
+    track = _track(rng, rough)
+    for effect, strength in zip(chosen, sizes, strict=True):
+        physics = effect.added(physics, rng, strength)
+    physics = replace(physics, track=track)
+    baseline = physics
+    for effect in chosen:
+        baseline = effect.removed(baseline)
+    plans = draw_protocol(rng)
+    lag1 = float(rng.uniform(0.3, REDDEST))
+    gauge = Gauge(lag1=0.0 if rng.uniform() < WHITE_SHARE else lag1)
+    return Recipe(chosen, sizes, physics, baseline, plans, gauge)
+
+
+def _within(size: float) -> float:
+    if not 0 <= size <= 1:
+        raise SrfError(f"size = {size:g} of an effect", "give a number from 0, hardly there, to 1, strong")
+    return size
+
+
+def _chosen(rng: np.random.Generator, kind: str | None, names: Sequence[str] | None) -> tuple[Effect, ...]:
+    """Return the effects by name, or as many as the kind has."""
+    drawn_kind = str(rng.choice(KINDS, p=SHARES))
+    order = [str(n) for n in rng.permutation(NAMES)]
+    outside = str(rng.choice(OUTSIDE_NAMES))
+    if names is None:
+        kind = drawn_kind if kind is None else kind
+        if kind not in KINDS:
+            raise SrfError(f"unknown kind of case '{kind}'", did_you_mean(kind, KINDS))
+        names = {"none": [], "single": order[:1], "pair": order[:2], "outside": [outside]}[kind]
+    if len(set(names)) < len(names):
+        raise SrfError(f"an effect is named twice: {', '.join(names)}", "name each once")
+    options = [variants(name) for name in names]
+    return tuple(some[int(rng.integers(len(some)))] for some in options)
+
+
+def _laws(rng: np.random.Generator, chosen: Sequence[Effect]) -> Physics:
+    """Return the laws' numbers, and now and then a baseline that is rigid, quasi-static or without a cut-off of age."""
+    usual = Physics()
+    numbers = {n: getattr(usual, n) * float(np.exp(s * rng.standard_normal())) for n, s in SPREAD.items()}
+    odd, which = rng.uniform() < ODD_SHARE, str(rng.choice(ODD))
+    physics = replace(usual, **numbers)
+    if not odd or any(effect.name in USUAL_ONLY for effect in chosen):
+        return physics
+    if which == "bare":
+        return replace(physics, bare=True, mu0=physics.mu0 + physics.B * float(np.log(physics.Vsat / physics.V0)))
+    return replace(physics, rigid=which == "rigid", massless=which == "massless")
+
+
+def _track(rng: np.random.Generator, rough: bool | float | None) -> Track:
+    is_rough = rng.uniform() < ROUGH_SHARE
+    size = float(np.exp(rng.uniform(*np.log(ROUGHNESS))))
+    length, seed = float(np.exp(rng.uniform(*np.log(CORRELATION)))), int(rng.integers(2**32))
+    if rough is not None and not isinstance(rough, bool):
+        size = float(rough)
+        if not 0 <= size < 0.1:
+            raise SrfError(
+                f"rough = {size:g} is no roughness of a track", "give the standard deviation of mu0, say 3e-4"
+            )
+        is_rough = size > 0
+    elif rough is not None:
+        is_rough = rough
+    return Track(size, length, seed) if is_rough else SMOOTH
+
+
+def draw_protocol(rng: np.random.Generator) -> tuple[Plan, ...]:
+    """Return seven runs like those of the examples, with velocities, loads, frequencies and switching times of their own."""
+
+    def near(value: float, spread: float, digits: int = 2) -> float:
+        return float(f"{value * (1 + rng.uniform(-spread, spread)):.{digits}g}")
+
+    slow, rise, fall = near(5, 0.2), near(2, 0.1), near(4, 0.1)
+    jump, light = near(1.5, 0.3), near(5, 0.08)
+    first, unstable = near(12, 0.15), near(8, 0.2)
+    return (
+        Plan("steps", ((2, slow), (1.5, near(20, 0.2)), (2, slow), (1, near(50, 0.2)), (2, near(10, 0.2))), light, 0.004),
+        Plan("stickslip", ((0.5, first), (5, unstable)), near(9.2, 0.05), 0.004),
+        Plan(
+            "onset", ((0.5, first), (4, unstable)), near(9, 0.05), 0.001,
+            eps=near(0.09, 0.25), f=near(108, 0.13, 3), onset=near(2, 0.12),
+        ),
+        Plan(
+            "strong", ((2.5, near(20, 0.25)),), near(7, 0.07), 0.001,
+            eps=near(0.2, 0.2), f=near(108, 0.13, 3), onset=near(0.6, 0.1),
+        ),
+        Plan("loadstep", ((6, near(10, 0.2)),), near(5, 0.08), 0.002, steps=((rise, jump), (fall, -jump))),
+        Plan(
+            "holdout-mod", ((3, near(15, 0.2)),), near(8, 0.07), 0.001, holdout=True,
+            eps=near(0.13, 0.2), f=near(80, 0.15, 3), onset=near(0.8, 0.12),
+        ),
+        Plan("holdout-shs", ((2, near(10, 0.2)), (4, near(0.1, 0.5)), (3, near(10, 0.2))), light, 0.004, holdout=True),
+    )  # fmt: skip
+
+
+# What a gauge makes of the true elongation: play, coloured noise, quanta.
+
+Array = np.ndarray
+
+
+def read_gauge(u: Array, gauge: Gauge, rng: np.random.Generator, *, backlash: float = 0.0) -> Array:
+    """Return the readings (n,) in um of the elongations u (n,): those of a first-order autoregressive noise, then rounded."""
+    shown = play(u, backlash) if backlash else u
+    draws = rng.standard_normal(u.size)
+    draws[1:] *= np.sqrt(1 - gauge.lag1**2)  # the first is as wide as all that follow
+    noise = gauge.sigma * lfilter([1.0], [1.0, -gauge.lag1], draws)
+    return np.asarray(np.round((shown + noise) / gauge.quantum) * gauge.quantum)
+
+
+def play(u: Array, half: float) -> Array:
+    """Return what a pointer with play shows: it stays until u is more than `half` um away, and then is dragged along."""
+    shown, at = np.empty_like(u), float(u[0])
+    for k, value in enumerate(u.tolist()):
+        at = min(max(at, value - half), value + half)
+        shown[k] = at
+    return shown
+
+
+# A case as a folder in the format srf-experiment/1: what the one who is to diagnose it gets to see.
+
+DESCRIPTION = "experiment.toml"
+HEADER = "time [s],load_point_velocity [um/s],normal_load [N],elongation [um]"
+STARTS = {  # name -> value, lower, upper: the same for every case, as in the examples
+    "mu0": (0.33, 0.2, 0.5),
+    "A": (0.012, 0.006, 0.03),
+    "B": (0.023, 0.01, 0.06),
+    "D0": (0.4, 0.1, 1.5),
+    "Vsat": (280.0, 50.0, 2000.0),
+    "lambda": (0.62, 0.2, 1.5),
+}
+BARE_START = (0.46, 0.3, 0.7)  # of mu0, where it is the steady friction at V0
+
+
+def description(title: str, baseline: Physics, plans: tuple[Plan, ...]) -> str:
+    """Return the text of experiment.toml: apparatus and model as the baseline has them, nothing of what is concealed."""
+    starts = dict(STARTS)
+    if baseline.bare:
+        starts["mu0"] = BARE_START
+        del starts["Vsat"]
+    if baseline.rigid:
+        del starts["lambda"]
+    mass = "" if baseline.massless else f'mass = "{baseline.M * 1e6:.3g} kg"\n'
+    lines = [
+        f'format = "srf-experiment/1"\ntitle = "{title}"\n',
+        f'[apparatus]\nstiffness = "{baseline.K:.6g} N/um"\n{mass}',
+        f'[model]\nlaw = "{"dieterich-ruina" if baseline.bare else "srf-vsat"}"\nageing = "dieterich"',
+        f'interface = "{"rigid" if baseline.rigid else "elastic"}"\ninertia = {_toml_truth(not baseline.massless)}\n',
+        "[parameters]   # start values and bounds of what is to be fitted; um, s, N",
+        *(f"{n} = {{ value = {v!r}, lower = {a!r}, upper = {b!r} }}" for n, (v, a, b) in starts.items()),
+        "V0 = { value = 1.0, fixed = true }",
+    ]
+    return "\n".join([*lines, *map(_run, plans)]) + "\n"
+
+
+def _run(plan: Plan) -> str:
+    drive = ", ".join(f"{{ duration = {d!r}, velocity = {v!r} }}" for d, v in plan.drive)
+    text = f'\n[[runs]]\nname = "{plan.name}"\nfile = "{plan.name}.csv"\nholdout = {_toml_truth(plan.holdout)}'
+    text += f"\ndrive = [{drive}]   # s, um/s"
+    if plan.eps:
+        text += f"\nmodulation = {{ frequency = {plan.f!r}, amplitude = {plan.eps!r}, onset = {plan.onset!r} }}"
+        text += "   # Hz, of the mean load, s; the load itself is the column"
+    return text
+
+
+def table(plan: Plan, observed: np.ndarray) -> str:
+    """Return the text of a run's CSV: time, nominal velocity of the load point, imposed load, readings `observed` (n,)."""
+    t, load = plan.times(), plan.load()
+    ends = np.array(list(accumulate(d for d, _ in plan.drive)))
+    velocities = np.array([v for _, v in plan.drive])
+    V = velocities[np.minimum(np.searchsorted(ends, t + 1e-9, side="right"), velocities.size - 1)]
+    W = [load(s)[0] for s in t.tolist()]
+    rows = (f"{s:.4f},{v:g},{w:.6f},{u:.3f}" for s, v, w, u in zip(t, V, W, observed, strict=True))
+    return "\n".join([HEADER, *rows]) + "\n"
+
+
+def case_files(title: str, baseline: Physics, readings: Mapping[Plan, np.ndarray]) -> dict[str, str]:
+    """Return the files of a case, name -> text."""
+    runs = {f"{plan.name}.csv": table(plan, observed) for plan, observed in readings.items()}
+    return {**runs, DESCRIPTION: description(title, baseline, tuple(readings))}
+
+
+def _toml_truth(value: bool) -> str:
+    return "true" if value else "false"
+
+
+# Concealed cases: an experiment's folder on one side, the truth about it on the other.
+
+ATTEMPTS = 8  # draws until every run of a case can be integrated
+Truth = dict[str, Any]
+
+
+def make_case(
+    folder: Path,
+    seed: int | Sequence[int],
+    *,
+    kind: str | None = None,
+    effects: Sequence[str] | None = None,
+    size: float | None = None,
+    rough: bool | float | None = None,
+    strengths: bool = True,
+) -> Truth:
+    """Write a concealed experiment to the new folder `folder` and return the truth about it, ready for JSON.
+
+    `kind` is none, single, pair or outside; `effects` names them instead. With `strengths` every run is moved again without each
+    effect, to know how far it moves the record. The same seed and choices give the same bytes.
+    Raises SrfError for unknown names, and where the folder exists.
+    """
+    if folder.exists():
+        raise SrfError(f"{folder} exists already", "A case is never overwritten; name another folder.")
+    recipe, motions, attempt = _moving(seed, {"kind": kind, "effects": effects, "size": size, "rough": rough})
+    rng = np.random.default_rng([*_whole(seed), attempt, 1])
+    readings = {plan: read_gauge(u, recipe.gauge, rng, backlash=recipe.physics.backlash) for plan, u in motions.items()}
+    truth = _truth(recipe, attempt, seed)
+    if strengths:
+        truth["strength"] = {e.name: strength_of(e, recipe, motions) for e in recipe.effects}
+    folder.mkdir(parents=True)
+    for name, text in case_files("PMMA on PMMA, concealed case", recipe.baseline, readings).items():
+        write_atomic(folder / name, text)  # the description last: without it a folder is no experiment
+    return truth
+
+
+def _whole(seed: int | Sequence[int]) -> list[int]:
+    return [seed] if isinstance(seed, int) else list(seed)
+
+
+def _moving(seed: int | Sequence[int], asked: Mapping[str, Any]) -> tuple[Recipe, dict[Plan, Array], int]:
+    """Return the first recipe of the seed whose runs all reach their ends, its motions, and how many came before it."""
+    for attempt in range(ATTEMPTS):
+        recipe = draw_recipe(np.random.default_rng([*_whole(seed), attempt, 0]), **asked)
+        motions: dict[Plan, Array] = {}
+        for plan in recipe.plans:
+            trace = move(recipe.physics, plan)
+            if not trace.complete:
+                break
+            motions[plan] = trace.u
+        else:
+            return recipe, motions, attempt
+    raise SrfError(
+        f"none of {ATTEMPTS} sliders drawn from seed {seed} could be followed to the end of its runs",
+        "Take another seed.",
+    )
+
+
+def strength_of(effect: Effect, recipe: Recipe, motions: Mapping[Plan, Array]) -> Truth:
+    """Return how far one effect moves the record: rms over noise by run, and over all samples of the fitted runs.
+
+    `noncentrality` is the sum of squares over the noise's variance, before a fit of the baseline has absorbed its share; null
+    where the slider without the effect cannot be followed.
+    """
+    less, backlash = effect.removed(recipe.physics), recipe.physics.backlash
+    rms: dict[str, float | None] = {}
+    total: float | None = 0.0
+    for plan, u in motions.items():
+        trace = move(less, plan)
+        moved = play(trace.u, less.backlash) if less.backlash else trace.u
+        change = ((play(u, backlash) if backlash else u) - moved) / recipe.gauge.sigma
+        rms[plan.name] = round(float(np.sqrt(np.mean(change**2))), 6) if trace.complete else None
+        if not plan.holdout:
+            total = total + float(change @ change) if trace.complete and total is not None else None
+    return {"rms_over_noise": rms, "noncentrality": None if total is None else round(total, 4)}
+
+
+def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
+    names = [e.name for e in recipe.effects]
+    listed = all(e.listed for e in recipe.effects)
+    return {
+        "effects": names,
+        "verdict": "none" if not names else "identified" if listed else "unknown",
+        "resembles": sorted({r for e in recipe.effects for r in e.resembles}),
+        "sizes": dict(zip(names, recipe.sizes, strict=True)),
+        "truth": {n: v for n, v in _changed(recipe.physics, recipe.baseline).items()},
+        "physics": asdict(recipe.physics),
+        "baseline": asdict(recipe.baseline),
+        "rough": recipe.physics.track.size,
+        "gauge": asdict(recipe.gauge),
+        "runs": [asdict(plan) for plan in recipe.plans],
+        "seed": _whole(seed),
+        "attempt": attempt,
+    }
+
+
+def _changed(p: Physics, baseline: Physics) -> dict[str, Any]:
+    """Return the fields in which the truth departs from its baseline, or from neutral values."""
+    usual = baseline
+    return {f.name: getattr(p, f.name) for f in fields(p) if getattr(p, f.name) != getattr(usual, f.name)}
+
+
+def known_physics(truth: Mapping[str, Any], *, baseline: bool = False) -> Physics:
+    """Return the slider that a truth describes, or the one that its stated model describes."""
+    values = dict(truth["baseline" if baseline else "physics"])
+    return Physics(**{**values, "track": Track(**values["track"])})
+
+
+def known_plans(truth: Mapping[str, Any]) -> tuple[Plan, ...]:
+    """Return the runs of a case from the truth about it."""
+    return tuple(
+        Plan(**{**r, "drive": tuple(map(tuple, r["drive"])), "steps": tuple(map(tuple, r["steps"]))})
+        for r in truth["runs"]
+    )
+
+
+def known_traces(truth: Mapping[str, Any]) -> dict[str, Trace]:
+    """Return what a model that knows the truth, the track included, predicts for every run, by the run's name."""
+    p = known_physics(truth)
+    traces = {plan.name: move(p, plan) for plan in known_plans(truth)}
+    return {
+        name: replace(trace, u=play(trace.u, p.backlash)) if p.backlash else trace for name, trace in traces.items()
+    }
+
+
+def known_gauge(truth: Mapping[str, Any]) -> Gauge:
+    """Return the gauge of a case from the truth about it."""
+    return Gauge(**truth["gauge"])

@@ -1,0 +1,317 @@
+"""The run of a concealed slider: its own equations, integrated by backward differentiation formulas.
+
+The stretch e of the interface is a state, the friction force is kappa e, and the slip velocity follows by inverting
+mu(v, phi) = F/W. Plain scalar functions; nothing here is shared with the equations that are fitted.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import accumulate
+
+import numpy as np
+from scipy.integrate import ode
+
+from srfcli.validation.generator.physics import Physics, Plan
+
+# The slider's equations written for the interface's elastic strain: friction is a stress that is known, v what flows under it.
+
+FASTEST = 60.0  # of ln(v/V0): what a solver's trial step may ask for is kept finite
+
+
+@dataclass(frozen=True)
+class Felt:
+    """The load at the asperities and its rate, N and N/s, beside W - W0 of the imposed one."""
+
+    W: float
+    rate: float
+    excess: float
+
+
+def felt_load(p: Physics, plan: Plan) -> Callable[[float], Felt]:
+    """Return the load that reaches the asperities, before any delay, as a function of time."""
+    imposed, switched, W0 = plan.load(), plan.switched(), plan.W0
+    height, omega = p.distortion * plan.eps * W0, 4 * math.pi * plan.f
+
+    def felt(t: float) -> Felt:
+        W, rate = imposed(t)
+        if not plan.eps:
+            return Felt(W, rate, W - W0)  # a slow step of the load is no modulation: it arrives in full
+        s, s_dot = switched(t)
+        angle = omega * t + p.distortion_phase
+        here = W0 + p.rho * (W - W0) + height * s * math.cos(angle)
+        slope = p.rho * rate + height * (s_dot * math.cos(angle) - s * omega * math.sin(angle))
+        return Felt(here, slope, W - W0)
+
+    return felt
+
+
+def at_unit_velocity(p: Physics, longest: float) -> Callable[[float, float, float, float, float], tuple[float, float]]:
+    """Return f(t, slip, ln phi, ln phi2, W) -> (m, a): mu = m + a x + drag e^x, x = ln(v/V0)."""
+    profile = p.track.profile(longest)
+    local = p.topo != 0 or p.bump != 0 or p.track.size != 0
+    drifting = p.drift_t != 0 or p.drift_x != 0
+    wave = 2 * math.pi / p.topo_L
+    first_age, second_age = math.log(p.V0 / p.D0), math.log(p.V0 / p.D2)
+
+    def terms(t: float, s: float, ln_phi: float, ln_phi2: float, W: float) -> tuple[float, float]:
+        grown = ln_phi + first_age if p.bare else math.log1p(p.Vsat / p.D0 * math.exp(ln_phi))
+        m = p.mu0 + p.B * grown
+        if p.W_power:
+            m += p.mu0 * ((W / p.Wref) ** p.W_power - 1)
+        if p.B2:
+            m += p.B2 * (ln_phi2 + second_age)
+        if local:
+            m += p.topo * math.cos(wave * s + p.topo_phase) + profile(s)
+            m += p.bump * math.exp(-0.5 * ((s - p.bump_x) / p.bump_w) ** 2)
+        if drifting:
+            m += p.drift_t * max(t - p.drift_t0, 0.0) + p.drift_x * max(s - p.drift_x0, 0.0)
+        return m, p.A + p.C * grown
+
+    return terms
+
+
+def log_velocity(R: float, a: float, c: float) -> float:
+    """Return the x with a x + c e^x = R for a > 0 and c >= 0, by Newton's method from the side where it cannot overshoot."""
+    x = R / a
+    if c <= 0.0:
+        return min(x, FASTEST)
+    if R > 0:
+        x = min(x, math.log1p(R / c))  # both bounds lie above the root: a convex function, approached from above
+    x = min(x, FASTEST)
+    for _ in range(60):
+        flow = c * math.exp(x)
+        step = (a * x + flow - R) / (a + flow)
+        x -= step
+        if abs(step) < 1e-14 * (1 + abs(x)):
+            break
+    return x
+
+
+def ageing(p: Physics) -> Callable[[float, float, float, float], float]:
+    """Return f(v, ln phi, W, W') -> d(ln phi)/dt."""
+
+    def rate(v: float, ln_phi: float, W: float, W_dot: float) -> float:
+        phi = math.exp(ln_phi)
+        D = p.D0 * (v / p.V_D) ** p.D_power if p.D_power else p.D0
+        q = max(v * phi / D, 1e-300)
+        worn = q if p.p_age == 1.0 else q**p.p_age
+        grown = (1 - p.slip_share) * (1 - worn) - (p.slip_share * q * math.log(q) if p.slip_share else 0.0)
+        return grown / phi - p.alpha / p.B * W_dot / W - p.age_rate
+
+    return rate
+
+
+def steady_age(p: Physics, V: float) -> float:
+    """Return ln phi in steady sliding at V um/s: where the ageing rate vanishes."""
+    from scipy.optimize import brentq
+
+    rate = ageing(p)
+    middle = math.log(p.D0 / V)
+    return float(brentq(lambda x: rate(V, x, 1.0, 0.0) * math.exp(x), middle - 20, middle + 20, xtol=1e-14))
+
+
+def stiffness(p: Physics) -> Callable[[float], float]:
+    """Return the interface's stiffness in N/um as a function of the load at the asperities."""
+    if p.n_kappa == 1.0:
+        return lambda W: W / p.lam
+    return lambda W: p.Wref / p.lam * (W / p.Wref) ** p.n_kappa
+
+
+# Where friction force, slip velocity and spring elongation come from: three kinds of slider.
+
+Sliding = tuple[float, float, float]  # slip velocity um/s, elongation of the spring um, friction force N
+Slide = Callable[[list[float], float, float, float, float], Sliding]  # of states, m, a, load, force along the drive
+Push = Callable[[list[float], Sliding, float, float], list[float]]  # of states, the above, stage velocity, force along
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A slider's mechanical states, what they say about its sliding, their rates, and their values in steady sliding."""
+
+    names: tuple[str, ...]
+    slide: Slide
+    push: Push
+    steady: Callable[[float, float, float], list[float]]  # of velocity, friction force, load
+
+
+def build_contact(p: Physics) -> Contact:
+    """Return the slider that `p` describes: without mass, rigid with mass, or elastic with mass."""
+    return _massless(p) if p.massless else _rigid(p) if p.rigid else _elastic(p)
+
+
+def _elastic(p: Physics) -> Contact:
+    """The stretch e of the interface is a state: kappa e + eta (z - v) = F = (W + Wa) mu(v, phi) gives v."""
+    kappa = stiffness(p)
+
+    def slide(y: list[float], m: float, a: float, W: float, aside: float) -> Sliding:
+        weight = W + p.Wa
+        pull = kappa(W) * y[2] + p.eta * y[1]
+        v = p.V0 * math.exp(log_velocity(pull / weight - m, a, p.drag + p.eta * p.V0 / weight))
+        return v, y[0], pull - p.eta * v
+
+    def push(y: list[float], sliding: Sliding, V: float, aside: float) -> list[float]:
+        v, u, F = sliding
+        return [V - y[1], (p.spring * u + aside - F) / p.M, y[1] - v]
+
+    return Contact(("u", "z", "e"), slide, push, lambda V, F, W: [F / p.spring, V, F / kappa(W)])
+
+
+def _rigid(p: Physics) -> Contact:
+    """There is nothing to stretch: ln v is a state, which inertia moves."""
+
+    def slide(y: list[float], m: float, a: float, W: float, aside: float) -> Sliding:
+        x = min(y[1], FASTEST)
+        v = p.V0 * math.exp(x)
+        return v, y[0], (W + p.Wa) * (m + a * x + p.drag * v / p.V0)
+
+    def push(y: list[float], sliding: Sliding, V: float, aside: float) -> list[float]:
+        v, u, F = sliding
+        return [V - v, (p.spring * u + aside - F) / (p.M * v)]
+
+    return Contact(("u", "ln_v"), slide, push, lambda V, F, W: [F / p.spring, math.log(V / p.V0)])
+
+
+def _massless(p: Physics) -> Contact:
+    """Spring and interface in series carry the friction force; their joint stretch D is the state."""
+    kappa = stiffness(p)
+
+    def slide(y: list[float], m: float, a: float, W: float, aside: float) -> Sliding:
+        yielding = 1 / p.spring + (0.0 if p.rigid else 1 / kappa(W))
+        F = (y[0] + aside / p.spring) / yielding
+        return p.V0 * math.exp(log_velocity(F / (W + p.Wa) - m, a, p.drag)), (F - aside) / p.spring, F
+
+    def push(y: list[float], sliding: Sliding, V: float, aside: float) -> list[float]:
+        return [V - sliding[0]]
+
+    return Contact(("D",), slide, push, lambda V, F, W: [F / p.spring + (0.0 if p.rigid else F / kappa(W))])
+
+
+# The run of a slider from steady sliding: states joined, integrated by backward differentiation formulas, read by a gauge.
+
+RTOL = 1e-8
+SMALLEST = {"u": 1e-8, "z": 1e-6, "e": 1e-10, "D": 1e-9, "s": 1e-7}  # absolute tolerances, um and um/s; others 1e-8
+LONGEST_STEP = 0.01  # s: no step jumps over the beginning of a load step
+OVERSHOOT = 60.0  # um, of slip beyond the stage's displacement
+MOST_STEPS = 200_000  # from one sample to the next
+Array = np.ndarray
+
+
+class Slider:
+    """The first-order system of one run. States: the contact's, ln phi, slip, then only what the effects at work need."""
+
+    def __init__(self, p: Physics, plan: Plan) -> None:
+        self.p, self.plan = p, plan
+        self.contact: Contact = build_contact(p)
+        self._felt = felt_load(p, plan)
+        self._terms = at_unit_velocity(p, plan.distance + OVERSHOOT)
+        self._aged = ageing(p)
+        extra = {"ln_phi2": p.B2, "Wm": p.memory, "gauge": p.lag, "stage": p.drive_tau, "X": p.ripple}
+        self.names = (*self.contact.names, "ln_phi", "s", *(name for name, size in extra.items() if size))
+        self._age = len(self.contact.names)
+        where = [self.names.index(name) if name in self.names else 0 for name in extra]  # 0 is always mechanical
+        self._age2, self._delay, self._gauge, self._stage, self._X = where
+
+    def sliding(self, t: float, y: list[float]) -> tuple[Sliding, Felt]:
+        """Return slip velocity, elongation and friction force, and the load at the asperities, at time t in s."""
+        felt, p = self._felt(t), self.p
+        if self._delay:
+            late = y[self._delay]
+            rate = (felt.W - late) / p.memory_tau
+            W = felt.W + p.memory * (late - felt.W)
+            felt = Felt(W, felt.rate + p.memory * (rate - felt.rate), felt.excess)
+        m, a = self._terms(t, y[self._age + 1], y[self._age], y[self._age2] if self._age2 else 0.0, felt.W)
+        return self.contact.slide(y, m, a, felt.W, -p.cross * felt.excess), felt
+
+    def rates(self, t: float, states: Array, V: float) -> list[float]:
+        """Return the rates of the states at time t in s, where the stage's nominal velocity is V um/s."""
+        y, p, nominal = states.tolist(), self.p, V
+        sliding, felt = self.sliding(t, y)
+        v, u, _ = sliding
+        if self._stage:
+            V = y[self._stage]
+        if self._X:
+            V *= 1 + p.ripple * math.cos(2 * math.pi * y[self._X] / p.ripple_p + p.ripple_phase)
+        out = self.contact.push(y, sliding, V, -p.cross * felt.excess)
+        out += (self._aged(v, y[self._age], felt.W, felt.rate), v)
+        if self._age2:
+            out.append(math.exp(-y[self._age2]) - v / p.D2)
+        if self._delay:
+            out.append((self._felt(t).W - y[self._delay]) / p.memory_tau)
+        if self._gauge:
+            out.append((u - y[self._gauge]) / p.lag)
+        if self._stage:
+            out.append((nominal - y[self._stage]) / p.drive_tau)
+        if self._X:
+            out.append(nominal)
+        return out
+
+    def shown(self, t: float, y: list[float]) -> float:
+        """Return the elongation in um that the gauge shows."""
+        return y[self._gauge] if self._gauge else self.sliding(t, y)[0][1]
+
+    def steady(self) -> list[float]:
+        """Return the states of steady sliding at the run's first velocity and load."""
+        p, V, W = self.p, self.plan.drive[0][1], self._felt(0.0).W
+        ln_phi, ln_phi2 = steady_age(p, V), math.log(p.D2 / V)
+        m, a = self._terms(0.0, 0.0, ln_phi, ln_phi2, W)
+        F = (W + p.Wa) * (m + a * math.log(V / p.V0) + p.drag * V / p.V0)
+        extra = {"ln_phi2": ln_phi2, "Wm": W, "gauge": F / p.spring, "stage": V, "X": 0.0}
+        mechanical = self.contact.steady(V, F, W)
+        return [*mechanical, ln_phi, 0.0, *(extra[name] for name in self.names[len(mechanical) + 2 :])]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What happened in a run: times (n,), gauge reading u (n,) without noise; NaN from where the solver gave up."""
+
+    t: Array
+    u: Array
+
+    @property
+    def complete(self) -> bool:
+        return bool(np.isfinite(self.u).all())
+
+
+def move(p: Physics, plan: Plan, *, rtol: float = RTOL) -> Trace:
+    """Return the motion of one run at its sample times, integrated anew from every step of the drive."""
+    slider = Slider(p, plan)
+    t = plan.times()
+    trace = Trace(t, np.full(t.size, np.nan))
+    edges = [0.0, *accumulate(d for d, _ in plan.drive)]
+    y: Array | None = np.array(slider.steady())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # what the solver has to say is that it gave up: the NaN say so
+        for (_, V), begin, end in zip(plan.drive, edges, edges[1:], strict=False):
+            solver = _solver(slider, rtol).set_f_params(V).set_initial_value(y, begin)
+            y = _through(slider, solver, trace, end)
+            if y is None:
+                break
+    return trace
+
+
+def _solver(slider: Slider, rtol: float) -> ode:
+    tolerance = [SMALLEST.get(name, 1e-8) * rtol / RTOL for name in slider.names]
+    longest = min(LONGEST_STEP, 0.25 / slider.plan.f) if slider.plan.eps else LONGEST_STEP
+    options = {"rtol": rtol, "atol": tolerance, "nsteps": MOST_STEPS, "max_step": longest}
+    # with_jacobian: Newton's method with differences; without it VODE iterates the stiff equations as they stand
+    return ode(slider.rates).set_integrator("vode", method="bdf", with_jacobian=True, **options)
+
+
+def _through(slider: Slider, solver: ode, trace: Trace, end: float) -> Array | None:
+    """Follow one piece of the drive to its end, reading the gauge, and return the states there; None where it was not reached."""
+    t = trace.t
+    try:
+        for k in np.flatnonzero((t >= solver.t - 1e-9) & (t < end - 1e-9)).tolist():
+            if t[k] > solver.t:
+                solver.integrate(t[k])
+            if not solver.successful():
+                return None
+            trace.u[k] = slider.shown(float(t[k]), solver.y.tolist())
+        y: Array = solver.integrate(end)
+    except OverflowError:  # a state ran away
+        return None
+    return y if solver.successful() else None

@@ -1,0 +1,314 @@
+"""The diagnosis of one case by somebody who has its folder and nothing else, and its answer."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from srfcli.core.errors import SrfError
+from srfcli.core.files import parse_json, read_text, write_atomic
+
+if TYPE_CHECKING:
+    from srfcli.diagnosis.answer import RunView
+    from srfcli.diagnosis.hypotheses import Refit
+    from srfcli.diagnosis.search import Fitted, Held
+    from srfcli.diagnosis.staged_search import Search
+    from srfcli.diagnosis.verdict import Diagnosis
+    from srfcli.laws.registry import Registry
+
+# What a diagnosis said of one case: a line of a file that grows while a trial runs, and from which it resumes.
+
+LARGEST = 64 * 2**20  # bytes of all answers
+
+FAILED = "failed"  # beside the verdicts: the diagnosis raised, ran out of time, or ended its process
+VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive", FAILED)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One case's answer: verdict, effects and stated confidence by hypothesis, "a+b" for two effects together.
+
+    `fit` holds the fitted runs' rms over noise, `held` each held-out run's rms in um and over noise, by `baseline` and
+    `augmented`; `parameters` are those that the effects brought, in declared units; `tried` has what was fitted, `ungated` the
+    verdict without a say of held-out runs; `cpu` and `wall` are in s; `code` tells programs apart.
+    """
+
+    case: str
+    verdict: str
+    effects: tuple[str, ...] = ()
+    confidence: Mapping[str, float] = field(default_factory=dict)
+    equivalent: tuple[tuple[str, ...], ...] = ()
+    not_identifiable: tuple[str, ...] = ()
+    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    fit: Mapping[str, float | None] = field(default_factory=dict)
+    held: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    tried: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    ungated: str = ""
+    cpu: float = 0.0
+    wall: float = 0.0
+    code: str = ""
+    failure: str = ""
+
+    @property
+    def said(self) -> str:
+        """Return the answer as the key under which its confidence is stated; the listed names for an ambiguous one."""
+        if self.verdict in ("identified", "ambiguous"):
+            return "+".join(sorted(self.effects))
+        return "none" if self.verdict == "inconclusive" else self.verdict
+
+
+def to_line(answer: Answer) -> str:
+    """Return the answer as one line of JSON; numbers that are none are null."""
+    return json.dumps(asdict(answer), sort_keys=True, allow_nan=False)
+
+
+def from_line(line: str, *, where: str) -> Answer:
+    """Return the answer of a line; SrfError, naming `where`, for one that is no answer."""
+    try:
+        found = parse_json(line, "the line")
+        if not isinstance(found, dict) or set(found) != {f.name for f in fields(Answer)}:
+            raise ValueError("not the keys of an answer")
+        if found["verdict"] not in VERDICTS:
+            raise ValueError(f"verdict {found['verdict']!r}")
+    except (SrfError, ValueError) as error:
+        raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
+    try:
+        equivalent = tuple(tuple(names) for names in found["equivalent"])
+        lists = {name: tuple(found[name]) for name in ("effects", "not_identifiable")}
+    except TypeError as error:
+        raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
+    return Answer(**{**found, **lists, "equivalent": equivalent})
+
+
+def read_answers(path: Path) -> dict[str, Answer]:
+    """Return the answers of a file by case, none where there is no file; SrfError for a damaged line or a case named twice."""
+    try:
+        text = read_text(path, limit=LARGEST, what="answers")
+    except FileNotFoundError:
+        return {}
+    found: dict[str, Answer] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        answer = from_line(line, where=f"{path}, line {number}")
+        if answer.case in found:
+            raise SrfError(f"{path}, line {number}: {answer.case} was answered before", "Delete one of the two lines.")
+        found[answer.case] = answer
+    return found
+
+
+def write_answers(path: Path, answers: Iterable[Answer]) -> None:
+    """Write one line per answer, by case: the file is whole at any moment, and the same however the cases were spread."""
+    lines = [to_line(a) + "\n" for a in sorted(answers, key=lambda a: a.case)]
+    write_atomic(path, "".join(lines))
+
+
+# The diagnosis of one case, by somebody who has its folder and nothing else. Nothing here can reach a truth.
+
+Diagnose = Callable[[Path, tuple[Path, ...]], Answer]  # folder of a case, folders of plugins
+ELSEWHERE = ("cli", "parallel", "results", "validation")  # parts of the package that no answer depends on
+
+
+@dataclass(frozen=True)
+class Task:
+    """One case to diagnose: its folder, the plugins' folders, by what, and how many seconds of CPU it may take."""
+
+    folder: Path
+    plugins: tuple[Path, ...]
+    diagnose: Diagnose
+    limit: float
+
+
+class _TooLong(BaseException):  # no Exception: a diagnosis that copes with everything must not cope with this
+    pass
+
+
+def answer_case(task: Task) -> Answer:
+    """Return the answer to one case; a diagnosis that raises, or takes too long, has failed, and says how."""
+    begun, used = time.perf_counter(), _cpu()
+    try:
+        with warnings.catch_warnings(), _limited(task.limit):
+            warnings.simplefilter("ignore")  # of optimisers under way: the verdict counts
+            found = task.diagnose(task.folder, task.plugins)
+    except Exception as error:
+        found = failed(task.folder.name, f"{type(error).__name__}: {error}; {_place(error)}")
+    except _TooLong:
+        found = failed(task.folder.name, f"more than {task.limit:g} s of CPU")
+    cpu, wall = round(_cpu() - used, 3), round(time.perf_counter() - begun, 3)
+    return replace(found, case=task.folder.name, code=code_of(task.plugins), cpu=cpu, wall=wall)
+
+
+def failed(case: str, why: str) -> Answer:
+    """Return the answer of a diagnosis that gave none."""
+    return Answer(case, FAILED, failure=" ".join(why.split()))
+
+
+def diagnose_case(folder: Path, plugins: tuple[Path, ...], *, by: type[Search] | None = None) -> Answer:
+    """Return what the tool's own diagnosis, or one `by` another search, says of the experiment in `folder`.
+
+    Held-out runs are read when it is done.
+    """
+    from srfcli.data.experiment import read_experiment
+    from srfcli.diagnosis.staged_search import Search
+    from srfcli.diagnosis.verdict import conclude
+
+    registry = _registry(plugins)
+    search = (by or Search)(registry, read_experiment(folder, registry=registry, holdout=False))
+    search.run()
+    return told(conclude(search, read_experiment(folder, registry=registry)), case=folder.name)
+
+
+def diagnose_by_state_space(folder: Path, plugins: tuple[Path, ...]) -> Answer:
+    """Return what the best-first search over state-space fits says of the experiment in `folder`."""
+    from srfcli.data.experiment import read_experiment
+    from srfcli.diagnosis.search import ModelSearch, conclude
+
+    registry = _registry(plugins)
+    search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
+    search.run()
+    verdict = conclude(search, read_experiment(folder, registry=registry))
+    shown, same = verdict.shown, verdict.shown is verdict.baseline
+
+    def errors(held: Held) -> Mapping[str, float | None]:
+        sides = {"baseline": held.baseline, "augmented": held.baseline if same else held.augmented}
+        rms = {n: _finite(float(np.sqrt(np.mean(f.found.nu[f.run.used] ** 2)))) for n, f in sides.items()}
+        return rms | {f"{n}_over_noise": _finite(float(np.sqrt(np.mean(f.white**2)))) for n, f in sides.items()}
+
+    def kept(fit: Fitted) -> Mapping[str, float]:
+        likelihood = fit.fit.likelihood
+        return {
+            "log_likelihood": round(fit.fit.log_likelihood, 3), "parameters": len(likelihood.names),
+            "samples": likelihood.samples, "evidence": round(fit.evidence, 3), "fine": int(fit.fine),
+        }  # fmt: skip
+
+    return Answer(
+        folder.name, verdict.verdict, tuple(verdict.effects), dict(verdict.confidence), (),
+        tuple(dict.fromkeys(x.effect for x in verdict.excluded)),
+        {name: {k: _finite(v) for k, v in value.items()} for name, value in verdict.brought().items()},
+        {"baseline": _finite(verdict.baseline.fit.maximum.point.rms), "augmented": _finite(shown.fit.maximum.point.rms)},
+        {h.baseline.run.name: errors(h) for h in verdict.held}, {f.model.name: kept(f) for f in reversed(verdict.ranked)},
+        verdict.ungated,
+    )  # fmt: skip
+
+
+SEARCHES: Mapping[str, Diagnose] = {"staged": diagnose_case, "state-space": diagnose_by_state_space}
+
+
+def told(diagnosis: Diagnosis, *, case: str) -> Answer:
+    """Return a diagnosis as an answer."""
+    from srfcli.diagnosis.answer import final, parameters_of, run_views
+
+    own = {q.name for q in diagnosis.baseline.fit.problem.experiment.parameters}
+    brought = {n: v for n, v in parameters_of(final(diagnosis).fit).items() if n not in own and "." not in n}
+    return Answer(
+        case,
+        diagnosis.verdict,
+        tuple(diagnosis.effects),
+        {name: float(share) for name, share in diagnosis.confidence.items()},
+        tuple(tuple(names) for names in diagnosis.equivalent),
+        tuple(dict.fromkeys(x.effect for x in diagnosis.not_identifiable)),
+        {name: {k: _finite(v) for k, v in value.items()} for name, value in brought.items()},
+        {
+            "baseline": _finite(diagnosis.baseline.adequacy.rms_over_noise),
+            "augmented": _finite(final(diagnosis).adequacy.rms_over_noise),
+        },
+        {view.run.name: _errors(view) for view in run_views(diagnosis) if view.holdout},
+        {"+".join(sorted(r.hypothesis.reported)) or "none": _evidence(r) for r in reversed(diagnosis.ranked)},
+        diagnosis.ungated,
+    )
+
+
+def _evidence(refit: Refit) -> Mapping[str, float]:
+    """Return what ranks a refit: log likelihood, how many parameters and samples it has, evidence, and whether noise is left."""
+    problem = refit.fit.problem
+    return {
+        "log_likelihood": round(float(refit.fit.log_likelihood), 3),
+        "parameters": len(problem.names) + 2 * refit.rough,
+        "samples": sum(int(run.used.sum()) for run in problem.runs),
+        "evidence": round(float(refit.evidence), 3),
+        "fine": int(refit.adequacy.fine),
+    }
+
+
+def _errors(view: RunView) -> Mapping[str, float | None]:
+    """Return a held-out run's rms in um, and over the noise, under baseline and final model."""
+    run = view.run
+
+    def rms(predicted: np.ndarray) -> float | None:
+        return _finite(float(np.sqrt(np.mean((run.observed - predicted)[run.used] ** 2))))
+
+    before, after = view.rms
+    sizes = {"baseline": rms(view.baseline), "augmented": rms(view.augmented)}
+    return {**sizes, "baseline_over_noise": _finite(before), "augmented_over_noise": _finite(after)}
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, str):
+        return value
+    return float(value) if value is not None and np.isfinite(value) else None
+
+
+@functools.cache
+def _registry(plugins: tuple[Path, ...]) -> Registry:
+    from srfcli.laws.registry import load_registry
+
+    return load_registry(plugins)
+
+
+@functools.cache
+def code_of(plugins: tuple[Path, ...]) -> str:
+    """Return twelve digits that change with any file of the package, or of `plugins`, on which an answer depends."""
+    package = Path(__file__).resolve().parents[2]
+    parts = [p for p in sorted(package.iterdir()) if p.name not in ELSEWHERE]
+    whole = hashlib.sha256()
+    for path in _sources([*parts, package.parent / "plugins", *plugins]):
+        whole.update(path.name.encode() + path.read_bytes())
+    return whole.hexdigest()[:12]
+
+
+def _sources(places: Sequence[Path]) -> Iterator[Path]:
+    for place in places:
+        files = sorted(place.rglob("*")) if place.is_dir() else [place]
+        yield from (p for p in files if p.suffix in (".py", ".toml", ".c") and p.is_file())
+
+
+def _cpu() -> float:
+    """Return the seconds of CPU that this process and the compilers it called have used."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def _place(error: Exception) -> str:
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{Path(last.filename).name}, line {last.lineno}"
+
+
+@contextmanager
+def _limited(seconds: float) -> Iterator[None]:
+    """Raise _TooLong in what is done inside once this process has used `seconds` of CPU for it."""
+    if sys.platform == "win32":  # it has no such clock
+        yield
+        return
+
+    def stop(number: int, frame: Any) -> None:
+        raise _TooLong
+
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, before)
