@@ -223,7 +223,7 @@ def test_a_title_is_broken_between_parameters_and_stays_in_the_figure() -> None:
     figure = plots.stability_diagram(BRANCHES, title=plots.titled("law, ageing", described))
     figure.canvas.draw()
     text = figure._suptitle.get_text()  # type: ignore[attr-defined]
-    assert text.startswith("law, ageing\nW$_0$ = 0.1235 µm\nD$_0$ = 0.1235 µm, λ = 0.1235 µm, a = ")
+    assert text.startswith("law, ageing\nW$_0$ = 0.1235 µm, f = 0.1235 µm\nD$_0$ = 0.1235 µm, λ = 0.1235 µm, a = ")
     extent = figure._suptitle.get_window_extent()  # type: ignore[attr-defined]
     assert extent.x1 <= figure.bbox.x1 and extent.y0 >= figure.axes[0].get_window_extent().y1
 
