@@ -35,7 +35,7 @@ SYMBOLS = {
     "W0": "W$_0$", "V0": "V$_0$", "D0": "D$_0$", "mu0": "µ$_0$", "Vsat": "V$_{sat}$", "Va": "V$_a$", "Vb": "V$_b$", "eps": "ε",
     "lambda": "λ", "alpha": "α", "phi": "φ",
 }  # fmt: skip
-HEADING, PER_INCH, LINE = 9.0, 15, 0.155  # points, characters and inches of a heading's line
+HEADING, LINE, MARGIN = 9.0, 0.155, 0.012  # points and inches of a heading's line; its margin, of the figure's width
 NAME, NAME_ROW, NAME_WIDTH = (
     9.0,
     0.19,
@@ -174,21 +174,23 @@ def heading(figure: Figure, text: str) -> None:
     """
     if not text:
         return
-    most = int(PER_INCH * figure.get_figwidth())
-    lines = [broken for line in text.split("\n") for broken in _broken(line, most)]
+    lines = [broken for line in text.split("\n") for broken in _broken(line, figure, (1 - 2 * MARGIN) * figure.bbox.width)]
     figure.set_figheight(figure.get_figheight() + LINE * len(lines[1:]))
-    figure.suptitle("\n".join(lines), x=0.012, ha="left", fontsize=HEADING, linespacing=1.3)
+    figure.suptitle("\n".join(lines), x=MARGIN, ha="left", fontsize=HEADING, linespacing=1.3)
 
 
-def _broken(line: str, most: int) -> list[str]:
+def _broken(line: str, figure: Figure, width: float) -> list[str]:
+    probe = figure.text(0, 0, "", fontsize=HEADING)
     lines = [""]
     for part in line.split(", "):
         joined = f"{lines[-1]}, {part}" if lines[-1] else part
-        if lines[-1] and len(joined.replace("$", "").replace("_", "")) > most:
+        probe.set_text(f"{joined},")
+        if lines[-1] and probe.get_window_extent().width > width:
             lines[-1] += ","
             lines.append(part)
         else:
             lines[-1] = joined
+    probe.remove()
     return lines
 
 
@@ -214,7 +216,7 @@ def one_panel(ax: Axes | None, *, title: str, size: tuple[float, float] | None =
     with house_style():
         if ax is not None:
             yield cast("Figure", ax.figure), ax
-            ax.set_title("\n".join(_broken(title.split("\n")[0], 60)), fontsize=HEADING)
+            ax.set_title("\n".join(_broken(title.split("\n")[0], cast("Figure", ax.figure), ax.bbox.width)), fontsize=HEADING)
             if len(ax.get_legend_handles_labels()[1]) > 1:
                 ax.legend(loc="best", handlelength=2.8, fontsize=NAME)
             return
