@@ -29,14 +29,14 @@ from common import Report
 from marked import heading, marked, tell
 
 from srfcli.codegen.model import Array
+from srfcli.core.parallel import run_processes
 from srfcli.data.values import Run
 from srfcli.diagnosis.staged_search import Search
 from srfcli.inference.noise import Noise
 from srfcli.inference.random_field import LatentFit
-from srfcli.parallel.pool import run_processes
-from srfcli.validation.generator.bank import unseal
-from srfcli.validation.trial.blind import Answer, Task, answer_case, diagnose_case, failed, read_answers, write_answers
-from srfcli.validation.trial.report import rate
+from srfcli.validation.blind import Answer, Task, answer_case, diagnose_case, failed, read_answers, write_answers
+from srfcli.validation.cases import unseal
+from srfcli.validation.marks import rate
 
 LIMIT = 1800.0  # s of CPU
 

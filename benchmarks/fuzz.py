@@ -34,7 +34,7 @@ from srfcli.inference.threshold_table import is_threshold_table, read_thresholds
 from srfcli.laws.expression import parse_expression
 from srfcli.laws.law_file import read_header, template
 from srfcli.laws.registry import bundled_registry, read_law, scan_python
-from srfcli.validation.trial.blind import Answer, read_answers, to_line
+from srfcli.validation.blind import Answer, read_answers, to_line
 
 DATA = sound_files.recording(60)
 EXPERIMENT = sound_files.EXPERIMENT.replace("window = [0.0, 1.5]", "window = [0.0, 0.5]")

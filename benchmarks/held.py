@@ -25,7 +25,7 @@ from srfcli.diagnosis.nudging import COARSE, LOOSE, Follower
 from srfcli.inference.noise import Noise
 from srfcli.inference.prediction import Hold
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.generator.case import make_case
+from srfcli.validation.cases import make_case
 
 LENGTHS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, None)  # slip lengths; None is free
 CONCEALED = ("log-log-coupling", "second-state", "load-transmission")

@@ -23,7 +23,7 @@ from srfcli.diagnosis.staged_search import Search, grow, whole
 from srfcli.inference.fit import Problem
 from srfcli.inference.random_field import LatentFit, fit_latent, tracks_for
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.generator.case import make_case
+from srfcli.validation.cases import make_case
 
 OFF = (0.02, 0.05, 0.1)
 FOUND = 5.0  # in log likelihood

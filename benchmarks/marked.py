@@ -10,9 +10,10 @@ from typing import Any
 from common import Report
 
 from srfcli.results.tables import cell_text
-from srfcli.validation.trial.blind import Answer
-from srfcli.validation.trial.mark import Mark, Sight, mark
-from srfcli.validation.trial.report import (
+from srfcli.validation.blind import Answer
+from srfcli.validation.marks import (
+    Mark,
+    Sight,
     ablated,
     by_effect,
     by_outside,
@@ -21,6 +22,7 @@ from srfcli.validation.trial.report import (
     confusion,
     cost,
     held,
+    mark,
     rates,
     sizes,
 )

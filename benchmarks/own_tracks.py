@@ -26,10 +26,9 @@ EFFECTS = (
 
 def one(task: tuple[tuple[str, ...], float, int, bool]) -> tuple[str, str, bool, float]:
     """Return the verdict, the names, whether both are right, and the CPU it took."""
-    from srfcli.validation.generator.case import case_files, draw_recipe, read_gauge
-    from srfcli.validation.generator.physics import Track
-    from srfcli.validation.generator.slider import move
-    from srfcli.validation.trial.blind import SEARCHES
+    from srfcli.validation.blind import SEARCHES
+    from srfcli.validation.cases import case_files, draw_recipe, read_gauge
+    from srfcli.validation.slider import Track, move
 
     effects, amplitude, seed, staged = task
     rng = np.random.default_rng([seed, int(1e6 * amplitude), 7])

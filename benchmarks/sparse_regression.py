@@ -49,9 +49,9 @@ from srfcli.diagnosis.nudging import FOLLOWED, PULLS, Follower
 from srfcli.inference.fit import first_level
 from srfcli.inference.noise import Noise
 from srfcli.laws.registry import Registry, load_registry
-from srfcli.validation.generator.bank import unseal
-from srfcli.validation.trial.blind import FAILED, Answer, failed, read_answers, write_answers
-from srfcli.validation.trial.mark import Mark
+from srfcli.validation.blind import FAILED, Answer, failed, read_answers, write_answers
+from srfcli.validation.cases import unseal
+from srfcli.validation.marks import Mark
 
 MARGIN, CHANCE = 1.04, 3.72  # of the remainder over that of a simulated baseline; standard errors of one in 10^4
 LEAST_NOISE = 0.005  # um

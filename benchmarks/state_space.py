@@ -26,7 +26,7 @@ NAMES = {"mu0": "mu0", "A": "A", "B": "B", "D0": "D0", "Vsat": "Vsat", "lambda":
 
 
 def plans():
-    from srfcli.validation.generator.physics import Plan
+    from srfcli.validation.slider import Plan
 
     return (
         Plan("steps", ((2, 5), (1, 20), (1, 50), (1, 10)), 5.0, 0.004),
@@ -43,9 +43,8 @@ def one(task: tuple[float, bool, int]) -> dict[str, object]:
     from srfcli.inference.fit import fit_problem
     from srfcli.inference.state_space import fit_state_space
     from srfcli.laws.registry import load_registry
-    from srfcli.validation.generator.case import SPREAD, Gauge, case_files, read_gauge
-    from srfcli.validation.generator.physics import SMOOTH, Physics, Track
-    from srfcli.validation.generator.slider import move
+    from srfcli.validation.cases import SPREAD, Gauge, case_files, read_gauge
+    from srfcli.validation.slider import SMOOTH, Physics, Track, move
 
     amplitude, shared, seed = task
     rng = np.random.default_rng([seed, int(1e6 * amplitude), shared])

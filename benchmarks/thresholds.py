@@ -24,9 +24,8 @@ import numpy as np
 from common import Report, interleaved
 
 from srfcli.codegen.model import GeneratedModel, open_model
-from srfcli.inference.threshold_match import Matcher
 from srfcli.inference.threshold_table import Scale, Thresholds, free_parameters, with_transmission
-from srfcli.inference.thresholds import MethodFit, fit_thresholds, generated, with_noise
+from srfcli.inference.thresholds import Matcher, MethodFit, fit_thresholds, generated, with_noise
 from srfcli.laws.registry import load_registry
 
 TRIAL = {"A": 0.012, "B": 0.023, "D0": 0.40, "Vsat": 280.0, "lambda": 0.62, "rho": 0.48}

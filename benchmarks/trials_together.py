@@ -15,8 +15,8 @@ import common  # noqa: F401  before NumPy: it fixes the number of threads
 from common import Report
 from marked import marked, tell
 
-from srfcli.validation.generator.bank import unseal
-from srfcli.validation.trial.blind import read_answers
+from srfcli.validation.blind import read_answers
+from srfcli.validation.cases import unseal
 
 
 def main() -> None:

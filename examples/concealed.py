@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 
 from srfcli.core.errors import SrfError
-from srfcli.validation.generator.case import NAMES, OUTSIDE_NAMES, make_case
+from srfcli.validation.cases import NAMES, OUTSIDE_NAMES, make_case
 
 
 def main() -> None:

@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from srfcli.codegen.slider import system as system
     from srfcli.core.errors import SrfError as SrfError
     from srfcli.core.errors import Status as Status
-    from srfcli.tasks.boundary import continue_boundary as continue_boundary
-    from srfcli.tasks.boundary import critical as critical
     from srfcli.tasks.compare import compare as compare
-    from srfcli.tasks.fit import fit as fit
-    from srfcli.tasks.floquet import floquet as floquet
-    from srfcli.tasks.linear import linear as linear
     from srfcli.tasks.map import map as map
+    from srfcli.tasks.recordings import fit as fit
     from srfcli.tasks.recordings import read_experiment as read_experiment
     from srfcli.tasks.simulate import simulate as simulate
+    from srfcli.tasks.stability import continue_boundary as continue_boundary
+    from srfcli.tasks.stability import critical as critical
+    from srfcli.tasks.stability import floquet as floquet
+    from srfcli.tasks.stability import linear as linear
 
 
 # name: the module that has it, imported when the name is first used
@@ -39,14 +39,14 @@ PUBLIC = {
     "SlidingSystem": "srfcli.codegen.slider",
     "SrfError": "srfcli.core.errors",
     "Status": "srfcli.core.errors",
-    "continue_boundary": "srfcli.tasks.boundary",
-    "critical": "srfcli.tasks.boundary",
-    "floquet": "srfcli.tasks.floquet",
-    "linear": "srfcli.tasks.linear",
+    "continue_boundary": "srfcli.tasks.stability",
+    "critical": "srfcli.tasks.stability",
+    "floquet": "srfcli.tasks.stability",
+    "linear": "srfcli.tasks.stability",
     "load_law": "srfcli.codegen.slider",
     "map": "srfcli.tasks.map",
     "compare": "srfcli.tasks.compare",
-    "fit": "srfcli.tasks.fit",
+    "fit": "srfcli.tasks.recordings",
     "read_experiment": "srfcli.tasks.recordings",
     "simulate": "srfcli.tasks.simulate",
     "system": "srfcli.codegen.slider",

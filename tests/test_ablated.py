@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from srfcli.validation.trial.blind import Answer
-from srfcli.validation.trial.report import information_criterion, ungated
+from srfcli.validation.blind import Answer
+from srfcli.validation.marks import information_criterion, ungated
 
 ALPHA, DRAG = "linker-dieterich", "viscous-drag"
 

@@ -155,8 +155,7 @@ def test_results_are_frozen_and_have_every_form(linear) -> None:
 
 
 def test_a_notebook_shows_a_table_and_escapes_what_it_shows(linear) -> None:
-    from srfcli.results.base import SHOWN, table_html
-    from srfcli.results.tables import Column, Table
+    from srfcli.results.tables import SHOWN, Column, Table, table_html
 
     page = linear._repr_html_()
     assert page.count("<tr>") == 4 and "W0 [N]" in page

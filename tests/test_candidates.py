@@ -13,9 +13,8 @@ from srfcli.diagnosis.hypotheses import Hypothesis, applicable
 from srfcli.diagnosis.staged_search import Search
 from srfcli.diagnosis.verdict import judge_held
 from srfcli.laws.registry import bundled_registry, load_registry
-from srfcli.validation.generator.case import Gauge, case_files, read_gauge
-from srfcli.validation.generator.physics import Physics, Plan
-from srfcli.validation.generator.slider import move
+from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.slider import Physics, Plan, move
 
 SHIPPED = bundled_registry()
 OF_THE_MODULATION = {"load-transmission", "load-distortion"}

@@ -13,8 +13,8 @@ from srfcli.diagnosis.diagram import stability
 from srfcli.laws.registry import bundled_registry
 from srfcli.numerics.critical import critical_line
 from srfcli.results.report_figures import diagram_figure
-from srfcli.validation.generator.case import case_files
-from srfcli.validation.generator.physics import Physics, Plan
+from srfcli.validation.cases import case_files
+from srfcli.validation.slider import Physics, Plan
 
 SHIPPED = bundled_registry()
 PLANS = (

@@ -16,9 +16,8 @@ from srfcli.inference.prediction import of_run, predict
 from srfcli.laws.registry import bundled_registry, load_registry
 from srfcli.motion.imposed import Modulation
 from srfcli.tasks.law_check import check_law
-from srfcli.validation.generator.case import EFFECTS, OUTSIDE, case_files
-from srfcli.validation.generator.physics import Physics, example_protocol
-from srfcli.validation.generator.slider import move
+from srfcli.validation.cases import EFFECTS, OUTSIDE, case_files
+from srfcli.validation.slider import Physics, example_protocol, move
 
 SHIPPED = bundled_registry()
 NAMES = [e.name for e in SHIPPED.entries("effect")]

@@ -14,9 +14,8 @@ from srfcli.diagnosis.staged_search import Search, resized
 from srfcli.diagnosis.verdict import conclude
 from srfcli.inference.random_field import fit_latent
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.generator.case import Gauge, case_files, read_gauge
-from srfcli.validation.generator.physics import Physics, Plan
-from srfcli.validation.generator.slider import move
+from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.slider import Physics, Plan, move
 
 SHIPPED = bundled_registry()
 MASS = 6.2e-7  # N s^2/um

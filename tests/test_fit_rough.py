@@ -11,9 +11,8 @@ from click.testing import CliRunner
 
 from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiler
-from srfcli.validation.generator.case import Gauge, case_files, read_gauge
-from srfcli.validation.generator.physics import Physics, Plan, Track
-from srfcli.validation.generator.slider import move
+from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.slider import Physics, Plan, Track, move
 
 PLANS = (
     Plan("up", ((0.6, 20), (0.6, 60)), 3.0, 0.002),

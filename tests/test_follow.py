@@ -25,9 +25,8 @@ from srfcli.diagnosis.nudging import (
 from srfcli.inference.fit import first_level
 from srfcli.inference.noise import Noise
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.generator.case import Gauge, case_files, read_gauge
-from srfcli.validation.generator.physics import Physics, Plan
-from srfcli.validation.generator.slider import move
+from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.slider import Physics, Plan, move
 
 SHIPPED = bundled_registry()
 PLANS = (

@@ -14,9 +14,8 @@ from srfcli.diagnosis.scores import Remainder, Scores
 from srfcli.diagnosis.search import CLOSE, ModelSearch, conclude, log_evidence
 from srfcli.inference.state_space import COLOUR, Likelihood, correlated, fit_state_space
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.generator.case import Gauge, case_files, read_gauge
-from srfcli.validation.generator.physics import Physics, Plan, Track
-from srfcli.validation.generator.slider import move
+from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.slider import Physics, Plan, Track, move
 
 SHIPPED = bundled_registry()
 PLANS = (

@@ -18,10 +18,9 @@ from click.testing import CliRunner
 from srfcli.cli.main import cli
 from srfcli.cli.options import Spread
 from srfcli.core.errors import SrfError
+from srfcli.core.parallel import Store, fingerprint, run_here, run_processes, stored
 from srfcli.numerics.map import compute_map, solve_tile
 from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings, tile_tasks
-from srfcli.parallel.pool import run_here, run_processes
-from srfcli.parallel.store import Store, fingerprint, stored
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -390,7 +389,7 @@ def test_a_worker_of_the_cluster_killed_in_mid_run_costs_its_tile(model, cluster
 def test_a_cluster_that_is_not_there_is_told(monkeypatch):
     if not _has_distributed():
         pytest.skip("DASK.DISTRIBUTED ABSENT: pip install 'srfcli[cluster]' to test --cluster")
-    monkeypatch.setattr("srfcli.parallel.pool.PATIENCE", "1s")
+    monkeypatch.setattr("srfcli.core.parallel.PATIENCE", "1s")
     with pytest.raises(SrfError, match="no scheduler answers"):
         list(Spread(cluster="tcp://127.0.0.1:1").run(square, TASKS))
 

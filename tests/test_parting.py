@@ -42,9 +42,8 @@ from srfcli.laws.registry import bundled_registry
 from srfcli.motion.imposed import ConstantLoad, Drive
 from srfcli.motion.integrators import integrate
 from srfcli.results import report
-from srfcli.validation.generator.case import Gauge, case_files, read_gauge
-from srfcli.validation.generator.physics import Physics, Plan
-from srfcli.validation.generator.slider import move
+from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.slider import Physics, Plan, move
 
 SHIPPED = bundled_registry()
 RIVALS = ("linker-dieterich", "load-transmission")

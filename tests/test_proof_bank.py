@@ -13,20 +13,24 @@ import pytest
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
 from srfcli.laws.registry import load_registry
-from srfcli.validation.generator.bank import SEAL, check_cases, make_bank, plan_bank, seal, unseal
-from srfcli.validation.generator.case import (
+from srfcli.validation.cases import (
     KINDS,
     NAMES,
     OUTSIDE_NAMES,
+    SEAL,
     STARTS,
+    check_cases,
     draw_recipe,
     known_physics,
     known_plans,
     known_traces,
+    make_bank,
     make_case,
+    plan_bank,
+    seal,
+    unseal,
 )
-from srfcli.validation.generator.physics import Physics, Plan
-from srfcli.validation.generator.slider import move
+from srfcli.validation.slider import Physics, Plan, move
 
 NOISE = float(np.hypot(0.02, 0.005 / np.sqrt(12)))  # um, of a gauge and its quanta
 LAWS = {"srf-vsat", "dieterich-ruina"}
@@ -44,7 +48,7 @@ def rms(x):
 def quick(monkeypatch):
     """Cases of two short runs, one held out."""
     plans = (SHORT[1], replace(SHORT[0], holdout=True))
-    monkeypatch.setattr("srfcli.validation.generator.case.draw_protocol", lambda rng: plans)
+    monkeypatch.setattr("srfcli.validation.cases.draw_protocol", lambda rng: plans)
 
 
 def contents(folder):
@@ -121,7 +125,7 @@ def test_recipes_draw_what_is_asked_for():
 
 
 def test_a_slider_that_cannot_be_followed_is_drawn_again_and_in_the_end_told(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr("srfcli.validation.generator.slider.MOST_STEPS", 3)
+    monkeypatch.setattr("srfcli.validation.slider.MOST_STEPS", 3)
     assert not move(Physics(), SHORT[0]).complete
     with pytest.raises(SrfError, match="none of 8 sliders"):
         make_case(tmp_path / "c", 1)

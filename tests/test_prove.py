@@ -23,15 +23,10 @@ from hypothesis import strategies as st
 from srfcli.cli import prove as command
 from srfcli.cli.main import main
 from srfcli.core.errors import SrfError
+from srfcli.core.parallel import run_processes
 from srfcli.laws.registry import load_registry
-from srfcli.parallel.pool import run_processes
-from srfcli.validation.generator.bank import plan_bank
-from srfcli.validation.generator.case import KINDS, NAMES, make_case, variants
-from srfcli.validation.generator.physics import Physics, Plan
-from srfcli.validation.trial import mark as marking
-from srfcli.validation.trial import mark as sight
-from srfcli.validation.trial import report
-from srfcli.validation.trial.blind import (
+from srfcli.validation import marks as report
+from srfcli.validation.blind import (
     Answer,
     Task,
     answer_case,
@@ -42,9 +37,22 @@ from srfcli.validation.trial.blind import (
     to_line,
     write_answers,
 )
-from srfcli.validation.trial.mark import INVISIBLE, SIZES, Sight, accepted, deviation, mark, see, stands_out
-from srfcli.validation.trial.report import Rate, calibration, quantile
-from srfcli.validation.trial.run import Trial, answer_all, begin, open_truths
+from srfcli.validation.cases import KINDS, NAMES, make_case, plan_bank, variants
+from srfcli.validation.marks import (
+    INVISIBLE,
+    SIZES,
+    Rate,
+    Sight,
+    accepted,
+    calibration,
+    deviation,
+    mark,
+    quantile,
+    see,
+    stands_out,
+)
+from srfcli.validation.slider import Physics, Plan
+from srfcli.validation.trials import Trial, answer_all, begin, open_truths
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = (
@@ -97,7 +105,7 @@ def peeks(folder, plugins):
 def quick(monkeypatch):
     """Cases of two short runs, one held out."""
     plans = (SHORT[1], replace(SHORT[0], holdout=True))
-    monkeypatch.setattr("srfcli.validation.generator.case.draw_protocol", lambda rng: plans)
+    monkeypatch.setattr("srfcli.validation.cases.draw_protocol", lambda rng: plans)
 
 
 def new_trial(folder, n=4, **more):
@@ -386,16 +394,16 @@ def test_a_damaged_line_is_named(tmp_path, line):
 def test_an_effect_stands_out_by_what_the_baseline_cannot_do():
     """The size's standard error in a linear fit, by the normal equations, of a drag beside the baseline."""
     plan, p = SHORT[1], replace(Physics(), drag=3e-5)
-    gauge = replace(sight.Gauge(), lag1=0.6)
-    shown = {plan: sight.move(p, plan).u}
+    gauge = replace(report.Gauge(), lag1=0.6)
+    shown = {plan: report.move(p, plan).u}
     drag = variants("viscous-drag")[0]
     left, raw = stands_out(drag, [], p, gauge=gauge, shown=shown)
 
-    base = sight.move(replace(p, drag=0.0), plan).u
+    base = report.move(replace(p, drag=0.0), plan).u
     columns = [(shown[plan] - base) / p.drag]
     for name in ("mu0", "A", "B", "D0", "Vsat", "lam"):
         h = 1e-4 * getattr(p, name)
-        up, down = (sight.move(replace(p, drag=0.0, **{name: getattr(p, name) + s * h}), plan).u for s in (1, -1))
+        up, down = (report.move(replace(p, drag=0.0, **{name: getattr(p, name) + s * h}), plan).u for s in (1, -1))
         columns.append((up - down) / (2 * h))
     J = np.column_stack(columns)
     n, level2 = len(base), 0.02**2 + 0.005**2 / 12
@@ -412,7 +420,7 @@ def test_a_shift_of_a_free_parameter_does_not_stand_out():
     p = replace(Physics(), Wa=0.05)
     adhesion = variants("adhesion-offset")[0]
     for plan, most in ((steady, 0.2), (SHORT[1], np.inf)):
-        left, raw = stands_out(adhesion, [], p, gauge=sight.Gauge(), shown={plan: sight.move(p, plan).u})
+        left, raw = stands_out(adhesion, [], p, gauge=report.Gauge(), shown={plan: report.move(p, plan).u})
         assert left < most
         assert raw > 20
     assert left > 5  # a step of the load shows it
@@ -562,9 +570,9 @@ def test_a_diagnosis_is_given_the_case_and_nothing_else(quick, tmp_path):
     trial = new_trial(tmp_path / "t", 1)
     (found,) = answer_all(trial, diagnose=peeks)
     assert found.not_identifiable == ("experiment.toml", "steps.csv", "wave.csv")
-    tree = ast.parse((ROOT / "srfcli" / "validation" / "trial" / "blind.py").read_text())
+    tree = ast.parse((ROOT / "srfcli" / "validation" / "blind.py").read_text())
     modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
-    forbidden = ("srfcli.validation.generator", "srfcli.validation.trial.run", "srfcli.validation.trial.mark")
+    forbidden = ("srfcli.validation.cases", "srfcli.validation.slider", "srfcli.validation.trials", "srfcli.validation.marks")
     assert not [m for m in modules if m.startswith(forbidden)]
 
 
@@ -576,7 +584,7 @@ def test_kinds_of_a_bank():
     assert plan_bank(200, 5, kinds=KINDS) == plan_bank(200, 5)
     with pytest.raises(SrfError, match="unknown kind of case 'sngle'"):
         plan_bank(5, 1, kinds=["sngle"])
-    assert command.KINDS == KINDS == marking.KINDS
+    assert command.KINDS == KINDS
 
 
 def deadly(task):

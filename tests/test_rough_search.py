@@ -17,9 +17,8 @@ from srfcli.diagnosis.staged_search import SHARES, Entrant, Search, grow, whole
 from srfcli.inference import random_field as latent
 from srfcli.inference.random_field import GRID, ROUGHLY, USUAL, Latent, Point, Roughness, Tracks, fit_latent, tracks_for
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.generator.case import Gauge, case_files, read_gauge
-from srfcli.validation.generator.physics import Physics, Plan, Track
-from srfcli.validation.generator.slider import move
+from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.slider import Physics, Plan, Track, move
 
 SHIPPED = bundled_registry()
 PLANS = (

@@ -15,9 +15,8 @@ from srfcli.diagnosis.staged_search import WORTH, Search, alike_on_rough_tracks,
 from srfcli.inference.noise import stretches, whiten
 from srfcli.inference.random_field import Roughness, Tracks, fit_latent, tracks_for
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.generator.case import Gauge, case_files, read_gauge
-from srfcli.validation.generator.physics import Physics, Plan
-from srfcli.validation.generator.slider import move
+from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.slider import Physics, Plan, move
 
 SHIPPED = bundled_registry()
 PLANS = (

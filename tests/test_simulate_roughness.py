@@ -26,8 +26,7 @@ from srfcli.data.experiment import read_experiment
 from srfcli.data.noise import FINEST_KNOTS, KNOTS, WIDEST_KNOTS, RoughTrack
 from srfcli.data.values import Experiment
 from srfcli.laws.registry import load_registry
-from srfcli.validation.generator.physics import Physics, Plan, Track
-from srfcli.validation.generator.slider import move
+from srfcli.validation.slider import Physics, Plan, Track, move
 
 STEADY = ("--V", "10", "--W0", "5", "--for", "2", "--rate", "100")
 

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.settings import Parameter
-from srfcli.inference.threshold_match import FAR, Matcher, forced_slopes, hopf_slopes
 from srfcli.inference.threshold_table import (
     FreeParameter,
     Scale,
@@ -28,7 +27,16 @@ from srfcli.inference.threshold_table import (
     thresholds_csv,
     with_transmission,
 )
-from srfcli.inference.thresholds import fit_thresholds, generated, uncertainty, with_noise
+from srfcli.inference.thresholds import (
+    FAR,
+    Matcher,
+    fit_thresholds,
+    forced_slopes,
+    generated,
+    hopf_slopes,
+    uncertainty,
+    with_noise,
+)
 from srfcli.numerics.boundary import along, polish
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import hopf_points

@@ -83,7 +83,7 @@ def command(
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.core.errors import SrfError
     from srfcli.numerics.continuation import AtlasSettings, StepSettings
-    from srfcli.tasks.boundary import continue_boundary
+    from srfcli.tasks.stability import continue_boundary
 
     if not 1e-4 <= step <= 0.5:
         raise SrfError(

@@ -72,7 +72,7 @@ def command(
     meshes that are doubled until the error is met. Odd crossings lose stability as W0 rises, even ones regain it.
     """
     from srfcli.cli.emit import Progress, emit, finish
-    from srfcli.tasks.boundary import critical
+    from srfcli.tasks.stability import critical
 
     slider = system.slider()
     limits = None if window is None else _window(window).fitted(slider.model.parameters, where=slider.model.title)

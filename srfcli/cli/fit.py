@@ -113,8 +113,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.inference.posterior import to_arviz
     from srfcli.results.fit import ADVICE
-    from srfcli.tasks.fit import fit
-    from srfcli.tasks.recordings import read_experiment
+    from srfcli.tasks.recordings import fit, read_experiment
 
     registry = system.registry()
     experiment = read_experiment(source, format=options["reader"], registry=registry)

@@ -48,7 +48,7 @@ def command(
     """
     from srfcli.cli.base import EXIT_CONDITION, EXIT_OK
     from srfcli.cli.emit import emit, finish
-    from srfcli.tasks.floquet import floquet
+    from srfcli.tasks.stability import floquet
 
     slider = system.slider(V=V, W0=W0, eps=eps)
     system.say_defaults(slider.resolved, ("V", "W0", "eps"))

@@ -39,7 +39,7 @@ def command(system: SystemOptions, over: tuple[Range, ...], all_roots: bool, out
     closed forms for a rigid interface, and for a rigid interface without inertia.
     """
     from srfcli.cli.emit import emit
-    from srfcli.tasks.linear import linear
+    from srfcli.tasks.stability import linear
 
     slider = system.slider()
     ranges = [r.fitted(slider.model.parameters, where=slider.model.title) for r in over or (parse_over("V=1:100:60"),)]

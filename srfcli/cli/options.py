@@ -502,7 +502,7 @@ class Spread:
         if self.resume is None:
             yield from self._fresh(function, tasks)
             return
-        from srfcli.parallel.store import Store, stored
+        from srfcli.core.parallel import Store, stored
 
         yield from stored(self._fresh, Store(self.resume), function, tasks)
 
@@ -510,15 +510,15 @@ class Spread:
         if not tasks:
             return
         if self.cluster is not None:
-            from srfcli.parallel.pool import run_cluster
+            from srfcli.core.parallel import run_cluster
 
             yield from run_cluster(function, tasks, address=self.cluster)
         elif self.workers > 1:
-            from srfcli.parallel.pool import run_processes
+            from srfcli.core.parallel import run_processes
 
             yield from run_processes(function, tasks, workers=self.workers)
         else:
-            from srfcli.parallel.pool import run_here
+            from srfcli.core.parallel import run_here
 
             yield from run_here(function, tasks)
 

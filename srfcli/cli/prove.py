@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from srfcli.results.tables import Table
-    from srfcli.validation.trial.run import Trial
+    from srfcli.validation.trials import Trial
 
 EXAMPLES = """
 srf prove --out proof                                      ten cases: a first look, half an hour
@@ -92,7 +92,7 @@ def command(
     import os
 
     from srfcli.core.errors import SrfError
-    from srfcli.validation.trial.run import Trial
+    from srfcli.validation.trials import Trial
 
     if as_json and as_csv:
         raise SrfError("--json and --csv exclude each other", "--report-only prints the other at no cost.")
@@ -131,8 +131,8 @@ def _answered(
     from srfcli.cli.emit import Progress
     from srfcli.core.errors import SrfError
     from srfcli.laws.registry import load_registry
-    from srfcli.validation.trial.blind import SEARCHES
-    from srfcli.validation.trial.run import answer_all, begin
+    from srfcli.validation.blind import SEARCHES
+    from srfcli.validation.trials import answer_all, begin
 
     if unfinished:
         raise SrfError("--unfinished ends a trial that was begun", f"srf prove --report-only {folder} --unfinished")
@@ -164,9 +164,8 @@ def _answered(
 def _report(trial: Trial, workers: int, unfinished: bool, format: str) -> None:
     """Unseal, mark every answer, print the tables and keep them beside the answers."""
     from srfcli.cli.emit import Progress, emit
-    from srfcli.validation.trial.mark import mark, see_all
-    from srfcli.validation.trial.report import cases, tables
-    from srfcli.validation.trial.run import open_truths
+    from srfcli.validation.marks import cases, mark, see_all, tables
+    from srfcli.validation.trials import open_truths
 
     truths, answers = open_truths(trial, unfinished=unfinished)
     sights = {}

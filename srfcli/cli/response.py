@@ -145,7 +145,7 @@ def _mean(
     import numpy as np
 
     from srfcli.numerics.response import mean_friction
-    from srfcli.results.boundary import worst
+    from srfcli.results.stability import worst
     from srfcli.results.tables import Table
 
     values = np.array(swept.base_points(model.parameters, where=model.title))

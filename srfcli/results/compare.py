@@ -10,8 +10,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import Status
-from srfcli.results.base import Result
-from srfcli.results.tables import Column, Table
+from srfcli.results.tables import Column, Result, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import Status
 from srfcli.core.units import from_base
-from srfcli.results.base import Result, own_figure
-from srfcli.results.tables import Column, Table
+from srfcli.results.tables import Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import Status
-from srfcli.results.base import Result, load_xarray
-from srfcli.results.boundary import COLUMNS, boundary_row
-from srfcli.results.tables import Column, Table
+from srfcli.results.stability import COLUMNS, boundary_row
+from srfcli.results.tables import Column, Result, Table, load_xarray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from srfcli.core.errors import SrfError, Status
+from srfcli.core.parallel import Run, run_here
 from srfcli.numerics.compare import (
     LawStudy,
     LawTask,
@@ -21,7 +22,6 @@ from srfcli.numerics.compare import (
     study_law,
 )
 from srfcli.results.compare import ComparisonResult
-from srfcli.tasks.values import Run, here
 
 if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
@@ -37,7 +37,7 @@ def compare(
     V: tuple[float, float] = (1.0, 100.0),
     K_over_W0: tuple[float, float] | None = None,
     points: Mapping[str, int] | None = None,
-    run: Run = here,
+    run: Run = run_here,
     progress: Callable[[str], None] = lambda name: None,
 ) -> ComparisonResult:
     """Return where laws differ once each is brought to the first one's observables at one low velocity.

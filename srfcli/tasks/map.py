@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from srfcli.core.errors import SrfError, Status
+from srfcli.core.parallel import Run, run_here
 from srfcli.core.settings import require_parameter
 from srfcli.core.units import to_base
 from srfcli.numerics.continuation import Atlas, AtlasSettings
@@ -17,7 +18,6 @@ from srfcli.numerics.normal_form import branch_coefficients, criticality_points
 from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings, check_grid
 from srfcli.numerics.special_points import SpecialPoint, special_points
 from srfcli.results.map import MapResult
-from srfcli.tasks.values import Run, here
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,7 +36,7 @@ def map(  # the command's own name
     curves: AtlasSettings | None = None,
     boundaries: bool = True,
     criticality: bool = True,
-    run: Run = here,
+    run: Run = run_here,
     tiles: Callable[[int, int], None] = lambda done, count: None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> MapResult:
@@ -95,7 +95,7 @@ def map_grid(
     curves: AtlasSettings | None = None,
     boundaries: bool = True,
     criticality: bool = True,
-    run: Run = here,
+    run: Run = run_here,
     tiles: Callable[[int, int], None] = lambda done, count: None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> MapResult:

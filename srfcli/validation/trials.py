@@ -14,9 +14,8 @@ from typing import Any
 
 from srfcli.core.errors import SrfError
 from srfcli.core.files import clear, parse_json, read_plain, write_atomic
-from srfcli.parallel.pool import run_processes
-from srfcli.validation.generator.bank import SEAL, Truths, check_cases, make_bank, unseal
-from srfcli.validation.trial.blind import (
+from srfcli.core.parallel import run_processes
+from srfcli.validation.blind import (
     Answer,
     Diagnose,
     Task,
@@ -26,6 +25,7 @@ from srfcli.validation.trial.blind import (
     read_answers,
     write_answers,
 )
+from srfcli.validation.cases import SEAL, Truths, check_cases, make_bank, unseal
 
 SCHEMA = "srf.trial/1"
 LIMIT = 1800.0  # s of CPU a case may take: six times what it should

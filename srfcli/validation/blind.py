@@ -118,7 +118,7 @@ def write_answers(path: Path, answers: Iterable[Answer]) -> None:
 # The diagnosis of one case, by somebody who has its folder and nothing else. Nothing here can reach a truth.
 
 Diagnose = Callable[[Path, tuple[Path, ...]], Answer]  # folder of a case, folders of plugins
-ELSEWHERE = ("cli", "parallel", "results", "validation")  # parts of the package that no answer depends on
+ELSEWHERE = ("cli", "results", "validation")  # parts of the package that no answer depends on
 
 
 @dataclass(frozen=True)
@@ -270,7 +270,7 @@ def _registry(plugins: tuple[Path, ...]) -> Registry:
 @functools.cache
 def code_of(plugins: tuple[Path, ...]) -> str:
     """Return twelve digits that change with any file of the package, or of `plugins`, on which an answer depends."""
-    package = Path(__file__).resolve().parents[2]
+    package = Path(__file__).resolve().parents[1]
     parts = [p for p in sorted(package.iterdir()) if p.name not in ELSEWHERE]
     whole = hashlib.sha256()
     for path in _sources([*parts, package.parent / "plugins", *plugins]):

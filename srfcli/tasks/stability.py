@@ -1,7 +1,8 @@
-"""`critical` and `continue`: the stability boundary under modulation, point by point and as curves."""
+"""`linear`, `floquet`, `critical` and `continue`: the stability of sliding under a constant and under a modulated load."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -9,18 +10,140 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from srfcli.codegen.model import GeneratedModel
 from srfcli.core.errors import SrfError, Status
+from srfcli.core.settings import check_value, require_parameter
 from srfcli.core.units import to_base
 from srfcli.numerics.continuation import Atlas, AtlasSettings, find_components
 from srfcli.numerics.critical import LoadWindow, critical_line, found_window
+from srfcli.numerics.floquet import solve_floquet
+from srfcli.numerics.hopf import HopfPoint, closed_forms, hopf_points, weakening
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.results.boundary import BoundaryResult, CriticalResult, worst
-from srfcli.tasks.values import checked
+from srfcli.results.stability import BoundaryResult, CriticalResult, LinearResult, PeriodicResult, worst
 
 if TYPE_CHECKING:
-    from srfcli.codegen.model import GeneratedModel
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.boundary import BoundaryPoint
+
+
+def swept(model: GeneratedModel, over: Mapping[str, Sequence[float] | float]) -> dict[str, tuple[float, ...]]:
+    """Return parameter -> values in declared units; raises SrfError for an unknown name or a value out of bounds."""
+    return {name: checked(model, name, values) for name, values in over.items()}
+
+
+def checked(model: GeneratedModel, name: str, values: Any) -> tuple[float, ...]:
+    """Return the values of one parameter, a number or several, in its declared unit; raises SrfError as `swept` does."""
+    parameter = require_parameter(name, model.parameters, where=model.title)
+    listed = np.atleast_1d(np.asarray(values, float))
+    if listed.ndim != 1 or not listed.size:
+        raise SrfError(f"{name}: expected a number or a list of numbers", f'Like {{"{name}": [1, 2, 5]}}.')
+    return tuple(check_value(parameter, float(v)) for v in listed)
+
+
+# `linear`: stability of steady sliding under constant load.
+
+VELOCITIES = tuple(np.geomspace(1.0, 100.0, 60).tolist())  # um/s
+
+
+def linear(
+    system: SlidingSystem, *, over: Mapping[str, Sequence[float] | float] | None = None, all_roots: bool = False
+) -> LinearResult:
+    """Return the critical load, K/W0 and frequency of steady sliding, from the exact characteristic polynomial.
+
+    Parameters
+    ----------
+    system : SlidingSystem
+        The slider, from `srfcli.symbolic.system`.
+    over : mapping from parameter to values, optional
+        Values in declared units; a grid of their products. V from 1 to 100 um/s if left out.
+    all_roots : bool
+        Whether every Hopf point is listed, also where stability returns or other roots are unstable.
+
+    Returns
+    -------
+    LinearResult
+        One row for each point of the grid; where there is no Hopf point its status says so.
+
+    Raises
+    ------
+    SrfError
+        For a parameter that the system does not have, or a value out of bounds.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> found = srf.linear(srf.system(), over={"V": [1, 10, 100]})
+    >>> [round(W0, 4) for W0 in found.to_dataframe()["W0"]]
+    [7.2832, 7.805, 13.0808]
+    """
+    grid = swept(system.model, over or {"V": VELOCITIES})
+    points: list[dict[str, Any]] = []
+    for values in itertools.product(*grid.values()):
+        points += _rows(system, dict(zip(grid, values, strict=True)), all_roots)
+    return LinearResult(system, grid, tuple(points))
+
+
+def _rows(system: SlidingSystem, at: dict[str, float], all_roots: bool) -> list[dict[str, Any]]:
+    """Return the rows of one parameter point: its critical load, or every Hopf point, or one row that says there is none."""
+    model, p = system.model, system.vector(**at)
+    value = {name: float(p[model.index(name)]) for name in model.names}
+    common: dict[str, Any] = {n: model.declared(n, value[n]) for n in at} | {"V": value["V"], "K": value["K"]}
+    common |= closed_forms(model, p)
+    points = hopf_points(model, p)
+    if not all_roots:
+        points = [q for q in points if q.leading and q.crossing_rate > 0][:1]
+    if not points:
+        falling = float(np.asarray(weakening(model, p))) > 0
+        return [common | {"status": "no Hopf" if falling else "velocity strengthening: no Hopf"}]
+    return [common | _point_cells(q, value) for q in points]
+
+
+def _point_cells(point: HopfPoint, value: dict[str, float]) -> dict[str, Any]:
+    cells: dict[str, Any] = {"W0": point.W0, "K_over_W0": value["K"] / point.W0, "Omega_c": point.Omega}
+    cells["crossing_rate"], cells["lyapunov"], cells["leading"] = point.crossing_rate, point.lyapunov, point.leading
+    known = math.isfinite(point.lyapunov)
+    cells["criticality"] = ("direct" if point.direct else "inverted") if known else None
+    if "D0" in value:
+        cells["Omega_reduced"] = value["D0"] * point.Omega / value["V"]
+    return cells | {"status": "ok" if known else "no Lyapunov coefficient: the Jacobian overflows"}
+
+
+# `floquet`: one forced periodic state in full.
+
+
+def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, harmonics: int = 5) -> PeriodicResult:
+    """Return the forced periodic state at the system's V, W0 and eps: multipliers, mean friction, harmonics.
+
+    Parameters
+    ----------
+    system : SlidingSystem
+        The slider, from `srfcli.symbolic.system`.
+    tol : float
+        Error of the multipliers; the mesh is doubled until it is met.
+    max_mesh : int
+        Intervals of the finest mesh.
+    harmonics : int
+        Harmonics of elongation and friction.
+
+    Returns
+    -------
+    PeriodicResult
+        Where no state was found its status says so.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> state = srf.floquet(srf.system(V=8, W0=9, eps=0.09))
+    >>> state.stable, round(state.state.mean_friction, 6)
+    (True, 0.418811)
+    """
+    p = system.model.vector(system.resolved.values)
+    system.model.check_changing_load(p)
+    found = solve_floquet(system.model, p, tol=tol, max_mesh=max_mesh, harmonics=harmonics)
+    return PeriodicResult(system, found)
+
+
+# `critical` and `continue`: the stability boundary under modulation, point by point and as curves.
 
 LINES = 5  # that are followed outwards to find the loads to look between
 Values = Sequence[float] | float

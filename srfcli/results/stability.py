@@ -1,0 +1,386 @@
+"""Stability of sliding: under constant load, of one forced periodic state, and the boundary under modulation."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+from srfcli.core.errors import Status
+from srfcli.results.tables import Column, Result, Table, own_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from srfcli.codegen.model import GeneratedModel
+    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.numerics.boundary import BoundaryPoint
+    from srfcli.numerics.continuation import Atlas
+    from srfcli.numerics.floquet import FloquetResult
+
+# Steady sliding under constant load: critical loads from the characteristic polynomial.
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class LinearResult(Result):
+    """Critical loads of steady sliding at every point of a grid.
+
+    Attributes
+    ----------
+    system : SlidingSystem
+        The laws and the parameters that were not swept.
+    over : Mapping[str, tuple of float]
+        The values of each parameter that was swept, in its declared unit.
+    points : tuple of Mapping[str, Any]
+        One mapping for each row of the table, from column to value.
+    """
+
+    system: SlidingSystem
+    over: Mapping[str, tuple[float, ...]]
+    points: tuple[Mapping[str, Any], ...] = field(repr=False)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return critical load, K/W0 and frequency with the closed forms beside them, a row for each point."""
+        units = {q.name: q for q in self.system.model.parameters}
+        names = [n for n in self.over if n not in ("V", "W0")]
+        columns = (
+            Column("V", "um/s", "driving velocity"),
+            Column("K_over_W0", "1/um", "critical K/W0"),
+            Column("W0", "N", "critical load: stability is lost above it"),
+            Column("Omega_c", "rad/s", "frequency at the bifurcation"),
+            *(Column(n, units[n].unit, units[n].about) for n in names),
+            Column("Omega_reduced", "1", "D0 Omega_c / V"),
+            Column("K_over_W0_rigid", "1/um", "the same for kappa to infinity (closed form)"),
+            Column("K_over_W0_quasistatic", "1/um", "the same for kappa to infinity and M to 0 (closed form)"),
+            Column("Omega_rigid", "rad/s", "Omega_c for kappa to infinity (closed form)"),
+            Column("crossing_rate", "1/(N s)", "d Re(s)/dW0 at the root", ".4g"),
+            Column("lyapunov", "1", "Re c/Omega of z' = i Omega z + c z |z|^2, delta ln v = 2 Re z", ".4g"),
+            Column("criticality", "", "direct or inverted Hopf bifurcation"),
+            Column("leading", "", "all other roots are stable"),
+            Column("status", "", ""),
+        )
+        cells = [tuple(row.get(c.name) for c in columns) for row in self.points]
+        kept = self.system.described(without=(*self.over, "W0", "eps", "f"))
+        return Table("srf.linear/1", columns, cells, title=self.system.model.title, parameters=kept)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the critical K/W0 (1/um) over the first parameter that was swept, a curve for each value of the others."""
+        from srfcli.results import plots
+
+        (x, values), *others = self.over.items()
+        unit = {q.name: q.unit for q in self.system.model.parameters}
+        title = plots.titled(self.table.title, self.table.parameters)
+        if x == "V" and not others:
+            curve = {k: [row.get(k) for row in self.points] for k in ("V", "K_over_W0")}
+            return plots.stability_diagram([], hopf=curve, title=title, ax=ax)
+        groups: dict[str, list[Mapping[str, Any]]] = {}
+        for row in self.points:
+            name = ", ".join(plots.valued(n, row[n], unit[n]) for n, _ in others)
+            groups.setdefault(name, []).append(row)
+        return plots.lines(
+            [row[x] for row in next(iter(groups.values()))],
+            [[row.get("K_over_W0") for row in group] for group in groups.values()],
+            list(groups),
+            plots.axis_label(x, unit[x]),
+            "critical K/W$_0$  [1/µm]",
+            logx=spread(values),
+            title=title,
+            ax=ax,
+        )
+
+
+def spread(values: tuple[float, ...]) -> bool:
+    """Return whether rising values are spaced logarithmically: by one ratio, or over a decade where they are two."""
+    if len(values) < 3:
+        return len(values) == 2 and 0 < 10 * values[0] <= values[1]
+    if values[0] <= 0:
+        return False
+    ratio = (values[-1] / values[0]) ** (1 / (len(values) - 1))
+    return all(abs(b / a / ratio - 1) < 1e-6 for a, b in itertools.pairwise(values))
+
+
+# One forced periodic state: its Floquet multipliers, mean friction and harmonics.
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class PeriodicResult(Result):
+    """The forced periodic state at one point.
+
+    Attributes
+    ----------
+    system : SlidingSystem
+        Laws and parameters.
+    state : FloquetResult
+        The orbit on its mesh, the multipliers (complex, n), mean friction and harmonics.
+    """
+
+    system: SlidingSystem
+    state: FloquetResult = field(repr=False)
+
+    @property
+    def stable(self) -> bool:
+        """Return whether all multipliers lie inside the unit circle."""
+        return bool(self.state.stable)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each multiplier, largest modulus first; `meta` has friction and harmonics."""
+        import numpy as np
+
+        r, model, parameters = self.state, self.system.model, self.system.described()
+        f = float(r.p[model.index("f")])
+        columns = (
+            Column("multiplier", "1", "number, largest modulus first"),
+            Column("re", "1", "real part", ".9g"),
+            Column("im", "1", "imaginary part", ".9g"),
+            Column("modulus", "1", "", ".9g"),
+            Column("theta", "rad", "angle over one forcing period", ".9g"),
+            Column("growth_rate", "1/s", "ln|multiplier| times the forcing frequency"),
+            Column("error", "1", "estimated error of the multipliers", ".2g"),
+        )
+        rows = []
+        for i, m in enumerate(r.multipliers):
+            modulus = abs(m)
+            growth = float(np.log(modulus) * f) if modulus > 0 else None
+            rows.append((i + 1, m.real, m.imag, modulus, float(np.angle(m)), growth, r.error))
+        intervals = len(r.orbit.edges) - 1
+        if not r.found:
+            notes: tuple[str, ...] = (f"no forced periodic state was found, on up to {intervals} intervals",)
+            meta: dict[str, Any] = {"stable": None, "intervals": intervals}
+            return Table("srf.floquet/1", columns, rows, model.title, notes, parameters, meta, r.status.value)
+        meta = {
+            "stable": r.stable,
+            "mean_friction": r.mean_friction,
+            "friction_shift": r.friction_shift,
+            "u_harmonics": [
+                {"k": k, "amplitude_um": abs(c), "phase": float(np.angle(c))} for k, c in enumerate(r.u_harmonics)
+            ],
+            "mu_harmonics": [
+                {"k": k, "amplitude": abs(c), "phase": float(np.angle(c))} for k, c in enumerate(r.mu_harmonics)
+            ],
+            "intervals": intervals,
+            "liouville": r.liouville,
+        }
+        notes = (
+            f"{'stable' if r.stable else 'unstable'}; error of the multipliers {r.error:.1g} on {intervals} intervals, "
+            f"product of the multipliers against exp(integrated trace) {_checked(r.liouville)}",
+            f"mean friction {r.mean_friction:.8f}, shift from eps = 0 {r.friction_shift:+.8f}",
+            "harmonics of u [um]: " + ", ".join(f"{k}: {abs(c):.4g}" for k, c in enumerate(r.u_harmonics)),
+            "harmonics of mu: " + ", ".join(f"{k}: {abs(c):.4g}" for k, c in enumerate(r.mu_harmonics)),
+        )
+        return Table("srf.floquet/1", columns, rows, model.title, notes, parameters, meta, r.status.value)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return one period of elongation, slip velocity, ages, friction and load, a panel for each."""
+        import numpy as np
+
+        from srfcli.numerics.floquet import waveforms
+        from srfcli.results import plots
+
+        own_figure(ax, "a periodic state")
+        r, model = self.state, self.system.model
+        waves = waveforms(model, r.p, r.orbit, 400)
+        # the period closes: its end is its beginning
+        tau, closed = np.append(waves.tau, 1.0), lambda values: np.append(values, values[0])
+        column = {name: closed(waves.x[:, i]) for i, name in enumerate(model.states)}
+        ages = {n[3:]: np.exp(values) for n, values in column.items() if n.startswith("ln_") and n != "ln_v"}
+        verdict = ("stable" if r.stable else "unstable") if r.found else "not converged"
+        title = plots.titled(f"{model.title}, {verdict}", self.table.parameters)
+        return plots.orbit(
+            tau, u=closed(waves.u), v=np.exp(column["ln_v"]), states=ages, mu=closed(waves.mu), W=closed(waves.W),
+            title=title,
+        )  # fmt: skip
+
+
+def _checked(mismatch: float) -> str:
+    return f"{mismatch:.1g}" if mismatch == mismatch else "not compared: the fastest multiplier is far below rounding"
+
+
+# Critical loads under modulation: points at given velocities, and the boundary as curves.
+
+COLUMNS = (
+    Column("eps", "1", "modulation amplitude"),
+    Column("component", "1", "number of the connected curve, none where points are found one by one"),
+    Column("crossing", "1", "number among the crossings at this V, from low W0; odd: stability is lost as W0 rises"),
+    Column("type", "", "ns, pd or fold: a multiplier off the real axis, at -1, at +1"),
+    Column("V", "um/s", "driving velocity"),
+    Column("K_over_W0", "1/um", "critical K/W0", ".10g"),
+    Column("W0", "N", "critical load", ".10g"),
+    Column("theta", "rad", "angle of the critical multiplier over one forcing period"),
+    Column("status", "", ""),
+    Column("W0_low", "N", "bracket of W0, from the estimated error", ".10g"),
+    Column("W0_high", "N", "bracket of W0, from the estimated error", ".10g"),
+    Column("error", "1", "estimated relative error", ".2g"),
+    Column("residual", "1", "what Newton's method left of the correction, relative", ".2g"),
+    Column("slope", "1", "d ln|multiplier| / d ln W0 at fixed V", ".4g"),
+    Column("others", "1", "largest modulus among the other multipliers", ".3g"),
+    Column("intervals", "1", "of the mesh"),
+)
+
+
+def boundary_row(
+    model: GeneratedModel,
+    point: BoundaryPoint,
+    component: int | None,
+    crossing: int | None,
+    extra: tuple[str, ...] = (),
+) -> tuple[Any, ...]:
+    """Return one boundary point under COLUMNS, then the parameters `extra` in their declared units."""
+    value = {n: point.value(model, n) for n in ("eps", "V", "K", "W0")}
+    width = point.error * value["W0"]
+    return (
+        value["eps"],
+        component,
+        crossing,
+        point.kind,
+        value["V"],
+        value["K"] / value["W0"],
+        value["W0"],
+        point.theta,
+        point.status.value,
+        value["W0"] - width,
+        value["W0"] + width,
+        point.error,
+        point.residual,
+        point.slope,
+        point.others,
+        point.orbit.x.shape[-2],
+        *(model.declared(n, point.value(model, n)) for n in extra),
+    )
+
+
+def worst(statuses: Iterable[Status]) -> Status:
+    """Return the first status whose numbers cannot be used as they stand, else OK."""
+    return next((s for s in statuses if not s.ok), Status.OK)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class CriticalResult(Result):
+    """Every critical load at some velocities and amplitudes, numbered from low W0.
+
+    Attributes
+    ----------
+    system : SlidingSystem
+        The laws and the parameters that were not swept.
+    points : tuple of BoundaryPoint
+        The polished crossings, each with its bracket, error and status.
+    crossings : tuple of int
+        The number of each at its velocity; stability is lost at odd ones as W0 rises, regained at even ones.
+    said : tuple of str
+        Where was looked, and what was not found.
+    worst : Status
+        The worst status of lines and points.
+    """
+
+    system: SlidingSystem
+    points: tuple[BoundaryPoint, ...] = field(repr=False)
+    crossings: tuple[int, ...] = field(repr=False)
+    said: tuple[str, ...] = field(repr=False)
+    worst: Status = Status.OK
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each critical load, with its bracket and error."""
+        model = self.system.model
+        rows = [boundary_row(model, q, None, k) for q, k in zip(self.points, self.crossings, strict=True)]
+        described = self.system.described(without=("W0", "V", "eps"))
+        return Table("srf.critical/1", COLUMNS, rows, model.title, self.said, described, status=self.worst.value)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the critical K/W0 (1/um) against V (um/s), a mark for each crossing."""
+        from srfcli.results import plots
+
+        names = [c.name for c in COLUMNS]
+        points = [dict(zip(names, row, strict=True)) for row in self.table.rows]
+        return plots.critical_points(points, title=plots.titled(self.table.title, self.table.parameters), ax=ax)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class BoundaryResult(Result):
+    """The stability boundary in a plane of two parameters: all components in a window, a set for each amplitude.
+
+    Attributes
+    ----------
+    system : SlidingSystem
+        The laws and the parameters that were not swept.
+    atlases : tuple of Atlas
+        The components in the plane of each amplitude: polished points, how each curve ends, notes and status.
+    worst : Status
+        The worst status, INTERRUPTED where the search was stopped.
+    """
+
+    system: SlidingSystem
+    atlases: tuple[Atlas, ...] = field(repr=False)
+    worst: Status = Status.OK
+
+    @property
+    def _axes(self) -> tuple[str, str]:
+        plane = self.atlases[0].plane if self.atlases else None
+        return (plane.x.name, plane.y.name) if plane else ("V", "W0")
+
+    @cached_property
+    def table(self) -> Table:
+        """Return a row for each point, component after component."""
+        from srfcli.numerics.continuation import crossing_numbers
+
+        model, rows, notes = self.system.model, [], []
+        extra = tuple(n for n in self._axes if n not in ("V", "W0", "eps"))
+        for atlas in self.atlases:
+            numbers = crossing_numbers(model, atlas)
+            for component, (branch, crossings) in enumerate(zip(atlas.branches, numbers, strict=True), 1):
+                pairs = zip(branch.points, crossings, strict=True)
+                rows += [boundary_row(model, q, component, k, extra) for q, k in pairs]
+            named = "" if "eps" in self._axes else f"eps = {atlas.plane.base[model.index('eps')]:g}: "
+            count = len(atlas.branches)
+            ends = "; ".join(f"{i}: {b.start.value}, {b.end.value}" for i, b in enumerate(atlas.branches, 1))
+            notes.append(f"{named}{count} component{'' if count == 1 else 's'}" + (f" (ends {ends})" if count else ""))
+            notes += [named + note for note in atlas.notes]
+        units = {q.name: q for q in model.parameters}
+        columns = (*COLUMNS, *(Column(n, units[n].unit, units[n].about) for n in extra))
+        described = self.system.described(without=(*self._axes, "eps"))
+        return Table("srf.continue/1", columns, rows, model.title, tuple(notes), described, status=self.worst.value)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the boundary in its plane; against V and K/W0 with that under constant load, and stable sliding shaded."""
+        import numpy as np
+
+        from srfcli.numerics.hopf import critical_point
+        from srfcli.results import plots
+
+        model, title = self.system.model, plots.titled(self.table.title, self.table.parameters)
+        if not self.atlases:
+            return plots.stability_diagram([], title=title, ax=ax)
+        plane, usual = self.atlases[0].plane, self._axes == ("V", "W0")
+        branches = [
+            {
+                "eps": float(atlas.plane.base[model.index("eps")]),
+                "V": [model.declared(plane.x.name, q.value(model, plane.x.name)) for q in branch.points],
+                "K_over_W0": [
+                    q.value(model, "K") / q.value(model, "W0")
+                    if usual
+                    else model.declared(plane.y.name, q.value(model, plane.y.name))
+                    for q in branch.points
+                ],
+                "label": "boundary" if "eps" in self._axes else None,
+            }
+            for atlas in self.atlases
+            for branch in atlas.branches
+        ]
+        if not usual:
+            unit = {q.name: q.unit for q in model.parameters}
+            xlabel, ylabel = (plots.axis_label(a, unit[a]) for a in self._axes)
+            return plots.boundaries(
+                branches, xlabel=xlabel, ylabel=ylabel, logx=plane.x.log, logy=plane.y.log, title=title, ax=ax
+            )
+        velocities = np.geomspace(plane.x.lo, plane.x.hi, 80)
+        hopf = []
+        for velocity in velocities:
+            p = plane.base.copy()
+            p[model.index("V")] = velocity
+            point = critical_point(model, p)[0]
+            hopf.append(None if point is None else float(p[model.index("K")]) / point.W0)
+        return plots.stability_diagram(branches, hopf={"V": velocities, "K_over_W0": hopf}, title=title, ax=ax)

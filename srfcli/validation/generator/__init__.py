@@ -1,1 +1,0 @@
-"""Concealed experiments: their own equations, their own solver, nothing shared with the fitter."""
