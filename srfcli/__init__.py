@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from srfcli.codegen.slider import system as system
     from srfcli.core.errors import SrfError as SrfError
     from srfcli.core.errors import Status as Status
-    from srfcli.tasks.compare import compare as compare
+    from srfcli.tasks.map import compare as compare
     from srfcli.tasks.map import map as map
     from srfcli.tasks.recordings import fit as fit
     from srfcli.tasks.recordings import read_experiment as read_experiment
@@ -45,7 +45,7 @@ PUBLIC = {
     "linear": "srfcli.tasks.stability",
     "load_law": "srfcli.codegen.slider",
     "map": "srfcli.tasks.map",
-    "compare": "srfcli.tasks.compare",
+    "compare": "srfcli.tasks.map",
     "fit": "srfcli.tasks.recordings",
     "read_experiment": "srfcli.tasks.recordings",
     "simulate": "srfcli.tasks.simulate",

@@ -33,7 +33,7 @@ from srfcli.numerics.compare import (
 )
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
-from srfcli.results.compare import compare_figure, highest_fold
+from srfcli.results.map import compare_figure, highest_fold
 
 LAWS = [
     {"law": "log-log"},

@@ -19,7 +19,7 @@ from sound_files import EXPERIMENT, SETTINGS, THRESHOLDS, recording
 
 from srfcli.cli.main import cli
 from srfcli.cli.options import parse_over
-from srfcli.cli.simulate_records import parse_pieces
+from srfcli.cli.simulate import parse_pieces
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import load_toml, resolve
 from srfcli.core.units import parse_quantity, parse_unit

@@ -12,9 +12,9 @@ from srfcli.numerics.collocation import Discretisation, condense
 from srfcli.numerics.continuation import AtlasSettings, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
-from srfcli.numerics.normal_form import branch_coefficients, critical_mode, criticality_points, cubic_coefficient
 from srfcli.numerics.orbit import solve_orbits
 from srfcli.numerics.plane import Axis, Plane
+from srfcli.numerics.special_points import branch_coefficients, critical_mode, criticality_points, cubic_coefficient
 
 LAWS = [{}, {"law": "log-log"}, {"ageing": "ruina"}, {"law": "two-state"}, {"interface": "rigid"}, {"inertia": False}]
 

@@ -17,9 +17,8 @@ from srfcli.core.errors import SrfError
 from srfcli.laws.registry import bundled_registry
 from srfcli.results import report, report_text
 from srfcli.results.plots import figure_bytes
-from srfcli.results.report import write_report
+from srfcli.results.report import VOID, Markup, command_lines, merged, tag, write_report
 from srfcli.results.report_figures import close_up, foremost, local_rms, run_figure, spots, trace
-from srfcli.results.report_sections import VOID, Markup, command_lines, merged, tag
 from srfcli.results.report_text import number, percent, probability, spans, with_error
 
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from srfcli.cli.simulate_records import Piece, build_drive, parse_pieces, parse_rates, sample_times, usual_rate
+from srfcli.cli.simulate import Piece, build_drive, parse_pieces, parse_rates, sample_times, usual_rate
 from srfcli.core.errors import SrfError
 from srfcli.results.simulation import Rows
 

@@ -113,7 +113,7 @@ def command(
     low velocity, so that what differs is the law and not its calibration.
     """
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.tasks.compare import compare
+    from srfcli.tasks.map import compare
 
     begun = time.perf_counter()
     sliders = _sliders(laws, ageings, system)

@@ -202,7 +202,7 @@ def _checked(mismatch: float) -> str:
 
 # Critical loads under modulation: points at given velocities, and the boundary as curves.
 
-COLUMNS = (
+BOUNDARY_COLUMNS = (
     Column("eps", "1", "modulation amplitude"),
     Column("component", "1", "number of the connected curve, none where points are found one by one"),
     Column("crossing", "1", "number among the crossings at this V, from low W0; odd: stability is lost as W0 rises"),
@@ -229,7 +229,7 @@ def boundary_row(
     crossing: int | None,
     extra: tuple[str, ...] = (),
 ) -> tuple[Any, ...]:
-    """Return one boundary point under COLUMNS, then the parameters `extra` in their declared units."""
+    """Return one boundary point under BOUNDARY_COLUMNS, then the parameters `extra` in their declared units."""
     value = {n: point.value(model, n) for n in ("eps", "V", "K", "W0")}
     width = point.error * value["W0"]
     return (
@@ -288,13 +288,15 @@ class CriticalResult(Result):
         model = self.system.model
         rows = [boundary_row(model, q, None, k) for q, k in zip(self.points, self.crossings, strict=True)]
         described = self.system.described(without=("W0", "V", "eps"))
-        return Table("srf.critical/1", COLUMNS, rows, model.title, self.said, described, status=self.worst.value)
+        return Table(
+            "srf.critical/1", BOUNDARY_COLUMNS, rows, model.title, self.said, described, status=self.worst.value
+        )
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the critical K/W0 (1/um) against V (um/s), a mark for each crossing."""
         from srfcli.results import plots
 
-        names = [c.name for c in COLUMNS]
+        names = [c.name for c in BOUNDARY_COLUMNS]
         points = [dict(zip(names, row, strict=True)) for row in self.table.rows]
         return plots.critical_points(points, title=plots.titled(self.table.title, self.table.parameters), ax=ax)
 
@@ -340,7 +342,7 @@ class BoundaryResult(Result):
             notes.append(f"{named}{count} component{'' if count == 1 else 's'}" + (f" (ends {ends})" if count else ""))
             notes += [named + note for note in atlas.notes]
         units = {q.name: q for q in model.parameters}
-        columns = (*COLUMNS, *(Column(n, units[n].unit, units[n].about) for n in extra))
+        columns = (*BOUNDARY_COLUMNS, *(Column(n, units[n].unit, units[n].about) for n in extra))
         described = self.system.described(without=(*self._axes, "eps"))
         return Table("srf.continue/1", columns, rows, model.title, tuple(notes), described, status=self.worst.value)
 
