@@ -25,8 +25,7 @@ from sound_files import SETTINGS, THRESHOLDS
 
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import load_toml, resolve
-from srfcli.core.units import parse_quantity, parse_unit
-from srfcli.core.units import parse_stated_quantity as quantity_of_file
+from srfcli.core.units import dimension, parse_quantity
 from srfcli.data.columns import open_source
 from srfcli.data.description import read_description
 from srfcli.data.experiment import read_experiment
@@ -127,7 +126,7 @@ def table(place: Path) -> None:
 def seeds() -> list[tuple[str, str, bytes, Callable[[Path], object], int]]:
     """What is fuzzed: name, file name, sound content, reader and its share of the inputs."""
     law, effect = (template(kind, "my-own", python=False).encode() for kind in ("friction", "effect"))
-    number = of_text(lambda t: parse_quantity(t, "N/um", name="K"), lambda t: quantity_of_file(t, "N/um", name="K"))
+    number = of_text(lambda t: parse_quantity(t, "N/um", name="K"))
     return [
         ("law file", "x.toml", law, header_and_law, 8),
         ("effect file", "x.toml", effect, header_and_law, 4),
@@ -135,7 +134,7 @@ def seeds() -> list[tuple[str, str, bytes, Callable[[Path], object], int]]:
         ("formula", "t", b"mu0 + A*log(v/V0) + B*log(1 + Vsat*phi/D0)",
          of_text(lambda t: parse_expression(t, ("v", "phi", "mu0", "A", "B", "D0", "V0", "Vsat"))), 12),
         ("number with unit", "t", b"-0.21e-3 N/um", number, 20),
-        ("unit", "t", b"N*s^2/um", of_text(parse_unit), 10),
+        ("unit", "t", b"N*s^2/um", of_text(dimension), 10),
         ("experiment.toml", "experiment.toml", EXPERIMENT.encode(), read_description, 12),
         ("experiment, whole", "experiment.toml", EXPERIMENT.encode(), experiment, 4),
         ("srf.toml", "srf.toml", SETTINGS.encode(), settings, 12),

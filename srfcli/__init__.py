@@ -11,11 +11,9 @@ Each function is a command of `srf`: values in, a result out, with `.table`, `.t
 from __future__ import annotations
 
 import importlib
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from srfcli.core.version import __version__ as __version__
+from srfcli.core import __version__ as __version__
 
 if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem as SlidingSystem
@@ -52,17 +50,6 @@ PUBLIC = {
     "system": "srfcli.codegen.slider",
 }
 __all__ = sorted(PUBLIC)
-
-
-class _Package(ModuleType):
-    """The package, in which a public function is not hidden by the module of its name."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in PUBLIC and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> Any:

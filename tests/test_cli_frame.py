@@ -135,7 +135,7 @@ def test_every_command_has_help_with_examples_or_subcommands() -> None:
         (["run", "--V", "8", "--set", "V=2"], 2, ["V is set twice"]),
         (["run", "--K", "-1"], 2, ["Error: K = -1 N/um is below its lower bound 0 N/um", "from 0 to 10 N/um"]),
         (["run", "--K", "11"], 2, ["K = 11 N/um is above its upper bound 10 N/um"]),
-        (["run", "--K", "3 kg"], 2, ["K = 3 kg: 'kg' is the wrong unit", "Write K in N/um"]),
+        (["run", "--K", "3 kg"], 2, ["K = 3 kg: 'kg' measures s^2*N/um, not N/um", "Give a unit of the dimension of 'N/um'"]),
         (["run", "--K", "nan"], 2, ["K = 'nan' is not a number"]),
         (["run", "--V", "0"], 2, ["V = 0 um/s is below its lower bound"]),
         (["run", "--angle", "3"], 2, ["unknown parameter 'angle'", "--loading inclined"]),

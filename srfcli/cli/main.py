@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import click
 
 from srfcli.cli.base import CONTEXT, SrfGroup, switches
-from srfcli.core.version import __version__
+from srfcli.core import __version__
 
 # command -> module:attribute and the first sentence of its help, in the order of `srf --help`, which imports none of them
 COMMANDS = {

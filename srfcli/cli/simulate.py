@@ -16,7 +16,7 @@ from srfcli.cli.base import Session, SrfCommand
 from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.core.units import convert, parse_quantity, split_quantity
-from srfcli.results.simulation import UNITS, Job, Record, Work, read_gauge, simulated_run
+from srfcli.results.simulation import UNITS, Gauge, Job, Record, Work, simulated_run
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
     from srfcli.laws.registry import Registry
     from srfcli.motion.imposed import Drive, Load
-    from srfcli.results.simulation import Record, Work
 
     Array = NDArray
 
@@ -312,6 +311,17 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     taken = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
     system.say_defaults(resolved, [name for name, program in taken.items() if program is None])
     return Work(mover, (job,), gauge, described, experiment, inputs, notes, meta)
+
+
+def read_gauge(given: Mapping[str, Any], unit: str) -> Gauge:
+    """Return the gauge that the options ask for, sizes in `unit`; raises SrfError for what no gauge does."""
+    from srfcli.data.noise import check_gauge
+
+    texts = {name: given[name] for name in ("noise", "quantum")}
+    sizes = {n: 0.0 if text is None else parse_quantity(text, unit, name=f"--{n}") for n, text in texts.items()}
+    gauge = Gauge(sizes["noise"], given["lag1"], sizes["quantum"], given["seed"])
+    check_gauge(noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed)
+    return gauge
 
 
 def _track(system: SystemOptions, given: Mapping[str, Any]) -> RoughTrack | None:

@@ -159,8 +159,8 @@ def open_model(
     return load_source(cached_source(key, build), key=key, laws=tuple(laws))
 
 
-WRITERS = (  # the files of this package that determine a module's text; __init__.py holds the version
-    "core/version", "core/settings", "laws/values", "laws/expression", "laws/law_file", "laws/effect_file", "symbolic/system",
+WRITERS = (  # the files of this package that determine a module's text
+    "core/__init__", "core/settings", "laws/values", "laws/expression", "laws/law_file", "laws/effect_file", "symbolic/system",
     "symbolic/equations", "symbolic/derive", "codegen/numpy_source",
 )  # fmt: skip
 

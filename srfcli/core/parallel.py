@@ -29,10 +29,10 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from srfcli.core import __version__
 from srfcli.core.cache import is_sealed, seal
 from srfcli.core.errors import SrfError
 from srfcli.core.files import clear, parse_json, read_plain, write_atomic
-from srfcli.core.version import __version__
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

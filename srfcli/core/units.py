@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
@@ -97,18 +98,32 @@ def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float
 
 
 def convert(number: float, written: str, unit: str, *, name: str) -> float:
-    """Return `number`, given in `written`, in `unit`; raises SrfError if the two do not measure the same thing.
+    """Return `number`, given in `written`, in `unit`; raises SrfError if the two do not measure the same thing."""
+    where = f"{name} = {number:g} {written}"
+    found = number if written == unit else number * unit_factor(written, unit, where=where)
+    if not math.isfinite(found):
+        raise SrfError(f"{where} is too large", "Write a finite number, as in 1e-3.")
+    return found
+
+
+def unit_factor(written: str, unit: str, *, where: str = "") -> float:
+    """Return what a number in `written` is multiplied by to be in `unit`; raises SrfError, beginning with `where`.
 
     A stress counts as the force on 1 mm^2, so that 1 MPa is 1 N and 1 MPa/mm is 1e-3 N/um.
     """
-    if written == unit:
-        return number
-    where = f"{name} = {number:g} {written}"
-    factor = factor_between(find_unit(written, where=where), find_unit(unit))
+    found, wanted = find_unit(written, where=where), find_unit(unit)
+    factor = factor_between(found, wanted)
     if factor is None:
-        expected = "a plain number" if unit == "1" else f"{unit}, or a unit of the same dimension"
-        raise SrfError(f"{where}: {written!r} is the wrong unit", f"Write {name} in {expected}.")
-    return number * factor
+        prefix = f"{where}: " if where else ""
+        measured = f"{written!r} measures {describe(found.powers)}, not {describe(wanted.powers)}"
+        hint = "Give a plain number." if unit == "1" else f"Give a unit of the dimension of {unit!r}."
+        raise SrfError(f"{prefix}{measured}", hint)
+    return factor
+
+
+def same_dimension(text: str, unit: str) -> bool:
+    """Return whether the unit `text` measures what `unit` does; raises SrfError for no unit at all."""
+    return factor_between(find_unit(text), find_unit(unit)) is not None
 
 
 def factor_between(source: Unit, target: Unit) -> float | None:
@@ -199,44 +214,10 @@ def _pint_registry(text: str, prefix: str, word: str) -> Any:
 _REGISTRY: Any = None
 
 
-# Dimensions over um, s and N: enough to see whether a law adds a length to a time.
+# Dimensions of formulas: enough to see whether a law adds a length to a time.
 
-Dimension = tuple[Fraction, Fraction, Fraction]  # powers of um, s, N
+Dimension = tuple[Fraction, Fraction, Fraction]  # powers of um, s, N; an angle is a number
 NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
-
-
-@dataclass(frozen=True)
-class LawUnit:
-    """A unit as declared: `factor` turns a number in it into um, s, N (and radians); `dimension` holds the powers."""
-
-    factor: float
-    dimension: Dimension
-
-
-def _unit(factor: float, um: int = 0, s: int = 0, newton: int = 0) -> LawUnit:
-    return LawUnit(factor, (Fraction(um), Fraction(s), Fraction(newton)))
-
-
-UNITS = {
-    "1": _unit(1.0),
-    "rad": _unit(1.0),
-    "deg": _unit(math.pi / 180),
-    "nm": _unit(1e-3, um=1),
-    "um": _unit(1.0, um=1),
-    "mm": _unit(1e3, um=1),
-    "m": _unit(1e6, um=1),
-    "ms": _unit(1e-3, s=1),
-    "s": _unit(1.0, s=1),
-    "Hz": _unit(1.0, s=-1),
-    "N": _unit(1.0, newton=1),
-    "mN": _unit(1e-3, newton=1),
-    "kN": _unit(1e3, newton=1),
-    "Pa": _unit(1e-12, um=-2, newton=1),
-    "kPa": _unit(1e-9, um=-2, newton=1),
-    "MPa": _unit(1e-6, um=-2, newton=1),
-    "kg": _unit(1e-6, um=-1, s=2, newton=1),  # 1 kg = 1 N s^2/m
-    "g": _unit(1e-9, um=-1, s=2, newton=1),
-}
 SYMBOL_UNITS = {
     "v": "um/s",
     "phi": "s",
@@ -248,27 +229,11 @@ SYMBOL_UNITS = {
 }
 QUANTITY_UNITS = {"mu": "1", "rate": "1", "term": "1", "kappa": "N/um"}
 
-_LAW_FACTOR = re.compile(r"([A-Za-z]+|1)(?:(?:\^|\*\*)(-?\d))?", re.ASCII)
 
-
-def parse_unit(text: str) -> LawUnit:
-    """Return the unit written as `um/s`, `1/um`, `N*s**2/um` or `N/um^2`; raises `SrfError` on anything else."""
-    if len(text) > 200:
-        raise SrfError(f"{len(text)} characters are no unit", "Write it as um/s, 1/um or N/um^2.")
-    factor, dimension = 1.0, NONE
-    parts = re.split(r"([*/])", text.strip().replace("**", "^").replace("µ", "u").replace("μ", "u"))
-    for index in range(0, len(parts), 2):
-        word = parts[index].strip()
-        match = _LAW_FACTOR.fullmatch(word)
-        if match is None or match[1] not in UNITS:
-            raise SrfError(f"unknown unit {text!r}", did_you_mean(match[1] if match else word, UNITS))
-        power = int(match[2] or 1) * (-1 if index and parts[index - 1] == "/" else 1)
-        unit = UNITS[match[1]]
-        factor *= unit.factor**power
-        dimension = multiply(dimension, unit.dimension, Fraction(power))
-        if not 1e-100 < factor < 1e100:
-            raise SrfError(f"{text!r} is no unit of use", "Write it as um/s, 1/um or N/um^2.")
-    return LawUnit(factor, dimension)
+def dimension(unit: str) -> Dimension:
+    """Return the dimension of a unit in a formula; raises SrfError for no unit."""
+    um, s, newton, _ = find_unit(unit).powers
+    return Fraction(um), Fraction(s), Fraction(newton)
 
 
 def multiply(left: Dimension, right: Dimension, power: Fraction = Fraction(1)) -> Dimension:
@@ -276,11 +241,11 @@ def multiply(left: Dimension, right: Dimension, power: Fraction = Fraction(1)) -
     return (left[0] + right[0] * power, left[1] + right[1] * power, left[2] + right[2] * power)
 
 
-def describe(dimension: Dimension) -> str:
-    """Return a dimension as text, `um/s`, `1` for none."""
-    names = ("um", "s", "N")
-    over = [n + (f"^{d}" if d != 1 else "") for n, d in zip(names, dimension, strict=True) if d > 0]
-    under = [n + (f"^{-d}" if d != -1 else "") for n, d in zip(names, dimension, strict=True) if d < 0]
+def describe(powers: Sequence[int | Fraction]) -> str:
+    """Return powers of um, s, N and, where they count, rad as text: `um/s`, `1` for none."""
+    listed = list(zip(("um", "s", "N", "rad"), powers, strict=False))
+    over = [n + (f"^{d}" if d != 1 else "") for n, d in listed if d > 0]
+    under = [n + (f"^{-d}" if d != -1 else "") for n, d in listed if d < 0]
     return "/".join(["*".join(over) or "1", *under])
 
 
@@ -312,43 +277,3 @@ def dimension_of(expr: sympy.Expr, units: dict[str, Dimension]) -> Dimension:
             name = "a power" if isinstance(expr, sympy.Pow) else expr.func.__name__
             raise SrfError(f"{name} is taken of {argument}, which has the unit {describe(dimension)}, not 1")
     return NONE
-
-
-# Numbers and units as an experiment's author writes them, to um, s, N.
-
-NAMES = ("um", "s", "N", "rad")
-
-
-def unit_factor(text: str, base: str) -> float:
-    """Return what a number in the unit `text` is multiplied by to be in `base`; raises SrfError for another dimension.
-
-    A stress counts as the force on 1 mm^2, so that 1 MPa is 1 N.
-    """
-    found, wanted = find_unit(text), find_unit(base)
-    factor = factor_between(found, wanted)
-    if factor is None:
-        raise SrfError(
-            f"{text!r} measures {_described(found.powers)}, not {_described(wanted.powers)}",
-            f"Give a unit of the dimension of {base!r}.",
-        )
-    return factor
-
-
-def parse_stated_quantity(text: str, base: str, *, name: str) -> float:
-    """Return the number that `text` states, in `base`; a bare number is in that unit."""
-    number, written = split_quantity(text, name=name, example=f"0.5 {base}" if base != "1" else "0.5")
-    value = number * unit_factor(written, base) if written else number
-    if not math.isfinite(value):
-        raise SrfError(f"{name} = {text!r} is too large", "Write a finite number, as in 1e-3.")
-    return value
-
-
-def same_dimension(text: str, base: str) -> bool:
-    """Return whether the unit `text` measures what `base` does; raises SrfError for no unit at all."""
-    return factor_between(find_unit(text), find_unit(base)) is not None
-
-
-def _described(powers: tuple[int, ...]) -> str:
-    over = [n + (f"^{p}" if p != 1 else "") for n, p in zip(NAMES, powers, strict=True) if p > 0]
-    under = [n + (f"^{-p}" if p != -1 else "") for n, p in zip(NAMES, powers, strict=True) if p < 0]
-    return "/".join(["*".join(over) or "1", *under])

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from srfcli.core.errors import SrfError, did_you_mean, printable, shown
 from srfcli.core.files import parse_toml, read_text, recover
-from srfcli.core.units import is_stress, parse_stated_quantity, same_dimension, split_quantity, unit_factor
+from srfcli.core.units import is_stress, same_dimension, split_quantity, unit_factor
 
 # `experiment.toml` in the format `srf-experiment/1`, read and validated without opening any data file.
 
@@ -383,7 +383,8 @@ class Node:
             return self.number()
         try:
             name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
-            number = parse_stated_quantity(self.value, unit, name=name)
+            number, written = split_quantity(self.value, name=name, example=f"0.5 {unit}" if unit != "1" else "0.5")
+            number *= unit_factor(written, unit) if written else 1.0
             if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
                 self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g} {unit}")
             return number

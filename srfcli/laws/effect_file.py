@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import ExpressionError, SrfError, did_you_mean
 from srfcli.core.settings import Parameter
-from srfcli.core.units import parse_unit
+from srfcli.core.units import find_unit
 from srfcli.laws.expression import check_identifier, parse_expression, symbol
 from srfcli.laws.law_file import AGEING_SYMBOLS, COMMON, LawReader, check_parameters
 from srfcli.laws.values import Effect, ExtraState
@@ -81,7 +81,7 @@ def finished(effect: Effect) -> Effect:
 def _with_numbers(effect: Effect) -> Effect:
     import sympy
 
-    numbers = {symbol(c.name): sympy.Rational(repr(c.default * parse_unit(c.unit).factor)) for c in effect.constants}
+    numbers = {symbol(c.name): sympy.Rational(repr(c.default * find_unit(c.unit).factor)) for c in effect.constants}
     return replace(
         effect,
         written=effect.changes,

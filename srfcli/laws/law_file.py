@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from srfcli.core.errors import ExpressionError, SrfError, did_you_mean
 from srfcli.core.files import parse_toml, read_text
 from srfcli.core.settings import Parameter
-from srfcli.core.units import QUANTITY_UNITS, parse_unit
+from srfcli.core.units import QUANTITY_UNITS, find_unit
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Check, Effect, FrictionLaw, Interface, Law, Reader, State
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def check_parameters(parameters: Iterable[Parameter], *, kind: str, states: Iter
                 "Change the default or the bounds.",
             )
         try:
-            parse_unit(p.unit)
+            find_unit(p.unit)
         except SrfError as error:
             raise SrfError(f"parameter '{p.name}': {error.message}", error.hint) from None
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from srfcli.core import __version__
 from srfcli.core.errors import SrfError
 from srfcli.core.files import SIDECAR, is_special, open_plain, write_atomic, write_files
-from srfcli.core.version import __version__
 from srfcli.laws.values import Law
 from srfcli.results.tables import json_text, plain_value
 

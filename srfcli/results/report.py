@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 from urllib.parse import quote
 
+from srfcli.core import __version__
 from srfcli.core.errors import SrfError
 from srfcli.core.files import write_atomic
-from srfcli.core.version import __version__
 from srfcli.results.plots import figure_bytes
 from srfcli.results.provenance import sidecar_path
 from srfcli.results.report_figures import (

@@ -95,18 +95,6 @@ class Gauge:
     seed: int = 0
 
 
-def read_gauge(given: Mapping[str, Any], unit: str) -> Gauge:
-    """Return the gauge that the options ask for, sizes in `unit`; raises SrfError for what no gauge does."""
-    from srfcli.core.units import parse_quantity
-    from srfcli.data.noise import check_gauge
-
-    texts = {name: given[name] for name in ("noise", "quantum")}
-    sizes = {n: 0.0 if text is None else parse_quantity(text, unit, name=f"--{n}") for n, text in texts.items()}
-    gauge = Gauge(sizes["noise"], given["lag1"], sizes["quantum"], given["seed"])
-    check_gauge(noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed)
-    return gauge
-
-
 def measure(gauge: Gauge, job: Job, observed: Array) -> Array | None:
     """Return the observable through the gauge, None where it reads exactly; each run has its own noise."""
     from srfcli.data.noise import measured

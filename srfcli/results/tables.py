@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any, TextIO
 
+from srfcli.core import __version__
 from srfcli.core.errors import SrfError, Status, printable
-from srfcli.core.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,7 @@ from srfcli.codegen.model import Array, GeneratedModel, load_source
 from srfcli.codegen.numpy_source import generate_motion
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
-from srfcli.core.units import QUANTITY_UNITS, SYMBOL_UNITS, Dimension, describe, dimension_of, parse_unit
+from srfcli.core.units import QUANTITY_UNITS, SYMBOL_UNITS, Dimension, describe, dimension, dimension_of, find_unit
 from srfcli.laws.effect_file import summary
 from srfcli.laws.expression import expm1, log1p, symbol
 from srfcli.laws.law_file import COMMON, FORMULA, formula_of, kind_of
@@ -86,9 +86,9 @@ def check_units(law: Law, registry: Registry) -> str:
     if formula is None:
         raise Skipped("a rigid interface has no formula")
     states = law.states if isinstance(law, FrictionLaw) else ()
-    units = {name: parse_unit(unit).dimension for name, unit in SYMBOL_UNITS.items()}
+    units = {name: dimension(unit) for name, unit in SYMBOL_UNITS.items()}
     units |= {state.name: units["phi"] for state in states}
-    units |= {p.name: parse_unit(p.unit).dimension for p in _parameters(law, registry)}
+    units |= {p.name: dimension(p.unit) for p in _parameters(law, registry)}
     for state in states:
         _expect(units[state.length], "um", f"length '{state.length}' of state '{state.name}'")
         _expect(units[state.weight], "1", f"weight '{state.weight}' of state '{state.name}'")
@@ -168,7 +168,7 @@ def check_worked_values(law: Law, registry: Registry) -> str:
         raise Skipped("the law gives none; add [[checks]]")
     if formula is None:
         raise SrfError("a rigid interface has no formula to check")
-    units = {p.name: parse_unit(p.unit).factor for p in _parameters(law, registry)}
+    units = {p.name: find_unit(p.unit).factor for p in _parameters(law, registry)}
     for number, check in enumerate(law.checks):
         values = reference_values(_parameters(law, registry))
         values |= {name: value * units.get(name, 1.0) for name, value in check.at}
@@ -232,7 +232,7 @@ def _finite(law: FrictionLaw, value: float, v: float, ageing: AgeingLaw) -> None
 
 
 def _expect(found: Dimension, unit: str, what: str) -> None:
-    if found != parse_unit(unit).dimension:
+    if found != dimension(unit):
         raise SrfError(f"{what} is in {describe(found)}, expected {unit}", "Look at the units under [parameters].")
 
 
@@ -332,19 +332,19 @@ class _Check:
             own = units[state.name]
             _expect_in_effect(found, (own[0], own[1] - 1, own[2]), f"rate of {state.name}")
         for slot, formula in formulas:
-            _expect_in_effect(dimension_of(formula, units), parse_unit(SLOT_UNITS[slot]).dimension, slot)
+            _expect_in_effect(dimension_of(formula, units), dimension(SLOT_UNITS[slot]), slot)
         if self.effect.observed:
             _expect_in_effect(
-                units[self.effect.observed], parse_unit("um").dimension, f"observed '{self.effect.observed}'"
+                units[self.effect.observed], dimension("um"), f"observed '{self.effect.observed}'"
             )
         return ", ".join([*(f"{slot} is in {SLOT_UNITS[slot]}" for slot, _ in formulas),
                           *(f"{s.name} in {describe(units[s.name])}" for s in self.effect.states)])  # fmt: skip
 
     def _symbol_units(self) -> dict[str, Dimension]:
         """Return the dimension of every name, those of the baseline's parameters among them."""
-        units = {n: parse_unit(u).dimension for n, u in {**SYMBOL_UNITS, **SLOT_UNITS, **PLACE_UNITS}.items()}
+        units = {n: dimension(u) for n, u in {**SYMBOL_UNITS, **SLOT_UNITS, **PLACE_UNITS}.items()}
         declared = (*self.base.parameters, *self.system.parameters, *self.effect.parameters, *self.effect.constants)
-        return units | {p.name: parse_unit(p.unit).dimension for p in declared}
+        return units | {p.name: dimension(p.unit) for p in declared}
 
     # ---- with a baseline
 
@@ -473,7 +473,7 @@ class _Check:
         return {n: v for n, v in run.items() if n in model.names}
 
     def _neutral_values(self) -> dict[str, float]:
-        units = {p.name: parse_unit(p.unit).factor for p in self.effect.parameters}
+        units = {p.name: find_unit(p.unit).factor for p in self.effect.parameters}
         return {n: v * units[n] for n, v in self.effect.neutral}
 
     def _vector(self, values: Mapping[str, float] | None = None) -> Array:
@@ -625,4 +625,4 @@ def evaluate(expr: sympy.Expr, values: Values) -> Any:
 
 def reference_values(parameters: Iterable[Parameter]) -> dict[str, float]:
     """Return the defaults of parameters in um, s, N."""
-    return {p.name: p.default * parse_unit(p.unit).factor for p in parameters}
+    return {p.name: p.default * find_unit(p.unit).factor for p in parameters}
