@@ -22,10 +22,11 @@ import time
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
 from common import Report, interleaved
+from threshold_tables import generated, with_noise
 
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.inference.threshold_table import Scale, Thresholds, free_parameters, with_transmission
-from srfcli.inference.thresholds import Matcher, MethodFit, fit_thresholds, generated, with_noise
+from srfcli.inference.thresholds import Matcher, MethodFit, fit_thresholds
 from srfcli.laws.registry import load_registry
 
 TRIAL = {"A": 0.012, "B": 0.023, "D0": 0.40, "Vsat": 280.0, "lambda": 0.62, "rho": 0.48}

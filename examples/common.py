@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.core.files import write_atomic
 from srfcli.laws.registry import load_registry
-from srfcli.results.plots import save_figure
+from srfcli.results.plots import figure_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,6 +39,6 @@ def progress(text: str = "") -> None:
 def save(figure: Figure, out: Path, name: str) -> None:
     """Save a figure as DIR/name and say so."""
     out.mkdir(parents=True, exist_ok=True)
-    save_figure(figure, out / name)
+    write_atomic(out / name, figure_bytes(figure, (out / name).suffix))
     progress()
     print(f"figure: {out / name}")

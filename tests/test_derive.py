@@ -21,7 +21,6 @@ from srfcli.numerics.hopf import hopf_points
 from srfcli.symbolic.derivation import dispersion_coefficients
 from srfcli.symbolic.derive import (
     characteristic_polynomial,
-    closed_critical_load,
     closed_limits,
     common_ageing,
     hurwitz_determinant,
@@ -85,28 +84,28 @@ def test_every_registered_ageing_law_is_told_apart() -> None:
 
 
 def test_closed_critical_load_of_the_papers_model() -> None:
-    found = closed_critical_load(build_system(REGISTRY))
+    found = closed_limits(build_system(REGISTRY))
     assert found is not None
     Omega, length = symbol("Omega_c"), symbol("lambda")
-    assert same(found[0], (K - M * Omega**2) * (D0 - length * DMU) / DMU)
-    assert same(found[1] ** 2, V**2 * DMU / (D0**2 * mu_v))
+    assert same(found.load, (K - M * Omega**2) * (D0 - length * DMU) / DMU)
+    assert same(found.omega_squared, V**2 * DMU / (D0**2 * mu_v))
 
 
 def test_closed_critical_load_of_a_constant_stiffness() -> None:
     """K - M Omega_c^2 in series with kappa0 takes the place of K."""
-    found = closed_critical_load(build_system(REGISTRY, interface="constant"))
+    found = closed_limits(build_system(REGISTRY, interface="constant"))
     assert found is not None
     dynamic, kappa0 = K - M * symbol("Omega_c") ** 2, symbol("kappa0")
-    assert same(found[0], dynamic * kappa0 / (dynamic + kappa0) * D0 / DMU)
+    assert same(found.load, dynamic * kappa0 / (dynamic + kappa0) * D0 / DMU)
 
 
 def test_closed_load_solves_the_dispersion_relation() -> None:
     system = build_system(REGISTRY)
-    found = closed_critical_load(system)
+    found = closed_limits(system)
     assert found is not None
     Omega = symbol("Omega_c")
     a = [c.subs(kappa, W0 / symbol("lambda")) for c in characteristic_polynomial(system)]
-    value = sum(c * (sp.I * Omega) ** k for k, c in enumerate(a)).subs(W0, found[0])
+    value = sum(c * (sp.I * Omega) ** k for k, c in enumerate(a)).subs(W0, found.load)
     square = {Omega: sp.sqrt(V**2 * DMU / (D0**2 * mu_v))}
     assert sp.simplify(value.subs(square)) == 0
 

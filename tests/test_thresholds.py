@@ -14,6 +14,7 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from threshold_tables import generated, thresholds_csv, with_noise
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.settings import Parameter
@@ -21,10 +22,8 @@ from srfcli.inference.threshold_table import (
     FreeParameter,
     Scale,
     free_parameters,
-    is_threshold_table,
     read_thresholds,
     thresholds,
-    thresholds_csv,
     with_transmission,
 )
 from srfcli.inference.thresholds import (
@@ -32,10 +31,8 @@ from srfcli.inference.thresholds import (
     Matcher,
     fit_thresholds,
     forced_slopes,
-    generated,
     hopf_slopes,
     uncertainty,
-    with_noise,
 )
 from srfcli.numerics.boundary import along, polish
 from srfcli.numerics.critical import critical_line
@@ -376,9 +373,6 @@ def test_units_comments_and_assumed_errors(tmp_path: Path) -> None:
     table = read_thresholds(path)
     assert table.V.tolist() == [10, 20] and table.eps == pytest.approx([0.09, 0.045]) and table.lines == (3, 5)
     assert table.sigma == pytest.approx([0.4, 0.3]) and "1 of 2 rows" in table.notes[0] and "3%" in table.notes[0]
-    assert is_threshold_table(path) and not is_threshold_table(tmp_path / "none.csv")
-    (tmp_path / "other.csv").write_text("t,load\n0,1\n", encoding="utf-8")
-    assert not is_threshold_table(tmp_path / "other.csv")
 
 
 def test_a_written_table_reads_back(tmp_path: Path, small: Any) -> None:
@@ -395,7 +389,6 @@ def test_a_written_table_reads_back(tmp_path: Path, small: Any) -> None:
 def test_no_text_crashes_the_reader(tmp_path_factory: Any, text: str) -> None:
     path = tmp_path_factory.getbasetemp() / "fuzzed.csv"
     path.write_text(text, encoding="utf-8", errors="replace", newline="")
-    is_threshold_table(path)
     try:
         table = read_thresholds(path)
     except SrfError:

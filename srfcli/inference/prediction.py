@@ -22,7 +22,6 @@ from srfcli.motion.integrators import integrate
 # What belongs to one run alone and is estimated with the parameters: its unobserved initial state, a trend of its observable.
 
 TINY = 1e-30  # imaginary step: exact to rounding, as nothing is subtracted
-TRENDS = ("slip", "time")
 UNLOADED = 0.1  # least distance of the bounds of a free start's friction: a run may begin without any
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,7 +13,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, did_you_mean
-from srfcli.core.files import open_plain, read_text
+from srfcli.core.files import read_text
 from srfcli.core.settings import Parameter, require_parameter
 from srfcli.core.units import find_unit, from_base, tidy, to_base
 
@@ -62,24 +61,6 @@ def thresholds(
     error = RELATIVE_ERROR * loads if sigma is None else np.asarray(sigma, float)
     lines = tuple(range(2, len(loads) + 2))
     return Thresholds(source, np.asarray(V, float), np.asarray(eps, float), loads, error, lines)
-
-
-def thresholds_csv(table: Thresholds) -> str:
-    """Return the table as CSV that `read_thresholds` reads back to the same numbers."""
-    rows = zip(table.V, table.eps, table.W0c, table.sigma, strict=True)
-    body = "".join(",".join(repr(float(v)) for v in row) + "\n" for row in rows)
-    return f"V [um/s],eps,W0c [N],sigma [N]\n{body}"
-
-
-def is_threshold_table(path: Path) -> bool:
-    """Return whether the first line of the file at `path` that says something names the columns V, eps and W0c."""
-    try:
-        with io.TextIOWrapper(open_plain(path), encoding="utf-8-sig", newline="") as stream:
-            _, header = next(_filled(stream.readline(LONGEST) for _ in range(LINES)), (0, ""))
-    except (OSError, SrfError, UnicodeDecodeError):
-        return False
-    names = {_name_and_unit(cell)[0] for cell in _split(header)}
-    return names >= set(REQUIRED)
 
 
 def read_thresholds(path: Path) -> Thresholds:

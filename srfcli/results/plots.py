@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from srfcli.core.errors import SrfError, printable
-from srfcli.core.files import check_target, write_atomic
+from srfcli.core.files import check_target
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -226,13 +226,6 @@ def one_panel(ax: Axes | None, *, title: str, size: tuple[float, float] | None =
         handles, names = own.get_legend_handles_labels()
         if len(names) > 1:
             names_below(figure, handles, names)
-
-
-def save_figure(figure: Figure, path: Path) -> bytes:
-    """Write the figure to `path` in the format of its ending, whole or not at all, and return what was written."""
-    content = figure_bytes(figure, path.suffix)
-    write_atomic(path, content)
-    return content
 
 
 def stability_diagram(

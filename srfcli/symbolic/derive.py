@@ -271,14 +271,6 @@ def closed_limits(system: System) -> ClosedLimits | None:
     return ClosedLimits(None if free is None else free[1], load, limit_load, quasistatic_load, common_ageing(system))
 
 
-def closed_critical_load(system: System) -> tuple[sp.Expr, sp.Expr] | None:
-    """Return (W0c, Omega_c) for any kappa and M, or None where they are not closed."""
-    found = closed_limits(system)
-    if found is None or found.load is None or found.omega_squared is None:
-        return None
-    return found.load, sp.sqrt(found.omega_squared)
-
-
 def in_law_parameters(system: System, expression: sp.Expr) -> sp.Expr:
     """Return `expression` with mu_v, mu_phi, mu_ss and kappa written out for the laws of `system`."""
     mu_v, mu_phi, mu_ss = friction_slopes(system)
