@@ -90,7 +90,7 @@ def test_a_map_has_two_dimensions(slider: srf.SlidingSystem) -> None:
     pytest.importorskip("xarray")
     field = found.to_xarray()
     assert field["growth_per_slip"].dims == ("V", "K_over_W0") and field["V"].attrs["units"] == "um/s"
-    assert (field["kind"].values == "stable").sum() == sum(row[5] == "stable" for row in found.table.rows)
+    assert (field["type"].values == "stable").sum() == sum(row[1] == "stable" for row in found.table.rows)
 
 
 def test_a_simulation_under_modulation_ends_in_the_periodic_state(slider: srf.SlidingSystem) -> None:

@@ -67,16 +67,16 @@ def test_csv_has_a_row_for_each_run_in_full_precision(small: Path) -> None:
     assert [r["run"] for r in rows] == ["one", "two"]
     one = rows[0]
     assert (one["samples"], one["used"], one["gaps"], one["resets"]) == ("120", "120", "0", "0")
-    assert (float(one["duration"]), float(one["rate_low"])) == pytest.approx((1.19, 100.0), rel=1e-9)
-    assert (float(one["V_low"]), float(one["V_high"]), float(one["W_mean"])) == (8.0, 12.0, 5.0)
+    assert (float(one["duration"]), float(one["rate_min"])) == pytest.approx((1.19, 100.0), rel=1e-9)
+    assert (float(one["V_min"]), float(one["V_max"]), float(one["W_mean"])) == (8.0, 12.0, 5.0)
     u = [float(line.split(",")[3]) for line in data()[1:]]
-    assert (float(one["lowest"]), float(one["highest"])) == (min(u), max(u))
+    assert (float(one["reading_min"]), float(one["reading_max"])) == (min(u), max(u))
     assert one["alpha_error"] == "" and float(one["lambda_error"]) > 0.1
 
 
 def test_json_has_everything(small: Path) -> None:
     done = json.loads(srf("check", str(small), "--json").stdout)
-    assert done["schema"] == "srf.check/1" and len(done["rows"]) == 2
+    assert done["schema"] == "srf.check/2" and len(done["rows"]) == 2
     run = done["meta"]["runs"][0]
     assert run["drive"] == [
         {"from": 0.0, "velocity": 8.0, "acceleration": 0.0},

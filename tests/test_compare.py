@@ -263,7 +263,7 @@ def test_the_command_compares(tmp_path):
         str(tmp_path / "a.svg"),
     )
     data = json.loads(out)
-    assert code == 0 and data["schema"] == "srf.compare/1"
+    assert code == 0 and data["schema"] == "srf.compare/2"
     first, second = data["rows"]
     assert first["law"] == "dieterich" and first["miss"] == 0 and second["miss"] < 1e-8
     assert first["reentrance_eps"] == pytest.approx(0.1, abs=0.01)

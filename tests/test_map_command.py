@@ -42,9 +42,9 @@ def test_files_hold_the_grid_the_boundary_and_the_figure(tmp_path):
     with (tmp_path / "map.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 96
-    assert {r["kind"] for r in rows} == {"stable", "ns"}
+    assert {r["type"] for r in rows} == {"stable", "ns"}
     for row in rows:
-        assert (float(row["growth_per_slip"]) < 0) == (row["kind"] == "stable")
+        assert (float(row["growth_per_slip"]) < 0) == (row["type"] == "stable")
     with (tmp_path / "edge.csv").open(encoding="utf-8") as stream:
         edge = list(csv.DictReader(stream))
     assert {r["component"] for r in edge} == {"1", "2"}
@@ -63,7 +63,7 @@ def test_criticality_can_be_left_out():
 def test_json_holds_everything():
     code, out, _ = run(*SMALL, "--json")
     data = json.loads(out)
-    assert code == 0 and data["schema"] == "srf.map/1" and len(data["rows"]) == 96
+    assert code == 0 and data["schema"] == "srf.map/2" and len(data["rows"]) == 96
     assert len(data["meta"]["components"]) == 2
     assert data["meta"]["unexplained_points"] == 0
     assert data["meta"]["crossings"] == [3, 3, 3, 3, 2, 0, 0, 0]  # the lower curve leaves through the bottom
@@ -112,7 +112,7 @@ def test_a_ratio_takes_a_unit():
         "map", "--eps", "0.1", "--over", "V=8:9:2", "--over", "K/W0=0.02:0.03 1/um:3", "--no-boundaries", "--csv"
     )
     assert code == 0
-    assert [line.split(",")[1] for line in out.splitlines()[1:4]] == ["0.02", "0.025", "0.03"]
+    assert [line.split(",")[3] for line in out.splitlines()[1:4]] == ["0.02", "0.025", "0.03"]
 
 
 @pytest.mark.parametrize(

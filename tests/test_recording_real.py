@@ -73,8 +73,8 @@ def test_a_velocity_step_of_p655(name: str, columns: str, shared: Path, tmp_path
     place = real(tmp_path / "p", folder / name, columns=columns, run="window = [3830.0, 3875.0]")
     done = json.loads(srf("check", str(place), "--json").stdout)
     row = done["rows"][0]
-    assert (row["V_low"], row["V_high"]) == pytest.approx((2.286, 22.86), rel=2e-3)
-    assert (row["rate_low"], row["rate_high"]) == pytest.approx((10, 1000), rel=1e-3)
+    assert (row["V_min"], row["V_max"]) == pytest.approx((2.286, 22.86), rel=2e-3)
+    assert (row["rate_min"], row["rate_max"]) == pytest.approx((10, 1000), rel=1e-3)
     assert row["W_mean"] == pytest.approx(99.91, abs=0.01) and 0.5 < row["lag1"] < 0.95
     assert done["meta"]["runs"][0]["drive"][1]["from"] == pytest.approx(3852.36, abs=0.1)
     text = srf("check", str(place)).stdout
@@ -98,7 +98,7 @@ def test_the_basalt_step(shared: Path, tmp_path: Path) -> None:
     path = shared / "data" / "basalt-b819-velocity-step" / "velstep4_BRAVA_expb819_basalt.txt"
     done = json.loads(srf("check", str(real(tmp_path / "b", path, columns=BASALT, run="")), "--json").stdout)
     row, run = done["rows"][0], done["meta"]["runs"][0]
-    assert row["samples"] == 5849 and (row["V_low"], row["V_high"]) == pytest.approx((3.0, 10.0), rel=5e-3)
+    assert row["samples"] == 5849 and (row["V_min"], row["V_max"]) == pytest.approx((3.0, 10.0), rel=5e-3)
     assert row["lag1"] == pytest.approx(0.75, abs=0.05)  # as its README says of a fit's residuals
     assert row["noise"] == pytest.approx(8.9e-4, rel=0.25)
     assert run["drive"][1]["from"] == pytest.approx(11676.4, abs=0.5)
@@ -111,7 +111,7 @@ def test_paper_on_paper(shared: Path, tmp_path: Path) -> None:
     run = 'drive = [{ duration = 1000, velocity = 1100 }]\nload = "0.301 N"'
     place = real(tmp_path / "m", path, columns=columns, run=run, stiffness="5.58e-4 1/um")
     row = json.loads(srf("check", str(place), "--json", "--no-simulate").stdout)["rows"][0]
-    assert row["rate_low"] == pytest.approx(2000, rel=1e-6) and row["quantum"] == pytest.approx(6e-4, rel=0.05)
+    assert row["rate_min"] == pytest.approx(2000, rel=1e-6) and row["quantum"] == pytest.approx(6e-4, rel=0.05)
     assert row["spikes"] > 100 and row["samples"] == 28_721
 
 

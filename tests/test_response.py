@@ -126,7 +126,7 @@ def test_the_command_prints_gains_phases_and_resonances():
     code, out, err = run("--V", "10", "--W0", "6", "--over", "f=1:400:90", "--csv")
     rows = list(csv.DictReader(io.StringIO(out)))
     assert code == 0 and len(rows) == 90
-    assert {r["steady"] for r in rows} == {"stable"}
+    assert {r["type"] for r in rows} == {"stable"}
     assert "resonance of velocity: " in err
     assert all(float(r["velocity_gain"]) > 0 and abs(float(r["force_phase"])) <= np.pi for r in rows)
 
@@ -135,8 +135,8 @@ def test_the_command_prints_mean_friction():
     code, out, _ = run("--V", "10", "--W0", "6", "--mean", "--eps", "0.05,0.1", "--over", "f=60,120", "--csv")
     rows = list(csv.DictReader(io.StringIO(out)))
     assert code == 0 and [r["eps"] for r in rows] == ["0.05", "0.05", "0.1", "0.1"]
-    assert all(float(r["drop"]) > 0 for r in rows)
-    assert all(float(r["drop"]) == pytest.approx(float(r["steady"]) - float(r["force"])) for r in rows)
+    assert all(float(r["force_drop"]) > 0 for r in rows)
+    assert all(float(r["force_drop"]) == pytest.approx(float(r["steady_force"]) - float(r["mean_force"])) for r in rows)
 
 
 @pytest.mark.parametrize("mode", [(), ("--mean", "--eps", "0.05,0.1")])

@@ -443,11 +443,11 @@ def test_the_command_writes_everything(fit_command: Any, small: Any, tmp_path: P
     done = fit_command(*arguments, "--bounds", "D0=300:500 nm", "--plot", "cost.svg", "--out", "fit.json")
     assert done.exit_code == 0, done.output
     data = json.loads(Path("fit.json").read_text(encoding="utf-8"))
-    assert data["schema"] == "srf.fit-thresholds/1" and data["status"] == "ok"
+    assert data["schema"] == "srf.fit-thresholds/2" and data["status"] == "ok"
     rows = {r["parameter"]: r for r in data["rows"]}
     assert list(rows) == ["D0", "lambda"] and rows["lambda"]["start"] == 0.62
     assert (rows["D0"]["lower"], rows["D0"]["upper"]) == pytest.approx((0.3, 0.5))
-    assert abs(rows["D0"]["value"] - 0.402) < 4 * rows["D0"]["error"]
+    assert abs(rows["D0"]["value"] - 0.402) < 4 * rows["D0"]["stderr"]
     meta = data["meta"]
     assert len(meta["loads"]) == 7 and meta["loads"][0]["type"] == "hopf" and meta["loads"][3]["type"] == "ns"
     assert meta["methods"][0]["chi2"] < meta["methods"][0]["chi2_start"]

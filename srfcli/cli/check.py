@@ -174,7 +174,7 @@ def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecas
     title = experiment.title or experiment.path.parent.name
     rows = [row(check, one) for check, one in zip(checks, told, strict=True)]
     columns = tuple(dataclasses.replace(c, unit=shown_unit(c.unit, stress=experiment.stress)) for c in COLUMNS)
-    return Table("srf.check/1", columns, rows, title, tuple(notes), parameters, meta)
+    return Table("srf.check/2", columns, rows, title, tuple(notes), parameters, meta)
 
 
 def _figure(experiment: Experiment, checks: Sequence[RunCheck]) -> Figure:
@@ -204,29 +204,29 @@ def _figure(experiment: Experiment, checks: Sequence[RunCheck]) -> Figure:
 # The tables of `srf check`: all columns for programs, rounded ones that fit a page for readers, and everything for JSON.
 
 COLUMNS = (
-    Column("run"),
-    Column("holdout", about="never touches a fit"),
+    Column("run", about="name"),
+    Column("role", about="fit, or held out"),
     Column("samples", about="samples with a time of their own"),
     Column("used", about="samples that are compared"),
-    Column("duration", "s"),
-    Column("rate_low", "Hz", "lowest sampling rate"),
-    Column("rate_high", "Hz", "highest sampling rate"),
-    Column("gaps"),
+    Column("duration", "s", "from the first sample to the last"),
+    Column("rate_min", "Hz", "lowest sampling rate"),
+    Column("rate_max", "Hz", "highest sampling rate"),
+    Column("gaps", about="gaps in the sampling"),
     Column("spikes", about="samples of the observable flagged as spikes"),
     Column("resets", about="transducers set anew"),
-    Column("observable"),
+    Column("observable", about="elongation, force or friction"),
     Column("unit", about="of the readings: um, N, MPa or 1"),
-    Column("lowest", about="smallest reading that is compared, in the observable's unit"),
-    Column("highest", about="largest one"),
+    Column("reading_min", about="smallest reading that is compared, in the observable's unit"),
+    Column("reading_max", about="largest one"),
     Column("noise", about="standard deviation about the trend, in the observable's unit"),
     Column("lag1", about="correlation from sample to sample"),
-    Column("white", about="white level, in the observable's unit"),
+    Column("white_noise", about="white level, in the observable's unit"),
     Column("quantum", about="quantisation step, 0 for none"),
-    Column("V_low", "um/s"),
-    Column("V_high", "um/s"),
-    Column("W_mean", "N"),
-    Column("W_low", "N"),
-    Column("W_high", "N"),
+    Column("V_min", "um/s", "lowest driving velocity"),
+    Column("V_max", "um/s", "highest driving velocity"),
+    Column("W_mean", "N", "mean load"),
+    Column("W_min", "N", "lowest load"),
+    Column("W_max", "N", "highest load"),
     Column("W_rate", "1/s", "largest |d ln W/dt|"),
     Column("f", "Hz", "frequency of a modulation that was found"),
     Column("eps", about="its amplitude over the mean load"),
@@ -250,13 +250,13 @@ def row(check: RunCheck, told: Reach | None) -> tuple[Any, ...]:
     read, found = run.observed[run.used], load.modulation
     found_out = {} if told is None else {"error": told.errors, "peak": told.peaks}
     cells = {
-        "run": run.name, "holdout": run.holdout, "samples": run.t.size, "used": int(run.used.sum()),
-        "duration": float(np.ptp(run.t)), "rate_low": min(rates), "rate_high": max(rates),
+        "run": run.name, "role": "held out" if run.holdout else "fit", "samples": run.t.size, "used": int(run.used.sum()),
+        "duration": float(np.ptp(run.t)), "rate_min": min(rates), "rate_max": max(rates),
         "gaps": int(check.sampling.gaps.size), "spikes": check.spikes, "resets": check.count("reset"),
-        "observable": run.quantity, "unit": run.unit, "lowest": float(read.min()), "highest": float(read.max()),
-        "noise": check.noise.total, "lag1": check.noise.lag1, "white": check.noise.white, "quantum": run.quantum,
-        "V_low": check.slowest, "V_high": check.fastest,
-        "W_mean": load.mean, "W_low": load.lowest, "W_high": load.highest, "W_rate": load.rate,
+        "observable": run.quantity, "unit": run.unit, "reading_min": float(read.min()), "reading_max": float(read.max()),
+        "noise": check.noise.total, "lag1": check.noise.lag1, "white_noise": check.noise.white, "quantum": run.quantum,
+        "V_min": check.slowest, "V_max": check.fastest,
+        "W_mean": load.mean, "W_min": load.lowest, "W_max": load.highest, "W_rate": load.rate,
         "f": found.frequency if found else None, "eps": found.amplitude if found else None,
         "onset": found.onset if found and math.isfinite(found.onset) else None,
         **{f"{name}_{key}": found_out.get(key, {}).get(name) for name in CHANGE_HEADINGS for key in ("error", "peak")},
@@ -301,11 +301,11 @@ def _range(low: float, high: float, digits: int) -> Any:
 SHOWN: dict[str, dict[str, Callable[[Cells], Any]]] = {
     "Samples": {
         "run": lambda r: r["run"],
-        "held out": lambda r: r["holdout"],
+        "role": lambda r: r["role"],
         "samples": lambda r: r["samples"],
         "used": lambda r: r["used"],
         "duration [s]": _digits("duration", 6),
-        "rate [Hz]": lambda r: _range(r["rate_low"], r["rate_high"], 4),
+        "rate [Hz]": lambda r: _range(r["rate_min"], r["rate_max"], 4),
         "gaps": lambda r: r["gaps"],
         "spikes": lambda r: r["spikes"],
         "resets": lambda r: r["resets"],
@@ -313,17 +313,17 @@ SHOWN: dict[str, dict[str, Callable[[Cells], Any]]] = {
     "Readings": {
         "run": lambda r: r["run"],
         "observable": lambda r: r["observable"] + (f" [{r['unit']}]" if r["unit"] != "1" else ""),
-        "lowest": _digits("lowest", 5),
-        "highest": _digits("highest", 5),
+        "lowest": _digits("reading_min", 5),
+        "highest": _digits("reading_max", 5),
         "noise": _digits("noise", 3),
         "lag1": lambda r: None if r["lag1"] is None else round(r["lag1"], 2) + 0.0,
-        "white": _digits("white", 3),
+        "white": _digits("white_noise", 3),
         "quantum": _digits("quantum", 3),
     },
     "Imposed": {
         "run": lambda r: r["run"],
-        "V [um/s]": lambda r: _range(r["V_low"], r["V_high"], 5),
-        "W [N]": lambda r: _range(r["W_low"], r["W_high"], 5),
+        "V [um/s]": lambda r: _range(r["V_min"], r["V_max"], 5),
+        "W [N]": lambda r: _range(r["W_min"], r["W_max"], 5),
         "mean W [N]": _digits("W_mean", 5),
         "W'/W [1/s]": _digits("W_rate", 3),
         "f [Hz]": _digits("f", 6),

@@ -183,7 +183,7 @@ def _searched(search: Search) -> Any:
 
 HYPOTHESES = (
     Column("hypothesis", "", "effects added to the baseline"),
-    Column("evidence", "", "log evidence over the baseline's", ".1f"),
+    Column("evidence", "", "log marginal likelihood over that of the baseline", ".1f"),
     Column("rms_over_noise", "", "1 where all but noise is explained", ".4f"),
     Column("p_value", "", "that noise alone is left", ".2g"),
     Column("confidence", "", "stated", ".3f"),
@@ -192,9 +192,9 @@ HYPOTHESES = (
 PARAMETERS = (
     Column("parameter", "", "name"),
     Column("baseline", "", "estimate"),
-    Column("stderr", "", "its standard error", ".2g"),
+    Column("baseline_stderr", "", "its standard error", ".2g"),
     Column("augmented", "", "estimate in the final model"),
-    Column("stderr ", "", "its standard error", ".2g"),
+    Column("augmented_stderr", "", "its standard error", ".2g"),
     Column("unit", "", "of the four before"),
     Column("bent_by", "", "how far the baseline was off, in the final model's standard errors", ".1f"),
 )

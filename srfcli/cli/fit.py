@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # `srf fit`: parameters from recordings, or from a table of critical loads.
 
+METHOD = "powell, or least-squares with exact derivatives"
 EXAMPLES = """
 srf fit EXPERIMENT                                  a folder with experiment.toml, or that file
 srf fit EXPERIMENT --profile --starts 5 --json
@@ -272,14 +273,14 @@ def _parameters(fit: ThresholdFit, title: str, described: Mapping[str, Any], res
     from srfcli.results.tables import Column, Table
 
     columns = (
-        Column("method", "", "powell, or least-squares with exact derivatives"),
-        Column("parameter", "", ""),
-        Column("unit", "", "of start, value, error and bounds"),
-        Column("start", "1", "where the fit began"),
-        Column("value", "1", "where it ended", ".7g"),
-        Column("error", "1", "standard error from the given sigma, linearised", ".3g"),
-        Column("lower", "1", "bound of the search"),
-        Column("upper", "1", "bound of the search"),
+        Column("method", "", METHOD),
+        Column("parameter", "", "name"),
+        Column("value", "", "estimate, in the unit beside it", ".7g"),
+        Column("stderr", "", "standard error from the given sigma, linearised", ".3g"),
+        Column("lower", "", "bound of the search"),
+        Column("upper", "", "bound of the search"),
+        Column("unit", "", "unit of all the columns before"),
+        Column("start", "", "where the fit began"),
         Column("flag", "", "why an error is missing or means nothing"),
     )
     rows = []
@@ -288,7 +289,7 @@ def _parameters(fit: ThresholdFit, title: str, described: Mapping[str, Any], res
             ends = [q.declared(v) for v in (q.lower, q.upper)]
             start, value, error = (q.declared(float(v)) for v in (q.start, m.values[i], m.uncertainty.errors[i]))
             rows.append(
-                (m.method, q.name, q.parameter.unit, start, value, error, *ends, m.uncertainty.flags[i] or "ok")
+                (m.method, q.name, value, error, *ends, q.parameter.unit, start, m.uncertainty.flags[i] or "ok")
             )
     names = [[c.name for c in t.columns] for t in rest]
     meta: dict[str, Any] = {
@@ -298,7 +299,7 @@ def _parameters(fit: ThresholdFit, title: str, described: Mapping[str, Any], res
     meta["information"] = {m.method: _information(fit.scale, m) for m in fit.methods}
     notes = (*fit.table.notes, *_remarks(fit))
     return Table(
-        "srf.fit-thresholds/1",
+        "srf.fit-thresholds/2",
         columns,
         rows,
         f"{fit.table.source}, {len(fit.table)} critical loads; {title}",
@@ -339,11 +340,11 @@ def _remarks(fit: ThresholdFit) -> list[str]:
 
 
 def _summary(fit: ThresholdFit) -> Table:
-    from srfcli.results.tables import Column, Table
+    from srfcli.results.tables import STATUS, Column, Table
 
     columns = (
-        Column("method", "", ""),
-        Column("status", "", ""),
+        Column("method", "", METHOD),
+        Column("status", "", STATUS),
         Column("chi2_start", "1", "sum of squared residuals in sigma at the start"),
         Column("chi2", "1", "the same at the end"),
         Column("freedom", "1", "critical loads less free parameters"),
@@ -365,7 +366,7 @@ def _trace(fit: ThresholdFit) -> Table:
     from srfcli.results.tables import Column, Table
 
     columns = (
-        Column("method", "", ""),
+        Column("method", "", METHOD),
         Column("evaluation", "1", "of the whole cost, counted from 1"),
         Column("chi2", "1", "lowest so far"),
     )
@@ -377,7 +378,7 @@ def _loads(fit: ThresholdFit) -> Table:
     from srfcli.results.tables import Column, Table
 
     columns = (
-        Column("method", "", ""),
+        Column("method", "", METHOD),
         Column("line", "1", "of the table"),
         Column("V", "um/s", "driving velocity"),
         Column("eps", "1", "as the table has it, before rho"),

@@ -67,7 +67,11 @@ def laws_table(registry: Registry, kind: str | None = None) -> Table:
     """Return the listing as a table; a law that shares its name with another says so in the column `clash`."""
     from srfcli.results.tables import Column, Table
 
-    columns = [Column("kind"), Column("name"), Column("origin"), Column("about"), Column("location"), Column("clash")]
+    columns = [
+        Column("kind", "", "friction, ageing, modifier, interface, effect or reader"), Column("name", "", "as options take it"),
+        Column("origin", "", "bundled, a folder or a package"), Column("about", "", "one sentence"),
+        Column("location", "", "file"), Column("clash", "", "other files of that name"),
+    ]  # fmt: skip
     rows: list[tuple[Any, ...]] = []
     for e in registry.entries(kind):
         if kind is None and e.kind == "reader":

@@ -121,7 +121,7 @@ def _linear(model: GeneratedModel, resolved: Resolved, swept: Range) -> tuple[Ta
             notes.append(f"resonance of {name}: {where}")
     if not found.stable.all():
         notes.append("where steady sliding is unstable the response is not what would be seen")
-    table = Table("srf.response/1", columns, rows, model.title, tuple(notes), _described(resolved, swept.name, "eps"))
+    table = Table("srf.response/2", columns, rows, model.title, tuple(notes), _described(resolved, swept.name, "eps"))
     status = Status.OK if np.isfinite(np.array(cells)).all() else Status.NO_CONVERGENCE
     log = swept.values is None and swept.spacing == "log"
     return (
@@ -170,7 +170,7 @@ def _mean(
     unit = model.parameters[model.index(swept.name)].unit
     columns = _mean_columns(swept.name, unit)
     notes = ("mean over a forcing period of the forced periodic state, stable or not",)
-    table = Table("srf.response.mean/1", columns, rows, model.title, notes, _described(resolved, swept.name, "eps"))
+    table = Table("srf.response.mean/2", columns, rows, model.title, notes, _described(resolved, swept.name, "eps"))
     log = swept.values is None and swept.spacing == "log"
 
     def figure() -> Figure:
@@ -193,18 +193,18 @@ def _mean(
 
 def _mean_columns(name: str, unit: str) -> tuple[Column, ...]:
     """Return the columns of --mean."""
-    from srfcli.results.tables import Column
+    from srfcli.results.tables import STATUS, Column
 
     return (
         Column("eps", "1", "modulation amplitude"),
         Column(name, unit, "", ".8g"),
-        Column("steady", "1", "friction force of steady sliding over W0"),
-        Column("force", "1", "mean friction force over W0"),
-        Column("drop", "1", "what modulation takes off it"),
-        Column("friction", "1", "mean friction coefficient"),
-        Column("growth", "1", "ln of the leading multiplier's modulus; the forced state is stable where negative"),
+        Column("steady_force", "1", "friction force of steady sliding over W0"),
+        Column("mean_force", "1", "mean friction force over W0"),
+        Column("force_drop", "1", "what modulation takes off the mean friction force, over W0"),
+        Column("mean_friction", "1", "mean friction coefficient"),
+        Column("growth_per_period", "1", "ln of the leading multiplier's modulus; the forced state is stable where negative"),
         Column("error", "1", "estimated error of the mesh", ".2g"),
-        Column("status"),
+        Column("status", "", STATUS),
     )
 
 
@@ -228,5 +228,5 @@ def _linear_columns(name: str, unit: str) -> tuple[Column, ...]:
                 Column(f"{part}_phase", "rad", "ahead of the load"),
             )
         ),
-        Column("steady", "", "whether steady sliding is stable"),
+        Column("type", "", "stable or unstable: steady sliding"),
     )

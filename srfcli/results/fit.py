@@ -34,9 +34,9 @@ PARAMETERS = (
 RUNS = (
     Column("run", "", "name"),
     Column("role", "", "fit, or held out"),
-    Column("samples", "", "compared"),
+    Column("used", "1", "samples that are compared"),
     Column("rms", "", "of the residual, in the unit beside it"),
-    Column("noise", "", "standard deviation of the gauge's white noise"),
+    Column("white_noise", "", "standard deviation of the gauge's white noise"),
     Column("unit", "", "of the two columns before"),
     Column("rms_over_noise", "", "1 where the model explains all but the noise", ".4g"),
     Column("lag1", "", "correlation of neighbouring residuals", ".3g"),
@@ -186,7 +186,7 @@ def parameter_table(
         "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in starts],
         "posterior": None if posterior is None else _described(posterior),
     }
-    return Table("srf.fit/1", PARAMETERS, rows, problem.experiment.title, tuple(notes), {}, meta, status=status.value)
+    return Table("srf.fit/2", PARAMETERS, rows, problem.experiment.title, tuple(notes), {}, meta, status=status.value)
 
 
 def posterior_table(problem: Problem, posterior: Posterior) -> Table:

@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import Status
-from srfcli.results.stability import BOUNDARY_COLUMNS, boundary_row
-from srfcli.results.tables import Column, Result, Table, load_xarray
+from srfcli.results.stability import boundary_columns, boundary_row
+from srfcli.results.tables import STATUS, Column, Result, Table, load_xarray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +27,13 @@ if TYPE_CHECKING:
     from srfcli.numerics.special_points import SpecialPoint
 
 BASE_UNITS = ("um", "s", "N", "rad")
+
+
+PLACE = ("eps", "V", "K_over_W0", "W0")  # where a point lies; parameters along other axes stand after these
+GROWTH = {
+    "growth_per_slip": ("1", "real part of the leading Floquet exponent times D0/V; stable where negative"),
+    "growth_rate": ("1/s", "real part of the leading Floquet exponent; stable where negative"),
+}
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -87,24 +94,21 @@ class MapResult(Result):
         return _points_table(self.system.model, self.atlas, list(self.cubic), self._common[0])
 
     def to_xarray(self) -> Any:
-        """Return growth and kind over the grid as an xarray.Dataset of two dimensions, named as the axes.
+        """Return growth and type of stability over the grid as an xarray.Dataset of two dimensions, named as the axes.
 
         Raises
         ------
         SrfError
             Where xarray is not installed.
         """
-        xarray, grid, table = load_xarray(), self.found.grid, self.table
-        names = [c.name for c in table.columns]
-        shape = (grid.x.count, grid.y.count)
-        columns = dict(zip(names, zip(*table.rows, strict=True), strict=True))
         import numpy as np
 
-        x, y = (np.array(columns[n]).reshape(shape) for n in names[:2])
-        made = xarray.Dataset(
-            {n: (tuple(names[:2]), np.array(columns[n]).reshape(shape)) for n in names[2:]},
-            coords={names[0]: x[:, 0], names[1]: y[0]},
-        )
+        xarray, grid, table = load_xarray(), self.found.grid, self.table
+        cells = zip(*table.rows, strict=True)
+        fields = {c.name: np.array(v).reshape(grid.x.count, grid.y.count) for c, v in zip(table.columns, cells, strict=True)}
+        x, y = column_name(grid.x), column_name(grid.y)
+        coords = {x: fields.pop(x)[:, 0], y: fields.pop(y)[0]}
+        made = xarray.Dataset({name: ((x, y), values) for name, values in fields.items()}, coords=coords)
         for column in table.columns:
             made[column.name].attrs = {"units": column.unit, "long_name": column.about}
         made.attrs = {"title": table.title, "status": table.status}
@@ -195,28 +199,14 @@ def _points_table(model: GeneratedModel, atlas: Atlas, cubic: list[Array], commo
     from srfcli.numerics.continuation import crossing_numbers
 
     extra = tuple(a.name for a in (atlas.plane.x, atlas.plane.y) if a.name not in ("V", "W0", "eps"))
-    declared = {q.name: q for q in model.parameters}
     rows = [
         (*boundary_row(model, q, k, number, extra), float(d))
         for k, (branch, numbers) in enumerate(zip(atlas.branches, crossing_numbers(model, atlas), strict=True), 1)
         for q, number, d in zip(branch.points, numbers, cubic[k - 1], strict=True)
     ]
     about = "cubic coefficient of the normal form, a period; supercritical where negative, subcritical where positive"
-    columns = (
-        *BOUNDARY_COLUMNS,
-        *(Column(n, declared[n].unit, declared[n].about) for n in extra),
-        Column("cubic", "1", about),
-    )
+    columns = (*boundary_columns(model, extra), Column("cubic", "1", about))
     return Table("srf.map.boundary/1", columns, rows, **{**common, "notes": ()})
-
-
-def growth_column(model: GeneratedModel) -> Column:
-    """Return the column of the leading exponent."""
-    if "D0" in model.names:
-        return Column(
-            "growth_per_slip", "1", "real part of the leading Floquet exponent times D0/V; stable where negative"
-        )
-    return Column("growth", "1/s", "real part of the leading Floquet exponent; stable where negative")
 
 
 def grid_table(model: GeneratedModel, found: StabilityMap, **common: Any) -> Table:
@@ -225,30 +215,31 @@ def grid_table(model: GeneratedModel, found: StabilityMap, **common: Any) -> Tab
 
     from srfcli.numerics.map import KINDS, per_slip
 
-    grid, p = found.grid, found.points(model)
-    growth, kind = found.growth, found.kind
-    scaled, theta = growth * per_slip(model, p), np.abs(np.angle(found.leading))
-    xs = [shown(model, grid.x, v) for v in grid.x.samples()]
-    ys = [shown(model, grid.y, v) for v in grid.y.samples()]
-    rows = [
-        (x, y, float(scaled[i, j]), float(growth[i, j]), float(theta[i, j]), KINDS[kind[i, j]], int(found.mesh[i, j]))
-        for i, x in enumerate(xs)
-        for j, y in enumerate(ys)
-    ]
+    grid, p, declared = found.grid, found.points(model), {q.name: q for q in model.parameters}
+    shape = found.kind.shape
+    place = {n: np.broadcast_to(p[model.index(n)], shape) for n in ("eps", "V", "W0")}
+    place["K_over_W0"] = np.broadcast_to(p[model.index("K")] / p[model.index("W0")], shape)
+    for axis, along in ((grid.x, np.s_[:, None]), (grid.y, np.s_[None, :])):
+        values = np.array([shown(model, axis, v) for v in axis.samples()])
+        place[column_name(axis)] = np.broadcast_to(values[along], shape)
+    extra = [a for a in (grid.x, grid.y) if column_name(a) not in PLACE]
+    growth = "growth_per_slip" if "D0" in model.names else "growth_rate"
     columns = (
-        Column(column_name(grid.x), axis_unit(model, grid.x), "", ".10g"),
-        Column(column_name(grid.y), axis_unit(model, grid.y), "", ".10g"),
-        growth_column(model),
-        Column("growth_per_period", "1", "ln of the leading multiplier's modulus over one forcing period"),
+        Column("eps", "1", "modulation amplitude"),
+        Column("type", "", "stable; ns, pd, fold: unstable by a multiplier off the real axis, negative, positive; unresolved"),
+        Column("V", "um/s", "driving velocity"),
+        Column("K_over_W0", "1/um", "stiffness over mean load", ".10g"),
+        Column("W0", "N", "mean load", ".10g"),
+        *(Column(column_name(a), axis_unit(model, a), declared[a.moved].about if not a.held else "", ".10g") for a in extra),
         Column("theta", "rad", "angle of the leading multiplier over one forcing period"),
-        Column(
-            "kind",
-            "",
-            "stable; ns, pd, fold: unstable by a multiplier off the real axis, negative, positive; unresolved",
-        ),
+        Column(growth, *GROWTH[growth]),
+        Column("growth_per_period", "1", "ln of the leading multiplier's modulus over one forcing period"),
         Column("intervals", "1", "of the mesh"),
     )
-    return Table("srf.map/1", columns, rows, **common)
+    cells = place | {"type": np.array(KINDS)[found.kind], "theta": np.abs(np.angle(found.leading)), "intervals": found.mesh}
+    cells |= {growth: found.growth * per_slip(model, p), "growth_per_period": found.growth}
+    rows = list(zip(*(cells[c.name].ravel().tolist() for c in columns), strict=True))
+    return Table("srf.map/2", columns, rows, **common)
 
 
 def components_table(
@@ -273,11 +264,11 @@ def components_table(
     names = [(column_name(a), axis_unit(model, a)) for a in (grid.x, grid.y)]
     columns = (
         Column("component", "1", "number of the connected curve"),
-        Column("points"),
+        Column("points", "1", "on the curve"),
         Column("type", "", "ns, pd or fold: a multiplier off the real axis, at -1, at +1"),
         *(Column(f"{n}_{end}", u) for n, u in names for end in ("min", "max")),
         *(Column(f"folds_{n}", "1", f"how often {n} turns round along the curve") for n, _ in names),
-        Column("other", "", "resonances and other special points on it"),
+        Column("special_points", "", "resonances and other special points on it, folds aside"),
         Column("start", "", "why the curve begins where it does"),
         Column("end", "", "why it ends; closed: an island"),
         Column("error", "1", "largest estimated relative error of its points", ".2g"),
@@ -302,12 +293,12 @@ def special_table(model: GeneratedModel, found: StabilityMap, special: list[list
         for s in marks
     ]
     columns = (
-        Column("component"),
+        Column("component", "1", "number of the connected curve"),
         Column("point", "", "fold: a parameter turns round; 1:k: resonance"),
         *(Column(n, u, "", ".10g") for n, u in names),
         Column("theta", "rad", "angle of the critical multiplier over one forcing period"),
         Column("error", "1", "estimated relative error", ".2g"),
-        Column("status", ""),
+        Column("status", "", STATUS),
     )
     return Table("srf.map.special/1", columns, rows, "special points")
 
@@ -411,11 +402,11 @@ COMPARISON_COLUMNS = (
         "share of the window, in ln V and ln K/W0, stable at a smaller amplitude, unstable at this one",
     ),
     Column("stabilised", "1", "share of the window unstable without modulation, stable at this amplitude"),
-    Column("folds", "1", "how often V turns round along the boundaries"),
+    Column("folds_V", "1", "how often V turns round along the boundaries"),
     Column("components", "1", "connected boundaries in the window"),
     Column("V_fold", "um/s", "highest velocity at which a boundary turns back to lower ones"),
     Column("miss", "1", "what matching left, relative", ".2g"),
-    Column("status"),
+    Column("status", "", STATUS),
 )
 
 
@@ -461,7 +452,7 @@ class ComparisonResult(Result):
         meta = law_meta(names, models, matches, self.goal, pairs)
         described = self.systems[0].described(without=("V", "W0", "eps"))
         return Table(
-            "srf.compare/1", COMPARISON_COLUMNS, rows, f"{len(names)} laws", notes, described, meta, worst.value
+            "srf.compare/2", COMPARISON_COLUMNS, rows, f"{len(names)} laws", notes, described, meta, worst.value
         )
 
     def plot(self, ax: Axes | None = None) -> Figure:

@@ -850,7 +850,7 @@ def _result(folder: Path, path: Path, data: Mapping[str, Any]) -> Markup:
         )
     runs = (data.get("meta") or {}).get("runs")
     if isinstance(runs, list) and runs and isinstance(runs[0], dict) and "rms_over_noise" in runs[0]:
-        rows = [[r["run"], r["role"], r["samples"], number(r["rms_over_noise"])] for r in runs]
+        rows = [[r["run"], r["role"], r.get("used", r.get("samples")), number(r["rms_over_noise"])] for r in runs]
         parts.append(
             table(
                 ["run", "role", "samples", "residual / noise"], rows, caption="How each run is fitted.", numeric=(2, 3)

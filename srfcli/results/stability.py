@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import Status
-from srfcli.results.tables import Column, Result, Table, own_figure
+from srfcli.results.tables import STATUS, Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,8 +51,9 @@ class LinearResult(Result):
             Column("V", "um/s", "driving velocity"),
             Column("K_over_W0", "1/um", "critical K/W0"),
             Column("W0", "N", "critical load: stability is lost above it"),
-            Column("Omega_c", "rad/s", "frequency at the bifurcation"),
             *(Column(n, units[n].unit, units[n].about) for n in names),
+            Column("Omega_c", "rad/s", "frequency at the bifurcation"),
+            Column("status", "", STATUS),
             Column("Omega_reduced", "1", "D0 Omega_c / V"),
             Column("K_over_W0_rigid", "1/um", "the same for kappa to infinity (closed form)"),
             Column("K_over_W0_quasistatic", "1/um", "the same for kappa to infinity and M to 0 (closed form)"),
@@ -61,7 +62,6 @@ class LinearResult(Result):
             Column("lyapunov", "1", "Re c/Omega of z' = i Omega z + c z |z|^2, delta ln v = 2 Re z", ".4g"),
             Column("criticality", "", "direct or inverted Hopf bifurcation"),
             Column("leading", "", "all other roots are stable"),
-            Column("status", "", ""),
         )
         cells = [tuple(row.get(c.name) for c in columns) for row in self.points]
         kept = self.system.described(without=(*self.over, "W0", "eps", "f"))
@@ -137,7 +137,7 @@ class PeriodicResult(Result):
             Column("multiplier", "1", "number, largest modulus first"),
             Column("re", "1", "real part", ".9g"),
             Column("im", "1", "imaginary part", ".9g"),
-            Column("modulus", "1", "", ".9g"),
+            Column("modulus", "1", "of the multiplier", ".9g"),
             Column("theta", "rad", "angle over one forcing period", ".9g"),
             Column("growth_rate", "1/s", "ln|multiplier| times the forcing frequency"),
             Column("error", "1", "estimated error of the multipliers", ".2g"),
@@ -211,7 +211,7 @@ BOUNDARY_COLUMNS = (
     Column("K_over_W0", "1/um", "critical K/W0", ".10g"),
     Column("W0", "N", "critical load", ".10g"),
     Column("theta", "rad", "angle of the critical multiplier over one forcing period"),
-    Column("status", "", ""),
+    Column("status", "", STATUS),
     Column("W0_low", "N", "bracket of W0, from the estimated error", ".10g"),
     Column("W0_high", "N", "bracket of W0, from the estimated error", ".10g"),
     Column("error", "1", "estimated relative error", ".2g"),
@@ -222,6 +222,14 @@ BOUNDARY_COLUMNS = (
 )
 
 
+def boundary_columns(model: GeneratedModel, extra: tuple[str, ...] = ()) -> tuple[Column, ...]:
+    """Return the columns of boundary points, the parameters `extra` among them, behind the load."""
+    declared = {q.name: q for q in model.parameters}
+    place = [c.name for c in BOUNDARY_COLUMNS].index("W0") + 1
+    added = (Column(n, declared[n].unit, declared[n].about) for n in extra)
+    return (*BOUNDARY_COLUMNS[:place], *added, *BOUNDARY_COLUMNS[place:])
+
+
 def boundary_row(
     model: GeneratedModel,
     point: BoundaryPoint,
@@ -229,7 +237,7 @@ def boundary_row(
     crossing: int | None,
     extra: tuple[str, ...] = (),
 ) -> tuple[Any, ...]:
-    """Return one boundary point under BOUNDARY_COLUMNS, then the parameters `extra` in their declared units."""
+    """Return one boundary point under `boundary_columns`, the parameters `extra` in their declared units."""
     value = {n: point.value(model, n) for n in ("eps", "V", "K", "W0")}
     width = point.error * value["W0"]
     return (
@@ -240,6 +248,7 @@ def boundary_row(
         value["V"],
         value["K"] / value["W0"],
         value["W0"],
+        *(model.declared(n, point.value(model, n)) for n in extra),
         point.theta,
         point.status.value,
         value["W0"] - width,
@@ -249,7 +258,6 @@ def boundary_row(
         point.slope,
         point.others,
         point.orbit.x.shape[-2],
-        *(model.declared(n, point.value(model, n)) for n in extra),
     )
 
 
@@ -341,8 +349,7 @@ class BoundaryResult(Result):
             ends = "; ".join(f"{i}: {b.start.value}, {b.end.value}" for i, b in enumerate(atlas.branches, 1))
             notes.append(f"{named}{count} component{'' if count == 1 else 's'}" + (f" (ends {ends})" if count else ""))
             notes += [named + note for note in atlas.notes]
-        units = {q.name: q for q in model.parameters}
-        columns = (*BOUNDARY_COLUMNS, *(Column(n, units[n].unit, units[n].about) for n in extra))
+        columns = boundary_columns(model, extra)
         described = self.system.described(without=(*self._axes, "eps"))
         return Table("srf.continue/1", columns, rows, model.title, tuple(notes), described, status=self.worst.value)
 

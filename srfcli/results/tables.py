@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table as RichTable
 
+STATUS = "ok, or what keeps the row from being used as it stands"
+
 # A result as a table, and its form for a reader: aligned plain text, or rich on a terminal.
 
 
