@@ -245,10 +245,13 @@ def _ended(group: click.Group, arguments: list[str], session: Session, **extra: 
         return EXIT_UNEXPECTED
     except SrfError as error:
         caret = error.caret() if isinstance(error, ExpressionError) else None
-        return _end(error.message, error.hint, error.exit_code, error, session, caret=caret)
+        command = _named_command(group, arguments)[1]
+        told = as_options(error.message, command)
+        hint = as_options(error.hint, command) if error.hint else None
+        return _end(told, hint, error.exit_code, error, session, caret=caret)
     except click.ClickException as error:
-        message, hint = _usage_text(error, group, arguments)
-        return _end(message, hint, error.exit_code, error, session)
+        told, hint = _usage_text(error, group, arguments)
+        return _end(told, hint, error.exit_code, error, session)
     except OSError as error:
         if error.errno == errno.EPIPE:
             _silence_stdout()
@@ -304,6 +307,12 @@ def _usage_text(error: click.ClickException, group: click.Group, arguments: Sequ
     if "--set" in options and name.startswith("--") and name[2:].isidentifier():
         hints.append(f"A law's parameter is set with --set {name[2:]}=VALUE.")
     return f"no such option {name} of {path}", " ".join([*hints, f"The options are listed by {path} --help"])
+
+
+def as_options(text: str, command: click.Command) -> str:
+    """Return `text` with the options of `command` for the parameters that the library names in backticks."""
+    options = {p.name: next((o for o in p.opts if o.startswith("--")), None) for p in command.params}
+    return re.sub(r"`(\w+)`", lambda m: options.get(m[1]) or m[0], text)
 
 
 def _named_command(group: click.Group, arguments: Sequence[str]) -> tuple[str, click.Command]:

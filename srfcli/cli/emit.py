@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from srfcli.cli.base import EXIT_INTERRUPTED, EXIT_OK, EXIT_PARTIAL, Session
+from srfcli.cli.base import EXIT_INTERRUPTED, EXIT_OK, EXIT_PARTIAL, Session, as_options
 from srfcli.cli.options import OutputOptions
 from srfcli.core.errors import SrfError, Status, printable
 from srfcli.core.files import check_target, write_atomic
@@ -111,7 +111,8 @@ def finish(status: Status, *, advice: str | None = None) -> None:
     if status.ok:
         raise click.exceptions.Exit(EXIT_OK)
     interrupted = status is Status.INTERRUPTED
-    click.echo(f"{'Interrupted' if interrupted else 'Not finished'}: {advice or status.advice}", err=True)
+    told = as_options(advice or status.advice, click.get_current_context().command)
+    click.echo(f"{'Interrupted' if interrupted else 'Not finished'}: {told}", err=True)
     raise click.exceptions.Exit(EXIT_INTERRUPTED if interrupted else EXIT_PARTIAL)
 
 

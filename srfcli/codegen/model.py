@@ -98,7 +98,7 @@ class GeneratedModel:
             if p[i] == 0 and self._finite(changed):
                 raise SrfError(
                     f"{self.title}: nothing can be computed at {parameter.name} = 0 where the normal load changes",
-                    f"Set another value, such as --set {parameter.name}={parameter.default:g}, or choose another law.",
+                    f"Set another value, such as {parameter.name}={parameter.default:g}, or choose another law.",
                 )
 
     def _finite(self, p: NDArray[np.float64]) -> bool:

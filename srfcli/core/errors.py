@@ -123,15 +123,15 @@ class Status(Enum):
 
 _ADVICE = {
     Status.OK: "Converged.",
-    Status.NO_CONVERGENCE: "Newton's method did not converge; start nearer, or raise --max-mesh or lower eps first.",
-    Status.TOLERANCE: "The estimated error is above the tolerance on the finest mesh allowed; raise --max-mesh.",
-    Status.MAX_STEPS: "The curve was cut at the step limit; raise --max-steps.",
+    Status.NO_CONVERGENCE: "Newton's method did not converge; start nearer, or raise `max_mesh` or lower eps first.",
+    Status.TOLERANCE: "The estimated error is above the tolerance on the finest mesh allowed; raise `max_mesh`.",
+    Status.MAX_STEPS: "The curve was cut at the step limit; raise `max_steps`.",
     Status.STEP_TOO_SMALL: "The step along the curve fell below its minimum; a singular point is near.",
     Status.LEFT_WINDOW: "The curve left the window that was asked for.",
     Status.CLOSED: "The curve returned to its start.",
     Status.NO_HOPF: "Velocity strengthening: no Hopf bifurcation.",
-    Status.UNSETTLED: "Crossings may lie beyond the loads looked at; look there with --window LOW:HIGH or --over W0=LOW:HIGH.",
+    Status.UNSETTLED: "Crossings may lie beyond the loads looked at; look there with another `window`, or with W0 in `over`.",
     Status.INTEGRATION: "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
-    Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise --max-evaluations, or start nearer.",
+    Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise `max_evaluations`, or start nearer.",
     Status.INTERRUPTED: "what was finished is kept.",
 }

@@ -229,8 +229,8 @@ def require_parameter(name: str, parameters: Sequence[Parameter], *, where: str 
         if parameter.name == name:
             return parameter
     hint = {
-        "angle": "Only an inclined spring has an angle: --loading inclined.",
-        "M": "The mass counts only with --inertia.",
+        "angle": "Only an inclined spring has an angle: `loading` inclined.",
+        "M": "The mass counts only with `inertia`.",
     }
     raise SrfError(
         f"unknown parameter {name!r} in {where}", hint.get(name) or did_you_mean(name, [p.name for p in parameters])

@@ -236,7 +236,7 @@ def sample(
     try:
         import emcee
     except ImportError as error:
-        raise SrfError("--sample needs emcee, which is not installed", 'pip install "srfcli[sample]"') from error
+        raise SrfError("`sample` needs emcee, which is not installed", 'pip install "srfcli[sample]"') from error
     k = len(problem.names)
     chains = 2 * k + 4
     rng = np.random.default_rng(seed)

@@ -127,7 +127,7 @@ def _without_compiler(
 ) -> RecordingFit:
     """Return the fit of the free-running model, with autoregressive noise."""
     if track in ("rough", "shared"):
-        raise SrfError(f"--track {track} needs a C compiler", "Install one, or the package ziglang.")
+        raise SrfError(f"`track` {track} needs a C compiler", "Install one, or the package ziglang.")
     model = open_model(registry, **asdict(experiment.choice))
     problem = fit_problem(model, experiment, free=free, trend=trend)
     try:

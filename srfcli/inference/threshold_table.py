@@ -301,13 +301,13 @@ def free_parameters(
     own = dict(bounds or {})
     if not names:
         raise SrfError(
-            "no parameter is free", f"Name some: --free A,B,D0; known: {', '.join(p.name for p in parameters)}"
+            "no parameter is free", f"Name some in `free`, as A,B,D0; known: {', '.join(p.name for p in parameters)}"
         )
     for name in own:
         require_parameter(name, parameters, where=where)
         if name not in names:
             raise SrfError(
-                f"bounds are given for {name}, which is not free", f"Free it: --free {name}, or leave them out."
+                f"bounds are given for {name}, which is not free", "Name it in `free`, or leave them out."
             )
     found = []
     for position, name in enumerate(names):
@@ -335,7 +335,7 @@ def _free(parameter: Parameter, start: float, own: tuple[float, float] | None, l
         shown = [f"{from_base(v, unit):.6g}" for v in (start, low, high)]
         raise SrfError(
             f"{name} starts at {shown[0]} {unit}, not between its bounds {shown[1]} and {shown[2]}",
-            f"Set another start, --set {name}=VALUE, or other bounds, --bounds {name}=LOW:HIGH.",
+            f"Set another start, or other `bounds` of {name}.",
         )
     if own is not None and low == 0 and start > 0:
         low = min(start, high) * 1e-6  # an end at 0 is one that a logarithm never reaches

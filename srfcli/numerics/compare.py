@@ -66,8 +66,8 @@ def check_adjusted(model: GeneratedModel, names: Sequence[str]) -> None:
     """Raise SrfError unless `names` are three different parameters of the model, mu0 not among them."""
     if len(set(names)) != 3 or len(names) != 3 or LEVEL in names:
         raise SrfError(
-            f"--adjust {','.join(names)} is not three parameters other than {LEVEL}",
-            f"Three are matched to slope, critical load and period, {LEVEL} to the level: --adjust A,B,D0.",
+            f"`adjust` {','.join(names)} is not three parameters other than {LEVEL}",
+            f"Three are matched to slope, critical load and period, {LEVEL} to the level: A,B,D0.",
         )
     for name in names:
         model.index(name)

@@ -83,7 +83,7 @@ def check_plot(path: Path, *, force: bool) -> None:
 
 
 def _missing() -> SrfError:
-    return SrfError("--plot needs matplotlib, which is not installed", 'pip install "srfcli[plot]"')
+    return SrfError("a figure needs matplotlib, which is not installed", 'pip install "srfcli[plot]"')
 
 
 def load_matplotlib() -> None:

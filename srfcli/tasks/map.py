@@ -214,10 +214,10 @@ def compare(
 
     names, models = tuple(systems), [s.model for s in systems.values()]
     if len(names) < 2:
-        raise SrfError("one law is nothing to compare", "Name more: --law srf-vsat --law log-log, or several --ageing.")
+        raise SrfError("one law is nothing to compare", "Name more, such as srf-vsat and log-log, or several ageing laws.")
     wanted = sorted({float(e) for e in np.atleast_1d(np.asarray(eps, float)) if e > 0})
     if not wanted:
-        raise SrfError("--eps 0 leaves nothing to compare", "Give an amplitude above 0: --eps 0.18.")
+        raise SrfError("`eps` 0 leaves nothing to compare", "Give an amplitude above 0, such as 0.18.")
     thirds = [wanted[-1] / 3, 2 * wanted[-1] / 3] if len(wanted) == 1 else []
     amplitudes = tuple(sorted({0.0, *thirds, *wanted}))
     goal, matches = _matches(systems, at, tuple(adjust), matched)
@@ -227,7 +227,7 @@ def compare(
         K = float(matches[0].p[models[0].index("K")])
         loads = (K / K_over_W0[1], K / K_over_W0[0]) if K_over_W0[0] > 0 else (0.0, 0.0)
     if not (V[0] > 0 and loads[0] > 0):
-        raise SrfError("--over begins at 0", "The window is logarithmic: begin above 0.")
+        raise SrfError("the window begins at 0", "The window is logarithmic: begin above 0.")
     window = Window(V=V, W0=loads, **(points or {}))
     usable = [k for k, m in enumerate(matches) if m.status.ok]
     tasks = [LawTask(models[k].source, models[k].key, matches[k].p, amplitudes, window) for k in usable]
@@ -258,7 +258,7 @@ def _matches(
     if goal is None:
         raise SrfError(
             f"{next(iter(systems))} has no critical load at {at:g} um/s: there is nothing to bring the others to",
-            "Name another law first, or another velocity with --at.",
+            "Name another law first, or another velocity in `at`.",
         )
     for model in models:
         check_adjusted(model, adjust)

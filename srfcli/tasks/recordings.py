@@ -107,7 +107,7 @@ def fit(
         For what cannot be fitted.
     """
     if track == "shared" and (profile or sample):
-        raise SrfError("--track shared does not go with --profile or --sample", "Leave it out, or name --track rough.")
+        raise SrfError("`track` shared does not go with `profile` or `sample`", "Leave it out, or name rough.")
     found = fit_recordings(
         registry or load_registry(), experiment, free=free, trend=trend, track=track,
         ask_shared=not (profile or sample), starts=starts, seed=seed, progress=lambda text: progress("fit", text, None),

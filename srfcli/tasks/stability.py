@@ -200,7 +200,7 @@ def critical(
     10.55524...
     """
     if not 1e-12 < tol < 0.1 or not 1e-8 < resolution < 1:
-        raise SrfError(f"--tol {tol:g} or --resolution {resolution:g} is out of range", "--tol 1e-8 --resolution 1e-3")
+        raise SrfError(f"`tol` {tol:g} or `resolution` {resolution:g} is out of range", "Take 1e-8 and 1e-3.")
     model, own = system.model, system.resolved.values
     model.check_changing_load(system.vector())
     velocities = (own["V"],) if V is None else checked(model, "V", V)
@@ -349,10 +349,10 @@ def _axes(
         log = name in logs if logs is not None else values[1] >= 10 * values[0] > 0
         axes.append(Axis(name, to_base(values[0], unit), to_base(values[1], unit), log))
     if "eps" in over and amplitudes:
-        raise SrfError("eps is an axis and has values too", "Leave out --eps, or take eps out of --over.")
+        raise SrfError("eps is an axis and has values too", "Leave out `eps`, or take eps out of `over`.")
     if axes[0].name == "W0":
         if len(axes) == 1:
-            raise SrfError("--over W0 alone spans no plane", "Add the other axis: --over V=1:100.")
+            raise SrfError("`over` W0 alone spans no plane", "Add the other axis, such as V from 1 to 100.")
         axes = axes[::-1]  # stability is followed across the load
     return axes
 
