@@ -291,8 +291,8 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
         mover = system.model(tables=TABLES)
         job = on_track(model, mover, job, track, start=given["start"])
     gauge = read_gauge(given, UNITS[observable])
-    described = _own_described(resolved, given) | track_parameters(track, given)
-    noted, told = track_told(track)
+    described = _own_parameters(resolved, given) | track_parameters(track, given)
+    noted, told = track_notes(track)
     chosen = _free(model, given["free"])
     spread = parse_spread(given["start_values"])
     if given["folder"] is not None and system.loading.value != "vertical":
@@ -419,7 +419,7 @@ def _modulated(
     return ModulatedLoad(base, Modulation(1.0, eps, f, onset=since)), (f, eps, since)
 
 
-def _own_described(resolved: Resolved, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _own_parameters(resolved: Resolved, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the parameters with their origin, but those in whose place a program stands."""
     replaced = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
     described = resolved.described()
@@ -552,8 +552,8 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
             experiment, model, choice, flags, perturb=(spread, gauge.seed), runs=again, folder=given["folder"]
         )
 
-    described = _runs_described(model, experiment, flags) | track_parameters(track, given)
-    noted, told = track_told(track)
+    described = _run_parameters(model, experiment, flags) | track_parameters(track, given)
+    noted, told = track_notes(track)
     inputs = (_description_file(path), *(run.file for run in runs))
     free = [run.name for run in runs if run.initial == "free"]
     notes = (f"initial state of {', '.join(free)} not known: begun in steady sliding",) if free else ()
@@ -634,7 +634,7 @@ def _values(model: GeneratedModel, experiment: Experiment) -> dict[str, float]:
     return {name: value for name, value in listed.items() if name in model.names and name not in ("K", "M")}
 
 
-def _runs_described(
+def _run_parameters(
     model: GeneratedModel, experiment: Experiment, flags: Mapping[str, float]
 ) -> dict[str, dict[str, Any]]:
     """Return name -> {value, unit, origin} of what does not change from run to run."""
@@ -960,7 +960,7 @@ def track_parameters(track: RoughTrack | None, given: Mapping[str, Any]) -> dict
     }
 
 
-def track_told(track: RoughTrack | None) -> tuple[tuple[str, ...], dict[str, Any]]:
+def track_notes(track: RoughTrack | None) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return the note on a track and its entry in a result's meta, as `srf fit` has them; nothing for a smooth one."""
     if track is None:
         return (), {}

@@ -50,7 +50,7 @@ class Seed:
 
 
 @dataclass
-class Brink:
+class Discontinuity:
     """A stable point, `ends[0]` in unit coordinates of the plane, whose state may end on the way to its neighbour `ends[1]`.
 
     At the neighbour no orbit was found, or quite another.
@@ -78,7 +78,7 @@ class StabilityMap:
     extra_leading: ComplexArray
     suspect: Array
     seeds: list[Seed]
-    brinks: list[Brink] = field(default_factory=list)
+    discontinuities: list[Discontinuity] = field(default_factory=list)
     finished: bool = True
 
     @property
@@ -173,12 +173,12 @@ def join_tiles(
     leading, mesh = np.full(shape, np.nan, dtype=complex), np.zeros(shape, dtype=int)
     covered = 0
     seeds: list[Seed] = []
-    brinks: list[Brink] = []
+    discontinuities: list[Discontinuity] = []
     for task, tile in tiles:
         place = (slice(task.columns[0], task.columns[1] + 1), slice(task.rows[0], task.rows[1] + 1))
         leading[place], mesh[place] = tile["leading"], int(tile["mesh"])
         seeds += _tile_seeds(model, grid, tile)
-        brinks += _tile_brinks(model, grid, tile)
+        discontinuities += _tile_discontinuities(model, grid, tile)
         covered += (task.columns[1] - task.columns[0]) * (task.rows[1] - task.rows[0])
     extra_at = np.concatenate([t["extra_at"] for _, t in tiles])
     _, first = np.unique(extra_at, axis=0, return_index=True)  # tiles that meet refine their common side alike
@@ -191,26 +191,26 @@ def join_tiles(
         np.concatenate([t["extra_leading"] for _, t in tiles])[first],
         np.concatenate([t["suspect"] for _, t in tiles]),
         seeds,
-        brinks,
+        discontinuities,
         covered == (shape[0] - 1) * (shape[1] - 1),
     )
 
 
-def _tile_brinks(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Brink]:
-    """Return the brinks of a tile, in the plane's unit coordinates."""
-    ends = tile["brink_ends"]
+def _tile_discontinuities(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Discontinuity]:
+    """Return the discontinuities of a tile, in the plane's unit coordinates."""
+    ends = tile["discontinuity_ends"]
     if not len(ends):
         return []
     unit = grid.plane(model).coordinates(model, grid.points(model, *_grid_quantities(grid, ends)))
     edges = np.linspace(0.0, 1.0, int(tile["mesh"]) + 1)
     return [
-        Brink(
+        Discontinuity(
             unit[k],
             int(axis),
-            complex(tile["brink_rho"][k]),
-            Discretisation(tile["brink_x"][k], tile["brink_stages"][k], edges),
+            complex(tile["discontinuity_rho"][k]),
+            Discretisation(tile["discontinuity_x"][k], tile["discontinuity_stages"][k], edges),
         )
-        for k, axis in enumerate(tile["brink_axis"])
+        for k, axis in enumerate(tile["discontinuity_axis"])
     ]
 
 
@@ -426,13 +426,13 @@ class _Block:
         Of all such points that is tried which lies a share of the way through their list.
         """
         found = np.zeros_like(self.converged)
-        brinks = [
+        discontinuities = [
             (c, r, c - dc, r - dr)
             for dc, dr in STEPS
             for c, r in np.argwhere(_moved(self.converged, dc, dr) & ~self.converged).tolist()
         ]
-        if brinks:
-            c, r, from_c, from_r = brinks[int(share * len(brinks))]
+        if discontinuities:
+            c, r, from_c, from_r = discontinuities[int(share * len(discontinuities))]
             guess = settle(self.model, self.p[:, c, r], self.x[from_c, from_r, 0], self.edges)
             if guess is not None:
                 self._solve(np.array([c]), np.array([r]), guess, tol)
@@ -678,8 +678,8 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
     `extra_leading` the points added; `suspect` (S, 3) cells in which a boundary may still hide (column, row, size in grid
     steps). Every pair of neighbours of different sign is a seed: `seed_ends` (E, 2, 2) in grid steps, `seed_axis` (E,),
     `seed_g` (E, 2), and between them `seed_p` (n_parameters, E), `seed_rho`, `seed_x`, `seed_stages`. Every stable point beside
-    one without an orbit, or with quite another, is a brink: `brink_ends` (K, 2, 2), it and that neighbour, `brink_axis` (K,), and
-    at it `brink_rho`, `brink_x`, `brink_stages`.
+    one without an orbit, or with quite another, is a discontinuity: `discontinuity_ends` (K, 2, 2), it and that neighbour,
+    `discontinuity_axis` (K,), and at it `discontinuity_rho`, `discontinuity_x`, `discontinuity_stages`.
     """
     done = refine(task, solve_block(task))
     samples = done.samples
@@ -697,7 +697,7 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
         "extra_leading": leading[count:],
         "suspect": suspect,
         **_seeds(task, samples, sides[crossed(sides[:, 0], sides[:, 1])], corner),
-        **_brinks(samples, sides[apart(sides[:, 0], sides[:, 1])], corner),
+        **_discontinuities(samples, sides[apart(sides[:, 0], sides[:, 1])], corner),
     }
 
 
@@ -744,16 +744,16 @@ def _seeds(task: TileTask, samples: Samples, sides: Array, corner: Array) -> dic
     }
 
 
-def _brinks(samples: Samples, sides: Array, corner: Array) -> dict[str, Array]:
+def _discontinuities(samples: Samples, sides: Array, corner: Array) -> dict[str, Array]:
     """Return the stable ends of `sides` (E, 3), whose state may end before it reaches the other end, with that end."""
     both = np.concatenate([sides, sides[:, [1, 0, 2]]])
     i, j, axis = both[samples.g[both[:, 0]] < 0].T
     return {
-        "brink_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
-        "brink_axis": axis,
-        "brink_rho": _upper(samples.multipliers[i, 0]),
-        "brink_x": samples.orbit.x[i],
-        "brink_stages": samples.orbit.stages[i],
+        "discontinuity_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
+        "discontinuity_axis": axis,
+        "discontinuity_rho": _upper(samples.multipliers[i, 0]),
+        "discontinuity_x": samples.orbit.x[i],
+        "discontinuity_stages": samples.orbit.stages[i],
     }
 
 

@@ -16,7 +16,7 @@ from srfcli.numerics.boundary import BoundaryPoint, along, bifurcation_kind, pol
 from srfcli.numerics.collocation import Discretisation
 from srfcli.numerics.continuation import Atlas, AtlasSettings, Curve, CurvePoint, correct, polish_curve, trace
 from srfcli.numerics.critical import locate_crossings, scan_line
-from srfcli.numerics.map import Brink, Seed, StabilityMap
+from srfcli.numerics.map import Discontinuity, Seed, StabilityMap
 from srfcli.numerics.orbit import scales, solve_orbits
 from srfcli.numerics.plane import Axis, Plane
 from srfcli.numerics.special_points import crossings_at
@@ -60,27 +60,27 @@ def find_boundaries(
     settings = settings or AtlasSettings()
     atlas = Atlas(found.grid.plane(model), [], [], [])
     waiting = sorted(found.seeds, key=lambda s: (float(np.ptp(s.ends, axis=0).max()), -s.axis))[::-1]
-    brinks = list(found.brinks)
+    discontinuities = list(found.discontinuities)
     traced: list[_Traced] = []
     missed: list[Seed] = []
     endless, sifted = 0, False
     try:
-        while waiting or brinks:
+        while waiting or discontinuities:
             if waiting:
                 seed = waiting.pop(0)
                 start = starting_point(model, atlas.plane, seed, settings)
                 missed += [seed] if start is None else []
             elif not sifted:
-                progress(f"{len(brinks)} places where a state may end")
-                brinks, sifted = not_led_on(model, atlas.plane, brinks), True
+                progress(f"{len(discontinuities)} places where a state may end")
+                discontinuities, sifted = not_continued(model, atlas.plane, discontinuities), True
                 continue
             else:
-                end = leads_on(model, atlas.plane, brinks.pop(len(brinks) // 2))
+                end = continued_end(model, atlas.plane, discontinuities.pop(len(discontinuities) // 2))
                 if end is None:
                     continue
                 start = fold_at(model, atlas.plane, end)
                 endless = 0 if start is not None else endless + 1
-                brinks = brinks if endless < PATIENCE else []
+                discontinuities = discontinuities if endless < PATIENCE else []
             if start is None or any(_same_place(t, start) for t in traced):
                 continue  # met again from a seed that the map's mesh misplaced
             progress(f"boundary {len(traced) + 1}")
@@ -89,7 +89,7 @@ def find_boundaries(
                 traced.append(_dense(curve))
                 atlas.branches.extend(polish_curve(model, atlas.plane, curve, settings))
                 waiting = [s for s in waiting if not passes(traced[-1], s)]
-                brinks = [b for b in brinks if not ends_state(traced[-1], b)]
+                discontinuities = [b for b in discontinuities if not ends_state(traced[-1], b)]
             if curve.end is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             yield atlas
@@ -265,9 +265,9 @@ def passes(traced: _Traced, seed: Seed) -> bool:
     return bool((near & alike).any())
 
 
-def ends_state(traced: _Traced, brink: Brink) -> bool:
-    """Return whether a curve of folds passes between a brink's ends."""
-    index, near = _met(traced, brink.ends, brink.axis)
+def ends_state(traced: _Traced, discontinuity: Discontinuity) -> bool:
+    """Return whether a curve of folds passes between a discontinuity's ends."""
+    index, near = _met(traced, discontinuity.ends, discontinuity.axis)
     return bool((near & traced.fold[index]).any())
 
 
@@ -339,17 +339,17 @@ STEPS = (
 FOLD_REACH = 0.01  # of the window: a fold farther from where the state was last found is another
 
 
-def not_led_on(
-    model: GeneratedModel, plane: Plane, brinks: Sequence[Brink], steps: Sequence[int] = STEPS
-) -> list[Brink]:
-    """Return the brinks whose stable state is not met at their neighbour after a few equal steps; in batches, for `leads_on`.
+def not_continued(
+    model: GeneratedModel, plane: Plane, discontinuities: Sequence[Discontinuity], steps: Sequence[int] = STEPS
+) -> list[Discontinuity]:
+    """Return the discontinuities whose stable state is not met at their neighbour after a few equal steps.
 
     Each step starts from the state before with the change of steady sliding, and the change of what remained over the last step.
     """
-    left: list[Brink] = []
-    by_mesh: dict[int, list[Brink]] = {}
-    for brink in brinks:
-        by_mesh.setdefault(len(brink.orbit.edges), []).append(brink)
+    left: list[Discontinuity] = []
+    by_mesh: dict[int, list[Discontinuity]] = {}
+    for discontinuity in discontinuities:
+        by_mesh.setdefault(len(discontinuity.orbit.edges), []).append(discontinuity)
     for group in by_mesh.values():
         edges, ends = group[0].orbit.edges, np.stack([b.ends for b in group])
         x, stages = np.stack([b.orbit.x for b in group]), np.stack([b.orbit.stages for b in group])
@@ -365,8 +365,8 @@ def not_led_on(
                 going &= found.converged & (off < NEAR) & (np.abs(found.multipliers[:, 0]) < 1)
             dx, dstages = found.orbit.x - x - shift, found.orbit.stages - stages - shift[:, None]
             x, stages, before = found.orbit.x, found.orbit.stages, p
-        left += [brink for brink, led in zip(group, going, strict=True) if not led]
-    return not_led_on(model, plane, left, steps[1:]) if left and steps[1:] else left
+        left += [discontinuity for discontinuity, reached in zip(group, going, strict=True) if not reached]
+    return not_continued(model, plane, left, steps[1:]) if left and steps[1:] else left
 
 
 def _points(model: GeneratedModel, plane: Plane, q: Array) -> Array:
@@ -374,13 +374,13 @@ def _points(model: GeneratedModel, plane: Plane, q: Array) -> Array:
     return np.stack([plane.point(model, row) for row in q], axis=1)
 
 
-def leads_on(model: GeneratedModel, plane: Plane, brink: Brink) -> Brink | None:
-    """Return the brink where the stable state, followed towards the neighbour, ends; None where it is stable at the neighbour.
+def continued_end(model: GeneratedModel, plane: Plane, discontinuity: Discontinuity) -> Discontinuity | None:
+    """Return the discontinuity where the stable state, followed towards the neighbour, ends; None where it is stable there.
 
     The steps are halved where Newton's method fails, or finds another state or an unstable one.
     """
-    here, way = brink.ends[0], brink.ends[1] - brink.ends[0]
-    share, step, orbit, rho = 0.0, 0.5, brink.orbit, brink.rho
+    here, way = discontinuity.ends[0], discontinuity.ends[1] - discontinuity.ends[0]
+    share, step, orbit, rho = 0.0, 0.5, discontinuity.orbit, discontinuity.rho
     while step > FINEST:
         ahead = min(share + step, 1.0)
         p = plane.point(model, here + ahead * way)[:, None]
@@ -395,10 +395,10 @@ def leads_on(model: GeneratedModel, plane: Plane, brink: Brink) -> Brink | None:
         orbit = Discretisation(found.orbit.x[0], found.orbit.stages[0], orbit.edges)
         if share == 1.0:
             return None
-    return Brink(np.array([here + share * way, brink.ends[1]]), brink.axis, rho, orbit)
+    return Discontinuity(np.array([here + share * way, discontinuity.ends[1]]), discontinuity.axis, rho, orbit)
 
 
-def fold_at(model: GeneratedModel, plane: Plane, end: Brink) -> CurvePoint | None:
+def fold_at(model: GeneratedModel, plane: Plane, end: Discontinuity) -> CurvePoint | None:
     """Return the fold at which a stable state ends, ready to be followed; None where its leading multiplier is not near +1."""
     if end.rho.real < MEETS or bifurcation_kind(end.rho) != "fold":
         return None
