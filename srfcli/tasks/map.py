@@ -58,7 +58,7 @@ def map(  # the command's own name
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     x, y : (name, low, high, points)
         The axes. A name is that of a parameter, its ends in its declared unit, or a ratio such as K/W0, in um, s, N, whose
         second part moves.
@@ -183,7 +183,7 @@ def compare(
     Parameters
     ----------
     systems : mapping from name to SlidingSystem
-        Two sliders or more, from `srfcli.symbolic.system`; the first is the reference.
+        Two sliders or more, from `srfcli.system`; the first is the reference.
     eps : number or sequence
         Relative amplitudes above 0.
     at : float

@@ -38,7 +38,7 @@ def simulate(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`; with eps above 0 the load is modulated at f.
+        The slider, from `srfcli.system`; with eps above 0 the load is modulated at f.
     t : array (n,)
         Times of the samples in s, rising.
     drive : Drive or sequence of (time, velocity), optional

@@ -53,7 +53,7 @@ def linear(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     over : mapping from parameter to values, optional
         Values in declared units; a grid of their products. V from 1 to 100 um/s if left out.
     all_roots : bool
@@ -117,7 +117,7 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     tol : float
         Error of the multipliers; the mesh is doubled until it is met.
     max_mesh : int
@@ -167,7 +167,7 @@ def critical(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     V, eps : number or sequence, optional
         Driving velocities in um/s and relative amplitudes; the system's own if left out.
     window : (float, float), optional
@@ -263,7 +263,7 @@ def continue_boundary(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     eps : number or sequence, optional
         Relative amplitudes, a boundary for each; the system's own if left out, none where eps is an axis.
     over : mapping from parameter to (low, high), optional
