@@ -17,7 +17,7 @@ from srfcli.cli.options import (
     system_options,
     values_option,
 )
-from srfcli.core.errors import Status
+from srfcli.core.errors import Status, worst
 from srfcli.core.settings import Parameter
 from srfcli.results.plots import titled
 
@@ -145,7 +145,6 @@ def _mean(
     import numpy as np
 
     from srfcli.numerics.response import mean_friction
-    from srfcli.results.stability import worst
     from srfcli.results.tables import Table
 
     values = np.array(swept.base_points(model.parameters, where=model.title))

@@ -16,7 +16,8 @@ from srfcli.cli.base import Session, SrfCommand
 from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.core.units import convert, parse_quantity, split_quantity
-from srfcli.results.simulation import UNITS, Gauge, Job, Record, Work, simulated_run
+from srfcli.laws.law_file import APPARATUS
+from srfcli.results.simulation import RISE, Gauge, Job, Record, Work, simulated_run
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,7 +40,6 @@ srf simulate EXPERIMENT --run onset --plot onset.svg
 srf simulate EXPERIMENT --set lambda=0.5 --out-dir predicted
 srf simulate EXPERIMENT --roughness 3e-4 --roughness-length 10 --seed 1 --out-dir rough
 """
-RISE = 0.02  # s; five times the slider's bounce on its interface, at usual loads
 OWN_RECORD = {  # what describes a record of one's own: an experiment brings its own
     "V": "--V", "W0": "--W0", "eps": "--eps", "drive": "--drive", "load": "--load", "load_file": "--load-file",
     "onset": "--onset", "duration": "--for", "rate": "--rate", "observable": "--observe", "free": "--free",
@@ -263,7 +263,6 @@ def _write(
 # A record of one's own for `srf simulate`: drive, load and sampling from the options.
 
 DRIVE_EXAMPLE, LOAD_EXAMPLE = "0.5:12, 4:8", "2:5, 0.2:5->7, 4:7"
-APPARATUS = ("V", "W0", "eps", "f", "K", "M", "angle")
 REFERENCE = ("V0",)  # a velocity that mu0 refers to: no record tells the two apart
 FACTOR = 5.0  # bounds of a fit lie so far from a value
 NAME = "simulated"
@@ -290,7 +289,7 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     if (track := _track(system, given)) is not None:
         mover = system.model(tables=TABLES)
         job = on_track(model, mover, job, track, start=given["start"])
-    gauge = read_gauge(given, UNITS[observable])
+    gauge = read_gauge(given, observable)
     described = _own_parameters(resolved, given) | track_parameters(track, given)
     noted, told = track_notes(track)
     chosen = _free(model, given["free"])
@@ -313,12 +312,16 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     return Work(mover, (job,), gauge, described, experiment, inputs, notes, meta)
 
 
-def read_gauge(given: Mapping[str, Any], unit: str) -> Gauge:
-    """Return the gauge that the options ask for, sizes in `unit`; raises SrfError for what no gauge does."""
+def read_gauge(given: Mapping[str, Any], observable: str) -> Gauge:
+    """Return the gauge that the options ask for, sizes in the observable's unit; raises SrfError for what no gauge does."""
     from srfcli.data.noise import check_gauge
+    from srfcli.data.values import OBSERVABLES
 
     texts = {name: given[name] for name in ("noise", "quantum")}
-    sizes = {n: 0.0 if text is None else parse_quantity(text, unit, name=f"--{n}") for n, text in texts.items()}
+    sizes = {
+        n: 0.0 if text is None else parse_quantity(text, OBSERVABLES[observable], name=f"--{n}")
+        for n, text in texts.items()
+    }
     gauge = Gauge(sizes["noise"], given["lag1"], sizes["quantum"], given["seed"])
     check_gauge(noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed)
     return gauge
@@ -539,7 +542,7 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
             f"the runs record {' and '.join(observables)}: one --noise has no unit for all",
             "Choose runs that record the same, with --run.",
         )
-    gauge = read_gauge(given, UNITS[runs[0].observable])
+    gauge = read_gauge(given, runs[0].observable)
     spread = parse_spread(given["start_values"])
     jobs, mover = tuple(_job(model, experiment, run, flags, given["start"]) for run in runs), model
     if (track := read_track(given)) is not None:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from srfcli.laws.registry import Registry
 
 Array = NDArray[Any]
+COMPLEX_STEP = 1e-30  # no difference is taken, and its square is nothing against 1
 ComplexArray = NDArray[Any]
 Function = Callable[..., NDArray[Any]]
 

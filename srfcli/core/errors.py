@@ -135,3 +135,8 @@ _ADVICE = {
     Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise `max_evaluations`, or start nearer.",
     Status.INTERRUPTED: "what was finished is kept.",
 }
+
+
+def worst(statuses: Iterable[Status]) -> Status:
+    """Return the first status whose numbers cannot be used as they stand, else OK."""
+    return next((s for s in statuses if not s.ok), Status.OK)

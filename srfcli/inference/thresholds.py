@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.inference.threshold_table import RHO, Scale, Thresholds
 from srfcli.numerics.boundary import CHUNK, BoundaryPoint, along, linearise_boundary, polish
@@ -302,8 +302,6 @@ def wanted_reach(line: _Line, datum: float, y: Array) -> float | None:
 
 # How a critical load moves with any parameter: exact derivatives, by implicit differentiation of what defines the boundary.
 
-STEP = 1e-30  # of a complex step: its square is nothing against 1
-
 
 def forced_slopes(model: GeneratedModel, points: Sequence[BoundaryPoint], names: tuple[str, ...]) -> Array:
     """Return dW0c/d(name) (len(points), k) at boundary points under modulation, all else fixed; base units.
@@ -352,7 +350,7 @@ def _coefficients(model: GeneratedModel, p: Array, name: str | None) -> tuple[Ar
     shifted: list[complex] = [complex(v) for v in p]
     h = 0.0
     if name is not None:
-        h = STEP * (abs(p[model.index(name)]) or 1.0)
+        h = COMPLEX_STEP * (abs(p[model.index(name)]) or 1.0)
         shifted[model.index(name)] += 1j * h
     a = np.asarray(model.characteristic(shifted))
     return a.real, a.imag / h if h else np.zeros(a.shape)

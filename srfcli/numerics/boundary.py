@@ -29,7 +29,7 @@ from srfcli.numerics.collocation import (
     stage_parameters,
     wanted_mesh,
 )
-from srfcli.numerics.orbit import interpolate, newton_step, scales, step_limit, uniform_mesh
+from srfcli.numerics.orbit import CHUNK, interpolate, newton_step, scales, step_limit, uniform_mesh
 
 # Points of a stability boundary: a forced periodic state one of whose multipliers lies on the unit circle.
 
@@ -149,7 +149,6 @@ def slope_in_last(linear: BoundaryLinear) -> Array:
 
 # Boundary points to full precision: Newton's method in one parameter, then meshes doubled until the error is met.
 
-CHUNK = 48
 LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
 FINE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
 SHALLOW = 0.02  # slopes in ln|rho| per ln(parameter) below this are computed anew

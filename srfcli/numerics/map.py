@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel, load_source
+from srfcli.core.parallel import run_here
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
 from srfcli.numerics.collocation import STAGES, Discretisation, join, kernel, mesh_error
@@ -132,18 +133,12 @@ def per_slip(model: GeneratedModel, p: Array) -> Array:
     return np.asarray(rate * p[model.index("D0")] / p[model.index("V")] if "D0" in model.names else rate)
 
 
-def serial(function: Callable[[TileTask], Tile], tasks: Sequence[TileTask]) -> Iterator[tuple[int, Tile]]:
-    """Yield the result of every task in this process, one after the other."""
-    for index, task in enumerate(tasks):
-        yield index, function(task)
-
-
 def compute_map(
     model: GeneratedModel,
     grid: MapGrid,
     settings: MapSettings | None = None,
     *,
-    run: Runner = serial,
+    run: Runner = run_here,
     progress: Callable[[int, int], Any] = lambda done, count: None,
 ) -> StabilityMap:
     """Return the stability map of `grid`; `run` says where the tiles are computed, which changes nothing in them.

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
+from srfcli.codegen.model import COMPLEX_STEP, Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.collocation import Discretisation, gauss, mesh_error, stage_parameters, wanted_mesh
 from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.orbit import OrbitBatch, interpolate, uniform_mesh
 
-STEP = 1e-30  # of a complex step: no difference is taken
 INTERVALS = 16
 LOST = 1e9  # the error of an orbit that was not found: the mesh grows as fast as it may
 
@@ -64,12 +63,12 @@ def _observed(model: GeneratedModel, name: str, rest: Array, p: Array, state: Co
     function, total = model.namespace[name], np.zeros(rest.shape[:-1], dtype=complex)
     for k in range(rest.shape[-1]):
         moved = rest.astype(complex)
-        moved[..., k] += 1j * STEP
-        total += function(0.0, moved, p).imag / STEP * state[..., k]
+        moved[..., k] += 1j * COMPLEX_STEP
+        total += function(0.0, moved, p).imag / COMPLEX_STEP * state[..., k]
     q = p.astype(complex)
-    q[model.index("eps")] += 1j * STEP
+    q[model.index("eps")] += 1j * COMPLEX_STEP
     whole = rest.astype(complex)
-    direct = [np.asarray(function(tau, whole, q)).imag / STEP for tau in (0.0, 0.25)]
+    direct = [np.asarray(function(tau, whole, q)).imag / COMPLEX_STEP for tau in (0.0, 0.25)]
     return total + direct[0] - 1j * direct[1]
 
 

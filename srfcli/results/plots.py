@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from srfcli.core.errors import SrfError, printable
 from srfcli.core.files import check_target
+from srfcli.laws.law_file import APPARATUS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +29,6 @@ SUFFIXES = (".png", ".svg", ".pdf")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (9, 2)), (0, (3, 1, 1, 1, 1, 1)), (0, (2, 2)))
 DOTTED = (0, (1, 1.2))  # kept for the constant load
-FIRST = ("V", "W0", "eps", "f", "K", "M", "angle")  # of the parameters under a figure's title; the law's own follow
 # one quantity, one colour, in every figure
 QUANTITY = {"u": COLOURS[0], "v": COLOURS[1], "V": COLOURS[6], "mu": COLOURS[2], "W": COLOURS[3], "state": COLOURS[5]}
 SYMBOLS = {
@@ -157,7 +157,7 @@ def titled(title: str, described: Mapping[str, Mapping[str, Any]]) -> str:
     `described` is as a table's parameters are.
     """
     known = [name for name, p in described.items() if isinstance(p.get("value"), float | int)]
-    groups = [[n for n in FIRST if n in known], [n for n in known if n not in FIRST]]
+    groups = [[n for n in APPARATUS if n in known], [n for n in known if n not in APPARATUS]]  # the law's own follow
     lines = [", ".join(valued(n, described[n]["value"], str(described[n].get("unit"))) for n in g) for g in groups]
     return "\n".join(line for line in [title, *lines] if line)
 

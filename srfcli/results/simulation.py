@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
     Array = NDArray
 
-UNITS = {"elongation": "um", "force": "N", "friction": "1"}
+RISE = (
+    0.02  # s over which steps of the load are rounded: five times the slider's bounce on its interface, at usual loads
+)
 MANY_BREAKS = 50  # a recorded load has knots, not changes
 FEW_SAMPLES = 20  # show no oscillation
 STICK = 0.1  # of the driving velocity: a cycle whose slowest slip is below it sticks
@@ -180,6 +182,8 @@ class Rows(Sequence[tuple[Any, ...]]):
 
 def record_table(work: Work, records: Sequence[Record], *, status: Status) -> Table:
     """Return the records one below the other: t, V, W, u, v, the ages, mu, tau, and what was recorded or measured."""
+    from srfcli.data.values import OBSERVABLES
+
     model, named = work.model, any(job.run is not None for job in work.jobs)
     gauge = any(r.measured is not None for r in records)
     ages = [name for name in model.states if name.startswith("ln_") and name != "ln_v"]
@@ -194,7 +198,7 @@ def record_table(work: Work, records: Sequence[Record], *, status: Status) -> Ta
         Column("mu", "1", "friction coefficient"),
         Column("tau", "N", "friction force W mu"),
     ]
-    units = {UNITS[job.observable] for job in work.jobs}
+    units = {OBSERVABLES[job.observable] for job in work.jobs}
     unit = units.pop() if len(units) == 1 else "um, N or 1"
     columns += [Column("recorded", unit, "what the run's file holds")] if named else []
     columns += [Column("measured", unit, "the simulated observable through the gauge")] if gauge else []
@@ -221,14 +225,11 @@ def _block(r: Record, ages: list[str], *, named: bool, gauge: bool) -> tuple[tup
     return ((r.job.name,) if named else ()), [c[:n] for c in columns]
 
 
-def worst(statuses: Sequence[Status]) -> Status:
-    """Return the first status that is not ok, else ok."""
-    return next((s for s in statuses if not s.ok), Status.OK)
-
-
 def summary(r: Record, *, named: bool) -> list[str]:
     """Return sentences about one record: the range of v, stick-slip under each steady drive, distance from a recording."""
     import numpy as np
+
+    from srfcli.data.values import OBSERVABLES
 
     n, trace, lead = r.done, r.trace, f"{r.job.name}: " if named else ""
     if n == 0:
@@ -241,7 +242,7 @@ def summary(r: Record, *, named: bool) -> list[str]:
         sentences.append(f"{lead}stopped at t = {trace.reached:.6g} s of {trace.t[-1]:g} s: {trace.status.advice}")
     if r.job.run is not None and (good := r.job.run.used[:n] & np.isfinite(r.job.run.observed[:n])).any():
         rms = float(np.sqrt(np.mean((r.observed[:n] - r.job.run.observed[:n])[good] ** 2)))
-        unit = UNITS[r.job.observable]
+        unit = OBSERVABLES[r.job.observable]
         sentences.append(
             f"{lead}root mean square distance from the recording {rms:.4g}{'' if unit == '1' else f' {unit}'}"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -259,11 +259,6 @@ def boundary_row(
         point.others,
         point.orbit.x.shape[-2],
     )
-
-
-def worst(statuses: Iterable[Status]) -> Status:
-    """Return the first status whose numbers cannot be used as they stand, else OK."""
-    return next((s for s in statuses if not s.ok), Status.OK)
 
 
 @dataclass(frozen=True, repr=False, eq=False)

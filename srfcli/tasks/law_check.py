@@ -13,7 +13,7 @@ import sympy
 from scipy.optimize import brentq
 from scipy.special import lambertw
 
-from srfcli.codegen.model import Array, GeneratedModel, load_source
+from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel, load_source
 from srfcli.codegen.numpy_source import generate_motion
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
@@ -252,7 +252,7 @@ def _sample(law: Law, registry: Registry) -> list[dict[str, float]]:
 
 
 def _complex_step(formula: sympy.Expr, name: str, point: Mapping[str, float]) -> float:
-    size = STEP * max(1.0, abs(point[name]))
+    size = COMPLEX_STEP * max(1.0, abs(point[name]))
     moved = {**point, name: complex(point[name], size)}
     return float(np.imag(evaluate(formula, moved)) / size)
 
@@ -506,8 +506,8 @@ def _stepped_states(model: GeneratedModel, points: _Points, p: Array) -> Array:
     columns = []
     for j in range(x.shape[1]):
         moved = x.copy()
-        moved[:, j] += 1j * STEP
-        columns.append(np.asarray(model.rates(moved, points.V, points.W, points.W_dot, p)).imag / STEP)
+        moved[:, j] += 1j * COMPLEX_STEP
+        columns.append(np.asarray(model.rates(moved, points.V, points.W, points.W_dot, p)).imag / COMPLEX_STEP)
     return np.stack(columns, axis=-1)
 
 
@@ -518,10 +518,10 @@ def _stepped_parameters(model: GeneratedModel, points: _Points, p: Array) -> Arr
     for j, name in enumerate(model.names):
         q, V = p.astype(complex), points.V.astype(complex)
         if name == "V":
-            V += 1j * STEP
+            V += 1j * COMPLEX_STEP
         else:
-            q[j] += 1j * STEP
-        columns.append(np.asarray(model.rates(x, V, points.W, points.W_dot, q)).imag / STEP)
+            q[j] += 1j * COMPLEX_STEP
+        columns.append(np.asarray(model.rates(x, V, points.W, points.W_dot, q)).imag / COMPLEX_STEP)
     return np.stack(columns, axis=-1)
 
 
@@ -547,7 +547,6 @@ def _expect_in_effect(found: Dimension, wanted: Dimension, what: str) -> None:
 
 # What checks of laws and of effects share: outcomes, and the numbers of formulas.
 
-STEP = 1e-30  # complex step: no difference is taken, so it may be this small
 Values = Mapping[str, Any]
 
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from srfcli.core.errors import SrfError, Status
+from srfcli.core.errors import SrfError, Status, worst
+from srfcli.data.values import OBSERVABLES
 from srfcli.motion import simulate as integrate
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, ModulatedLoad, Modulation
-from srfcli.results.simulation import Gauge, Job, Record, SimulationResult, Work, measure, observe, worst
+from srfcli.results.simulation import RISE, Gauge, Job, Record, SimulationResult, Work, measure, observe
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.data.values import Experiment
 
-OBSERVABLES = ("elongation", "force", "friction")
-RISE = 0.02  # s over which steps of the load are rounded
 
 
 def simulate(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.codegen.model import GeneratedModel
-from srfcli.core.errors import SrfError, Status
+from srfcli.core.errors import SrfError, Status, worst
 from srfcli.core.settings import check_value, require_parameter
 from srfcli.core.units import to_base
 from srfcli.numerics.continuation import Atlas, AtlasSettings, find_components
@@ -19,7 +19,7 @@ from srfcli.numerics.critical import LoadWindow, critical_line, found_window
 from srfcli.numerics.floquet import solve_floquet
 from srfcli.numerics.hopf import HopfPoint, closed_forms, hopf_points, weakening
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.results.stability import BoundaryResult, CriticalResult, LinearResult, PeriodicResult, worst
+from srfcli.results.stability import BoundaryResult, CriticalResult, LinearResult, PeriodicResult
 
 if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
