@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
     Array = NDArray
 
-RISE = (
-    0.02  # s over which steps of the load are rounded: five times the slider's bounce on its interface, at usual loads
-)
+RISE = 0.02  # s over which steps of the load are rounded: five times the slider's bounce on its interface
 MANY_BREAKS = 50  # a recorded load has knots, not changes
 FEW_SAMPLES = 20  # show no oscillation
 STICK = 0.1  # of the driving velocity: a cycle whose slowest slip is below it sticks
