@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from srfcli.codegen.c_source import compiler
-from srfcli.codegen.model import load_source
+from srfcli.codegen.model import COMPLEX_STEP, load_source
 from srfcli.core.errors import SrfError
 from srfcli.laws.registry import bundled_registry
 from srfcli.laws.values import Effect
@@ -22,7 +22,7 @@ from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.integrators import integrate, integrate_lsoda, scalar_function
 from srfcli.symbolic.equations import equations_of
 from srfcli.symbolic.system import System, build_system
-from srfcli.tasks.law_check import STEP, evaluate
+from srfcli.tasks.law_check import evaluate
 
 REGISTRY = bundled_registry()
 POINTS = 12
@@ -186,9 +186,9 @@ def test_the_rates_fulfil_the_balance(make_model, names):
         balance = Balance(system, model, point, p)
         r = np.asarray(model.rates(x, point["V"], point["W"], point["W_dot"], p))
         assert np.isfinite(r).all()
-        now, later = balance.at(x, 0.0), balance.at(x + 1j * STEP * r, 1j * STEP)
+        now, later = balance.at(x, 0.0), balance.at(x + 1j * COMPLEX_STEP * r, 1j * COMPLEX_STEP)
         rate = {
-            n: np.imag(later[n]) / STEP
+            n: np.imag(later[n]) / COMPLEX_STEP
             for n in ("W", "mu", "F", "S", "u", "force", *(s.name for s in system.friction.states))
         }
         slip = now["z"] if "z" in now else now["v"] + rate["S"] if not system.inertia else now["v"]
