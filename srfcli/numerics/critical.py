@@ -12,6 +12,7 @@ samples are added, down to a stated resolution.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -471,8 +472,9 @@ def scan_line(
     swing = swing_pair(model, p, batch.orbit, multipliers)
     scan = LineScan(name, p, np.asarray(values, float), multipliers, g, batch.orbit, swing, np.inf)
     coordinate = np.log if log else np.asarray
-    while True:
+    for count in itertools.count():
         position = coordinate(scan.values)
+        tongues &= count < ROUNDS
         close = _suspects(position, scan.g, resolution)
         halves = np.nonzero(close | _rising_inside(position, scan, resolution) if tongues else close)[0]
         left, share = _resonances(position, scan, resolution) if tongues else (halves[:0], np.zeros(0))
@@ -597,7 +599,8 @@ def _with_samples(
 FROZEN = 16  # phases at which the Jacobian is looked at
 BESIDE = np.array([-(3**-0.5), 0.0, 3**-0.5])  # of |d|, from a multiple of pi: where samples must be,
 CENTRED = 0.25  # and how close, likewise
-DAMPED = 3.0  # a swing with |d| above it leaves no tongue that an interval could hide
+DAMPED = 1.5  # a swing with |d| above it leaves no tongue that an interval could hide
+ROUNDS = 5  # in which samples are added
 HARMONICS = 0.5  # of the mesh's intervals: swings above that many to a period are not resolved
 
 
@@ -652,5 +655,6 @@ def _rising_inside(position: Array, scan: LineScan, resolution: float) -> Array:
     """Return for each interval whether a sample at its end lies in a tongue that may reach zero though the sample does not."""
     d, psi, split = scan.swing.T
     with np.errstate(invalid="ignore"):
-        below = (psi > 1) & (-d < DAMPED) & (d + split < 0) & (d + np.hypot(split, CENTRED * d) > 0)
+        hidden = d + split < np.minimum(scan.g - MESH_ERROR, 0.0)  # where it leads g itself shows it
+        below = (psi > 1) & (-d < DAMPED) & hidden & (d + np.hypot(split, CENTRED * d) > 0)
     return (below[:-1] | below[1:]) & (np.diff(position) > 2 * resolution) & np.isfinite(scan.g[:-1] + scan.g[1:])
