@@ -15,7 +15,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.numerics.boundary import pick_multiplier
-from srfcli.numerics.collocation import Condensed, Discretisation, condense_plainly, gauss
+from srfcli.numerics.collocation import Condensed, Discretisation, condense_plainly, gauss, running_products
 from srfcli.numerics.continuation import Branch, CurvePoint
 from srfcli.numerics.plane import Plane
 from srfcli.numerics.special_points import RESONANCES, SpecialPoint, locate
@@ -97,11 +97,10 @@ def _forced(c: Condensed, source: ComplexArray) -> tuple[ComplexArray, ComplexAr
     alone = np.linalg.solve(c.block, both)
     own = (alone[..., 0] + 1j * alone[..., 1]).reshape(N, m, n)
     gain = np.einsum("m,Nmn->Nn", gauss(m).step, own)
-    y, out = np.zeros(n, complex), np.empty((N, m, n), complex)
-    for i in range(N):
-        out[i] = own[i] + c.local[i, :, :, :n] @ y
-        y = c.maps[i, :n, :n] @ y + gain[i]
-    return out, y
+    maps = np.zeros((N, n + 1, n + 1), complex)
+    maps[:, :n, :n], maps[:, :n, n], maps[:, n, n] = c.maps[:, :n, :n], gain, 1.0
+    y = running_products(maps)[:, :n, n]
+    return own + (c.local[..., :n] @ y[:-1, None, :, None])[..., 0], y[-1]
 
 
 def branch_coefficients(model: GeneratedModel, branch: Branch) -> Array:
