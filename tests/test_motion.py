@@ -109,7 +109,9 @@ def test_a_smooth_modulation_takes_the_steps_of_order_eight(model):
     x0 = np.asarray(model.steady(p))
     by = [model.index(name) for name in ("mu0", "A", "D0")]
     found, fine = (
-        integrate(model, p, drive=Drive.constant(8.0), load=load, t=t, start=x0, by=by, rtol=rtol, atol=np.full(4, rtol))
+        integrate(
+            model, p, drive=Drive.constant(8.0), load=load, t=t, start=x0, by=by, rtol=rtol, atol=np.full(4, rtol)
+        )
         for rtol in (1e-10, 1e-12)
     )
     assert found.steps < 3000
@@ -117,9 +119,7 @@ def test_a_smooth_modulation_takes_the_steps_of_order_eight(model):
     assert np.abs(found.S - fine.S).max() < 1e-6 * np.abs(fine.S).max()
     alone = integrate(model, p, drive=Drive.constant(8.0), load=load, t=t, start=x0, rtol=1e-10, atol=np.full(4, 1e-10))
     assert np.abs(alone.x - fine.x).max() < 1e-7
-    other = integrate_lsoda(
-        model, p, Drive.constant(8.0), load, t, x0, by, np.zeros((4, 3)), 1e-10, np.full(4, 1e-10)
-    )
+    other = integrate_lsoda(model, p, Drive.constant(8.0), load, t, x0, by, np.zeros((4, 3)), 1e-10, np.full(4, 1e-10))
     assert np.abs(fine.S - other.S).max() < 1e-4 * np.abs(fine.S).max()
 
 
