@@ -4,10 +4,11 @@
 
 Every shipped friction law, ageing law and interface, each with the defaults beside it, at the amplitudes EPS and velocities V.
 The brute scan looks at 100 loads a decade, from 1e-3 times the lowest to 1e3 times the highest load of the window around the
-critical load without modulation, on 64 intervals, halves where a pair could hide, and polishes what it brackets: it shares orbits
-and polishing with `srf critical`, and nothing of where `srf critical` looks. A line counts as agreeing where both hold the same
-loads to 1e-6; what was bracketed and not located (status no-convergence) counts for neither. What one has and the other has not
-is listed, and how many loads the brute scan found no forced state at.
+critical load without modulation, and at V up to 1 um/s, where the slider's swing is little damped and tongues are narrow, at
+1000 a decade between 0.01 and 500 N; on 64 intervals. It halves where the interpolation of the growth rate could hide a pair,
+and polishes what it brackets: it shares orbits and polishing with `srf critical`, and nothing of where `srf critical` looks.
+A line counts as agreeing where both hold the same loads to 1e-6; what was bracketed and not located (status no-convergence)
+counts for neither. What one has and the other has not is listed, and how many loads the brute scan found no forced state at.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ EPS = (0.09, 0.3, 0.5)
 V = (0.1, 1.0, 10.0, 100.0)
 BEYOND = 1e3
 PER_DECADE = 100
+TONGUES, DENSE = (0.01, 500.0), 1000  # N, and loads a decade between them
+SLOW = 1.0  # um/s: up to which tongues are narrow
 SAME = 1e-6  # in ln W0
 
 
@@ -42,7 +45,10 @@ def brute(model: GeneratedModel, p: np.ndarray) -> tuple[list[float], int]:
     lo, hi = load_window(model, [p])
     lo, hi = lo / BEYOND, hi * BEYOND
     values = np.geomspace(lo, hi, int(PER_DECADE * np.log10(hi / lo)))
-    scan = scan_line(model, p, "W0", values, intervals=64, resolution=1e-3)
+    if p[model.index("V")] <= SLOW:
+        fine = np.geomspace(*TONGUES, int(DENSE * np.log10(TONGUES[1] / TONGUES[0])))
+        values = np.unique(np.concatenate([values, fine]))
+    scan = scan_line(model, p, "W0", values, intervals=64, resolution=1e-3, tongues=False)
     points = locate_crossings(model, p, scan, tol=1e-8)
     return [q.value(model, "W0") for q in points if q.status.ok], int(scan.lost.size)
 

@@ -18,6 +18,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.laws.registry import bundled_registry
 from srfcli.numerics import compare
 from srfcli.numerics.compare import (
+    LawPart,
     LawStudy,
     LawTask,
     Match,
@@ -25,10 +26,11 @@ from srfcli.numerics.compare import (
     changed_areas,
     check_adjusted,
     contrast,
+    law_parts,
     match,
     observe,
-    read_study,
     study_law,
+    study_part,
     turns,
 )
 from srfcli.numerics.critical import critical_line
@@ -94,7 +96,7 @@ WINDOW = Window((5.0, 40.0), (7.0, 40.0), 14, 24)
 def study(model):
     """The paper's law without modulation and at eps = 0.13, in a small window."""
     task = LawTask(model.source, model.key, model.vector(), (0.0, 0.13), WINDOW, onset=0.01)
-    return read_study(study_law(task))
+    return study_law(task)
 
 
 def test_crossings_are_critical_loads(model, study):
@@ -115,7 +117,7 @@ def test_re_entrance_begins_between_one_crossing_and_three(model, study):
     counts = []
     for eps in (low - 0.01, high + 0.01):
         task = LawTask(model.source, model.key, model.vector(), (eps,), WINDOW, onset=1.0)
-        counts.append(np.isfinite(read_study(study_law(task)).crossings[0]).sum(axis=1).max())
+        counts.append(np.isfinite(study_law(task).crossings[0]).sum(axis=1).max())
     assert counts[0] == 1 and counts[1] == 3
 
 
@@ -123,8 +125,9 @@ def test_re_entrance_begins_between_one_crossing_and_three(model, study):
 def test_an_interrupted_study_is_none(model):
     """At whatever moment: half a study, kept by --resume, would be taken for a whole one."""
     task = LawTask(model.source, model.key, model.vector(), (0.13,), Window((5.0, 40.0), (5.0, 40.0), 5, 7), onset=1.0)
+    part = LawPart(task, 0.13, mapped=True)
     begun = time.process_time()
-    whole = study_law(task)
+    whole = study_part(part)
     spent = time.process_time() - begun
     before = signal.signal(signal.SIGVTALRM, signal.default_int_handler)
     ended = 0
@@ -132,7 +135,7 @@ def test_an_interrupted_study_is_none(model):
         for share in (0.1, 0.3, 0.5, 0.7, 0.9):
             signal.setitimer(signal.ITIMER_VIRTUAL, share * spent)
             try:
-                found = study_law(task)
+                found = study_part(part)
             except KeyboardInterrupt:
                 ended += 1
             else:
@@ -146,7 +149,7 @@ def test_an_interrupted_study_is_none(model):
 
 def test_a_study_without_re_entrance_says_so(model):
     task = LawTask(model.source, model.key, model.vector(), (0.0, 0.03), WINDOW)
-    found = read_study(study_law(task))
+    found = study_law(task)
     assert np.isnan(found.onset).all() and found.folds == (0, 0)
 
 
@@ -165,7 +168,9 @@ def test_re_entrance_that_comes_and_goes_between_two_amplitudes_is_seen(model, m
     fold, plain = np.array([[5.0, 10], [9, 12], [7, 15]]), np.array([[5.0, 10], [9, 12]])
     monkeypatch.setattr(compare, "_followed", lambda m, t, eps: iter([[fold if there(eps) else plain]]))
     task = LawTask(model.source, model.key, model.vector(), (0.0, 0.13), WINDOW, onset=1e-3)
-    for (low, high), edge in zip(compare._reentrance(model, task, several), (onset, end), strict=True):
+    known = {part.eps: bool(study_part(part)["several"]) for part in law_parts(task) if not part.mapped}
+    known |= dict(zip(task.amplitudes, several, strict=True))
+    for (low, high), edge in zip(compare._reentrance(model, task, known), (onset, end), strict=True):
         if edge is None:
             assert np.isnan([low, high]).all()
         else:

@@ -80,7 +80,7 @@ def test_points_agree_with_critical_loads_at_the_same_velocity(model, atlas):
     """A sample of points against scans of W0, which know nothing of the curve."""
     checked = 0
     for branch in atlas.branches:
-        for i in [*range(0, len(branch.points), 16), len(branch.points) - 1]:
+        for i in [*range(0, len(branch.points), 12), len(branch.points) - 1]:
             point = branch.points[i]
             if abs(point.slope) < STEEP:
                 continue  # beside a fold; see the next test
@@ -116,7 +116,7 @@ def test_folds_are_passed(model, atlas):
         turns = np.nonzero(np.diff(np.sign(np.diff(V))) != 0)[0] + 1
         for i in turns:
             assert slopes[i - 1] * slopes[i + 1] < 0
-            assert abs(np.log(V[i - 1] / V[i])) < 0.01
+            assert np.abs(np.log(V[[i - 1, i + 1]] / V[i])).min() < 0.01
         away = np.ones(len(V), bool)
         away[np.unique(np.clip(np.concatenate([turns - 1, turns, turns + 1]), 0, len(V) - 1))] = False
         changes = np.nonzero(np.diff(np.sign(slopes)) != 0)[0]

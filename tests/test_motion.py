@@ -103,6 +103,27 @@ def moved(model, drive, load, t, *, rtol=1e-8, W0, how=integrate):
 
 
 @needs_compiler
+def test_a_smooth_modulation_takes_the_steps_of_order_eight(model):
+    """Radau IIA takes 8000 steps for it, and errs by 1e-10 um."""
+    p, t, load = model.vector({"V": 8.0, "W0": 9.0}), np.linspace(0.0, 0.2, 401), Modulation(9.0, 0.09, 120.0, 0.0)
+    x0 = np.asarray(model.steady(p))
+    by = [model.index(name) for name in ("mu0", "A", "D0")]
+    found, fine = (
+        integrate(
+            model, p, drive=Drive.constant(8.0), load=load, t=t, start=x0, by=by, rtol=rtol, atol=np.full(4, rtol)
+        )
+        for rtol in (1e-10, 1e-12)
+    )
+    assert found.steps < 3000
+    assert np.abs(found.x - fine.x).max() < 1e-7
+    assert np.abs(found.S - fine.S).max() < 1e-6 * np.abs(fine.S).max()
+    alone = integrate(model, p, drive=Drive.constant(8.0), load=load, t=t, start=x0, rtol=1e-10, atol=np.full(4, 1e-10))
+    assert np.abs(alone.x - fine.x).max() < 1e-7
+    other = integrate_lsoda(model, p, Drive.constant(8.0), load, t, x0, by, np.zeros((4, 3)), 1e-10, np.full(4, 1e-10))
+    assert np.abs(fine.S - other.S).max() < 1e-4 * np.abs(fine.S).max()
+
+
+@needs_compiler
 @pytest.mark.parametrize("rtol, error", [(1e-6, 0.05), (1e-8, 1e-3), (1e-10, 1e-4)])
 def test_output_between_steps_holds_at_rest(make_model, rtol, error):
     """At 1e-9 um/s the rates are the noise of Newton's method times 1e12 / s: no slope to draw a curve by."""

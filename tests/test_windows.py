@@ -34,6 +34,37 @@ def test_islands_far_below(model):
     assert line.crossings == tuple(range(1, len(line.points) + 1))
 
 
+@pytest.mark.parametrize(
+    ("law", "V", "eps", "loads"),
+    [
+        ("srf-vsat", 0.1, 0.3, (27.3093, 27.4527)),
+        ("two-state", 0.1, 0.09, (0.0693416, 0.072986)),
+        ("dieterich-ruina", 1.0, 0.5, (63.499, 64.1819)),
+    ],
+)
+def test_tongues_narrower_than_the_spacing_of_loads(make_model, law, V, eps, loads):
+    """The swing meets a multiple of half the forcing frequency between two loads that show nothing of it."""
+    model = make_model(law=law)
+    base = model.vector({"V": V, "eps": eps})
+    line = critical_line(model, base, tol=1e-6)
+    assert line.status is Status.OK
+    found = np.array([q.value(model, "W0") for q in line.points])
+    values = np.geomspace(0.98 * loads[0], 1.02 * loads[1], 80)
+    scan = scan_line(model, base, "W0", values, intervals=64, tongues=False)
+    assert len(scan.brackets()) == 2
+    for i, load in zip(scan.brackets(), loads, strict=True):
+        assert scan.values[i] < load < scan.values[i + 1]
+        assert np.abs(np.log(found / load)).min() < 2e-5
+
+
+def test_the_edge_of_a_narrow_tongue_is_a_boundary_point(model):
+    line = critical_line(model, model.vector({"V": 0.1, "eps": 0.3}), lo=27.0, hi=28.0, samples=4)
+    assert line.status is Status.OK and len(line.points) == 2
+    for point in line.points:
+        error, _ = error_of_load(Slider(0.1, point.value(model, "W0"), 0.3), point.orbit.x[0, 0])
+        assert abs(error) < 1e-6
+
+
 def test_a_jump_between_branches_is_no_crossing(model):
     """Where the slider's swing is driven at its own frequency, two stable states end in folds, with unstable ones between."""
     line = critical_line(model, model.vector({"V": 0.1, "eps": 0.5}), lo=6.7242987, hi=7.0565009, samples=3)

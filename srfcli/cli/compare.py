@@ -119,10 +119,10 @@ def command(
     sliders = _sliders(laws, ageings, system)
     window = _window(next(iter(sliders.values())).model, over)
     warn_uncompiled("boundaries take about twice as long")
-    with Progress("compare", total=len(sliders)) as progress:
+    with Progress("compare") as progress:
         found = compare(
             sliders, eps=eps, at=_velocity(at), adjust=adjust.split(","), matched=matched, **window, run=spread.run,
-            progress=lambda name: progress.advance(note=name),
+            progress=lambda name, share: progress.advance(note=name, share=share),
         )  # fmt: skip
     every = dict.fromkeys(law for slider in sliders.values() for law in slider.model.laws)
     emit(found.table, output, laws=every, timings={"all": time.perf_counter() - begun}, figure=found.plot)

@@ -315,7 +315,7 @@ def c_source(model: GeneratedModel) -> str:
         functions = FUNCTIONS | TABLE_FUNCTIONS
     needs = (LAMBERTW if "lambertw(" in model.source else "") + (TABLES if tables else "")
     body = "\n".join(c_function(model.source, name, label=label) for name, label in functions.items())
-    own = (files("srfcli") / "codegen" / "radau.c").read_text(encoding="utf-8")
+    own = "".join((files("srfcli") / "codegen" / name).read_text(encoding="utf-8") for name in ("radau.c", "dop853.c"))
     return head + needs + body + own + (_filter_source(model) if "field_gain" in model.namespace else "")
 
 

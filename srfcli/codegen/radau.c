@@ -194,6 +194,7 @@ typedef struct {
     double *S, *Sf, *work;                  /* NX x ns at each node, one after another */
     int *active, stride;                    /* columns that the last step solved for, and how wide `work` is */
     double *Sf_now;                         /* NX x ns, evaluated at the last node; Sf holds slopes for output */
+    double *explicit_work;                  /* 18 times NX x ns, for dop853.c; NULL where tables have columns */
     int nodes;
     Node node[NODES];
 } History;
@@ -243,6 +244,22 @@ static void output_slopes(History *q, double h) {
         }
         for (int k = 0; k < na; k++) out[q->active[k]] = (D[0] * B[k] + D[1] * B[rows + k] + D[2] * B[2 * rows + k]) / h;
     }
+}
+
+/* The slopes for output at the first step's start from its increments, as in output_slopes. What hands over ends a hair off the slow
+   motion of a stiff state: the rates there are those of a return to it that takes no time. */
+static void restart_slopes(History *q, const double *Z, double h) {
+    const double node[4] = {0.0, C[0], C[1], 1.0};
+    double G[3];
+    for (int k = 1; k < 4; k++) {
+        double l = 1.0 / node[k];
+        for (int j = 1; j < 4; j++)
+            if (j != k) l *= -node[j] / (node[k] - node[j]);
+        G[k - 1] = l / h;
+    }
+    for (int r = 0; r < NX; r++) q->node[0].f[r] = G[0] * Z[r] + G[1] * Z[NX + r] + G[2] * Z[2 * NX + r];
+    size_t rows = (size_t)NX * q->stride;
+    for (int r = 0; r < NX * q->ns; r++) q->Sf[r] = G[0] * q->work[r] + G[1] * q->work[rows + r] + G[2] * q->work[2 * rows + r];
 }
 
 static void drop_oldest(History *q) {
@@ -494,21 +511,31 @@ static double first_step(Imposed *force, const Node *n, double span, double rtol
     return fmin(fmin(100.0 * h, second), span);
 }
 
-/* integrates one smooth segment [a, b]; returns the next output index, or -1 - (it) where it stopped early */
+static int explicit_steps(Imposed *force, History *q, double b, double rtol, const double *atol, double longest, long max_steps, int next, int nt, const double *t, double *X, double *S, double *stats, const volatile int *stop);
+
+/* integrates one smooth segment [a, b], explicitly as far as it is not stiff; returns the next output index, or -1 - (it) where it stopped early */
 static int segment(Imposed *force, History *q, double a, double b, double rtol, const double *atol, double longest, long max_steps, int next, int nt, const double *t, double *X, double *S, double *stats, const volatile int *stop) {
     double V, W, W_dot, Z[NZ], Z0[NZ], J[3][NX * NX], J0[NX * NX], f0[NX], before = 0.0, last_error = 1.0, last_h = 0.0;
     double carry = 0.0;
-    int rejected = 0, first = 1, unseen = 0;
+    int rejected = 0, first = 1, unseen = 0, handed = 0;
     Node *now = &q->node[0];
     now->t = a;
     imposed(force, a, &V, &W, &W_dot);
     memset(now->f, 0, sizeof now->f);
     srf_rates(now->x, V, W, W_dot, force->p, now->f);
-    memcpy(f0, now->f, sizeof f0);
     q->nodes = 1;
+    if (!q->ns || q->explicit_work) {
+        next = explicit_steps(force, q, b, rtol, atol, longest, max_steps, next, nt, t, X, S, stats, stop);
+        if (next < 0 || now->t >= b) return next;
+        handed = now->t > a;
+        imposed(force, now->t, &V, &W, &W_dot);
+        memset(now->f, 0, sizeof now->f);
+        srf_rates(now->x, V, W, W_dot, force->p, now->f);
+    }
+    memcpy(f0, now->f, sizeof f0);
     sensitivity_rates(q, 0, force);
     if (q->ns) memcpy(q->Sf, q->Sf_now, (size_t)NX * q->ns * sizeof(double));
-    double h = fmin(first_step(force, now, b - a, rtol, atol), longest);
+    double h = fmin(first_step(force, now, b - now->t, rtol, atol), longest);
     while (now->t < b) {
         if (*stop || stats[0] + stats[1] >= max_steps) return -1 - next;
         double left = b - now->t;
@@ -572,6 +599,8 @@ static int segment(Imposed *force, History *q, double a, double b, double rtol, 
         memcpy(f0, f_after, sizeof f0);
         q->node[q->nodes] = after;
         output_slopes(q, h);
+        if (handed) restart_slopes(q, Z, h);
+        handed = 0;
         q->nodes++;
         sensitivity_rates(q, q->nodes - 1, force);
         stats[0] += 1;
@@ -611,13 +640,14 @@ int srf_integrate(int n_segments, const double *edges, const double *drive, cons
     q.scale = scale;
     if (ns) {
         size_t widest = own + 12 * TN + NX;
-        block = malloc(((2 * NODES + 1) * size + 2 * NZ * widest) * sizeof(double) + widest * sizeof(int));
+        block = malloc(((2 * NODES + 19) * size + 2 * NZ * widest) * sizeof(double) + widest * sizeof(int));
         if (!block) return -1;
         q.S = block;
         q.Sf = block + NODES * size;
         q.work = block + 2 * NODES * size;
         q.Sf_now = q.work + 2 * NZ * widest;
-        q.active = (int *)(q.Sf_now + size);
+        q.explicit_work = ns > own ? NULL : q.Sf_now + size;
+        q.active = (int *)(q.Sf_now + 19 * size);
         memcpy(q.S, S0, size * sizeof(double));
     }
     memcpy(q.node[0].x, x0, NX * sizeof(double));

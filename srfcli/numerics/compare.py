@@ -7,16 +7,16 @@ V; and the smallest amplitude at which a line meets more than one boundary (re-e
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.codegen.model import Array, GeneratedModel, load_source
+from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status
 from srfcli.numerics.continuation import AtlasSettings, Branch, find_components
 from srfcli.numerics.hopf import critical_point, hopf_points, weakening
-from srfcli.numerics.map import compute_map
+from srfcli.numerics.map import compute_map, tile_model
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane
 from srfcli.numerics.special_points import polyline_heights
@@ -152,6 +152,7 @@ def _levelled(model: GeneratedModel, p: Array, goal: Observables) -> Array:
 
 # One law's boundaries at several amplitudes, and what two laws' boundaries say of each other.
 
+MAPPED = 4.0  # times as long as a search on lines a map takes
 EXPERIMENT = 0.03  # relative error of the paper's critical loads
 
 
@@ -169,7 +170,7 @@ class Window:
         return np.geomspace(*self.V, 4 * self.columns + 1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # parts are found by their task itself: its parameters are an array
 class LawTask:
     """All that the study of a law depends on: its model's source, parameters, rising amplitudes, window, and tolerances."""
 
@@ -202,44 +203,73 @@ class LawStudy:
     status: tuple[Status, ...]
 
 
-def study_law(task: LawTask) -> dict[str, Array]:
-    """Return the study of a law as plain arrays, which `read_study` puts together; it depends on nothing but `task`.
+@dataclass(frozen=True)
+class LawPart:
+    """What is studied of a law at one amplitude: its boundaries from a map, or only whether they are re-entrant."""
+
+    task: LawTask
+    eps: float
+    mapped: bool
+
+    @property
+    def weight(self) -> float:
+        """Return about how long this takes, relative to other parts."""
+        return MAPPED if self.mapped and self.eps > 0 else 1.0
+
+
+def law_parts(task: LawTask) -> list[LawPart]:
+    """Return the parts of a law's study that do not depend on each other, those that take longest first."""
+    largest = max(task.amplitudes)
+    between = np.linspace(0, largest, max(1, math.ceil(largest / task.stride)) + 1).tolist()
+    looked = [eps for eps in between if min(abs(eps - k) for k in task.amplitudes) > 0.4 * task.stride]
+    return [LawPart(task, eps, True) for eps in task.amplitudes[::-1]] + [
+        LawPart(task, eps, False) for eps in looked[::-1]
+    ]
+
+
+def study_part(part: LawPart) -> dict[str, Array]:
+    """Return a part of a law's study as plain arrays, which `join_study` puts together; it depends on nothing but `part`.
 
     A KeyboardInterrupt ends it: half a search is no study, and must not be kept as one.
     """
-    model = load_source(task.source, key=task.key)
-    out: dict[str, Array] = {"amplitudes": np.array(task.amplitudes)}
-    several = []
-    for k, eps in enumerate(task.amplitudes):
-        curves, folds, odd, status = _boundaries(model, task, eps) if eps > 0 else _without(model, task)
-        several.append(_reentrant(curves, task.window))
-        lines = _padded(curves, task.window)
-        out |= {f"crossings_{k}": lines, f"folds_{k}": np.array(folds), f"odd_{k}": np.array(odd)}
-        out[f"status_{k}"] = np.array(list(Status).index(status))
-        out[f"sizes_{k}"] = np.array([len(c) for c in curves], dtype=int)
-        out[f"curves_{k}"] = np.concatenate([np.zeros((0, 2)), *curves])
-    out["reentrance"] = np.array(_reentrance(model, task, several))
-    return out
+    task, eps = part.task, part.eps
+    model = tile_model(task.source, task.key)
+    if not part.mapped:
+        return {"several": np.array(_there(model, task, eps))}
+    curves, folds, odd, status = _boundaries(model, task, eps) if eps > 0 else _without(model, task)
+    return {
+        "several": np.array(_reentrant(curves, task.window)),
+        "crossings": _padded(curves, task.window),
+        "folds": np.array(folds),
+        "odd": np.array(odd),
+        "status": np.array(list(Status).index(status)),
+        "sizes": np.array([len(c) for c in curves], dtype=int),
+        "curves": np.concatenate([np.zeros((0, 2)), *curves]),
+    }
 
 
-def read_study(arrays: dict[str, Array]) -> LawStudy:
-    """Return the study that `study_law` made plain arrays of."""
-    count = range(len(arrays["amplitudes"]))
-    curves = []
-    for k in count:
-        cuts = np.cumsum(arrays[f"sizes_{k}"])[:-1]
-        parts = np.split(arrays[f"curves_{k}"], cuts) if arrays[f"sizes_{k}"].size else []
-        curves.append(tuple(parts))
-    onset, end = (tuple(bracket) for bracket in arrays["reentrance"].tolist())
+def join_study(task: LawTask, found: Mapping[LawPart, dict[str, Array]]) -> LawStudy:
+    """Return the study whose parts, all of `law_parts`, were found; the ends of re-entrance are bracketed here."""
+    mapped = {part.eps: arrays for part, arrays in found.items() if part.mapped}
+    rows = [mapped[eps] for eps in task.amplitudes]
+    several = {part.eps: bool(arrays["several"]) for part, arrays in found.items()}
+    onset, end = _reentrance(tile_model(task.source, task.key), task, several)
     return LawStudy(
-        tuple(arrays[f"crossings_{k}"] for k in count),
-        tuple(curves),
-        tuple(int(arrays[f"folds_{k}"]) for k in count),
-        tuple(int(arrays[f"odd_{k}"]) for k in count),
+        tuple(row["crossings"] for row in rows),
+        tuple(
+            tuple(np.split(row["curves"], np.cumsum(row["sizes"])[:-1])) if row["sizes"].size else () for row in rows
+        ),
+        tuple(int(row["folds"]) for row in rows),
+        tuple(int(row["odd"]) for row in rows),
         onset,
         end,
-        tuple(list(Status)[int(arrays[f"status_{k}"])] for k in count),
+        tuple(list(Status)[int(row["status"])] for row in rows),
     )
+
+
+def study_law(task: LawTask) -> LawStudy:
+    """Return the study of a law, its parts one after the other."""
+    return join_study(task, {part: study_part(part) for part in law_parts(task)})
 
 
 def _boundaries(model: GeneratedModel, task: LawTask, eps: float) -> tuple[list[Array], int, int, Status]:
@@ -306,31 +336,34 @@ def _reentrant(curves: Sequence[Array], window: Window) -> bool:
     return any(turns(c[:, 0]) for c in curves) or any(len(h) > 1 for h in _heights(curves, window))
 
 
-def _reentrance(model: GeneratedModel, task: LawTask, several: Sequence[bool]) -> tuple[tuple[float, float], ...]:
-    """Return the brackets of the amplitudes at which re-entrance begins, and is gone again; see LawStudy."""
+def _there(model: GeneratedModel, task: LawTask, eps: float) -> bool:
+    """Return whether boundaries are re-entrant at one amplitude."""
+    found = _followed(model, task, eps) if eps > 0 else iter([_without(model, task)[0]])
+    return any(_reentrant(curves, task.window) for curves in found)
 
-    def there(eps: float) -> bool:
-        found = _followed(model, task, eps) if eps > 0 else iter([_without(model, task)[0]])
-        return any(_reentrant(curves, task.window) for curves in found)
+
+def _reentrance(
+    model: GeneratedModel, task: LawTask, known: Mapping[float, bool]
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the brackets of the amplitudes at which re-entrance begins, and is gone again; see LawStudy.
+
+    `known` says of amplitudes, no farther apart than the task's stride, whether it is there.
+    """
 
     def halved(low: float, high: float) -> tuple[float, float]:
         after = known[high]
         while high - low > task.onset:
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if there(middle) == after else (middle, high)
+            low, high = (low, middle) if _there(model, task, middle) == after else (middle, high)
         return low, high
 
-    known = dict(zip(task.amplitudes, several, strict=True))
-    largest = max(task.amplitudes)
-    for eps in np.linspace(0, largest, max(1, math.ceil(largest / task.stride)) + 1).tolist():
-        if min(abs(eps - k) for k in known) > 0.4 * task.stride:
-            known[eps] = there(eps)
     brackets: list[tuple[float, float]] = []
     rising = sorted(known)
     for before, eps in zip([0.0, *rising], rising, strict=False):
         if len(brackets) < 2 and known[eps] == (not brackets):
             brackets.append(halved(before, eps))
-    return (*brackets, *((np.nan, np.nan),) * (2 - len(brackets)))
+    onset, end = (*brackets, *((np.nan, np.nan),) * (2 - len(brackets)))
+    return onset, end
 
 
 def _followed(model: GeneratedModel, task: LawTask, eps: float) -> Iterator[list[Array]]:

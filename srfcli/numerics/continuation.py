@@ -1,8 +1,9 @@
 """Pseudo-arclength continuation of a stability boundary, and all components of one in a window.
 
-The unknowns are the state at tau = 0 and the two unit coordinates q; a step predicts along the tangent (with the curvature
-that the last two tangents show), and corrects on the hyperplane through the prediction. The first correction is a full Newton
-step with the exact gradient; those after it reuse the gradient's row, which leaves an error far below the final polish.
+The unknowns are the state at tau = 0 and the two unit coordinates q; a step predicts on the cubic through the last two points and
+their tangents, and corrects on the hyperplane through the prediction. The first correction is a full Newton step with the exact
+gradient; those after it reuse the gradient's row, which leaves an error far below the final polish. A step is as long as the
+prediction, the turn of the tangent and the distance of the curve from its chord allow; meshes grow and shrink on the way.
 
 A curve followed from one point misses what closes on itself, so every sign change on a set of lines is accounted for: by a
 branch that passes through it, or by a new branch that starts there. What closes between two lines is not looked at.
@@ -18,14 +19,18 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.boundary import BoundaryLinear, BoundaryPoint, Direction, linearise_boundary, polish, slope_in_last
-from srfcli.numerics.collocation import Discretisation, mesh_error, respond, wanted_mesh
+from srfcli.numerics.collocation import Discretisation, mesh_error, respond
 from srfcli.numerics.critical import INTERVALS, LineScan, locate_crossings, scan_line
 from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
 from srfcli.numerics.plane import Plane
 
 # Pseudo-arclength continuation of a stability boundary in a plane of two parameters.
 
-STALE = 0.3  # of the step's length: a larger correction spoils the tangent
+STALE = 0.3  # of the step: a larger correction, in the same norm, spoils the tangent
+ORBIT_SHARE = 0.1  # of the orbit's change in that norm
+ORDER = 0.3  # power of the share that a correction may grow by, which the step grows by: it goes with the fourth of the step
+FEWEST = 16  # intervals of a mesh that is followed
+COARSER = 0.75  # of a mesh: one that suffices with this share of the intervals takes its place
 ORBIT_WEIGHT = 0.05  # of the orbit's change in the arclength: regular where the curve has a cusp in the plane
 
 
@@ -36,9 +41,10 @@ class StepSettings:
     first: float = 0.01
     largest: float = 0.035
     smallest: float = 1e-5
-    turn: float = 0.25  # radians between successive tangents
-    correction: float = 2e-3  # first Newton correction aimed at: a single step then suffices
-    tol: float = 1e-5
+    turn: float = 0.5  # radians between successive tangents, in parameters and state together
+    chord: float = 3e-4  # distance of the curve from the chord between two points
+    correction: float = 3e-3  # first Newton correction aimed at: a single step then suffices
+    tol: float = 2e-5
     max_steps: int = 3000
     mesh_error: float = 2e-4  # on the mesh that is followed; beyond it the mesh is refined on the way
     max_mesh: int = 512
@@ -95,8 +101,8 @@ def correct(
     """Return the boundary point on the hyperplane through (orbit, q) with normal (normal_x, normal_q), or None.
 
     `normal_x` (n,) weighs the state at tau = 0 and may be zero: with normal_q a unit vector the point lies on that grid line.
-    `reach` is the length of the step that led here: a correction that is not small against it makes the tangent stale, and
-    the linearisation is taken anew.
+    `reach` is the size of the step that led here (`change_size`): a correction that is not small against it makes the tangent
+    stale, and the linearisation is taken anew.
     """
     n = orbit.x.shape[-1]
     q, orbit = q.copy(), Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges)
@@ -122,7 +128,7 @@ def correct(
             head[:n], head[n, 0], head[n + 1 :] = solution[:n], 1.0, solution[n:] * rate[:, None]
             dxs, dall = respond(linear.condensed, head)
             dx, dstages = dxs[..., 0], dall[..., 0]
-        change = max(float(np.abs(solution[n:, 0]).max()), 0.1 * float((np.abs(dx) / scales(model, p)).max()))
+        change = change_size(model, p, solution[n:, 0], dx)
         if iteration and change > 0.7 * previous:
             return None
         previous = change
@@ -157,6 +163,11 @@ def correct(
             return _normalised(model, point, orientation)
         growth = None if change > STALE * reach or change > 0.05 else growth
     return None
+
+
+def change_size(model: GeneratedModel, p: Array, dq: Array, dx: Array) -> float:
+    """Return the size of a change of unit coordinates `dq` (2,) and mesh values `dx` (N, n) at parameters `p`."""
+    return max(float(np.abs(dq).max()), ORBIT_SHARE * float((np.abs(dx) / scales(model, p)).max()))
 
 
 def _matrix(
@@ -198,26 +209,33 @@ def _normalised(model: GeneratedModel, point: CurvePoint, orientation: CurvePoin
 
 
 def predict(a: CurvePoint, b: CurvePoint | None, ds: float) -> tuple[Array, Discretisation]:
-    """Return the prediction a distance `ds` beyond `a`, with the curvature between `b` and `a` where `b` is the point before."""
-    q = a.q + ds * a.tangent_q
-    x = a.orbit.x + ds * a.tangent_orbit.x
-    stages = a.orbit.stages + ds * a.tangent_orbit.stages
-    if b is not None and a.step > 0:
-        half = 0.5 * ds * ds / a.step
-        q = q + half * (a.tangent_q - b.tangent_q)
-        x += half * (a.tangent_orbit.x - b.tangent_orbit.x)
-        stages += half * (a.tangent_orbit.stages - b.tangent_orbit.stages)
-    return q, Discretisation(x, stages, a.orbit.edges)
+    """Return the prediction a distance `ds` beyond `a`: on the cubic through `a`, the point `b` before it and their tangents."""
+    known = b is not None and a.step > 0
+    beyond = ds * ds * (ds + a.step) / a.step**2 if known else 0.0
+    bent = ds * ds / a.step if known else 0.0
+    b = b if b is not None else a
+
+    def ahead(here: Array, tangent: Array, there: Array, other: Array) -> Array:
+        moved = here + (ds + bent + beyond) * tangent
+        return moved + beyond * other - (bent + 2 * beyond) / a.step * (here - there) if known else moved
+
+    return ahead(a.q, a.tangent_q, b.q, b.tangent_q), Discretisation(
+        ahead(a.orbit.x, a.tangent_orbit.x, b.orbit.x, b.tangent_orbit.x),
+        ahead(a.orbit.stages, a.tangent_orbit.stages, b.orbit.stages, b.tangent_orbit.stages),
+        a.orbit.edges,
+    )
 
 
 def follow(
     model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings, *, forward: bool = True
 ) -> Iterator[CurvePoint | Status]:
     """Yield the points beyond `start` one by one, then the status that ended the curve."""
+    start = remeshed(model, plane, start, settings) or start
     current, before = (start if forward else reversed_tangent(start)), None
     ds, first = settings.first, current
     for count in range(settings.max_steps):
         q, orbit = predict(current, before, ds)
+        reach = change_size(model, current.p, q - current.q, orbit.x - current.orbit.x)
         point = correct(
             model,
             plane,
@@ -228,16 +246,18 @@ def follow(
             metric(model, current.p, current.orbit.x[0], current.tangent_orbit.x[0]),
             orientation=current,
             tol=settings.tol,
-            reach=ds,
+            reach=reach,
         )
         turned = np.inf if point is None else _angle(model, current, point)
-        if point is None or turned > 2 * settings.turn or abs(np.angle(point.rho / current.rho)) > 0.5:
+        bend = np.inf if point is None else _bend(current, point)
+        spoilt = turned > 2 * settings.turn or bend > 2 * settings.chord
+        if point is None or spoilt or abs(np.angle(point.rho / current.rho)) > 0.5:
             ds *= 0.4
             if ds < settings.smallest:
                 yield Status.STEP_TOO_SMALL
                 return
             continue
-        point.step = ds
+        point.step = arclength(model, current, point, turned)
         leaving = _edge_crossed(current.q, point.q)
         if leaving is not None:
             landed = _land(model, plane, current, before, leaving)
@@ -245,7 +265,6 @@ def follow(
                 ds *= 0.4
                 continue
             if landed is not None:
-                landed.step = ds
                 yield landed
             yield Status.LEFT_WINDOW
             return
@@ -254,28 +273,57 @@ def follow(
             yield Status.CLOSED
             return
         before, current = current, point
-        if mesh_error(model, point.orbit) > settings.mesh_error:
-            finer = refined(model, plane, point, settings)
-            before, current = (None, finer) if finer is not None else (before, current)
-        wanted = min(settings.correction, 0.7 * STALE * ds)
-        growth = min(0.6 * settings.turn / max(turned, 1e-9), (wanted / max(point.correction, 1e-9)) ** (1 / 3))
+        other = remeshed(model, plane, point, settings)
+        if other is not None:
+            before, current = _on_mesh(before, other.orbit.edges), replace(other, step=point.step)
+        wanted = min(settings.correction, 0.7 * STALE * reach)
+        growth = min(
+            0.6 * settings.turn / max(turned, 1e-9),
+            (wanted / max(point.correction, 1e-9)) ** ORDER,
+            (0.6 * settings.chord / max(bend, 1e-9)) ** 0.5,
+        )
         ds = min(settings.largest, ds * float(np.clip(growth, 0.5, 1.6)))
     yield Status.MAX_STEPS
 
 
-def refined(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: StepSettings) -> CurvePoint | None:
-    """Return `point` on a mesh whose error is half of what the settings allow, or None where it does not converge there."""
-    N = len(point.orbit.edges) - 1
-    mesh = wanted_mesh(mesh_error(model, point.orbit), N, settings.mesh_error, settings.max_mesh)
-    if mesh <= N:
+def remeshed(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: StepSettings) -> CurvePoint | None:
+    """Return `point` on a finer mesh where its own is too coarse, on a coarser one that suffices, None where it may stay."""
+    N, error = len(point.orbit.edges) - 1, float(mesh_error(model, point.orbit))
+    mesh = suited_mesh(error, N, settings)
+    if (error <= settings.mesh_error and mesh > COARSER * N) or mesh == N:
         return None
-    edges = uniform_mesh(int(mesh))
+    edges = uniform_mesh(mesh)
     seen = replace(point, tangent_orbit=interpolate(point.tangent_orbit, edges))
     normal_x = metric(model, point.p, point.orbit.x[0], point.tangent_orbit.x[0])
     start = interpolate(point.orbit, edges)
     return correct(
-        model, plane, point.q, start, point.rho, point.tangent_q, normal_x, orientation=seen, reach=point.step
+        model, plane, point.q, start, point.rho, point.tangent_q, normal_x, orientation=seen, reach=point.step or np.inf
     )
+
+
+def _on_mesh(point: CurvePoint, edges: Array) -> CurvePoint:
+    """Return `point` interpolated on another mesh, uncorrected."""
+    return replace(point, orbit=interpolate(point.orbit, edges), tangent_orbit=interpolate(point.tangent_orbit, edges))
+
+
+def suited_mesh(error: float, intervals: int, settings: StepSettings) -> int:
+    """Return the intervals, a multiple of 4, that leave half the settings' error where `intervals` leave `error`, as N^-8."""
+    ratio = float(np.clip((2 * np.nan_to_num(error, nan=np.inf) / settings.mesh_error) ** 0.125, 0.25, 4.0))
+    return min(max(4 * int(np.ceil(intervals * ratio / 4)), FEWEST), max(settings.max_mesh, intervals))
+
+
+def arclength(model: GeneratedModel, a: CurvePoint, b: CurvePoint, turned: float) -> float:
+    """Return the length of the curve between two points, in parameters and state together, that turns by `turned` (radians)."""
+    away = ORBIT_WEIGHT * (b.orbit.x[0] - a.orbit.x[0]) / state_size(model, a.p, a.orbit.x[0])
+    return float(np.hypot(np.linalg.norm(b.q - a.q), np.linalg.norm(away))) * (1 + turned**2 / 24)
+
+
+def _bend(a: CurvePoint, b: CurvePoint) -> float:
+    """Return how far the curve strays from the chord between two points, in the plane: the length times the turn, over 8."""
+    u, v, chord = a.tangent_q, b.tangent_q, b.q - a.q
+    size = np.linalg.norm(u) * np.linalg.norm(v)
+    turned = np.arccos(np.clip(u @ v / size, -1.0, 1.0)) if size else 0.0
+    return float(np.linalg.norm(chord) * turned / 8)
 
 
 def _angle(model: GeneratedModel, a: CurvePoint, b: CurvePoint) -> float:

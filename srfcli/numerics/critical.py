@@ -6,19 +6,22 @@ as 1/W0 (it strengthens), towards low loads to a constant or proportionally to W
 settled on a quadratic in 1/W0, or in W0, with no zero ahead crosses no more.
 
 g = ln |leading multiplier| over one forcing period. Between two samples a pair of crossings can hide only where |g| is small
-against the error of interpolating it; there the line is halved, down to a stated resolution.
+against the error of interpolating it, or where the slider's own swing meets a multiple of half the forcing frequency; there
+samples are added, down to a stated resolution.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.numerics.boundary import BoundaryPoint, along, polish
+from srfcli.numerics.boundary import BoundaryPoint, along, pick_multiplier, polish
 from srfcli.numerics.collocation import Discretisation, join, mesh_error, wanted_mesh
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.orbit import OrbitBatch, forced_guess, interpolate, solve_orbits, steady_guess, uniform_mesh
@@ -127,7 +130,8 @@ def locate_crossings(
             found.append(point)
             continue
         values = np.geomspace(lower / margin, upper * margin, 9)
-        again = scan_line(model, base, scan.name, values, intervals=2 * (len(scan.orbit.edges) - 1), resolution=1e-6)
+        finer = 2 * (len(scan.orbit.edges) - 1)
+        again = scan_line(model, base, scan.name, values, intervals=finer, resolution=1e-6, tongues=False)
         found += locate_crossings(model, base, again, tol=tol, max_mesh=max_mesh, depth=depth + 1, outer=across)
     return _distinct(sorted(found, key=lambda q: q.value(model, scan.name)), model, scan.name)
 
@@ -165,7 +169,12 @@ def polish_brackets(
     blend = share[:, None, None]
     x = (1 - blend) * scan.orbit.x[left] + blend * scan.orbit.x[left + 1]
     stages = (1 - blend[..., None]) * scan.orbit.stages[left] + blend[..., None] * scan.orbit.stages[left + 1]
-    target = scan.multipliers[np.where(share < 0.5, left, left + 1), 0]
+    near = scan.multipliers[np.where(share < 0.5, left, left + 1)]
+    leading = scan.multipliers[
+        np.where(g0 > 0, left, left + 1), 0
+    ]  # of the unstable end: on the stable one another may lead
+    chosen = pick_multiplier(near, leading.real + 1j * np.abs(leading.imag))
+    target = np.take_along_axis(near, chosen[:, None], axis=-1)[:, 0]
     target = target.real + 1j * np.abs(target.imag)
     guess = Discretisation(x, stages, scan.orbit.edges)
     return polish(model, p, guess, target, along(scan.name, len(left)), tol=tol, max_mesh=max_mesh)
@@ -224,6 +233,7 @@ WINDOW_INTERVALS = {
 OVERLAP = 3  # samples that neighbouring pieces share: a crossing at their seam is in one of them
 FARTHEST = 4  # decades followed beyond either end
 UNEVEN = 0.02  # of the growth rate: what a settled one may differ from its quadratic
+UNLOADED = 1e-6  # of a load: as good as none
 MARGIN = 2.0  # of a window beyond the outermost crossing
 
 
@@ -312,7 +322,21 @@ def _settled(model: GeneratedModel, scan: LineScan, direction: int) -> bool:
     g, h = scan.g[outer], (scan.values[outer] / end) ** -direction  # 1 at the end, 0 infinitely far out
     if not np.isfinite(g).all() or np.ptp(np.sign(g)) or mesh_error(model, scan.orbit)[outer].max() > ROUGHEST:
         return False
-    return bool(_quiet(g, h))
+    return bool(_quiet(g, h)) and (direction > 0 or _swing_settled(model, scan))
+
+
+def _swing_settled(model: GeneratedModel, scan: LineScan) -> bool:
+    """Return whether the swing meets no further multiple of pi between the lowest load of a scan and none.
+
+    Towards high loads it meets one after another, of ever higher harmonics of the forcing, which the growth rate shows to fade.
+    """
+    d, psi, _ = scan.swing[0]
+    p = scan.p[:, 0].copy()
+    p[model.index(scan.name)] *= UNLOADED
+    p[model.index("eps")] = 0.0
+    fastest = max(np.linalg.eigvals(model.cycle_jacobian(0.0, model.steady(p), p)), key=lambda value: value.imag)
+    ahead = np.floor(np.array([fastest.imag, psi]) / np.pi)
+    return bool(ahead[0] == ahead[1] or min(-d, -fastest.real) > DAMPED)
 
 
 def _quiet(g: Array, h: Array) -> bool:
@@ -338,7 +362,10 @@ ROUGHEST = 0.1  # estimated error of a climbed state's multipliers on its mesh; 
 
 @dataclass
 class LineScan:
-    """Samples along `name` (rising `values`): multipliers (B, n), `g` (B,), the orbits, and the resolution reached."""
+    """Samples along `name` (rising `values`): multipliers (B, n), `g` (B,), the orbits, and the resolution reached.
+
+    `swing` (B, 3) is the slider's own swing beside the forcing; see `swing_pair`.
+    """
 
     name: str
     p: Array
@@ -346,6 +373,7 @@ class LineScan:
     multipliers: ComplexArray
     g: Array
     orbit: Discretisation
+    swing: Array
     resolution: float
 
     @property
@@ -428,10 +456,12 @@ def scan_line(
     guess: Discretisation | None = None,
     resolution: float = 1e-3,
     log: bool = True,
+    tongues: bool = True,
 ) -> LineScan:
     """Return the growth rate along parameter `name` through `values` (rising), at the other parameters of `base` (n_parameters,).
 
-    `resolution` is the smallest spacing, in ln(value) where `log`, that halving reaches.
+    `resolution` is the smallest spacing, in ln(value) where `log`, that halving reaches; `tongues`: whether the places are
+    looked at where the slider's swing meets the forcing.
     """
     p = np.repeat(base[:, None], len(values), axis=1)
     p[model.index(name)] = values
@@ -439,14 +469,20 @@ def scan_line(
         model, robust_orbits(model, p, guess, uniform_mesh(intervals) if guess is None else guess.edges)
     )
     multipliers, g = growth(batch)
-    scan = LineScan(name, p, np.asarray(values, float), multipliers, g, batch.orbit, np.inf)
+    swing = swing_pair(model, p, batch.orbit, multipliers)
+    scan = LineScan(name, p, np.asarray(values, float), multipliers, g, batch.orbit, swing, np.inf)
     coordinate = np.log if log else np.asarray
-    while True:
+    for count in itertools.count():
         position = coordinate(scan.values)
-        wanted = np.nonzero(_suspects(position, scan.g, resolution))[0]
-        if not wanted.size:
+        tongues &= count < ROUNDS
+        close = _suspects(position, scan.g, resolution)
+        halves = np.nonzero(close | _rising_inside(position, scan, resolution) if tongues else close)[0]
+        left, share = _resonances(position, scan, resolution) if tongues else (halves[:0], np.zeros(0))
+        new = ~np.isin(left, halves)
+        left, share = np.r_[halves, left[new]], np.r_[np.full(len(halves), 0.5), share[new]]
+        if not left.size:
             break
-        scan = halve(model, base, scan, wanted, log=log)
+        scan = _with_samples(model, base, scan, left, share, log=log)
     suspects = _suspects(coordinate(scan.values), scan.g, 0.0)
     gaps = np.diff(coordinate(scan.values))
     scan.resolution = float(gaps[suspects].max()) if suspects.any() else float(resolution)
@@ -523,17 +559,23 @@ def interpolation_error(position: Array, g: Array) -> Array:
     return error
 
 
-def halve(model: GeneratedModel, base: Array, scan: LineScan, wanted: Array, *, log: bool) -> LineScan:
-    """Return `scan` with the intervals `wanted` halved."""
-    a, b = scan.values[wanted], scan.values[wanted + 1]
-    middle = np.sqrt(a * b) if log else 0.5 * (a + b)
-    left, right = scan.orbit.part(wanted), scan.orbit.part(wanted + 1)
-    guess = Discretisation(0.5 * (left.x + right.x), 0.5 * (left.stages + right.stages), scan.orbit.edges)
-    p = np.repeat(base[:, None], len(middle), axis=1)
-    p[model.index(scan.name)] = middle
+def _with_samples(
+    model: GeneratedModel, base: Array, scan: LineScan, left: Array, share: Array, *, log: bool
+) -> LineScan:
+    """Return `scan` with samples added in the intervals `left` (M,), each at its `share` (M,) of the interval."""
+    a, b = scan.values[left], scan.values[left + 1]
+    fresh = a * (b / a) ** share if log else a + share * (b - a)
+    lower, upper, t = scan.orbit.part(left), scan.orbit.part(left + 1), share[:, None, None]
+    guess = Discretisation(
+        (1 - t) * lower.x + t * upper.x,
+        (1 - t[..., None]) * lower.stages + t[..., None] * upper.stages,
+        scan.orbit.edges,
+    )
+    p = np.repeat(base[:, None], len(fresh), axis=1)
+    p[model.index(scan.name)] = fresh
     batch = robust_orbits(model, p, guess, scan.orbit.edges)
     multipliers, g = growth(batch)
-    values = np.concatenate([scan.values, middle])
+    values = np.concatenate([scan.values, fresh])
     order = np.argsort(values)
     return LineScan(
         scan.name,
@@ -542,5 +584,77 @@ def halve(model: GeneratedModel, base: Array, scan: LineScan, wanted: Array, *, 
         np.concatenate([scan.multipliers, multipliers])[order],
         np.concatenate([scan.g, g])[order],
         join([scan.orbit, batch.orbit]).part(order),
+        np.concatenate([scan.swing, swing_pair(model, p, batch.orbit, multipliers)])[order],
         scan.resolution,
     )
+
+
+# Where the slider's own swing meets the forcing: tongues that are narrower than the samples' spacing.
+#
+# A multiplier pair of modulus e^d and angle psi (counted on through all turns) can leave its circle only where psi is a multiple
+# of pi. Near one its growth is d + sqrt(delta^2 - (psi - k pi)^2), which needs a half-width delta > |d| to reach zero; and the
+# swing that the forcing drives there moves all other multipliers, most at the middle or at |d|/sqrt(3) beside it. With samples
+# at these three places the interpolation of g shows what lies between.
+
+FROZEN = 16  # phases at which the Jacobian is looked at
+BESIDE = np.array([-(3**-0.5), 0.0, 3**-0.5])  # of |d|, from a multiple of pi: where samples must be,
+CENTRED = 0.25  # and how close, likewise
+DAMPED = 1.5  # a swing with |d| above it leaves no tongue that an interval could hide
+ROUNDS = 5  # in which samples are added
+HARMONICS = 0.5  # of the mesh's intervals: swings above that many to a period are not resolved
+
+
+def swing_pair(model: GeneratedModel, p: Array, orbit: Discretisation, multipliers: ComplexArray) -> Array:
+    """Return d, psi and the split (B, 3) of the multipliers e^(d +- i psi), or +-e^(d +- split), of the slider's own oscillation.
+
+    psi is 0 where nothing oscillates. The mean over the period of the frozen Jacobian's eigenvalue with the largest imaginary
+    part counts the turns; the two multipliers that fit it best, in product and angle, say the rest.
+    """
+    n, N = multipliers.shape[-1], orbit.x.shape[-2]
+    at = np.arange(FROZEN) * N // FROZEN
+    with np.errstate(all="ignore"):
+        jacobian = model.cycle_jacobian(orbit.edges[at], orbit.x[:, at], p[..., None])
+        usable: Any = np.isfinite(multipliers).all(axis=-1) & np.isfinite(jacobian).all(axis=(-1, -2, -3))
+        values = np.linalg.eigvals(np.where(usable[:, None, None, None], jacobian, 0.0)).astype(complex)
+        fastest = np.argmax(values.imag, axis=-1)[..., None]
+        mean = np.take_along_axis(values, fastest, axis=-1)[..., 0].mean(axis=-1)[:, None]
+        size, angle = np.log(np.maximum(np.abs(multipliers), 1e-300)), np.abs(np.angle(multipliers))
+        one, other = np.triu_indices(n, 1)
+        turned = np.abs(angle - np.abs(np.angle(np.exp(1j * mean.imag))))
+        off = np.abs(size[:, one] + size[:, other] - 2 * mean.real) + turned[:, one] + turned[:, other]
+        pair = np.argmin(np.where(np.isfinite(off), off, np.inf), axis=-1)
+    row = np.arange(len(pair))
+    a, b = (row, one[pair]), (row, other[pair])
+    turns = 2 * np.pi * np.rint(mean.imag[:, 0] / (2 * np.pi))
+    psi = np.where(mean.imag[:, 0] > 0, turns + np.where(mean.imag[:, 0] < turns, -angle[a], angle[a]), 0.0)
+    found = np.stack([0.5 * (size[a] + size[b]), psi, 0.5 * np.abs(size[a] - size[b])], axis=-1)
+    return np.where(usable[:, None], found, np.nan)
+
+
+def _resonances(position: Array, scan: LineScan, resolution: float) -> tuple[Array, Array]:
+    """Return intervals (M,) without a sample where the swing meets a multiple of pi, and where to put one, as shares (M,)."""
+    d, psi = scan.swing[:, 0], scan.swing[:, 1]
+    low, high = np.fmin(psi[:-1], psi[1:]), np.fmax(psi[:-1], psi[1:])
+    damping = np.fmin(-d[:-1], -d[1:])
+    most = 2 * np.pi * HARMONICS * (len(scan.orbit.edges) - 1)
+    with np.errstate(invalid="ignore"):
+        usable = (damping > 0) & (damping < DAMPED) & (high < most) & (np.diff(position) > resolution)
+    left, share = [], []
+    for i in np.nonzero(usable)[0].tolist():
+        close = CENTRED * damping[i]
+        turns = np.arange(max(1, int(low[i] / np.pi)), int(high[i] / np.pi) + 2)
+        places = (np.pi * turns[:, None] + damping[i] * BESIDE).ravel()
+        places = places[(places > low[i] + close) & (places < high[i] - close)]
+        if places.size:
+            left.append(i)
+            share.append((places[places.size // 2] - psi[i]) / (psi[i + 1] - psi[i]))
+    return np.array(left, dtype=int), np.array(share)
+
+
+def _rising_inside(position: Array, scan: LineScan, resolution: float) -> Array:
+    """Return for each interval whether a sample at its end lies in a tongue that may reach zero though the sample does not."""
+    d, psi, split = scan.swing.T
+    with np.errstate(invalid="ignore"):
+        hidden = d + split < np.minimum(scan.g - MESH_ERROR, 0.0)  # where it leads g itself shows it
+        below = (psi > 1) & (-d < DAMPED) & hidden & (d + np.hypot(split, CENTRED * d) > 0)
+    return (below[:-1] | below[1:]) & (np.diff(position) > 2 * resolution) & np.isfinite(scan.g[:-1] + scan.g[1:])

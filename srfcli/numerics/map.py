@@ -20,9 +20,9 @@ from srfcli.codegen.model import Array, ComplexArray, GeneratedModel, load_sourc
 from srfcli.core.parallel import run_here
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
-from srfcli.numerics.collocation import STAGES, Discretisation, join, kernel, mesh_error
+from srfcli.numerics.collocation import STAGES, Discretisation, condense, join, kernel, mesh_error
 from srfcli.numerics.critical import robust_orbits
-from srfcli.numerics.orbit import OrbitBatch, interpolate, ordered_eigenvalues, solve_orbits, uniform_mesh
+from srfcli.numerics.orbit import CHUNK, OrbitBatch, interpolate, ordered_eigenvalues, solve_orbits, uniform_mesh
 from srfcli.numerics.plane import MapGrid, MapSettings, TileTask, tile_tasks
 
 # Stability maps: the leading Floquet multiplier over a grid of two parameters, put together from its tiles.
@@ -517,7 +517,8 @@ def neighbours(known: Array, new: Array) -> tuple[Array, Array]:
 SAFETY = 1.5  # on an interpolation error, which is itself an estimate
 SHRINKS = 0.5  # of a cell's error that its quarters keep: 0.25 where g is smooth, more where multipliers meet
 CROSSED = 0.5  # a cell that a boundary crosses is halved, too, where its error exceeds this share of the largest |g|
-JUMP = 0.5  # of a state's logarithms between neighbours: it may be another state then
+JUMP = 0.5  # of a state's logarithms between neighbours: it may be another state then,
+LEFT = 0.1  # if what the tangents of the two do not explain of it exceeds this
 
 # in units of half a cell: its middle and the middles of its sides, and the corners whose mean foretells each
 MIDDLES = np.array([(1, 0), (1, 2), (0, 1), (2, 1), (1, 1)])
@@ -681,7 +682,8 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
     nc, nr = task.columns[1] - task.columns[0] + 1, task.rows[1] - task.rows[0] + 1
     count, corner = nc * nr, np.array([task.columns[0], task.rows[0]])
     leading = _upper(samples.multipliers[:, 0])
-    crossed, apart = _crossed(samples), _apart(samples, tile_points(task)[0].logarithmic)
+    names = task.grid.x.moved, task.grid.y.moved
+    crossed, apart = _crossed(samples), _apart(samples, tile_points(task)[0], names)
     sides = _sides(done, 2**task.settings.depth, lambda i, j: crossed(i, j) | apart(i, j))
     suspect = done.suspect.copy()
     suspect[:, :2] += corner
@@ -702,17 +704,40 @@ def _crossed(samples: Samples) -> Between:
     return lambda i, j: np.asarray(np.isfinite(g[i]) & np.isfinite(g[j]) & ((g[i] > 0) != (g[j] > 0)))
 
 
-def _apart(samples: Samples, logarithmic: Sequence[bool]) -> Between:
+def _apart(samples: Samples, model: GeneratedModel, names: tuple[str, str]) -> Between:
     """Return the test whether, of two samples, one is stable and the state of the other may not be the same."""
-    g, start = samples.g, samples.orbit.x[:, 0][:, np.array(logarithmic)]
+    g, logs = samples.g, np.array(model.logarithmic)
+    start = samples.orbit.x[:, 0][:, logs]
     saddle = (g > 0) & (np.abs(np.angle(samples.multipliers[:, 0])) < 1e-7)
 
     def apart(i: Array, j: Array) -> Array:
-        far = np.abs(start[i] - start[j]).max(axis=-1) > JUMP
-        stable, one = (g[i] < 0) & (g[j] < 0), np.fmin(g[i], g[j]) < 0
-        return np.asarray((stable & far) | (one & (np.isnan(g[i]) | np.isnan(g[j]) | saddle[i] | saddle[j])))
+        one = np.fmin(g[i], g[j]) < 0
+        found = one & (np.isnan(g[i]) | np.isnan(g[j]) | saddle[i] | saddle[j])
+        far = np.nonzero((g[i] < 0) & (g[j] < 0) & (np.abs(start[i] - start[j]).max(axis=-1) > JUMP))[0]
+        if far.size:
+            found[far] = _unlike(model, samples, names, i[far], j[far])
+        return np.asarray(found)
 
     return apart
+
+
+def _unlike(model: GeneratedModel, samples: Samples, names: tuple[str, str], i: Array, j: Array) -> Array:
+    """Return whether the states of samples i (E,) and j (E,) differ by more than their tangents along `names` explain.
+
+    The change between neighbours on one branch is the mean of the tangents times the step, up to its third power.
+    """
+    n, logs = samples.orbit.x.shape[-1], np.array(model.logarithmic)
+    every, place = np.unique(np.concatenate([i, j]), return_inverse=True)
+    slopes = np.full((len(every), n, len(names)), np.nan)
+    for a in range(0, len(every), CHUNK):
+        part = every[a : a + CHUNK]
+        end = condense(model, samples.p[:, part], samples.orbit.part(part), names).prefix[:, -1, :n]
+        slopes[a : a + CHUNK] = np.linalg.solve(np.eye(n) - end[..., :n], end[..., n + 1 :])
+    rows = [model.index(name) for name in names]
+    step = (samples.p[rows][:, j] - samples.p[rows][:, i]).T
+    told = 0.5 * ((slopes[place[: len(i)]] + slopes[place[len(i) :]]) @ step[..., None])[..., 0]
+    change = samples.orbit.x[j, 0] - samples.orbit.x[i, 0]
+    return np.asarray(~(np.abs(change - told)[:, logs].max(axis=-1) < LEFT))
 
 
 def _upper(rho: Array) -> Array:

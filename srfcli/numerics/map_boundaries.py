@@ -377,21 +377,29 @@ def _points(model: GeneratedModel, plane: Plane, q: Array) -> Array:
 def continued_end(model: GeneratedModel, plane: Plane, discontinuity: Discontinuity) -> Discontinuity | None:
     """Return the discontinuity where the stable state, followed towards the neighbour, ends; None where it is stable there.
 
-    The steps are halved where Newton's method fails, or finds another state or an unstable one.
+    The steps are halved where Newton's method fails, or finds another state or an unstable one, and grow where it hardly moves.
     """
     here, way = discontinuity.ends[0], discontinuity.ends[1] - discontinuity.ends[0]
     share, step, orbit, rho = 0.0, 0.5, discontinuity.orbit, discontinuity.rho
+    p, dx, dstages = plane.point(model, here), np.zeros_like(orbit.x), np.zeros_like(orbit.stages)
     while step > FINEST:
         ahead = min(share + step, 1.0)
-        p = plane.point(model, here + ahead * way)[:, None]
-        guess = Discretisation(orbit.x[None], orbit.stages[None], orbit.edges)
-        found = solve_orbits(model, p, guess, max_iterations=10)
-        moved = float((np.abs(found.orbit.x[0] - orbit.x) / scales(model, p[:, 0])).max())
+        q = plane.point(model, here + ahead * way)
+        shift, reach = model.steady(q) - model.steady(p), ahead - share
+        guess = Discretisation(
+            (orbit.x + shift + reach * dx)[None], (orbit.stages + shift + reach * dstages)[None], orbit.edges
+        )
+        found = solve_orbits(model, q[:, None], guess, max_iterations=10)
+        off = float((np.abs(found.orbit.x[0] - guess.x[0]) / scales(model, q)).max())
         leading = complex(found.multipliers[0, 0])
-        if not found.converged[0] or moved > NEAR or not abs(leading) < 1:
+        if not found.converged[0] or off > NEAR or not abs(leading) < 1:
             step /= 2
             continue
-        share, rho = ahead, leading
+        dx, dstages = (
+            (found.orbit.x[0] - orbit.x - shift) / reach,
+            (found.orbit.stages[0] - orbit.stages - shift) / reach,
+        )
+        share, rho, p, step = ahead, leading, q, 2 * step if off < NEAR / 4 else step
         orbit = Discretisation(found.orbit.x[0], found.orbit.stages[0], orbit.edges)
         if share == 1.0:
             return None

@@ -1,8 +1,8 @@
 """Points of a stability boundary where something changes; which way a Neimark-Sacker bifurcation opens.
 
 They are folds and cusps of the curve, resonances, and zeros of a caller's function.
-Between two neighbouring points of a polished branch a test function of opposite signs is brought to zero by the Illinois method,
-each trial corrected onto the boundary on the hyperplane across the chord, which joins the points in parameters and state.
+Between two neighbouring points of a polished branch a test function of opposite signs is brought to zero (Chandrupatla's method);
+each trial is corrected onto the boundary on the hyperplane across the chord, which joins the points in parameters and state.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import numpy as np
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind, pick_multiplier
-from srfcli.numerics.collocation import Condensed, Discretisation, condense_plainly, gauss, mesh_error
+from srfcli.numerics.collocation import Condensed, Discretisation, condense_plainly, gauss, mesh_error, running_products
 from srfcli.numerics.continuation import Branch, CurvePoint, correct, metric
 from srfcli.numerics.orbit import interpolate
 from srfcli.numerics.plane import Plane
 
+EXACT = 1e-9  # a correction so small leaves the tangent as it is
 CLOSE = 1e-8  # of the chord: where the search for a zero ends
 MEETING = 0.05  # of Re(rho) from +1 or -1: a Neimark-Sacker boundary that ends so near ends in a strong resonance
 CUSPED = 1e-3  # of the tangent in the plane beside a cusp: what is left of it at the cusp
@@ -186,29 +187,40 @@ def locate(
     max_iterations: int = 40,
 ) -> SpecialPoint:
     """Return the zero of `test` between two points of a branch; where it is not met, the nearest point with its status."""
-    ends = branch.points[between[0]], branch.points[between[1]]
-    low, high = 0.0, 1.0
-    a, b = (_on_chord(model, plane, ends, s) for s in (low, high))
-    best = min(((s, c) for s, c in ((low, a), (high, b)) if c is not None), key=lambda t: abs(test(t[1])), default=None)
+    chord = _Chord.between(model, plane, branch.points[between[0]], branch.points[between[1]])
+    a, b = (chord.corrected(model, plane, s) for s in (0.0, 1.0))
+    best = min(((s, c) for s, c in ((0.0, a), (1.0, b)) if c is not None), key=lambda t: abs(test(t[1])), default=None)
     if a is None or b is None or test(a) * test(b) > 0 or best is None:
         return _special(model, branch, between, what, axis, best, Status.NO_CONVERGENCE)
-    fa, fb, status = test(a), test(b), Status.NO_CONVERGENCE
-    for count in range(max_iterations):
-        share = 0.5 if abs(fa) == abs(fb) or count % 8 == 7 else fa / (fa - fb)
-        s = low + float(np.clip(share, 1e-3, 1 - 1e-3)) * (high - low)
-        point = _on_chord(model, plane, ends, s)
+    # the bracket's end found last, the other one, and what the last took the place of: (share, value)
+    last, other, before = (1.0, test(b)), (0.0, test(a)), (0.0, test(a))
+    share, status = 0.5, Status.NO_CONVERGENCE
+    for _ in range(max_iterations):
+        width = abs(other[0] - last[0])
+        s = last[0] + float(np.clip(share, 1e-3, 1 - 1e-3)) * (other[0] - last[0])
+        point = chord.corrected(model, plane, s)
         if point is None:
             break
         value = test(point)
         best = (s, point)
-        if value * fa > 0:
-            low, fa, fb = s, value, fb / 2
-        else:
-            high, fb, fa = s, value, fa / 2
-        if high - low < CLOSE or abs(value) < 1e-9:
+        before, last, other = (last, (s, value), other) if value * last[1] > 0 else (other, (s, value), last)
+        width = abs(other[0] - last[0])
+        if width < CLOSE or abs(value) < 1e-9:
             status = Status.OK
             break
-    return _special(model, branch, between, what, axis, best, status, width=high - low)
+        share = _inverse_quadratic(last, other, before)
+    return _special(model, branch, between, what, axis, best, status, width=width)
+
+
+def _inverse_quadratic(last: tuple[float, float], other: tuple[float, float], before: tuple[float, float]) -> float:
+    """Return where between the ends `last` and `other` of a bracket to look next, as a share (Chandrupatla 1997)."""
+    (x1, f1), (x2, f2), (x3, f3) = last, other, before
+    if f1 == f2 or f3 in (f1, f2):
+        return 0.5
+    place, value = (x1 - x2) / (x3 - x2), (f1 - f2) / (f3 - f2)
+    if not (1 - np.sqrt(max(1 - place, 0.0)) < value < np.sqrt(max(place, 0.0))):
+        return 0.5
+    return float(f1 / (f2 - f1) * f3 / (f2 - f3) + (x3 - x1) / (x2 - x1) * f1 / (f3 - f1) * f2 / (f3 - f2))
 
 
 def _special(
@@ -234,30 +246,40 @@ def _special(
     return SpecialPoint(what, axis, place, point.p, point.rho, error, status)
 
 
-def _on_chord(
-    model: GeneratedModel, plane: Plane, ends: tuple[BoundaryPoint, BoundaryPoint], s: float
-) -> CurvePoint | None:
-    """Return the boundary point on the hyperplane across the chord between two points, a share `s` along it, or None."""
-    a, b = ends
-    q = [plane.coordinates(model, e.p) for e in ends]
-    edges = max((e.orbit.edges for e in ends), key=len)
-    orbits = [interpolate(_single(e.orbit), edges) for e in ends]
-    blend = Discretisation(
-        (1 - s) * orbits[0].x + s * orbits[1].x, (1 - s) * orbits[0].stages + s * orbits[1].stages, edges
-    )
-    rho = a.rho if s < 0.5 else b.rho
-    chord = q[1] - q[0]
-    across = metric(model, a.p, blend.x[0], orbits[1].x[0] - orbits[0].x[0])
-    point = correct(model, plane, q[0] + s * chord, blend, rho, chord, across, tol=1e-6)
-    if point is not None:  # again from there: the tangent is that of the place a correction starts at
-        point = correct(model, plane, point.q, point.orbit, point.rho, chord, across, tol=1e-6)
-    if point is not None and point.tangent_q @ chord + point.tangent_orbit.x[0] @ across < 0:
-        point.tangent_q = -point.tangent_q  # so that a test function of the tangent is continuous
-    return point
+@dataclass
+class _Chord:
+    """The hyperplanes across the chord between two points of a branch, and what was found on them: (share, q, orbit, rho)."""
 
+    q: Array
+    across: Array
+    found: list[tuple[float, Array, Discretisation, complex]]
 
-def _single(orbit: Discretisation) -> Discretisation:
-    return Discretisation(orbit.x[0], orbit.stages[0], orbit.edges)
+    @staticmethod
+    def between(model: GeneratedModel, plane: Plane, a: BoundaryPoint, b: BoundaryPoint) -> _Chord:
+        """Return the chord from `a` to `b`, its ends on the finer mesh of the two."""
+        edges = max((e.orbit.edges for e in (a, b)), key=len)
+        ends = [interpolate(Discretisation(e.orbit.x[0], e.orbit.stages[0], e.orbit.edges), edges) for e in (a, b)]
+        q = [plane.coordinates(model, e.p) for e in (a, b)]
+        across = metric(model, a.p, 0.5 * (ends[0].x[0] + ends[1].x[0]), ends[1].x[0] - ends[0].x[0])
+        return _Chord(q[1] - q[0], across, [(0.0, q[0], ends[0], a.rho), (1.0, q[1], ends[1], b.rho)])
+
+    def corrected(self, model: GeneratedModel, plane: Plane, s: float) -> CurvePoint | None:
+        """Return the boundary point on the hyperplane a share `s` along the chord, or None; first guess from those beside it."""
+        k = next((k for k, known in enumerate(self.found) if known[0] > s), len(self.found) - 1)
+        (s0, q0, a, rho0), (s1, q1, b, rho1) = self.found[k - 1], self.found[k]
+        w = (s - s0) / (s1 - s0)
+        blend = Discretisation((1 - w) * a.x + w * b.x, (1 - w) * a.stages + w * b.stages, a.edges)
+        rho = rho0 if w < 0.5 else rho1
+        point = correct(model, plane, (1 - w) * q0 + w * q1, blend, rho, self.q, self.across, tol=1e-6)
+        if point is not None and point.correction > EXACT:  # the tangent is that of the place a correction starts at
+            point = correct(model, plane, point.q, point.orbit, point.rho, self.q, self.across, tol=1e-6)
+        if point is None:
+            return None
+        if point.tangent_q @ self.q + point.tangent_orbit.x[0] @ self.across < 0:
+            point.tangent_q = -point.tangent_q  # so that a test function of the tangent is continuous
+        if s0 < s < s1:
+            self.found.insert(k, (s, point.q, point.orbit, point.rho))
+        return point
 
 
 # Which way a Neimark-Sacker bifurcation opens: the cubic coefficient of its normal form, for the map over one forcing period.
@@ -344,11 +366,10 @@ def _forced(c: Condensed, source: ComplexArray) -> tuple[ComplexArray, ComplexAr
     alone = np.linalg.solve(c.block, both)
     own = (alone[..., 0] + 1j * alone[..., 1]).reshape(N, m, n)
     gain = np.einsum("m,Nmn->Nn", gauss(m).step, own)
-    y, out = np.zeros(n, complex), np.empty((N, m, n), complex)
-    for i in range(N):
-        out[i] = own[i] + c.local[i, :, :, :n] @ y
-        y = c.maps[i, :n, :n] @ y + gain[i]
-    return out, y
+    maps = np.zeros((N, n + 1, n + 1), complex)
+    maps[:, :n, :n], maps[:, :n, n], maps[:, n, n] = c.maps[:, :n, :n], gain, 1.0
+    y = running_products(maps)[:, :n, n]
+    return own + (c.local[..., :n] @ y[:-1, None, :, None])[..., 0], y[-1]
 
 
 def branch_coefficients(model: GeneratedModel, branch: Branch) -> Array:

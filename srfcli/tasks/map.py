@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,16 +14,18 @@ from srfcli.core.parallel import Run, run_here
 from srfcli.core.settings import require_parameter
 from srfcli.core.units import to_base
 from srfcli.numerics.compare import (
+    LawPart,
     LawStudy,
     LawTask,
     Match,
     Observables,
     Window,
     check_adjusted,
+    join_study,
+    law_parts,
     match,
     observe,
-    read_study,
-    study_law,
+    study_part,
 )
 from srfcli.numerics.continuation import Atlas, AtlasSettings
 from srfcli.numerics.map import StabilityMap, compute_map
@@ -176,7 +178,7 @@ def compare(
     K_over_W0: tuple[float, float] | None = None,
     points: Mapping[str, int] | None = None,
     run: Run = run_here,
-    progress: Callable[[str], None] = lambda name: None,
+    progress: Callable[[str, float], None] = lambda name, share: None,
 ) -> ComparisonResult:
     """Return where laws differ once each is brought to the first one's observables at one low velocity.
 
@@ -199,7 +201,7 @@ def compare(
     run : callable
         How independent laws are computed; one after the other if left out.
     progress : callable
-        Told the name of each law that is done.
+        Told of each part that is done the law's name, and the share of all work that is done then, from 0 to 1.
 
     Returns
     -------
@@ -231,11 +233,18 @@ def compare(
     window = Window(V=V, W0=loads, **(points or {}))
     usable = [k for k, m in enumerate(matches) if m.status.ok]
     tasks = [LawTask(models[k].source, models[k].key, matches[k].p, amplitudes, window) for k in usable]
+    parts = [part for task in tasks for part in law_parts(task)]
+    whole, done = sum(part.weight for part in parts), 0.0
+    found: list[dict[LawPart, dict[str, Any]]] = [{} for _ in tasks]
     studies: dict[int, LawStudy] = {}
     try:
-        for place, arrays in run(study_law, tasks):
-            studies[usable[place]] = read_study(arrays)
-            progress(names[usable[place]])
+        for place, arrays in run(study_part, parts):
+            law = tasks.index(parts[place].task)
+            found[law][parts[place]] = arrays
+            if len(found[law]) == len(law_parts(tasks[law])):
+                studies[usable[law]] = join_study(tasks[law], found[law])
+            done += parts[place].weight
+            progress(names[usable[law]], done / whole)
     except KeyboardInterrupt:
         if not studies:
             raise
