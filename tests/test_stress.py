@@ -118,9 +118,3 @@ def test_a_record_of_which_nothing_was_reached() -> None:
     values = ["K=6.4", "M=0.2", "mu0=123.7", "A=3.9e-5", "B=2.7e-4", "D0=15.7", "V0=4.9", "lambda=0.015"]
     done = srf(*words.split(), *(w for v in values for w in ("--set", v)))
     assert done.exit_code == 3 and "nothing of the record was reached" in done.output, done.output
-
-
-def test_one_command_one_result_for_any_number_of_workers() -> None:
-    grid = ["map", "--eps", "0.09", "--over", "V=1:100:3", "--over", "K/W0=0.002:0.03:3", "--csv"]
-    results = {srf(*grid, "--workers", workers).stdout for workers in ("1", "3")}
-    assert len(results) == 1 and results.pop().count("\n") >= 9

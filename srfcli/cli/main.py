@@ -13,6 +13,7 @@ import click
 
 from srfcli.cli.base import CONTEXT, SrfGroup, switches
 from srfcli.core.version import __version__
+from srfcli.parallel import ONE_THREAD
 
 # command -> module:attribute and the first sentence of its help, in the order of `srf --help`, which imports none of them
 COMMANDS = {
@@ -135,8 +136,7 @@ def cli() -> None:
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run `srf` with `argv`, or with the process's arguments, and exit."""
-    for library in ("OPENBLAS", "MKL", "OMP"):  # all matrices here are small: threads only cost their start
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    os.environ.update(ONE_THREAD)
     gc.set_threshold(
         100_000, 10, 10
     )  # to look for cycles among what is imported, and at the end, is a sixth of a short run

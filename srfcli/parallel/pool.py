@@ -21,6 +21,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar
 
 from srfcli.core.errors import SrfError
+from srfcli.parallel import ONE_THREAD
 
 # Tasks on processes of this machine. A worker that dies costs the task it was at, which another one does again.
 
@@ -29,7 +30,7 @@ Result = TypeVar("Result")
 
 ATTEMPTS = 3  # a task that took this many workers with it is at fault itself
 _ENVIRONMENT = {
-    **dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1"),
+    **ONE_THREAD,
     "PYTHONSAFEPATH": "1",  # a worker is started by `python -c`, which would import from the current folder first
 }
 
