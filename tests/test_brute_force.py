@@ -210,7 +210,7 @@ def test_a_state_of_slip_events_returns_by_integration(model, eps):
     start = np.array([found.orbit.x[0, model.states.index(n)] for n in ("u", "z", "ln_v", "ln_phi")])
     period = solve_ivp(
         lambda t, y: rates(s, t, *y), (0.0, 1 / s.f), start, method="Radau", jac=lambda t, y: jacobian(s, t, y[2], y[3]),
-        rtol=1e-7, atol=1e-9, dense_output=True,
+        rtol=1e-6, atol=1e-8, dense_output=True,
     )  # fmt: skip
     assert period.success
     assert period.y[:, -1] == pytest.approx(start, rel=1e-4, abs=1e-4)

@@ -177,11 +177,11 @@ def test_parts_of_the_living_stay() -> None:
         with whole_folder(Path("made"), lambda: None) as fresh:
             (fresh / "mine").write_text("whole")
             held.set()
-            go.wait(60)
+            go.wait(1200)
 
     writer = threading.Thread(target=write)
     writer.start()
-    assert held.wait(60)
+    assert held.wait(1200)
     assert forked(lambda: CliRunner().invoke(cli, command(FOLDER, "5"), prog_name="srf").exit_code) == 0
     go.set()
     writer.join()
