@@ -298,6 +298,7 @@ def test_at_random_moments() -> None:
 
 AT_IMPORT = """
 import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background of a shell
 class Watch:
     def find_spec(name, *other):
         if name == {module!r}:
