@@ -5,9 +5,9 @@
 Each friction law with the paper's ageing law and interface, each ageing law, modifier and interface with the paper's friction
 law: every parameter is drawn at random, in its logarithm within its bounds and some decades of its default (`--decades`), and
 so are V, W0, eps and f. A command may say that it did not converge (3) or that the system is none (2). What counts as a failure
-is a traceback, a warning of Python or NumPy, and a NaN or a missing number in a row whose status is ok. The second table
-compares the verdict of `srf floquet` with multipliers from shooting with DOP853 on the paper's equations written by hand
-(`tests/brute.py`).
+is a traceback, a warning of Python or NumPy, and a NaN or a missing number in a row whose status is ok. With `--ends` each
+parameter is then swept over the ends of its range by `srf linear` and `srf response`. The last table compares the verdict of
+`srf floquet` with multipliers from shooting with DOP853 on the paper's equations written by hand (`tests/brute.py`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,11 @@ import numpy as np
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.codegen.model import open_model
+from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.core.settings import Parameter
-from srfcli.laws.registry import bundled_registry
+from srfcli.core.units import to_base
+from srfcli.laws.registry import Registry, bundled_registry
+from srfcli.numerics.floquet import climbed
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from brute import Slider, shoot, steady
@@ -77,6 +79,47 @@ def commands(point: dict[str, float]) -> dict[str, list[str]]:
         "critical": ["critical", "--V", V, "--eps", eps, "--f", f],
         "simulate": ["simulate", "--V", V, "--W0", W0, "--eps", eps, "--f", f, "--for", length, "--rate", rate],
     }
+
+
+def over_the_ends(registry: Registry) -> collections.Counter[str]:
+    """Count what the rows say where one parameter runs over its bounds, its default and 0, for every system."""
+    counts: collections.Counter[str] = collections.Counter()
+    for names in systems():
+        named = [w for k, v in names.items() for w in (f"--{k}", v)]
+        for p in open_model(registry, **names).parameters:
+            if p.name in ("W0", "eps", "f"):
+                continue
+            ends = {max(p.lower, -1e29), p.default or 1.0, min(p.upper, 1e29)} | ({0.0} if p.lower <= 0 else set())
+            over = f"{p.name}={','.join(map(repr, sorted(ends)))}"
+            for words in (["linear"], ["response"], ["response", "--mean", "--eps", "0.1"]):
+                command = [*words, "--over", over, *named]
+                said, why = verdict(command)
+                if said in ("failed", "refused"):
+                    counts[f"{' '.join(words[:2])}: {said}"] += 1
+                    print(f"{said.upper()} srf {' '.join(command)}: {why}", flush=True)
+                    continue
+                done = CliRunner().invoke(cli, [*command, "--json"], prog_name="srf")
+                for row in json.loads(done.stdout)["rows"]:
+                    counts[f"{' '.join(words[:2])}: {row['status']}"] += 1
+                    numbers = [row[n] for n in ("W0", "friction_gain", "force") if n in row]
+                    if (row["status"] == "ok") != (None not in numbers) and "Lyapunov" not in row["status"]:
+                        print(f"FAILED srf {' '.join(command)}: {row}", flush=True)
+    return counts
+
+
+def why_not(model: GeneratedModel, values: dict[str, float]) -> str:
+    """Say what keeps `srf floquet` from a state: how far eps can be raised from 0, and what becomes of the state there."""
+    p = model.vector({q.name: to_base(values[q.name], q.unit) for q in model.parameters if q.name in values})
+    with np.errstate(all="ignore"):
+        if not model.has_rates(p):
+            return "a formula has no value"
+        batch, reached = climbed(model, p[:, None], 512)
+        swing = float(np.ptp(batch.orbit.stages[0][..., list(model.logarithmic)], axis=(0, 1)).max())
+        if reached == 0:
+            return "none near eps = 0: growth over a period, or a rate, beyond what numbers hold"
+        if reached == 1:
+            return "found, and its multipliers not to the tolerance"
+        return "velocity or age runs over 300 decades" if swing > 680 else "the branch of states ends before eps"
 
 
 def verdict(arguments: list[str]) -> tuple[str, str]:
@@ -146,30 +189,42 @@ def main() -> None:
     asked.add_argument("--seed", type=int, default=1)
     asked.add_argument("--seconds", type=float, default=float("inf"), help="stop each part after so long")
     asked.add_argument("--decades", type=float, default=3.0)
+    asked.add_argument("--ends", action="store_true", help="sweep the ends of each parameter too")
     asked.add_argument("--skip", default="", help="commands that are left out, with commas")
     given = asked.parse_args()
     global decades
     decades = given.decades
     chance = random.Random(given.seed)
     counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
+    reasons: collections.Counter[str] = collections.Counter()
     registry, begun = bundled_registry(), time.monotonic()
     for number in range(given.draws):
         for names in systems():
             if time.monotonic() - begun > given.seconds:
                 break
             options, point = draw(open_model(registry, **names).parameters, chance)
+            values = {n: float(v) for n, v in (w.split("=") for w in options if w != "--set")}
             named = [w for k, v in names.items() for w in (f"--{k}", v)]
             for command, arguments in commands(point).items():
                 if command in given.skip.split(","):
                     continue
                 said, why = verdict([*arguments, *named, *options])
                 counts[command][said] += 1
+                if command == "floquet" and said == "not converged":
+                    reasons[why_not(open_model(registry, **names), values | point)] += 1
                 if said == "failed":
                     print(f"FAILED draw {number}: srf {' '.join([*arguments, *named, *options])}: {why}", flush=True)
     print("| command | draws | ok | not converged | refused | failed |\n|---|---|---|---|---|---|")
     for command, count in counts.items():
         cells = " | ".join(str(count[n]) for n in ("ok", "not converged", "refused", "failed"))
         print(f"| {command} | {count.total()} | {cells} |")
+    print("\n| what kept floquet from a state | draws |\n|---|---|")
+    for name, value in reasons.most_common():
+        print(f"| {name} | {value} |")
+    if given.ends:
+        print("\n| over the ends of each parameter | rows |\n|---|---|")
+        for name, value in sorted(over_the_ends(registry).items()):
+            print(f"| {name} | {value} |")
     print("\n| stability of the paper's system at random points | |\n|---|---|")
     for name, value in compared(given.points, chance, given.seconds).items():
         print(f"| {name} | {value} |")

@@ -11,11 +11,13 @@ Each function is a command of `srf`: values in, a result out, with `.table`, `.t
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
 from srfcli.core import __version__ as __version__
 
+TYPE_CHECKING = False  # as type checkers know it: to import `typing` takes longer than all else here
 if TYPE_CHECKING:
+    from typing import Any
+
     from srfcli.codegen.slider import SlidingSystem as SlidingSystem
     from srfcli.codegen.slider import load_law as load_law
     from srfcli.codegen.slider import system as system

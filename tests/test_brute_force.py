@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import csv
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from brute import Slider, error_of_load, hopf_load, jacobian, rates, shoot, steady
+from scipy.integrate import solve_ivp
 
 from srfcli.core.errors import Status
 from srfcli.numerics.boundary import linearise_boundary
 from srfcli.numerics.collocation import Discretisation, gauss
 from srfcli.numerics.critical import critical_line
+from srfcli.numerics.floquet import solve_floquet
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.orbit import interpolate, solve_orbits, steady_guess, uniform_mesh
 
@@ -196,3 +199,25 @@ def test_brute_force_finds_an_error_that_is_there():
     s = Slider(8.0, 8.318175557644711 * 1.001, 0.045)
     error, _ = error_of_load(s, steady(replace(s, eps=0.0)))
     assert error == pytest.approx(1e-3, rel=0.05)
+
+
+@pytest.mark.parametrize("eps", [0.8, pytest.param(0.95, marks=pytest.mark.slow)])
+def test_a_state_of_slip_events_returns_by_integration(model, eps):
+    """eps up to which velocities run over sixteen decades within a period: no uniform mesh leads there; Radau goes along."""
+    s = Slider(V=10.0, W0=20.0, eps=eps, f=3.0)
+    found = solve_floquet(model, model.vector({"V": s.V, "W0": s.W0, "eps": eps, "f": s.f}), max_mesh=4096)
+    assert found.status is Status.OK and np.ptp(found.orbit.x[:, model.states.index("ln_v")]) > 37
+    start = np.array([found.orbit.x[0, model.states.index(n)] for n in ("u", "z", "ln_v", "ln_phi")])
+    period = solve_ivp(
+        lambda t, y: rates(s, t, *y), (0.0, 1 / s.f), start, method="Radau", jac=lambda t, y: jacobian(s, t, y[2], y[3]),
+        rtol=1e-6, atol=1e-8, dense_output=True,
+    )  # fmt: skip
+    assert period.success
+    assert period.y[:, -1] == pytest.approx(start, rel=1e-4, abs=1e-4)
+    t = np.concatenate(
+        [np.linspace(a, b, 20, endpoint=False) for a, b in itertools.pairwise(period.t)] + [period.t[-1:]]
+    )
+    u, _, ln_v, ln_phi = period.sol(t)
+    mu = s.mu0 + s.A * (ln_v - np.log(s.V0)) + s.B * np.log1p(s.Vsat * np.exp(ln_phi) / s.D0)
+    assert found.mean_friction == pytest.approx(np.trapezoid(mu, t) * s.f, rel=1e-5)
+    assert abs(found.u_harmonics[0]) == pytest.approx(np.trapezoid(u, t) * s.f, rel=1e-5)

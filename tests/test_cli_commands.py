@@ -337,7 +337,7 @@ def interrupted_after(seconds: float, arguments: Sequence[str]) -> tuple[int, st
             time.sleep(seconds)
             assert process.poll() is None, "it was done before it could be interrupted"
             process.send_signal(signal.SIGINT)
-            return process.wait(60), process.stderr.read() if process.stderr else ""
+            return process.wait(1200), process.stderr.read() if process.stderr else ""
         finally:
             process.kill()
 

@@ -248,7 +248,9 @@ def test_scalar_text_is_the_array_text(make_model, names):
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C compiler on this machine")
-@pytest.mark.parametrize("names", [*OTHER, *PAIRS, OF_ONES_OWN[-4]], ids=name_of)
+@pytest.mark.parametrize(  # effects in pairs: their rates and scalar text are held against the equations above
+    "names", [*OTHER, *(pytest.param(n, marks=pytest.mark.slow) for n in PAIRS), OF_ONES_OWN[-4]], ids=name_of
+)
 def test_compiled_motion_is_that_of_lsoda(make_model, names):
     _, model, p = prepared(make_model, names)
     t = np.linspace(0.0, 0.4, 81)

@@ -9,6 +9,7 @@ import os
 import resource
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -176,11 +177,11 @@ def test_parts_of_the_living_stay() -> None:
         with whole_folder(Path("made"), lambda: None) as fresh:
             (fresh / "mine").write_text("whole")
             held.set()
-            go.wait(60)
+            go.wait(1200)
 
     writer = threading.Thread(target=write)
     writer.start()
-    assert held.wait(60)
+    assert held.wait(1200)
     assert forked(lambda: CliRunner().invoke(cli, command(FOLDER, "5"), prog_name="srf").exit_code) == 0
     go.set()
     writer.join()
@@ -293,3 +294,38 @@ def test_at_random_moments() -> None:
         assert state(Path()) in (old, new)
     srf(*command(words, before))
     assert hidden() == []
+
+
+AT_IMPORT = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background of a shell
+class Watch:
+    def find_spec(name, *other):
+        if name == {module!r}:
+            os.kill(os.getpid(), {number:d})
+sys.meta_path.insert(0, Watch)
+sys.argv = ["srf", "linear", "--over", "V=8", "--out", "a.csv"]
+from srfcli.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "number", "code", "said"),
+    [
+        ("click", signal.SIGINT, -signal.SIGINT, ""),
+        ("srfcli.core.errors", signal.SIGINT, -signal.SIGINT, ""),
+        ("srfcli.cli.linear", signal.SIGINT, 130, "Error: interrupted"),
+        ("srfcli.tasks.stability", signal.SIGINT, 130, "Error: interrupted"),
+        ("click", signal.SIGTERM, -signal.SIGTERM, ""),
+        ("srfcli.tasks.stability", signal.SIGTERM, -signal.SIGTERM, ""),
+        ("srfcli.tasks.stability", signal.SIGKILL, -signal.SIGKILL, ""),
+    ],
+)
+def test_while_modules_are_imported(module: str, number: int, code: int, said: str) -> None:
+    """Nothing is left, no traceback is shown, and the caller sees by what it ended."""
+    done = subprocess.run(
+        [sys.executable, "-c", AT_IMPORT.format(module=module, number=number)], capture_output=True, text=True
+    )
+    assert done.returncode == code and done.stderr.strip() == said and done.stdout == ""
+    assert not list(Path().iterdir())

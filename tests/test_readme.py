@@ -108,7 +108,7 @@ def test_commands_print_what_is_shown(path: Path, environment: dict[str, str], t
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=1200,
         )
         assert done.returncode == 0, f"$ {example.command}\n{done.stderr}"
         assert "Traceback" not in done.stderr

@@ -120,7 +120,62 @@ def test_a_record_of_which_nothing_was_reached() -> None:
     assert done.exit_code == 3 and "nothing of the record was reached" in done.output, done.output
 
 
-def test_one_command_one_result_for_any_number_of_workers() -> None:
-    grid = ["map", "--eps", "0.09", "--over", "V=1:100:3", "--over", "K/W0=0.002:0.03:3", "--csv"]
-    results = {srf(*grid, "--workers", workers).stdout for workers in ("1", "3")}
-    assert len(results) == 1 and results.pop().count("\n") >= 9
+SYSTEMS = [
+    *(("law", e.name) for e in bundled_registry().entries("friction")),
+    *(("ageing", e.name) for e in bundled_registry().entries("ageing") if e.name != "dieterich"),
+    *(("ageing", f"dieterich+{e.name}") for e in bundled_registry().entries("modifier")),
+    *(("interface", e.name) for e in bundled_registry().entries("interface") if e.name != "elastic"),
+]
+
+
+@pytest.mark.parametrize("system", SYSTEMS, ids="-".join)
+def test_over_the_ends_of_a_parameter(system: tuple[str, str]) -> None:
+    """Point by point: numbers, or one reason in its row; what lies beside a point that has none is found all the same."""
+    kind, name = system
+    for p in open_model(bundled_registry(), **{kind: name}).parameters:
+        if p.name in ("W0", "eps", "f"):
+            continue
+        ends = sorted({max(p.lower, -1e29), p.default or 1.0, min(p.upper, 1e29)} | ({0.0} if p.lower <= 0 else set()))
+        over = f"{p.name}={','.join(map(repr, ends))}"
+        done = srf("linear", "--over", over, f"--{kind}", name, "--json")
+        assert done.exit_code == 0, (over, done.stderr)
+        rows = json.loads(done.stdout)["rows"]
+        assert [row[p.name] for row in rows] == ends
+        for row in rows:
+            found = row["status"] in ("ok", "no Lyapunov coefficient: the Jacobian overflows")
+            assert found == (row["W0"] is not None) and (found or row["status"].startswith(REASONS)), row
+
+
+REASONS = ("no Hopf", "velocity strengthening: ", "no value: ")
+
+
+@pytest.mark.parametrize(
+    ("words", "without"),
+    [
+        ("--over B=0,0.0241 --ageing nagata", [0]),
+        ("--over B=0,0.0241,1 --ageing dieterich+linker-dieterich", [0]),
+        ("--over A=1e-6,0.0126 --law rice-regularized", [0]),
+        ("--over Vsat=0,256", []),
+    ],
+)
+def test_response_where_a_formula_has_no_value(words: str, without: list[int]) -> None:
+    for mean in ([], ["--mean", "--eps", "0.05"]):
+        done = srf("response", "--V", "10", "--W0", "5", *mean, *words.split(), "--json")
+        assert done.exit_code == (3 if without else 0), done.stderr
+        rows = json.loads(done.stdout)["rows"]
+        assert [i for i, row in enumerate(rows) if row["status"] == "no-value"] == without
+        for i, row in enumerate(rows):
+            # only steady friction, which needs no rates, may be known
+            assert i in without or None not in row.values(), row
+
+
+def test_a_map_with_an_edge_that_has_no_value() -> None:
+    plane = ["--over", "B=0:0.02:3:lin", "--over", "K/W0=0.01:0.03:3", "--V", "10", "--eps", "0.1"]
+    done = srf("map", *plane, "--ageing", "nagata")
+    assert done.exit_code == 3 and "no-value at 3 points: A formula has no value" in done.output
+
+
+def test_what_steady_sliding_does_not_have_is_not_swept() -> None:
+    for name in ("W0", "eps", "f"):
+        done = srf("linear", "--over", f"{name}=0.1,0.2")
+        assert done.exit_code == 2 and f"{name} is swept and" in done.stderr

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import click
 
 from srfcli.cli.base import CONTEXT, SrfGroup, switches
-from srfcli.core import __version__
+from srfcli.core import ONE_THREAD, __version__
 
 # command -> module:attribute and the first sentence of its help, in the order of `srf --help`, which imports none of them
 COMMANDS = {
@@ -135,8 +135,7 @@ def cli() -> None:
 
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run `srf` with `argv`, or with the process's arguments, and exit."""
-    for library in ("OPENBLAS", "MKL", "OMP"):  # all matrices here are small: threads only cost their start
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    os.environ.update(ONE_THREAD)
     gc.set_threshold(
         100_000, 10, 10
     )  # to look for cycles among what is imported, and at the end, is a sixth of a short run

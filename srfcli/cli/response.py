@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from srfcli.codegen.model import GeneratedModel
     from srfcli.core.settings import Resolved
+    from srfcli.numerics.response import LinearResponse
     from srfcli.results.tables import Column, Table
 
 EXAMPLES = """
@@ -108,9 +109,7 @@ def _linear(model: GeneratedModel, resolved: Resolved, swept: Range) -> tuple[Ta
     found = linear_response(model, model.vector({**resolved.values, swept.name: values, "eps": 0.0}))
     parts = {name: getattr(found, name) for name in QUANTITIES}
     cells = [f(parts[name]) for name in QUANTITIES for f in (np.abs, np.angle)]
-    rows = [
-        (x, *(float(c[i]) for c in cells), "stable" if found.stable[i] else "unstable") for i, x in enumerate(shown)
-    ]
+    rows = [(x, *(float(c[i]) for c in cells), _steady(found, i), found.status[i].value) for i, x in enumerate(shown)]
     unit = model.parameters[model.index(swept.name)].unit
     columns = _linear_columns(swept.name, unit)
     notes = ["to first order in eps: amplitudes are eps times the gains"]
@@ -119,16 +118,21 @@ def _linear(model: GeneratedModel, resolved: Resolved, swept: Range) -> tuple[Ta
             top = resonance(values, np.abs(parts[name]))
             where = "none inside the range" if top is None else f"{top[0]:.6g} Hz, gain {top[1]:.6g}"
             notes.append(f"resonance of {name}: {where}")
-    if not found.stable.all():
+    if any(_steady(found, i) == "unstable" for i in range(len(shown))):
         notes.append("where steady sliding is unstable the response is not what would be seen")
     table = Table("srf.response/2", columns, rows, model.title, tuple(notes), _described(resolved, swept.name, "eps"))
-    status = Status.OK if np.isfinite(np.array(cells)).all() else Status.NO_CONVERGENCE
+    status = worst(found.status)
     log = swept.values is None and swept.spacing == "log"
     return (
         table,
         lambda: _bode(shown, parts, f"{swept.name}  [{unit}]", log, titled(model.title, table.parameters)),
         status,
     )
+
+
+def _steady(found: LinearResponse, i: int) -> str | None:
+    """Return whether steady sliding is stable at a point, None where it has no rates."""
+    return None if not found.status[i].ok else "stable" if found.stable[i] else "unstable"
 
 
 def _bode(x: list[float], parts: dict[str, Any], xlabel: str, log: bool, title: str) -> Figure:
@@ -228,4 +232,5 @@ def _linear_columns(name: str, unit: str) -> tuple[Column, ...]:
             )
         ),
         Column("type", "", "stable or unstable: steady sliding"),
+        Column("status"),
     )

@@ -91,24 +91,25 @@ class GeneratedModel:
 
     def check_changing_load(self, p: NDArray[np.float64]) -> None:
         """Raise SrfError, naming the parameter, where a value of 0 leaves the rates under a changing load without a value."""
-        if self._finite(p):
+        if self.has_rates(p).all():
             return
         for i, parameter in enumerate(self.parameters):
             changed = p.copy()
             changed[i] = to_base(parameter.default, parameter.unit) or 1.0
-            if p[i] == 0 and self._finite(changed):
+            if p[i] == 0 and self.has_rates(changed).all():
                 raise SrfError(
                     f"{self.title}: nothing can be computed at {parameter.name} = 0 where the normal load changes",
                     f"Set another value, such as {parameter.name}={parameter.default:g}, or choose another law.",
                 )
 
-    def _finite(self, p: NDArray[np.float64]) -> bool:
-        """Return whether the rates at steady sliding have values as the load changes."""
+    def has_rates(self, p: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return whether the rates at steady sliding have values as the load changes, (...,) for p (n_parameters, ...)."""
         with np.errstate(all="ignore"):
             try:
-                return bool(np.isfinite(self.rates(self.steady(p), p[0], p[1], 0.1 * p[1], p)).all())
+                rates = self.rates(self.steady(p), p[0], p[1], 0.1 * p[1], p)
+                return np.asarray(np.isfinite(rates).all(axis=-1))
             except ArithmeticError:
-                return False
+                return np.zeros(p.shape[1:], dtype=bool)
 
     def declared(self, name: str, value: float) -> float:
         """Return a value in um, s, N in the unit the parameter is declared in."""

@@ -107,6 +107,7 @@ class Status(Enum):
     NO_HOPF = "no-hopf"
     UNSETTLED = "window-not-settled"
     INTEGRATION = "integration-stopped"
+    NO_VALUE = "no-value"
     EVALUATIONS = "max-evaluations"
     INTERRUPTED = "interrupted"
 
@@ -132,6 +133,7 @@ _ADVICE = {
     Status.NO_HOPF: "Velocity strengthening: no Hopf bifurcation.",
     Status.UNSETTLED: "Crossings may lie beyond the loads looked at; look there with another `window`, or with W0 in `over`.",
     Status.INTEGRATION: "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
+    Status.NO_VALUE: "A formula has no value where a parameter is 0 or at the end of its range; leave that out.",
     Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise `max_evaluations`, or start nearer.",
     Status.INTERRUPTED: "what was finished is kept.",
 }

@@ -51,6 +51,8 @@ def check_plain(path: Path) -> os.stat_result:
         kind = next((name for is_kind, name in _KINDS if is_kind(found.st_mode)), "no regular file")
         hint = "Name a file in it." if kind == "a folder" else "Name a file; save first what comes through a pipe."
         raise SrfError(f"no file {path}, but {kind}", hint)
+    if path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix":  # said to be files; reading may wait or fail
+        raise SrfError(f"no file {path}, but a part of the running system", "Name a file; copy what is meant to one first.")
     return found
 
 
@@ -67,7 +69,7 @@ def open_plain(path: Path) -> io.BufferedReader:
 def read_plain(path: Path, *, limit: int = TEXT, what: str = "a description") -> bytes:
     """Return the content of a regular file of at most `limit` bytes; raises SrfError for a longer one, else as `open_plain`."""
     with open_plain(path) as stream:
-        data = stream.read(limit + 1)
+        data = stream.read(limit + 1) or b""  # nothing where it would wait
     if len(data) > limit:
         raise SrfError(f"{path}: longer than {limit / 2**20:g} MB, too long for {what}", "Is it the right file?")
     return data

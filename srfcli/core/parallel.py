@@ -29,7 +29,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from srfcli.core import __version__
+from srfcli.core import ONE_THREAD, __version__
 from srfcli.core.cache import is_sealed, seal
 from srfcli.core.errors import SrfError
 from srfcli.core.files import clear, parse_json, read_plain, write_atomic
@@ -44,7 +44,7 @@ Result = TypeVar("Result")
 
 ATTEMPTS = 3  # a task that took this many workers with it is at fault itself
 _ENVIRONMENT = {
-    **dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1"),
+    **ONE_THREAD,
     "PYTHONSAFEPATH": "1",  # a worker is started by `python -c`, which would import from the current folder first
 }
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from srfcli.core.errors import SrfError, did_you_mean, printable, shown
-from srfcli.core.files import parse_toml, read_text, recover
+from srfcli.core.files import check_plain, parse_toml, read_text, recover
 from srfcli.core.units import is_stress, same_dimension, split_quantity, unit_factor
 
 # `experiment.toml` in the format `srf-experiment/1`, read and validated without opening any data file.
@@ -132,7 +132,7 @@ def find_file(path: Path) -> Path:
             raise SrfError(f"{path}: holds no {FILE_NAME}", hint)
         return file
     if not path.is_file():
-        raise SrfError(f"{path}: neither a folder nor a file", f"Give a folder with an {FILE_NAME}, or the TOML file.")
+        check_plain(path)  # says what it is instead
     return path
 
 

@@ -90,6 +90,8 @@ class Registry:
         for problem in self.problems:
             if problem.name == name:
                 raise SrfError(problem.message, problem.hint)
+        if os.sep in name:
+            raise SrfError(f"no {what} {name}", "A name has no slash, and a law's file ends in .toml or .py.")
         others = [e.kind for e in self._entries if e.name == name]
         known = did_you_mean(name, (e.name for e in self.entries(kind)))
         hint = f"'{name}' is of kind {others[0]}. Known: {known.rpartition('Known: ')[2]}" if others else known
@@ -192,6 +194,8 @@ def load_registry(
         path = path.expanduser()
         if not path.exists():
             raise SrfError(f"{origin}: no folder {path}", "Give a folder that holds law files.")
+        if not path.is_dir() and path.suffix not in (".toml", ".py"):
+            raise SrfError(f"{origin}: {path} is neither a folder nor a law's file", "A law's file ends in .toml or .py.")
         collect.folder(origin, path)
     return Registry(collect.entries, collect.problems, named=named, trust=trust)
 

@@ -333,6 +333,13 @@ def _top_coefficient(m: int) -> Array:
     return np.linalg.inv(np.polynomial.legendre.legvander(nodes, m))[m]
 
 
+def last_coefficient(model: GeneratedModel, orbit: Discretisation) -> Array:
+    """Return what the polynomials still carry in their last Legendre coefficient, over the logarithmic unknowns, (..., N)."""
+    weights = _top_coefficient(orbit.stages.shape[-2])
+    top = weights[0] * orbit.x + np.einsum("j,...jn->...n", weights[1:], orbit.stages)
+    return np.linalg.norm(top[..., list(model.logarithmic)], axis=-1)
+
+
 def mesh_error(model: GeneratedModel, orbit: Discretisation) -> Array:
     """Return the estimated relative error (...,) that the mesh leaves in a critical parameter.
 
@@ -340,10 +347,8 @@ def mesh_error(model: GeneratedModel, orbit: Discretisation) -> Array:
     carries: COVERING times its mean square over the logarithmic unknowns is above the true error of nearly all critical
     loads, of every law tried (benchmarks/mesh_error.py). It says nothing of multipliers far inside the unit circle.
     """
-    weights = _top_coefficient(orbit.stages.shape[-2])
-    top = weights[0] * orbit.x + np.einsum("j,...jn->...n", weights[1:], orbit.stages)
     factor = COVERING if model.namespace["ELASTIC"] else COVERING_RIGID
-    return factor * (top[..., list(model.logarithmic)] ** 2).sum(axis=-1) @ orbit.steps
+    return factor * last_coefficient(model, orbit) ** 2 @ orbit.steps
 
 
 def wanted_mesh(error: Array, intervals: int, tol: float, max_mesh: int) -> Array:

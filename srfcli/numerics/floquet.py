@@ -12,16 +12,25 @@ from srfcli.numerics.collocation import (
     Discretisation,
     condense_plainly,
     gauss,
+    last_coefficient,
     log_determinant,
     mesh_error,
     stage_parameters,
 )
-from srfcli.numerics.critical import robust_orbits
-from srfcli.numerics.orbit import interpolate, solve_orbits, uniform_mesh
+from srfcli.numerics.critical import CLIMBING, FIRST_CLIMB, robust_orbits
+from srfcli.numerics.orbit import OrbitBatch, interpolate, solve_orbits, steady_guess, uniform_mesh
 
 FIRST_MESH = 16
 PATIENT = 256  # intervals up to which a state that was not found is looked for on a finer mesh
 STIFF = 3.0
+NEWTON = 1e-10  # last step of Newton's method
+ROUNDED = (
+    1e-7  # the same where a multiplier next to 1 lets rounding grow beyond that; the error of the multipliers tells
+)
+CLIMBED_ON = 64  # intervals of the first mesh that is laid where the state needs it
+CALM = 0.2  # share of the intervals that are spread evenly
+SMALLEST_CLIMB, MOST_CLIMBS = 1e-4, 200  # shares of eps
+WHILE_CLIMBING = 1e-4  # estimated error from which on the mesh is made finer on the way
 RELIED_ON = 31.0  # an interval halved gains 2^8 in theory, 2^5 is relied on
 
 
@@ -29,6 +38,7 @@ RELIED_ON = 31.0  # an interval halved gains 2^8 in theory, 2^5 is relied on
 class FloquetResult:
     """A forced periodic state. Multipliers (n,) over one forcing period, largest first, with their estimated error.
 
+    The error is that of the worst multiplier, relative for those beyond 1.
     `mean_friction` is the mean of mu over the period, `friction_shift` what modulation adds to steady sliding's mu.
     `u_harmonics`, `mu_harmonics` (H+1,) are complex amplitudes: q = c_0 + sum |c_k| cos(2 pi k tau + arg c_k).
     `liouville` is |product of the multipliers / exp(integrated trace) - 1|: Liouville's identity, apart from the estimate.
@@ -72,25 +82,31 @@ def solve_floquet(
 ) -> FloquetResult:
     """Return the forced periodic state at `p` (n_parameters,), its mesh doubled until the multipliers' error is below `tol`.
 
-    The error is the larger of two estimates: what the last doubling changed, and what the orbit's polynomials still carry.
+    The error is the larger of two estimates: what the last doubling changed, and what the orbit's polynomials still carry. Meshes
+    are uniform. Where they lead to no state, or to none of this error, the mesh is laid where the state needs it.
     """
     column = p[:, None]
-    batch = robust_orbits(model, column, None, uniform_mesh(FIRST_MESH), tol=1e-10)
-    while not batch.converged[0] and 2 * (len(batch.orbit.edges) - 1) <= min(max_mesh, PATIENT):
-        edges = uniform_mesh(2 * (len(batch.orbit.edges) - 1))
-        batch = robust_orbits(model, column, None, edges, tol=1e-10)
-    error = np.inf
-    while batch.converged[0] and error > tol and 2 * (len(batch.orbit.edges) - 1) <= max_mesh:
-        finer = interpolate(batch.orbit, uniform_mesh(2 * (len(batch.orbit.edges) - 1)))
-        fine = solve_orbits(model, column, finer, tol=1e-10)
-        shift = np.abs(np.sort_complex(fine.multipliers[0]) - np.sort_complex(batch.multipliers[0])).max()
-        error = max(float(shift) / RELIED_ON, float(mesh_error(model, fine.orbit)[0])) + 1e-12
-        batch = fine
+    batch = robust_orbits(model, column, None, uniform_mesh(FIRST_MESH), tol=NEWTON)
+    for newton in (NEWTON, ROUNDED):
+        intervals = FIRST_MESH
+        while not batch.converged[0] and 2 * intervals <= min(max_mesh, PATIENT):
+            intervals *= 2
+            batch = robust_orbits(model, column, None, uniform_mesh(intervals), tol=newton)
+    batch, error = _refined(model, batch, tol, max_mesh)
+    if error > tol and max_mesh >= 2 * CLIMBED_ON:
+        if batch.converged[0]:
+            start = _solved(model, column, interpolate(batch.orbit, _laid(model, batch.orbit, CLIMBED_ON)))
+        else:
+            start = climbed(model, column, max_mesh // 2)[0]
+        laid, smaller = _refined(model, start, tol, max_mesh)
+        if smaller < error:
+            batch, error = laid, smaller
     status = Status.NO_CONVERGENCE if not batch.converged[0] else Status.OK if error <= tol else Status.TOLERANCE
     orbit = Discretisation(batch.orbit.x[0], batch.orbit.stages[0], batch.orbit.edges)
-    waves = waveforms(model, p, orbit, max(256, 8 * harmonics))
     rest = float(model.steady_friction(p))
-    u_k, mu_k = harmonic_amplitudes(waves.u, harmonics), harmonic_amplitudes(waves.mu, harmonics)
+    finer = interpolate(orbit, _split(orbit.edges, 8 * (harmonics + 8)))
+    at = finer.phases, finer.stages, stage_parameters(p)
+    u_k, mu_k = (_harmonics(finer, q(*at), harmonics) for q in (model.cycle_elongation, model.cycle_friction))
     return FloquetResult(
         p=p,
         orbit=orbit,
@@ -103,6 +119,85 @@ def solve_floquet(
         mu_harmonics=mu_k,
         status=status,
     )
+
+
+def _intervals(batch: OrbitBatch) -> int:
+    return len(batch.orbit.edges) - 1
+
+
+def _split(edges: Array, intervals: int) -> Array:
+    """Return the edges with each interval split evenly, so that there are at least so many."""
+    parts = -(-intervals // (len(edges) - 1))
+    return np.interp(np.arange(parts * (len(edges) - 1) + 1) / parts, np.arange(len(edges)), edges)
+
+
+def _solved(model: GeneratedModel, p: Array, guess: Discretisation) -> OrbitBatch:
+    """Return one orbit from a guess near it, to NEWTON or, where rounding stops that, to ROUNDED."""
+    batch = solve_orbits(model, p, guess, tol=NEWTON, max_iterations=CLIMBING)
+    return batch if batch.converged[0] else solve_orbits(model, p, guess, tol=ROUNDED)
+
+
+def _refined(model: GeneratedModel, batch: OrbitBatch, tol: float, max_mesh: int) -> tuple[OrbitBatch, float]:
+    """Return one orbit on its mesh halved until the error is below `tol`, and that error; infinite where there is no orbit."""
+    error = np.inf
+    while batch.converged[0] and error > tol and 2 * _intervals(batch) <= max_mesh:
+        fine = _solved(model, batch.p, interpolate(batch.orbit, _split(batch.orbit.edges, 2 * _intervals(batch))))
+        after, before = (np.sort_complex(b.multipliers[0]) for b in (fine, batch))
+        shift = (np.abs(after - before) / np.maximum(1.0, np.abs(after))).max()
+        error = max(float(shift) / RELIED_ON, float(mesh_error(model, fine.orbit)[0])) + 1e-12
+        batch = fine
+    return batch, error if batch.converged[0] else np.inf
+
+
+def _laid(model: GeneratedModel, orbit: Discretisation, intervals: int) -> Array:
+    """Return a mesh on which each interval's polynomials of a batch of one carry about as much in their last coefficient.
+
+    An interval of width h carries h^STAGES, so that its share of the intervals goes with the root of that; a share for all keeps
+    the mesh from leaving the calm part of the period to a few.
+    """
+    density = last_coefficient(model, orbit)[0] ** (1 / orbit.stages.shape[-2]) / orbit.steps
+    density = np.maximum(density, np.maximum(np.roll(density, 1), np.roll(density, -1)))
+    density += CALM * float((density * orbit.steps).sum())
+    reached = np.concatenate([[0.0], np.cumsum(density * orbit.steps)])
+    edges = np.interp(np.linspace(0.0, 1.0, intervals + 1), reached / reached[-1], orbit.edges)
+    edges[0], edges[-1] = 0.0, 1.0
+    return edges
+
+
+def climbed(model: GeneratedModel, p: Array, finest: int) -> tuple[OrbitBatch, float]:
+    """Return the orbit at `p` (n_parameters, 1) by raising eps from 0 on a mesh that is laid anew at each step.
+
+    The number says which share of eps was reached: below 1 a step of SMALLEST_CLIMB of eps failed, as where the branch of states
+    turns back or velocities leave the range of numbers, and the orbit, of the last eps that went, is marked as not converged.
+    """
+    eps = model.index("eps")
+    calm, edges = p.copy(), uniform_mesh(CLIMBED_ON)
+    calm[eps] = 0.0
+    batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=ROUNDED)
+    reached, step, tries = 0.0, FIRST_CLIMB, 0
+    slope = Discretisation(np.zeros_like(batch.orbit.x), np.zeros_like(batch.orbit.stages), edges)
+    while batch.converged[0] and reached < 1 and step > SMALLEST_CLIMB and tries < MOST_CLIMBS:
+        tries += 1
+        target = 1.0 if reached + step > 1 - SMALLEST_CLIMB else reached + step
+        q, before, ahead = p.copy(), batch.orbit, target - reached
+        q[eps] *= target
+        guess = Discretisation(before.x + ahead * slope.x, before.stages + ahead * slope.stages, before.edges)
+        found = solve_orbits(model, q, guess, tol=ROUNDED, max_iterations=CLIMBING)
+        if not found.converged[0]:
+            step /= 2
+            continue
+        finer = 2 if mesh_error(model, found.orbit)[0] > WHILE_CLIMBING and 2 * _intervals(found) <= finest else 1
+        moved = interpolate(found.orbit, _laid(model, found.orbit, finer * _intervals(found)))
+        again = solve_orbits(model, q, moved, tol=ROUNDED, max_iterations=CLIMBING)
+        if again.converged[0]:
+            found, before = again, interpolate(before, again.orbit.edges)
+        slope = Discretisation(
+            (found.orbit.x - before.x) / ahead, (found.orbit.stages - before.stages) / ahead, found.orbit.edges
+        )
+        batch, reached, step = found, target, 1.5 * step
+    batch.converged &= reached >= 1
+    batch.p[:] = p
+    return batch, reached
 
 
 def waveforms(model: GeneratedModel, p: Array, orbit: Discretisation, samples: int) -> Waveforms:
@@ -118,11 +213,13 @@ def waveforms(model: GeneratedModel, p: Array, orbit: Discretisation, samples: i
     )
 
 
-def harmonic_amplitudes(values: Array, count: int) -> ComplexArray:
-    """Return c_0..c_count of equally spaced samples: the mean, then amplitudes with their phases at tau = 0."""
-    spectrum = np.fft.rfft(values) / len(values)
-    spectrum[1:] *= 2
-    return spectrum[: count + 1]
+def _harmonics(orbit: Discretisation, values: Array, count: int) -> ComplexArray:
+    """Return c_0..c_count of values (N, m) at the Gauss points, by their quadrature: the mean, then amplitudes with phases."""
+    weighted = values * orbit.steps[:, None] * gauss(orbit.stages.shape[-2]).weights
+    waves = np.exp(-2j * np.pi * np.arange(count + 1)[:, None, None] * orbit.phases)
+    amplitudes = (waves * weighted).sum(axis=(-1, -2))
+    amplitudes[1:] *= 2
+    return amplitudes
 
 
 def _liouville(model: GeneratedModel, p: Array, orbit: Discretisation) -> float:

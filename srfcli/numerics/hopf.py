@@ -64,6 +64,15 @@ def weakening(model: GeneratedModel, p: Array) -> float:
     return float(slopes[..., 1:].sum(axis=-1) - slopes[..., 0])
 
 
+def steady_is_stable(model: GeneratedModel, p: Array, W0: float) -> bool | None:
+    """Return whether all roots of the characteristic polynomial at load `W0` decay; None where it overflows."""
+    with np.errstate(all="ignore"):
+        coefficients = np.asarray(model.characteristic(_with_load(model, p, W0)))
+    if not np.isfinite(coefficients).all():
+        return None
+    return bool((np.roots(coefficients[::-1]).real < 0).all())
+
+
 def closed_forms(model: GeneratedModel, p: Array) -> dict[str, float]:
     """Return the generated closed forms at `p`, where the system has them and they are positive.
 

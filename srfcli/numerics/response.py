@@ -27,6 +27,7 @@ class LinearResponse:
 
     `friction` is that of mu, `force` that of the friction force over W0, `position` that of the slider (um), `velocity` that of
     the interface's slip velocity over V. `stable` says whether steady sliding is stable there: elsewhere this is not seen.
+    Where the rates have no value `status` is NO_VALUE, and the functions are NaN.
     """
 
     p: Array
@@ -35,6 +36,7 @@ class LinearResponse:
     position: ComplexArray
     velocity: ComplexArray
     stable: Array
+    status: tuple[Status, ...]
 
 
 def linear_response(model: GeneratedModel, p: Array) -> LinearResponse:
@@ -45,6 +47,8 @@ def linear_response(model: GeneratedModel, p: Array) -> LinearResponse:
     jacobian = model.cycle_jacobian(0.0, rest, p)
     by_eps = model.cycle_parameter("eps")
     forcing = by_eps(0.0, rest, p) - 1j * by_eps(0.25, rest, p)  # F cos + G sin is Re((F - iG) exp(2 pi i tau))
+    known = np.isfinite(jacobian).all(axis=(-1, -2)) & np.isfinite(forcing).all(axis=-1)
+    jacobian[~known], forcing[~known] = -np.eye(n), np.nan
     state = np.linalg.solve(2j * np.pi * np.eye(n) - jacobian, forcing[..., None])[..., 0]
     friction, load = (_observed(model, f"cycle_{name}", rest, p, state) for name in ("friction", "load"))
     mu, W, W0 = model.cycle_friction(0.0, rest, p), model.cycle_load(0.0, rest, p), p[model.index("W0")]
@@ -54,7 +58,8 @@ def linear_response(model: GeneratedModel, p: Array) -> LinearResponse:
         (friction * W + mu * load) / W0,
         -_observed(model, "cycle_elongation", rest, p, state),  # x = Vt - u
         state[..., model.states.index("ln_v")],
-        np.linalg.eigvals(jacobian).real.max(axis=-1) < 0,
+        known & (np.linalg.eigvals(jacobian).real.max(axis=-1) < 0),
+        tuple(Status.OK if k else Status.NO_VALUE for k in np.atleast_1d(known)),
     )
 
 
@@ -113,7 +118,7 @@ def mean_friction(model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mes
     """Return the mean friction of the forced periodic states at `p` (n_parameters, B), each on a mesh of error below `tol`."""
     count = p.shape[1]
     columns = np.full((4, count), np.nan)
-    status = [Status.NO_CONVERGENCE] * count
+    status = [Status.NO_CONVERGENCE if known else Status.NO_VALUE for known in model.has_rates(p)]
     waiting: list[tuple[Array, OrbitBatch]] = [
         (np.arange(count), robust_orbits(model, p, None, uniform_mesh(INTERVALS), tol=1e-9))
     ]

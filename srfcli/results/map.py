@@ -166,8 +166,10 @@ def _summary(
     if not found.finished:
         left = "interrupted: what was not reached is unresolved, and no boundary was followed"
         return (left, *map_notes(found)), meta, Status.INTERRUPTED
+    without = int((~model.has_rates(found.points(model))).sum()) if found.lost else 0
+    reason = [f"{Status.NO_VALUE.value} at {without} points: {Status.NO_VALUE.advice}"] if without else []
     if not wanted:
-        return tuple(map_notes(found)), meta, status
+        return (*reason, *map_notes(found)), meta, status
     values = found.points(model)[model.index(found.grid.x.moved), :, 0]
     met = crossings_at(model, atlas.plane, atlas.branches, values)
     odd = unexplained(model, found, atlas)
@@ -186,7 +188,7 @@ def _summary(
     if bad:
         notes.append(f"{bad} special points could not be located; their rows say so")
     stopped = atlas.status is Status.INTERRUPTED  # counts before what else went wrong
-    return (*notes, *atlas.notes), meta, atlas.status if stopped or status.ok else status
+    return (*notes, *reason, *atlas.notes), meta, atlas.status if stopped or status.ok else status
 
 
 def _plain(table: Table) -> list[dict[str, Any]]:

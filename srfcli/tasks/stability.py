@@ -17,11 +17,12 @@ from srfcli.core.units import to_base
 from srfcli.numerics.continuation import Atlas, AtlasSettings, find_components
 from srfcli.numerics.critical import LoadWindow, critical_line, found_window
 from srfcli.numerics.floquet import solve_floquet
-from srfcli.numerics.hopf import HopfPoint, closed_forms, hopf_points, weakening
+from srfcli.numerics.hopf import HopfPoint, closed_forms, hopf_points, steady_is_stable, weakening
 from srfcli.numerics.plane import Axis, Plane
 from srfcli.results.stability import BoundaryResult, CriticalResult, LinearResult, PeriodicResult
 
 if TYPE_CHECKING:
+    from srfcli.codegen.model import Array
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.boundary import BoundaryPoint
 
@@ -42,6 +43,7 @@ def checked(model: GeneratedModel, name: str, values: Any) -> tuple[float, ...]:
 
 # `linear`: stability of steady sliding under constant load.
 
+LOADS = np.geomspace(1e-3, 1e5, 9)  # um, times K: where there is no Hopf point, stability is that of these
 VELOCITIES = tuple(np.geomspace(1.0, 100.0, 60).tolist())  # um/s
 
 
@@ -67,7 +69,7 @@ def linear(
     Raises
     ------
     SrfError
-        For a parameter that the system does not have, or a value out of bounds.
+        For a parameter that the system does not have or that has no part here, or a value out of bounds.
 
     Examples
     --------
@@ -77,6 +79,9 @@ def linear(
     [7.2832, 7.805, 13.0808]
     """
     grid = swept(system.model, over or {"V": VELOCITIES})
+    for name in set(grid) & {"W0", "eps", "f"}:
+        what = "is what is found" if name == "W0" else "has no part in steady sliding under constant load"
+        raise SrfError(f"{name} is swept and {what}", "Sweep another parameter, or use `srf critical`.")
     points: list[dict[str, Any]] = []
     for values in itertools.product(*grid.values()):
         points += _rows(system, dict(zip(grid, values, strict=True)), all_roots)
@@ -93,9 +98,21 @@ def _rows(system: SlidingSystem, at: dict[str, float], all_roots: bool) -> list[
     if not all_roots:
         points = [q for q in points if q.leading and q.crossing_rate > 0][:1]
     if not points:
-        falling = float(np.asarray(weakening(model, p))) > 0
-        return [common | {"status": "no Hopf" if falling else "velocity strengthening: no Hopf"}]
+        return [common | {"status": _without_hopf(model, p)}]
     return [common | _point_cells(q, value) for q in points]
+
+
+def _without_hopf(model: GeneratedModel, p: Array) -> str:
+    """Return why steady sliding has no Hopf bifurcation in W0."""
+    slope = weakening(model, p)
+    if slope <= 0:
+        return "velocity strengthening: no Hopf"
+    stable = [steady_is_stable(model, p, W0) for W0 in LOADS * p[model.index("K")]]
+    if None in stable or not math.isfinite(slope):
+        return "no value: the law's slopes overflow"
+    if all(stable) or not any(stable):
+        return f"no Hopf: {'stable' if stable[0] else 'unstable'} at every load looked at"
+    return "no Hopf found"
 
 
 def _point_cells(point: HopfPoint, value: dict[str, float]) -> dict[str, Any]:
