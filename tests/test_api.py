@@ -50,6 +50,7 @@ def test_a_public_function_says_what_it_takes_and_returns(name: str) -> None:
     function = getattr(srf, name)
     text = inspect.getdoc(function)
     assert text.splitlines()[0].endswith(".") and "\nParameters\n-" in text and "\nReturns\n-" in text
+    assert "\nRaises\n-" in text and "\nExamples\n-" in text
     told = text.partition("\nParameters\n")[2].partition("\nReturns\n")[0]
     for parameter in inspect.signature(function).parameters:
         assert parameter in told, f"srf.{name} does not say what {parameter} is"

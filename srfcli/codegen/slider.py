@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SlidingSystem:
-    """A slider with its laws and parameters, as `srfcli.symbolic.system` makes it.
+    """A slider with its laws and parameters, as `srfcli.system` makes it.
 
     Attributes
     ----------

@@ -44,7 +44,7 @@ def critical(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     V, eps : number or sequence, optional
         Driving velocities in um/s and relative amplitudes; the system's own if left out.
     window : (float, float), optional
@@ -69,6 +69,10 @@ def critical(
     ------
     SrfError
         For values out of bounds.
+
+    References
+    ----------
+    Cochard, Bureau and Baumberger (2003), Trans. ASME J. Appl. Mech. 70, 220.
 
     Examples
     --------
@@ -140,7 +144,7 @@ def continue_boundary(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     eps : number or sequence, optional
         Relative amplitudes, a boundary for each; the system's own if left out, none where eps is an axis.
     over : mapping from parameter to (low, high), optional

@@ -45,7 +45,7 @@ def compare(
     Parameters
     ----------
     systems : mapping from name to SlidingSystem
-        Two sliders or more, from `srfcli.symbolic.system`; the first is the reference.
+        Two sliders or more, from `srfcli.system`; the first is the reference.
     eps : number or sequence
         Relative amplitudes above 0.
     at : float
@@ -71,6 +71,15 @@ def compare(
     ------
     SrfError
         For one law only, no amplitude above 0, or a reference without a critical load at that velocity.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> laws = {name: srf.system(ageing=name) for name in ("dieterich", "ruina")}
+    >>> small = {"V": (5, 20), "K_over_W0": (0.015, 0.03), "points": {"columns": 4, "rows": 6}}
+    >>> found = srf.compare(laws, eps=0.09, **small).to_dataframe()
+    >>> found[["law", "stabilised"]].round(2).values.tolist()
+    [['dieterich', 0.5], ['ruina', 0.67]]
     """
     import numpy as np
 

@@ -17,7 +17,7 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     tol : float
         Error of the multipliers; the mesh is doubled until it is met.
     max_mesh : int
@@ -29,6 +29,15 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
     -------
     PeriodicResult
         Where no state was found its status says so.
+
+    Raises
+    ------
+    SrfError
+        For a law without a value under a load that changes.
+
+    References
+    ----------
+    Ascher, Mattheij and Russell (1995), Numerical Solution of Boundary Value Problems: collocation.
 
     Examples
     --------

@@ -27,7 +27,7 @@ def linear(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     over : mapping from parameter to values, optional
         Values in declared units; a grid of their products. V from 1 to 100 um/s if left out.
     all_roots : bool
@@ -42,6 +42,11 @@ def linear(
     ------
     SrfError
         For a parameter that the system does not have, or a value out of bounds.
+
+    References
+    ----------
+    Cochard, Bureau and Baumberger (2003), Trans. ASME J. Appl. Mech. 70, 220: the appendix.
+    Rice and Ruina (1983), Trans. ASME J. Appl. Mech. 50, 343.
 
     Examples
     --------

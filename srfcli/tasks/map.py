@@ -45,7 +45,7 @@ def map(  # the command's own name
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`.
+        The slider, from `srfcli.system`.
     x, y : (name, low, high, points)
         The axes. A name is that of a parameter, its ends in its declared unit, or a ratio such as K/W0, in um, s, N, whose
         second part moves.
@@ -71,6 +71,10 @@ def map(  # the command's own name
     ------
     SrfError
         For axes that the system does not have, or that span no plane.
+
+    References
+    ----------
+    Kuznetsov (2004), Elements of Applied Bifurcation Theory: normal forms and resonances.
 
     Examples
     --------

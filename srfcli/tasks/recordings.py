@@ -42,6 +42,24 @@ def read_experiment(
     ------
     SrfError
         For what is missing, contradictory or unreadable, with the file and the line or column.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import srfcli as srf
+    >>> lines = ["time [s],load_point_velocity [um/s],friction", *(f"{0.1 * i:.1f},3,0.6" for i in range(20))]
+    >>> _ = Path("run.csv").write_text("\\n".join(lines))
+    >>> described = '''
+    ... format = "srf-experiment/1"
+    ... apparatus = { stiffness = "3e-3 1/um" }
+    ... model = { law = "dieterich-ruina", ageing = "ruina", interface = "rigid", inertia = false }
+    ... parameters = { D0 = { value = 10.0, lower = 1.0, upper = 100.0 } }
+    ... runs = [{ name = "run", file = "run.csv", load = "10 MPa" }]
+    ... '''
+    >>> _ = Path("experiment.toml").write_text(described)
+    >>> experiment = srf.read_experiment(".")
+    >>> [(run.name, run.observed.shape) for run in experiment.runs]
+    [('run', (20,))]
     """
     known = registry or load_registry([Path(p) for p in plugins])
     return description.read_experiment(Path(path), registry=known, format=format, holdout=holdout)

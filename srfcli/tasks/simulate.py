@@ -38,7 +38,7 @@ def simulate(
     Parameters
     ----------
     system : SlidingSystem
-        The slider, from `srfcli.symbolic.system`; with eps above 0 the load is modulated at f.
+        The slider, from `srfcli.system`; with eps above 0 the load is modulated at f.
     t : array (n,)
         Times of the samples in s, rising.
     drive : Drive or sequence of (time, velocity), optional
@@ -63,6 +63,10 @@ def simulate(
     ------
     SrfError
         For times that do not rise, a drive that begins at rest without `start`, or a load that is not above 0.
+
+    References
+    ----------
+    Hairer and Wanner (1996), Solving Ordinary Differential Equations II: Radau IIA of order 5.
 
     Examples
     --------
