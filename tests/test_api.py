@@ -171,6 +171,7 @@ def test_figures_can_share_ones_own_axes(linear) -> None:
     ax = figure.subplots()
     assert linear.plot(ax=ax) is figure and ax.get_xlabel() == "V  [µm/s]"
     assert linear.plot() is not figure
+    assert linear.plot()._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]  # as a notebook shows it
 
 
 def test_values_are_checked_as_on_the_command_line(slider: srf.SlidingSystem) -> None:
