@@ -43,6 +43,11 @@ def test_nothing_is_loaded_from_other_hosts(site: Path) -> None:
         assert not [place for place in loaded if "//" in place], page
 
 
+def test_pages_are_linked_by_their_titles(site: Path) -> None:
+    text = (site / "fit.html").read_text(encoding="utf-8")
+    assert 'href="measurements.html"' in text and not re.findall(r">[\w/-]+\.md</a>", text)
+
+
 def test_the_reference_has_every_command_and_its_options(site: Path) -> None:
     text = text_of(site / "reference" / "commands.html")
     assert all(f"Usage: srf {name} " in text for name in COMMANDS)

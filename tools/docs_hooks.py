@@ -1,8 +1,10 @@
-"""What MkDocs asks for while it builds the site: the help of every command, from the commands themselves."""
+"""What MkDocs asks for while it builds the site: the help of every command, and titles for pages that are linked by file."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import click
@@ -12,6 +14,7 @@ from srfcli.cli.main import cli
 
 WIDTH = 84  # characters that a page shows without scrolling
 PLACE = "<!-- commands -->"
+FILE_LINK = re.compile(r"\[[\w/-]+\.md\]\(([\w./-]+\.md)")
 
 
 def commands(command: click.Command, context: click.Context) -> Iterator[tuple[click.Command, click.Context]]:
@@ -29,8 +32,15 @@ def section(command: click.Command, context: click.Context) -> str:
     return f"## `{context.command_path}`\n\n```text\n{command.get_help(context)}\n```\n"
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Return a page with the commands in their place."""
+def title(page: Path) -> str:
+    """Return the heading of a document."""
+    return page.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ") if page.is_file() else page.name
+
+
+def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
+    """Return a page with the commands in their place, and `[fit.md](fit.md)` as a link to *Fitting recordings*."""
+    folder = Path(page.file.abs_src_path).parent
+    markdown = FILE_LINK.sub(lambda found: f"[{title(folder / found[1])}]({found[1]}", markdown)
     if PLACE not in markdown:
         return markdown
     top = click.Context(cli, info_name="srf", terminal_width=WIDTH, help_option_names=CONTEXT["help_option_names"])
