@@ -50,6 +50,7 @@ def test_a_public_function_says_what_it_takes_and_returns(name: str) -> None:
     function = getattr(srf, name)
     text = inspect.getdoc(function)
     assert text.splitlines()[0].endswith(".") and "\nParameters\n-" in text and "\nReturns\n-" in text
+    assert "\nRaises\n-" in text and "\nExamples\n-" in text
     told = text.partition("\nParameters\n")[2].partition("\nReturns\n")[0]
     for parameter in inspect.signature(function).parameters:
         assert parameter in told, f"srf.{name} does not say what {parameter} is"
@@ -169,6 +170,7 @@ def test_figures_can_share_ones_own_axes(linear) -> None:
     ax = figure.subplots()
     assert linear.plot(ax=ax) is figure and ax.get_xlabel() == "V  [µm/s]"
     assert linear.plot() is not figure
+    assert linear.plot()._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]  # as a notebook shows it
 
 
 def test_values_are_checked_as_on_the_command_line(slider: srf.SlidingSystem) -> None:

@@ -411,3 +411,28 @@ def test_lists_of_values() -> None:
         parse_values(["1,0"], SPEED)
     with pytest.raises(SrfError, match="given twice"):
         parse_overs(["V=1,2", "V=3,4"])
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_tab_key_completes_commands_options_and_laws(shell: str) -> None:
+    def completed(*words: str) -> str:
+        here = words[-1] if shell == "fish" else str(len(words) - 1)
+        line = " ".join(words[:-1] if shell == "fish" else words)
+        asked = {"_SRF_COMPLETE": f"{shell}_complete", "COMP_WORDS": line, "COMP_CWORD": here}
+        done = subprocess.run(
+            [sys.executable, "-m", "srfcli"], env={**os.environ, **asked}, capture_output=True, text=True, cwd=ROOT
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout
+
+    assert "linear" in completed("srf", "lin")
+    assert "--ageing" in completed("srf", "linear", "--ag")
+    assert "dieterich-ruina" in completed("srf", "linear", "--law", "diet")
+    source = subprocess.run(
+        [sys.executable, "-m", "srfcli"],
+        env={**os.environ, "_SRF_COMPLETE": f"{shell}_source"},
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert source.returncode == 0 and "srf" in source.stdout

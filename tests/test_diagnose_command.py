@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tomli
 from click.testing import CliRunner, Result
 
 from srfcli.cli.diagnose import prediction_names
@@ -162,10 +162,10 @@ def test_predictions_are_written_for_every_run(found: dict[str, Any], folder: Pa
 
 
 def test_the_augmented_experiment_has_laws_that_say_it(folder: Path) -> None:
-    described = tomllib.loads((folder / "augmented" / "experiment.toml").read_text())
+    described = tomli.loads((folder / "augmented" / "experiment.toml").read_text())
     assert described["model"]["ageing"] == "ageing.toml" and "effects" not in described["model"]
     assert described["parameters"]["alpha"]["value"] == pytest.approx(ALPHA, rel=0.1)
-    law = tomllib.loads((folder / "augmented" / "ageing.toml").read_text())
+    law = tomli.loads((folder / "augmented" / "ageing.toml").read_text())
     assert "W_dot" in law["rate"] and law["parameters"]["alpha"]["default"] == described["parameters"]["alpha"]["value"]
     assert [r["holdout"] for r in described["runs"]] == [False, False, True]
 
@@ -221,7 +221,7 @@ def test_held_out_files_are_opened_when_the_models_are_final(
 ) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(experiment, copy)
-    description = tomllib.loads((copy / "experiment.toml").read_text())
+    description = tomli.loads((copy / "experiment.toml").read_text())
     (held,) = (r["file"] for r in description["runs"] if r["holdout"])
     (copy / held).unlink()
     finished = []
@@ -267,7 +267,7 @@ def test_where_nothing_is_missing_the_augmented_model_is_the_baseline(folder: Pa
     )
     assert found["verdict"] in ("none", "inconclusive") and found["effects"] == []
     assert found["augmented"] == found["baseline"] and found["location"]["runs"] == []
-    described = tomllib.loads((out / "augmented" / "experiment.toml").read_text())
+    described = tomli.loads((out / "augmented" / "experiment.toml").read_text())
     assert described["parameters"].keys() == found["baseline"]["parameters"].keys() or "V0" in described["parameters"]
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli
 from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
@@ -94,7 +94,7 @@ def test_a_laboratory_s_table_becomes_an_experiment(form: str, step: dict[str, n
     assert {"suffixes": "shear stress [MPa]", "forces": "force [N]", "spring": "elongation [um]"}.get(
         form, "run1"
     ) in checked
-    mu0 = tomllib.loads(Path("experiment.toml").read_text())["parameters"]["mu0"]["value"]
+    mu0 = tomli.loads(Path("experiment.toml").read_text())["parameters"]["mu0"]["value"]
     assert mu0 == pytest.approx(0.605, abs=0.01)
 
 
@@ -120,7 +120,7 @@ def test_the_draft_says_what_it_is_and_can_be_piped(step: dict[str, np.ndarray])
     done = srf("new", "run1.csv", "--stiffness", "2e-3 1/um", "--out", "-")
     assert "A is a, B is b, D0 is Dc" in done.stdout and not Path("experiment.toml").exists()
     assert "left aside: layer thickness" in done.stderr
-    assert tomllib.loads(done.stdout)["columns"]["friction"] == {"name": "mu", "unit": "1"}
+    assert tomli.loads(done.stdout)["columns"]["friction"] == {"name": "mu", "unit": "1"}
 
 
 def test_holds_and_oscillations_are_told_from_steps() -> None:
@@ -132,12 +132,12 @@ def test_holds_and_oscillations_are_told_from_steps() -> None:
     table(["time_s", "v", "mu", "sigma_MPa"], [t, 5 + 0 * t, 0.6 + 0 * t, sigma], "osc.csv")
     done = srf("new", "osc.csv", "--stiffness", "2e-3 1/um", "--force")
     assert "oscillates by 10 % at 0.5 Hz" in done.stderr
-    made = tomllib.loads(Path("experiment.toml").read_text())
+    made = tomli.loads(Path("experiment.toml").read_text())
     assert made["model"]["ageing"] == "dieterich+linker-dieterich" and "alpha" in made["parameters"]
     assert made["runs"][0]["modulation"]["frequency"] == pytest.approx(0.5)
     assert srf("check", ".", "--no-simulate").exit_code == 0
     srf("new", "osc.csv", "--kind", "steps", "--stiffness", "2e-3 1/um", "--force")
-    assert "modulation" not in tomllib.loads(Path("experiment.toml").read_text())["runs"][0]
+    assert "modulation" not in tomli.loads(Path("experiment.toml").read_text())["runs"][0]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import io
 import os
 import site
@@ -13,6 +14,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import tomli
+
+import srfcli
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -130,11 +134,30 @@ def test_a_new_law_and_the_paper(run) -> None:  # type: ignore[no-untyped-def]
 
 
 def test_what_is_required_is_written_down() -> None:
-    import tomllib
-
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomli.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     text = (ROOT / "docs" / "dependencies.md").read_text(encoding="utf-8")
-    extras = [r for name in ("plot", "units", "dev") for r in project["optional-dependencies"][name]]
+    extras = [r for name in project["optional-dependencies"] for r in project["optional-dependencies"][name]]
     for requirement in (*project["dependencies"], *extras):
         name = requirement.split(">")[0].split("[")[0]
         assert name == "srfcli" or f"| {name} |" in text, name
+
+
+def test_the_citation_names_this_version_and_the_paper() -> None:
+    """CITATION.cff has what version 1.2.0 of its format asks for; cffconvert, where it is installed, validates all of it."""
+    yaml = pytest.importorskip("yaml", reason="CITATION NOT READ: PyYAML is not installed; it comes with the extra docs")
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert cited["cff-version"] == "1.2.0" and {"message", "title", "authors"} <= set(cited)
+    assert cited["version"] == srfcli.__version__ and cited["license"] == "MIT"
+    paper = cited["preferred-citation"]
+    assert {"type", "title", "authors"} <= set(paper) and (paper["volume"], paper["start"], paper["year"]) == (70, 220, 2003)
+    readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    assert paper["title"] in readme and paper["journal"] in readme
+    if importlib.util.find_spec("cffconvert"):
+        code = "import cffconvert, sys; cffconvert.Citation(sys.stdin.read()).validate()"
+        subprocess.run([sys.executable, "-c", code], input=(ROOT / "CITATION.cff").read_text(), text=True, check=True)
+
+
+def test_classifiers_exist() -> None:
+    known = pytest.importorskip("trove_classifiers")  # comes with hatchling
+    project = tomli.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert set(project["classifiers"]) <= known.classifiers

@@ -6,7 +6,6 @@ import io
 import os
 import re
 import struct
-import tomllib
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli
 from click.testing import CliRunner
 from recording_cases import TOML, data, write
 
@@ -24,7 +24,7 @@ from srfcli.data.experiment import read_experiment
 from srfcli.laws.registry import Registry, load_registry
 
 TABLE = Path(__file__).with_name("recording_breaches.toml")
-BREACHES = [row for rows in tomllib.loads(TABLE.read_text(encoding="utf-8")).values() for row in rows]
+BREACHES = [row for rows in tomli.loads(TABLE.read_text(encoding="utf-8")).values() for row in rows]
 
 
 @pytest.fixture(scope="module")

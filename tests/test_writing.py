@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tomli
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -140,7 +140,7 @@ def test_file_names_are_plain_and_differ(tmp_path: Path) -> None:
 @settings(max_examples=60, deadline=None)
 def test_any_title_survives(title: str) -> None:
     wrote = writing.experiment_files(experiment(title=title.encode("utf-8", "ignore").decode()))
-    assert tomllib.loads(wrote["experiment.toml"])["title"] == title.encode("utf-8", "ignore").decode()
+    assert tomli.loads(wrote["experiment.toml"])["title"] == title.encode("utf-8", "ignore").decode()
 
 
 @given(st.floats(1e-12, 1e12), st.sampled_from([1.0, 1e-6, 1e3, math.pi / 180]))

@@ -151,10 +151,11 @@ class Screen:
     def __init__(self, stream: TextIO, name: str) -> None:
         self.unescaped, self.called = stream, name
 
-    def write(self, text: str) -> int:
-        """Write the text, printable."""
+    def write(self, text: str | bytes) -> int:
+        """Write the text, printable; bytes, in which click writes a shell's completions, are UTF-8."""
+        shown = text if isinstance(text, str) else text.decode("utf-8", "replace")
         with self._named():
-            self.unescaped.write(printable(text))
+            self.unescaped.write(printable(shown))
         return len(text)
 
     def flush(self) -> None:

@@ -9,6 +9,7 @@ def command(system: SystemOptions, over: tuple[Range, ...], output: OutputOption
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import os
@@ -155,6 +156,21 @@ def parse_overs(texts: Sequence[str]) -> tuple[Range, ...]:
             hint = "Give one range for each parameter, or list values: V=1,2,5."
             raise SrfError(f"--over {made.name} is given twice", hint)
     return ranges
+
+
+def names_of(kind: str) -> Callable[[click.Context, click.Parameter, str], list[Any]]:
+    """Return what completes the name of a law of this kind where the tab key is pressed: the laws that are found."""
+
+    def complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[Any]:
+        from click.shell_completion import CompletionItem
+
+        from srfcli.laws.registry import load_registry
+
+        with contextlib.suppress(SrfError):  # a folder that is gone; the command itself says so
+            return [CompletionItem(e.name, help=e.about) for e in load_registry().entries(kind) if e.name.startswith(begun)]
+        return []
+
+    return complete
 
 
 def over_option(*, default: Sequence[str] = (), help: str = "") -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -369,9 +385,9 @@ def _about(key: str) -> str:
 
 def _system_click_options() -> list[Callable[[Any], Any]]:
     chosen = [
-        click.option("--law", metavar="NAME", help=_about("law")),
-        click.option("--ageing", metavar="NAME", help=_about("ageing")),
-        click.option("--interface", metavar="NAME", help=_about("interface")),
+        click.option("--law", metavar="NAME", help=_about("law"), shell_complete=names_of("friction")),
+        click.option("--ageing", metavar="NAME", help=_about("ageing"), shell_complete=names_of("ageing")),
+        click.option("--interface", metavar="NAME", help=_about("interface"), shell_complete=names_of("interface")),
         click.option("--loading", type=click.Choice(LOADINGS), help=_about("loading")),
         click.option(
             "--inertia/--no-inertia", default=None, help="Whether the slider's mass counts.  [default: it does]"

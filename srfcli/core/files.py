@@ -17,11 +17,12 @@ import signal
 import stat
 import sys
 import tempfile
-import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import tomli
 
 from srfcli.core.errors import SrfError
 
@@ -89,8 +90,8 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
     try:
         if long := next((n for n, line in enumerate(text.splitlines(), 1) if _LONG_KEY.search(line)), None):
             raise SrfError(f"{path}, line {long}: a key of more than {DEPTH} parts", "A few levels are enough.")
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        return tomli.loads(text)
+    except tomli.TOMLDecodeError as error:
         raise SrfError(f"{path}: not TOML: {error}") from None
     except RecursionError:
         raise SrfError(f"{path}: nested too deeply", "A few levels are enough.") from None

@@ -419,7 +419,7 @@ def _spelled(place: Place) -> str:
     return out
 
 
-# Where in a TOML text each key and each element stands: `tomllib` gives values without lines.
+# Where in a TOML text each key and each element stands: `tomli` gives values without lines.
 
 Place = tuple[str | int, ...]
 
@@ -429,7 +429,7 @@ _BLANK = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
 
 
 def key_lines(text: str) -> dict[Place, int]:
-    """Return the line (from 1) of every key and array element, by its path, in a text that `tomllib` accepts.
+    """Return the line (from 1) of every key and array element, by its path, in a text that `tomli` accepts.
 
     `("runs", 0, "file")` is where the first run names its file, `("runs", 0)` the line of its header.
     """

@@ -12,6 +12,7 @@ from srfcli.results.plots import (
     QUANTITY,
     Values,
     _decade_ticks,
+    bare_figure,
     heading,
     house_style,
     load_matplotlib,
@@ -218,14 +219,10 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
     pairs of times. Samples that are not used are marked, gaps are shaded.
     """
     load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     columns = 1 if len(runs) < 4 else 2
     rows = math.ceil(len(runs) / columns)
     with house_style():
-        figure = Figure(figsize=(6.4 * columns, 3.3 * rows + 0.4))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((6.4 * columns, 3.3 * rows + 0.4))
         outer = figure.add_gridspec(rows, columns)
         for k, run in enumerate(runs):
             inner = outer[k // columns, k % columns].subgridspec(3, 1, height_ratios=(3, 1, 1), hspace=0.06)
@@ -386,11 +383,7 @@ def _names(figure: Figure, axes: Sequence[Axes]) -> None:
 
 def _grid(rows: int, columns: int, *, size: tuple[float, float]) -> tuple[Figure, list[list[Axes]]]:
     load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size)
-    FigureCanvasAgg(figure)
+    figure = bare_figure(size)
     made = figure.subplots(rows, columns, sharex=("row" if columns > 1 else "col"), squeeze=False)
     return figure, [list(row) for row in made]
 
@@ -472,13 +465,9 @@ def fit_figure(rows: Sequence[FitRow], *, quantity: str, unit: str, title: str =
     `title` names the laws, `found` the parameters with their errors.
     """
     with house_style():
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
         columns = 2 if len(rows) > 1 else 1
         lines = -(-len(rows) // columns)
-        figure = Figure(figsize=(6.0 * columns if columns == 1 else 5.2 * columns, 2.9 * lines + 0.9))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((6.0 * columns if columns == 1 else 5.2 * columns, 2.9 * lines + 0.9))
         grid = figure.add_gridspec(lines, columns)
         label = quantity if unit == "1" else f"{quantity}\n[{unit.replace('um', 'µm')}]"
         handles: list[Any] = []

@@ -60,6 +60,7 @@ ADVICE = {
     Status.INTERRUPTED: "the likeliest parameters so far are above.",
 }
 CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
+BROAD = 3e-3  # of the friction: a random friction field ten times that of a polished track
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -119,9 +120,16 @@ class FitResult(Result):
             found.problem, found.fit, self.intervals, found.starts, self.posterior, self.runs, self.worst
         )
         if found.track is not None:
-            made = replace(
-                made, notes=(*made.notes, str(found.track)), meta={**made.meta, "track": asdict(found.track)}
-            )
+            from srfcli.inference.state_space import typical_friction
+
+            told = [str(found.track)]
+            share = found.track.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
+            if share > BROAD:
+                told.append(
+                    f"that field is {100 * share:.1g} % of the friction, more than a track has: it may stand in for physics that "
+                    "the model lacks. Try another ageing law or friction law, or `srf diagnose`."
+                )
+            made = replace(made, notes=(*made.notes, *told), meta={**made.meta, "track": asdict(found.track)})
         if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
             note = f"interrupted: {len(found.starts)} of {self.asked} starts were done"
             made = replace(made, notes=(*made.notes, note))

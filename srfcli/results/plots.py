@@ -43,6 +43,8 @@ NAME, NAME_ROW, NAME_WIDTH = (
 )  # points of a curve's name below the axes, inches of a row and of a letter
 HANDLE = 0.65  # inches beside a name
 
+SCREEN = 90.0  # dots per inch in a notebook
+
 STYLE: dict[str, Any] = {
     "figure.figsize": (6.0, 4.2),
     "figure.constrained_layout.use": True,
@@ -122,22 +124,30 @@ def name_text(name: str, *, narrow: bool = False, wide: bool = False) -> str:
     return (words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$")
 
 
-def new_figure(rows: int = 1, *, size: tuple[float, float] | None = None) -> tuple[Figure, list[Axes]]:
-    """Return a figure of `rows` panels above each other on one x axis; call it, and draw, within `house_style`."""
+def bare_figure(size: tuple[float, float] | None = None) -> Figure:
+    """Return a figure without panels, which a notebook shows even where nobody has imported pyplot."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size)
     FigureCanvasAgg(figure)
+    vars(figure)["_repr_png_"] = lambda: figure_bytes(figure, ".png", dpi=SCREEN)
+    return figure
+
+
+def new_figure(rows: int = 1, *, size: tuple[float, float] | None = None) -> tuple[Figure, list[Axes]]:
+    """Return a figure of `rows` panels above each other on one x axis; call it, and draw, within `house_style`."""
+    figure = bare_figure(size)
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False)
     return figure, [row[0] for row in axes]
 
 
-def figure_bytes(figure: Figure, suffix: str) -> bytes:
+def figure_bytes(figure: Figure, suffix: str, *, dpi: float | None = None) -> bytes:
     """Return the figure as a .png, .svg or .pdf file's content; equal figures give equal bytes."""
     buffer = io.BytesIO()
     with house_style():
-        figure.savefig(buffer, format=suffix.lstrip(".").lower(), metadata=_METADATA[suffix.lower()])
+        form, dots = suffix.lstrip(".").lower(), dpi or STYLE["savefig.dpi"]
+        figure.savefig(buffer, format=form, metadata=_METADATA[suffix.lower()], dpi=dots)
     return buffer.getvalue()
 
 

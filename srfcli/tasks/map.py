@@ -87,6 +87,10 @@ def map(  # the command's own name
     SrfError
         For axes that the system does not have, or that span no plane.
 
+    References
+    ----------
+    Kuznetsov (2004), Elements of Applied Bifurcation Theory: normal forms and resonances.
+
     Examples
     --------
     >>> import srfcli as srf
@@ -211,6 +215,15 @@ def compare(
     ------
     SrfError
         For one law only, no amplitude above 0, or a reference without a critical load at that velocity.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> laws = {name: srf.system(ageing=name) for name in ("dieterich", "ruina")}
+    >>> small = {"V": (5, 20), "K_over_W0": (0.015, 0.03), "points": {"columns": 4, "rows": 6}}
+    >>> found = srf.compare(laws, eps=0.09, **small).to_dataframe()
+    >>> found[["law", "stabilised"]].round(2).values.tolist()
+    [['dieterich', 0.5], ['ruina', 0.67]]
     """
     import numpy as np
 

@@ -50,6 +50,24 @@ def read_experiment(
     ------
     SrfError
         For what is missing, contradictory or unreadable, with the file and the line or column.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import srfcli as srf
+    >>> lines = ["time [s],load_point_velocity [um/s],friction", *(f"{0.1 * i:.1f},3,0.6" for i in range(20))]
+    >>> _ = Path("run.csv").write_text("\\n".join(lines))
+    >>> described = '''
+    ... format = "srf-experiment/1"
+    ... apparatus = { stiffness = "3e-3 1/um" }
+    ... model = { law = "dieterich-ruina", ageing = "ruina", interface = "rigid", inertia = false }
+    ... parameters = { D0 = { value = 10.0, lower = 1.0, upper = 100.0 } }
+    ... runs = [{ name = "run", file = "run.csv", load = "10 MPa" }]
+    ... '''
+    >>> _ = Path("experiment.toml").write_text(described)
+    >>> experiment = srf.read_experiment(".")
+    >>> [(run.name, run.observed.shape) for run in experiment.runs]
+    [('run', (20,))]
     """
     known = registry or load_registry([Path(p) for p in plugins])
     return description.read_experiment(Path(path), registry=known, format=format, holdout=holdout)
@@ -105,6 +123,40 @@ def fit(
     ------
     SrfError
         For what cannot be fitted.
+
+    References
+    ----------
+    Kalman (1960), J. Basic Eng. 82, 35: the filter. Vehtari and others (2021), Bayesian Analysis 16, 667: R-hat.
+
+    Examples
+    --------
+    A velocity step, simulated with D0 = 10 um and read with noise:
+
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> import srfcli as srf
+    >>> t, V = np.arange(300) * 0.2, np.repeat([1.0, 10.0], [100, 200])
+    >>> laws = {"law": "dieterich-ruina", "ageing": "dieterich", "interface": "rigid", "inertia": False}
+    >>> slider = srf.system(**laws, W0=10, K="30 MPa/mm", mu0=0.6, A=0.008, B=0.011, D0=10)
+    >>> record = srf.simulate(slider, t=t, drive=[(0, 1), (20, 10)], observable="friction").records[0]
+    >>> mu = record.observed + np.random.default_rng(1).normal(0, 2e-4, t.size)
+    >>> head = "time [s],load_point_velocity [um/s],friction"
+    >>> np.savetxt("run.csv", np.column_stack([t, V, mu]), delimiter=",", header=head, comments="")
+    >>> described = '''
+    ... format = "srf-experiment/1"
+    ... apparatus = { stiffness = "3e-3 1/um" }
+    ... model = { law = "dieterich-ruina", ageing = "dieterich", interface = "rigid", inertia = false }
+    ... runs = [{ name = "run", file = "run.csv", load = "10 MPa" }]
+    ... [parameters]
+    ... mu0 = { value = 0.6, lower = 0.5, upper = 0.7 }
+    ... A = { value = 0.01, lower = 0.001, upper = 0.05 }
+    ... B = { value = 0.01, lower = 0.001, upper = 0.05 }
+    ... D0 = { value = 5.0, lower = 1.0, upper = 100.0 }
+    ... '''
+    >>> _ = Path("experiment.toml").write_text(described)
+    >>> found = srf.fit(srf.read_experiment("."), track="smooth")
+    >>> found.status.ok, round(found.values["D0"]), found.stderr["D0"] < 0.2
+    (True, 10, True)
     """
     if track == "shared" and (profile or sample):
         raise SrfError("`track` shared does not go with `profile` or `sample`", "Leave it out, or name rough.")

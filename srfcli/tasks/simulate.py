@@ -63,6 +63,10 @@ def simulate(
     SrfError
         For times that do not rise, a drive that begins at rest without `start`, or a load that is not above 0.
 
+    References
+    ----------
+    Hairer and Wanner (1996), Solving Ordinary Differential Equations II: Radau IIA of order 5.
+
     Examples
     --------
     >>> import numpy as np

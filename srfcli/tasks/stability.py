@@ -71,6 +71,11 @@ def linear(
     SrfError
         For a parameter that the system does not have or that has no part here, or a value out of bounds.
 
+    References
+    ----------
+    Cochard, Bureau and Baumberger (2003), Trans. ASME J. Appl. Mech. 70, 220: the appendix.
+    Rice and Ruina (1983), Trans. ASME J. Appl. Mech. 50, 343.
+
     Examples
     --------
     >>> import srfcli as srf
@@ -147,6 +152,15 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
     PeriodicResult
         Where no state was found its status says so.
 
+    Raises
+    ------
+    SrfError
+        For a law without a value under a load that changes.
+
+    References
+    ----------
+    Ascher, Mattheij and Russell (1995), Numerical Solution of Boundary Value Problems: collocation.
+
     Examples
     --------
     >>> import srfcli as srf
@@ -209,6 +223,10 @@ def critical(
     ------
     SrfError
         For values out of bounds.
+
+    References
+    ----------
+    Cochard, Bureau and Baumberger (2003), Trans. ASME J. Appl. Mech. 70, 220.
 
     Examples
     --------
