@@ -155,7 +155,7 @@ def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecas
     told = [None] * len(checks) if forecast is None else forecast.runs
     notices = [str(n) for n in experiment.notices]
     notices += [f"{check.run.name}: {notice}" for check in checks for notice in check.run.notices]
-    notes = [*notices, NOISE, *([] if forecast is None else sentences(forecast))]
+    notes = [*notices, *filter(None, [experiment.rescaled()]), NOISE, *([] if forecast is None else sentences(forecast))]
     choice = experiment.choice
     together = forecast and forecast.together
     meta = {

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
-from srfcli.core.units import is_stress, split_quantity, to_base
+from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
 from srfcli.data.clock import Mask, Rate, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
 from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, ColumnSpec, Node, RunDescription, read_description
@@ -66,7 +66,7 @@ def read_experiment(
     """
     described = read_description(Path(path))
     choice, known = read_choice(described.model, described.apparatus, registry)
-    parameters, notices = read_parameters(described.parameters, known, choice)
+    parameters, notices = read_parameters(described.parameters, known, choice, described.apparatus.geometry)
 
     def read(run: RunDescription) -> Run:
         return read_run(run, described.apparatus, described.columns, registry=registry, format=format, limit=limit)
@@ -172,7 +172,7 @@ def _place(name: str, node: Node) -> str:
 
 
 def read_parameters(
-    node: Node | None, known: tuple[Parameter, ...], choice: ModelChoice
+    node: Node | None, known: tuple[Parameter, ...], choice: ModelChoice, geometry: Geometry = NO_GEOMETRY
 ) -> tuple[tuple[FitParameter, ...], tuple[Notice, ...]]:
     """Return the listed parameters in um, s, N, and what is odd about them."""
     if node is None:
@@ -183,7 +183,7 @@ def read_parameters(
         entry = node.child(name)
         if name not in declared:
             _unknown(entry, name, declared, choice)
-        parameter = _parameter(entry, declared[name])
+        parameter = _parameter(entry, declared[name], geometry if name == "K" else NO_GEOMETRY)
         own = to_base(declared[name].default, declared[name].unit)
         if name in ("K", "M") and not math.isclose(parameter.value, own, rel_tol=1e-9):
             what = f"{name} starts from another value than [apparatus] gives; a simulation uses the apparatus"
@@ -199,12 +199,12 @@ def _unknown(entry: Node, name: str, declared: dict[str, Parameter], choice: Mod
     entry.fail(f"unknown parameter '{name}' of {laws}", _IMPOSED.get(name) or did_you_mean(name, declared))
 
 
-def _parameter(entry: Node, parameter: Parameter) -> FitParameter:
+def _parameter(entry: Node, parameter: Parameter, geometry: Geometry) -> FitParameter:
     entry.table(f"{parameter.name} = {{ value = {parameter.default:g}, lower = ..., upper = ... }}.").keys(_ENTRY)
     fixed = entry.get("fixed")
     held = fixed.boolean() if fixed else False
     numbers = {
-        key: entry.child(key).quantity(parameter.unit) if key in entry.value else default
+        key: _stated(entry.child(key), parameter, geometry) if key in entry.value else default
         for key, default in (("value", parameter.default), ("lower", parameter.lower), ("upper", parameter.upper))
     }
     value, lower, upper = numbers["value"], numbers["lower"], numbers["upper"]
@@ -226,6 +226,19 @@ def _parameter(entry: Node, parameter: Parameter) -> FitParameter:
         )
     factor = to_base(1.0, parameter.unit)
     return FitParameter(parameter.name, value * factor, lower * factor, upper * factor, held, parameter.unit)
+
+
+def _stated(node: Node, parameter: Parameter, geometry: Geometry) -> float:
+    """Return a parameter's number in its unit; a stiffness has to be stated as that of the apparatus is."""
+    if parameter.name == "K" and isinstance(node.value, str):
+        written = split_quantity(node.value, name="K")[1]
+        own = "1/um" if parameter.unit == "1/um" else "MPa/um or N/um"
+        if written and same_dimension(written, "1/um") != (parameter.unit == "1/um"):
+            node.fail(
+                f"a stiffness in {written} beside that of [apparatus], which is in {own}",
+                "Friction per micron is another thing than stress or force per micron, if loads differ: state both in one.",
+            )
+    return node.quantity(parameter.unit, geometry)
 
 
 # One recording, from its description and its file to a run that can be compared with a simulation.
@@ -251,11 +264,16 @@ def read_run(
         if error.message.startswith("unknown reader") and not format:
             run.node.child("format").fail(error.message, error.hint)
         raise
-    columns = read_columns(run, source, specs, limit=limit)
+    columns = read_columns(run, source, specs, limit=limit, geometry=apparatus.geometry)
     keep, notices = kept_samples(run.file, columns.rows, columns.seconds, columns.remarks.get("time"))
     t, rows = columns.seconds[keep], columns.rows[keep]
     arrays = {role: values[keep] for role, values in columns.arrays.items()}
     notices = [*columns.notices, *notices, *sampling_notices(run.file, rows, t, find_sampling(t))]
+    if not apparatus.per_load and not {"normal_load", "normal_stress"} & arrays.keys() and run.load is None:
+        raise SrfError(
+            f"{run.node.where}: friction is recorded without a load, and the stiffness is in {apparatus.stated}",
+            'Give the run load = "20 MPa", or the stiffness as friction per micron, in 1/um.',
+        )
     drive, told = _drive(run, columns, t, arrays)
     load, weighed = _load(run, columns, rows, t, arrays)
     check_start(run, drive, float(t[0]))
@@ -290,7 +308,9 @@ def read_run(
 
 
 def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[str, bool]:
-    """Return for each force of the run, by name, whether it is stated as a stress."""
+    """Return for each force of the run, by name, whether it is stated as a stress, which with an area it is."""
+    if apparatus.geometry.area:
+        return {"all": True}
     found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in FORCES}
     if run.load is not None and isinstance(text := run.node.child("load").value, str):
         found["load"] = is_stress(split_quantity(text, name="load")[1] or "N")
