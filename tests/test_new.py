@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tomllib
 from collections.abc import Sequence
@@ -152,6 +153,51 @@ def test_a_stiffness_per_load_is_never_rescaled_in_silence(step: dict[str, np.nd
         text.replace('stiffness = "0.002 1/um"', 'stiffness = "0.04 MPa/um"').replace("K =", "# K =")
     )
     assert "counts for each run" not in srf("check", ".", "--no-simulate").stdout
+
+
+def to_and_fro(*, strokes: int, K: float = 4e-4, W: float = 0.02, D0: float = 4.0, V: float = 5.0) -> np.ndarray:
+    """Return t, x and F (3, n) of a slider on a spring that turns back every 40 s, with the law regularised."""
+    A, B, mu0, dt, rng = 0.012, 0.008, 0.5, 5e-4, np.random.default_rng(1)
+    F, phi, x, out = 0.0, D0 / V, 0.0, []
+    for i in range(int(40 * strokes / dt)):
+        s = 1 - 2 * (int(i * dt // 40) % 2)
+        if i % 100 == 0:
+            out.append((i * dt, x, F + rng.normal(0.0, 4e-6)))
+        v = 2 * V * math.exp(-(mu0 + B * math.log(V * phi / D0)) / A) * math.sinh(F / W / A)
+        F, phi, x = F + dt * K * (s * V - v), phi + dt * (1 - abs(v) * phi / D0), x + dt * s * V
+    return np.array(out).T
+
+
+def test_a_reciprocating_tribometer_becomes_a_run_for_each_stroke() -> None:
+    t, x, F = to_and_fro(strokes=2)
+    table(["time [s]", "Position [um]", "Friction [uN]", "Normal [mN]"], [t, x, 1e6 * F, 20 + 0 * t])
+    done = srf("new", "run1.csv", "--stiffness", "400 uN/um")
+    assert "run1 slides to and fro: 2 strokes, a run each" in done.stderr
+    runs = tomllib.loads(Path("experiment.toml").read_text())["runs"]
+    assert [(r["name"], r.get("direction"), r["holdout"]) for r in runs] == [
+        ("run1-1", None, False), ("run1-2", "backward", False),
+    ]  # fmt: skip
+    assert 40 < runs[1]["window"][0] < 50 and runs[1]["window"][1] == pytest.approx(80, abs=0.1)
+    rows = {
+        line.split(",")[0]: line.split(",")
+        for line in srf("fit", ".", "--track", "smooth", "--csv").stdout.splitlines()
+    }
+    for name, true in (("A", 0.012), ("B", 0.008), ("D0", 4.0)):
+        value, error = float(rows[name][1]), float(rows[name][2])
+        assert abs(value - true) < 4 * error < 0.5 * true, name
+    # as one run it is refused, with a window and a direction that would do
+    whole = Path("experiment.toml").read_text().split("[[runs]]")[0] + '[[runs]]\nname = "all"\nfile = "run1.csv"\n'
+    Path("experiment.toml").write_text(whole)
+    said = srf("check", ".", code=2).stderr
+    assert "the drive turns back before t = 47" in said and 'direction = "backward"' in said
+
+
+def test_a_ram_that_unloads_at_the_end_slides_in_one_direction(step: dict[str, np.ndarray]) -> None:
+    n = step["t"].size // 4
+    x, mu = step["x"].copy(), step["mu"].copy()
+    x[-n:], mu[-n:] = x[-n] - np.arange(n), np.maximum(mu[-n] - 0.02 * np.arange(n), 0.0)
+    table(["time_s", "x_lp [um]", "mu"], [step["t"], x, mu])
+    assert "to and fro" not in srf("new", "run1.csv", "--stiffness", "2e-3 1/um").stderr
 
 
 def test_friction_alone_does_not_go_with_a_stiffness_of_stress(step: dict[str, np.ndarray]) -> None:

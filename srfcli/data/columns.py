@@ -341,6 +341,9 @@ def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
             f"{run.node.where}: the run has no load, and {run.file} no normal_load or normal_stress",
             f'Write load = "5 N", or name the column. {_near(["normal_load", "normal_stress"], names)}'.strip(),
         )
+    if run.backward:
+        channels[1] = replace(observable, factor=-observable.factor)
+        moves = replace(moves, factor=-moves.factor) if moves else None
     return [*channels, *([moves] if moves else []), *weights[:1]]
 
 

@@ -42,7 +42,7 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
 _TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs")
 _COLUMN = ("name", "unit", "scale", "offset", "integrate")
-_RUN = ("name", "file", "format", "holdout", "window", "drive", "start", "load", "modulation", "initial")
+_RUN = ("name", "file", "format", "holdout", "window", "drive", "start", "load", "modulation", "initial", "direction")
 _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
 
 
@@ -89,6 +89,7 @@ class RunDescription:
     modulation: tuple[float, float, float] | None
     initial: str
     node: Node = field(repr=False, compare=False)
+    backward: bool = False
 
 
 @dataclass(frozen=True)
@@ -260,7 +261,9 @@ def _run(node: Node, geometry: Geometry) -> RunDescription:
     if not file.text().strip() or "\0" in file.text():
         file.expected("the name of a data file")
     holdout, format, start, initial = (node.get(key) for key in ("holdout", "format", "start", "initial"))
-    drive, load, window = node.get("drive"), node.get("load"), node.get("window")
+    drive, load, window, direction = (node.get(key) for key in ("drive", "load", "window", "direction"))
+    if direction and direction.text() not in ("forward", "backward"):
+        direction.expected('"forward" or "backward"', did_you_mean(direction.text(), ("forward", "backward")))
     if initial and initial.text() not in ("steady", "free"):
         initial.expected('"steady" or "free"', did_you_mean(initial.text(), ("steady", "free")))
     weight = load.quantity("N", geometry) if load else None
@@ -279,6 +282,7 @@ def _run(node: Node, geometry: Geometry) -> RunDescription:
         modulation=_modulation(modulation) if modulation else None,
         initial=initial.text() if initial else "steady",
         node=node,
+        backward=direction is not None and direction.text() == "backward",
     )
 
 

@@ -15,10 +15,11 @@ import numpy as np
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
 from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, is_stress, parse_stated_quantity, split_quantity
-from srfcli.data.columns import open_source, split_heading
+from srfcli.data.columns import open_source, read_columns, split_heading
 from srfcli.data.description import ROLES, check_unit, read_description
-from srfcli.data.experiment import read_choice, read_experiment, read_parameters
-from srfcli.data.imposed import find_modulation
+from srfcli.data.experiment import moved, read_choice, read_experiment, read_parameters
+from srfcli.data.imposed import Stroke, find_modulation, strokes
+from srfcli.data.values import OBSERVABLES as OBSERVED
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
 
@@ -78,6 +79,7 @@ STILL, HELD = (
     0.05,
 )  # of the fastest velocity, below which nothing slides; of the slowest sliding, below which is a hold
 SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps
+STROKES = 40  # of a file that are written
 LETTERS = "A is a, B is b, D0 is Dc (or L), mu is tau/sigma, W is sigma, K is k; a stress in MPa counts as the force on 1 mm^2"
 ROCK = {  # start values and bounds of A, B and D0 that hold most velocity steps on rock and gouge
     "A": (0.01, 0.0005, 0.05),
@@ -319,16 +321,17 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         aside = [h for h in headings if h not in {n.heading for n in own}]
         if aside and path == files[0]:
             remarks.append(f"left aside: {', '.join(aside)}")
-    names = _run_names(files)
+    sketch = _Sketch(tuple(files), _run_names(files), folder, wish, named)
+    sketch, told = _parted(sketch, registry)
+    remarks += told
     for name in wish.holdout:
-        if name not in names:
-            raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, names))
-    sketch = _Sketch(tuple(files), names, folder, wish, named)
+        if name not in sketch.names:
+            raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, sketch.names))
     runs, free = _read(sketch, registry)
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs)
     remarks.append(f"kind of experiment: {kind}, {why}")
-    if free:
-        remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(free)}")
+    if still := [name for name in free if name not in sketch.strokes]:
+        remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(still)}")
     sketch = replace(
         sketch, kind=kind, why=why, free=free, modulations=_modulations(runs) if kind == "oscillation" else {},
         durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
@@ -336,6 +339,37 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     text = sketch.text(_parameters(sketch, runs, registry))
     _check(text, registry)
     return Draft(text, named, kind, tuple(remarks))
+
+
+def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
+    """Return the sketch with a run for each stroke of the files whose drive turns back, and what to say of it."""
+    if sketch.wish.drive is not None:
+        return sketch, []
+    with tempfile.TemporaryDirectory() as home:
+        file = Path(home) / "experiment.toml"
+        file.write_text(sketch.text((), absolute=True), encoding="utf-8")
+        described = read_description(file)
+        files: list[Path] = []
+        names: list[str] = []
+        parts: dict[str, Stroke] = {}
+        told: list[str] = []
+        for run in described.runs:
+            source = open_source(run.file, registry=registry, format=run.format)
+            columns = read_columns(run, source, described.columns, geometry=described.apparatus.geometry)
+            rising = np.isfinite(columns.seconds) & (np.diff(columns.seconds, prepend=-np.inf) > 0)
+            arrays = {role: values[rising] for role, values in columns.arrays.items()}
+            t, observed = columns.seconds[rising], arrays[next(r for r in OBSERVED if r in arrays)]
+            found = strokes(t, moved(t, arrays), observed)
+            shown = found[:STROKES]
+            files += [run.file] * max(len(shown), 1)
+            names += [f"{run.name}-{k + 1}" for k in range(len(shown))] or [run.name]
+            parts |= {f"{run.name}-{k + 1}": stroke for k, stroke in enumerate(shown)}
+            if found:
+                some = f", of which the first {STROKES} are written" if len(found) > STROKES else ""
+                told.append(
+                    f"{run.name} slides to and fro: {len(found)} strokes{some}, a run each, from half the force on"
+                )
+    return replace(sketch, files=tuple(files), names=names, strokes=parts, free=tuple(parts)), told
 
 
 def _run_names(files: Sequence[Path]) -> list[str]:
@@ -363,6 +397,7 @@ class _Sketch:
     free: tuple[str, ...] = ()
     modulations: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     durations: Mapping[str, float] = field(default_factory=dict)
+    strokes: Mapping[str, Stroke] = field(default_factory=dict)  # by name, where a file holds several
 
     @property
     def ageing(self) -> str:
@@ -420,7 +455,11 @@ class _Sketch:
         if wish.reader:
             lines.append(f"format = {_quoted(wish.reader)}")
         lines.append(f"holdout = {'true' if name in wish.holdout else 'false'}   # true: never fitted, judges the fit")
-        if wish.window:
+        stroke = self.strokes.get(name)
+        if stroke:
+            lines.append(f"window = [{stroke.begin!r}, {stroke.end!r}]   # s of the file's clock: one stroke")
+            lines += ['direction = "backward"   # drive and observable count with the other sign'] * stroke.backward
+        elif wish.window:
             lines.append(f"window = [{wish.window[0]!r}, {wish.window[1]!r}]   # s of the file's clock")
         elif not absolute:
             lines.append("# window = [0.0, 100.0]   # only this part of the recording, s of the file's clock")
@@ -445,7 +484,7 @@ class _Sketch:
 
 def _read(sketch: _Sketch, registry: Registry) -> tuple[list[Run], tuple[str, ...]]:
     """Return the runs as an experiment reads them, and those that have to begin from a free state."""
-    free: tuple[str, ...] = ()
+    free = sketch.free
     while True:
         text = replace(sketch, free=free).text((), absolute=True)
         with tempfile.TemporaryDirectory() as home:
@@ -489,7 +528,10 @@ def _kind(runs: Sequence[Run]) -> tuple[str, str]:
             return "shs", f"as the drive of {run.name} holds for {float(np.mean(held)):.0%} of the time"
     ranges = [np.abs(run.drive(run.t)) for run in runs]
     low, high = min(float(V.min()) for V in ranges), max(float(V.max()) for V in ranges)
-    return "steps", f"as the drive goes from {low:.3g} to {high:.3g} um/s" if high > low else f"at {low:.3g} um/s"
+    return (
+        "steps",
+        f"as the drive goes from {low:.3g} to {high:.3g} um/s" if high > 1.001 * low else f"at {low:.3g} um/s",
+    )
 
 
 def _levels(V: np.ndarray) -> int:

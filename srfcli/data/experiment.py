@@ -29,6 +29,7 @@ from srfcli.data.imposed import (
     find_modulation,
     load_from_column,
     modulation_notices,
+    strokes,
 )
 from srfcli.data.noise import (
     Noise,
@@ -274,6 +275,7 @@ def read_run(
             f"{run.node.where}: friction is recorded without a load, and the stiffness is in {apparatus.stated}",
             'Give the run load = "20 MPa", or the stiffness as friction per micron, in 1/um.',
         )
+    _refuse_strokes(run, t, arrays)
     drive, told = _drive(run, columns, t, arrays)
     load, weighed = _load(run, columns, rows, t, arrays)
     check_start(run, drive, float(t[0]))
@@ -304,6 +306,30 @@ def read_run(
         quantum=quantum,
         notices=(*notices, *told, *weighed, *flaws),
         stress=any(units.values()),
+    )
+
+
+def moved(t: Array, arrays: Mapping[str, Array]) -> Array:
+    """Return the displacement of the load point at the times t (n,), from its column or the integral of the velocities."""
+    if "load_point_displacement" in arrays:
+        return arrays["load_point_displacement"]
+    V = arrays["load_point_velocity"]
+    steps = np.where(np.isfinite(V[:-1]), V[:-1], 0.0) * np.diff(t)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _refuse_strokes(run: RunDescription, t: Array, arrays: Mapping[str, Array]) -> None:
+    """Raise SrfError for a run that slides in both directions."""
+    if run.drive is not None or not {"load_point_displacement", "load_point_velocity"} & arrays.keys():
+        return
+    found = strokes(t, moved(t, arrays), arrays[next(r for r in OBSERVABLES if r in arrays)])
+    if not found:
+        return
+    turn = found[1] if len(found) > 1 else found[0]
+    raise SrfError(
+        f"{run.node.where}: the drive turns back before t = {turn.begin:.6g} s and slides there; a run slides in one direction",
+        f"Make a run of each stroke: window = [{turn.begin:.6g}, {turn.end:.6g}] and, of a backward one, "
+        f'direction = "backward"; `srf new {run.file.name}` writes them.',
     )
 
 

@@ -170,6 +170,60 @@ def _count(number: int) -> str:
     return f"{number} straight piece" + ("s" if number != 1 else "")
 
 
+# A drive that turns back: the laws hold for sliding in one direction, so that each stroke is a run of its own.
+
+TURN = 0.2  # of the range of displacements: what turns back by less is no stroke
+OPPOSED = 0.5  # of the median observable: what opposes sliding by more slides, or is on the way to it
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """Sliding in one direction from `begin` to `end` s: after a turn from where the force has come to half its usual size."""
+
+    begin: float
+    end: float
+    backward: bool
+
+
+def strokes(t: Array, moved: Array, observed: Array) -> list[Stroke]:
+    """Return the strokes of a recording whose drive turns back and slides there; none where it only goes on or unloads.
+
+    `moved` (n,) is the displacement of the load point, `observed` (n,) elongation, force or friction of either sign. After a turn
+    the slider sticks while the spring is unloaded, so that what comes before the change of sign is left out.
+    """
+    known = np.isfinite(moved) & np.isfinite(observed)
+    t, x, y = t[known], moved[known], observed[known]
+    if t.size < 2 * FEWEST or not np.ptp(x) > 0:
+        return []
+    turns = _turns(x, TURN * float(np.ptp(x)))
+    usual = float(np.median(np.abs(y)))
+    found, slid = [], [False, False]
+    for first, last in pairwise([0, *turns, t.size - 1]):
+        backward = bool(x[last] < x[first])
+        shear = -y[first : last + 1] if backward else y[first : last + 1]
+        slid[backward] |= bool(np.median(shear[shear.size // 2 :]) > OPPOSED * usual)
+        opposed = np.flatnonzero(shear <= OPPOSED * usual)
+        opposed = opposed[opposed < shear.size // 2]  # after that, what falls short is stick-slip
+        begin = first + (int(opposed[-1]) + 1 if first and opposed.size else 0)
+        if last - begin >= 4 * FEWEST:
+            found.append(Stroke(float(f"{t[begin]:.10g}"), float(f"{t[last - 1]:.10g}"), backward))
+    return found if all(slid) and turns else []
+
+
+def _turns(x: Array, least: float) -> list[int]:
+    """Return the indices of the extremes between which x (n,) moves by more than `least`, without the two ends."""
+    turns, extreme, rising = [], 0, 0  # one pass: an extreme is one once x has come back from it by `least`
+    for i, value in enumerate(x.tolist()):
+        if rising == 0 and abs(value - x[0]) > least:
+            rising, extreme = (1 if value > x[0] else -1), i
+        elif rising and rising * (value - x[extreme]) > 0:
+            extreme = i
+        elif rising and rising * (x[extreme] - value) > least:
+            turns.append(extreme)
+            rising, extreme = -rising, i
+    return turns
+
+
 # Straight pieces in a noisy record, as many as the record supports and no more (Bayesian information criterion).
 
 FEWEST = 5  # samples of a piece
