@@ -155,7 +155,12 @@ def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecas
     told = [None] * len(checks) if forecast is None else forecast.runs
     notices = [str(n) for n in experiment.notices]
     notices += [f"{check.run.name}: {notice}" for check in checks for notice in check.run.notices]
-    notes = [*notices, *filter(None, [experiment.rescaled()]), NOISE, *([] if forecast is None else sentences(forecast))]
+    notes = [
+        *notices,
+        *filter(None, [experiment.rescaled()]),
+        NOISE,
+        *([] if forecast is None else sentences(forecast)),
+    ]
     choice = experiment.choice
     together = forecast and forecast.together
     meta = {
@@ -193,6 +198,7 @@ def _figure(experiment: Experiment, checks: Sequence[RunCheck]) -> Figure:
                 "label": run.quantity + (f"\n[{unit_text(run.unit)}]" if run.unit != "1" else ""),
                 "load_unit": run.load_unit,
                 "used": run.used,
+                "proposed": run.proposed,
                 "V": run.drive(t),
                 "W": run.load(t)[0],
                 "gaps": [(t[g], t[g + 1]) for g in check.sampling.gaps.tolist()],

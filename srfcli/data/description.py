@@ -39,10 +39,24 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
     "shear_stress": "MPa",
     "friction": "1",
 }
+CORRECTIONS = ("reset", "spike")  # of a run: what is proposed, and made only where it is asked for
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
 _TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs")
 _COLUMN = ("name", "unit", "scale", "offset", "integrate")
-_RUN = ("name", "file", "format", "holdout", "window", "drive", "start", "load", "modulation", "initial", "direction")
+_RUN = (
+    "name",
+    "file",
+    "format",
+    "holdout",
+    "window",
+    "drive",
+    "start",
+    "load",
+    "modulation",
+    "initial",
+    "direction",
+    "corrections",
+)
 _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
 
 
@@ -90,6 +104,7 @@ class RunDescription:
     initial: str
     node: Node = field(repr=False, compare=False)
     backward: bool = False
+    corrections: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -283,7 +298,21 @@ def _run(node: Node, geometry: Geometry) -> RunDescription:
         initial=initial.text() if initial else "steady",
         node=node,
         backward=direction is not None and direction.text() == "backward",
+        corrections=_corrections(node.get("corrections")),
     )
+
+
+def _corrections(node: Node | None) -> frozenset[str]:
+    """Return which of the corrections that `srf check` proposes are made."""
+    if node is None:
+        return frozenset()
+    if not isinstance(node.value, list):
+        node.expected("a list of corrections", f"Write corrections = {list(CORRECTIONS)}, or one of them.")
+    for index in range(len(node.value)):
+        entry = node.child(index)
+        if entry.text() not in CORRECTIONS:
+            entry.fail(f"unknown correction '{entry.text()}'", did_you_mean(entry.text(), CORRECTIONS))
+    return frozenset(node.value)
 
 
 def _window(node: Node) -> tuple[float, float]:

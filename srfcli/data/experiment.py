@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from srfcli.data.clock import Mask, Rate, Sampling, find_sampling, kept_samples,
 from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, ColumnSpec, Node, RunDescription, read_description
 from srfcli.data.imposed import (
+    ACCIDENTS,
     DIFFERS,
     Found,
     Place,
@@ -288,7 +289,9 @@ def read_run(
     if len(set(units.values())) > 1:
         named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())
         notices.append(Notice("unit", run.file.name, f"{named}: a stress counts as the force on 1 mm^2"))
-    observed, used, quantum, flaws = clean_observable(place, arrays[role], rise=rise, load=load)
+    observed, used, quantum, flaws, proposed = clean_observable(
+        place, arrays[role], rise=rise, load=load, corrections=run.corrections
+    )
     return Run(
         name=run.name,
         file=run.file,
@@ -306,6 +309,7 @@ def read_run(
         quantum=quantum,
         notices=(*notices, *told, *weighed, *flaws),
         stress=any(units.values()),
+        proposed=proposed,
     )
 
 
@@ -349,7 +353,7 @@ def _drive(run: RunDescription, columns: Columns, t: Array, arrays: dict[str, Ar
     role = next((r for r in ("load_point_velocity", "load_point_displacement") if r in arrays), "")
     where = f"{run.file.name}: column '{columns.channels[role].heading}'" if role else ""
     if run.drive is None:
-        return drive_from_column(role, t, arrays[role], where)
+        return drive_from_column(role, t, arrays[role], where, correct="reset" in run.corrections)
     drive = declared_drive(run, columns, t)
     return drive, drive_differs(drive, t, arrays[role], where) if role else []
 
@@ -382,11 +386,15 @@ CALM = 1e-3  # relative change of the load between samples within which a jump o
 COARSE = 0.5  # quantisation step over white noise from which it is told
 
 
-def clean_observable(place: Place, x: Array, *, rise: Array, load: Load) -> tuple[Array, Mask, float, list[Notice]]:
-    """Return the observable (n,), which samples are to be compared, its quantisation step, and what was found.
+def clean_observable(
+    place: Place, x: Array, *, rise: Array, load: Load, corrections: Collection[str] = ()
+) -> tuple[Array, Mask, float, list[Notice], Array | None]:
+    """Return the observable (n,), which samples are to be compared, its quantisation step, what was found, and what is proposed.
 
-    `rise` (n,) is the fastest rise per second that the drive allows. Level jumps of the transducer are taken out; empty cells,
-    spikes, saturated samples and those beside a jump are not to be compared. Raises SrfError where nothing is left.
+    `rise` (n,) is the fastest rise per second that the drive allows. Empty cells and saturated samples are not to be compared.
+    With "spike" among the `corrections` spikes are not either; with "reset" level jumps of the transducer are taken out, and the
+    samples beside them are not compared. What is proposed is the observable (n,) with all of this done, None where nothing is.
+    Raises SrfError where nothing is left.
     """
     t, path, rows = place.t, place.path, place.rows
     known = np.isfinite(x)
@@ -405,10 +413,16 @@ def clean_observable(place: Place, x: Array, *, rise: Array, load: Load) -> tupl
         notices += spots("saturation", clipped, path, rows, t, told)
     steps = np.append(np.diff(t), t[-1] - t[-2])
     spiky = spikes(filled, quantum, rise * steps) & ~clipped
-    notices += spots("spike", spiky, path, rows, t, f"standing out in '{place.heading}', not compared")
+    if spiky.sum() > ACCIDENTS + x.size // 500:  # the tail of the noise, and no accidents
+        spiky[:] = False
+    left = "not compared" if "spike" in corrections else 'compared as they are; corrections = ["spike"] leaves them out'
+    notices += spots("spike", spiky, path, rows, t, f"standing out in '{place.heading}', {left}")
     calm = np.interp(t, t[~spiky], filled[~spiky])
-    level, beside, told_jumps = _without_jumps(place, calm, rise, load, quantum)
-    observed = np.where(spiky, filled + level - calm, level)
+    level, beside, told_jumps = _without_jumps(place, calm, rise, load, quantum, taken_out="reset" in corrections)
+    proposed = level if spiky.any() or (level != calm).any() else None
+    observed = np.where(spiky, filled + level - calm, level) if "reset" in corrections else filled
+    beside = beside & ("reset" in corrections)
+    spiky = spiky & ("spike" in corrections)
     white = white_level(calm)
     if quantum > COARSE * white > 0:
         what = f"steps of {quantum:.4g}, {quantum / white:.2g} times the white noise, which they add to"
@@ -418,10 +432,12 @@ def clean_observable(place: Place, x: Array, *, rise: Array, load: Load) -> tupl
         raise SrfError(
             f"{path.name}: column '{place.heading}': {int(used.sum())} samples can be compared", "8 are needed."
         )
-    return observed, used, quantum, [*notices, *told_jumps]
+    return observed, used, quantum, [*notices, *told_jumps], proposed
 
 
-def _without_jumps(place: Place, x: Array, rise: Array, load: Load, quantum: float) -> tuple[Array, Mask, list[Notice]]:
+def _without_jumps(
+    place: Place, x: Array, rise: Array, load: Load, quantum: float, *, taken_out: bool
+) -> tuple[Array, Mask, list[Notice]]:
     W, _ = load(place.t)
     change = np.abs(np.diff(W, prepend=W[0])) / W
     jumps = observable_jumps(x, place.t, rise, change < CALM, quantum)
@@ -429,10 +445,15 @@ def _without_jumps(place: Place, x: Array, rise: Array, load: Load, quantum: flo
     notices = []
     for jump in jumps:
         where = span(place.path, place.rows, place.t, jump.at, jump.at + 1)
-        done = "a transducer set anew; what follows is moved back by that much"
         if not jump.certain:
             done = "faster than the drive moves, but too little to be sure of a transducer set anew; left as it is"
-        what = f"'{place.heading}' jumps by {jump.size:.4g}: {done}, and the two samples are not compared"
+        elif taken_out:
+            done = (
+                "a transducer set anew; what follows is moved back by that much, and the two samples are not compared"
+            )
+        else:
+            done = 'faster than the drive moves; left as it is; corrections = ["reset"] moves what follows back by that much'
+        what = f"'{place.heading}' jumps by {jump.size:.4g}: {done}"
         notices.append(Notice("reset", where, what))
     return level, beside, notices
 
@@ -496,8 +517,8 @@ class RunCheck:
 
     @property
     def spikes(self) -> int:
-        """Return how many samples of the observable stand out and are not compared."""
-        told = (n.what for n in self.run.notices if n.kind == "spike" and n.what.endswith("not compared"))
+        """Return how many samples of the observable stand out."""
+        told = (n.what for n in self.run.notices if n.kind == "spike" and not n.what.endswith("the load is bridged"))
         return sum(int(what.split()[0]) for what in told)  # the notice begins with their number
 
 

@@ -62,6 +62,7 @@ class Run:
     `observed` is finite everywhere; where `used` is False it is a placeholder and a notice says why. `drive` and `load` hold
     on all of [t[0], t[-1]]. `start` is the place on the track in um, `initial` "steady" or "free", `stiffness` K in N/um,
     `modulation` the declared frequency (Hz), relative amplitude and onset (s), `quantum` the quantisation step, or 0.
+    `proposed` is the observable as the corrections that are proposed would make it, None where there are none.
     `stress` where stresses were recorded: a stress counts as the force on 1 mm^2, so that what is in N is in MPa.
     """
 
@@ -81,6 +82,7 @@ class Run:
     quantum: float
     notices: tuple[Notice, ...]
     stress: bool = False
+    proposed: Array | None = field(default=None, repr=False)
 
     @property
     def unit(self) -> str:
