@@ -437,7 +437,7 @@ def sentences(forecast: Forecast) -> list[str]:
     if judge is None:
         return [*told, "what the loads can tell is not estimated: no simulated run resembles its recording"]
     told += [_sentence(name, judge, forecast) for name in judge.errors]
-    beside = f"with {', '.join(forecast.free)} unknown within their bounds" if forecast.free else "with all else known"
+    beside = f"with {', '.join(forecast.free)} unknown" if forecast.free else "with all else known"
     told.append(
         f"at best: for the model and the start values of the experiment, {beside}, and the noise as found; a rough track, or "
         "a model that fails, costs more"
