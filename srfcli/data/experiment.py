@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,7 @@ from srfcli.data.noise import (
     spikes,
     white_level,
 )
+from srfcli.data.scales import own_bounds
 from srfcli.data.values import OBSERVABLES, Experiment, FitParameter, ModelChoice, Notice, Run
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
@@ -74,6 +75,12 @@ def read_experiment(
         return read_run(run, described.apparatus, described.columns, registry=registry, format=format, limit=limit)
 
     runs = tuple(read(run) for run in described.runs if holdout or not run.holdout)
+    if choice.effects and runs and described.parameters is not None:
+        from srfcli.symbolic.system import apart  # only for a description that has effects
+
+        own = [registry.get("effect", name) for name in choice.effects]
+        stated = described.parameters.value
+        parameters = own_bounds(parameters, apart([e for e in own if isinstance(e, Effect)]), runs, stated)
     return Experiment(
         described.path,
         described.title,
@@ -162,7 +169,14 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
             )
         names.append(name)
         found.append(effect)
-    return tuple(names), tuple(p for effect in apart(found) for p in effect.parameters)
+    return tuple(names), tuple(_roomy(p, effect) for effect in apart(found) for p in effect.parameters)
+
+
+def _roomy(p: Parameter, effect: Effect) -> Parameter:
+    """Return an effect's parameter without the bounds of its file where those follow the recording, which is not read yet."""
+    if not any(name == p.name and which != "default" for name, which, _ in effect.scaled):
+        return p
+    return replace(p, lower=0.0 if p.lower >= 0 else -math.inf, upper=math.inf)
 
 
 def _place(name: str, node: Node) -> str:
