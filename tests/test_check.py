@@ -19,7 +19,7 @@ from srfcli.cli.check import CAN, verdict_of
 from srfcli.cli.main import cli
 from srfcli.codegen.model import open_model
 from srfcli.data.experiment import check_run, read_experiment
-from srfcli.data.values import Experiment
+from srfcli.data.values import Experiment, FitParameter
 from srfcli.inference import cramer_rao as reach
 from srfcli.inference.cramer_rao import Forecast, Reach, forecast, noise_of
 from srfcli.inference.fit import fit, fit_problem
@@ -38,8 +38,8 @@ def srf(*arguments: str, code: int = 0) -> Result:
     return done
 
 
-def told(experiment: Experiment) -> Forecast:
-    return forecast(experiment, [check_run(run) for run in experiment.runs], registry=REGISTRY)
+def told(experiment: Experiment, *, apparatus: bool = False) -> Forecast:
+    return forecast(experiment, [check_run(run) for run in experiment.runs], registry=REGISTRY, apparatus=apparatus)
 
 
 @pytest.fixture
@@ -184,6 +184,27 @@ def test_errors_are_those_of_a_fit(made: Path) -> None:
         assert found.together.errors[name] < min(r.errors[name] for r in found.runs)
 
 
+def test_stiffness_and_trends_are_unknown_too_and_cost_what_they_cost_a_fit(made: Path) -> None:
+    """What is said of alpha is what a fit finds that knows neither the machine's stiffness nor a run's trend."""
+    experiment = read_experiment(made, registry=REGISTRY)
+    known, found = told(experiment), told(experiment, apparatus=True)
+    assert found.free[-2:] == ("K", "a trend of each run") and "K" not in known.free
+    stated = experiment.runs[0].stiffness
+    free = replace(
+        experiment,
+        parameters=(*experiment.parameters, FitParameter("K", stated, stated / 2, 2 * stated, False, "N/um")),
+    )
+    problem = fit_problem(open_model(REGISTRY, **asdict(experiment.choice)), free, trend="slip")
+    errors = fit(problem).stderr
+    lam = next(p.value for p in experiment.parameters if p.name == "lambda")
+    assert found.together is not None and known.together is not None
+    assert found.together.errors["alpha"] == pytest.approx(errors["alpha"], rel=0.15)
+    assert found.together.errors["lambda"] == pytest.approx(errors["lambda"] / lam, rel=0.15)
+    for name in ("alpha", "lambda"):
+        assert found.together.errors[name] > known.together.errors[name]
+    assert "K, a trend of each run unknown" in srf("check", str(made)).stdout
+
+
 @pytest.mark.parametrize(("name", "case"), [("onset", "open-01"), ("strong", "open-01"), ("loadstep", "open-01")])
 def test_errors_from_differences(name: str, case: str, shared: Path) -> None:
     """alpha and lambda with all else known, from simulations at two values each: within a factor of 1.1, where a linear
@@ -192,7 +213,7 @@ def test_errors_from_differences(name: str, case: str, shared: Path) -> None:
     fixed = replace(experiment, parameters=tuple(replace(p, fixed=True) for p in experiment.parameters))
     run = next(r for r in experiment.runs if r.name == name)
     check = check_run(run)
-    found = forecast(fixed, [check], registry=REGISTRY).runs[0]
+    found = forecast(fixed, [check], registry=REGISTRY, apparatus=False).runs[0]
     choice = replace(experiment.choice, ageing="dieterich+linker-dieterich")
     model = open_model(REGISTRY, **asdict(choice))
     lam = next(p.value for p in experiment.parameters if p.name == "lambda")

@@ -157,7 +157,8 @@ def test_the_truth_explains_the_example(shared, case):
 def test_the_names_are_those_of_the_table(shared):
     table = (shared / "diagnosis.md").read_text().partition("## The answer")[0]
     names = [line.split("`")[1] for line in table.splitlines() if line.startswith("| `")]
-    assert sorted({SHIPPED.get("effect", n).reported for n in NAMES}) == sorted(names)
+    searched = [e for e in (SHIPPED.get("effect", n) for n in NAMES) if not e.on_request]
+    assert sorted({e.reported for e in searched}) == sorted(names)
 
 
 @pytest.mark.parametrize("name", NAMES)

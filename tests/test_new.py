@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -59,6 +61,7 @@ def table(headings: Sequence[str], columns: Sequence[np.ndarray], name: str = "r
     return path
 
 
+DEGREES = 180 / np.pi / 25e3  # of a circle of 25 mm, to a um
 FORMS = {
     "brackets": (["Time(s)", "Displ(microns)", "Friction", "Normal_stress(MPa)"], (1, 1, 1, 1), "txmS", "5e-3 1/um"),
     "suffixes": (
@@ -76,6 +79,17 @@ FORMS = {
     "letters": (["t (min)", "v_lp (um/s)", "mu", "sigma (MPa)"], (1 / 60, 1, 1, 1), "tVmS", "2e-3 1/um"),
     "forces": (["Elapsed time", "LP Disp", "Fs [kN]", "Fn [kN]"], (1, 1, SIGMA / 1e3, 1e-3), "txmS", "40 N/mm"),
     "spring": (["time [s]", "stage_um", "u [mm]", "load [N]"], (1, 1, 0.5, 1), "txmS", "40 N/mm"),
+    "words": (["Elapsed (s)", "Stroke (mm)", "Friction [uN]", "Fz [mN]"], (1, 1e-3, SIGMA * 1e6, 1e3), "txmS", "40 N/mm"),
+    "rotary": (["time [s]", "Angle [deg]", "Torque [N m]", "Axial load [N]"], (1, DEGREES, SIGMA * 0.025, 1), "txmS", "40 N/mm"),
+    "strain": (["time [s]", "Shear strain", "Shear traction [MPa]", "eff. normal stress [MPa]"], (1, 1 / 4000, SIGMA, 1), "txmS",
+               "40 MPa/mm"),
+    "area": (["time [s]", "Angular speed [rpm]", "Torque [mN m]", "Fn [N]"], (1, DEGREES / 6, SIGMA * 50 * 25, 50), "tVmS",
+             "1250 N m/rad"),
+}  # fmt: skip
+RIGS = {
+    "rotary": ["--radius", "25 mm"],
+    "strain": ["--thickness", "4 mm"],
+    "area": ["--radius", "25 mm", "--area", "50 mm^2"],
 }
 
 
@@ -84,18 +98,113 @@ def test_a_laboratory_s_table_becomes_an_experiment(form: str, step: dict[str, n
     headings, factors, which, stiffness = FORMS[form]
     keys = {"t": "t", "x": "x", "V": "V", "m": "mu", "S": "sigma"}
     table(headings, [step[keys[c]] * f for c, f in zip(which, factors, strict=True)])
-    done = srf("new", "run1.csv", "--stiffness", stiffness)
+    done = srf("new", "run1.csv", "--stiffness", stiffness, *RIGS.get(form, ()))
     assert done.stdout.strip() == "experiment.toml"
     assert "steps, as the drive goes from 1 to 10 um/s" in done.stderr
     checked = srf("check", ".", "--no-simulate").stdout
     assert "1 to 10" in checked and "20" in checked
-    stress = form not in ("forces", "spring")
+    stress = form not in ("forces", "spring", "words", "rotary")
     assert ("W [MPa]" in checked) is stress and ("W [N]" in checked) is not stress
+    mu0 = tomli.loads(Path("experiment.toml").read_text())["parameters"]["mu0"]["value"]
+    stiff = json.loads(srf("check", ".", "--no-simulate", "--json").stdout)["meta"]["runs"][0]["stiffness"]
+    assert stiff == pytest.approx(k * SIGMA * {"brackets": 2.5}.get(form, 1.0)), form
     assert {"suffixes": "shear stress [MPa]", "forces": "force [N]", "spring": "elongation [um]"}.get(
         form, "run1"
     ) in checked
-    mu0 = tomli.loads(Path("experiment.toml").read_text())["parameters"]["mu0"]["value"]
     assert mu0 == pytest.approx(0.605, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("headings", "options", "said", "hint"),
+    [
+        (["t [s]", "v [um/s]", "Torque [N m]", "Fn [N]"], (), "'N m' measures um*N, not N", 'radius = "25 mm"'),
+        (["t [s]", "Angle [deg]", "Fs [N]", "Fn [N]"], (), "'deg' measures rad, not um", 'radius = "25 mm"'),
+        (["t [s]", "Shear strain", "Fs [N]", "Fn [N]"], (), "measures 1, not um", 'thickness = "4 mm"'),
+        (["t [s]", "v [um/s]", "Fs [N]", "Fn [N]"], ("--area", "0 mm^2"), "expected an area above 0", ""),
+        (["t [s]", "v [um/s]", "Fs [N]", "Fn [N]"], ("--area", "3 mm^2", "--mass", "1 kg"), "a mass beside an area", ""),
+        (["t [s]", "v [um/s]", "Upper stress [MPa]", "Lower stress [MPa]"], (), "which column is", "shear_stress=HEADING"),
+        (["t [s]", "v [um/s]", "shear one [N]", "shear two [N]", "Fn [N]"], (), "which column is", "shear_stress=HEADING"),
+    ],
+)  # fmt: skip
+def test_what_a_rig_has_to_say(headings: list[str], options: tuple[str, ...], said: str, hint: str) -> None:
+    t = np.arange(0.0, 10.0, 0.1)
+    table(headings, [t, 1 + t, 0.6 + 0 * t, 1 + 0 * t, 1 + 0 * t][: len(headings)])
+    done = srf("new", "run1.csv", "--stiffness", "1 N/um", *options, code=2)
+    assert said in done.stderr and hint in done.stderr, done.stderr
+
+
+def test_a_stiffness_per_load_is_never_rescaled_in_silence(step: dict[str, np.ndarray]) -> None:
+    for name, load in (("one.csv", SIGMA), ("two.csv", 2 * SIGMA)):
+        table(
+            ["time_s", "v", "tau_MPa", "sigma_n_MPa"],
+            [step["t"], step["V"], load * step["mu"], load + 0 * step["t"]],
+            name,
+        )
+    srf("new", "one.csv", "two.csv", "--stiffness", "2e-3 1/um")
+    said = srf("check", ".", "--no-simulate").stdout
+    assert (
+        "0.04 MPa/um under 20 MPa in one, 0.08 MPa/um under 40 MPa in two; a machine's own stiffness does not grow"
+        in said
+    )
+    text = Path("experiment.toml").read_text().replace("# K =", "K =")
+    Path("experiment.toml").write_text(text.replace('upper = "0.004 1/um"', 'upper = "0.08 MPa/um"'))
+    assert "a stiffness in MPa/um beside that of [apparatus], which is in 1/um" in srf("check", ".", code=2).stderr
+    Path("experiment.toml").write_text(
+        text.replace('stiffness = "0.002 1/um"', 'stiffness = "0.04 MPa/um"').replace("K =", "# K =")
+    )
+    assert "counts for each run" not in srf("check", ".", "--no-simulate").stdout
+
+
+def to_and_fro(*, strokes: int, K: float = 4e-4, W: float = 0.02, D0: float = 4.0, V: float = 5.0) -> np.ndarray:
+    """Return t, x and F (3, n) of a slider on a spring that turns back every 40 s, with the law regularised."""
+    A, B, mu0, dt, rng = 0.012, 0.008, 0.5, 5e-4, np.random.default_rng(1)
+    F, phi, x, out = 0.0, D0 / V, 0.0, []
+    for i in range(int(40 * strokes / dt)):
+        s = 1 - 2 * (int(i * dt // 40) % 2)
+        if i % 100 == 0:
+            out.append((i * dt, x, F + rng.normal(0.0, 4e-6)))
+        v = 2 * V * math.exp(-(mu0 + B * math.log(V * phi / D0)) / A) * math.sinh(F / W / A)
+        F, phi, x = F + dt * K * (s * V - v), phi + dt * (1 - abs(v) * phi / D0), x + dt * s * V
+    return np.array(out).T
+
+
+def test_a_reciprocating_tribometer_becomes_a_run_for_each_stroke() -> None:
+    t, x, F = to_and_fro(strokes=2)
+    table(["time [s]", "Position [um]", "Friction [uN]", "Normal [mN]"], [t, x, 1e6 * F, 20 + 0 * t])
+    done = srf("new", "run1.csv", "--stiffness", "400 uN/um")
+    assert "run1 slides to and fro: 2 strokes, a run each" in done.stderr
+    runs = tomli.loads(Path("experiment.toml").read_text())["runs"]
+    assert [(r["name"], r.get("direction"), r["holdout"]) for r in runs] == [
+        ("run1-1", None, False), ("run1-2", "backward", False),
+    ]  # fmt: skip
+    assert 40 < runs[1]["window"][0] < 50 and runs[1]["window"][1] == pytest.approx(80, abs=0.1)
+    rows = {
+        line.split(",")[0]: line.split(",")
+        for line in srf("fit", ".", "--track", "smooth", "--csv").stdout.splitlines()
+    }
+    for name, true in (("A", 0.012), ("B", 0.008), ("D0", 4.0)):
+        value, error = float(rows[name][1]), float(rows[name][2])
+        assert abs(value - true) < 4 * error < 0.5 * true, name
+    # as one run it is refused, with a window and a direction that would do
+    whole = Path("experiment.toml").read_text().split("[[runs]]")[0] + '[[runs]]\nname = "all"\nfile = "run1.csv"\n'
+    Path("experiment.toml").write_text(whole)
+    said = srf("check", ".", code=2).stderr
+    assert "the drive turns back before t = 47" in said and 'direction = "backward"' in said
+
+
+def test_a_ram_that_unloads_at_the_end_slides_in_one_direction(step: dict[str, np.ndarray]) -> None:
+    n = step["t"].size // 4
+    x, mu = step["x"].copy(), step["mu"].copy()
+    x[-n:], mu[-n:] = x[-n] - np.arange(n), np.maximum(mu[-n] - 0.02 * np.arange(n), 0.0)
+    table(["time_s", "x_lp [um]", "mu"], [step["t"], x, mu])
+    assert "to and fro" not in srf("new", "run1.csv", "--stiffness", "2e-3 1/um").stderr
+
+
+def test_friction_alone_does_not_go_with_a_stiffness_of_stress(step: dict[str, np.ndarray]) -> None:
+    table(["time_s", "v", "mu"], [step["t"], step["V"], step["mu"]])
+    said = srf("new", "run1.csv", "--stiffness", "12 MPa/um", code=2).stderr
+    assert "friction is recorded without a load, and the stiffness is in MPa/um" in said
+    srf("new", "run1.csv", "--stiffness", "12 MPa/um", "--load", "20 MPa")
 
 
 def test_the_first_fit_is_two_commands_away_and_in_the_units_of_the_recording(step: dict[str, np.ndarray]) -> None:

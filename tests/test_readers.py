@@ -6,6 +6,7 @@ import io
 import json
 import re
 import struct
+import sys
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from recording_cases import TOML, data, write
 
 from srfcli.core.errors import SrfError
-from srfcli.data.columns import open_source
+from srfcli.data.columns import open_source, split_heading
 from srfcli.data.experiment import check_run, read_experiment
 from srfcli.laws.registry import load_registry
 from srfcli.laws.values import Source
@@ -62,14 +63,53 @@ def look_bytes(numbers: np.ndarray, *, width: int = 8, units: tuple[str, ...] = 
     return head.ljust(36 + 32 * 84, b"\0") + numbers.astype(f">f{width}").tobytes()
 
 
+def old_look_bytes(numbers: np.ndarray) -> bytes:
+    """Return a look file of the older kind, with sixteen channel headers."""
+    whole = look_bytes(numbers)
+    return whole[: 36 + 16 * 84] + whole[36 + 32 * 84 :]
+
+
+def hdf5_bytes(numbers: np.ndarray, *, matlab: bool = False) -> bytes:
+    """Return an HDF5 file with a dataset for each column, or what MATLAB's save -v7.3 makes of column vectors."""
+    h5py = pytest.importorskip("h5py")
+    stream = io.BytesIO()
+    with h5py.File(stream, "w", userblock_size=512 if matlab else 0) as file:
+        for name, values in zip(NAMES, numbers, strict=True):
+            file[name] = values[None, :] if matlab else values
+            if matlab:
+                file[name].attrs["MATLAB_class"] = np.bytes_("double")
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\0\2IM" if matlab else b""
+    return head + stream.getvalue()[len(head) :]
+
+
+def tdms_bytes(numbers: np.ndarray) -> bytes:
+    nptdms = pytest.importorskip("nptdms")
+    stream = io.BytesIO()
+    with nptdms.TdmsWriter(stream) as writer:
+        writer.write_segment([nptdms.ChannelObject("rig", n, v) for n, v in zip(NAMES, numbers, strict=True)])
+    return stream.getvalue()
+
+
+def export_bytes(numbers: np.ndarray) -> bytes:
+    lines = ["a rig of ours", "  ".join(NAMES), *("  ".join(map(repr, row)) for row in numbers.T.tolist())]
+    return "\r\n".join(lines).encode()
+
+
 WRITERS: dict[str, Callable[[np.ndarray], bytes]] = {
     "csv": csv_bytes,
     "tsv": lambda x: csv_bytes(x, "\t"),
     "npz": npz_bytes,
     "matlab": mat_bytes,
     "look": look_bytes,
+    "export": export_bytes,
 }
-SUFFIX = {"csv": ".csv", "tsv": ".txt", "npz": ".npz", "matlab": ".mat", "look": ""}
+EXTRAS: dict[str, Callable[[np.ndarray], bytes]] = {
+    "old look": old_look_bytes,
+    "hdf5": hdf5_bytes,
+    "matlab 7.3": lambda x: hdf5_bytes(x, matlab=True),
+    "tdms": tdms_bytes,
+}
+SUFFIX = {"csv": ".csv", "tsv": ".txt", "npz": ".npz", "matlab": ".mat", "look": "", "export": ".txt"}
 
 
 def columns(source: Source, wanted: tuple[int, ...] | None = None) -> np.ndarray:
@@ -77,17 +117,20 @@ def columns(source: Source, wanted: tuple[int, ...] | None = None) -> np.ndarray
     return np.concatenate([np.stack(b) for b in blocks], axis=1) if blocks else np.empty((0, 0))
 
 
-@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("kind", [*WRITERS, *EXTRAS])
 def test_numbers_come_back_to_the_last_bit(kind: str, tmp_path: Path) -> None:
     """Whatever the file is called, with the columns in the order asked for."""
     numbers = table() + np.random.default_rng(1).normal(size=(4, 120))
-    for name in (f"run{SUFFIX[kind]}", "run.dat"):
+    for name in (f"run{SUFFIX.get(kind, '')}", "run.dat"):
         path = tmp_path / name
-        path.write_bytes(WRITERS[kind](numbers))
+        path.write_bytes((WRITERS | EXTRAS)[kind](numbers))
         source = open_source(path, registry=REGISTRY)
-        assert [h.split(" [")[0] for h in source.headings] == [n[: 12 if kind == "look" else 99] for n in NAMES]
-        assert np.array_equal(columns(source), numbers)
-        assert np.array_equal(columns(source, (2, 0)), numbers[[2, 0]])
+        headings = [h.split(" [")[0] for h in source.headings]
+        expected = [n[: 12 if "look" in kind else 99] for n in NAMES]
+        order = [headings.index(name) for name in expected]  # HDF5 lists them by name
+        assert sorted(headings) == sorted(expected)
+        assert np.array_equal(columns(source, tuple(order)), numbers)
+        assert np.array_equal(columns(source, (order[2], order[0])), numbers[[2, 0]])
 
 
 @pytest.mark.parametrize("kind", WRITERS)
@@ -121,6 +164,71 @@ def test_spellings_of_a_text_table(name: str, tmp_path: Path) -> None:
     source = open_source(tmp_path / "a.csv", registry=REGISTRY)
     assert source.headings == ("time [s]", "elongation [um]")
     assert columns(source).tolist() == [[0.0, 1.0], [1.0, 2.0]]
+
+
+EXPORTS = {
+    "a line of units": b"Time\tShear stress\ns\tMPa\n0\t1\n1\t2\n2\t3\n",
+    "a preamble, decimal commas": b"Sample;till\nOperator;X\n\nTime (s);Shear stress (MPa)\n0,0;1,0\n1,0;2\n2;3\n",
+    "blanks, units in brackets": b"# of a rig\n time   shear stress\n (s)   (MPa)\n  0.0  1.0\n 1.0  2\n 2   3\n",
+    "LabVIEW": b"Separator\tTab\n***End_of_Header***\t\n\nTime [s]\tShear stress [MPa]\tComment\n0,0\t1,0\n1,0\t2\n2\t3\n",
+    "xlook": b"number of records = 3\n  col 1  col 2\n  Time  Shear_stress\n  sec  MPa\n 3recs 3recs\n 0.0 1.0\n 1 2\n 2 3\n",
+    "blanks in headings": b"time [s] shear stress [MPa]\n0 1\n1 2\n2 3\n",
+    "quoted, with a preamble": b'"Method","a.im"\n\n"Time","Shear stress"\n"(s)","(MPa)"\n"0.0","1"\n"1.0","2"\n"2","3"\n',
+}
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+@pytest.mark.parametrize("file", ["a.csv", "a.txt", "a.lvm"])
+def test_what_rigs_export_as_text(name: str, file: str, tmp_path: Path) -> None:
+    (tmp_path / file).write_bytes(EXPORTS[name])
+    source = open_source(tmp_path / file, registry=REGISTRY)
+    parts = [split_heading(h) for h in source.headings]
+    plain = [(n.lower().replace("_", " "), u) for n, u in parts]
+    assert plain in ([("time", "s"), ("shear stress", "MPa")], [("time", "sec"), ("shear stress", "MPa")])
+    assert columns(source).tolist() == [[0.0, 1.0, 2.0], [1.0, 2.0, 3.0]]
+
+
+def test_a_gap_in_an_exported_column_is_told_by_its_line(tmp_path: Path) -> None:
+    rows = "".join(f"{k / 10}\t{k}\n" for k in range(20))
+    (tmp_path / "a.txt").write_text(f"Time\tForce\ns\tN\n{rows}2.0\t\n2.1\tx\n", encoding="utf-8")
+    with pytest.raises(SrfError, match=r"line 24, column 'Force \[N\]': found 'x', expected a number"):
+        columns(open_source(tmp_path / "a.txt", registry=REGISTRY))
+
+
+def test_structure_of_hdf5_and_tdms(tmp_path: Path) -> None:
+    """Units in attributes, matrices, tables of named fields, groups with like names, and a clock of sample intervals."""
+    h5py, nptdms, t = pytest.importorskip("h5py"), pytest.importorskip("nptdms"), np.arange(40.0)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time"] = t
+        file["time"].attrs["units"] = "s"
+        file["one/x"], file["two/x"] = 2 * t, 3 * t
+        file["one/x"].attrs["unit"] = np.bytes_("mm")
+        file["data"], file["k"], file["name"] = np.stack([t, 4 * t], axis=1), 5.0, "till"
+        file["table"] = np.rec.fromarrays([5 * t, 6 * t], names="force,load")
+    source = open_source(tmp_path / "a.h5", registry=REGISTRY)
+    found = dict(zip(source.headings, columns(source), strict=True))
+    assert set(found) == {"time [s]", "one/x [mm]", "two/x", "data_1", "data_2", "force", "load"}
+    assert np.array_equal(found["one/x [mm]"], 2 * t) and np.array_equal(found["data_2"], 4 * t)
+    assert np.array_equal(found["load"], 6 * t)
+    with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:
+        clock = {"wf_increment": 0.25, "wf_start_offset": 1.0, "unit_string": "kN"}
+        writer.write_segment(
+            [nptdms.ChannelObject("rig", "Shear", t, properties=clock), nptdms.ChannelObject("rig", "Id", ["a"])]
+        )
+    source = open_source(tmp_path / "a.tdms", registry=REGISTRY)
+    assert source.headings == ("time [s]", "Shear [kN]")
+    assert np.array_equal(columns(source), [1 + 0.25 * t, t])
+
+
+@pytest.mark.parametrize(("kind", "extra"), [("hdf5", "srfcli[hdf5]"), ("tdms", "srfcli[tdms]")])
+def test_without_its_library_a_reader_says_how(
+    kind: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a").write_bytes(EXTRAS[kind](table()))
+    monkeypatch.setitem(sys.modules, {"hdf5": "h5py", "tdms": "nptdms"}[kind], None)
+    with pytest.raises(SrfError, match="is not installed") as caught:
+        open_source(tmp_path / "a", registry=REGISTRY)
+    assert extra in str(caught.value.hint)
 
 
 @pytest.mark.parametrize("cell", ["", "nan", "NaN", "NA", "n/a", "null", "inf", "-Infinity", "#N/A"])
@@ -198,10 +306,10 @@ def test_look_files_of_both_widths(width: int, tmp_path: Path) -> None:
     assert np.array_equal(columns(source), numbers)
 
 
-@pytest.mark.parametrize("kind", ["npz", "matlab", "look"])
+@pytest.mark.parametrize("kind", ["npz", "matlab", "look", "hdf5", "tdms"])
 @pytest.mark.parametrize("share", [0.05, 0.5, 0.9, 0.999])
 def test_a_file_that_ends_early(kind: str, share: float, tmp_path: Path) -> None:
-    whole = WRITERS[kind](table())
+    whole = (WRITERS | EXTRAS)[kind](table())
     (tmp_path / "cut").write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(SrfError, match="cut"):
         columns(open_source(tmp_path / "cut", registry=REGISTRY, format=kind))
@@ -246,7 +354,9 @@ BAD_READERS = {
 @pytest.mark.parametrize("name", BAD_READERS)
 def test_a_reader_that_fails_is_named(name: str, tmp_path: Path) -> None:
     body, message = BAD_READERS[name]
-    text = f"from srfcli.laws.api import reader\n\n\n@reader(name='bad', suffixes=('.bad',))\ndef bad(path):\n    {body}\n"
+    text = (
+        f"from srfcli.laws.api import reader\n\n\n@reader(name='bad', suffixes=('.bad',))\ndef bad(path):\n    {body}\n"
+    )
     (tmp_path / "bad.py").write_text(text, encoding="utf-8")
     (tmp_path / "x.bad").write_bytes(b"1")
     registry = load_registry((tmp_path,), user=False, entry_points=False)

@@ -17,7 +17,7 @@ from srfcli.cli.main import cli
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import KINDS, check_run, read_experiment
 from srfcli.data.imposed import Place, find_modulation, load_from_column
-from srfcli.data.noise import describe_noise
+from srfcli.data.noise import describe_noise, measured
 from srfcli.data.values import Run
 from srfcli.laws.registry import load_registry
 from srfcli.motion.imposed import ConstantLoad
@@ -138,7 +138,10 @@ FLAWS: dict[str, tuple[Callable[[Columns], None], str]] = {
     "nan": (nan, "one.csv: rows 301-304, t = 3 to 3.03 s: 4 samples without a number in 'spring', not compared"),
     "repeated-time": (repeated, "one.csv: row 501, t = 4.99 s: 1 sample with the time of the sample before, left out"),
     "backward-time": (backward, "one.csv: row 501, t = 4 s: 1 sample whose time does not fit"),
-    "spike": (spike, "one.csv: rows 701-702, t = 7 to 7.01 s: 2 samples standing out in 'spring', not compared"),
+    "spike": (
+        spike,
+        "one.csv: rows 701-702, t = 7 to 7.01 s: 2 samples standing out in 'spring', compared as they are; ",
+    ),
     "reset": (reset, "one.csv: rows 900-901, t = 8.99 to 9 s: 'spring' jumps by "),
     "saturation": (saturation, "at the extreme value 9.7 of 'spring': saturated, not compared"),
     "quantisation": (quantisation, "one.csv: column 'spring': steps of 0.05, "),
@@ -209,6 +212,7 @@ def test_a_sound_recording_has_no_notices(tmp_path: Path) -> None:
 def test_samples_are_left_out_where_the_notice_says(tmp_path: Path) -> None:
     c = Columns()
     nan(c), spike(c), repeated(c)
+    c.toml += 'corrections = ["spike"]\n'
     run = c.read(tmp_path)
     assert run.t.size == N - 1 and np.all(np.diff(run.t) > 0)
     out = set(np.flatnonzero(~run.used).tolist())
@@ -220,9 +224,44 @@ def test_a_reset_is_taken_out(tmp_path: Path) -> None:
     c = Columns()
     sound = c.u.copy()
     reset(c)
+    c.toml += 'corrections = ["reset"]\n'
     run = c.read(tmp_path)
     assert run.observed[run.used] == pytest.approx(sound[run.used], abs=0.08)
     assert np.flatnonzero(~run.used).tolist() == [899, 900]
+
+
+def test_a_correction_is_proposed_and_drawn_and_made_only_where_it_is_asked_for(tmp_path: Path) -> None:
+    c = Columns()
+    sound = c.u.copy()
+    spike(c), reset(c)
+    run = c.read(tmp_path)
+    assert run.used.all() and np.array_equal(run.observed, np.asarray([float(f"{x:.9g}") for x in c.u]))
+    assert run.proposed is not None and run.proposed == pytest.approx(sound, abs=0.1)
+    said = [n.what for n in run.notices]
+    assert all("left as it is" in w or "compared as they are" in w or "compared as it is" in w for w in said), said
+    figure = CliRunner().invoke(cli, ["check", str(tmp_path), "--no-simulate", "--plot", str(tmp_path / "a.svg")])
+    assert figure.exit_code == 0
+    drawn = (tmp_path / "a.svg").read_text(encoding="utf-8")
+    assert "spike, proposed" in drawn and "level moved back, proposed" in drawn
+    c.toml += 'corrections = ["resets"]\n'
+    with pytest.raises(SrfError, match="unknown correction 'resets'") as caught:
+        c.read(tmp_path)
+    assert "Did you mean 'reset'?" in str(caught.value.hint)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_flaw_is_found_in_the_noise_of_a_laboratory(seed: int, tmp_path: Path) -> None:
+    """A line at 5 Hz with half of the variance, colour, tails, steps of the gauge, and a displacement that wanders."""
+    random = np.random.default_rng(seed)
+    c = Columns()
+    line = np.sin(2 * np.pi * 5.3 * c.t + seed)
+    colour = measured(np.zeros(N), noise=1.0, lag1=0.9, seed=seed)
+    c.u = np.round((c.u + 0.03 * (line + colour + random.standard_t(3, N))) / 0.01) * 0.01
+    wander = measured(np.zeros(N), noise=0.8, lag1=0.95, seed=seed + 7)
+    c.V = np.cumsum(c.V) / 100 + wander + random.normal(0, 0.2, N)
+    c.heading, c.toml = HEADING.replace("velocity [um/s]", "displacement [um]"), NO_DRIVE
+    kinds = {n.kind for n in c.read(tmp_path).notices}
+    assert not kinds & {"spike", "reset", "saturation"}, kinds
 
 
 def test_a_lone_spike_on_a_constant_load_is_bridged(tmp_path: Path) -> None:

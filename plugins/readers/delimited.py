@@ -1,20 +1,25 @@
-"""Text tables: one heading line, then numbers between commas, semicolons or tabs."""
+"""Text tables: one heading line, then numbers between commas, semicolons or tabs; and what rigs export around such tables."""
 
 import csv as cells_of
 import io
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from srfcli.core.units import find_unit
 from srfcli.laws.api import Source, SrfError, reader
 
 BLOCK = 4 * 2**20  # bytes that are parsed at a time
 LONGEST = 2**20  # bytes of a line
 SAMPLE = 2**16  # bytes by which the number of lines is estimated
+SNIFFED = 4096  # bytes from which a reader is chosen
 NOTHING = {"", "nan", "na", "n/a", "null", "none", "-nan", "#n/a"}
-NUMBER = re.compile(r"[+-]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eEdD][+-]?\d++)?")  # possessive: in the time that the cell is long
+NUMBER = re.compile(
+    r"[+-]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eEdD][+-]?\d++)?"
+)  # possessive: in the time that the cell is long
 INFINITE = re.compile(r"[+-]?inf(?:inity)?", re.IGNORECASE)
 
 
@@ -23,12 +28,12 @@ def _text(head: bytes) -> bool:
 
 
 def _is_tabbed(head: bytes) -> bool:
-    return _text(head) and b"\t" in _first_line(head)
+    return _text(head) and b"\t" in _first_line(head) and _layout(head) is None
 
 
 def _is_separated(head: bytes) -> bool:
     line = _first_line(head)
-    return _text(head) and b"\t" not in line and (b"," in line or b";" in line)
+    return _text(head) and b"\t" not in line and (b"," in line or b";" in line) and _layout(head) is None
 
 
 def _first_line(head: bytes) -> bytes:
@@ -47,6 +52,144 @@ def csv(path: Path) -> Source:
 def tsv(path: Path) -> Source:
     """Text with tabs, one heading line"""
     return _open(path, "\t")
+
+
+@reader(
+    name="export",
+    suffixes=(".txt", ".dat", ".asc", ".lvm"),
+    sniff=lambda head: _text(head) and _layout(head) is not None,
+)
+def export(path: Path) -> Source:
+    """Text that rigs export: a preamble, units in a line of their own, blanks between columns, decimal commas"""
+    with path.open("rb") as stream:
+        head = stream.read(SAMPLE)
+    layout = _layout(head) if _text(head) else None
+    if layout is None:
+        raise SrfError(
+            f"{path}: found no table: lines of numbers, as many in each, below a line of headings",
+            "Name another reader with format = ...; `srf laws --kind reader` lists them.",
+        )
+    table = _Table(path, layout.headings, layout.delimiter, layout.line - 1, layout.offset, decimal=layout.decimal)
+    return Source(layout.headings, table.blocks, about=_about(path, layout.offset))
+
+
+class _Layout(NamedTuple):
+    """Where a table begins, as line from 1 and byte, and how its numbers stand; a delimiter " " is any blanks."""
+
+    headings: tuple[str, ...]
+    delimiter: str
+    decimal: str
+    line: int
+    offset: int
+
+
+ROWS_SEEN = 3  # lines of numbers that make a table, fewer where the file ends
+
+
+def _layout(head: bytes) -> _Layout | None:
+    """Return how a table stands in what a rig exported, None where the text is no table or one that needs none of this."""
+    text = head.removeprefix(b"\xef\xbb\xbf")
+    skipped = len(head) - len(text)
+    raw = text.replace(b"\r\n", b"\n ").replace(b"\r", b"\n").split(b"\n")  # a blank for the byte that was there
+    if len(head) == SNIFFED or len(head) == SAMPLE:
+        raw = raw[:-1]  # it may be cut
+    lines = [_decoded(line).strip() for line in raw]
+    begin = next((k for k, line in enumerate(lines) if _table_begins(lines, k)), None)
+    if begin is None:
+        return None
+    delimiter, decimal = _how(lines[begin])
+    count = len(_cells(lines[begin], delimiter))
+    above = [k for k in range(begin) if lines[k]]
+    names, units = None, None
+    for k in reversed(above[-4:]):
+        cells = _cells(lines[k].lstrip("#% "), delimiter, count)
+        if all(re.fullmatch(r"\d+recs", cell) for cell in cells):  # of xlook: how many there are
+            continue
+        if len(cells) == count + 1:  # LabVIEW heads a column of comments that most lines leave out
+            cells = cells[:-1]
+        if len(cells) != count:
+            break
+        if names is None and all(_is_unit(cell) for cell in cells):
+            units = cells
+        elif names is None:
+            names = cells
+            first = k
+            break
+    if names is None and units is not None:  # letters that could be units head the columns: t, N
+        names, units = units, None
+        first = above[-1]
+    if names is None:
+        return None
+    plain = (
+        units is None
+        and decimal == "."
+        and delimiter != " "
+        and [k for k in above if lines[k][0] not in "#%"][:1] in ([first], [])
+    )
+    if plain or (delimiter != " " and lines[first][0] in "#%" and units is None and decimal == "."):
+        return None
+    units = units or [""] * count
+    bare = [unit.strip("[]() ") for unit in units]
+    headings = tuple(
+        f"{n} [{u}]" if u and "[" not in n and "(" not in n else n for n, u in zip(names, bare, strict=True)
+    )
+    if len(set(headings)) < count:
+        headings = tuple(f"{h}_{k + 1}" if headings.count(h) > 1 else h for k, h in enumerate(headings))
+    return _Layout(headings, delimiter, decimal, begin + 1, skipped + sum(len(line) + 1 for line in raw[:begin]))
+
+
+def _table_begins(lines: Sequence[str], k: int) -> bool:
+    """Return whether line k and those after it are numbers, two or more and as many in each."""
+    seen = [line for line in lines[k : k + ROWS_SEEN] if line]
+    if not seen or not lines[k] or len(seen) < min(ROWS_SEEN, len(lines) - k):
+        return False
+    delimiter, decimal = _how(seen[0])
+    rows = [_cells(line, delimiter) for line in seen]
+    return len(rows[0]) > 1 and all(
+        len(row) == len(rows[0]) and all(_is_number(c, decimal) for c in row) for row in rows
+    )
+
+
+def _how(line: str) -> tuple[str, str]:
+    """Return the delimiter of a line of numbers and its decimal sign."""
+    for delimiter in "\t;":
+        if delimiter in line:
+            return delimiter, "," if "," in line else "."
+    blanks = line.split()
+    if len(blanks) > 1 and "," in line and all(_is_number(cell, ",") for cell in blanks):
+        return " ", ","
+    return ("," if "," in line else " "), "."
+
+
+def _cells(line: str, delimiter: str, count: int = 0) -> list[str]:
+    """Return the cells of a line; blanks inside a heading are no delimiters where two of them stand between headings."""
+    if delimiter != " ":
+        cells = next(cells_of.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+        cells = [cell.strip() for cell in cells]
+        return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
+    apart = line.split()
+    if count and len(apart) != count:
+        wide = re.split(r"\t|\s{2,}", line)
+        joined = re.findall(r"[^\s\[(]+(?:\s*(?:\[[^\]]*\]|\([^)]*\)))?", line)
+        closed = re.findall(r"[^\[\](]*[^\[\](\s]\s*(?:\[[^\]]*\]|\([^)]*\))", line)
+        apart = next((cells for cells in (wide, joined, closed) if len(cells) == count), apart)
+    return [cell.strip() for cell in apart]
+
+
+def _is_number(cell: str, decimal: str) -> bool:
+    return bool(NUMBER.fullmatch(cell.replace(decimal, ".", 1))) or cell.lower() in NOTHING - {""}
+
+
+def _is_unit(cell: str) -> bool:
+    """Return whether a cell states a unit and nothing else: in brackets, or as the table of units has it."""
+    bare = cell.strip("[]() ")
+    if not bare or bare == "-":
+        return True
+    try:
+        find_unit(bare)
+    except SrfError:
+        return False
+    return True
 
 
 def _open(path: Path, delimiters: str) -> Source:
@@ -123,8 +266,11 @@ def _decoded(line: bytes) -> str:
 class _Table:
     """The numbers below the headings, read block by block at the speed of C where every cell is a number."""
 
-    def __init__(self, path: Path, headings: tuple[str, ...], delimiter: str, line: int, offset: int) -> None:
+    def __init__(
+        self, path: Path, headings: tuple[str, ...], delimiter: str, line: int, offset: int, *, decimal: str = "."
+    ) -> None:
         self.path, self.headings, self.delimiter, self.line, self.offset = path, headings, delimiter, line, offset
+        self.decimal = decimal
 
     def blocks(self, columns: tuple[int, ...]) -> Iterator[Sequence[np.ndarray]]:
         """Yield the columns in blocks of rows."""
@@ -155,6 +301,10 @@ class _Table:
         """Return the columns of a block in which each line has a number in each cell, else None."""
         if b'"' in block or b"#" in block or b"%" in block or b"_" in block:
             return None
+        if self.decimal == ",":
+            block = block.replace(b",", b".")
+        if self.delimiter == " ":
+            return self._blanks(block, columns)
         codes = np.frombuffer(block if block.endswith(b"\n") else block + b"\n", dtype=np.uint8)
         ends = np.flatnonzero(codes == 10)
         counts = np.diff(np.searchsorted(np.flatnonzero(codes == ord(self.delimiter)), ends), prepend=0)
@@ -167,6 +317,17 @@ class _Table:
         except (ValueError, UnicodeDecodeError):
             return None
         return None if table.shape[0] != ends.size else [np.ascontiguousarray(table[:, k]) for k in range(len(columns))]
+
+    def _blanks(self, block: bytes, columns: tuple[int, ...]) -> Sequence[np.ndarray] | None:
+        """Return the columns of a block of numbers between blanks, None where a line has more or fewer or none."""
+        lines = [line for line in block.split(b"\n") if line.strip()]
+        try:
+            table = np.loadtxt(io.StringIO(block.decode("ascii")), comments=None, ndmin=2)
+        except (ValueError, UnicodeDecodeError):
+            return None
+        if table.shape != (len(lines), len(self.headings)):
+            return None
+        return [np.ascontiguousarray(table[:, k]) for k in columns]
 
     def _slow(self, block: bytes, columns: tuple[int, ...], first: int) -> Sequence[np.ndarray]:
         """Return the columns of a block cell by cell: empty ones are NaN, bad ones raise SrfError with line and column."""
@@ -181,7 +342,7 @@ class _Table:
     def _row(self, text: str, columns: tuple[int, ...], number: int) -> list[float]:
         _check(self.path, text.encode("latin-1"), number)
         try:
-            cells = next(cells_of.reader([text], delimiter=self.delimiter, skipinitialspace=True, strict=True))
+            cells = text.split() if self.delimiter == " " else self._split(text)
         except cells_of.Error as error:
             raise SrfError(f"{self.path}, line {number}: {error}", "Close every quote on its own line.") from None
         if len(cells) == len(self.headings) + 1 and not cells[-1].strip():
@@ -194,7 +355,11 @@ class _Table:
             raise SrfError(f"{self.path}, line {number}: found {len(cells)} cells, expected {len(self.headings)}", hint)
         return [self._number(cells[k].strip(), k, number) for k in columns]
 
+    def _split(self, text: str) -> list[str]:
+        return next(cells_of.reader([text], delimiter=self.delimiter, skipinitialspace=True, strict=True))
+
     def _number(self, cell: str, column: int, line: int) -> float:
+        cell = cell.replace(",", ".", 1) if self.decimal == "," else cell
         if NUMBER.fullmatch(cell):
             return float(cell.replace("d", "e").replace("D", "e"))
         if cell.lower() in NOTHING or INFINITE.fullmatch(cell):

@@ -38,14 +38,16 @@ class _Variable:
 @reader(
     name="matlab",
     suffixes=(".mat",),
-    sniff=lambda head: head.startswith(b"MATLAB ") and head[126:128] in (b"IM", b"MI"),
+    sniff=lambda head: (
+        head.startswith(b"MATLAB ") and not head.startswith(b"MATLAB 7.3") and head[126:128] in (b"IM", b"MI")
+    ),
 )
 def matlab(path: Path) -> Source:
     """MATLAB 5 file, a vector for each column, or a matrix `data` as data_1, data_2, ...; units in [columns]"""
     with path.open("rb") as stream:
         head = stream.read(TEXT)
         if head.startswith(b"MATLAB 7.3"):
-            raise SrfError(f"{path}: MATLAB 7.3 is another format (HDF5)", "Save it with save(..., '-v7') or as CSV.")
+            raise SrfError(f"{path}: MATLAB 7.3 is another format (HDF5)", "Leave the reader out, or save with -v7.")
         order = "<" if head[126:128] == b"IM" else ">"
         try:
             variables = list(_variables(stream, order))

@@ -155,7 +155,12 @@ def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecas
     told = [None] * len(checks) if forecast is None else forecast.runs
     notices = [str(n) for n in experiment.notices]
     notices += [f"{check.run.name}: {notice}" for check in checks for notice in check.run.notices]
-    notes = [*notices, NOISE, *([] if forecast is None else sentences(forecast))]
+    notes = [
+        *notices,
+        *filter(None, [experiment.rescaled()]),
+        NOISE,
+        *([] if forecast is None else sentences(forecast)),
+    ]
     choice = experiment.choice
     together = forecast and forecast.together
     meta = {
@@ -193,6 +198,7 @@ def _figure(experiment: Experiment, checks: Sequence[RunCheck]) -> Figure:
                 "label": run.quantity + (f"\n[{unit_text(run.unit)}]" if run.unit != "1" else ""),
                 "load_unit": run.load_unit,
                 "used": run.used,
+                "proposed": run.proposed,
                 "V": run.drive(t),
                 "W": run.load(t)[0],
                 "gaps": [(t[g], t[g + 1]) for g in check.sampling.gaps.tolist()],
@@ -431,7 +437,7 @@ def sentences(forecast: Forecast) -> list[str]:
     if judge is None:
         return [*told, "what the loads can tell is not estimated: no simulated run resembles its recording"]
     told += [_sentence(name, judge, forecast) for name in judge.errors]
-    beside = f"with {', '.join(forecast.free)} unknown within their bounds" if forecast.free else "with all else known"
+    beside = f"with {', '.join(forecast.free)} unknown" if forecast.free else "with all else known"
     told.append(
         f"at best: for the model and the start values of the experiment, {beside}, and the noise as found; a rough track, or "
         "a model that fails, costs more"

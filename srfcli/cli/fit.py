@@ -10,8 +10,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import Session, SrfCommand
-from srfcli.cli.options import OutputOptions, SystemOptions, output_options, parse_over, system_options
-from srfcli.core.errors import SrfError
+from srfcli.cli.options import (
+    OutputOptions,
+    Spread,
+    SystemOptions,
+    output_options,
+    parse_over,
+    system_options,
+    worker_options,
+)
+from srfcli.core.errors import SrfError, Status
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,6 +27,7 @@ if TYPE_CHECKING:
     from srfcli.core.settings import Parameter
     from srfcli.inference.threshold_table import Scale
     from srfcli.inference.thresholds import MethodFit, ThresholdFit, Trace
+    from srfcli.results.campaign import CampaignResult
     from srfcli.results.tables import Table
 
 # `srf fit`: parameters from recordings, or from a table of critical loads.
@@ -30,13 +39,22 @@ srf fit EXPERIMENT --profile --starts 5 --json
 srf fit EXPERIMENT --trend slip --free A,B,D0
 srf fit EXPERIMENT --sample 4000 --draws draws.nc    the posterior; the draws for ArviZ
 srf fit EXPERIMENT --track smooth                   no random friction field, whatever the recording says
+srf fit A B C --table out.csv --workers 3           a campaign: each by itself, a row each
 srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c, sigma
 """
 USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seven runs, 63 in the other
 
 
 @click.command("fit", cls=SrfCommand, epilog=EXAMPLES)
-@click.argument("source", metavar="EXPERIMENT|THRESHOLDS.csv", type=click.Path(path_type=Path))
+@click.argument(
+    "sources", metavar="EXPERIMENT...|THRESHOLDS.csv", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@click.option(
+    "--table",
+    "place",
+    metavar="FILE.csv",
+    help="Fit each experiment by itself, and keep a row for each in this file, which is written as they are done.",
+)
 @click.option(
     "--free", multiple=True, metavar="NAMES", help="Parameters to fit; else those that the experiment leaves free."
 )
@@ -64,16 +82,27 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
 @click.option(
     "--max-evaluations", type=click.IntRange(1), help="Of the cost over the critical loads, for each minimiser."
 )
+@worker_options
 @system_options
 @output_options
-def command(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
+def command(
+    sources: tuple[Path, ...],
+    place: str | None,
+    spread: Spread,
+    system: SystemOptions,
+    output: OutputOptions,
+    **options: Any,
+) -> None:
     """Fit the model of an experiment to its recordings, all runs together, by maximum likelihood.
 
     The gauge's noise, its level and colour, and a random friction field along slip are estimated with the parameters and count
-    in their errors. A CSV file is taken for a table of critical loads, which the paper's procedure fits: the laws are then those
-    of the options below.
+    in their errors. Several experiments, or --table, are a campaign: each is fitted by itself and has a row. A CSV file is taken
+    for a table of critical loads, which the paper's procedure fits: the laws are then those of the options below.
     """
-    if source.suffix.lower() == ".csv":
+    campaign, source = place is not None or len(sources) > 1, sources[0]
+    if not campaign:
+        _refuse(options, ("workers", "cluster", "resume"), "several experiments")
+    if source.suffix.lower() == ".csv" and not campaign:
         from srfcli.data.draft import looks_like_recording
 
         if looks_like_recording(source, registry=system.registry()):
@@ -94,6 +123,9 @@ def command(source: Path, system: SystemOptions, output: OutputOptions, **option
     if system.flags:
         name = next(iter(system.flags))
         raise SrfError(f"{name} is set, and an experiment has its own values", "Change it in experiment.toml.")
+    if campaign:
+        _fit_campaign(sources, place, spread, system, output, **options)
+        return
     _fit_recordings(
         source, system, output, **{k: v for k, v in options.items() if k not in ("bounds", "method", "tol")}
     )
@@ -145,6 +177,57 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
         to_arviz(found.posterior).to_netcdf(str(kept))
         Session.current().say(f"Wrote {kept}")
     finish(found.status, advice=ADVICE.get(found.status))
+
+
+def _fit_campaign(
+    sources: Sequence[Path],
+    place: str | None,
+    spread: Spread,
+    system: SystemOptions,
+    output: OutputOptions,
+    **options: Any,
+) -> None:
+    """Fit each experiment by itself, a row each; the table is written anew whenever one is done."""
+    import time
+
+    from srfcli.cli.emit import Progress, emit, finish, render, warn_uncompiled
+    from srfcli.core.files import check_target, write_atomic
+    from srfcli.tasks.campaign import fit_campaign
+
+    _refuse(options, ("profile", "sample", "draws"), "one experiment")
+    target = None if place is None else Path(place).expanduser()
+    if target is not None:
+        if target.suffix.lower() != ".csv":
+            raise SrfError(f"--table {place} is no .csv file", f"End it in .csv: --table {target.with_suffix('.csv')}")
+        check_target(target, force=output.force or spread.resume is not None, what="--table")
+    warn_uncompiled("the fits have no random friction field, and take up to 34 times as long")
+    free = [n.strip() for text in options["free"] for n in text.split(",") if n.strip()] or None
+    begun = time.perf_counter()
+    with Progress("fit", total=len(sources)) as progress:
+
+        def done(so_far: CampaignResult) -> None:
+            progress.advance(note=f"{len(so_far.rows)} of {len(sources)} experiments")
+            if target is not None:
+                write_atomic(target, render(so_far.table, "csv").encode("utf-8"))
+
+        found = fit_campaign(
+            sources, reader=options["reader"], plugins=system.plugins, run=spread.run, done=done,
+            options={"free": free, "seed": options["seed"], **{k: options[k] for k in ("trend", "track", "starts")}},
+        )  # fmt: skip
+    emit(
+        found.table, output, seed=options["seed"], timings={"fit": time.perf_counter() - begun}, figure=found.plot,
+        inputs=[p for p in (s / "experiment.toml" if s.is_dir() else s for s in sources) if p.is_file()],
+    )  # fmt: skip
+    if target is not None and found.rows:
+        Session.current().say(f"Wrote {target}")
+    failed = [str(row["experiment"]) for row in found.rows if row["status"] == "failed"]
+    advice = {
+        Status.INTERRUPTED: "the rows that were done are kept. With --resume DIR the next run goes on from there.",
+        Status.NO_CONVERGENCE: f"{len(failed)} of {len(sources)} experiments have no fit ({', '.join(failed[:5])}); see `reason`."
+        if failed
+        else "of some experiments the likelihood's maximum was not reached; see `status`.",
+    }
+    finish(found.worst, advice=advice.get(found.worst))
 
 
 class FitShare:

@@ -48,6 +48,11 @@ KINDS = ("steps", "shs", "oscillation")
 )
 @click.option("--load", metavar="W", help="Constant normal load or stress, if no column has it: '5 N', '20 MPa'.")
 @click.option("--mass", metavar="M", help="Of the slider, '2.37 kg'; without it the slider is quasi-static.")
+@click.option(
+    "--radius", metavar="R", help="Of a rotary rig, '25 mm': torque over it is force, angle times it is displacement."
+)
+@click.option("--thickness", metavar="H", help="Of the layer, '4 mm', where strain is recorded.")
+@click.option("--area", metavar="A", help="Of the sliding contact, '25 cm^2': forces then become stresses.")
 @click.option("--window", metavar="FROM,TO", help="Only this part of the recordings, in s of the file's clock.")
 @click.option("--law", metavar="NAME", default="dieterich-ruina", show_default=True, help="Friction law.")
 @click.option(
@@ -117,6 +122,7 @@ def _wish(files: tuple[Path, ...], options: dict[str, Any], registry: Registry) 
         drive=_drive(drive),
         load=load,
         window=_window(options["window"]),
+        rig={key: options[key] for key in ("radius", "thickness", "area") if options[key]},
         **given,
     )
 

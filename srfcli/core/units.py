@@ -30,6 +30,7 @@ class Unit:
 
 DIMENSIONLESS, LENGTH, TIME, FORCE = (0, 0, 0, 0), (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)
 STRESS, RATE, MASS, ANGLE = (-2, 0, 1, 0), (0, -1, 0, 0), (-1, 2, 1, 0), (0, 0, 0, 1)
+TORQUE, TURNING = (1, 0, 1, 0), (0, -1, 0, 1)
 _TABLE = {  # factors to um, s, N, rad
     name: Unit(factor, powers)
     for powers, names in {
@@ -37,17 +38,28 @@ _TABLE = {  # factors to um, s, N, rad
         LENGTH: {"nm": 1e-3, "um": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6},
         TIME: {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
         RATE: {"Hz": 1.0, "kHz": 1e3},
-        FORCE: {"mN": 1e-3, "N": 1.0, "kN": 1e3, "MN": 1e6},
-        STRESS: {"Pa": 1e-12, "kPa": 1e-9, "MPa": 1e-6, "GPa": 1e-3, "bar": 1e-7},
+        FORCE: {"nN": 1e-9, "uN": 1e-6, "mN": 1e-3, "N": 1.0, "kN": 1e3, "MN": 1e6, "gf": 9.80665e-3, "kgf": 9.80665},
+        STRESS: {
+            "Pa": 1e-12,
+            "kPa": 1e-9,
+            "MPa": 1e-6,
+            "GPa": 1e-3,
+            "bar": 1e-7,
+            "kbar": 1e-4,
+            "psi": 6894.757293168361e-12,
+        },
         MASS: {"g": 1e-9, "kg": 1e-6},  # 1 kg = 1 N s^2/m
-        ANGLE: {"rad": 1.0, "deg": math.pi / 180.0},
+        ANGLE: {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "rev": 2 * math.pi},
+        TORQUE: {"uNm": 1.0, "mNm": 1e3, "Nm": 1e6, "kNm": 1e9},
+        TURNING: {"rpm": math.pi / 30.0},
     }.items()
     for name, factor in names.items()
 }
 _SPELLED = {  # in small letters, as headings of recordings have them
     "": "1", "-": "1", "none": "1", "dimensionless": "1", "micron": "um", "microns": "um", "micrometer": "um",
     "micrometers": "um", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "hz": "Hz", "newton": "N", "newtons": "N",
-    "kgs": "kg", "mpa": "MPa",
+    "kgs": "kg", "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "minute": "min", "minutes": "min", "hours": "h", "degree": "deg",
+    "degrees": "deg", "°": "deg", "radian": "rad", "radians": "rad", "kn": "kN", "percent": "%",
 }  # fmt: skip
 SQUARE_MILLIMETRE = 1e6  # um^2: a stress is taken as the force on this area
 
@@ -69,13 +81,25 @@ def from_base(value: float, unit: str) -> float:
     return value / find_unit(unit).factor
 
 
-def parse_quantity(text: str, unit: str, *, name: str) -> float:
+@dataclass(frozen=True)
+class Geometry:
+    """Of a rig: the radius that an arm or a ring slides on and a layer's thickness in um, the sheared area in mm^2; or None."""
+
+    radius: float | None = None
+    thickness: float | None = None
+    area: float | None = None
+
+
+NO_GEOMETRY = Geometry()
+
+
+def parse_quantity(text: str, unit: str, *, name: str, geometry: Geometry = NO_GEOMETRY) -> float:
     """Return the number that `text` states, in `unit`; a bare number is in that unit. `name` is for the error.
 
     `parse_quantity("210 N/mm", "N/um", name="K")` is 0.21. Raises SrfError for no finite number or a wrong unit.
     """
     number, written = split_quantity(text, name=name, example=f"0.5 {unit}" if unit != "1" else "0.5")
-    return convert(number, written, unit, name=name) if written else number
+    return convert(number, written, unit, name=name, geometry=geometry) if written else number
 
 
 def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float, str]:
@@ -97,28 +121,41 @@ def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float
     return number, match[2]
 
 
-def convert(number: float, written: str, unit: str, *, name: str) -> float:
+def convert(number: float, written: str, unit: str, *, name: str, geometry: Geometry = NO_GEOMETRY) -> float:
     """Return `number`, given in `written`, in `unit`; raises SrfError if the two do not measure the same thing."""
     where = f"{name} = {number:g} {written}"
-    found = number if written == unit else number * unit_factor(written, unit, where=where)
+    found = number if written == unit else number * unit_factor(written, unit, geometry, where=where)
     if not math.isfinite(found):
         raise SrfError(f"{where} is too large", "Write a finite number, as in 1e-3.")
     return found
 
 
-def unit_factor(written: str, unit: str, *, where: str = "") -> float:
+def unit_factor(written: str, unit: str, geometry: Geometry = NO_GEOMETRY, *, where: str = "") -> float:
     """Return what a number in `written` is multiplied by to be in `unit`; raises SrfError, beginning with `where`.
 
-    A stress counts as the force on 1 mm^2, so that 1 MPa is 1 N and 1 MPa/mm is 1e-3 N/um.
+    A stress counts as the force on 1 mm^2, so that 1 MPa is 1 N and 1 MPa/mm is 1e-3 N/um. With its radius a torque is a force
+    and an angle a length, with its thickness a strain is a length, and with its area a force is a stress.
     """
     found, wanted = find_unit(written, where=where), find_unit(unit)
     factor = factor_between(found, wanted)
-    if factor is None:
-        prefix = f"{where}: " if where else ""
-        measured = f"{written!r} measures {describe(found.powers)}, not {describe(wanted.powers)}"
-        hint = "Give a plain number." if unit == "1" else f"Give a unit of the dimension of {unit!r}."
-        raise SrfError(f"{prefix}{measured}", hint)
-    return factor
+    if factor is not None:
+        force = wanted.powers[2] == 1 and found.powers[0] == wanted.powers[0]
+        return factor / geometry.area if geometry.area and force else factor
+    ratio = found.factor / wanted.factor
+    gap = tuple(w - f for w, f in zip(wanted.powers, found.powers, strict=True))
+    hint = "Give a plain number." if unit == "1" else f"Give a unit of the dimension of {unit!r}."
+    if gap[1:3] == (0, 0):
+        turns = {(-1, 0): -1, (1, -1): 1, (-2, 1): -2}.get((gap[0], gap[3]))  # torque; angle; torque over angle
+        if turns is not None and (found.powers[2], found.powers[3]) != (0, 0):
+            if geometry.radius:
+                return ratio * geometry.radius**turns / (geometry.area or 1.0 if wanted.powers[2] else 1.0)
+            hint = f'A rotary rig needs its radius, from which {unit} follow: [apparatus] radius = "25 mm"'
+        elif gap == (1, 0, 0, 0) and found.powers[2] == 0:  # a strain for a length
+            if geometry.thickness:
+                return ratio * geometry.thickness
+            hint = f'A strain needs the layer\'s thickness, from which {unit} follow: [apparatus] thickness = "4 mm"'
+    prefix = f"{where}: " if where else ""
+    raise SrfError(f"{prefix}{written!r} measures {describe(found.powers)}, not {describe(wanted.powers)}", hint)
 
 
 def same_dimension(text: str, unit: str) -> bool:

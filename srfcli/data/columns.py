@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import open_plain
+from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit
 from srfcli.data.description import ROLES, ColumnSpec, RunDescription, check_unit
 from srfcli.data.values import OBSERVABLES, Notice
 from srfcli.laws.registry import Entry, Registry
@@ -206,10 +208,15 @@ def split_heading(heading: str) -> tuple[str, str | None]:
 
 
 def read_columns(
-    run: RunDescription, source: Source, specs: Mapping[str, ColumnSpec], *, limit: int = LIMIT
+    run: RunDescription,
+    source: Source,
+    specs: Mapping[str, ColumnSpec],
+    *,
+    limit: int = LIMIT,
+    geometry: Geometry = NO_GEOMETRY,
 ) -> Columns:
     """Return what the run needs of its file; raises SrfError for a missing column, a wrong unit or too large a recording."""
-    finder = _Finder(run.file, source.headings, specs)
+    finder = _Finder(run.file, source.headings, specs, geometry)
     channels = _needed(run, finder)
     notices = list(finder.notices)
     _refuse_large(run, source, len(channels), limit)
@@ -226,8 +233,10 @@ def read_columns(
 class _Finder:
     """The headings of a file, looked up by role."""
 
-    def __init__(self, path: Path, headings: tuple[str, ...], specs: Mapping[str, ColumnSpec]) -> None:
-        self.path, self.headings, self.specs = path, headings, specs
+    def __init__(
+        self, path: Path, headings: tuple[str, ...], specs: Mapping[str, ColumnSpec], geometry: Geometry
+    ) -> None:
+        self.path, self.headings, self.specs, self.geometry = path, headings, specs, geometry
         self.parts = [split_heading(h) for h in headings]
         self.notices: list[Notice] = []
 
@@ -235,7 +244,7 @@ class _Finder:
         """Return the channel of a role, None where neither [columns] nor a heading has it."""
         spec = self.specs.get(role)
         if spec is None:
-            found = [i for i, (name, _) in enumerate(self.parts) if _plain(name) == role]
+            found = [i for i, (name, unit) in enumerate(self.parts) if _heads(name, unit) == role]
             if not found:
                 return None
             spec = ColumnSpec(role)
@@ -266,16 +275,26 @@ class _Finder:
         written, heading = self.parts[column][1], self.headings[column]
         where = f"{self.path}: column '{heading}'"
         unit = spec.unit if spec.unit is not None else written if written is not None else ROLES[role]
-        factor = check_unit(unit, role, spec.node if spec.unit is not None else None, where)
+        node = spec.node if spec.unit is not None else None
+        factor = check_unit(unit, role, node, where, self.geometry)
         if spec.unit is not None and written is not None:
             try:
-                same = check_unit(written, role) == factor
+                same = check_unit(written, role, geometry=self.geometry) == factor
             except SrfError:
                 same = False
             if not same:
                 what = f"the heading says {written!r}, [columns] says {spec.unit!r}, which counts"
                 self.notices.append(Notice("unit", where, what))
         return Channel(role, heading, column, unit, factor, spec)
+
+
+def _heads(name: str, unit: str | None) -> str:
+    """Return the role that a heading names; what is headed friction and has a unit of force or stress is a force."""
+    plain = _plain(name)
+    if plain == "friction" and unit is not None:
+        with contextlib.suppress(SrfError):
+            return "force" if find_unit(unit).powers[2] == 1 else plain
+    return plain
 
 
 def _plain(name: str) -> str:
@@ -322,6 +341,9 @@ def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
             f"{run.node.where}: the run has no load, and {run.file} no normal_load or normal_stress",
             f'Write load = "5 N", or name the column. {_near(["normal_load", "normal_stress"], names)}'.strip(),
         )
+    if run.backward:
+        channels[1] = replace(observable, factor=-observable.factor)
+        moves = replace(moves, factor=-moves.factor) if moves else None
     return [*channels, *([moves] if moves else []), *weights[:1]]
 
 

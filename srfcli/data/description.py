@@ -13,7 +13,16 @@ from typing import Any, NoReturn
 
 from srfcli.core.errors import SrfError, did_you_mean, printable, shown
 from srfcli.core.files import check_plain, parse_toml, read_text, recover
-from srfcli.core.units import is_stress, same_dimension, split_quantity, unit_factor
+from srfcli.core.units import (
+    NO_GEOMETRY,
+    Geometry,
+    find_unit,
+    is_stress,
+    parse_quantity,
+    same_dimension,
+    split_quantity,
+    unit_factor,
+)
 
 # `experiment.toml` in the format `srf-experiment/1`, read and validated without opening any data file.
 
@@ -30,9 +39,24 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
     "shear_stress": "MPa",
     "friction": "1",
 }
+CORRECTIONS = ("reset", "spike")  # of a run: what is proposed, and made only where it is asked for
+GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
 _TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs")
 _COLUMN = ("name", "unit", "scale", "offset", "integrate")
-_RUN = ("name", "file", "format", "holdout", "window", "drive", "start", "load", "modulation", "initial")
+_RUN = (
+    "name",
+    "file",
+    "format",
+    "holdout",
+    "window",
+    "drive",
+    "start",
+    "load",
+    "modulation",
+    "initial",
+    "direction",
+    "corrections",
+)
 _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
 
 
@@ -49,6 +73,7 @@ class Apparatus:
     unit: str
     stated: str
     mass: float | None
+    geometry: Geometry = NO_GEOMETRY
 
 
 @dataclass(frozen=True)
@@ -78,6 +103,8 @@ class RunDescription:
     modulation: tuple[float, float, float] | None
     initial: str
     node: Node = field(repr=False, compare=False)
+    backward: bool = False
+    corrections: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -107,14 +134,15 @@ def read_description(path: Path) -> Description:
     title = root.get("title")
     apparatus = root.require("apparatus", '[apparatus] with stiffness = "0.21 N/um".').table("[apparatus].")
     parameters, columns = root.get("parameters"), root.get("columns")
+    machine = _apparatus(apparatus)
     return Description(
         path=file,
         title=title.text() if title else "",
-        apparatus=_apparatus(apparatus),
+        apparatus=machine,
         model=root.require("model", '[model] with law = "srf-vsat" and ageing = "dieterich".').table("[model]."),
         parameters=parameters.table("[parameters].") if parameters else None,
-        columns=_columns(columns.table("[columns].")) if columns else {},
-        runs=_runs(root.require("runs", _RUNS)),
+        columns=_columns(columns.table("[columns]."), machine.geometry) if columns else {},
+        runs=_runs(root.require("runs", _RUNS), machine.geometry),
     )
 
 
@@ -137,7 +165,8 @@ def find_file(path: Path) -> Path:
 
 
 def _apparatus(node: Node) -> Apparatus:
-    node.keys(("stiffness", "mass"))
+    node.keys(("stiffness", "mass", "radius", "thickness", "area"))
+    geometry = _geometry(node)
     hint = 'Write stiffness = "0.21 N/um", "1.5 MPa/mm", or "1.0e-3 1/um" for friction per micron.'
     stiffness = node.require("stiffness", hint)
     if not isinstance(stiffness.value, str):
@@ -147,23 +176,43 @@ def _apparatus(node: Node) -> Apparatus:
         if not unit:
             stiffness.fail(f"'{stiffness.value}' has no unit, and two are possible", hint)
         per_load = same_dimension(unit, "1/um")
-        value = number * unit_factor(unit, "1/um" if per_load else "N/um")
+        value = number * unit_factor(unit, "1/um" if per_load else "N/um", geometry)
     except SrfError as error:
         if error.message.startswith(str(node.file)):
             raise
-        stiffness.fail(error.message, error.hint if "unknown unit" in error.message else hint)
+        told = "unknown unit" in error.message or "rotary" in (error.hint or "")
+        stiffness.fail(error.message, error.hint if told else hint)
     if not value > 0:
         stiffness.expected("a positive stiffness")
     mass = node.get("mass")
     kilograms = mass.quantity("kg") if mass else 0.0
     if mass and kilograms < 0:
         mass.expected('a mass of 0 or more, as "2.37 kg"')
+    if mass and kilograms and geometry.area:
+        mass.fail("a mass beside an area, with which forces count as stresses", "Leave one of the two out.")
     base = "1/um" if per_load else "N/um"
-    text = f"{value!r} {base}" if is_stress(unit) else stiffness.value  # nothing below this knows of stresses
-    return Apparatus(value, per_load, text, base, unit, kilograms * 1e-6 if kilograms else None)
+    plain = not is_stress(unit) and (per_load or find_unit(unit).powers == (-1, 0, 1, 0)) and not geometry.area
+    text = stiffness.value if plain else f"{value!r} {base}"  # nothing below this knows of stresses and of geometry
+    stated = "MPa/um" if geometry.area and not per_load else unit if plain or is_stress(unit) else base
+    return Apparatus(value, per_load, text, base, stated, kilograms * 1e-6 if kilograms else None, geometry)
 
 
-def _columns(node: Node) -> dict[str, ColumnSpec]:
+def _geometry(node: Node) -> Geometry:
+    """Return what turns torques, angles, strains and forces into what is compared."""
+    found: dict[str, float] = {}
+    for key, unit in (("radius", "um"), ("thickness", "um"), ("area", "mm^2")):
+        entry = node.get(key)
+        if entry is None:
+            continue
+        if not isinstance(entry.value, str):
+            entry.expected("text with a number and its unit", f'Write {key} = "{GEOMETRY[key]}".')
+        found[key] = entry.quantity(unit)
+        if not found[key] > 0:
+            entry.expected(f"{'an' if key == 'area' else 'a'} {key} above 0")
+    return Geometry(**found)
+
+
+def _columns(node: Node, geometry: Geometry) -> dict[str, ColumnSpec]:
     node.keys(ROLES)
     specs = {}
     for role in node.value:
@@ -175,7 +224,7 @@ def _columns(node: Node) -> dict[str, ColumnSpec]:
         name = entry.require("name", "Give the column's heading in the data file.").text()
         unit, scale, offset, integrate = (entry.get(key) for key in _COLUMN[1:])
         if unit:
-            check_unit(unit.text(), role, unit)
+            check_unit(unit.text(), role, unit, geometry=geometry)
         if scale and scale.number() == 0:
             scale.expected("a number other than 0")
         if integrate and role != "time":
@@ -191,11 +240,13 @@ def _columns(node: Node) -> dict[str, ColumnSpec]:
     return specs
 
 
-def check_unit(unit: str, role: str, node: Node | None = None, where: str = "") -> float:
+def check_unit(
+    unit: str, role: str, node: Node | None = None, where: str = "", geometry: Geometry = NO_GEOMETRY
+) -> float:
     """Return the factor from `unit` to um, s, N for a column's role; raises SrfError at `node` or `where`."""
     base = {"um/s": "um/s", "MPa": "N"}.get(ROLES[role], ROLES[role])
     try:
-        return unit_factor(unit, base)
+        return unit_factor(unit, base, geometry)
     except SrfError as error:
         message = f"{error.message}; {role} is in {ROLES[role]} or a unit of that dimension"
         if node is not None:
@@ -203,10 +254,10 @@ def check_unit(unit: str, role: str, node: Node | None = None, where: str = "") 
         raise SrfError(f"{where}: {message}", error.hint) from None
 
 
-def _runs(node: Node) -> tuple[RunDescription, ...]:
+def _runs(node: Node, geometry: Geometry) -> tuple[RunDescription, ...]:
     runs: list[RunDescription] = []
     for entry in node.tables(_RUNS):
-        run = _run(entry)
+        run = _run(entry, geometry)
         for other in runs:
             if other.name == run.name:
                 entry.child("name").fail(
@@ -216,7 +267,7 @@ def _runs(node: Node) -> tuple[RunDescription, ...]:
     return tuple(runs)
 
 
-def _run(node: Node) -> RunDescription:
+def _run(node: Node, geometry: Geometry) -> RunDescription:
     node.keys(_RUN)
     name = node.require("name", 'Write name = "steps".')
     if not name.text().strip():
@@ -225,10 +276,12 @@ def _run(node: Node) -> RunDescription:
     if not file.text().strip() or "\0" in file.text():
         file.expected("the name of a data file")
     holdout, format, start, initial = (node.get(key) for key in ("holdout", "format", "start", "initial"))
-    drive, load, window = node.get("drive"), node.get("load"), node.get("window")
+    drive, load, window, direction = (node.get(key) for key in ("drive", "load", "window", "direction"))
+    if direction and direction.text() not in ("forward", "backward"):
+        direction.expected('"forward" or "backward"', did_you_mean(direction.text(), ("forward", "backward")))
     if initial and initial.text() not in ("steady", "free"):
         initial.expected('"steady" or "free"', did_you_mean(initial.text(), ("steady", "free")))
-    weight = load.quantity("N") if load else None
+    weight = load.quantity("N", geometry) if load else None
     if load and weight is not None and not weight > 0:
         load.expected('a load above 0, as "5 N"')
     modulation = node.get("modulation")
@@ -244,7 +297,22 @@ def _run(node: Node) -> RunDescription:
         modulation=_modulation(modulation) if modulation else None,
         initial=initial.text() if initial else "steady",
         node=node,
+        backward=direction is not None and direction.text() == "backward",
+        corrections=_corrections(node.get("corrections")),
     )
+
+
+def _corrections(node: Node | None) -> frozenset[str]:
+    """Return which of the corrections that `srf check` proposes are made."""
+    if node is None:
+        return frozenset()
+    if not isinstance(node.value, list):
+        node.expected("a list of corrections", f"Write corrections = {list(CORRECTIONS)}, or one of them.")
+    for index in range(len(node.value)):
+        entry = node.child(index)
+        if entry.text() not in CORRECTIONS:
+            entry.fail(f"unknown correction '{entry.text()}'", did_you_mean(entry.text(), CORRECTIONS))
+    return frozenset(node.value)
 
 
 def _window(node: Node) -> tuple[float, float]:
@@ -374,7 +442,7 @@ class Node:
             self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g}")
         return number
 
-    def quantity(self, unit: str) -> float:
+    def quantity(self, unit: str, geometry: Geometry = NO_GEOMETRY) -> float:
         """Return this value in `unit`: a number in that unit, or text with a unit of its dimension."""
         if not isinstance(self.value, str):
             if isinstance(self.value, bool) or not isinstance(self.value, int | float):
@@ -383,8 +451,7 @@ class Node:
             return self.number()
         try:
             name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
-            number, written = split_quantity(self.value, name=name, example=f"0.5 {unit}" if unit != "1" else "0.5")
-            number *= unit_factor(written, unit) if written else 1.0
+            number = parse_quantity(self.value, unit, name=name, geometry=geometry)
             if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
                 self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g} {unit}")
             return number

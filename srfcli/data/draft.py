@@ -14,11 +14,12 @@ import numpy as np
 
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
-from srfcli.core.units import find_unit, is_stress, split_quantity
-from srfcli.data.columns import open_source, split_heading
+from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, is_stress, parse_quantity, split_quantity
+from srfcli.data.columns import open_source, read_columns, split_heading
 from srfcli.data.description import ROLES, check_unit, read_description
-from srfcli.data.experiment import read_choice, read_experiment, read_parameters
-from srfcli.data.imposed import find_modulation
+from srfcli.data.experiment import moved, read_choice, read_experiment, read_parameters
+from srfcli.data.imposed import Stroke, find_modulation, strokes
+from srfcli.data.values import OBSERVABLES as OBSERVED
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
 
@@ -45,10 +46,30 @@ NAMED = {  # role -> what headings call it, in small letters without their unit;
         "fnorm",
     ),
 }  # fmt: skip
+WORDS = {  # role -> words of a heading that mean it, where no heading is one of NAMED, and units that such a column has
+    "time": ({"time", "elapsed", "clock", "timestamp"}, {"s"}),
+    "load_point_velocity": (
+        {"velocity", "vel", "speed", "rate", "rpm", "sliding", "v", "vs", "rotation", "angular"}, {"um/s", "rad/s", "1/s"},
+    ),
+    "load_point_displacement": (
+        {"displacement", "disp", "displ", "position", "pos", "stroke", "slip", "distance", "travel", "angle", "rotation",
+         "theta", "strain", "lp", "ram", "stage", "sliding", "x", "gamma"}, {"um", "rad", "1"},
+    ),
+    "normal_stress": (
+        {"normal", "norm", "effective", "sn", "seff", "sigman", "sigma", "fn", "fz", "load", "axial", "weight"}, {"MPa", "N"},
+    ),
+    "shear_stress": (
+        {"shear", "friction", "frictional", "tangential", "traction", "lateral", "tau", "drag", "ft", "fx", "ff", "fs",
+         "torque", "moment"}, {"MPa", "N", "N*um"},
+    ),
+    "friction": ({"friction", "mu", "cof", "coefficient", "coeff"}, {"1"}),
+}  # fmt: skip
+ASIDE = {"thickness", "gap", "height", "dilation", "dilatancy", "compaction", "depth", "pore", "confining", "temperature", "temp",
+         "humidity", "std", "error", "setpoint", "target", "command", "raw", "pz", "zpos"}  # fmt: skip
 SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
     "s": "s", "sec": "s", "ms": "ms", "min": "min", "um": "um", "microns": "um", "micron": "um", "mm": "mm", "m": "m",
     "um_s": "um/s", "mm_s": "mm/s", "um/s": "um/s", "mm/s": "mm/s", "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "pa": "Pa",
-    "n": "N", "kn": "kN",
+    "n": "N", "kn": "kN", "un": "uN", "mn": "mN", "deg": "deg", "rad": "rad", "rpm": "rpm",
 }  # fmt: skip
 STRESSES = {"normal_load": "normal_stress", "force": "shear_stress"}
 FORCES = {stress: force for force, stress in STRESSES.items()}
@@ -58,11 +79,17 @@ STILL, HELD = (
     0.05,
 )  # of the fastest velocity, below which nothing slides; of the slowest sliding, below which is a hold
 SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps
+STROKES = 40  # of a file that are written
 LETTERS = "A is a, B is b, D0 is Dc (or L), mu is tau/sigma, W is sigma, K is k; a stress in MPa counts as the force on 1 mm^2"
 ROCK = {  # start values and bounds of A, B and D0 that hold most velocity steps on rock and gouge
     "A": (0.01, 0.0005, 0.05),
     "B": (0.01, 0.0002, 0.05),
     "D0": (10.0, 0.5, 500.0),
+}
+RIG = {
+    "radius": "of the sliding circle: torque over it is the force, angle times it the displacement",
+    "thickness": "of the sheared layer: strain times it is the displacement",
+    "area": "of the sheared contact: force over it is the stress",
 }
 FACTOR = 5.0  # from another law's defaults to its bounds
 
@@ -87,6 +114,12 @@ class Wish:
     title: str = ""
     reader: str | None = None
     holdout: Sequence[str] = ()
+    rig: Mapping[str, str] = field(default_factory=dict)  # radius, thickness and area, as [apparatus] has them
+
+    def geometry(self) -> Geometry:
+        """Return what the rig says, in um and mm^2."""
+        units = {"radius": "um", "thickness": "um", "area": "mm^2"}
+        return Geometry(**{k: parse_quantity(v, units[k], name=f"--{k}") for k, v in self.rig.items()})
 
 
 @dataclass(frozen=True)
@@ -109,7 +142,14 @@ class Draft:
     remarks: tuple[str, ...]
 
 
-def name_columns(headings: Sequence[str], wish: Mapping[str, str], *, path: Path, per_load: bool) -> tuple[Named, ...]:
+def name_columns(
+    headings: Sequence[str],
+    wish: Mapping[str, str],
+    *,
+    path: Path,
+    per_load: bool,
+    geometry: Geometry = NO_GEOMETRY,
+) -> tuple[Named, ...]:
     """Return the columns of a file that play a role; `wish` names some of them, `per_load` prefers friction to a force.
 
     Raises SrfError for a column that the file has not, or a unit of the wrong dimension.
@@ -118,7 +158,8 @@ def name_columns(headings: Sequence[str], wish: Mapping[str, str], *, path: Path
     for role, text in wish.items():
         if role not in ROLES:
             raise SrfError(f"--column {role}: no such role", did_you_mean(role, ROLES))
-        found[role] = _wished(role, text, headings, path)
+        named = _wished(role, text, headings, path, geometry)
+        found[named.role] = named
     taken = {named.heading for named in found.values()}
     for role, names in NAMED.items():
         if role in found:
@@ -135,6 +176,7 @@ def name_columns(headings: Sequence[str], wish: Mapping[str, str], *, path: Path
             actual, heading, unit or ROLES[actual], name != actual or split_heading(heading)[1] is None
         )
         taken.add(heading)
+    _by_words(headings, found)
     seen = [role for role in (OBSERVABLES if not per_load else OBSERVABLES[::-1]) if role in found]
     asked = [role for role in seen if role in wish]
     left = set(seen) - set((asked or seen)[:1])
@@ -143,13 +185,66 @@ def name_columns(headings: Sequence[str], wish: Mapping[str, str], *, path: Path
     return tuple(replace(n, said=n.said or len(seen) > 1) for role, n in found.items() if role not in left)
 
 
-def _wished(role: str, text: str, headings: Sequence[str], path: Path) -> Named:
+def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
+    """Add to `found` what the words and the unit of a heading tell together, or a unit alone that no other column has.
+
+    A role that two columns could play as well is left open.
+    """
+    taken = {named.heading for named in found.values()}
+    units_of = {h: _spelled(h)[1] for h in headings if h not in taken}
+    words = {h: set(re.findall(r"[a-z]+", _spelled(h)[0])) for h in units_of}
+    units_of = {h: "1" if unit is None and "strain" in words[h] else unit for h, unit in units_of.items()}
+    kinds = {h: _kind_of_unit(unit) for h, unit in units_of.items()}
+    free = [h for h in kinds if not words[h] & ASIDE]
+    for role, (known, units) in WORDS.items():
+        if _played(role, found):
+            continue
+        # a unit that is not told will do for a role that is told by a number without one
+        fit = [h for h in free if kinds[h] in units or (kinds[h] == "" and role == "time")]
+        score = {h: len(words[h] & known) for h in fit}
+        if role == "normal_stress":  # a normal displacement is told by its unit, a shear stress by its word
+            score = {h: 0 if words[h] & WORDS["shear_stress"][0] else n for h, n in score.items()}
+        best = max(score.values(), default=0)
+        named = [h for h in fit if score[h] == best > 0]
+        if not best and role in ("time", "load_point_velocity", "shear_stress"):
+            alone = {"time": {"s"}, "load_point_velocity": {"um/s", "rad/s"}, "shear_stress": {"N*um"}}[role]
+            named = [h for h in fit if kinds[h] in alone]
+        if len(named) != 1:
+            continue
+        heading = named[0]
+        unit = units_of[heading]
+        actual = FORCES.get(role, role) if kinds[heading] in ("N", "N*um") else role
+        found[actual] = Named(actual, heading, unit or ROLES[actual], True)
+        free.remove(heading)
+
+
+def _played(role: str, found: Mapping[str, Named]) -> bool:
+    """Return whether a role, or another that makes it needless, is found already."""
+    same = ({"load_point_velocity", "load_point_displacement"}, {"normal_stress", "normal_load"}, set(OBSERVABLES))
+    return any(role in group and group & set(found) for group in same) or role in found
+
+
+def _kind_of_unit(unit: str | None) -> str:
+    """Return what a unit measures, as one unit of that kind; "" for none at all, "?" for anything else."""
+    if unit is None:
+        return ""
+    try:
+        powers = find_unit(unit).powers
+    except SrfError:
+        return "?"
+    kinds = ("s", "um/s", "rad/s", "1/s", "um", "rad", "1", "MPa", "N", "N*um")
+    return next((kind for kind in kinds if find_unit(kind).powers == powers), "?")
+
+
+def _wished(role: str, text: str, headings: Sequence[str], path: Path, geometry: Geometry) -> Named:
     name, unit = (text, None) if text in headings else split_heading(text)
     heading = next((h for h in headings if name in (h, split_heading(h)[0])), None)
     if heading is None:
         raise SrfError(f"{path} has no column '{name}'", did_you_mean(name, headings))
     found = unit or _spelled(heading)[1] or ROLES[role]
-    check_unit(found, role, where=f"--column {role}")
+    if role == "friction" and _kind_of_unit(found) in ("N", "N*um", "MPa"):
+        role = "shear_stress" if _kind_of_unit(found) == "MPa" else "force"
+    check_unit(found, role, where=f"--column {role}", geometry=geometry)
     return Named(role, heading, found, True)
 
 
@@ -174,6 +269,11 @@ def _by_unit(role: str, unit: str | None) -> str | None:
     except SrfError:
         return None
     role = STRESSES.get(role, role) if stress else FORCES.get(role, role) if find_unit(unit).powers[2] else role
+    if role == "friction" and _kind_of_unit(unit) in ("N", "N*um", "MPa"):
+        return "shear_stress" if stress else "force"
+    turned = {"load_point_displacement": ("rad", "1"), "load_point_velocity": ("rad/s", "1/s"), "force": ("N*um",)}
+    if _kind_of_unit(unit) in turned.get(role, ()):
+        return role
     try:
         check_unit(unit, role)
     except SrfError:
@@ -209,7 +309,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     remarks: list[str] = []
     for path in files:
         headings = open_source(path, registry=registry, format=wish.reader).headings
-        own = name_columns(headings, wish.columns, path=path, per_load=per_load)
+        own = name_columns(headings, wish.columns, path=path, per_load=per_load, geometry=wish.geometry())
         lacks = missing(own, wish, path, headings)
         if lacks:
             raise SrfError(lacks[0][1], " ".join(f"Say it with {option}." for option, _ in lacks))
@@ -221,16 +321,17 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         aside = [h for h in headings if h not in {n.heading for n in own}]
         if aside and path == files[0]:
             remarks.append(f"left aside: {', '.join(aside)}")
-    names = _run_names(files)
+    sketch = _Sketch(tuple(files), _run_names(files), folder, wish, named)
+    sketch, told = _parted(sketch, registry)
+    remarks += told
     for name in wish.holdout:
-        if name not in names:
-            raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, names))
-    sketch = _Sketch(tuple(files), names, folder, wish, named)
+        if name not in sketch.names:
+            raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, sketch.names))
     runs, free = _read(sketch, registry)
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs)
     remarks.append(f"kind of experiment: {kind}, {why}")
-    if free:
-        remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(free)}")
+    if still := [name for name in free if name not in sketch.strokes]:
+        remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(still)}")
     sketch = replace(
         sketch, kind=kind, why=why, free=free, modulations=_modulations(runs) if kind == "oscillation" else {},
         durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
@@ -238,6 +339,37 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     text = sketch.text(_parameters(sketch, runs, registry))
     _check(text, registry)
     return Draft(text, named, kind, tuple(remarks))
+
+
+def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
+    """Return the sketch with a run for each stroke of the files whose drive turns back, and what to say of it."""
+    if sketch.wish.drive is not None:
+        return sketch, []
+    with tempfile.TemporaryDirectory() as home:
+        file = Path(home) / "experiment.toml"
+        file.write_text(sketch.text((), absolute=True), encoding="utf-8")
+        described = read_description(file)
+        files: list[Path] = []
+        names: list[str] = []
+        parts: dict[str, Stroke] = {}
+        told: list[str] = []
+        for run in described.runs:
+            source = open_source(run.file, registry=registry, format=run.format)
+            columns = read_columns(run, source, described.columns, geometry=described.apparatus.geometry)
+            rising = np.isfinite(columns.seconds) & (np.diff(columns.seconds, prepend=-np.inf) > 0)
+            arrays = {role: values[rising] for role, values in columns.arrays.items()}
+            t, observed = columns.seconds[rising], arrays[next(r for r in OBSERVED if r in arrays)]
+            found = strokes(t, moved(t, arrays), observed)
+            shown = found[:STROKES]
+            files += [run.file] * max(len(shown), 1)
+            names += [f"{run.name}-{k + 1}" for k in range(len(shown))] or [run.name]
+            parts |= {f"{run.name}-{k + 1}": stroke for k, stroke in enumerate(shown)}
+            if found:
+                some = f", of which the first {STROKES} are written" if len(found) > STROKES else ""
+                told.append(
+                    f"{run.name} slides to and fro: {len(found)} strokes{some}, a run each, from half the force on"
+                )
+    return replace(sketch, files=tuple(files), names=names, strokes=parts, free=tuple(parts)), told
 
 
 def _run_names(files: Sequence[Path]) -> list[str]:
@@ -265,6 +397,7 @@ class _Sketch:
     free: tuple[str, ...] = ()
     modulations: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     durations: Mapping[str, float] = field(default_factory=dict)
+    strokes: Mapping[str, Stroke] = field(default_factory=dict)  # by name, where a file holds several
 
     @property
     def ageing(self) -> str:
@@ -279,6 +412,7 @@ class _Sketch:
         lines += [
             f"stiffness = {_quoted(wish.stiffness)}   # of the machine: N/um, MPa/mm, or 1/um for friction per micron"
         ]
+        lines += [f"{key} = {_quoted(value)}   # {RIG[key]}" for key, value in wish.rig.items()]
         if wish.mass:
             lines += [f"mass = {_quoted(wish.mass)}"]
         else:
@@ -321,7 +455,11 @@ class _Sketch:
         if wish.reader:
             lines.append(f"format = {_quoted(wish.reader)}")
         lines.append(f"holdout = {'true' if name in wish.holdout else 'false'}   # true: never fitted, judges the fit")
-        if wish.window:
+        stroke = self.strokes.get(name)
+        if stroke:
+            lines.append(f"window = [{stroke.begin!r}, {stroke.end!r}]   # s of the file's clock: one stroke")
+            lines += ['direction = "backward"   # drive and observable count with the other sign'] * stroke.backward
+        elif wish.window:
             lines.append(f"window = [{wish.window[0]!r}, {wish.window[1]!r}]   # s of the file's clock")
         elif not absolute:
             lines.append("# window = [0.0, 100.0]   # only this part of the recording, s of the file's clock")
@@ -346,7 +484,7 @@ class _Sketch:
 
 def _read(sketch: _Sketch, registry: Registry) -> tuple[list[Run], tuple[str, ...]]:
     """Return the runs as an experiment reads them, and those that have to begin from a free state."""
-    free: tuple[str, ...] = ()
+    free = sketch.free
     while True:
         text = replace(sketch, free=free).text((), absolute=True)
         with tempfile.TemporaryDirectory() as home:
@@ -390,7 +528,10 @@ def _kind(runs: Sequence[Run]) -> tuple[str, str]:
             return "shs", f"as the drive of {run.name} holds for {float(np.mean(held)):.0%} of the time"
     ranges = [np.abs(run.drive(run.t)) for run in runs]
     low, high = min(float(V.min()) for V in ranges), max(float(V.max()) for V in ranges)
-    return "steps", f"as the drive goes from {low:.3g} to {high:.3g} um/s" if high > low else f"at {low:.3g} um/s"
+    return (
+        "steps",
+        f"as the drive goes from {low:.3g} to {high:.3g} um/s" if high > 1.001 * low else f"at {low:.3g} um/s",
+    )
 
 
 def _levels(V: np.ndarray) -> int:

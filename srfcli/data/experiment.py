@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
-from srfcli.core.units import is_stress, split_quantity, to_base
+from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
 from srfcli.data.clock import Mask, Rate, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
 from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, ColumnSpec, Node, RunDescription, read_description
 from srfcli.data.imposed import (
+    ACCIDENTS,
     DIFFERS,
     Found,
     Place,
@@ -29,6 +30,7 @@ from srfcli.data.imposed import (
     find_modulation,
     load_from_column,
     modulation_notices,
+    strokes,
 )
 from srfcli.data.noise import (
     Noise,
@@ -40,6 +42,7 @@ from srfcli.data.noise import (
     spikes,
     white_level,
 )
+from srfcli.data.scales import own_bounds
 from srfcli.data.values import OBSERVABLES, Experiment, FitParameter, ModelChoice, Notice, Run
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
@@ -66,12 +69,18 @@ def read_experiment(
     """
     described = read_description(Path(path))
     choice, known = read_choice(described.model, described.apparatus, registry)
-    parameters, notices = read_parameters(described.parameters, known, choice)
+    parameters, notices = read_parameters(described.parameters, known, choice, described.apparatus.geometry)
 
     def read(run: RunDescription) -> Run:
         return read_run(run, described.apparatus, described.columns, registry=registry, format=format, limit=limit)
 
     runs = tuple(read(run) for run in described.runs if holdout or not run.holdout)
+    if choice.effects and runs and described.parameters is not None:
+        from srfcli.symbolic.system import apart  # only for a description that has effects
+
+        own = [registry.get("effect", name) for name in choice.effects]
+        stated = described.parameters.value
+        parameters = own_bounds(parameters, apart([e for e in own if isinstance(e, Effect)]), runs, stated)
     return Experiment(
         described.path,
         described.title,
@@ -160,7 +169,14 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
             )
         names.append(name)
         found.append(effect)
-    return tuple(names), tuple(p for effect in apart(found) for p in effect.parameters)
+    return tuple(names), tuple(_roomy(p, effect) for effect in apart(found) for p in effect.parameters)
+
+
+def _roomy(p: Parameter, effect: Effect) -> Parameter:
+    """Return an effect's parameter without the bounds of its file where those follow the recording, which is not read yet."""
+    if not any(name == p.name and which != "default" for name, which, _ in effect.scaled):
+        return p
+    return replace(p, lower=0.0 if p.lower >= 0 else -math.inf, upper=math.inf)
 
 
 def _place(name: str, node: Node) -> str:
@@ -172,7 +188,7 @@ def _place(name: str, node: Node) -> str:
 
 
 def read_parameters(
-    node: Node | None, known: tuple[Parameter, ...], choice: ModelChoice
+    node: Node | None, known: tuple[Parameter, ...], choice: ModelChoice, geometry: Geometry = NO_GEOMETRY
 ) -> tuple[tuple[FitParameter, ...], tuple[Notice, ...]]:
     """Return the listed parameters in um, s, N, and what is odd about them."""
     if node is None:
@@ -183,7 +199,7 @@ def read_parameters(
         entry = node.child(name)
         if name not in declared:
             _unknown(entry, name, declared, choice)
-        parameter = _parameter(entry, declared[name])
+        parameter = _parameter(entry, declared[name], geometry if name == "K" else NO_GEOMETRY)
         own = to_base(declared[name].default, declared[name].unit)
         if name in ("K", "M") and not math.isclose(parameter.value, own, rel_tol=1e-9):
             what = f"{name} starts from another value than [apparatus] gives; a simulation uses the apparatus"
@@ -199,12 +215,12 @@ def _unknown(entry: Node, name: str, declared: dict[str, Parameter], choice: Mod
     entry.fail(f"unknown parameter '{name}' of {laws}", _IMPOSED.get(name) or did_you_mean(name, declared))
 
 
-def _parameter(entry: Node, parameter: Parameter) -> FitParameter:
+def _parameter(entry: Node, parameter: Parameter, geometry: Geometry) -> FitParameter:
     entry.table(f"{parameter.name} = {{ value = {parameter.default:g}, lower = ..., upper = ... }}.").keys(_ENTRY)
     fixed = entry.get("fixed")
     held = fixed.boolean() if fixed else False
     numbers = {
-        key: entry.child(key).quantity(parameter.unit) if key in entry.value else default
+        key: _stated(entry.child(key), parameter, geometry) if key in entry.value else default
         for key, default in (("value", parameter.default), ("lower", parameter.lower), ("upper", parameter.upper))
     }
     value, lower, upper = numbers["value"], numbers["lower"], numbers["upper"]
@@ -226,6 +242,19 @@ def _parameter(entry: Node, parameter: Parameter) -> FitParameter:
         )
     factor = to_base(1.0, parameter.unit)
     return FitParameter(parameter.name, value * factor, lower * factor, upper * factor, held, parameter.unit)
+
+
+def _stated(node: Node, parameter: Parameter, geometry: Geometry) -> float:
+    """Return a parameter's number in its unit; a stiffness has to be stated as that of the apparatus is."""
+    if parameter.name == "K" and isinstance(node.value, str):
+        written = split_quantity(node.value, name="K")[1]
+        own = "1/um" if parameter.unit == "1/um" else "MPa/um or N/um"
+        if written and same_dimension(written, "1/um") != (parameter.unit == "1/um"):
+            node.fail(
+                f"a stiffness in {written} beside that of [apparatus], which is in {own}",
+                "Friction per micron is another thing than stress or force per micron, if loads differ: state both in one.",
+            )
+    return node.quantity(parameter.unit, geometry)
 
 
 # One recording, from its description and its file to a run that can be compared with a simulation.
@@ -251,11 +280,17 @@ def read_run(
         if error.message.startswith("unknown reader") and not format:
             run.node.child("format").fail(error.message, error.hint)
         raise
-    columns = read_columns(run, source, specs, limit=limit)
+    columns = read_columns(run, source, specs, limit=limit, geometry=apparatus.geometry)
     keep, notices = kept_samples(run.file, columns.rows, columns.seconds, columns.remarks.get("time"))
     t, rows = columns.seconds[keep], columns.rows[keep]
     arrays = {role: values[keep] for role, values in columns.arrays.items()}
     notices = [*columns.notices, *notices, *sampling_notices(run.file, rows, t, find_sampling(t))]
+    if not apparatus.per_load and not {"normal_load", "normal_stress"} & arrays.keys() and run.load is None:
+        raise SrfError(
+            f"{run.node.where}: friction is recorded without a load, and the stiffness is in {apparatus.stated}",
+            'Give the run load = "20 MPa", or the stiffness as friction per micron, in 1/um.',
+        )
+    _refuse_strokes(run, t, arrays)
     drive, told = _drive(run, columns, t, arrays)
     load, weighed = _load(run, columns, rows, t, arrays)
     check_start(run, drive, float(t[0]))
@@ -268,7 +303,9 @@ def read_run(
     if len(set(units.values())) > 1:
         named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())
         notices.append(Notice("unit", run.file.name, f"{named}: a stress counts as the force on 1 mm^2"))
-    observed, used, quantum, flaws = clean_observable(place, arrays[role], rise=rise, load=load)
+    observed, used, quantum, flaws, proposed = clean_observable(
+        place, arrays[role], rise=rise, load=load, corrections=run.corrections
+    )
     return Run(
         name=run.name,
         file=run.file,
@@ -286,11 +323,38 @@ def read_run(
         quantum=quantum,
         notices=(*notices, *told, *weighed, *flaws),
         stress=any(units.values()),
+        proposed=proposed,
+    )
+
+
+def moved(t: Array, arrays: Mapping[str, Array]) -> Array:
+    """Return the displacement of the load point at the times t (n,), from its column or the integral of the velocities."""
+    if "load_point_displacement" in arrays:
+        return arrays["load_point_displacement"]
+    V = arrays["load_point_velocity"]
+    steps = np.where(np.isfinite(V[:-1]), V[:-1], 0.0) * np.diff(t)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _refuse_strokes(run: RunDescription, t: Array, arrays: Mapping[str, Array]) -> None:
+    """Raise SrfError for a run that slides in both directions."""
+    if run.drive is not None or not {"load_point_displacement", "load_point_velocity"} & arrays.keys():
+        return
+    found = strokes(t, moved(t, arrays), arrays[next(r for r in OBSERVABLES if r in arrays)])
+    if not found:
+        return
+    turn = found[1] if len(found) > 1 else found[0]
+    raise SrfError(
+        f"{run.node.where}: the drive turns back before t = {turn.begin:.6g} s and slides there; a run slides in one direction",
+        f"Make a run of each stroke: window = [{turn.begin:.6g}, {turn.end:.6g}] and, of a backward one, "
+        f'direction = "backward"; `srf new {run.file.name}` writes them.',
     )
 
 
 def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[str, bool]:
-    """Return for each force of the run, by name, whether it is stated as a stress."""
+    """Return for each force of the run, by name, whether it is stated as a stress, which with an area it is."""
+    if apparatus.geometry.area:
+        return {"all": True}
     found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in FORCES}
     if run.load is not None and isinstance(text := run.node.child("load").value, str):
         found["load"] = is_stress(split_quantity(text, name="load")[1] or "N")
@@ -303,7 +367,7 @@ def _drive(run: RunDescription, columns: Columns, t: Array, arrays: dict[str, Ar
     role = next((r for r in ("load_point_velocity", "load_point_displacement") if r in arrays), "")
     where = f"{run.file.name}: column '{columns.channels[role].heading}'" if role else ""
     if run.drive is None:
-        return drive_from_column(role, t, arrays[role], where)
+        return drive_from_column(role, t, arrays[role], where, correct="reset" in run.corrections)
     drive = declared_drive(run, columns, t)
     return drive, drive_differs(drive, t, arrays[role], where) if role else []
 
@@ -336,11 +400,15 @@ CALM = 1e-3  # relative change of the load between samples within which a jump o
 COARSE = 0.5  # quantisation step over white noise from which it is told
 
 
-def clean_observable(place: Place, x: Array, *, rise: Array, load: Load) -> tuple[Array, Mask, float, list[Notice]]:
-    """Return the observable (n,), which samples are to be compared, its quantisation step, and what was found.
+def clean_observable(
+    place: Place, x: Array, *, rise: Array, load: Load, corrections: Collection[str] = ()
+) -> tuple[Array, Mask, float, list[Notice], Array | None]:
+    """Return the observable (n,), which samples are to be compared, its quantisation step, what was found, and what is proposed.
 
-    `rise` (n,) is the fastest rise per second that the drive allows. Level jumps of the transducer are taken out; empty cells,
-    spikes, saturated samples and those beside a jump are not to be compared. Raises SrfError where nothing is left.
+    `rise` (n,) is the fastest rise per second that the drive allows. Empty cells and saturated samples are not to be compared.
+    With "spike" among the `corrections` spikes are not either; with "reset" level jumps of the transducer are taken out, and the
+    samples beside them are not compared. What is proposed is the observable (n,) with all of this done, None where nothing is.
+    Raises SrfError where nothing is left.
     """
     t, path, rows = place.t, place.path, place.rows
     known = np.isfinite(x)
@@ -359,10 +427,16 @@ def clean_observable(place: Place, x: Array, *, rise: Array, load: Load) -> tupl
         notices += spots("saturation", clipped, path, rows, t, told)
     steps = np.append(np.diff(t), t[-1] - t[-2])
     spiky = spikes(filled, quantum, rise * steps) & ~clipped
-    notices += spots("spike", spiky, path, rows, t, f"standing out in '{place.heading}', not compared")
+    if spiky.sum() > ACCIDENTS + x.size // 500:  # the tail of the noise, and no accidents
+        spiky[:] = False
+    left = "not compared" if "spike" in corrections else 'compared as they are; corrections = ["spike"] leaves them out'
+    notices += spots("spike", spiky, path, rows, t, f"standing out in '{place.heading}', {left}")
     calm = np.interp(t, t[~spiky], filled[~spiky])
-    level, beside, told_jumps = _without_jumps(place, calm, rise, load, quantum)
-    observed = np.where(spiky, filled + level - calm, level)
+    level, beside, told_jumps = _without_jumps(place, calm, rise, load, quantum, taken_out="reset" in corrections)
+    proposed = level if spiky.any() or (level != calm).any() else None
+    observed = np.where(spiky, filled + level - calm, level) if "reset" in corrections else filled
+    beside = beside & ("reset" in corrections)
+    spiky = spiky & ("spike" in corrections)
     white = white_level(calm)
     if quantum > COARSE * white > 0:
         what = f"steps of {quantum:.4g}, {quantum / white:.2g} times the white noise, which they add to"
@@ -372,10 +446,12 @@ def clean_observable(place: Place, x: Array, *, rise: Array, load: Load) -> tupl
         raise SrfError(
             f"{path.name}: column '{place.heading}': {int(used.sum())} samples can be compared", "8 are needed."
         )
-    return observed, used, quantum, [*notices, *told_jumps]
+    return observed, used, quantum, [*notices, *told_jumps], proposed
 
 
-def _without_jumps(place: Place, x: Array, rise: Array, load: Load, quantum: float) -> tuple[Array, Mask, list[Notice]]:
+def _without_jumps(
+    place: Place, x: Array, rise: Array, load: Load, quantum: float, *, taken_out: bool
+) -> tuple[Array, Mask, list[Notice]]:
     W, _ = load(place.t)
     change = np.abs(np.diff(W, prepend=W[0])) / W
     jumps = observable_jumps(x, place.t, rise, change < CALM, quantum)
@@ -383,10 +459,15 @@ def _without_jumps(place: Place, x: Array, rise: Array, load: Load, quantum: flo
     notices = []
     for jump in jumps:
         where = span(place.path, place.rows, place.t, jump.at, jump.at + 1)
-        done = "a transducer set anew; what follows is moved back by that much"
         if not jump.certain:
             done = "faster than the drive moves, but too little to be sure of a transducer set anew; left as it is"
-        what = f"'{place.heading}' jumps by {jump.size:.4g}: {done}, and the two samples are not compared"
+        elif taken_out:
+            done = (
+                "a transducer set anew; what follows is moved back by that much, and the two samples are not compared"
+            )
+        else:
+            done = 'faster than the drive moves; left as it is; corrections = ["reset"] moves what follows back by that much'
+        what = f"'{place.heading}' jumps by {jump.size:.4g}: {done}"
         notices.append(Notice("reset", where, what))
     return level, beside, notices
 
@@ -450,8 +531,8 @@ class RunCheck:
 
     @property
     def spikes(self) -> int:
-        """Return how many samples of the observable stand out and are not compared."""
-        told = (n.what for n in self.run.notices if n.kind == "spike" and n.what.endswith("not compared"))
+        """Return how many samples of the observable stand out."""
+        told = (n.what for n in self.run.notices if n.kind == "spike" and not n.what.endswith("the load is bridged"))
         return sum(int(what.split()[0]) for what in told)  # the notice begins with their number
 
 

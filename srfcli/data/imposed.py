@@ -67,9 +67,13 @@ def drive_differs(drive: Drive, t: Array, V: Array, where: str) -> list[Notice]:
     return [Notice("drive-differs", where, what)]
 
 
-def drive_from_column(role: str, t: Array, values: Array, where: str) -> tuple[Drive, list[Notice]]:
-    """Return the drive in the column of that role, and how it was found."""
-    return (drive_from_velocity if role == "load_point_velocity" else drive_from_displacement)(t, values, where)
+def drive_from_column(
+    role: str, t: Array, values: Array, where: str, *, correct: bool = False
+) -> tuple[Drive, list[Notice]]:
+    """Return the drive in the column of that role, and how it was found; to `correct` a displacement its jumps are taken out."""
+    if role == "load_point_velocity":
+        return drive_from_velocity(t, values, where)
+    return drive_from_displacement(t, values, where, correct=correct)
 
 
 def drive_from_velocity(t: Array, V: Array, where: str) -> tuple[Drive, list[Notice]]:
@@ -140,7 +144,7 @@ def _piece(t: Array, V: Array, sigma: Array, penalty: float) -> tuple[float, flo
     return mean + slope * (float(t[0]) - middle), slope
 
 
-def drive_from_displacement(t: Array, X: Array, where: str) -> tuple[Drive, list[Notice]]:
+def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = False) -> tuple[Drive, list[Notice]]:
     """Return the drive in a column of displacements: the slopes of a continuous line of straight pieces through it."""
     known = np.isfinite(X)
     if known.sum() < 8:
@@ -150,11 +154,10 @@ def drive_from_displacement(t: Array, X: Array, where: str) -> tuple[Drive, list
         notices.append(
             Notice("nan", where, f"{int((~known).sum())} samples without a displacement; a line bridges them")
         )
-    line = corners(t[known], X[known])
+    line = corners(t[known], X[known], correct=correct)
     for at, size in line.jumps:
-        what = (
-            f"the displacement jumps by {size:.4g} um after t = {t[known][at]:.7g} s: its transducer's doing, taken out"
-        )
+        done = "taken out as a transducer's" if correct else 'left as it is; corrections = ["reset"] takes it out'
+        what = f"the displacement jumps by {size:.4g} um after t = {t[known][at]:.7g} s: {done}"
         notices.append(Notice("reset", where, what))
     slopes = np.diff(line.heights) / np.diff(line.knots)
     drive = Drive.steps(list(zip([float(t[0]), *line.knots[1:-1].tolist()], slopes.tolist(), strict=True)))
@@ -170,6 +173,60 @@ def _count(number: int) -> str:
     return f"{number} straight piece" + ("s" if number != 1 else "")
 
 
+# A drive that turns back: the laws hold for sliding in one direction, so that each stroke is a run of its own.
+
+TURN = 0.2  # of the range of displacements: what turns back by less is no stroke
+OPPOSED = 0.5  # of the median observable: what opposes sliding by more slides, or is on the way to it
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """Sliding in one direction from `begin` to `end` s: after a turn from where the force has come to half its usual size."""
+
+    begin: float
+    end: float
+    backward: bool
+
+
+def strokes(t: Array, moved: Array, observed: Array) -> list[Stroke]:
+    """Return the strokes of a recording whose drive turns back and slides there; none where it only goes on or unloads.
+
+    `moved` (n,) is the displacement of the load point, `observed` (n,) elongation, force or friction of either sign. After a turn
+    the slider sticks while the spring is unloaded, so that what comes before the change of sign is left out.
+    """
+    known = np.isfinite(moved) & np.isfinite(observed)
+    t, x, y = t[known], moved[known], observed[known]
+    if t.size < 2 * FEWEST or not np.ptp(x) > 0:
+        return []
+    turns = _turns(x, TURN * float(np.ptp(x)))
+    usual = float(np.median(np.abs(y)))
+    found, slid = [], [False, False]
+    for first, last in pairwise([0, *turns, t.size - 1]):
+        backward = bool(x[last] < x[first])
+        shear = -y[first : last + 1] if backward else y[first : last + 1]
+        slid[backward] |= bool(np.median(shear[shear.size // 2 :]) > OPPOSED * usual)
+        opposed = np.flatnonzero(shear <= OPPOSED * usual)
+        opposed = opposed[opposed < shear.size // 2]  # after that, what falls short is stick-slip
+        begin = first + (int(opposed[-1]) + 1 if first and opposed.size else 0)
+        if last - begin >= 4 * FEWEST:
+            found.append(Stroke(float(f"{t[begin]:.10g}"), float(f"{t[last - 1]:.10g}"), backward))
+    return found if all(slid) and turns else []
+
+
+def _turns(x: Array, least: float) -> list[int]:
+    """Return the indices of the extremes between which x (n,) moves by more than `least`, without the two ends."""
+    turns, extreme, rising = [], 0, 0  # one pass: an extreme is one once x has come back from it by `least`
+    for i, value in enumerate(x.tolist()):
+        if rising == 0 and abs(value - x[0]) > least:
+            rising, extreme = (1 if value > x[0] else -1), i
+        elif rising and rising * (value - x[extreme]) > 0:
+            extreme = i
+        elif rising and rising * (x[extreme] - value) > least:
+            turns.append(extreme)
+            rising, extreme = -rising, i
+    return turns
+
+
 # Straight pieces in a noisy record, as many as the record supports and no more (Bayesian information criterion).
 
 FEWEST = 5  # samples of a piece
@@ -177,6 +234,7 @@ ROUNDS = 40  # of the search for the places of the corners
 STRETCH = 128  # samples over which noise has its colour
 BURST = 100  # samples for which a gauge may go astray
 AROUND = 15  # stretches that share their colour
+CLEAR = 8.0  # standard deviations about the lines beside it that a level jump exceeds
 NEAR = 200  # samples on each side by which a jump is told from a corner
 EVEN = 1e-5  # of the largest noise: what is quieter would be lost in the rounding of the running sums
 LEAST = 1e-100  # um or um/s: what is squared must not vanish
@@ -284,8 +342,10 @@ def coloured_noise(t: Array, x: Array) -> Array:
     return np.asarray(sigma * np.sqrt(np.maximum(near[stretch], 1.0)))
 
 
-def corners(t: Array, x: Array) -> Line:
+def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
     """Return the continuous line of straight pieces that x (n,) over t supports, once the level jumps are taken out of x.
+
+    Without `correct` the jumps are found and stay.
 
     The number of pieces follows from BIC, in which the noise counts with the colour that it has over 128 samples; their places
     follow from least squares. A change of slope by less than 2 % is the wobble of a servo, and is not followed.
@@ -295,11 +355,11 @@ def corners(t: Array, x: Array) -> Line:
     for _ in range(4):
         breaks = split(t, x, sigma, straight=True, penalty=penalty)
         found = _jumps(t, x, sigma, breaks, penalty)
+        jumps += found
+        if not found or not correct:
+            break
         for at, size in found:
             x[at + 1 :] -= size
-        jumps += found
-        if not found:
-            break
     knots = np.concatenate([t[:1], _places(t, x, breaks), t[-1:]])
     for _ in range(3):
         knots = _pruned(t, x, sigma, knots, penalty)
@@ -360,8 +420,11 @@ def _jumps(t: Array, x: Array, sigma: Array, breaks: list[int], penalty: float) 
         bent = _polished(t[near], x[near], sigma[near], np.array([t[a], middle, t[b - 1]]))
         together = float((((x[near] - np.interp(t[near], *bent)) / sigma[near]) ** 2).sum())
         alike = abs(lines[1][0] - lines[0][0]) < 0.2 * max(abs(lines[0][0]), abs(lines[1][0]))
-        if together - apart > penalty and alike:  # the motion goes on as before
-            found.append((at, float(lines[1][1] - lines[0][1])))
+        size = float(lines[1][1] - lines[0][1])
+        # the motion goes on as before, and the jump stands out of the scatter and happens at once
+        clear = abs(size) > CLEAR * float(np.std(x[near] - fits)) and abs(x[at + 1] - x[at]) > 0.5 * abs(size)
+        if together - apart > penalty and alike and clear:
+            found.append((at, size))
     return found
 
 

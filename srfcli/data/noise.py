@@ -259,7 +259,8 @@ def observable_jumps(x: Array, t: Array, rate: Array, steady: Mask, quantum: flo
             continue
         allowed = float(rate[max(i - 20, 0) : i + 22].max() * (t[i + 1] - t[i]))
         certain = abs(jump.size) > max(20 * allowed, LARGE * float(np.median(np.abs(x))))
-        if jump.size > 3 * allowed or (jump.size < 0 and _goes_on(x, t, i, float(rate[i]), abs(jump.size))):
+        outruns = jump.size > 3 * allowed and _stays(x, t, i, jump.size)
+        if outruns or (jump.size < 0 and _goes_on(x, t, i, float(rate[i]), abs(jump.size))):
             found.append(Jump(i, jump.size, certain))
     return found if len(jumps) <= MOST_RESETS else []
 
@@ -294,6 +295,13 @@ def _levels(x: Array) -> tuple[Array, Array]:
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, BESIDE, mode="edge"), BESIDE)
     medians = np.median(windows, axis=1)
     return medians[1 : x.size], medians[BESIDE + 1 : x.size + BESIDE]
+
+
+def _stays(x: Array, t: Array, i: int, size: float) -> bool:
+    """Return whether the level goes on after a step as before it, for the twenty samples on each side: no reloading begins."""
+    left, right = slice(max(i - 19, 0), i + 1), slice(i + 1, i + 21)
+    slopes = [float(np.polyfit(t[s] - t[i], x[s], 1)[0]) for s in (left, right)]
+    return abs(slopes[1] - slopes[0]) * float(t[right][-1] - t[i]) < 0.5 * abs(size)
 
 
 def _goes_on(x: Array, t: Array, i: int, rate: float, size: float) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
-from srfcli.core.units import factor_between, find_unit
+from srfcli.core.units import factor_between, find_unit, split_quantity
 from srfcli.motion.imposed import Drive, Load
 
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
@@ -62,6 +62,7 @@ class Run:
     `observed` is finite everywhere; where `used` is False it is a placeholder and a notice says why. `drive` and `load` hold
     on all of [t[0], t[-1]]. `start` is the place on the track in um, `initial` "steady" or "free", `stiffness` K in N/um,
     `modulation` the declared frequency (Hz), relative amplitude and onset (s), `quantum` the quantisation step, or 0.
+    `proposed` is the observable as the corrections that are proposed would make it, None where there are none.
     `stress` where stresses were recorded: a stress counts as the force on 1 mm^2, so that what is in N is in MPa.
     """
 
@@ -81,6 +82,7 @@ class Run:
     quantum: float
     notices: tuple[Notice, ...]
     stress: bool = False
+    proposed: Array | None = field(default=None, repr=False)
 
     @property
     def unit(self) -> str:
@@ -117,6 +119,28 @@ class Experiment:
     def stress(self) -> bool:
         """Return whether stresses were recorded, so that forces are shown in MPa."""
         return any(run.stress for run in self.runs)
+
+    def rescaled(self) -> str:
+        """Return, of a stiffness stated in 1/um, what it is under the load of each run, as a sentence; "" for any other."""
+        number, unit = split_quantity(self.stiffness_text, name="stiffness")
+        if find_unit(unit).powers[2]:
+            return ""
+        under: dict[str, str] = {}
+        for run in self.runs:
+            W = run.load.rest(float(run.t[0]))
+            told = f"{run.stiffness:.4g} {run.load_unit}/um under {W:.4g} {run.load_unit}"
+            if W != 1.0 and told not in under:
+                under[told] = run.name
+        if not under:
+            return ""
+        listed = ", ".join(f"{told} in {name}" for told, name in list(under.items())[:6])
+        more = ", ..." if len(under) > 6 else ""
+        apart = (
+            "; a machine's own stiffness does not grow with the load: state it in MPa/um or N/um"
+            if len(under) > 1
+            else ""
+        )
+        return f"the stiffness of {number:g} {unit} counts for each run's first load: {listed}{more}{apart}"
 
     def shown(self, unit: str) -> tuple[str, float]:
         """Return the unit that a quantity declared in `unit` is shown in, and the factor to it: a stiffness as it was stated."""

@@ -21,7 +21,7 @@ import sympy as sp
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
 from srfcli.core.units import find_unit, from_base, split_quantity
-from srfcli.data.description import open_node
+from srfcli.data.description import GEOMETRY, open_node
 from srfcli.data.values import Experiment, FitParameter, ModelChoice
 from srfcli.data.writing import DESCRIPTION, KILOGRAM, shortest
 from srfcli.diagnosis.hypotheses import Hypothesis
@@ -91,6 +91,9 @@ def augment(
     )
     lines = ['format = "srf-experiment/1"', f"title = {_value(title.strip())}", "", "[apparatus]"]
     text = experiment.stiffness_text if "K" not in values else f"{shortest(K, 1.0)!r} {base}"
+    rig = {key: description["apparatus"][key] for key in GEOMETRY if key in description["apparatus"]}
+    text = text.replace(" N/um", " MPa/um") if "area" in rig else text  # beside an area a force would be divided by it
+    lines += [f"{key} = {_value(value)}" for key, value in rig.items()]
     lines += [f"stiffness = {_value(text)}"] + ([f'mass = "{shortest(mass, KILOGRAM)!r} kg"'] if mass else [])
     lines += ["", "[model]", *(f'{"law" if kind == "friction" else kind} = "{kind}.toml"' for kind in LAWS)]
     lines += [f"inertia = {_value(inertia)}"] + ([f"effects = {_value(list(effects))}"] if effects else [])

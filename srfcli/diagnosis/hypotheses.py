@@ -53,6 +53,8 @@ def applicable(
         assert isinstance(effect, Effect)
         if effects is not None and effect.reported not in effects and effect.name not in effects:
             continue
+        if effects is None and effect.on_request:
+            continue
         if effect.name in names or any(n in base.names for n in effect.lacks):
             continue
         taken = [p.name for p in effect.parameters if p.name in base.names] if not effect.settings else []

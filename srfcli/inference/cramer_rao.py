@@ -3,8 +3,10 @@
 Asked for are alpha (Linker and Dieterich: a change of load changes the age), the interface's lambda, and the exponent n with
 which its stiffness grows with the load. Each run is simulated with its own drive and load at the experiment's start values,
 alpha = 0 and n = 1; the derivatives of the observable, whitened with the noise that was found, give the Fisher information. An
-error is the Cramer-Rao bound with the experiment's free parameters unknown within their bounds: a fit of these recordings by this
-model cannot do better. A rough track, or start values that are far off, make it worse.
+error is the Cramer-Rao bound with the experiment's free parameters unknown within their bounds, and with them what a laboratory
+does not know either: the machine's stiffness, within a factor of two, and a trend of each run with slip. The noise's level and
+colour may be unknown, too: of Gaussian noise their information and that of the mean are apart, so that it costs nothing. A fit
+of these recordings by this model cannot do better. A rough track, or start values that are far off, make it worse.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from srfcli.core.units import to_base
 from srfcli.data.clock import Mask
 from srfcli.data.experiment import RunCheck
 from srfcli.data.values import Experiment, ModelChoice
-from srfcli.inference.prediction import own_names, own_start, predict, run_parameters
+from srfcli.inference.prediction import own_names, own_start, predict, run_parameters, stiffness_share
 from srfcli.laws.registry import Registry
 
 MODIFIER = "linker-dieterich"
@@ -33,6 +35,7 @@ SIZES = {
     "n": 0.1,
 }  # that one would want to see: of rock's alpha, of lambda's own value, of n
 FAR = 3.0  # root mean square of simulation minus recording over the recording's own spread, from which it is another motion
+STIFFER = 1.5  # from half to twice the stated stiffness
 LONGEST = 20_000  # samples of a run that are simulated; of more, evenly chosen pairs stand for the others
 UNKNOWN = 100.0  # an error beyond this tells nothing: alpha and n are of order 1, lambda counts relative to itself
 
@@ -83,6 +86,7 @@ class _Question:
     asked: Mapping[str, str]
     free: tuple[str, ...]
     widths: Mapping[str, float]
+    trend: str | None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -95,10 +99,14 @@ def forecast(
     checks: Sequence[RunCheck],
     *,
     registry: Registry,
+    apparatus: bool = True,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Forecast:
-    """Return what these runs of an experiment could tell at best; raises SrfError where its model cannot be built."""
-    question = _question(experiment, checks, registry)
+    """Return what these runs of an experiment could tell at best; raises SrfError where its model cannot be built.
+
+    Stiffness and trends are unknown, too, unless `apparatus` is False: then it is a fit of the experiment's own free parameters.
+    """
+    question = _question(experiment, checks, registry, apparatus)
     runs, fitted = [], []
     for check in checks:
         progress(check.run.name)
@@ -110,6 +118,8 @@ def forecast(
         if one.believed and not holdout:
             fitted.append((check, told))
     free = tuple(q.name for q in experiment.parameters if not q.fixed)
+    free += ("K",) if "K" in question.free and "K" not in free else ()
+    free += ("a trend of each run",) if question.trend else ()
     if len(fitted) < 2:
         return Forecast(tuple(runs), None, free)
     errors, peaks = _errors(question, [told for _, told in fitted])
@@ -121,7 +131,7 @@ def _variation(checks: Sequence[RunCheck]) -> float:
     return math.log(max(c.load.highest for c in checks) / min(c.load.lowest for c in checks))
 
 
-def _question(experiment: Experiment, checks: Sequence[RunCheck], registry: Registry) -> _Question:
+def _question(experiment: Experiment, checks: Sequence[RunCheck], registry: Registry, apparatus: bool) -> _Question:
     choice, listed = experiment.choice, {q.name: q for q in experiment.parameters}
     values, spelled = {}, {}
     if choice.interface == "elastic":  # W/lambda is kappa0 (W/Wref)^n at n = 1
@@ -140,7 +150,11 @@ def _question(experiment: Experiment, checks: Sequence[RunCheck], registry: Regi
     if "lambda" in spelled and "lambda" in listed:
         widths["kappa0"] *= values["kappa0"] / listed["lambda"].value  # the same, relative to the value
     free = tuple(spelled.get(q.name, q.name) for q in listed.values() if not q.fixed)
-    return _Question(model, experiment, values, asked, tuple(n for n in free if n in model.names), widths)
+    if apparatus and "K" not in free:
+        share = stiffness_share(experiment, checks[0].run)
+        free, widths = (*free, "K"), {**widths, "K": STIFFER * checks[0].run.stiffness / share}
+    free = tuple(n for n in free if n in model.names)
+    return _Question(model, experiment, values, asked, free, widths, "slip" if apparatus else None)
 
 
 def _default(registry: Registry, interface: str, name: str) -> float:
@@ -179,12 +193,12 @@ def _simulated(question: _Question, check: RunCheck) -> _Told:
     model, run = question.model, check.run
     chosen, weight = _chosen(run.t.size)
     short = replace(run, t=run.t[chosen], observed=run.observed[chosen], used=run.used[chosen])
-    values, own = dict(question.values), own_names(model, short, None)
+    values, own = dict(question.values), own_names(model, short, question.trend)
     p, ranges = run_parameters(model, question.experiment, short, values), []
     for name in own:
         values[name], low, high = own_start(model, short, p, name)
         ranges.append(_width(low, high, values[name]))
-    found = predict(model, question.experiment, short, values, by=(*question.names, *own))
+    found = predict(model, question.experiment, short, values, by=(*question.names, *own), trend=question.trend)
     sigma, rho = (x[chosen] for x in noise_of(check))
     seen = short.used & (short.t <= found.reached) & np.isfinite(found.J).all(axis=1)
     Z = np.where(seen[:, None], found.J, 0.0) / sigma[:, None]

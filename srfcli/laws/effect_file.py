@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import ExpressionError, SrfError, did_you_mean
 from srfcli.core.settings import Parameter
-from srfcli.core.units import find_unit
+from srfcli.core.units import describe, dimension, dimension_of, find_unit
 from srfcli.laws.expression import check_identifier, parse_expression, symbol
 from srfcli.laws.law_file import AGEING_SYMBOLS, COMMON, LawReader, check_parameters
 from srfcli.laws.values import Effect, ExtraState
@@ -21,12 +21,16 @@ PLACES = ("slip", "stage", "time", "theta", "envelope")  # unknowns and abbrevia
 RUN_NAMES = ("W0", "eps", "f", "K", "V", "modulated")
 KEYS = (
     "format", "kind", "name", "about", "cites", "parameters", "constants", *SLOTS, "states", "settings", "frees", "needs",
-    "lacks", "observed", "constitutive", "answers",
+    "lacks", "observed", "constitutive", "answers", "on_request",
 )  # fmt: skip
 MOST = 1000  # values of an inner parameter
 SCAN = 8  # values at which an inner parameter is tried where its author says nothing
 _TAKEN = {*PLACES, *RUN_NAMES, *COMMON, "mu", "W", "v", "phi", "u", "kappa", "force", "start", "begin"}
-_PARAMETER = ("default", "unit", "lower", "upper", "bounds", "about", "neutral", "scan")
+_PARAMETER = ("default", "unit", "lower", "upper", "bounds", "about", "neutral", "scan", "within", "typical")
+SCALES = {  # of a recording, which bounds and sizes may be stated in, with their units
+    "segment": "um", "track": "um", "duration": "s", "interval": "s", "V_low": "um/s", "V_high": "um/s", "load": "N", "D0": "um",
+    "V0": "um/s",
+}  # fmt: skip
 _CONSTANT = ("value", "unit", "about")
 _STATE = ("name", "rate", "steady", "logarithmic")
 
@@ -129,6 +133,7 @@ class EffectReader(LawReader):
             states=self.extra(known), settings=self.settings(), frees=self.listed("frees"), neutral=neutral, scans=scans,
             needs=self.listed("needs"), lacks=self.listed("lacks"), observed=self.text("observed"),
             constitutive=self.flag("constitutive", True), answers=self.text("answers"), constants=constants,
+            scaled=tuple(self.scaled(parameters)), on_request=self.flag("on_request", False),
         )  # fmt: skip
         try:
             return finished(effect)
@@ -154,11 +159,37 @@ class EffectReader(LawReader):
             scans.append((name, int(count)))
         return tuple(neutral), tuple(scans)
 
+    def scaled(self, parameters: Sequence[Parameter]) -> Iterator[tuple[str, str, sympy.Expr]]:
+        """Yield (parameter, lower, upper or default, formula) of what is stated in the scales of a recording."""
+        for p in parameters:
+            entry = self.table["parameters"][p.name]
+            within, where = entry.get("within"), f"parameters.{p.name}"
+            if within is not None and (not isinstance(within, list) or len(within) != 2):
+                self.fail(f"{where}.within", "expected two formulas", 'Write within = ["2.5*D0", "segment/2"].')
+            stated = [("lower", "within", within[0]), ("upper", "within", within[1])] if within is not None else []
+            stated += [("default", "typical", entry["typical"])] if "typical" in entry else []
+            for which, key, text in stated:
+                if not isinstance(text, str):
+                    self.fail(f"{where}.{key}", f"found {text!r}, expected a formula in quotes")
+                try:
+                    formula = parse_expression(text, SCALES)
+                except ExpressionError as error:
+                    message = f"{self.path}: {where}.{key}: {error.message}"
+                    raise ExpressionError(message, error.hint, text=error.text, column=error.column) from None
+                units = {name: dimension(unit) for name, unit in SCALES.items()}
+                try:
+                    found, wanted = dimension_of(formula, units), dimension(p.unit)
+                except SrfError as error:
+                    self.fail(f"{where}.{key}", error.message, error.hint)
+                if formula.free_symbols and found != wanted:
+                    self.fail(f"{where}.{key}", f"'{text}' is in {describe(found)}, {p.name} in {p.unit}")
+                yield p.name, which, formula
+
     def parameter(self, name: str, entry: object) -> Parameter:
         """Return one parameter."""
         if isinstance(entry, dict):
             self.keys(f"parameters.{name}", entry, _PARAMETER)
-            entry = {k: v for k, v in entry.items() if k not in ("neutral", "scan")}
+            entry = {k: v for k, v in entry.items() if k not in ("neutral", "scan", "within", "typical")}
         return super().parameter(name, entry)
 
     def constants(self) -> tuple[Parameter, ...]:

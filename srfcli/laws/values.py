@@ -96,6 +96,8 @@ class Effect(Law):
     in a formula the slot's own name is what was there before. `settings` replace choices of the model (interface, inertia),
     `frees` names parameters of the apparatus that are fitted instead. `neutral` holds the sizes' neutral values, `scans` the
     inner parameters (unseen at neutral sizes) with the number of values to try. `answers` is the name under which it is reported.
+    `scaled` holds (parameter, lower, upper or default, formula in the scales of a recording) for what takes a number's place.
+    One `on_request` is searched for only where it is named.
     `constants` are numbers with units that formulas in `written` name; in `changes` and `states` their values stand, um, s, N.
     """
 
@@ -112,6 +114,8 @@ class Effect(Law):
     answers: str = ""
     constants: tuple[Parameter, ...] = ()
     written: tuple[tuple[str, sympy.Expr], ...] = field(default=(), compare=False)
+    scaled: tuple[tuple[str, str, sympy.Expr], ...] = ()
+    on_request: bool = False
 
     @property
     def reported(self) -> str:

@@ -256,6 +256,9 @@ def _panel(axes: list[Axes], run: Mapping[str, Any]) -> None:
         axis.margins(x=0.01, y=0.08)
         for begin, end in run.get("gaps", ()):
             axis.axvspan(begin, end, color="#BBBBBB", alpha=0.5, linewidth=0)
+    proposed = run.get("proposed")
+    if proposed is not None:
+        _proposed(axes[0], t, np.asarray(run["observed"]), np.asarray(proposed))
     for axis in axes:
         axis.ticklabel_format(axis="y", useOffset=False)
     _imposed(axes[1], np.asarray(run["V"]), wide=True)
@@ -265,6 +268,26 @@ def _panel(axes: list[Axes], run: Mapping[str, Any]) -> None:
     axes[2].set_xlabel("time  [s]")
     for axis in axes[:2]:
         axis.tick_params(labelbottom=False)
+
+
+def _proposed(axis: Axes, t: Any, observed: Any, proposed: Any) -> None:
+    """Draw the record as proposed corrections would make it, where they change it: spikes ringed, a moved level dashed."""
+    import numpy as np
+
+    from srfcli.data.clock import runs_of
+    from srfcli.data.noise import WIDEST_SPIKE
+
+    lone, moved = np.zeros(t.size, bool), np.zeros(t.size, bool)
+    for first, last in runs_of(proposed != observed):
+        (lone if last - first < WIDEST_SPIKE else moved)[first : last + 1] = True
+    style: dict[str, Any] = {"color": COLOURS[1], "zorder": 3}
+    if lone.any():
+        axis.plot(t[lone], observed[lone], "o", markersize=5, markerfacecolor="none", label="spike, proposed", **style)
+    if moved.any():
+        axis.plot(
+            *_thinned(t[moved], proposed[moved]), "--", linewidth=0.8, label="level moved back, proposed", **style
+        )
+    axis.legend(loc="best", fontsize="small")
 
 
 def _imposed(axis: Axes, values: Any, *, wide: bool) -> None:

@@ -180,7 +180,9 @@ def parameter_table(
             None if c is None else from_base(c, declared) * factor for c in (*cells, float(problem.start[k]))
         ]
         rows.append((name, *shown, unit, start, flag(fit, k)))
-    notes = _notes(fit, intervals, starts) + ([] if posterior is None else _posterior_notes(posterior))
+    notes = _notes(fit, intervals, starts)
+    notes += filter(None, [problem.experiment.rescaled()])
+    notes += [] if posterior is None else _posterior_notes(posterior)
     meta = {
         "runs": [dict(zip((c.name for c in RUNS), row, strict=True)) for row in runs.rows],
         "correlation": fit.correlation,

@@ -200,6 +200,7 @@ def _renamed(effect: Effect, names: Mapping[str, str]) -> Effect:
         states=tuple(replace(s, rate=s.rate.xreplace(swap), steady=s.steady.xreplace(swap)) for s in effect.states),
         neutral=tuple((names.get(n, n), v) for n, v in effect.neutral),
         scans=tuple((names.get(n, n), v) for n, v in effect.scans),
+        scaled=tuple((names.get(n, n), which, formula) for n, which, formula in effect.scaled),
     )
 
 

@@ -1,0 +1,91 @@
+"""What is large and small in a recording, and an effect's bounds and sizes in these terms, not in those of one slider."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from srfcli.core.settings import Parameter
+from srfcli.core.units import find_unit, to_base
+from srfcli.data.values import FitParameter, Run
+from srfcli.laws.values import Effect
+
+
+def scales_of(runs: Sequence[Run], parameters: Sequence[FitParameter]) -> dict[str, float]:
+    """Return the scales that effect files may name, in um, s, N, of the runs that are fitted (of all, where none is).
+
+    `segment` is the longest slip at one velocity and `track` in one run, `duration` that of the longest run, `interval` the
+    shortest between samples, `V_low` and `V_high` the range of the drive while it moves, `load` the mean of the normal load. D0
+    and V0 are the model's start values, and are missing where the model has none.
+    """
+    fitted = [run for run in runs if not run.holdout] or list(runs)
+    slips, moving = [], []
+    for run in fitted:
+        edges = [float(run.t[0]), *(b for b in run.drive.breaks if run.t[0] < b < run.t[-1]), float(run.t[-1])]
+        middle = 0.5 * (np.array(edges[1:]) + np.array(edges[:-1]))
+        V = np.abs(run.drive(middle))
+        slips.append((V * np.diff(edges)).tolist())
+        moving.append(V[1e-3 * V.max() < V] if V.any() else V)
+    V = np.concatenate(moving)
+    found = {
+        "segment": max(max(s) for s in slips), "track": max(sum(s) for s in slips),
+        "duration": max(float(np.ptp(run.t)) for run in fitted),
+        "interval": min(float(np.median(np.diff(run.t))) for run in fitted),
+        "V_low": float(V.min(initial=math.inf)), "V_high": float(V.max(initial=0.0)),
+        "load": float(np.mean([run.load(run.t)[0].mean() for run in fitted])),
+    }  # fmt: skip
+    found |= {q.name: q.value for q in parameters if q.name in ("D0", "V0")}
+    return {name: value for name, value in found.items() if 0 < value < math.inf}
+
+
+def at_scale(effect: Effect, scales: Mapping[str, float]) -> Effect:
+    """Return the effect with bounds and default sizes as the recording has them, where its file states them in its scales.
+
+    A parameter of which a scale is missing, or whose bounds would not rise, keeps the numbers of its file.
+    """
+    stated: dict[str, dict[str, float]] = {}
+    for name, which, formula in effect.scaled:
+        if {str(s) for s in formula.free_symbols} <= scales.keys():
+            stated.setdefault(name, {})[which] = float(formula.subs({s: scales[str(s)] for s in formula.free_symbols}))
+    return replace(effect, parameters=tuple(_moved(p, stated.get(p.name, {})) for p in effect.parameters))
+
+
+def own_bounds(
+    parameters: Sequence[FitParameter],
+    effects: Sequence[Effect],
+    runs: Sequence[Run],
+    stated: Mapping[str, Collection[str]],
+) -> tuple[FitParameter, ...]:
+    """Return the parameters of an experiment with the bounds that the recording gives those of its effects.
+
+    `stated` has by name which of lower and upper the experiment says itself: these stay. Bounds make room for the start value.
+    """
+    scales, found = scales_of(runs, parameters), dict[str, Parameter]()
+    for effect in effects:
+        named = {name for name, which, _ in effect.scaled if which != "default"}
+        found |= {p.name: p for p in at_scale(effect, scales).parameters if p.name in named}
+    out = []
+    for q in parameters:
+        if q.name not in found:
+            out.append(q)
+            continue
+        p, own = found[q.name], stated.get(q.name, ())
+        low, high = (to_base(x, p.unit) for x in (p.lower, p.upper))
+        room = abs(q.value) if q.value else 0.1 * (high - low)
+        low, high = min(low, q.value - room / 2), max(high, q.value + room)
+        low = max(low, 0.0) if p.lower >= 0 else low
+        out.append(replace(q, lower=q.lower if "lower" in own else low, upper=q.upper if "upper" in own else high))
+    return tuple(out)
+
+
+def _moved(p: Parameter, stated: Mapping[str, float]) -> Parameter:
+    factor = find_unit(p.unit).factor
+    said = {which: value / factor for which, value in stated.items()}
+    lower, upper = said.get("lower", p.lower), said.get("upper", p.upper)
+    if not stated or not lower < upper:
+        return p
+    default = said.get("default", p.default)
+    return replace(p, lower=lower, upper=upper, default=min(max(default, lower), upper))

@@ -1,0 +1,219 @@
+"""`fit` of many experiments: a row each, whatever becomes of the others."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from srfcli.core.errors import SrfError, Status
+from srfcli.core.units import from_base
+from srfcli.data.values import Run
+from srfcli.inference.noise import lag_one
+from srfcli.laws.registry import load_registry
+from srfcli.results.campaign import PAIRS, CampaignResult
+from srfcli.results.fit import FitResult, unit_of
+from srfcli.tasks.fit import fit
+from srfcli.tasks.recordings import read_experiment
+
+TAIL = 1 / 3  # of a segment, at its end, that is looked at for steady sliding
+LONG = 2.0  # slip lengths in that part, and a time constant of the spring's: a shorter one tells nothing
+SURE = 3.0  # standard errors of a slope that is one
+DRIFT = 0.02  # of B (A where it is larger) that friction may change by over a slip length in steady sliding
+BAD = 1.3  # rms over noise from which the fit is flagged
+Runner = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One experiment and how it is fitted; `digest` is of its description and data, so that a changed one is fitted anew."""
+
+    path: str
+    options: tuple[tuple[str, Any], ...]
+    reader: str | None
+    plugins: tuple[str, ...]
+    digest: str
+
+
+def fit_campaign(
+    paths: Sequence[str | Path],
+    *,
+    options: Mapping[str, Any] | None = None,
+    reader: str | None = None,
+    plugins: Sequence[str | Path] = (),
+    run: Runner | None = None,
+    done: Callable[[CampaignResult], None] = lambda so_far: None,
+) -> CampaignResult:
+    """Return the fits of many experiments, a row each in the order of `paths`.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Folders with an experiment.toml, or these files.
+    options : mapping, optional
+        Keyword arguments of `fit` for each of them: free, trend, track, starts, seed.
+    reader : str, optional
+        Reader of all data files.
+    plugins : sequence of path
+        Folders in which laws and readers are looked for, too.
+    run : callable, optional
+        Spreads the work, as `srfcli.parallel` does; one after the other in this process if left out.
+    done : callable
+        Told the rows so far after each experiment.
+
+    Returns
+    -------
+    CampaignResult
+        An experiment that cannot be read or fitted has a row with its reason. Ctrl-C keeps the rows that are done.
+    """
+    tasks = [
+        Task(str(p), tuple(sorted((options or {}).items())), reader, tuple(map(str, plugins)), _digest(Path(p)))
+        for p in paths
+    ]
+    rows: dict[int, dict[str, Any]] = {}
+
+    def so_far(status: Status = Status.OK) -> CampaignResult:
+        worst = Status.NO_CONVERGENCE if any(r["status"] != Status.OK.value for r in rows.values()) else Status.OK
+        return CampaignResult([rows[k] for k in sorted(rows)], len(tasks), worst if status is Status.OK else status)
+
+    try:
+        for index, kept in (run or _here)(fit_one, tasks):
+            rows[index] = json.loads(np.asarray(kept["row"]).tobytes().decode("utf-8"))
+            done(so_far())
+    except KeyboardInterrupt:
+        return so_far(Status.INTERRUPTED)
+    return so_far()
+
+
+def _here(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+    yield from ((k, function(task)) for k, task in enumerate(tasks))
+
+
+def _digest(path: Path) -> str:
+    """Return a hash of the description, and of size and time of the files beside it; "" where nothing can be read."""
+    file = path / "experiment.toml" if path.is_dir() else path
+    try:
+        parts = [file.read_bytes()]
+        for other in sorted(file.parent.glob("*")):
+            told = other.stat()
+            parts.append(f"{other.name} {told.st_size} {told.st_mtime_ns}".encode())
+    except OSError:
+        return ""
+    return hashlib.sha256(b"\0".join(parts)).hexdigest()
+
+
+def fit_one(task: Task) -> dict[str, Any]:
+    """Return the row of one experiment as JSON in an array of bytes, as stores and workers carry it."""
+    try:
+        registry = load_registry([Path(p) for p in task.plugins])
+        experiment = read_experiment(task.path, format=task.reader, registry=registry)
+        found = fit(experiment, registry=registry, **dict(task.options))
+        if found.worst is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        row = _row(task.path, found)
+    except SrfError as error:
+        row = _failed(task.path, error.message)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        row = _failed(task.path, f"nothing can be computed at these values: {' '.join(str(error).split())[:200]}")
+    except Exception as error:  # one experiment must not cost the others
+        row = _failed(task.path, f"unexpected {type(error).__name__}: {' '.join(str(error).split())[:200]}")
+    return {"row": np.frombuffer(json.dumps(row).encode("utf-8"), dtype=np.uint8)}
+
+
+def _failed(path: str, reason: str) -> dict[str, Any]:
+    return {"experiment": path, "status": "failed", "reason": reason}
+
+
+def _row(path: str, found: FitResult) -> dict[str, Any]:
+    experiment, problem, result = found.experiment, found.found.problem, found.found.fit
+    runs = [run for run in experiment.runs if not run.holdout]
+    table = {row[0]: row for row in found.table.rows}
+    listed = {q.name for q in experiment.parameters}
+    own = [name for name in result.names if name in listed]
+    parameters = {name: (table[name][1], _number(table[name][2]), table[name][5]) for name in own}
+    values = {**{q.name: q.value for q in experiment.parameters}, **result.values}
+    place = {name: k for k, name in enumerate(result.names)}
+    covariance = np.asarray(result.covariance)
+
+    def shared(a: str, b: str) -> float | None:
+        if not {a, b} <= place.keys():
+            return None
+        scale = from_base(1.0, unit_of(problem, a)) * from_base(1.0, unit_of(problem, b))
+        return _number(float(covariance[place[a], place[b]]) * scale)
+
+    row: dict[str, Any] = {
+        "experiment": path, "status": found.worst.value, "law": f"{experiment.choice.law}, {experiment.choice.ageing}",
+        "runs": len(runs), "samples": sum(int(run.used.sum()) for run in runs),
+        "load": float(np.mean([run.load(run.t)[0].mean() for run in runs])), "load_unit": runs[0].load_unit,
+        "parameters": parameters, "rms_over_noise": _number(result.rms_over_noise()),
+        "covariances": {f"cov_{a}_{b}": shared(a, b) for a, b in PAIRS},
+    }  # fmt: skip
+    V = np.concatenate([np.abs(run.drive(run.t)) for run in runs])
+    row |= {"V_low": float(V.min()), "V_high": float(V.max())}
+    if {"A", "B"} <= values.keys():
+        variances = [covariance[place[n], place[n]] if n in place else 0.0 for n in ("A", "B")]
+        both = 2 * float(covariance[place["A"], place["B"]]) if {"A", "B"} <= place.keys() else 0.0
+        row["A_minus_B"] = values["A"] - values["B"]
+        row["A_minus_B_stderr"] = _number(float(np.sqrt(max(sum(variances) - both, 0.0)))) if place else None
+    unit, factor = experiment.shown("1/um" if _per_load(experiment.stiffness_text) else "N/um")
+    stated = float(
+        values.get("K", runs[0].stiffness / (_first(runs[0]) if _per_load(experiment.stiffness_text) else 1.0))
+    )
+    row |= {"k": stated * factor, "k_unit": unit, "k_stderr": table["K"][2] if "K" in table else None}
+    length = float(values.get("D0", 10.0))
+    allowed = DRIFT * max(abs(values.get("A", 0.0)), abs(values.get("B", 0.0))) / length
+    found_slopes = [s for run in runs for s in _slopes(run, length)]
+    steady = [not (abs(slope) > SURE * error and abs(slope) > allowed) for slope, error in found_slopes]
+    sure = [slope for slope, error in found_slopes if abs(slope) > SURE * error]
+    row |= {"segments": len(steady), "steady": sum(steady), "slope": 1e3 * max(sure, key=abs) if sure else None}
+    row["flags"] = "; ".join(_flags(row, found))
+    return row
+
+
+def _number(value: float | None) -> float | None:
+    return float(value) if value is not None and np.isfinite(value) else None
+
+
+def _per_load(text: str) -> bool:
+    return "N" not in text and "Pa" not in text
+
+
+def _first(run: Run) -> float:
+    return float(run.load.rest(float(run.t[0])))
+
+
+def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
+    if not found.worst.ok:
+        yield "the maximum was not reached"
+    yield from (f"{line[0]} {line[-1]}" for line in found.table.rows if line[-1])
+    if row["steady"] < row["segments"]:
+        yield f"friction still changes with slip at the end of {row['segments'] - row['steady']} of {row['segments']} segments"
+    if not row["segments"]:
+        yield "no segment is long enough to say whether it ends in steady sliding"
+    if row["rms_over_noise"] is not None and row["rms_over_noise"] > BAD:
+        yield f"residual {row['rms_over_noise']:.2g} times the noise"
+
+
+def _slopes(run: Run, length: float) -> Iterator[tuple[float, float]]:
+    """Yield d mu/d slip (1/um) and its error for the end of each segment of constant velocity that is long enough."""
+    W = run.load(run.t)[0]
+    mu = run.observed * {"elongation": run.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[run.observable]
+    starts = [float(run.t[0]), *(b for b in run.drive.breaks if run.t[0] < b < run.t[-1]), float(run.t[-1])]
+    for begin, end in pairwise(starts):
+        V, rate, _ = run.drive.piece(begin)
+        part = (run.t >= end - TAIL * (end - begin)) & (run.t <= end) & run.used
+        if rate or V <= 0 or V * TAIL * (end - begin) < LONG * length or part.sum() < 16:
+            continue
+        x = V * (run.t[part] - run.t[part].mean())
+        y = mu[part] - mu[part].mean()
+        slope = float(x @ y / (x @ x))
+        rest = y - slope * x
+        rho = float(np.clip(lag_one(rest, [(0, rest.size)]), 0.0, 0.99))
+        error = float(np.sqrt(rest @ rest / (rest.size - 2) / (x @ x) * (1 + rho) / (1 - rho)))
+        yield slope, error

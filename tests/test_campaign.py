@@ -1,0 +1,128 @@
+"""`srf fit A B C --table out.csv`: many experiments, a row each, whatever becomes of the others."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from srfcli.cli.main import cli
+from srfcli.tasks.campaign import fit_campaign
+
+pytestmark = pytest.mark.usefixtures("empty_folder")
+TRUE = {"A": 0.009, "B": 0.006, "D0": 6.0}
+K, LOAD = 4e-3, 20.0  # 1/um, MPa
+
+
+def srf(*arguments: str, code: int = 0) -> Result:
+    done = CliRunner().invoke(cli, list(arguments), prog_name="srf")
+    assert done.exit_code == code, done.stderr
+    return done
+
+
+def experiment(name: str, *, seed: int, drift: float = 0.0) -> Path:
+    """Write a velocity step of a spring slider, by Euler, as an experiment; `drift` is the change of friction with slip, 1/um."""
+    rng, dt, rows = np.random.default_rng(seed), 1e-3, []
+    mu, phi, x = 0.6, TRUE["D0"], 0.0
+    for i in range(36_000):
+        V = 1.0 if i * dt < 16.0 else 10.0
+        v = math.exp((mu - 0.6 - TRUE["B"] * math.log(phi / TRUE["D0"])) / TRUE["A"])
+        if i % 100 == 0:
+            rows.append(f"{i * dt:.4g},{V},{LOAD * (mu + drift * x + rng.normal(0, 1e-4)):.8g},{LOAD}")
+        mu, phi, x = mu + dt * K * (V - v), phi + dt * (1 - v * phi / TRUE["D0"]), x + dt * v
+    Path(name).mkdir()
+    (Path(name) / "a.csv").write_text(
+        "\n".join(["time [s],load_point_velocity,shear_stress,normal_stress", *rows]) + "\n"
+    )
+    srf("new", f"{name}/a.csv", "--stiffness", f"{K * LOAD} MPa/um", "--out", f"{name}/experiment.toml")
+    return Path(name)
+
+
+def rows_of(path: Path) -> dict[str, dict[str, str]]:
+    with path.open(encoding="utf-8") as stream:
+        return {row["experiment"]: row for row in csv.DictReader(stream)}
+
+
+def test_a_row_for_each_experiment_and_a_reason_for_those_without_a_fit() -> None:
+    experiment("one", seed=1)
+    experiment("drifts", seed=2, drift=4e-5)
+    Path("broken").mkdir()
+    Path("broken/experiment.toml").write_text("format = 3\n")
+    done = srf("fit", "one", "broken", "drifts", "--table", "out.csv", "--track", "smooth", "--workers", "2", code=3)
+    assert "1 of 3 experiments have no fit (broken); see `reason`" in done.stderr
+    rows = rows_of(Path("out.csv"))
+    assert list(rows) == ["one", "broken", "drifts"]
+    assert rows["broken"]["status"] == "failed" and "broken/experiment.toml" in rows["broken"]["reason"]
+    one = {
+        key: float(value)
+        for key, value in rows["one"].items()
+        if key not in ("experiment", "flags", "reason") and _is(value)
+    }
+    for name, true in TRUE.items():
+        assert abs(one[name] - true) < 4 * one[f"{name}_stderr"] < 0.4 * true
+    # the error of A - B is that of two numbers that go together
+    variance = one["A_stderr"] ** 2 + one["B_stderr"] ** 2 - 2 * one["cov_A_B"]
+    assert one["A_minus_B"] == pytest.approx(one["A"] - one["B"]) and one["A_minus_B_stderr"] == pytest.approx(
+        variance**0.5
+    )
+    assert one["A_minus_B_stderr"] < one["A_stderr"]
+    assert (one["k"], rows["one"]["k_unit"], rows["one"]["k_stderr"]) == (pytest.approx(K * LOAD), "MPa/um", "")
+    assert one["load"] == pytest.approx(LOAD) and one["rms_over_noise"] == pytest.approx(1.0, abs=0.15)
+    # steady sliding at the end of a segment, and friction that goes on rising with slip
+    assert one["segments"] == one["steady"] == 1 and not rows["one"]["flags"]
+    assert float(rows["drifts"]["slope"]) == pytest.approx(0.04, rel=0.2)
+    assert "friction still changes with slip at the end of 1 of 1 segments" in rows["drifts"]["flags"]
+
+
+def _is(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def test_finished_rows_are_kept_when_it_is_interrupted_and_gone_on_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    for seed, name in enumerate(("one", "two", "three")):
+        experiment(name, seed=seed)
+    asked: list[str] = []
+    import srfcli.tasks.campaign as campaign
+
+    real = campaign.fit_one
+
+    def stopped_at_the_third(task: campaign.Task) -> object:
+        asked.append(task.path)
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return real(task)
+
+    monkeypatch.setattr(campaign, "fit_one", stopped_at_the_third)
+    arguments = ("fit", "one", "two", "three", "--table", "out.csv", "--track", "smooth", "--resume", "parts")
+    done = srf(*arguments, code=130)
+    assert "the rows that were done are kept" in done.stderr and "2 of 3 experiments were done" in done.stdout
+    before = rows_of(Path("out.csv"))
+    assert list(before) == ["one", "two"]
+    asked.append("and on")  # so that nothing stops it now
+    srf(*arguments)
+    assert asked == ["one", "two", "three", "and on", "three"]
+    after = rows_of(Path("out.csv"))
+    assert list(after) == ["one", "two", "three"] and {k: after[k] for k in before} == before
+
+
+def test_from_python_and_what_is_refused() -> None:
+    experiment("one", seed=1)
+    found = fit_campaign(["one", "nowhere"], options={"track": "smooth", "free": ["A", "B", "D0"]})
+    assert [row["status"] for row in found.rows] == ["ok", "failed"] and found.failed == 1
+    frame = found.to_dataframe()
+    assert frame["A"].notna().tolist() == [True, False] and "mu0" not in frame
+    assert "A - B" in {axes.get_ylabel().split(",")[0] for axes in found.plot().axes}
+    Path("out.csv").write_text("mine")
+    srf("fit", "one", "--table", "out.csv", code=2)
+    assert Path("out.csv").read_text() == "mine"
+    assert "is no .csv file" in srf("fit", "one", "--table", "out.txt", code=2).stderr
+    assert "--profile is for fits of one experiment" in srf("fit", "one", "one", "--profile", code=2).stderr
+    assert "--workers is for fits of several experiments" in srf("fit", "one", "--workers", "2", code=2).stderr
