@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from srfcli.diagnosis.answer import RunView
     from srfcli.diagnosis.design import Parting
     from srfcli.diagnosis.residual_scan import Location
-    from srfcli.diagnosis.staged_search import Search
+    from srfcli.diagnosis.search import ModelSearch
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.laws.registry import Registry
 
@@ -59,9 +59,9 @@ srf fit found/augmented                              the augmented model is an e
 def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], **options: Any) -> None:
     """Say where recordings and their model part, and which physics the model lacks.
 
-    The baseline of the experiment is fitted; where it leaves more than noise, every registered effect is tried for what it could
-    explain beyond the baseline's own parameters and a rough track. Held-out runs are opened when the models are final, and judge
-    them. Verdicts are none, identified, ambiguous, unknown and inconclusive.
+    The baseline of the experiment is fitted with a random friction field and coloured gauge noise. Every registered effect is
+    scored for what it could explain beyond these, and those that promise most are fitted. Held-out runs are opened when the
+    models are final, and judge them. Verdicts are none, identified, ambiguous, unknown and inconclusive.
     """
     from srfcli.cli.options import open_registry
 
@@ -95,9 +95,10 @@ def _diagnose(
     from srfcli.codegen.c_source import GET_COMPILER, compiler
     from srfcli.core.errors import Status
     from srfcli.data.experiment import read_experiment
-    from srfcli.diagnosis.answer import answer, final, ranked_rows
+    from srfcli.diagnosis.answer import answer, ranked_rows
+    from srfcli.diagnosis.discrepancy import explain_unknown
     from srfcli.diagnosis.residual_scan import locate
-    from srfcli.diagnosis.staged_search import Search
+    from srfcli.diagnosis.search import ModelSearch
     from srfcli.diagnosis.verdict import conclude
     from srfcli.results.tables import json_text, plain_value
 
@@ -112,7 +113,7 @@ def _diagnose(
             progress.advance(note=text, bound=search.share if searching else None)
             Session.current().detail(text)
 
-        search = Search(registry, experiment, report, effects or None, options["trend"])
+        search = ModelSearch(registry, experiment, report, effects or None, options["trend"])
         searching = True
         status = _searched(search)
         searching = False
@@ -120,13 +121,21 @@ def _diagnose(
         whole = read_experiment(source, registry=registry, format=options["reader"])
         diagnosis = conclude(search, whole)
         report("location")
-        last = None if final(diagnosis) is diagnosis.baseline else final(diagnosis).fit
-        location = locate(diagnosis.baseline.fit, diagnosis.noise, last=last, seed=options["seed"])
-        missing = _explained(search, diagnosis) if status is Status.OK else {}
+        last = None if diagnosis.final is diagnosis.baseline or not diagnosis.final.fine else diagnosis.final
+        location = locate(diagnosis.baseline, last=last, seed=options["seed"])
+        missing: dict[str, Any] = {}
+        if status is Status.OK and diagnosis.verdict == "unknown":
+
+            def stopped() -> None:
+                nonlocal status
+                status = Status.INTERRUPTED
+
+            report(SENTENCES["unknown"])
+            missing = explain_unknown(search, diagnosis, stopped=stopped)
         parting = _parted(registry, diagnosis, options["seed"]) if status is Status.OK else None
     found = plain_value(answer(diagnosis, location, parting=parting))
     if missing:
-        found["missing"] = plain_value({k: v for k, v in missing.items() if k not in ("force", "toml")})
+        found["missing"] = plain_value({k: v for k, v in missing.items() if k not in ("force", "toml", "csv")})
     if status is not Status.OK:
         found["status"] = status.value
     if folder is not None:
@@ -146,13 +155,6 @@ def _diagnose(
     )
 
 
-def _explained(search: Search, diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return what there is to say of a force that no registered effect explains; nothing for other verdicts."""
-    from srfcli.diagnosis.discrepancy import explain_unknown
-
-    return explain_unknown(search, diagnosis) if diagnosis.verdict == "unknown" else {}
-
-
 def _parted(registry: Registry, diagnosis: Diagnosis, seed: int) -> Parting | None:
     """Return the run that would part what is ambiguous; nothing for other verdicts."""
     if diagnosis.verdict != "ambiguous":
@@ -162,14 +164,15 @@ def _parted(registry: Registry, diagnosis: Diagnosis, seed: int) -> Parting | No
     return parting_experiment(registry, diagnosis, seed=seed)
 
 
-def _searched(search: Search) -> Any:
+def _searched(search: ModelSearch) -> Any:
     """Run the search; interrupted, it keeps what it has if the baseline is fitted."""
     from srfcli.core.errors import Status
+    from srfcli.inference.fit import Interrupted
 
     try:
         search.run()
-    except KeyboardInterrupt:
-        if not any(not r.hypothesis.effects for r in search.tried.values()):
+    except (KeyboardInterrupt, Interrupted):
+        if not search.fitted:
             raise SrfError(
                 "interrupted before the baseline was fitted; nothing is kept",
                 "`srf fit` of the same experiment keeps what it has at any time.",
@@ -184,10 +187,10 @@ def _searched(search: Search) -> Any:
 HYPOTHESES = (
     Column("hypothesis", "", "effects added to the baseline"),
     Column("evidence", "", "log evidence over the baseline's", ".1f"),
-    Column("rms_over_noise", "", "1 where all but noise is explained", ".4f"),
-    Column("p_value", "", "that noise alone is left", ".2g"),
+    Column("rms_over_noise", "", "of the innovations: 1 where all but noise is explained", ".4f"),
+    Column("field", "", "amplitude of the random friction that it needs", ".2g"),
     Column("confidence", "", "stated", ".3f"),
-    Column("track", "", "rough where it was needed"),
+    Column("against", "", "what speaks against it"),
 )
 PARAMETERS = (
     Column("parameter", "", "name"),
@@ -201,8 +204,8 @@ PARAMETERS = (
 RUNS = (
     Column("run", "", "name"),
     Column("role", "", "fit, or held out"),
-    Column("baseline", "", "residual over noise", ".4f"),
-    Column("augmented", "", "residual over noise", ".4f"),
+    Column("baseline", "", "innovations over noise, rms", ".4f"),
+    Column("augmented", "", "innovations over noise, rms", ".4f"),
     Column("share", "", "of the baseline's excess misfit", ".2f"),
     Column("p_value", "", "adjusted for all that was looked at", ".1g"),
     Column("where", "", "times (s) that hold most of it"),
@@ -226,14 +229,7 @@ def print_answer(found: dict[str, Any], diagnosis: Diagnosis, location: Location
     ranked = ranked_rows(diagnosis)
     zero = next(r["evidence"] for r in ranked if r["name"] == "none")
     rows = [
-        (
-            r["name"],
-            r["evidence"] - zero,
-            r["rms_over_noise"],
-            r["p_value"],
-            r["confidence"],
-            "rough" if r["rough"] else "",
-        )
+        (r["name"], r["evidence"] - zero, r["rms_over_noise"], r["field"], r["confidence"], r["against"])
         for r in ranked[:MOST]
     ]
     _print(Table("srf.diagnose.hypotheses/1", HYPOTHESES, rows, "hypotheses", tuple(_notes(found))))
@@ -268,7 +264,10 @@ def _notes(found: dict[str, Any]) -> list[str]:
     for name, side in (("baseline", found["baseline"]), ("final model", found["augmented"])):
         held = side["holdout"]["rms_over_noise"]
         rest = "" if held is None else f", {held:.4g} in those held out"
-        notes.append(f"{name}: rms over noise {side['fit']['rms_over_noise']:.4g} in the runs fitted{rest}")
+        field = side["field"]
+        track = "needs no random friction" if field is None else f"needs random friction of {field['amplitude']:.2g}"
+        like = " with the final model's" if name == "baseline" and found["baseline"] != found["augmented"] else ""
+        notes.append(f"{name}: {track};{like} rms over noise {side['fit']['rms_over_noise']:.4g} in the runs fitted{rest}")
     notes += [f"{a} and {b} cannot be told apart by these recordings" for a, b in found["equivalent"]]
     notes += [f"{x['effect']} is not identifiable: {x['reason']}" for x in found["not_identifiable"]]
     notes += _missing(found.get("missing") or {})
@@ -283,7 +282,7 @@ def _missing(missing: dict[str, Any]) -> list[str]:
     if not missing:
         return []
     latent = missing["latent"]
-    notes = [f"a friction of {latent['amplitude']:.2g} that changes within {latent['time']:.2g} s is missing"]
+    notes = [f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"]
     for name, share in list(latent["coordinates"].items())[:1]:
         notes[0] += f"; a function of {name} is {100 * share:.0f} % of it"
     if missing["form"] is None:
@@ -365,20 +364,20 @@ def write_answer(
     Of a `parting` run an experiment for each hypothesis is written.
     """
     from srfcli.data.experiment import read_experiment
-    from srfcli.diagnosis.answer import final, material, run_views
+    from srfcli.diagnosis.answer import material, run_views
     from srfcli.diagnosis.augment import augment
     from srfcli.diagnosis.diagram import stability
     from srfcli.results.provenance import Provenance, write_sidecar
     from srfcli.results.tables import json_text
 
-    last = final(diagnosis)
+    last = diagnosis.final
     with whole_folder(folder, lambda: check_answer(folder, force=force)) as fresh:  # an hour may have passed
         text = (json_text(found, indent=2) + "\n").encode("utf-8")
         write_atomic(fresh / ANSWER, text)
         runs = diagnosis.experiment.runs
         inputs = (diagnosis.experiment.path, *dict.fromkeys(r.file for r in runs))
         made = Provenance(
-            arguments=Session.current().arguments, laws=last.fit.problem.model.laws, inputs=inputs, seed=seed,
+            arguments=Session.current().arguments, laws=last.fit.likelihood.problem.model.laws, inputs=inputs, seed=seed,
             timings={"diagnose": seconds},
         )  # fmt: skip
         write_sidecar(fresh / ANSWER, text, made)
@@ -396,12 +395,15 @@ def write_answer(
             shutil.copyfile(source, fresh / "augmented" / name)
         made_of = material(diagnosis, location)
         made_of["diagram"] = stability(
-            registry, diagnosis.experiment, diagnosis.baseline.fit.values,
+            registry, diagnosis.experiment, diagnosis.shown.fit.values,
             read_experiment(fresh / "augmented", registry=registry, format=reader),
         )  # fmt: skip
         _in_shown_units(made_of, diagnosis)
         if missing:
             made_of["force"] = missing["force"]
+            names = prediction_names(list(missing["csv"]), "missing")
+            for name, text in zip(names, missing["csv"].values(), strict=True):
+                write_atomic(fresh / name, text)
             if missing["toml"] is not None:
                 write_atomic(fresh / FORM, missing["toml"])
         if parting is not None:
@@ -476,14 +478,14 @@ def _report(folder: Path, found: dict[str, Any], made: dict[str, Any]) -> None:
         Session.current().say(f"Warning: no report: {type(error).__name__}: {error}")
 
 
-def prediction_names(runs: list[str]) -> list[str]:
-    """Return one file name per run, none twice even where case does not count."""
+def prediction_names(runs: list[str], word: str = "prediction") -> list[str]:
+    """Return one file name per run, none twice even where case does not count; they begin with `word`."""
     names: list[str] = []
     for run in runs:
         stem = re.sub(r"[^\w .-]+", "-", run).strip(" .") or "run"
-        name, number = f"prediction-{stem}.csv", 2
+        name, number = f"{word}-{stem}.csv", 2
         while name.lower() in (other.lower() for other in names):
-            name, number = f"prediction-{stem}-{number}.csv", number + 1
+            name, number = f"{word}-{stem}-{number}.csv", number + 1
         names.append(name)
     return names
 

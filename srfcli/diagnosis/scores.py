@@ -20,8 +20,14 @@ from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.errors import SrfError
 from srfcli.core.units import split_quantity, to_base
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.hypotheses import Excluded, inner_grid, neutral_values, own_parameters
-from srfcli.diagnosis.sensitivities import Shape, along_table
+from srfcli.diagnosis.hypotheses import (
+    Excluded,
+    Shape,
+    along_table,
+    inner_grid,
+    neutral_values,
+    own_parameters,
+)
 from srfcli.inference.recordings import slip_along
 from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns, filter_run
 from srfcli.laws.registry import Registry

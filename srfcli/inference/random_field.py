@@ -156,7 +156,7 @@ class Latent:
         return predict(
             problem.model, problem.experiment, run, problem.named(theta), by=problem.names if slopes else (),
             trend=None if run.holdout else problem.trend, tables=(tracks.spline(run),) if self.rough else (),
-            by_tables=(0,) if slopes and self.rough and run.name in tracks.of else (), hold=problem.hold,
+            by_tables=(0,) if slopes and self.rough and run.name in tracks.of else (),
             rtol=problem.rtol,
         )  # fmt: skip
 

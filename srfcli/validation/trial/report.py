@@ -8,7 +8,7 @@ from itertools import pairwise
 from math import log
 from typing import Any
 
-from srfcli.diagnosis.staged_search import CLOSE
+from srfcli.diagnosis.search import CLOSE
 from srfcli.results.tables import Column, Table
 from srfcli.validation.trial.blind import VERDICTS, Answer
 from srfcli.validation.trial.mark import CONFIDENT, INVISIBLE, KINDS, Mark
