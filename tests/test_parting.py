@@ -88,7 +88,8 @@ def found(diagnosis: Diagnosis) -> parting.Parting:
 def gap(diagnosis: Diagnosis, proposal: Proposal, true: str) -> float:
     """Return the log likelihood that the true hypothesis wins by a run of the generator's own motion and new noise."""
     e, run = diagnosis.experiment, run_of(proposal, diagnosis.experiment)
-    values = next(r for r in diagnosis.close if r.name == true).fit.values
+    fitted = next(f for f in diagnosis.close if f.name == true).fit
+    values = {n: fitted.values[n] for n in fitted.likelihood.problem.names}
     slider = replace(Physics(), **{FIELDS.get(name, name): value for name, value in values.items()})
     plan = Plan("x", proposal.drive, proposal.W0, proposal.interval, eps=proposal.eps, f=proposal.f,
                 onset=proposal.onset, steps=proposal.steps)  # fmt: skip
@@ -170,7 +171,7 @@ def test_one_class_is_said_to_be_one(diagnosis: Diagnosis, monkeypatch: pytest.M
     double = replace(first, hypothesis=Hypothesis((replace(effect, name="double", answers="double"),)))
     best = parting_experiment(SHIPPED, replace(diagnosis, close=(first, double, second)))
     assert best is not None and best.names == (first.name, "double", second.name)
-    assert best.gain < 1e-6 < LEAST and not best.parts and best.repeats is None
+    assert best.gain < 1e-3 < LEAST and not best.parts and best.repeats is None
     assert "one class" in sentences(best)[0] and first.name in sentences(best)[0]
 
 

@@ -42,7 +42,7 @@ srf fit found/augmented                              the augmented model is an e
 
 @click.command("diagnose", cls=SrfCommand, epilog=EXAMPLES)
 @click.argument("source", metavar="EXPERIMENT", type=click.Path(path_type=Path))
-@click.option("--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect only; may be repeated.")
+@click.option("--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable.")
 @click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
 @plugins_option
 @click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
@@ -79,7 +79,7 @@ def _check_effects(registry: Registry, effects: tuple[str, ...]) -> None:
 
     if not effects:
         return
-    known = {e.name for e in registry.entries("effect")}
+    known = {e.name for e in (*registry.entries("effect"), *registry.entries("ageing"))}
     known |= {law.reported for e in registry.entries("effect") if isinstance(law := registry.load(e), Effect)}
     for name in effects:
         if name not in known:

@@ -126,7 +126,7 @@ def together(views: Sequence[RunView], place: int) -> float | None:
 def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
     """Return the arrays and tables of which figures and report are made, by name."""
     windows = {r.name: [list(w) for w in r.windows] for r in location.runs}
-    friction = [unexplained_friction(f) for f in (diagnosis.baseline, diagnosis.final)]
+    friction = [unexplained_friction(f, with_parameters=False) for f in (diagnosis.baseline, diagnosis.final)]
     runs = []
     for v in run_views(diagnosis):
         runs.append({

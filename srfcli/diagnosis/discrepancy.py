@@ -29,6 +29,7 @@ from srfcli.core.units import from_base
 from srfcli.diagnosis.hypotheses import own_parameters
 from srfcli.diagnosis.search import CLOSE, Fitted, ModelSearch
 from srfcli.diagnosis.verdict import HELD, Diagnosis, Held, at_bounds, held_out
+from srfcli.inference.fit import root
 from srfcli.inference.recordings import slip_along
 from srfcli.laws.effect_file import formula_text
 from srfcli.laws.expression import symbol
@@ -40,6 +41,7 @@ from srfcli.symbolic.system import apart
 # The friction that is missing, along the recordings.
 
 NORMAL = 1.959963984540054  # standard deviations of a 95 % band
+STEP = 0.2  # standard errors of the differences that tell what the parameters' errors do to it
 BINS = 12  # in which the force is averaged along a quantity of state
 COORDINATES = ("v", "phi", "W", "dlnWdt", "slip", "t")
 
@@ -74,19 +76,34 @@ class RunForce:
         return "\n".join([",".join(heads), *rows]) + "\n"
 
 
-def unexplained_friction(fitted: Fitted) -> dict[str, RunForce]:
-    """Return the friction of each fitted run that the model leaves to its random field; nothing of a model without one."""
+def unexplained_friction(fitted: Fitted, *, with_parameters: bool = True) -> dict[str, RunForce]:
+    """Return the friction of each fitted run that the model leaves to its random field; nothing of a model without one.
+
+    The band is that of the field given the recordings, and of the parameters, to first order, unless that is left out.
+    """
     if fitted.fit.smooth:
         return {}
-    states = list(fitted.fit.likelihood.problem.model.states)
+    likelihood, maximum = fitted.fit.likelihood, fitted.fit.maximum
+    states = list(likelihood.problem.model.states)
     at, age = states.index("field"), next(i for i, s in enumerate(states) if s.startswith("ln_") and s != "ln_v")
+
+    def field_of(x: Array) -> list[Array]:
+        return [f.smoothed().mean[:, at] for f in likelihood.at(x, slopes=False, keep=True).runs]
+
+    smoothed = [f.smoothed() for f in fitted.remainder.runs]
+    variance = [np.maximum(s.covariance[:, at, at], 0.0) for s in smoothed]
+    free = np.nonzero(np.diag(maximum.covariance) > 0)[0] if with_parameters else np.zeros(0, dtype=int)
+    for direction in root(maximum.covariance[np.ix_(free, free)]).T:
+        x = maximum.point.x.copy()
+        x[free] += STEP * direction
+        for own, s, moved in zip(variance, smoothed, field_of(x), strict=True):
+            own += np.nan_to_num((moved - s.mean[:, at]) / STEP) ** 2
     found = {}
-    for f in fitted.remainder.runs:
-        smoothed = f.smoothed()
-        x, sd = smoothed.mean, np.sqrt(np.maximum(smoothed.covariance[:, at, at], 0.0))
+    for f, s, own in zip(fitted.remainder.runs, smoothed, variance, strict=True):
+        x, spread = s.mean, NORMAL * np.sqrt(own)
         W, W_dot = f.run.load(f.run.t)
         found[f.run.name] = RunForce(
-            f.run.t, x[:, at], x[:, at] - NORMAL * sd, x[:, at] + NORMAL * sd, np.exp(x[:, states.index("ln_v")]),
+            f.run.t, x[:, at], x[:, at] - spread, x[:, at] + spread, np.exp(x[:, states.index("ln_v")]),
             np.exp(x[:, age]), W, W_dot / W, slip_along(f.run, x, tuple(states)),
         )  # fmt: skip
     return found

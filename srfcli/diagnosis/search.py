@@ -18,6 +18,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.goodness_of_fit import log_evidence, shortcomings
@@ -37,6 +38,7 @@ from srfcli.laws.values import Effect
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, each at p = 1e-6
 CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
 LARGEST = 2  # effects of a model
+ALIKE = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
 SINGLES, PAIRS = 5, 3  # promises of each model that are followed
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 COARSE = 1e-3  # tolerance of the integration: 0.02 in log likelihood
@@ -94,6 +96,7 @@ class _Move:
     least: float = field(compare=False, default=-np.inf)  # log likelihood from which it is worth a fit
     fresh: int = field(compare=False, default=0)  # how many of the last effects are at sizes that are only expected
     again: bool = field(compare=False, default=False)  # fitted before, from other sizes
+    direction: Array | None = field(compare=False, default=None)  # of what its last effect is expected to explain
 
 
 class ModelSearch:
@@ -118,6 +121,7 @@ class ModelSearch:
     ) -> None:
         self.registry, self.experiment, self.progress, self.trend = registry, experiment, progress, trend
         self.candidates, self.excluded = applicable(registry, experiment, effects)
+        self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]
         self.budget, self.threads, self.begun = budget, threads, time.process_time()
         self.fitted: dict[str, Fitted] = {}
         self.queue: list[_Move] = []
@@ -215,26 +219,41 @@ class ModelSearch:
         return time.process_time() - self.begun > self.budget
 
     def _search(self) -> None:
-        while self.queue and not self.spent:
-            move = heapq.heappop(self.queue)
+        """Fit what comes close to the best model, or would mend it; expand the best once nothing does."""
+        while not self.spent:
             best = self.best()
-            if -move.expected < best.evidence + (-CLOSE if best.fine else CLOSE):
-                break  # nothing that is left comes close, or would mend what is wrong
-            if move.hypothesis.name in self.fitted and self.fitted[move.hypothesis.name].evidence > -move.expected - WORTH:
+            least = best.evidence + (-CLOSE if best.fine else CLOSE)
+            if not self.queue or -self.queue[0].expected < least:
+                if best.scores is not None or len(best.hypothesis.effects) >= LARGEST:
+                    break
+                self._expand(best)
                 continue
-            self.progress(f"{move.hypothesis.name}: expected log evidence {-move.expected:.1f}, best {best.evidence:.1f}")
+            move = heapq.heappop(self.queue)
+            name = move.hypothesis.name
+            if name in self.fitted and self.fitted[name].evidence > -move.expected - WORTH:
+                continue
+            self.progress(f"{name}: expected log evidence {-move.expected:.1f}, best {best.evidence:.1f}")
             try:
                 found = self._record(self.fit(move))
             except SrfError as error:
-                self.excluded.append(Excluded(move.hypothesis.name, error.message))
+                self.excluded.append(Excluded(name, error.message))
                 continue
+            self._revise(move, found)
             if found is self.best() and not found.fine and not move.again:
                 again = self._again(found)
                 if again:
                     heapq.heappush(self.queue, again)
-                    continue
-            if found is self.best() and len(found.hypothesis.effects) < LARGEST:
-                self._expand(found)
+
+    def _revise(self, move: _Move, found: Fitted) -> None:
+        """Raise what is expected of effects that are like a fitted one at first order by what that gained beyond its promise."""
+        surprise = found.evidence + move.expected
+        if move.direction is None or surprise <= 0:
+            return
+        for other in self.queue:
+            own = other.direction
+            if own is not None and own.size == move.direction.size and abs(float(own @ move.direction)) > ALIKE:
+                other.expected -= surprise
+        heapq.heapify(self.queue)
 
     def _expand(self, node: Fitted) -> Fitted:
         """Push what a fitted model promises: one more effect, two at once, something built in, another ageing law."""
@@ -253,7 +272,8 @@ class ModelSearch:
             least = HINT
         for score in [s for s in scores.singles if s.gain > least][:SINGLES]:
             hypothesis = Hypothesis((*present, score.effect), node.hypothesis.ageing)
-            self._push(node.evidence + score.gain + one, hypothesis, node, (*self._sizes(node), score.values))
+            sizes = (*self._sizes(node), score.values)
+            self._push(node.evidence + score.gain + one, hypothesis, node, sizes, direction=score.direction)
         if not node.fine:
             for effect in (e for e in joining if e.settings or e.observed):
                 self._build(node, effect, one)
@@ -269,12 +289,20 @@ class ModelSearch:
         )
 
     def _push(
-        self, expected: float, hypothesis: Hypothesis, parent: Fitted, sizes: tuple[dict[str, float], ...]
+        self,
+        expected: float,
+        hypothesis: Hypothesis,
+        parent: Fitted,
+        sizes: tuple[dict[str, float], ...],
+        direction: Array | None = None,
     ) -> None:
         self.count += 1
         fresh = len(hypothesis.effects) - len(parent.hypothesis.effects)
         least = parent.fit.log_likelihood - ASTRAY
-        heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(parent.fit.values), sizes, least, fresh))
+        move = _Move(
+            -expected, self.count, hypothesis, dict(parent.fit.values), sizes, least, fresh, direction=direction
+        )
+        heapq.heappush(self.queue, move)
 
     def _likelihood(self, hypothesis: Hypothesis, node: Fitted, name: str) -> Likelihood | None:
         """Return the likelihood of a model beside a fitted one; what cannot be joined is left out, with the reason."""
@@ -344,11 +372,11 @@ class ModelSearch:
     def _swap(self, node: Fitted) -> None:
         """Push the other registered ageing laws, each after a few steps from where the model stands."""
         stated, *modifiers = self.experiment.choice.ageing.split("+")
-        for entry in self.registry.entries("ageing"):
-            if entry.name == stated:
+        for name in self.laws:
+            if name == stated:
                 continue
-            hypothesis = Hypothesis((), "+".join([entry.name, *modifiers]))
-            likelihood = self._likelihood(hypothesis, node, entry.name)
+            hypothesis = Hypothesis((), "+".join([name, *modifiers]))
+            likelihood = self._likelihood(hypothesis, node, name)
             if likelihood is None:
                 continue
             x = likelihood.coordinates(_followable(node.fit.values, likelihood.problem))

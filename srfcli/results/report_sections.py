@@ -213,6 +213,8 @@ def _run(matter: Matter, one: Trace) -> Markup:
     where = f"; they part at the shaded times, furthest from {spans([one.worst])}" if one.worst else ""
     alt = f"Run {one.name}: recording, simulations and residuals over time{where}."
     caption = f"{one.name}: residual over noise {fell}{where}. Dotted lines: two standard deviations of the noise."
+    if one.unexplained is not None:
+        caption += " Random friction is what each model, left to itself, takes for the track's."
     return matter.figure(f"run {one.name}", alt, caption)
 
 

@@ -95,7 +95,7 @@ def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
             return guess
     try:
         roots = [r for r in sp.solve(reduced, y) if not r.has(sp.I)]
-    except NotImplementedError:
+    except (NotImplementedError, TypeError):  # the latter where sympy compares symbols on its way
         roots = []
     if not roots:
         raise SrfError(
