@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from srfcli.tasks.boundary import continue_boundary as continue_boundary
     from srfcli.tasks.boundary import critical as critical
     from srfcli.tasks.compare import compare as compare
+    from srfcli.tasks.diagnose import diagnose as diagnose
     from srfcli.tasks.fit import fit as fit
     from srfcli.tasks.floquet import floquet as floquet
     from srfcli.tasks.linear import linear as linear
@@ -46,6 +47,7 @@ PUBLIC = {
     "load_law": "srfcli.codegen.slider",
     "map": "srfcli.tasks.map",
     "compare": "srfcli.tasks.compare",
+    "diagnose": "srfcli.tasks.diagnose",
     "fit": "srfcli.tasks.fit",
     "read_experiment": "srfcli.tasks.recordings",
     "simulate": "srfcli.tasks.simulate",

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from srfcli.cli.diagnose import prediction_names
 from srfcli.cli.main import cli
 from srfcli.diagnosis.search import Fitted, ModelSearch
 from srfcli.diagnosis.verdict import UNEXPLAINED
+from srfcli.results.diagnosis import prediction_names
 
 ALPHA = 0.03
 TOML = """format = "srf-experiment/1"
