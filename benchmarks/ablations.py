@@ -6,10 +6,10 @@
 BANK is a folder of cases as `srf prove` makes, TRUTHS their truths, answers.jsonl and known.jsonl those of the trial: what the
 whole diagnosis said of the same cases, and what was visible. The first N cases are taken, all of them if left out.
 
-colour      noise is taken for white, of the level it has: nothing is whitened, neither in fits nor in scores nor in the
-            question whether noise is left
-projection  effects are scored by what they explain of the misfit alone: what the baseline's parameters or a rough track
-            could explain as well is not taken off
+field       friction is deterministic: no model has a random friction field
+colour      the gauge's noise is white in every model
+projection  effects are scored by what they explain of the misfit alone: what parameters, field or gauge noise could explain as
+            well is not taken off
 
 What the held-out runs are worth, and what the Bayesian information criterion alone would choose, needs no second diagnosis:
 those tables are in the trial's own report.
@@ -20,20 +20,17 @@ from __future__ import annotations
 import argparse
 import functools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import common  # noqa: F401  before NumPy: it fixes the number of threads
-import numpy as np
 from common import Report
 from marked import heading, marked, tell
 
 from srfcli.codegen.model import Array
 from srfcli.core.parallel import run_processes
-from srfcli.data.values import Run
-from srfcli.diagnosis.staged_search import Search
-from srfcli.inference.noise import Noise
-from srfcli.inference.random_field import LatentFit
+from srfcli.diagnosis.scores import Remainder
+from srfcli.diagnosis.search import ModelSearch
 from srfcli.validation.blind import Answer, Task, answer_case, diagnose_case, failed, read_answers, write_answers
 from srfcli.validation.cases import unseal
 from srfcli.validation.marks import rate
@@ -41,24 +38,33 @@ from srfcli.validation.marks import rate
 LIMIT = 1800.0  # s of CPU
 
 
-class WithoutColour(Search):
-    """The search with white noise."""
+class WithoutField(ModelSearch):
+    """The search without a random friction field."""
 
-    def gauged(self, runs: Sequence[Run], residuals: Mapping[str, Array]) -> dict[str, Noise]:
-        """Return noise of the right level and no colour."""
-        return {name: Noise(noise.level) for name, noise in super().gauged(runs, residuals).items()}
+    options: ClassVar[Mapping[str, Any]] = {"smooth": True}
 
 
-class WithoutProjection(Search):
+class WithoutColour(ModelSearch):
+    """The search with white gauge noise."""
+
+    options: ClassVar[Mapping[str, Any]] = {"processes": 0}
+
+
+class Bare(Remainder):
+    """What a fit leaves, nothing of it taken off."""
+
+    def free(self, columns: Array) -> Array:
+        """Return columns as they are."""
+        return columns
+
+
+class WithoutProjection(ModelSearch):
     """The search whose scores take nothing off."""
 
-    def tangent(self, fitted: LatentFit) -> LatentFit:
-        """Return the fit as if no parameter and no track changed the prediction."""
-        flat = {n: replace(p, J=np.zeros_like(p.J)) for n, p in fitted.point.predictions.items()}
-        return replace(fitted, point=replace(fitted.point, predictions=flat))
+    remainder = Bare
 
 
-PARTS: dict[str, type[Search]] = {"colour": WithoutColour, "projection": WithoutProjection}
+PARTS: dict[str, type[ModelSearch]] = {"field": WithoutField, "colour": WithoutColour, "projection": WithoutProjection}
 
 
 def answered(bank: Path, part: str, names: Sequence[str], workers: int, kept: Path | None) -> Iterator[Answer]:

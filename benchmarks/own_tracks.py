@@ -1,6 +1,6 @@
-"""The best-first search over state-space fits where each run has a random friction field of its own.
+"""The diagnosis where each run has a random friction field of its own.
 
-usage: own_tracks.py [--repeats N] [--workers N] [--staged]      N cases of each effect, 1 if left out; by the staged search
+usage: own_tracks.py [--repeats N] [--workers N]      N cases of each effect, 1 if left out
 
 Cases are drawn like those of a sealed trial (`srf prove`), by the same independent generator, but the slider is set down anew
 before each run: amplitudes of 1e-4 and 3e-4 in turn, correlation lengths of 3 to 30 um. They are not sealed.
@@ -24,13 +24,13 @@ EFFECTS = (
 )  # fmt: skip
 
 
-def one(task: tuple[tuple[str, ...], float, int, bool]) -> tuple[str, str, bool, float]:
+def one(task: tuple[tuple[str, ...], float, int]) -> tuple[str, str, bool, float]:
     """Return the verdict, the names, whether both are right, and the CPU it took."""
-    from srfcli.validation.blind import SEARCHES
+    from srfcli.validation.blind import diagnose_case
     from srfcli.validation.cases import case_files, draw_recipe, read_gauge
     from srfcli.validation.slider import Track, move
 
-    effects, amplitude, seed, staged = task
+    effects, amplitude, seed = task
     rng = np.random.default_rng([seed, int(1e6 * amplitude), 7])
     recipe = draw_recipe(rng, effects=list(effects) if effects else None, kind=None if effects else "none", rough=amplitude)
     readings = {}
@@ -44,7 +44,7 @@ def one(task: tuple[tuple[str, ...], float, int, bool]) -> tuple[str, str, bool,
         for file, text in case_files("own tracks", recipe.baseline, readings).items():
             (folder / file).write_text(text, encoding="utf-8")
         begun = time.process_time()
-        found = SEARCHES["staged" if staged else "state-space"](folder, ())
+        found = diagnose_case(folder, ())
     used = time.process_time() - begun
     listed = all(e.listed for e in recipe.effects)
     if not effects:
@@ -60,11 +60,10 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--staged", action="store_true")
     asked = parser.parse_args()
-    report = common.Report("own_tracks" + ("_staged" if asked.staged else ""), __doc__ or "")
+    report = common.Report("own_tracks", __doc__ or "")
     tasks = [
-        (effects, (1e-4, 3e-4)[number % 2], seed, asked.staged)
+        (effects, (1e-4, 3e-4)[number % 2], seed)
         for seed in range(asked.repeats)
         for number, effects in enumerate(EFFECTS)
     ]

@@ -44,10 +44,7 @@ from srfcli.codegen.model import open_model
 from srfcli.data.experiment import read_experiment
 from srfcli.data.noise import describe_noise
 from srfcli.data.values import Run
-from srfcli.diagnosis.hypotheses import Hypothesis
-from srfcli.diagnosis.nudging import FOLLOWED, PULLS, Follower
-from srfcli.inference.fit import first_level
-from srfcli.inference.noise import Noise
+from srfcli.diagnosis.search import ModelSearch
 from srfcli.laws.registry import Registry, load_registry
 from srfcli.validation.blind import FAILED, Answer, failed, read_answers, write_answers
 from srfcli.validation.cases import unseal
@@ -58,24 +55,20 @@ LEAST_NOISE = 0.005  # um
 
 
 def fitted_baseline(registry: Registry, folder: Path, kept: Path | None) -> tuple[dict[str, float], float]:
-    """Return the baseline's parameters as the diagnosis begins, while held, then free if the model follows; and CPU s."""
+    """Return the baseline's parameters as the diagnosis fits them, on a random friction field, and CPU s."""
     path = kept / f"{folder.parent.name}-{folder.name}.json" if kept else None
     if path is not None and path.exists():
         found = json.loads(path.read_text(encoding="utf-8"))
     else:
         begun = time.process_time()
         experiment = read_experiment(folder, registry=registry, holdout=False)
-        follower, bare = Follower(registry, experiment, None), Hypothesis()
-        noise = {r.name: Noise(first_level(r)) for r in experiment.runs if not r.holdout}
-        place, held = follower.led(bare, {}, noise, PULLS[0])
-        free = follower.released(bare, place, held, noise)
-        found = {"names": free.problem.names, "place": place.tolist(), "free": free.theta.tolist()}
-        found |= {"reduced": free.reduced, "cpu": [time.process_time() - begun]}
+        fitted = ModelSearch(registry, experiment).fit(None)
+        names = fitted.fit.likelihood.problem.names
+        found = {"values": {n: fitted.fit.values[n] for n in names}, "cpu": [time.process_time() - begun]}
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps(found), encoding="utf-8")
-    best = found["free" if found["reduced"] < FOLLOWED else "place"]
-    return dict(zip(found["names"], best, strict=True)), sum(found["cpu"])
+    return found["values"], sum(found["cpu"])
 
 
 def noise_of(run: Run) -> tuple[float, float]:

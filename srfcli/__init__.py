@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from srfcli.codegen.slider import system as system
     from srfcli.core.errors import SrfError as SrfError
     from srfcli.core.errors import Status as Status
+    from srfcli.tasks.diagnose import diagnose as diagnose
     from srfcli.tasks.map import compare as compare
     from srfcli.tasks.map import map as map
     from srfcli.tasks.recordings import fit as fit
@@ -46,6 +47,7 @@ PUBLIC = {
     "load_law": "srfcli.codegen.slider",
     "map": "srfcli.tasks.map",
     "compare": "srfcli.tasks.map",
+    "diagnose": "srfcli.tasks.diagnose",
     "fit": "srfcli.tasks.recordings",
     "read_experiment": "srfcli.tasks.recordings",
     "simulate": "srfcli.tasks.simulate",

@@ -128,7 +128,9 @@ def fitted(experiment: Experiment, **values: tuple[float, float, float, str]) ->
     listed = tuple(FitParameter(n, *v[:3], False, v[3]) for n, v in values.items())
     kept = tuple(q for q in experiment.parameters if q.name not in values)
     return SimpleNamespace(
-        problem=SimpleNamespace(experiment=replace(experiment, parameters=(*kept, *listed))),
+        likelihood=SimpleNamespace(
+            problem=SimpleNamespace(experiment=replace(experiment, parameters=(*kept, *listed)))
+        ),
         values={n: v[0] for n, v in values.items()},
     )
 

@@ -9,9 +9,11 @@ import pytest
 
 from srfcli.codegen.c_source import compiler
 from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.goodness_of_fit import log_evidence
 from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.scores import Remainder, Scores
-from srfcli.diagnosis.search import CLOSE, ModelSearch, conclude, log_evidence
+from srfcli.diagnosis.search import CLOSE, ModelSearch
+from srfcli.diagnosis.verdict import conclude
 from srfcli.inference.state_space import COLOUR, Likelihood, correlated, fit_state_space
 from srfcli.laws.registry import bundled_registry
 from srfcli.validation.cases import Gauge, case_files, read_gauge
@@ -75,7 +77,7 @@ def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(tmp_path):
     description.write_text(description.read_text().replace('ageing = "dieterich"', 'ageing = "perrin-rice-zheng"'))
     experiment = read_experiment(folder, registry=SHIPPED, holdout=False)
     candidates, _ = applicable(SHIPPED, experiment, FEW)
-    problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
+    problem = Hypothesis().problem(SHIPPED, experiment)
     begun = Likelihood(problem)
     fitted = fit_state_space(problem, start=begun.values(begun.start), processes=0, close=1e3)
     scores = Scores(SHIPPED, experiment, Remainder(fitted), (), candidates)
@@ -88,16 +90,16 @@ def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(tmp_path):
 def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
     """The column of an effect against the likelihood of the model that has it, a little from its neutral value."""
     experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
-    problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
+    problem = Hypothesis().problem(SHIPPED, experiment)
     fitted = fit_state_space(problem, processes=0)
     effect = SHIPPED.get("effect", name)
     scores = Scores(SHIPPED, experiment, Remainder(fitted), (), [effect])
     column = scores.columns[len(scores.columns) // 2]
-    model = Hypothesis((effect,)).model(SHIPPED, experiment, rough=False, random_field=True)
+    model = Hypothesis((effect,)).model(SHIPPED, experiment)
     longs = {p.name: long for long, p in own_parameters(effect, model).items()}
     values = dict(fitted.values) | {longs[n]: v for n, v in column.inner.items()}
     size = scores.singles[0].stderr * 0.3
-    wider = Hypothesis((effect,)).problem(SHIPPED, experiment, rough=False, at=values, random_field=True)
+    wider = Hypothesis((effect,)).problem(SHIPPED, experiment, at=values)
     gained = []
     for step in (size, -size):
         likelihood = Likelihood(wider, smooth=fitted.smooth, rtol=1e-6)
@@ -114,7 +116,7 @@ def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
 def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, shared):
     """The gain of a shared field against a Gaussian density with its covariance written out, and its sign."""
     experiment = read_experiment(recorded(tmp_path, Physics(), shared=shared), registry=SHIPPED, holdout=False)
-    fitted = fit_state_space(Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True), processes=0)
+    fitted = fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=0)
     remainder = Remainder(fitted)
     assert (remainder.shared.gain > CLOSE) == shared
     if shared:
@@ -129,7 +131,7 @@ def test_coloured_gauge_noise_is_not_taken_for_a_fine_field(tmp_path):
     """From the file's start values the fit is as likely as from the field that was drawn."""
     folder = recorded(tmp_path, Physics(), gauge=Gauge(lag1=0.7))
     experiment = read_experiment(folder, registry=SHIPPED, holdout=False)
-    problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
+    problem = Hypothesis().problem(SHIPPED, experiment)
     found = fit_state_space(problem)
     drawn = {"field_amplitude": 3e-4, "field_length": 6.0 * np.sqrt(3)}
     assert found.log_likelihood > fit_state_space(problem, start=drawn, processes=1, smooth=False).log_likelihood - 1.0
@@ -138,6 +140,6 @@ def test_coloured_gauge_noise_is_not_taken_for_a_fine_field(tmp_path):
 
 def test_evidence_charges_for_what_is_free(tmp_path):
     experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
-    problem = Hypothesis().problem(SHIPPED, experiment, rough=False, random_field=True)
+    problem = Hypothesis().problem(SHIPPED, experiment)
     fitted = fit_state_space(problem, processes=0)
     assert log_evidence(fitted) < fitted.log_likelihood - 10.0

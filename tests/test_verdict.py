@@ -1,151 +1,142 @@
-"""From fits to a verdict, with fits that are made up: who is asked, what counts as nothing, and what held-out runs are worth."""
+"""From fits to a verdict, with fits that are made up: what counts as nothing, as one answer, and what held-out runs are worth."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from srfcli.core.settings import Parameter
-from srfcli.data.values import Run
 from srfcli.diagnosis import verdict as module
-from srfcli.diagnosis.hypotheses import neutral_values
-from srfcli.diagnosis.staged_score import Score
-from srfcli.diagnosis.verdict import _noise_for, conclude, interesting, undetermined
-from srfcli.inference.noise import Noise
+from srfcli.diagnosis.hypotheses import Hypothesis, neutral_values
+from srfcli.diagnosis.scores import Score
+from srfcli.diagnosis.verdict import HELD, UNEXPLAINED, conclude, interesting
 from srfcli.laws.registry import bundled_registry
-from srfcli.motion.imposed import ConstantLoad, Drive
 
 SHIPPED = bundled_registry()
+SEEN, HIDDEN = 1e-9, 1e9  # sizes that could have been seen
 
 
-def effect(name):
-    return SHIPPED.get("effect", name)
+def score(name, detectable, direction=(1.0, 0.0)):
+    return Score(SHIPPED.get("effect", name), 1.0, {}, 0.0, 1.0, detectable, 0.5, np.array(direction))
 
 
-def refit(*names, evidence, fine=True, rough=False):
-    effects = tuple(effect(n) for n in names)
+def fitted(*names, evidence, fine=True, scores=()):
+    hypothesis = Hypothesis(tuple(SHIPPED.get("effect", n) for n in names))
     return SimpleNamespace(
-        name="+".join(names) or "none", evidence=evidence, rough=rough, fit=SimpleNamespace(point=None),
-        hypothesis=SimpleNamespace(effects=effects, reported=tuple(e.reported for e in effects)),
-        adequacy=SimpleNamespace(fine=fine, rms_over_noise=1.0 if fine else 1.05, p_value=0.5 if fine else 1e-9),
+        hypothesis=hypothesis, name=hypothesis.name, evidence=evidence, fine=fine,
+        against=() if fine else ("a stretch of steps is off",), promised=scores,
     )  # fmt: skip
 
 
-def score(name, detectable):
-    return Score(effect(name), 1.0, {}, 0.0, 1.0, 0.5, detectable, np.array([1.0, 0.0]))
+def held(rms, gain=1.0, whole=True):
+    white = rms * np.where(np.arange(400) % 2, 1.0, -1.0)
+    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain)
 
 
-def search(*refits, scored=None, late=()):
-    """A search that has ended; `late` are the scores that it finds when it is asked for those that it has not."""
-    found = SimpleNamespace(
-        ranked=lambda: sorted(refits, key=lambda r: -r.evidence), tried={(r.name, r.rough): r for r in refits},
-        scored=dict(scored or {}), experiment=SimpleNamespace(runs=()), registry=SHIPPED, effects=None, excluded=[],
-        noise={}, trend=None, asked=[],
-    )  # fmt: skip
-    found.score = lambda baseline, candidates: found.asked.append(baseline.name) or list(late)
-    return found
+@pytest.fixture
+def concluded(monkeypatch):
+    """Return the verdict on a search that ended with some fits; `held` are the held-out runs."""
+
+    def verdict(*fits, held=()):
+        monkeypatch.setattr(module, "held_out", lambda *_: tuple(held))
+        monkeypatch.setattr(module, "on_the_track_of", lambda best, baseline: baseline)
+        monkeypatch.setattr(module, "at_bounds", lambda best: [])
+        ranked = sorted(fits, key=lambda f: -f.evidence)
+        baseline = next(f for f in fits if f.name == "none")
+        return conclude(
+            SimpleNamespace(ranked=lambda: ranked, baseline=baseline, excluded=[]), SimpleNamespace(runs=())
+        )
+
+    return verdict
 
 
-@pytest.fixture(autouse=True)
-def no_recording(monkeypatch):
-    monkeypatch.setattr(module, "applicable", lambda *_: ([], []))
-    monkeypatch.setattr(module, "likeliest_bump", lambda point: None)
-
-
-def concluded(found):
-    return conclude(found, SimpleNamespace(runs=()))
-
-
-SEEN = {("none", False): [score("viscous-drag", 1e-9)]}
-HIDDEN = [score("viscous-drag", 1e9), score("linker-dieterich", 1e9)]
+LOST = fitted(evidence=0.0, fine=False)
 
 
 @pytest.mark.parametrize(
     ("evidence", "said"), [(98.0, ("identified", ("viscous-drag",))), (90.0, ("unknown", ()))], ids=["hardly", "far"]
 )
-def test_one_hypothesis_that_is_fine_is_taken_where_one_that_is_not_is_hardly_ahead_of_it(evidence, said):
+def test_a_model_that_passes_is_taken_where_one_that_does_not_is_hardly_ahead_of_it(concluded, evidence, said):
     found = concluded(
-        search(
-            refit("slip-evolution", evidence=100.0, fine=False),
-            refit("viscous-drag", evidence=evidence),
-            refit(evidence=0.0, fine=False),
-            scored=SEEN,
-        )
+        fitted("slip-evolution", evidence=100.0, fine=False), fitted("viscous-drag", evidence=evidence), LOST
     )
     assert (found.verdict, found.effects) == said
+    assert found.final is (found.best if said[1] else found.ranked[0])
 
 
-def test_a_further_effect_that_gains_little_is_not_named():
-    pair = refit("viscous-drag", "slip-evolution", evidence=103.0)
-    found = concluded(search(pair, refit("viscous-drag", evidence=100.0), refit(evidence=0.0, fine=False), scored=SEEN))
+def test_a_further_effect_that_gains_little_is_not_named(concluded):
+    pair = fitted("viscous-drag", "slip-evolution", evidence=103.0)
+    found = concluded(pair, fitted("viscous-drag", evidence=100.0), LOST)
     assert (found.verdict, found.effects) == ("identified", ("viscous-drag",))
 
 
-@pytest.mark.parametrize(("late", "verdict"), [(HIDDEN, "inconclusive"), (SEEN["none", False], "none")])
-def test_nothing_is_said_to_be_missing_only_after_asking_what_could_have_been_seen(late, verdict):
-    """The baseline that is left over stands on a rough track, around which nothing was scored yet."""
-    found = search(
-        refit(evidence=99.0, rough=True), refit("viscous-drag", evidence=100.0), refit(evidence=0.0, fine=False),
-        scored={("none", False): []}, late=late,
-    )  # fmt: skip
-    answer = concluded(found)
-    assert (found.asked, answer.verdict, len(answer.scores)) == (["none"], verdict, len(late))
+def test_models_that_do_equally_well_are_all_named(concluded):
+    found = concluded(fitted("slip-evolution", evidence=101.0), fitted("viscous-drag", evidence=99.0), LOST)
+    assert (found.verdict, set(found.effects)) == ("ambiguous", {"viscous-drag", "slip-evolution"})
+    assert 0.5 < found.confidence["slip-evolution"] < 0.75 and sum(found.confidence.values()) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("late", [HIDDEN, SEEN["none", False]], ids=["inconclusive", "none"])
-def test_a_bump_is_something_and_no_merit_of_held_out_runs(late, monkeypatch):
-    bump = SimpleNamespace(p_value=1e-9, place=12.0, width=0.8, height=1e-3)
-    monkeypatch.setattr(module, "likeliest_bump", lambda point: bump)
-    answer = concluded(search(refit(evidence=99.0, rough=True), late=late))
-    assert (answer.verdict, answer.ungated) == ("unknown", "unknown")
-    assert "bump at 12.0 um" in answer.reasons[-1]
+@pytest.mark.parametrize(
+    ("sizes", "verdict"), [((SEEN, SEEN), "none"), ((SEEN, HIDDEN), "none"), ((HIDDEN, HIDDEN), "inconclusive")]
+)
+def test_nothing_is_missing_only_where_it_could_have_been_seen(concluded, sizes, verdict):
+    scores = [score(n, size) for n, size in zip(("viscous-drag", "linker-dieterich"), sizes, strict=True)]
+    found = concluded(fitted(evidence=0.0, scores=scores))
+    assert found.verdict == verdict and found.final is found.baseline
+    assert found.detectable == {"viscous-drag": sizes[0], "linker-dieterich": sizes[1]}
 
 
-def run(name, observable):
-    t = 0.004 * np.arange(200)
-    return Run(name, Path("x"), False, 0.0, "steady", t, np.zeros(t.size), observable, np.ones(t.size, bool),
-               Drive.steps([(0.0, 10.0)]), ConstantLoad(7.0), 0.21, None, 0.0, ())  # fmt: skip
+@pytest.mark.parametrize(
+    ("runs", "verdict"),
+    [
+        ([held(1.0)], "identified"),
+        ([held(1.0), held(1.5 * HELD)], "unknown"),
+        ([held(1.0, gain=-3.0)], "unknown"),
+        ([held(1.0, gain=-3.0), held(1.0, gain=5.0)], "identified"),
+        ([held(1.0, whole=False)], "unknown"),
+    ],
+    ids=["predicted", "not predicted", "worse than by the baseline", "better in all", "not followed"],
+)
+def test_held_out_runs_refuse(concluded, runs, verdict):
+    found = concluded(fitted("viscous-drag", evidence=100.0), LOST, held=runs)
+    assert (found.verdict, found.ungated) == (verdict, "identified")
+    assert ("held-out" in found.reasons[-1]) is (verdict == "unknown")
 
 
-@pytest.mark.parametrize(("observable", "level"), [("elongation", 0.02), ("force", 0.004), ("friction", 0.02)])
-def test_the_noise_of_a_held_out_run_is_that_of_the_same_observable(observable, level):
-    """Where there is none, that of any."""
-    fitted = [run("a", "elongation"), run("b", "force")]
-    found = SimpleNamespace(
-        experiment=SimpleNamespace(runs=fitted), noise={"a": Noise(0.02, (), 0.02), "b": Noise(0.004, (), 0.004)}
-    )
-    assert _noise_for(found, run("c", observable)).level == level
+def test_a_baseline_that_passes_is_refused_by_held_out_runs_too(concluded):
+    assert concluded(fitted(evidence=0.0, scores=[score("viscous-drag", SEEN)]), held=[held(2.0)]).verdict == "unknown"
 
 
-def test_the_scores_of_what_was_found_are_not_asked_for_anew():
-    found = search(refit("viscous-drag", evidence=100.0, rough=True), refit(evidence=0.0, fine=False), scored=SEEN)
-    found.tried["none", True] = refit(evidence=-5.0, fine=False, rough=True)
-    answer = concluded(found)
-    assert (found.asked, answer.verdict, answer.scores) == ([], "identified", tuple(SEEN["none", False]))
+def test_a_model_far_off_has_no_share_of_the_confidence(concluded):
+    found = concluded(fitted("viscous-drag", evidence=100.0, fine=False), LOST)
+    assert found.verdict == "unknown" and found.confidence["unknown"] > 0.99
+    sure = concluded(fitted("viscous-drag", evidence=100.0), LOST)
+    assert sure.confidence["unknown"] == pytest.approx(UNEXPLAINED, rel=0.05)
+
+
+def test_effects_of_one_signal_are_one_class(concluded):
+    scores = [
+        score("viscous-drag", SEEN), score("slip-evolution", SEEN, (0.99, 0.1411)), score("friction-drift", SEEN, (0.0, 1.0)),
+    ]  # fmt: skip
+    baseline = fitted(evidence=0.0, fine=False, scores=scores)
+    found = concluded(fitted("viscous-drag", evidence=100.0), baseline)
+    assert found.equivalent == (("viscous-drag", "slip-evolution"),)
+
+
+def test_an_effect_that_parameters_absorb_is_not_identifiable(concluded):
+    lost = replace(score("viscous-drag", HIDDEN), surviving=1e-4)
+    found = concluded(fitted(evidence=0.0, scores=[lost, score("friction-drift", SEEN)]))
+    assert [x.effect for x in found.not_identifiable] == ["viscous-drag"]
+    assert "99.99 %" in found.not_identifiable[0].reason
 
 
 def test_an_interesting_size_is_in_base_units():
     """A user's lag, 3 ms by default and nothing at 1 ms, is interesting from 0.002 s on: sizes that can be seen are in s."""
-    own = effect("sensor-lag")
+    own = SHIPPED.get("effect", "sensor-lag")
     (name,) = own.sizes
     in_ms = replace(own, parameters=(Parameter(name, 3.0, "ms", 0.0, 100.0),), neutral=((name, 1.0),))
     assert interesting(replace(score("sensor-lag", 1.0), effect=in_ms)) == pytest.approx(0.002)
     assert neutral_values(in_ms) == {name: pytest.approx(0.001)}
-
-
-@pytest.mark.parametrize(("error", "nothing"), [(1e-9, False), (3e-7, True)])
-@pytest.mark.parametrize(("name", "size"), [("inertia", "M"), ("interface-compliance", "lambda")])
-def test_what_is_built_in_has_to_stand_out_from_nothing(name, size, error, nothing):
-    """A mass of 4 kg with an error of 1200 was named beside a stiffness: it came with another roughness of the track."""
-    found = refit(name, "viscous-drag", evidence=0.0)
-    names = ("A", size, "c")
-    found.fit = SimpleNamespace(
-        problem=SimpleNamespace(names=names, model=SimpleNamespace(names=names)), covariance=np.diag([1.0, error**2, 1.0]),
-        values={"A": 0.01, size: 4e-7, "c": 1e-5},
-    )  # fmt: skip
-    assert undetermined(found) is nothing
-    assert undetermined(refit("viscous-drag", evidence=0.0)) is False  # a drag's error says nothing here

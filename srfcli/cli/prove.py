@@ -58,13 +58,6 @@ KINDS = ("none", "single", "pair", "outside")
     metavar="MINUTES",
     help="CPU time after which a case has failed.",
 )
-@click.option(
-    "--search",
-    type=click.Choice(["staged", "state-space"]),
-    default="staged",
-    show_default=True,
-    help="What diagnoses: the search of `srf diagnose`, or the best-first search over state-space fits.",
-)
 @plugins_option
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, in full precision.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print the marks as CSV, one case a line.")
@@ -78,7 +71,6 @@ def command(
     report: Path | None,
     unfinished: bool,
     limit: float,
-    search: str,
     plugins: tuple[Path, ...],
     as_json: bool,
     as_csv: bool,
@@ -104,7 +96,7 @@ def command(
     count = workers or os.cpu_count() or 1
     if report is None:
         assert out is not None
-        trial = _answered(out, cases, seed, kinds, resume, unfinished, count, limit, search, plugins)
+        trial = _answered(out, cases, seed, kinds, resume, unfinished, count, limit, plugins)
     else:
         given = {"--cases": cases is not None, "--seed": seed is not None, "--kind": bool(kinds), "--resume": resume}
         for option in (name for name, present in given.items() if present):
@@ -123,7 +115,6 @@ def _answered(
     unfinished: bool,
     workers: int,
     limit: float,
-    search: str,
     plugins: tuple[Path, ...],
 ) -> Trial:
     """Return the trial with an answer to every case; Ctrl-C ends the command, and what was answered is kept."""
@@ -131,7 +122,6 @@ def _answered(
     from srfcli.cli.emit import Progress
     from srfcli.core.errors import SrfError
     from srfcli.laws.registry import load_registry
-    from srfcli.validation.blind import SEARCHES
     from srfcli.validation.trials import answer_all, begin
 
     if unfinished:
@@ -152,8 +142,7 @@ def _answered(
         waiting = trial.waiting()
         session.say(f"SHA-256 of the sealed truths: {trial.digest()}")
         with Progress("diagnosed", total=len(waiting)) as progress:
-            by = SEARCHES[search]
-            for answer in answer_all(trial, workers=workers, plugins=plugins, limit=60 * limit, diagnose=by):
+            for answer in answer_all(trial, workers=workers, plugins=plugins, limit=60 * limit):
                 progress.advance(note=f"{answer.case} in {answer.cpu:.0f} s of CPU")
     except KeyboardInterrupt:
         click.echo(f"Interrupted: the answers so far are kept.\nTry: srf prove --out {folder} --resume", err=True)

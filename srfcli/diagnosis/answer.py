@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.core.units import find_unit, from_base, split_quantity
 from srfcli.data.values import Run
 from srfcli.diagnosis.design import Parting, described
-from srfcli.diagnosis.hypotheses import Refit
+from srfcli.diagnosis.discrepancy import RunForce, unexplained_friction
 from srfcli.diagnosis.residual_scan import Location, Row
-from srfcli.diagnosis.verdict import NOTHING, Diagnosis
-from srfcli.inference.noise import stretches, whiten
+from srfcli.diagnosis.verdict import Diagnosis, parameters_of
 from srfcli.inference.prediction import of_run
-from srfcli.inference.random_field import LatentFit
+from srfcli.inference.state_space import Filtered
 
 SCHEMA = "srf.diagnose/1"
 
 
 @dataclass(frozen=True)
 class RunView:
-    """One run under both models: observed and predictions (n,) in the observable's unit, the place `slip` (n,) in um.
+    """One run under both models: what each expects of a reading (n,), given those before it, in the observable's unit.
 
-    `rms` holds the residuals' root mean square over the noise, by baseline and by the final model; `noise` is the gauge's level.
+    `white` are the innovations over their standard deviations (n,), by baseline and by the final model, `rms` their root mean
+    squares; `noise` is that standard deviation under the final model, its median; `slip` (n,) is the place in um.
     """
 
     run: Run
@@ -35,31 +35,26 @@ class RunView:
     rms: tuple[float, float]
     noise: float
     slip: Array
-
-
-def final(diagnosis: Diagnosis) -> Refit:
-    """Return the model that the answer calls augmented: the baseline itself where nothing is to be added."""
-    return diagnosis.baseline if diagnosis.verdict in NOTHING else diagnosis.best
+    white: tuple[Array, Array] = field(repr=False)
 
 
 def run_views(diagnosis: Diagnosis) -> tuple[RunView, ...]:
     """Return every run under baseline and final model, fitted ones first."""
-    before, after = diagnosis.baseline.fit, final(diagnosis).fit
-    same = final(diagnosis) is diagnosis.baseline
-    found = []
-    for run in before.problem.runs:
-        y0, y1 = before.point.predictions[run.name].y, after.point.predictions[run.name].y
-        noise = diagnosis.noise[run.name]
-        parts = stretches(run.t, run.used)
-        rms = [float(np.sqrt(np.mean(whiten(noise, run.observed - y, parts) ** 2))) for y in (y0, y1)]
-        found.append(RunView(run, False, y0, y1, (rms[0], rms[1]), noise.level, slip_of(run, y0)))
-    for held in diagnosis.held:
-        run = replace(held.run, holdout=True)
-        y1, rms1 = (held.baseline, held.rms_baseline) if same else (held.augmented, held.rms_augmented)
-        found.append(
-            RunView(run, True, held.baseline, y1, (held.rms_baseline, rms1), held.level, slip_of(run, held.baseline))
-        )
-    return tuple(found)
+    before, after = diagnosis.shown.fit.maximum.point.runs, diagnosis.final.fit.maximum.point.runs
+    found = [_view(b, a, False) for b, a in zip(before, after, strict=True)]
+    same = diagnosis.final is diagnosis.baseline
+    return (*found, *(_view(h.shown, h.shown if same else h.augmented, True) for h in diagnosis.held))
+
+
+def _view(before: Filtered, after: Filtered, holdout: bool) -> RunView:
+    run, sides = before.run, (before, after)
+    y = [run.observed - f.found.nu for f in sides]
+    white = [f.found.nu / np.sqrt(f.found.S) for f in sides]
+    rms = [float(np.sqrt(np.mean(w[run.used] ** 2))) for w in white]
+    noise = float(np.median(np.sqrt(after.found.S[run.used])))
+    return RunView(
+        replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), noise, slip_of(run, y[1]), (white[0], white[1])
+    )
 
 
 def slip_of(run: Run, predicted: Array) -> Array:
@@ -75,21 +70,6 @@ def slip_of(run: Run, predicted: Array) -> Array:
     return np.asarray(run.start + moved - (u - u[0]))
 
 
-def parameters_of(fitted: LatentFit) -> dict[str, dict[str, Any]]:
-    """Return the free parameters in their declared units with standard errors; a stiffness also as a ratio to the stated one."""
-    units = {q.name: q.unit for q in fitted.problem.experiment.parameters}
-    errors = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
-    found: dict[str, dict[str, Any]] = {}
-    for name, value, error in zip(fitted.problem.names, fitted.point.theta.tolist(), errors.tolist(), strict=True):
-        unit = units.get(name, "1")
-        found[name] = {"value": from_base(value, unit), "stderr": from_base(error, unit), "unit": unit}
-    if "K" in found:
-        number, unit = split_quantity(fitted.problem.experiment.stiffness_text, name="stiffness")
-        stated = from_base(number * find_unit(unit).factor, found["K"]["unit"])
-        found["ratio"] = {"value": found["K"]["value"] / stated, "stderr": found["K"]["stderr"] / stated, "unit": "1"}
-    return found
-
-
 def answer(
     diagnosis: Diagnosis,
     location: Location,
@@ -101,13 +81,19 @@ def answer(
 
     `parting` is the run that would part what is ambiguous.
     """
-    views, last = run_views(diagnosis), final(diagnosis)
+    views, last = run_views(diagnosis), diagnosis.final
     sides = {}
-    for place, (name, refit) in enumerate((("baseline", diagnosis.baseline), ("augmented", last))):
+    for place, (name, fitted, own) in enumerate(
+        (("baseline", diagnosis.shown, diagnosis.baseline), ("augmented", last, last))
+    ):
+        values = own.fit.values
         sides[name] = {
-            "parameters": parameters_of(refit.fit),
-            "fit": {"rms_over_noise": refit.adequacy.rms_over_noise},
+            "parameters": parameters_of(fitted),
+            "fit": {"rms_over_noise": fitted.fit.maximum.point.rms},
             "holdout": {"rms_over_noise": together([v for v in views if v.holdout], place)},
+            "field": None
+            if own.fit.smooth
+            else {"amplitude": values["field_amplitude"], "length_um": values["field_length"]},
         }
     found = {
         "schema": SCHEMA,
@@ -128,7 +114,7 @@ def answer(
     return found
 
 
-def together(views: list[RunView], place: int) -> float | None:
+def together(views: Sequence[RunView], place: int) -> float | None:
     """Return the root mean square over the noise of several runs together; None of none."""
     if not views:
         return None
@@ -140,25 +126,17 @@ def together(views: list[RunView], place: int) -> float | None:
 def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
     """Return the arrays and tables of which figures and report are made, by name."""
     windows = {r.name: [list(w) for w in r.windows] for r in location.runs}
+    friction = [unexplained_friction(f, with_parameters=False) for f in (diagnosis.baseline, diagnosis.final)]
     runs = []
     for v in run_views(diagnosis):
-        W, _ = v.run.load(v.run.t)
-        run = {"name": v.run.name, "holdout": v.holdout, "t": v.run.t, "observed": v.run.observed, "used": v.run.used}
-        run |= {
-            "baseline": v.baseline,
-            "augmented": v.augmented,
-            "noise_level": v.noise,
-            "V": v.run.drive(v.run.t),
-            "W": W,
-        }
-        run |= {
-            "slip": v.slip,
-            "windows": windows.get(v.run.name, []),
-            "observable": v.run.observable,
-            "rms": list(v.rms),
-        }
-        runs.append(run | {"modulation": of_run(v.run)})
-    about = {e.reported: e.about for r in diagnosis.ranked for e in r.hypothesis.effects}
+        runs.append({
+            "name": v.run.name, "holdout": v.holdout, "t": v.run.t, "observed": v.run.observed, "used": v.run.used,
+            "baseline": v.baseline, "augmented": v.augmented, "noise_level": v.noise, "V": v.run.drive(v.run.t),
+            "W": v.run.load(v.run.t)[0], "slip": v.slip, "windows": windows.get(v.run.name, []),
+            "observable": v.run.observable, "rms": list(v.rms), "modulation": of_run(v.run), "white": list(v.white),
+            "friction": [_force_of(found.get(v.run.name), v.run) for found in friction],
+        })  # fmt: skip
+    about = {e.reported: e.about for f in diagnosis.ranked for e in f.hypothesis.effects}
     return {
         "title": diagnosis.experiment.title,
         "about": about,
@@ -168,6 +146,13 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
         "parameters": parameter_rows(diagnosis),
         "scores": score_rows(diagnosis),
     }
+
+
+def _force_of(force: RunForce | None, run: Run) -> Array | None:
+    """Return the friction that a model leaves to its field along a run; zero on a smooth track, None of a held-out run."""
+    if run.holdout:
+        return None
+    return np.zeros(run.t.size) if force is None else force.force
 
 
 def atlas_row(row: Row) -> dict[str, Any]:
@@ -181,15 +166,16 @@ def atlas_row(row: Row) -> dict[str, Any]:
 def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return what was fitted, best evidence first."""
     return [
-        {"name": r.name, "evidence": r.evidence, "rms_over_noise": r.adequacy.rms_over_noise, "p_value": r.adequacy.p_value,
-         "rough": r.rough, "confidence": diagnosis.confidence.get("+".join(sorted(r.hypothesis.reported)) or "none", 0.0)}
-        for r in diagnosis.ranked
+        {"name": f.name, "evidence": f.evidence, "rms_over_noise": f.fit.maximum.point.rms,
+         "field": 0.0 if f.fit.smooth else f.fit.values["field_amplitude"], "confidence": diagnosis.confidence.get(f.name, 0.0),
+         "against": f.against[0] if f.against else ""}
+        for f in diagnosis.ranked
     ]  # fmt: skip
 
 
 def parameter_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return each parameter under both models, and how far the baseline had bent it, in the final model's standard errors."""
-    before, after = parameters_of(diagnosis.baseline.fit), parameters_of(final(diagnosis).fit)
+    before, after = parameters_of(diagnosis.shown), parameters_of(diagnosis.final)
     rows = []
     for name in dict.fromkeys([*before, *after]):
         a, b = before.get(name), after.get(name)

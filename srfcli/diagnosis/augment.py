@@ -25,7 +25,7 @@ from srfcli.data.description import GEOMETRY, open_node
 from srfcli.data.values import Experiment, FitParameter, ModelChoice
 from srfcli.data.writing import DESCRIPTION, KILOGRAM, shortest
 from srfcli.diagnosis.hypotheses import Hypothesis
-from srfcli.inference.random_field import LatentFit
+from srfcli.inference.state_space import StateSpaceFit
 from srfcli.laws.effect_file import formula_text
 from srfcli.laws.expression import parse_expression, symbol
 from srfcli.laws.law_file import FORMAT, known_symbols
@@ -56,7 +56,7 @@ def augment(
     registry: Registry,
     experiment: Experiment,
     hypothesis: Hypothesis,
-    fitted: LatentFit,
+    fitted: StateSpaceFit,
     *,
     folder: Path,
     reader: str | None = None,
@@ -66,6 +66,7 @@ def augment(
     The recordings are copied, or named by their place relative to `folder` where they are large. `reader` is how every data file
     was read, if the user named one.
     """
+    experiment = hypothesis.experiment(experiment)
     laws = fold(registry, experiment.choice, hypothesis.effects)
     renamed = _final_names(registry, experiment, hypothesis, laws)
     listed = [
@@ -74,7 +75,7 @@ def augment(
             name=renamed.get(q.name, q.name),
             value=float(np.clip(fitted.values.get(q.name, q.value), q.lower, q.upper)),
         )
-        for q in fitted.problem.experiment.parameters
+        for q in fitted.likelihood.problem.experiment.parameters
     ]
     values = {q.name: q.value for q in listed}
     stiffness, unit = split_quantity(experiment.stiffness_text, name="stiffness")
@@ -87,7 +88,7 @@ def augment(
     description = open_node(experiment.path).value
     runs, copies = _runs(description["runs"], experiment.path.parent, folder, reader)
     title = experiment.title + (
-        f" (augmented with {', '.join(hypothesis.reported)})" if hypothesis.effects else " (fitted)"
+        f" (augmented with {', '.join(hypothesis.reported)})" if hypothesis.reported else " (fitted)"
     )
     lines = ['format = "srf-experiment/1"', f"title = {_value(title.strip())}", "", "[apparatus]"]
     text = experiment.stiffness_text if "K" not in values else f"{shortest(K, 1.0)!r} {base}"

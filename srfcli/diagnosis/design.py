@@ -1,13 +1,15 @@
 """The discriminating design: the run that would tell apart hypotheses which explain a recording equally well.
 
 Of many runs that the apparatus can make, each fitted model says what it would see. What counts is the part of their difference
-that no refit could absorb: with d the whitened difference, X the whitened derivatives by all that is free in the wrong model and
-Q what the recordings so far say of that, the log likelihood that the wrong model loses is on average
+that no refit could absorb: with d the standardised innovations of the wrong model over what the true one shows, X their
+derivatives by all that is free in the wrong model, and Q what the recordings so far say of that, the log likelihood that the
+wrong model loses is on average
 
     gain = min over z of (|d - X z|^2 + z' Q z) / 2 = d' (1 + X Q^-1 X')^-1 d / 2,
 
-lambda (1 - rho^2) / 2 in the words of experimental design. It is taken for the worse of the two ways round, the best runs are
-found by it, and theirs is found again with the motion itself in place of its derivatives.
+lambda (1 - rho^2) / 2 in the words of experimental design. A random friction field takes its own part of the difference, as in
+any fit. The gain is taken for the worse of the two ways round, the best runs are found by it, and theirs is found again with the
+motion itself in place of its derivatives.
 """
 
 from __future__ import annotations
@@ -20,17 +22,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from srfcli.codegen.model import Array
 from srfcli.data.values import Experiment, Run
 from srfcli.data.writing import DESCRIPTION, experiment_files, run_csv
 from srfcli.diagnosis.augment import augment
-from srfcli.diagnosis.hypotheses import Refit
+from srfcli.diagnosis.search import Fitted
 from srfcli.diagnosis.verdict import Diagnosis
-from srfcli.inference.noise import Noise, stretches, whiten
-from srfcli.inference.prediction import basis, of_run, run_parameters, stiffness_share
-from srfcli.inference.random_field import Latent, Tracks, solve_scaled, tracks_for
+from srfcli.inference.fit import Problem
+from srfcli.inference.prediction import of_run, predict, run_parameters, stiffness_share
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 
@@ -40,7 +40,7 @@ ENOUGH = 12.0  # of log likelihood: hypotheses so far apart are told apart
 LEAST = 3.0  # below which a run is not worth making
 MOST = 3  # hypotheses that are to be parted
 DRAWN, VARIED = 60, 16  # runs that are tried, and variations of the best of them
-LOOKED, ROUGH_LOOKED = 36, 12  # of these, how many with derivatives, at most
+LOOKED = 36  # of these, how many with derivatives, at most
 CONFIRMED = 3  # of the best, how many with the motion itself
 ROUNDS = 10  # of Gauss and Newton
 GROWS = 0.1  # e-foldings in a run that leave sliding as steady as it was
@@ -83,91 +83,80 @@ class Parting:
 
 @dataclass(frozen=True)
 class Side:
-    """A fitted hypothesis that is to predict a run: with `prior` precision (k, k) over its scaled parameters.
+    """A fitted hypothesis that is to predict a run: precision (k, k) of its parameters over `scale` (k,), by what is recorded."""
 
-    Where all runs slid on one track, the prior goes on with the track's numbers and `shared` holds; on a track of its own a run
-    adds numbers that nothing is known of but their roughness.
-    """
-
-    refit: Refit
-    latent: Latent
-    prior: Array
-    shared: bool
+    fitted: Fitted
+    names: tuple[str, ...]
+    scale: Array
+    precision: Array
 
     @classmethod
-    def of(cls, refit: Refit) -> Side:
-        """Return the side of a hypothesis."""
-        problem, point = refit.fit.problem, refit.fit.point
-        latent, n = Latent(problem), point.theta.size
-        rough = bool(point.tracks.splines) and point.roughness.amplitude > 0
-        if not rough:
-            return cls(refit, latent, point.N[:n, :n], False)
-        inverse = np.linalg.inv(point.tracks.root(point.roughness))
-        whole = point.N.copy()
-        whole[n:, n:] += inverse.T @ inverse
-        if point.tracks.shared:
-            return cls(refit, latent, whole, True)
-        own = whole[:n, :n] - whole[:n, n:] @ np.linalg.solve(whole[n:, n:], whole[n:, :n])
-        return cls(refit, latent, own, False)
+    def of(cls, fitted: Fitted) -> Side:
+        """Return the side of a hypothesis; what belongs to one recorded run alone is not free in another."""
+        likelihood, point = fitted.fit.likelihood, fitted.fit.maximum.point
+        kept = [i for i, n in enumerate(likelihood.names) if "." not in n]
+        others = [i for i in range(len(likelihood.names)) if i not in kept]
+        unit = likelihood.unit(point.x)
+        scale = np.maximum(np.abs([point.values[likelihood.names[i]] for i in kept]), 1e-12)
+        I = point.information / np.outer(unit, unit)
+        own = I[np.ix_(kept, kept)]
+        if others:
+            cross = I[np.ix_(others, kept)]
+            own = own - cross.T @ np.linalg.pinv(I[np.ix_(others, others)], hermitian=True) @ cross
+        return cls(fitted, tuple(likelihood.names[i] for i in kept), scale, own * np.outer(scale, scale))
 
     @property
     def name(self) -> str:
         """Return the hypothesis' name."""
-        return self.refit.name
+        return self.fitted.name
 
     @property
-    def rough(self) -> bool:
-        """Return whether a track's numbers are estimated with the parameters."""
-        return self.refit.fit.point.roughness.amplitude > 0 and bool(self.refit.fit.point.tracks.splines)
+    def problem(self) -> Problem:
+        """Return the problem that was fitted."""
+        return self.fitted.fit.likelihood.problem
 
-    def track(self, run: Run) -> Tracks:
-        """Return the track on which a run would slide: the known one, a new one, or none."""
-        if not self.rough:
-            return Tracks((), {})
-        if self.shared:
-            return replace(self.refit.fit.point.tracks, of={run.name: 0})
-        return tracks_for([run], shared=False)
-
-    def precision(self, run: Run) -> Array:
-        """Return what is known beforehand of all that is free in a run (k, k): parameters, track, trend."""
-        Q = self.prior
-        if self.rough and not self.shared:
-            inverse = np.linalg.inv(self.track(run).root(self.refit.fit.point.roughness))
-            Q = block_diag(Q, inverse.T @ inverse)
-        return block_diag(Q, [[0.0]]) if self.latent.problem.trend else Q
+    def values(self, z: Array | None = None) -> dict[str, float]:
+        """Return the parameters after steps z (k,) from the fit, within their bounds."""
+        likelihood, found = self.fitted.fit.likelihood, dict(self.fitted.fit.values)
+        if z is not None:
+            moved = {n: found[n] + float(s * step) for n, s, step in zip(self.names, self.scale, z, strict=True)}
+            found = likelihood.values(likelihood.coordinates({**found, **moved}))
+        return found
 
     def steady(self, run: Run) -> bool:
         """Return whether the sliding with which a run begins is stable: no apparatus begins with any other."""
-        problem = self.latent.problem
-        p = run_parameters(problem.model, problem.experiment, run, self.refit.fit.values)
+        model = self.problem.model
+        p = run_parameters(model, self.problem.experiment, run, {**self.values(), "field_amplitude": 0.0})
         V, W = float(run.drive(run.t[:1])[0]), run.load.rest(float(run.t[0]))
-        J = np.asarray(problem.model.rates_jacobian(np.asarray(problem.model.steady(p)), V, W, 0.0, p), dtype=float)
+        J = np.asarray(model.rates_jacobian(np.asarray(model.steady(p)), V, W, 0.0, p), dtype=float)
         return bool(np.linalg.eigvals(J).real.max() * float(np.ptp(run.t)) < GROWS)
 
-    def predicted(self, run: Run, z: Array | None = None, *, slopes: bool = False) -> tuple[Array, Array] | None:
-        """Return what the hypothesis foretells, (n,) and its derivatives (n, k) by `z`, steps from the fit; None if it fails."""
-        problem, theta = self.latent.problem, self.refit.fit.point.theta
-        tracks, trend, n = self.track(run), problem.trend, theta.size
-        if z is not None:
-            theta = np.clip(theta + z[:n] * self.latent.scale, problem.lower, problem.upper)
-            if tracks.splines:
-                tracks = tracks.with_numbers(tracks.numbers + z[n : n + tracks.numbers.size])
-        found = self.latent.predicted(run, theta, tracks, slopes=slopes)
-        y, J = found.y, found.J.copy()
-        if not (found.status.ok and np.isfinite(y).all() and np.isfinite(J).all()):
+    def predicted(self, run: Run) -> Array | None:
+        """Return what the hypothesis foretells (n,), on a smooth track; None if it cannot be followed."""
+        values = {**self.values(), "field_amplitude": 0.0}
+        found = predict(self.problem.model, self.problem.experiment, run, values)
+        return found.y if found.status.ok and np.isfinite(found.y).all() else None
+
+    def filtered(
+        self, run: Run, y: Array, z: Array | None = None, *, slopes: bool = True
+    ) -> tuple[Array, Array, Array] | None:
+        """Return innovations over what is shown, `y` (n,), standardised and not, and derivatives (n, k) of the former by z."""
+        seen = replace(run, observed=y)
+        f = self.fitted.fit.likelihood.filtered(seen, self.values(z), slopes=slopes)
+        if not f.whole:
             return None
+        X = np.zeros((y.size, len(self.names)))
         if slopes:
-            J[:, :n] *= self.latent.scale
-        if trend:
-            line = basis(run, trend)
-            y = y + (line * z[-1] if z is not None else 0.0)
-            J = np.column_stack([J, line]) if slopes else J
-        return y, J
+            root = np.sqrt(f.found.S)[:, None]
+            for j, (name, scale) in enumerate(zip(self.names, self.scale, strict=True)):
+                if name in f.names:
+                    X[:, j] = -f.found.nu_d[:, f.names.index(name)] / root[:, 0] * scale
+        return f.white, f.found.nu, X
 
 
 @dataclass(frozen=True)
 class Loss:
-    """What a wrong model loses: `w` (n,) and `X` (n, k) whitened, `Q`; `left` (n,) what is left of the difference, unwhitened."""
+    """What a wrong model loses: `w` (n,) and `X` (n, k) standardised, `Q`; `left` (n,) is the difference itself."""
 
     w: Array
     X: Array
@@ -178,7 +167,7 @@ class Loss:
         """Return the log likelihood lost in the first `samples`, in a run made `times` times."""
         w, X = self.w[:samples], self.X[:samples]
         b = times * (X.T @ w)
-        return 0.5 * max(times * float(w @ w) - float(b @ solve_scaled(times * (X.T @ X) + self.Q, b)), 0.0)
+        return 0.5 * max(times * float(w @ w) - float(b @ _solved(times * (X.T @ X) + self.Q, b)), 0.0)
 
 
 @dataclass(frozen=True)
@@ -200,22 +189,19 @@ def parting_experiment(registry: Registry, diagnosis: Diagnosis, *, seed: int = 
     sides = foremost(diagnosis)
     if diagnosis.verdict != "ambiguous" or len(sides) < 2:
         return None
-    return Design(diagnosis.experiment, diagnosis.noise, sides, seed).best()
+    return Design(diagnosis.experiment, sides, seed).best()
 
 
 def foremost(diagnosis: Diagnosis) -> tuple[Side, ...]:
-    """Return the hypotheses that are to be parted: the best of each name, three at most."""
-    best: dict[frozenset[str], Refit] = {}
-    for refit in diagnosis.close:
-        best.setdefault(frozenset(refit.hypothesis.reported), refit)
-    return tuple(Side.of(r) for r in list(best.values())[:MOST])
+    """Return the hypotheses that are to be parted, three at most."""
+    return tuple(Side.of(f) for f in diagnosis.close[:MOST])
 
 
 class Design:
     """The search for a run among those that an apparatus can make."""
 
-    def __init__(self, experiment: Experiment, noise: Mapping[str, Noise], sides: Sequence[Side], seed: int) -> None:
-        self.experiment, self.noise, self.sides = experiment, noise, tuple(sides)
+    def __init__(self, experiment: Experiment, sides: Sequence[Side], seed: int) -> None:
+        self.experiment, self.sides = experiment, tuple(sides)
         self.reach: Reach = reach_of(experiment)
         self.rng = np.random.default_rng(seed)
         self.tried = 0
@@ -241,8 +227,6 @@ class Design:
         by_kind: dict[str, list[Trial]] = {}
         for trial in sorted(trials, key=lambda t: -t.bound):
             by_kind.setdefault(trial.proposal.kind, []).append(trial)
-        if any(s.rough for s in self.sides):
-            most = min(most, ROUGH_LOOKED)
         found: list[Trial] = []
         while any(by_kind.values()) and len(found) < most:
             for queue in by_kind.values():  # stick-slip has the largest differences, and absorbs most of them
@@ -263,8 +247,13 @@ class Design:
             found = side.predicted(run)
             if found is None:
                 return None
-            y[side.name] = found[0]
-        parted = [0.5 * float(np.sum(self.whitened(run, y[a.name] - y[b.name]) ** 2)) for a, b in self.pairs()]
+            y[side.name] = found
+        parted = []
+        for true, wrong in self.pairs():
+            seen = wrong.filtered(run, y[true.name], slopes=False)
+            if seen is None:
+                return None
+            parted.append(0.5 * float(seen[0] @ seen[0]))
         return Trial(proposal, run, y, min(parted))
 
     def begun(self, proposal: Proposal) -> tuple[Proposal, Run] | None:
@@ -280,28 +269,14 @@ class Design:
         """Return every pair of a true and a wrong hypothesis."""
         return list(permutations(self.sides, 2))
 
-    def whitened(self, run: Run, columns: Array) -> Array:
-        """Return columns over a run's samples (n,) or (n, k) as its gauge's noise weighs them."""
-        return whiten(self.noise[self.like(run)], columns, stretches(run.t, run.used))
-
-    def like(self, run: Run) -> str:
-        """Return the name of the recorded run that has a run's gauge and sampling; of any, if its own was not fitted."""
-        name = (self.reach.modulated if run.modulation else self.reach.plain).name
-        return name if name in self.noise else next(iter(self.noise))
-
     def gain(self, trial: Trial) -> float:
         """Return the gain at first order: that of the least parted pair, the worse way round."""
-        slopes = {}
-        for side in self.sides:
-            found = side.predicted(trial.run, slopes=True)
-            if found is None:
-                return 0.0
-            slopes[side.name] = (self.whitened(trial.run, found[1]), side.precision(trial.run))
         least = np.inf
         for true, wrong in self.pairs():
-            difference = trial.y[true.name] - trial.y[wrong.name]
-            w = self.whitened(trial.run, difference)
-            least = min(least, Loss(w, *slopes[wrong.name], difference).gain())
+            seen = wrong.filtered(trial.run, trial.y[true.name])
+            if seen is None:
+                return 0.0
+            least = min(least, Loss(seen[0], seen[2], wrong.precision, seen[1]).gain())
         return least
 
     def judge(self, trial: Trial) -> Parting | None:
@@ -312,6 +287,7 @@ class Design:
             if lost is None:
                 return None
             losses[true.name, wrong.name] = lost
+        wrongs = {s.name: float(s.values()[s.fitted.fit.likelihood.gauge(trial.run)["gauge_white"]]) for s in self.sides}
         worth = {pair: lost.gain() for pair, lost in losses.items()}
         true_name, wrong_name = min(worth, key=lambda pair: worth[pair])
         seconds, repeats = _enough(list(losses.values()), trial)
@@ -324,39 +300,38 @@ class Design:
             names, trial.proposal, run, worth[true_name, wrong_name],
             {a: min(g for (true, _), g in worth.items() if true == a) for a in names}, seconds, repeats, (first, second),
             float(run.t[at]), float(left[at]), abs(float(left[at] * scale[run.observable])), UNITS[run.observable],
-            self.noise[self.like(run)].level, trial.y,
+            wrongs[wrong_name], trial.y,
         )  # fmt: skip
 
     def refitted(self, run: Run, wrong: Side, y: Array) -> Loss | None:
         """Return what a wrong model loses once it was fitted to what the true one shows, and to all that it is known from."""
-        Q = wrong.precision(run)
+        Q = wrong.precision
         z, damping = np.zeros(Q.shape[0]), 0.0
-        current = self.at(run, wrong, y, z)
+        current = wrong.filtered(run, y, z)
         if current is None:
             return None
-        r, X = current
+        r, left, X = current
         for _ in range(ROUNDS):
-            A, b = X.T @ X + Q, X.T @ r[0] - Q @ z
+            A, b = X.T @ X + Q, X.T @ r - Q @ z
             A[np.diag_indices_from(A)] *= 1 + damping
-            step = solve_scaled(A, b)
-            if float(b @ step) < 0.02 * (1 + float(r[0] @ r[0] + z @ Q @ z)) and not damping:
+            step = _solved(A, b)
+            if float(b @ step) < 0.02 * (1 + float(r @ r + z @ Q @ z)) and not damping:
                 break
-            trial = self.at(run, wrong, y, z + step)
-            if trial is not None and _cost(trial[0][0], z + step, Q) < _cost(r[0], z, Q):
-                (r, X), z = trial, z + step
+            trial = wrong.filtered(run, y, z + step)
+            if trial is not None and _cost(trial[0], z + step, Q) < _cost(r, z, Q):
+                (r, left, X), z = trial, z + step
                 damping = 0.0 if damping < 1e-3 else damping / 10
             elif damping > 1e4:
                 break
             else:
                 damping = max(10 * damping, 1e-2)
-        return Loss(r[0] + X @ z, X, Q, r[1])
+        return Loss(r + X @ z, X, Q, left)
 
-    def at(self, run: Run, wrong: Side, y: Array, z: Array) -> tuple[tuple[Array, Array], Array] | None:
-        """Return the difference left at `z`, whitened and not (n,), and the whitened derivatives there (n, k)."""
-        found = wrong.predicted(run, z, slopes=True)
-        if found is None:
-            return None
-        return (self.whitened(run, y - found[0]), y - found[0]), self.whitened(run, found[1])
+
+def _solved(A: Array, b: Array) -> Array:
+    """Return A^-1 b, after scaling; a direction of which nothing is known stays where it is."""
+    d = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    return np.asarray(np.linalg.lstsq(A / np.outer(d, d), b / d, rcond=1e-12)[0] / d)
 
 
 def _cost(r: Array, z: Array, Q: Array) -> float:
@@ -738,15 +713,15 @@ def parting_files(
     files: dict[str, str] = {}
     run = replace(found.run, holdout=False)
     text = run_text(found, diagnosis.experiment)
-    for refit in diagnosis.close:
-        place = f"{FOLDER}/{refit.name}"
-        if refit.name not in found.predicted or f"{place}/{DESCRIPTION}" in files:
+    for fitted in diagnosis.close:
+        place = f"{FOLDER}/{fitted.name}"
+        if fitted.name not in found.predicted or f"{place}/{DESCRIPTION}" in files:
             continue
         made = augment(
-            registry, diagnosis.experiment, refit.hypothesis, refit.fit, folder=folder / place, reader=reader
+            registry, diagnosis.experiment, fitted.hypothesis, fitted.fit, folder=folder / place, reader=reader
         )
         head = made.files[DESCRIPTION].partition(RUNS)[0].partition(COLUMNS)[0]
         files |= {f"{place}/{name}": content for name, content in made.files.items()}
         files[f"{place}/{DESCRIPTION}"] = f"{head.rstrip()}\n\n{text}"
-        files[f"{place}/{run.file.name}"] = run_csv(replace(run, observed=found.predicted[refit.name]))
+        files[f"{place}/{run.file.name}"] = run_csv(replace(run, observed=found.predicted[fitted.name]))
     return files

@@ -1,19 +1,19 @@
-"""The discrepancy that no registered effect explains: a friction of no assumed form, then the sparsest closed form for it.
+"""The discrepancy that no registered effect explains: the friction that the baseline leaves to chance, and a closed form for it.
 
-A cubic spline over each run's own clock is added to mu. Its numbers have the prior of a rough track (see `latent`), in seconds;
-amplitude and correlation time are those of the largest marginal likelihood, and the model's own parameters are estimated again
-with it: what they can absorb is not missing.
+A random friction field along slip has the baseline follow the recordings. What it took for that, smoothed over all readings of a
+run, is the friction that is missing, at the resolution of the recording; a track shows no preference for velocity, age or load.
 
-The candidates are effects that nobody claims to be physics: powers and logarithms of slip in units of the state's length, of
-velocity, age and load, places on the track, delays. They are scored as registered effects are, refitted where they promise most,
-and the best is kept while its evidence pays for its parameters. What comes out is a description, offered as an effect file.
+The candidates for a closed form are effects that nobody claims to be physics: powers and logarithms of slip in units of the
+state's length, of velocity, age and load, places on the track, delays. The search that looks for registered effects looks for
+them. What comes out is a description, offered as an effect file, unless held-out runs refuse it or it stands at a bound.
+Fixed-interval smoother: de Jong, Biometrika 76 (1989).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import floor, isfinite, log10
 from pathlib import Path
@@ -23,19 +23,14 @@ import numpy as np
 import sympy as sp
 from scipy.stats import rankdata
 
-from srfcli.codegen.model import Array, open_model
-from srfcli.codegen.splines import Spline
-from srfcli.core.errors import SrfError
+from srfcli.codegen.model import Array
 from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base
-from srfcli.data.values import Run
-from srfcli.diagnosis.hypotheses import NEAR, Hypothesis, Refit, applicable, own_parameters
-from srfcli.diagnosis.staged_score import Score, scores
-from srfcli.diagnosis.staged_search import WORTH, Search, contest
-from srfcli.diagnosis.verdict import Diagnosis, Held, judge_held
-from srfcli.inference.fit import Problem
-from srfcli.inference.prediction import Hold
-from srfcli.inference.random_field import LatentFit, Tracks, fit_latent
+from srfcli.diagnosis.hypotheses import own_parameters
+from srfcli.diagnosis.search import CLOSE, Fitted, ModelSearch
+from srfcli.diagnosis.verdict import HELD, Diagnosis, Held, at_bounds, held_out
+from srfcli.inference.fit import root
+from srfcli.inference.recordings import slip_along
 from srfcli.laws.effect_file import formula_text
 from srfcli.laws.expression import symbol
 from srfcli.laws.law_file import read_header
@@ -43,21 +38,17 @@ from srfcli.laws.registry import Entry, Registry
 from srfcli.laws.values import Effect
 from srfcli.symbolic.system import apart
 
-# The friction that is missing, as a function of time in each run: estimated along the recordings, of no assumed form.
+# The friction that is missing, along the recordings.
 
-TABLE = ("mu", "time")
-KNOTS, FINEST = 90, 0.01  # intervals of a run's spline, and how short the shortest may be (s)
-AMPLITUDES = np.array([0.0, *np.geomspace(5e-5, 5e-2, 13)])  # of mu
-TIMES = np.geomspace(0.02, 4.0, 9)  # s, correlation times that are tried
-ROUNDS, STEPS = 4, 12
 NORMAL = 1.959963984540054  # standard deviations of a 95 % band
+STEP = 0.2  # standard errors of the differences that tell what the parameters' errors do to it
 BINS = 12  # in which the force is averaged along a quantity of state
 COORDINATES = ("v", "phi", "W", "dlnWdt", "slip", "t")
 
 
 @dataclass(frozen=True)
 class RunForce:
-    """The missing friction coefficient `force` (n,) along one run at its samples `t` (s), its 95 % band `low`, `high`.
+    """The friction `force` (n,) that no law explains along one run, at its samples `t` (s), and its 95 % band `low`, `high`.
 
     Beside it what the model passes through: v (um/s), phi (s), W (N), dlnWdt (1/s), slip (um, from the run's start).
     """
@@ -77,113 +68,48 @@ class RunForce:
         found = {k: getattr(self, k) for k in self.__dataclass_fields__}
         return found | {"band": np.vstack([self.low, self.high])}
 
+    def csv(self) -> str:
+        """Return the run as a table, in full precision."""
+        heads = ("time [s]", "friction", "low", "high", "v [um/s]", "phi [s]", "W [N]", "dlnWdt [1/s]", "slip [um]")
+        columns = (self.t, self.force, self.low, self.high, self.v, self.phi, self.W, self.dlnWdt, self.slip)
+        rows = (",".join(map(repr, row)) for row in zip(*(c.tolist() for c in columns), strict=True))
+        return "\n".join([",".join(heads), *rows]) + "\n"
 
-@dataclass(frozen=True)
-class Force:
-    """The missing friction of all runs: standard deviation `amplitude`, correlation time `time` (s).
 
-    `share` is the part of the samples that were looked at, `gain` the log likelihood over the same model on a smooth track
-    without a force,
-    `coordinates` the share of the force's square that is a function of one quantity of state, the same in all runs.
+def unexplained_friction(fitted: Fitted, *, with_parameters: bool = True) -> dict[str, RunForce]:
+    """Return the friction of each fitted run that the model leaves to its random field; nothing of a model without one.
+
+    The band is that of the field given the recordings, and of the parameters, to first order, unless that is left out.
     """
+    if fitted.fit.smooth:
+        return {}
+    likelihood, maximum = fitted.fit.likelihood, fitted.fit.maximum
+    states = list(likelihood.problem.model.states)
+    at, age = states.index("field"), next(i for i, s in enumerate(states) if s.startswith("ln_") and s != "ln_v")
 
-    runs: Mapping[str, RunForce]
-    amplitude: float
-    time: float
-    share: float
-    gain: float
-    rms_over_noise: float
-    coordinates: Mapping[str, float]
-    fit: LatentFit = field(repr=False)
+    def field_of(x: Array) -> list[Array]:
+        return [f.smoothed().mean[:, at] for f in likelihood.at(x, slopes=False, keep=True).runs]
 
-    def described(self) -> dict[str, Any]:
-        """Return the arrays of each run by its name, as figures take them."""
-        return {name: run.described() for name, run in self.runs.items()}
-
-
-def tracks_over_time(runs: Sequence[Run], *, knots: int = KNOTS) -> Tracks:
-    """Return functions of each run's own clock that vanish, with `knots` intervals each."""
-    spans = [(float(r.t[0]), float(r.t[-1])) for r in runs]
-    splines = tuple(Spline.over(a, b, max((b - a) / knots, FINEST)) for a, b in spans)
-    return Tracks(splines, {r.name: i for i, r in enumerate(runs)})
-
-
-def missing_force(search: Search, refit: Refit, *, knots: int = KNOTS) -> Force:
-    """Return the friction that a fitted hypothesis lacks, along the runs that it was fitted to.
-
-    Where the hypothesis is far off, the force is found while the slider is held to the recording first, then without.
-    """
-    near = refit.adequacy.rms_over_noise < NEAR
-    around = refit.fit if near else search.loosely(refit)
-    tracks, roughness = tracks_over_time(around.problem.runs, knots=knots), None
-    search.progress(f"{refit.name}: the force that is missing")
-    for hold in [None] if near else [around.problem.hold, None]:
-        problem = _problem(search, refit, around, hold)
-        fitted = fit_latent(
-            problem, problem.start, search.noise, tracks=tracks, roughness=roughness, known_noise=True, rounds=ROUNDS,
-            steps=STEPS, grid=(TIMES, AMPLITUDES),
+    smoothed = [f.smoothed() for f in fitted.remainder.runs]
+    variance = [np.maximum(s.covariance[:, at, at], 0.0) for s in smoothed]
+    free = np.nonzero(np.diag(maximum.covariance) > 0)[0] if with_parameters else np.zeros(0, dtype=int)
+    for direction in root(maximum.covariance[np.ix_(free, free)]).T:
+        x = maximum.point.x.copy()
+        x[free] += STEP * direction
+        for own, s, moved in zip(variance, smoothed, field_of(x), strict=True):
+            own += np.nan_to_num((moved - s.mean[:, at]) / STEP) ** 2
+    found = {}
+    for f, s, own in zip(fitted.remainder.runs, smoothed, variance, strict=True):
+        x, spread = s.mean, NORMAL * np.sqrt(own)
+        W, W_dot = f.run.load(f.run.t)
+        found[f.run.name] = RunForce(
+            f.run.t, x[:, at], x[:, at] - spread, x[:, at] + spread, np.exp(x[:, states.index("ln_v")]),
+            np.exp(x[:, age]), W, W_dot / W, slip_along(f.run, x, tuple(states)),
         )  # fmt: skip
-        tracks, roughness, around = fitted.point.tracks, fitted.point.roughness, fitted
-        search.evaluations += fitted.evaluations
-    smooth = search.tried.get((refit.name, False))
-    return _force(refit, smooth.fit if smooth is not None else refit.fit, fitted)
+    return found
 
 
-def _problem(search: Search, refit: Refit, around: LatentFit, hold: Hold | None) -> Problem:
-    """Return the problem of a refit, from where `around` stands, whose model has the force instead of a track."""
-    choice = search.experiment.choice.plus(e.name for e in refit.hypothesis.effects)
-    model = open_model(search.registry, **asdict(choice), tables=(TABLE, hold.table) if hold else (TABLE,))
-    problem = around.problem
-    return replace(problem, model=model, start=np.clip(around.point.theta, problem.lower, problem.upper), hold=hold)
-
-
-def _force(refit: Refit, bare: LatentFit, fitted: LatentFit) -> Force:
-    """Return force, bands and states from the fit that has the force."""
-    tracks, roughness = fitted.point.tracks, fitted.point.roughness
-    covariance = _covariance(fitted)
-    found, squares, count = {}, 0.0, 0
-    for run in fitted.problem.runs:
-        design = tracks.spline(run).design(run.t)
-        own = list(tracks.columns(run))
-        spread = NORMAL * np.sqrt(
-            np.maximum(np.einsum("ij,jk,ik->i", design, covariance[np.ix_(own, own)], design), 0.0)
-        )
-        values = design @ tracks.spline(run).numbers
-        found[run.name] = RunForce(run.t, values, values - spread, values + spread, **_states(fitted, run))
-        r = (run.observed - fitted.point.predictions[run.name].y)[run.used] / fitted.noise[run.name].level
-        squares, count = squares + float(r @ r), count + r.size
-    whole = sum(r.t.size for r in refit.fit.problem.runs)
-    share = sum(r.t.size for r in fitted.problem.runs) / whole
-    return Force(
-        found, roughness.amplitude, roughness.length, share, float(fitted.log_likelihood - bare.log_likelihood),
-        float(np.sqrt(squares / count)), _coordinates(found), fitted,
-    )  # fmt: skip
-
-
-def _covariance(fitted: LatentFit) -> Array:
-    """Return the covariance of the force's numbers, that of the parameters included."""
-    point, n = fitted.point, fitted.point.theta.size
-    if not point.roughness.amplitude:
-        return np.zeros((point.tracks.numbers.size,) * 2)
-    L = point.tracks.root(point.roughness)
-    G, cross, own = point.N[n:, n:], point.N[:n, n:], point.N[:n, :n]
-    d = np.sqrt(np.maximum(np.diag(own), 1e-300))
-    kept = np.linalg.pinv(own / np.outer(d, d), rcond=1e-12, hermitian=True) / np.outer(d, d) if n else own
-    core = L.T @ (G - cross.T @ kept @ cross) @ L + np.eye(L.shape[1])
-    return np.asarray(L @ np.linalg.solve(core, L.T))
-
-
-def _states(fitted: LatentFit, run: Run) -> dict[str, Array]:
-    """Return what the model passes through along a run."""
-    x, states = fitted.point.predictions[run.name].x, fitted.problem.model.states
-    v = np.exp(x[:, states.index("ln_v")])
-    age = next(i for i, s in enumerate(states) if s.startswith("ln_") and s != "ln_v")
-    W, W_dot = run.load(run.t)
-    slip = run.start + np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(run.t))])
-    return {"v": v, "phi": np.exp(x[:, age]), "W": W, "dlnWdt": W_dot / W, "slip": slip}
-
-
-def _coordinates(runs: Mapping[str, RunForce]) -> dict[str, float]:
+def coordinates_of(runs: Mapping[str, RunForce]) -> dict[str, float]:
     """Return the share of the force's variance within runs that averages over bins of each quantity of state account for."""
     values = np.concatenate([r.force - r.force.mean() for r in runs.values()])
     weights = np.concatenate([1 / np.maximum((r.high - r.low) ** 2, 1e-18) for r in runs.values()])
@@ -205,11 +131,7 @@ def _coordinates(runs: Mapping[str, RunForce]) -> dict[str, float]:
 
 FOLDER = Path(__file__).parent / "terms"
 ORIGIN = "terms"
-MOST_TERMS = 3
-TRIED = 4  # refitted at each step, those that promise most
-TWINS, ALIKE = 3, 0.98  # of so many signals that are so alike
-PAYS = 3.0  # gain in log evidence below which a further term is not worth its words
-MOST_EVALUATIONS = 700  # of the recordings by a model with slopes
+BUDGET = 60.0  # s of CPU, of the search for a closed form
 
 
 def with_terms(registry: Registry) -> Registry:
@@ -227,172 +149,75 @@ def _entries() -> tuple[Entry, ...]:
     return tuple(found)
 
 
-def best_form(search: Search, diagnosis: Diagnosis) -> ClosedForm | None:
-    """Return the closed form that explains most for its length, judged on held-out runs; None where no term helps."""
-    own = _with_own_terms(search)
-    names = [e.name for e in own.registry.entries("effect") if e.origin == ORIGIN]
-    candidates, _ = applicable(own.registry, own.experiment, names)
-    best = _Selection(own, candidates).run(diagnosis)
-    best = _smoothed(own, best)
-    search.evaluations += own.evaluations
-    best = _as_judged(own, best) if best is not None else None
-    terms = [e for e in best.hypothesis.effects if e.name in names] if best is not None else []
-    if best is None or not terms:
-        return None
-    held = judge_held(own, best, diagnosis.baseline, diagnosis.experiment)
-    fitted = tuple(_fitted(e, best) for e in terms)
-    beside = tuple(e for e in best.hypothesis.effects if e.name not in names)
-    gain = best.fit.log_likelihood - _as_judged(own, diagnosis.baseline).fit.log_likelihood
-    return ClosedForm(fitted, beside, best, gain, held)
+def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
+    """Return the closed form that explains most for its length; None where no term helps, or held-out runs refuse all."""
+    registry = with_terms(search.registry)
+    names = {e.name for e in registry.entries("effect") if e.origin == ORIGIN}
+    own = ModelSearch(
+        registry, search.experiment, search.progress, sorted(names), search.trend, budget=BUDGET, threads=search.threads
+    )
+    start = [diagnosis.baseline]
+    if diagnosis.best is not diagnosis.baseline and not diagnosis.best.fine:
+        start.append(diagnosis.best)
+    own.extend(start)
+    least = max(f.evidence for f in start) + CLOSE
+    for best in own.ranked():
+        terms = [e for e in best.hypothesis.effects if e.name in names]
+        if not terms or best.evidence < least:
+            continue
+        held = held_out(diagnosis.baseline, best, diagnosis.experiment)
+        if at_bounds(best) or not _predicted(held):
+            search.progress(f"{best.name} is not offered: held-out runs refuse it, or it stands at a bound")
+            continue
+        beside = tuple(e for e in best.hypothesis.effects if e.name not in names)
+        gain = best.fit.log_likelihood - diagnosis.baseline.fit.log_likelihood
+        return ClosedForm(tuple(_fitted(e, best) for e in terms), beside, best, gain, held)
+    return None
 
 
-def _as_judged(search: Search, refit: Refit) -> Refit:
-    """Return a refit under the noise as it is known now: better fits that came later may have told it better."""
-    return search.tried.get((refit.name, refit.rough), refit)
+def _predicted(held: Sequence[Held]) -> bool:
+    """Return whether held-out runs are followed, and no worse than by the baseline."""
+    if not all(h.augmented.whole for h in held):
+        return False
+    white = np.concatenate([h.augmented.white for h in held]) if held else np.zeros(1)
+    return float(np.sqrt(np.mean(white**2))) < HELD and sum(h.gain for h in held) >= 0
 
 
-def _smoothed(search: Search, best: Refit | None) -> Refit | None:
-    """Return the refit on a smooth track instead where the term leaves nothing for a rough one to do."""
-    if best is None or not best.rough:
-        return best
-    smooth = search.refit(best.hypothesis, best, {}, rough=False)
-    return max((_as_judged(search, best), smooth), key=lambda r: r.evidence)
-
-
-def _with_own_terms(search: Search) -> Search:
-    """Return a search that knows the terms, and all that the one before has fitted."""
-    return replace(
-        search, registry=with_terms(search.registry), effects=None, tried=dict(search.tried), scored={}, excluded=[],
-        followed=dict(search.followed), held=dict(search.held), loose=dict(search.loose), noise=dict(search.noise),
-        stale=set(), evaluations=0,
-    )  # fmt: skip
-
-
-@dataclass
-class _Selection:
-    """Forward selection over candidate terms, from the baseline and from the best that registered effects could do."""
-
-    search: Search
-    candidates: Sequence[Effect]
-    done: set[frozenset[str]] = field(default_factory=set)
-
-    def run(self, diagnosis: Diagnosis) -> Refit | None:
-        """Return the refit with the best evidence that has a term; None where no term was worth it."""
-        start = diagnosis.baseline
-        best = self.step(start)
-        if diagnosis.best.hypothesis.effects and not (best is not None and best.adequacy.fine):
-            other = self.step(diagnosis.best)
-            found = [_as_judged(self.search, r) for r in (best, other) if r is not None]
-            best = max(found, key=lambda r: r.evidence, default=None)
-        for _ in range(MOST_TERMS - 1):
-            if best is None or best.adequacy.fine:
-                break
-            longer = self.step(best)
-            best = _as_judged(self.search, longer or best)
-            if longer is None:
-                break
-        return best
-
-    def step(self, start: Refit) -> Refit | None:
-        """Return the best refit with one term more than `start`; None where none has evidence enough."""
-        search = self.search
-        if start.rough or start.adequacy.rms_over_noise < NEAR:
-            found = []
-            for hypothesis, own in search.widened(start, _foremost(self.scored(start, start.fit))):
-                if self.new(hypothesis):
-                    found.append(search.refit(hypothesis, start, own, rough=start.rough))
-        else:
-            candidates = _foremost(self.scored(start, search.loosely(start)))
-            entrants = [(h, own) for h, own in search.widened(start, candidates) if self.new(h)]
-            found = contest(search, start, entrants)
-        best = max((_as_judged(search, r) for r in found), key=lambda r: r.evidence, default=None)
-        return best if best is not None and best.evidence > _as_judged(search, start).evidence + PAYS else None
-
-    def new(self, hypothesis: Hypothesis) -> bool:
-        """Return whether a hypothesis was not tried before and there is something left to try it with."""
-        key = frozenset(e.name for e in hypothesis.effects)
-        if key in self.done:
-            return False
-        if self.search.evaluations > MOST_EVALUATIONS:
-            self.search.progress(f"{hypothesis.name} is not tried: the budget is spent")
-            return False
-        self.done.add(key)
-        return True
-
-    def scored(self, start: Refit, around: LatentFit) -> list[Score]:
-        """Return the scores of all terms that a refit lacks and can be joined with, largest gain first, by slopes `around`."""
-        search, present = self.search, start.hypothesis.effects
-        left = search.joining(self.candidates, present)
-        found: list[Score] = []
-        for group in _groups(left, present):
-            search.progress(f"{start.name}: {len(group)} terms scored")
-            try:
-                found += scores(search.registry, around.problem.experiment, around, group, present=present)
-            except SrfError as error:  # such as two terms that leave no steady state in closed form
-                search.progress(f"{', '.join(e.name for e in group)}: {error.message}")
-        return sorted((s for s in found if s.gain > WORTH), key=lambda s: -s.gain)
-
-
-def _groups(left: Sequence[Effect], present: Sequence[Effect]) -> Iterator[list[Effect]]:
-    """Yield terms that one model can have together, with those present: one that moves the steady state goes without others."""
-    rests = [_rest(e) for e in present]
-    if "moves" not in rests:
-        yield [e for e in left if _rest(e) != "moves"]
-        if "keeps" not in rests:
-            yield from ([e] for e in left if _rest(e) == "moves")
-    else:
-        yield [e for e in left if _rest(e) == "silent"]
-
-
-def _rest(effect: Effect) -> str:
-    """Return what an effect does to the age's rate at rest: nothing (silent), something that keeps v phi = D0, or it moves it."""
-    rate = dict(effect.changes).get("rate")
-    if rate is None:
-        return "silent"
-    still = rate.subs(symbol("W_dot"), 0)
-    if sp.simplify(still - symbol("rate")) == 0:
-        return "silent"
-    steady = still.subs({symbol("rate"): 0, symbol("phi"): symbol("D0") / symbol("v")})
-    return "keeps" if sp.simplify(steady) == 0 else "moves"
-
-
-def _foremost(listed: Sequence[Score]) -> list[Score]:
-    """Return the scores that promise most, of twins no more than two."""
-    found: list[Score] = []
-    for score in listed:
-        twins = sum(abs(float(score.direction @ other.direction)) > ALIKE for other in found)
-        if twins < TWINS:
-            found.append(score)
-        if len(found) == TRIED:
-            break
-    return found
-
-
-def _fitted(effect: Effect, refit: Refit) -> FittedTerm:
+def _fitted(effect: Effect, fitted: Fitted) -> FittedTerm:
     """Return a term with its estimates, in declared units."""
-    fitted = refit.fit
-    errors = dict(zip(fitted.problem.names, np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0)).tolist(), strict=True))
-    values = {}
-    for name, p in own_parameters(effect, fitted.problem.model).items():
-        values[p.name] = (from_base(fitted.values[name], p.unit), from_base(errors[name], p.unit))
+    likelihood, values = fitted.fit.likelihood, {}
+    errors = dict(zip(likelihood.names, np.sqrt(np.maximum(np.diag(fitted.fit.covariance), 0.0)).tolist(), strict=True))
+    for name, p in own_parameters(effect, likelihood.problem.model).items():
+        values[p.name] = (from_base(fitted.fit.values[name], p.unit), from_base(errors[name], p.unit))
     return FittedTerm(effect, values)
 
 
-def explain_unknown(search: Search, diagnosis: Diagnosis) -> dict[str, Any]:
+def explain_unknown(
+    search: ModelSearch, diagnosis: Diagnosis, *, stopped: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
     """Return what there is to say where no registered effect explains a recording, as plain data and arrays.
 
     `force` holds, by run, the arrays of `RunForce.described`, and `form`, `unit`; `latent` is how that force was estimated.
     `form`, `gain`, `held_gain`, `terms` and the rest of `ClosedForm.described` are of the closed form, `form` None where no term
-    helps; `toml` is that form as an effect file.
+    helps; `toml` is that form as an effect file. Interrupted, the closed form is left out, and `stopped` is called.
     """
-    force = missing_force(search, diagnosis.baseline)
-    form = best_form(search, diagnosis)
+    baseline = diagnosis.baseline
+    force = unexplained_friction(baseline)
     found: dict[str, Any] = {"form": None, "gain": None, "held_gain": None, "terms": [], "toml": None}
+    try:
+        form = best_form(search, diagnosis)
+    except KeyboardInterrupt:
+        form = None
+        stopped()
     if form is not None:
         found |= {**form.described(), "toml": form.as_toml()}
-    about = {"amplitude": force.amplitude, "time": force.time, "share": force.share, "gain": force.gain}
-    found["latent"] = about | {"rms_over_noise": force.rms_over_noise, "coordinates": dict(force.coordinates)}
-    found["force"] = {**force.described(), "form": found["form"], "unit": "1"}
+    values = baseline.fit.values
+    found["latent"] = {
+        "amplitude": values["field_amplitude"], "length": values["field_length"],
+        "rms_over_noise": baseline.fit.maximum.point.rms, "coordinates": coordinates_of(force) if force else {},
+    }  # fmt: skip
+    found["csv"] = {name: run.csv() for name, run in force.items()}
+    found["force"] = {**{n: run.described() for n, run in force.items()}, "form": found["form"], "unit": "1"}
     return found
 
 
@@ -425,7 +250,7 @@ class ClosedForm:
 
     terms: tuple[FittedTerm, ...]
     beside: tuple[Effect, ...]
-    refit: Refit = field(repr=False)
+    fitted: Fitted = field(repr=False)
     gain: float
     held: tuple[Held, ...] = field(repr=False)
 
@@ -470,17 +295,16 @@ class ClosedForm:
 
     def described(self) -> dict[str, Any]:
         """Return it as plain data: form, gains, terms, and what is left."""
-        squares = [(h.run.used.sum(), h.rms_baseline**2, h.rms_augmented**2) for h in self.held]
-        count = sum(int(n) for n, _, _ in squares)
-        rms = [(sum(float(s[0] * s[k]) for s in squares) / count) ** 0.5 if count else None for k in (1, 2)]
+        sides = [[getattr(h, side).white for h in self.held] for side in ("baseline", "augmented")]
+        rms = [float(np.sqrt(np.mean(np.concatenate(w) ** 2))) if w else None for w in sides]
         return {
             "form": self.text,
             "gain": self.gain,
             "held_gain": self.held_gain,
             "terms": [t.described() for t in self.terms],
             "beside": [e.name for e in self.beside],
-            "rms_over_noise": self.refit.adequacy.rms_over_noise,
-            "leaves_noise_alone": self.refit.adequacy.fine,
+            "rms_over_noise": self.fitted.fit.maximum.point.rms,
+            "leaves_noise_alone": self.fitted.fine,
             "held_rms_over_noise": {"baseline": rms[0], "form": rms[1]},
         }
 

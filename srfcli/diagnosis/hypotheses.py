@@ -1,29 +1,25 @@
-"""Which registered effects may be missing in an experiment, and what a hypothesis gave once fitted."""
+"""Which registered effects may be missing in an experiment, and the models that have them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 
 import numpy as np
+import sympy as sp
 
 from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.settings import Parameter
 from srfcli.core.units import split_quantity, to_base
-from srfcli.data.values import Experiment, FitParameter, Run
-from srfcli.diagnosis.goodness_of_fit import Adequacy, judge_residuals
+from srfcli.data.scales import at_scale, scales_of
+from srfcli.data.values import Experiment, FitParameter
 from srfcli.inference.fit import Problem, fit_problem
-from srfcli.inference.noise import Noise
-from srfcli.inference.prediction import Hold, of_run
-from srfcli.inference.random_field import LatentFit
+from srfcli.inference.prediction import of_run
 from srfcli.laws.expression import symbol
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 
-# Which registered effects may be missing in an experiment, and the experiments that have them.
-
-TRACK = ("mu", "slip")
 UNMODULATED = {symbol(name): 0 for name in ("modulated", "eps", "envelope")}
 
 
@@ -42,7 +38,7 @@ def applicable(
 
     Among the former are those that could join it only beside another one that brings what they need.
     """
-    base = open_model(registry, **asdict(experiment.choice))
+    base, scales = open_model(registry, **asdict(experiment.choice)), scales_of(experiment.runs, experiment.parameters)
     found, excluded, waiting = [], [], []
     free = {p.name for p in experiment.parameters if not p.fixed}
     present = [registry.get("effect", name) for name in experiment.choice.effects]
@@ -65,6 +61,7 @@ def applicable(
             continue
         if set(effect.frees) & free:
             continue
+        effect = at_scale(effect, scales)
         reason = _unseen(effect, experiment)
         if any(n not in base.names for n in effect.needs):
             waiting += [effect] if not reason else []
@@ -95,34 +92,44 @@ def _unseen(effect: Effect, experiment: Experiment) -> str:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Effects that together with the baseline might have made the recording; none of them for the baseline itself."""
+    """The baseline with some effects, or with the ageing law `ageing` in place of its own; as it is with neither."""
 
     effects: tuple[Effect, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """Return the effects' names, or none."""
-        return "+".join(e.name for e in self.effects) or "none"
+    ageing: str = ""
 
     @property
     def reported(self) -> tuple[str, ...]:
-        """Return the names under which a verdict has the effects."""
-        return tuple(e.reported for e in self.effects)
+        """Return the names under which a verdict has what was added."""
+        return (*((self.ageing,) if self.ageing else ()), *(e.reported for e in self.effects))
 
-    def model(
-        self, registry: Registry, experiment: Experiment, *, rough: bool, hold: Hold | None = None,
-        random_field: bool = False,
-    ) -> GeneratedModel:  # fmt: skip
-        """Return the model, with a table along the track if it is rough, and one for the recording if that holds."""
-        return open_model(
-            registry, **asdict(experiment.choice.plus(_key(registry, e) for e in self.effects)),
-            tables=((TRACK,) if rough else ()) + ((hold.table,) if hold else ()), random_field=random_field,
-        )  # fmt: skip
+    @property
+    def name(self) -> str:
+        """Return these names joined, or none."""
+        return "+".join(sorted(self.reported)) or "none"
 
-    def problem(self, registry: Registry, experiment: Experiment, *, rough: bool, at: Mapping[str, float] | None = None,
-                trend: str | None = None, hold: Hold | None = None, random_field: bool = False) -> Problem:  # fmt: skip
+    def experiment(self, experiment: Experiment) -> Experiment:
+        """Return the experiment under the hypothesis' ageing law."""
+        if not self.ageing:
+            return experiment
+        return replace(experiment, choice=replace(experiment.choice, ageing=self.ageing))
+
+    def model(self, registry: Registry, experiment: Experiment, *, random_field: bool = True) -> GeneratedModel:
+        """Return the model, with a random friction field along slip unless that is left out."""
+        choice = self.experiment(experiment).choice.plus(e.name for e in self.effects)
+        return open_model(registry, **asdict(choice), random_field=random_field)
+
+    def problem(
+        self,
+        registry: Registry,
+        experiment: Experiment,
+        *,
+        at: Mapping[str, float] | None = None,
+        trend: str | None = None,
+        random_field: bool = True,
+    ) -> Problem:
         """Return the fit of baseline and effects together, from the values in `at` where there are some."""
-        model = self.model(registry, experiment, rough=rough, hold=hold, random_field=random_field)
+        experiment = self.experiment(experiment)
+        model = self.model(registry, experiment, random_field=random_field)
         added = [q for e in self.effects for q in fit_parameters(e, model, experiment)]
         at = at or {}
         names = {q.name for q in added}
@@ -132,20 +139,7 @@ class Hypothesis:
         )
         problem = fit_problem(model, replace(experiment, parameters=listed), trend=trend)
         start = [at.get(n, s) for n, s in zip(problem.names, problem.start, strict=True)]
-        return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper), hold=hold)
-
-
-def built_beside(hypothesis: Hypothesis, candidates: Sequence[Effect]) -> list[Hypothesis]:
-    """Return a hypothesis with each effect that is built in, a mass or an interface: beside others it has no score."""
-    present = hypothesis.effects
-    reported = {e.reported for e in present}
-    built = [e for e in candidates if e.settings and e.reported not in reported]
-    return [Hypothesis((e, *present)) for e in built] if present else []
-
-
-def _key(registry: Registry, effect: Effect) -> str:
-    """Return what `open_model` knows an effect by."""
-    return effect.name
+        return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper))
 
 
 def own_parameters(effect: Effect, model: GeneratedModel) -> dict[str, Parameter]:
@@ -195,85 +189,30 @@ def inner_grid(effect: Effect) -> list[dict[str, float]]:
     return [dict(combination) for combination in product(*axes)]
 
 
-# A hypothesis, fitted.
-
-DEARER = 0.004  # of chi-squared per degree of freedom while held, what a further effect has to take away
-HALFWAY = 1.25  # residual over noise within which a rough track may be what is left
-ASTRAY = 3.0  # times the chi-squared of where it came from: a start from which a fit had better be led
-PAIRS, ROUGHENED = 3, 2  # how many are fitted with a second effect, at each stage, and on rough tracks
-NEAR = 2.5  # residual over noise within which slopes at the fit tell where a better one is
-
-
 @dataclass(frozen=True)
-class Refit:
-    """A hypothesis, fitted: its evidence is the log likelihood, tracks integrated out, less what its parameters cost."""
+class Shape:
+    """An effect of first order that is a function g of one table's argument and of inner parameters."""
 
-    hypothesis: Hypothesis
-    fit: LatentFit
-    adequacy: Adequacy
-    evidence: float
-    rough: bool
-
-    @property
-    def name(self) -> str:
-        """Return the hypothesis' name."""
-        return self.hypothesis.name
-
-    @property
-    def halfway(self) -> bool:
-        """Return whether it leaves more than noise, and no more than a rough track may be."""
-        return not self.adequacy.fine and self.adequacy.rms_over_noise < HALFWAY
+    argument: str
+    g: Callable[..., Array]
+    inner: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A hypothesis while held: parameters (k,), also by name, chi-squared per degree of freedom."""
-
-    hypothesis: Hypothesis
-    theta: Array
-    values: dict[str, float]
-    reduced: float
-
-    @property
-    def single(self) -> bool:
-        """Return whether it adds one effect."""
-        return len(self.hypothesis.effects) == 1
-
-    @property
-    def rank(self) -> float:
-        """Return what it leaves, and what its effects cost."""
-        return self.reduced + DEARER * len(self.hypothesis.effects)
-
-
-def residuals_of(fitted: LatentFit) -> dict[str, Array]:
-    """Return what a fit leaves (n,) of each run."""
-    return {r.name: r.observed - fitted.point.predictions[r.name].y for r in fitted.problem.runs}
-
-
-def judge_fit(fitted: LatentFit, noise: Mapping[str, Noise], runs: Sequence[Run] | None = None) -> Adequacy:
-    """Return whether noise is all that a fit leaves, of all its runs or of some."""
-    every = fitted.problem.runs if runs is None else runs
-    return judge_residuals(every, residuals_of(fitted), noise, freedom=freedom_spent(fitted))
-
-
-def freedom_spent(fitted: LatentFit) -> dict[str, float]:
-    """Return how many parameters' worth of freedom each run's residual has lost, to the track above all."""
-    point, n = fitted.point, fitted.point.theta.size
-    out = {r.name: n / max(len(fitted.problem.runs), 1) for r in fitted.problem.runs}
-    if not point.tracks.splines or not point.roughness.amplitude:
-        return out
-    L = point.tracks.root(point.roughness)
-    M = L.T @ point.N[n:, n:] @ L
-    share = np.diag(np.linalg.solve(M + np.eye(M.shape[0]), M))
-    at = 0
-    weights = []
-    for spline in point.tracks.splines:
-        weights.append(float(share[at : at + spline.numbers.size].sum()))
-        at += spline.numbers.size
-    users: dict[int, list[str]] = {}
-    for name, i in point.tracks.of.items():
-        users.setdefault(i, []).append(name)
-    for i, names in users.items():
-        for name in names:
-            out[name] += weights[i] / len(names)
-    return out
+def along_table(effect: Effect) -> Shape | None:
+    """Return the shape of an effect that adds size * g(slip, time or stage) to mu, or multiplies V by 1 + it; None for others."""
+    if len(effect.changes) != 1 or len(effect.sizes) != 1 or effect.states or effect.settings:
+        return None
+    (slot, formula), size = effect.changes[0], effect.sizes[0]
+    if slot not in ("mu", "V"):
+        return None
+    slope = sp.diff(formula, symbol(size)).subs(symbol(size), sp.nsimplify(neutral_values(effect)[size]))
+    if slot == "V":
+        slope = sp.simplify(slope / symbol("V"))
+    inner = [p.name for p in effect.parameters if p.name != size]
+    used = {str(s) for s in slope.free_symbols}
+    arguments = used - set(inner)
+    tables = {"slip", "time"} if slot == "mu" else {"stage"}
+    if len(arguments) != 1 or not arguments <= tables:
+        return None
+    (argument,) = arguments
+    return Shape(argument, sp.lambdify([symbol(argument), *map(symbol, inner)], slope, "numpy"), tuple(inner))

@@ -1,13 +1,13 @@
-"""Where recording and baseline differ: local statistics of a residual over runs, times, phases, frequencies and states.
+"""Where recording and baseline differ: local statistics of innovations over runs, times, phases, frequencies and states.
 
-Least squares spreads a misfit over all that its parameters reach. Two other choices leave it where it is: the parameters that a
-better model has, and those under which as many samples as possible are in order (a Cauchy likelihood, in which a sample that is
-far off counts little).
+With standardised innovations r and columns X, their derivatives by the parameters, what no parameter explains is M r,
+M = 1 - X (X'X)^-1 X'. For local columns B, (B'M r)' (B'M B)^-1 (B'M r) is chi-squared under noise, whatever the true parameters
+are; so, nearly, is the sum of squares of M r over a set of samples, with tr(M) over the set for its degrees of freedom. The
+smallest p-value of all of them is judged by its own distribution, simulated through the same projection.
 
-With whitened residuals r, columns X of parameters and track, and the track's prior precision Q, what no parameter and no track
-explains is M r, M = 1 - X (X'X + Q)^-1 X'. For local columns B, (B'M r)' (B'M B)^-1 (B'M r) is chi-squared under noise, whatever
-the true parameters are; so, nearly, is the sum of squares of M r over a set of samples, with tr(M) over the set for its degrees
-of freedom. The smallest p-value of all of them is judged by its own distribution, simulated through the same projection.
+A model that lacks something bends its parameters and widens its random friction field, and its misfit is everywhere. Where a
+better model is known, the baseline is read with the parameters, the field and the gauge's noise of that one: then the innovations
+are far off where the physics is missing.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from scipy.special import gammaincc, gammaln
 
 from srfcli.codegen.model import Array
 from srfcli.data.values import Run
-from srfcli.inference.noise import Noise, stretches, whiten
-from srfcli.inference.prediction import Prediction, of_run
-from srfcli.inference.random_field import Latent, LatentFit, Point
+from srfcli.diagnosis.search import Fitted
+from srfcli.inference.kalman import Innovations
+from srfcli.inference.noise import stretches
+from srfcli.inference.prediction import of_run
+from srfcli.inference.recordings import slip_along
 from srfcli.motion.simulate import stick_slip
 
 # Where recording and baseline part: runs and times, phases of forcing and stick-slip, frequencies, quantities of state.
@@ -76,49 +78,30 @@ class Location:
         }
 
 
-def locate(
-    fitted: LatentFit, noise: Mapping[str, Noise], *, last: LatentFit | None = None, draws: int = DRAWS, seed: int = 0
-) -> Location:
-    """Return where the recordings part from a fit, with error control over everything that is looked at.
+def locate(fitted: Fitted, *, last: Fitted | None = None, draws: int = DRAWS, seed: int = 0) -> Location:
+    """Return where the recordings part from a fitted model, with error control over everything that is looked at.
 
-    `draws` recordings with nothing but noise (and the track) are simulated through the same projection. A fit that is far off has
-    bent its parameters, and its misfit is everywhere; once it is sure that there is one, the places are those of the same model
-    with parameters that leave as much as possible in order (see `unbent`), `last` being the better model. Phases, lines and
+    `draws` recordings with nothing but noise are simulated through the same projection. Of a model that is known to be better,
+    `last`, the parameters, the field and the noise are taken, and what is uncertain of them counts as noise. Phases, lines and
     quantities are looked for as long as each run is followed: once cycles are lost, a residual says nothing of them.
     """
-    forcing = {r.name: of_run(r)["f"] for r in fitted.problem.runs if of_run(r)["modulated"]}
-    precision, root, at = _prior(fitted)
-    pieces = pieces_of(fitted, noise)
-    atlas = Atlas(pieces, precision, root=root)
-    M = atlas.projected([p.white for p in pieces], at=at)
-    found = read_atlas(atlas, M, atlas.null(draws, seed=seed), forcing)
-    if found.p_value >= LEVEL:
-        return found
-    straight = unbent(fitted, noise, last)
-    pieces, prior = pieces_of(straight, noise), _prior(straight)[0]
-    whole, begun = (_read_kept(some, prior, forcing, draws, seed) for some in (pieces, [p.followed() for p in pieces]))
-    told = begun.coordinate or found.coordinate
+    likelihood, values = fitted.fit.likelihood, fitted.fit.values
+    forcing = {r.name: of_run(r)["f"] for r in likelihood.problem.runs if of_run(r)["modulated"]}
+    if last is None:
+        pieces = pieces_of(fitted, values)
+        atlas = Atlas(pieces, len(likelihood.names))
+        return read_atlas(atlas, atlas.projected([p.white for p in pieces]), atlas.null(draws, seed=seed), forcing)
+    values = {n: last.fit.values.get(n, v) for n, v in values.items()}  # on a smooth track its field is of amplitude 0
+    pieces, k = pieces_of(fitted, values), len(likelihood.names)
+    whole, begun = (_read_kept(some, k, forcing, draws, seed) for some in (pieces, [p.followed() for p in pieces]))
     rows = [r for r in whole.atlas if r.axis in OWN] + [r for r in begun.atlas if r.axis not in OWN]
-    return replace(begun, runs=whole.runs, coordinate=told, p_value=found.p_value, atlas=tuple(rows))
+    return replace(begun, runs=whole.runs, p_value=min(whole.p_value, begun.p_value), atlas=tuple(rows))
 
 
-def _read_kept(pieces: Sequence[Piece], prior: Array, forcing: Mapping[str, float], draws: int, seed: int) -> Location:
+def _read_kept(pieces: Sequence[Piece], k: int, forcing: Mapping[str, float], draws: int, seed: int) -> Location:
     """Return what stands out of residuals as they are."""
-    atlas = Atlas(pieces, prior, kept=True)
+    atlas = Atlas(pieces, k, kept=True)
     return read_atlas(atlas, atlas.projected([p.white for p in pieces]), atlas.null(draws, seed=seed), forcing)
-
-
-def _prior(fitted: LatentFit) -> tuple[Array, Array | None, Array]:
-    """Return precision (k, k) and root (k, j) of the track's prior among all columns, and the columns' own values (k,)."""
-    point, n = fitted.point, fitted.point.theta.size
-    k = n + point.tracks.numbers.size
-    precision, at = np.zeros((k, k)), np.zeros(k)
-    if not point.tracks.splines:
-        return precision, None, at
-    L = point.tracks.root(point.roughness if point.roughness.amplitude else replace(point.roughness, amplitude=1e-9))
-    inverse = np.linalg.inv(L)
-    precision[n:, n:], at[n:] = inverse.T @ inverse, point.tracks.numbers
-    return precision, np.vstack([np.zeros((n, L.shape[1])), L]), at
 
 
 def read_atlas(atlas: Atlas, M: Sequence[Array], null: Array, forcing: Mapping[str, float]) -> Location:
@@ -243,52 +226,41 @@ def _kept(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 # A fit's runs as pieces of an atlas: residuals and columns, whitened, with what their samples can be sorted by.
 
-LOST, LEAST = 0.3, 30.0  # of the record's standard deviation, and at least so many of the noise's: a cycle is lost
+LEAST = 30.0  # standard deviations of an innovation: a cycle is lost
 
 
-def pieces_of(fitted: LatentFit, noise: Mapping[str, Noise]) -> list[Piece]:
-    """Return each fitted run's residual and columns, whitened, with what its samples can be sorted by."""
-    problem, point = fitted.problem, fitted.point
-    n = point.theta.size
-    scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
+def pieces_of(fitted: Fitted, values: Mapping[str, float]) -> list[Piece]:
+    """Return each fitted run's standardised innovations under `values`, derivatives, and what its samples can be sorted by."""
+    likelihood = fitted.fit.likelihood
     found = []
-    for run in problem.runs:
-        p = point.predictions[run.name]
-        difference = run.observed - p.y
-        good = run.used & np.isfinite(difference) & np.isfinite(p.J).all(axis=1)
-        spans = stretches(run.t, good)
-        index = np.concatenate([np.arange(a, b) for a, b in spans]) if spans else np.zeros(0, dtype=int)
-        ends = np.cumsum([0, *(b - a for a, b in spans)]).tolist()
-        J = p.J.copy()
-        J[:, :n] *= scale
-        white = whiten(noise[run.name], np.column_stack([difference, J]), spans)
-        track = point.tracks.columns(run) if run.name in point.tracks.of else range(0)
-        places = np.array([*range(n), *(n + i for i in track)], dtype=int)
-        sorted_by = {name: x[index] for name, x in _coordinates(fitted, run, p).items()}
-        forcing, cycle = _forcing(run), _cycle(run)
-        parts = tuple(pairwise(ends))
-        columns = (white[:, 0], white[:, 1:], places, noise[run.name], parts)
+    for f in likelihood.over_runs(lambda run: likelihood.filtered(run, values, slopes=True, keep=True)):
+        run, got = f.run, f.found
+        index = np.nonzero(run.used & np.isfinite(got.nu) & (got.S > 0))[0]
+        scale = np.array([abs(values.get(n, 0.0)) for n in f.names])
+        white = got.nu[index] / np.sqrt(got.S[index])
+        X = -got.nu_d[index] / np.sqrt(got.S[index])[:, None] * scale
+        places = np.array([likelihood.names.index(n) for n in f.names], dtype=int)
+        good = np.zeros(run.t.size, dtype=bool)
+        good[index] = True
+        ends = np.cumsum([0, *(b - a for a, b in stretches(run.t, good))]).tolist()
+        sorted_by = {name: x[index] for name, x in _coordinates(fitted, run, got).items()}
+        forcing, cycle = (None if x is None else x[index] for x in (_forcing(run), _cycle(run)))
+        lost = LEAST if cycle is not None else np.inf  # steady sliding has no cycle to lose
         known = {k: x for k, x in sorted_by.items() if np.isfinite(x).all()}
-        forcing, cycle = (None if x is None else x[index] for x in (forcing, cycle))
-        slips = LOST * float(np.std(run.observed[run.used])) / noise[run.name].innovation
-        lost = np.inf if cycle is None else max(slips, LEAST)  # steady sliding has no cycle to lose
-        found.append(Piece(run.name, run.t[index], *columns, known, forcing, cycle, lost))
+        found.append(Piece(run.name, run.t[index], white, X, places, tuple(pairwise(ends)), known, forcing, cycle, lost))
     return found
 
 
-def _coordinates(fitted: LatentFit, run: Run, p: Prediction) -> dict[str, Array]:
-    """Return the quantities that the misfit may go with, each (n,), as the fit has them."""
-    model = fitted.problem.model
-    W, W_dot = run.load(run.t)
-    found = {"W": W, "dlnW/dt": W_dot / W, "time": run.t}
+def _coordinates(fitted: Fitted, run: Run, found: Innovations) -> dict[str, Array]:
+    """Return the quantities that the misfit may go with, each (n,), as the filter expects them."""
+    states = fitted.fit.likelihood.problem.model.states
+    assert found.kept is not None
+    x, (W, W_dot) = found.kept.mean, run.load(run.t)
+    known = {"W": W, "dlnW/dt": W_dot / W, "time": run.t, "position": slip_along(run, x, tuple(states))}
     for state, name in (("ln_v", "v"), ("ln_phi", "phi")):
-        if state in model.states:
-            found[name] = p.x[:, model.states.index(state)]  # their logarithms: it is the same order
-    V = run.drive(run.t)
-    moved = np.concatenate([[0.0], np.cumsum(0.5 * (V[1:] + V[:-1]) * np.diff(run.t))])
-    u = p.y * {"elongation": 1.0, "force": 1 / run.stiffness, "friction": W / run.stiffness}[run.observable]
-    found["position"] = run.start + moved - (u - u[0])
-    return found
+        if state in states:
+            known[name] = x[:, states.index(state)]  # their logarithms: it is the same order
+    return known
 
 
 def _forcing(run: Run) -> Array | None:
@@ -310,91 +282,13 @@ def _cycle(run: Run) -> Array | None:
     return np.asarray(np.mod(phase, 1.0))
 
 
-# A model's parameters where they are not bent by what the model misses.
-
-WIDTH = 3.0  # standard deviations of the noise beyond which a sample counts less and less
-ROUNDS, SHARES, SOLVES = 4, (1.0, 0.3, 0.1), 12
-CELL, CALM = 64, 4.0  # samples of a cell, and standard deviations of its power up to which it is in order
-CLEAN = 0.1  # share of the recordings that a better model's parameters must leave in order to be taken
-
-
-def unbent(fitted: LatentFit, noise: Mapping[str, Noise], last: LatentFit | None) -> LatentFit:
-    """Return a fit with straightened parameters, its track as it was; `last` is a fit of a model that has what this one misses.
-
-    The better model's parameters are taken where they leave a tenth of the recordings in order, else the most orderly ones.
-    """
-    latent, theta = Latent(fitted.problem), fitted.point.theta
-
-    def at(values: Array) -> LatentFit:
-        point = fitted.point
-        return replace(fitted, point=latent.at(values, point.tracks, noise, point.roughness))
-
-    starts = [fitted]
-    if last is not None:
-        known = last.values
-        moved = np.array([known.get(n, v) for n, v in zip(fitted.problem.names, theta.tolist(), strict=True)])
-        other = at(np.clip(moved, fitted.problem.lower, fitted.problem.upper))
-        if in_order(pieces_of(other, noise)) >= CLEAN:
-            return other
-        starts.append(other)
-    return min((_orderly(latent, start, noise) for start in starts), key=lambda f: _cost(f, noise))
-
-
-def in_order(pieces: Sequence[Piece]) -> float:
-    """Return the share of all cells in which there is no more than noise."""
-    fine = []
-    for p in pieces:
-        for part in np.array_split(p.white, max(p.white.size // CELL, 1)):
-            fine.append(float(part @ part) < part.size + CALM * np.sqrt(2 * part.size))
-    return float(np.mean(fine)) if fine else 0.0
-
-
-def _cost(fitted: LatentFit, noise: Mapping[str, Noise]) -> float:
-    """Return minus the log of the Cauchy likelihood; a sample that is not predicted counts as one far off."""
-    total = 0.0
-    sizes = {r.name: int(r.used.sum()) for r in fitted.problem.runs}
-    for p in pieces_of(fitted, noise):
-        total += float(np.sum(np.log1p((p.white / WIDTH) ** 2))) + (sizes[p.name] - p.white.size) * np.log1p(1e8)
-    return total
-
-
-def _orderly(latent: Latent, fitted: LatentFit, noise: Mapping[str, Noise]) -> LatentFit:
-    """Return the fit after steps in the parameters that lower the Cauchy cost."""
-    problem, best, cost = fitted.problem, fitted, _cost(fitted, noise)
-    for _ in range(ROUNDS):
-        step, before = _step(pieces_of(best, noise), best.point.theta.size) * latent.scale, cost
-        for share in SHARES:
-            theta = np.clip(best.point.theta + share * step, problem.lower, problem.upper)
-            point: Point = latent.at(theta, best.point.tracks, noise, best.point.roughness)
-            trial = replace(best, point=point)
-            found = _cost(trial, noise)
-            if found < cost:
-                best, cost = trial, found
-                break
-        if before - cost < 1e-3 * before:
-            break
-    return best
-
-
-def _step(pieces: Sequence[Piece], n: int) -> Array:
-    """Return the change of the scaled parameters (n,) that minimises the Cauchy cost of the linearised residuals."""
-    r = np.concatenate([p.white for p in pieces])
-    X = np.concatenate([p.X[:, :n] for p in pieces])
-    step = np.zeros(n)
-    for _ in range(SOLVES):
-        w = 1 / (1 + ((r - X @ step) / WIDTH) ** 2)
-        A = X.T @ (X * w[:, None])
-        d = np.sqrt(np.maximum(np.diag(A), 1e-300))
-        step = np.linalg.lstsq(A / np.outer(d, d), (X.T @ (w * r)) / d, rcond=1e-12)[0] / d
-    return np.asarray(step)
-
-
 # Local statistics of a residual, all under one null: windows, bins, lines and smooth functions that may stand out.
 
 WAVES, SHORTEST, HALVINGS = 4, 24, 5  # cosines over a window, samples of the shortest, how often a run is halved
 BINS = 12
 NUMBERS_AT_ONCE = 4_000_000  # numbers of simulated residuals held at a time
 OFF = 1.08  # factor by which a run's own noise level may differ from the assumed variance and count as noise
+STILL = 1e-6  # standard deviations by which a parameter moves all innovations together: it has nothing to do with them
 ABSORBED = 1e-4  # share of a column's squares below which what is left of it is rounding
 LINES = 64  # samples from which a spectrum is looked at
 
@@ -412,7 +306,6 @@ class Piece:
     white: Array
     X: Array = field(repr=False)
     places: Array
-    noise: Noise
     parts: tuple[tuple[int, int], ...]
     coordinates: Mapping[str, Array] = field(default_factory=dict, repr=False)
     forcing: Array | None = field(default=None, repr=False)
@@ -430,10 +323,6 @@ class Piece:
             self, t=self.t[:n], white=self.white[:n], X=self.X[:n], parts=parts, coordinates=sorted_by, forcing=forcing,
             cycle=cycle,
         )  # fmt: skip
-
-    def whitened(self, columns: Array) -> Array:
-        """Return columns (n, q) filtered as the residual is."""
-        return whiten(self.noise, columns, list(self.parts))
 
 
 @dataclass(frozen=True)
@@ -489,25 +378,27 @@ def log_tail(x: Array, freedom: Array | float) -> Array:
 class Atlas:
     """All places of some runs, and the projection that goes with them."""
 
-    def __init__(
-        self, pieces: Sequence[Piece], precision: Array, *, root: Array | None = None, kept: bool = False
-    ) -> None:
-        """Take runs, the prior precision (k, k) of the columns and, of a track that is drawn in simulations, its root (k, j).
+    def __init__(self, pieces: Sequence[Piece], k: int, *, kept: bool = False) -> None:
+        """Take runs whose columns are at places below k.
 
         Where residuals are `kept` as they are, as their parameters come from elsewhere, nothing is projected; what is then
         uncertain of the parameters counts as noise.
         """
-        self.pieces, self.root, self.precision, self.kept = tuple(pieces), root, precision, kept
-        k = precision.shape[0]
-        A = precision.copy()
+        self.pieces, self.k, self.kept = tuple(pieces), k, kept
+        self.root: Array | None = None
+        A = np.zeros((k, k))
         for p in self.pieces:
             A[np.ix_(p.places, p.places)] += p.X.T @ p.X
-        d = np.sqrt(np.maximum(np.diag(A), 1e-300))
-        self.inverse = (np.linalg.pinv(A / np.outer(d, d), rcond=1e-13, hermitian=True) / np.outer(d, d)) if k else A
+        d = np.sqrt(np.diag(A))
+        moving = np.nonzero(d > STILL)[0]
+        d = d[moving]
+        values, vectors = np.linalg.eigh(A[np.ix_(moving, moving)] / np.outer(d, d))
+        good = values > 1e-13 * max(float(values.max(initial=0.0)), 1e-300)
+        root = np.zeros((k, int(good.sum())))
+        root[moving] = vectors[:, good] / np.sqrt(values[good]) / d[:, None]
+        self.inverse = root @ root.T
         if kept:
-            values, vectors = np.linalg.eigh(self.inverse)
-            self.root = vectors * np.sqrt(np.maximum(values, 0.0))
-            self.inverse = -self.inverse
+            self.root, self.inverse = root, -self.inverse
         self.spare = [1 - np.einsum("ij,jk,ik->i", p.X, self._block(p, p), p.X, optimize=True) for p in self.pieces]
         self.spectra = [self._spectrum(i) for i in range(len(self.pieces))]
         self.items = [*self._windows(), *self._bins()]
@@ -516,12 +407,11 @@ class Atlas:
     def _block(self, a: Piece, b: Piece) -> Array:
         return np.asarray(self.inverse[np.ix_(a.places, b.places)])
 
-    def projected(self, residuals: Sequence[Array], *, at: Array | None = None) -> list[Array]:
-        """Return M r by run, r (n,) or (n, d); `at` (k,) are the values at which the residuals' own prior is centred."""
+    def projected(self, residuals: Sequence[Array]) -> list[Array]:
+        """Return M r by run, r (n,) or (n, d)."""
         if self.kept:
             return [self._levelled(r) for r in residuals]
-        b = -(self.precision @ at) if at is not None else np.zeros(self.precision.shape[0])
-        b = np.repeat(b[:, None], residuals[0].shape[1], axis=1) if residuals[0].ndim > 1 else b
+        b = np.zeros((self.k, *residuals[0].shape[1:]))
         for p, r in zip(self.pieces, residuals, strict=True):
             b[p.places] += p.X.T @ r
         step = self.inverse @ b
@@ -680,13 +570,10 @@ class Atlas:
     def _linear(self, axis: str, run: str, kind: str, spans: tuple[tuple[float, float], ...],
                 parts: Sequence[tuple[int, slice, Array]], groups: Sequence[tuple[int, int]]) -> _Item:  # fmt: skip
         """Return the statistics of groups of columns, with the roots of (B'M B)^-1."""
-        q, k = parts[0][2].shape[1], self.precision.shape[0]
+        q, k = parts[0][2].shape[1], self.k
         white, C, G = [], np.zeros((q, k)), np.zeros((q, q))
         for i, s, B in parts:
             p = self.pieces[i]
-            full = np.zeros((p.white.size, B.shape[1]))
-            full[s] = B
-            B = p.whitened(full)[s] if p.noise.order or p.noise.pieces else B / p.noise.innovation
             white.append((i, s, B))
             C[:, p.places] += B.T @ p.X[s]
             G += B.T @ B

@@ -20,14 +20,21 @@ from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.errors import SrfError
 from srfcli.core.units import split_quantity, to_base
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.hypotheses import Excluded, inner_grid, neutral_values, own_parameters
-from srfcli.diagnosis.sensitivities import Shape, along_table
+from srfcli.diagnosis.hypotheses import (
+    Excluded,
+    Shape,
+    along_table,
+    inner_grid,
+    neutral_values,
+    own_parameters,
+)
 from srfcli.inference.recordings import slip_along
 from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns, filter_run
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 
 NODES, MOST_NODES = 0.4, 400  # of a shared field: correlation lengths between them; how many
+NOTHING = 1e-100  # of a column's squares: a bump beyond the ends of all runs, say
 FINE = 20  # points between samples at which a function of slip or stage is averaged
 
 
@@ -288,7 +295,7 @@ class Scores:
         best: dict[str, Score] = {}
         for column in self.columns:
             whole = float(np.sum(column.columns**2))
-            if not whole > 0 or not np.isfinite(whole):
+            if not whole > NOTHING or not np.isfinite(whole):
                 continue  # it does nothing here
             gain, size, covariance, free = self._judge(column.columns)
             effect = column.effect
@@ -333,7 +340,7 @@ class Scores:
         """Return what any two of the foremost effects could explain together, largest gain first."""
         chosen: dict[str, list[tuple[float, _Column]]] = {}
         for column in self.columns:
-            if np.isfinite(column.columns).all() and np.any(column.columns):
+            if np.isfinite(column.columns).all() and np.sum(column.columns**2) > NOTHING:
                 chosen.setdefault(column.effect.reported, []).append((self._judge(column.columns)[0], column))
         foremost = [max(found, key=lambda f: f[0])[1] for found in chosen.values()]
         found = []

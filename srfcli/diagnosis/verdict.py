@@ -1,83 +1,77 @@
-"""From what was fitted to what is said: a set of hypotheses that may be it, the gate of held-out runs, and a verdict."""
+"""From what was fitted to what is said: the models that may be it, the gate of held-out runs, a verdict and its confidence."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from srfcli.codegen.model import Array
-from srfcli.core.units import to_base
+from srfcli.core.errors import Status
+from srfcli.core.units import find_unit, from_base, split_quantity, to_base
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.goodness_of_fit import DOUBT, SURE, Adequacy, joined, sampled
-from srfcli.diagnosis.hypotheses import (
-    HALFWAY,
-    NEAR,
-    Excluded,
-    Hypothesis,
-    Refit,
-    applicable,
-    judge_fit,
-    neutral_values,
-    own_parameters,
-)
-from srfcli.diagnosis.nudging import LOOSE, Follower
-from srfcli.diagnosis.staged_score import Score
-from srfcli.diagnosis.staged_search import CLOSE, Search
-from srfcli.inference.fit import Problem
-from srfcli.inference.noise import Noise
-from srfcli.inference.random_field import fit_latent, likeliest_bump, tracks_for
+from srfcli.diagnosis.hypotheses import Excluded, neutral_values
+from srfcli.diagnosis.scores import Score
+from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, Fitted, ModelSearch
+from srfcli.inference.state_space import Filtered, Likelihood, StateSpaceFit, maximise
 
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
 NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
+HELD = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
 SAME = 0.97  # likeness of two effects' projected columns beyond which they are one class
-DETERMINED = 2.0  # standard errors from nothing, of a mass or an interface that is built in
-FEW = 4.0  # standard deviations by which the level of a short run's noise may be off
-TEMPER = 3.0  # by which evidence is divided before it becomes a stated confidence: found on a bank of its own
-# shares of the sealed cases of seeds 227 and 817 (docs/proof.md) by verdict: what was concealed is not registered; the best
-# hypothesis is wrong for another reason. Of 58 `unknown` 44 were so, of 63 `none` one had an effect, of 120 names 9 were wrong
-SHARES = {"unknown": (0.76, 0.0), "none": (0.01, 0.02)}
-NAMED = (0.035, 0.045)  # the same of every other verdict
+ABSORBED = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
+TEMPER = 3.0  # by which log evidence is divided before it becomes a stated confidence, until a bank says better
+LACKING = 40.0  # in log evidence, what a model that fails a test loses in the stated confidence
+UNEXPLAINED = 0.03  # least share of the confidence that something is missing that is not registered
 
 
 @dataclass(frozen=True)
 class Held:
-    """One held-out run under the baseline and under the final model: predictions (n,) and gain in log likelihood.
+    """One held-out run filtered under the baseline and under the best model, both as they were fitted to the other runs.
 
-    `noise_alone` is whether the final model leaves noise alone, its parameters as they were fitted to other runs; `level` is the
-    gauge's noise there.
+    `shown` is that of the baseline with the best model's field and gauge noise.
     """
 
-    run: Run
-    baseline: Array
-    augmented: Array
-    gain: float
-    rms_baseline: float
-    rms_augmented: float
-    noise_alone: bool
-    level: float
+    baseline: Filtered
+    augmented: Filtered
+    shown: Filtered
+
+    @property
+    def run(self) -> Run:
+        """Return the run."""
+        return self.baseline.run
+
+    @property
+    def gain(self) -> float:
+        """Return what the best model gains in log likelihood."""
+        return self.augmented.log_likelihood - self.baseline.log_likelihood
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Everything that is said and what it rests on."""
+    """Everything that is said and what it rests on; `close` are the models that may be it, best first.
+
+    `shown` is the baseline with the final model's field and gauge noise, its own parameters fitted again.
+    `detectable` is the size, in um, s, N, from which each effect could have been seen; `ungated` the verdict, had held-out runs
+    no say.
+    """
 
     experiment: Experiment
     verdict: str
-    best: Refit
-    baseline: Refit
-    ranked: tuple[Refit, ...]
-    close: tuple[Refit, ...]
+    best: Fitted
+    baseline: Fitted
+    shown: Fitted
+    ranked: tuple[Fitted, ...]
+    close: tuple[Fitted, ...]
     confidence: dict[str, float]
     scores: tuple[Score, ...]
     not_identifiable: tuple[Excluded, ...]
     detectable: dict[str, float]
     equivalent: tuple[tuple[str, ...], ...]
-    held: tuple[Held, ...]
-    noise: dict[str, Noise]
+    held: tuple[Held, ...] = field(repr=False)
     reasons: tuple[str, ...]
-    ungated: str = ""  # the verdict, had held-out runs no say
+    ungated: str
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -85,241 +79,160 @@ class Diagnosis:
         if self.verdict == "identified":
             return self.best.hypothesis.reported
         if self.verdict == "ambiguous":
-            return tuple(dict.fromkeys(n for r in self.close for n in r.hypothesis.reported))
+            return tuple(dict.fromkeys(n for f in self.close for n in f.hypothesis.reported))
         return ()
 
     @property
-    def augmented(self) -> Refit:
-        """Return the model that the report shows beside the baseline: the best, whatever the verdict calls it."""
-        return self.best
+    def final(self) -> Fitted:
+        """Return the model that the answer calls augmented: the baseline itself where nothing is to be added."""
+        return self.baseline if self.verdict in NOTHING else self.best
 
 
-def conclude(search: Search, held_out: Experiment) -> Diagnosis:
-    """Return the verdict on a finished search; `held_out` is the experiment read with its held-out runs, opened only now."""
-    ranked = tuple(r for r in search.ranked() if not undetermined(r))
-    best, alone = ranked[0], next(r for r in ranked if not r.hypothesis.effects)
-    close = tuple(r for r in ranked if r.adequacy.fine and best.evidence - r.evidence < CLOSE)
-    if close:  # a hypothesis that holds a smaller one, and gains nothing by it, is not another answer
-        close = tuple(
-            r for r in close if not any(set(o.hypothesis.reported) < set(r.hypothesis.reported) for o in close)
-        )
-        best = close[0]
-    # what an effect explains is shown against a baseline on a track like its own
-    baseline = search.tried.get((alone.name, best.rough), alone) if best.hypothesis.effects else alone
-    listed = _scored(search, baseline, asked=any(not r.hypothesis.effects for r in close))
-    ungated, reasons = _verdict(best, close, (), listed)
-    bumped = _bumped(best)
-    ungated = "unknown" if bumped and ungated in NOTHING else ungated
-    held = judge_held(search, best, baseline, held_out)
-    found, reasons = _verdict(best, close, held, listed)
-    refused = _refused(search, best, held_out, held) if found != "unknown" else ""
-    if refused or (bumped and found in NOTHING):
-        found = "unknown"
-    reasons += [reason for reason in (refused, bumped) if reason]
-    unseen = [*search.excluded, *_unidentifiable(listed)]
+def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
+    """Return the verdict on a finished search; `whole` is the experiment with its held-out runs, opened only now."""
+    ranked = tuple(search.ranked())
+    baseline, best = search.baseline, ranked[0]
+    close = tuple(f for f in ranked if f.fine and best.evidence - f.evidence < CLOSE)
+    names = [set(f.hypothesis.reported) for f in close]
+    close = tuple(f for f in close if not any(n < set(f.hypothesis.reported) for n in names))
+    best = close[0] if close else best
+    shown = on_the_track_of(best, baseline) if best.fine else baseline
+    held = held_out(baseline, best, whole, shown)
+    scores = tuple(baseline.promised)
+    ungated, reasons = _said(best, close, scores)
+    refused = _refused(best, baseline, held) if ungated != "unknown" else ""
+    verdict = "unknown" if refused else ungated
+    reasons += [refused] if refused else []
+    reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]
+    absorbed = [
+        Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.surviving):.2f} % of it")
+        for s in scores
+        if s.surviving < ABSORBED and s.detectable > interesting(s)
+    ]
     return Diagnosis(
-        held_out, found, best, baseline, ranked, close, _confidence(ranked, found), tuple(listed), tuple(unseen),
-        {s.effect.reported: s.detectable for s in listed}, _equivalent(listed, close),
-        held, search.noise, tuple(reasons), ungated,
+        whole, verdict, best, baseline, baseline if verdict in NOTHING else shown, ranked, close,
+        _confidence(ranked, verdict), scores,
+        (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores}, _equivalent(scores, close), held,
+        tuple(reasons), ungated,
     )  # fmt: skip
 
 
-def undetermined(refit: Refit) -> bool:
-    """Return whether a mass or an interface that a hypothesis builds in is nothing by its own error: such a one is not there.
+def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
+    """Return the baseline with field and gauge noise of a better model, its own parameters fitted again from those of that one.
 
-    Where slopes tell that nothing depends on it, more evidence is that of another minimum, or of another roughness.
+    By itself it widens the field until that takes up what is missing, and nothing is left to be seen.
     """
-    built = [e for e in refit.hypothesis.effects if e.settings]
-    if not built:
-        return False
-    fitted = refit.fit
-    errors = np.sqrt(np.maximum(np.diag(fitted.covariance), 0.0))
-    known = dict(zip(fitted.problem.names, errors.tolist(), strict=True))
-    sizes = [n for e in built for n in (*own_parameters(e, fitted.problem.model), *e.frees) if n in known]
-    return any(fitted.values[n] < DETERMINED * known[n] for n in sizes)
+    if best is baseline:
+        return baseline
+    old = baseline.fit.likelihood
+    likelihood = Likelihood(
+        old.problem, smooth=best.fit.smooth, processes=best.fit.likelihood.processes, rtol=COARSE, threads=old.threads
+    )
+    held = [n for n in likelihood.names if n not in old.problem.names]
+    found = maximise(likelihood, likelihood.coordinates(best.fit.values), held=held, close=NEAR)
+    if found.status is Status.INTEGRATION:
+        return baseline
+    return replace(baseline, fit=StateSpaceFit(likelihood, found, likelihood.evaluations))
 
 
-def _scored(search: Search, baseline: Refit, *, asked: bool) -> list[Score]:
-    """Return the scores around the baseline, found only now if a verdict asks for them; else those on the other kind of track."""
-    key, other = (baseline.name, baseline.rough), (baseline.name, not baseline.rough)
-    if asked and key not in search.scored:
-        return search.score(baseline, applicable(search.registry, search.experiment, search.effects)[0])
-    return search.scored.get(key) or search.scored.get(other, [])
-
-
-def _bumped(best: Refit) -> str:
-    """Return what to say of a bump on the track, nothing where there is none."""
-    bump = likeliest_bump(best.fit.point) if best.rough else None
-    if bump is None or bump.p_value >= DOUBT:
-        return ""
-    return (
-        f"the track has a bump at {bump.place:.1f} um, {bump.width:g} um wide and {bump.height:+.2g} high: no roughness "
-        f"explains it (p = {bump.p_value:.1g})"
+def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | None = None) -> tuple[Held, ...]:
+    """Return every held-out run under two fitted models, and under the baseline as it is shown, if that is another."""
+    models = (baseline, best, shown or baseline)
+    return tuple(
+        Held(*(f.fit.likelihood.held_out(run, f.fit.values) for f in models)) for run in whole.runs if run.holdout
     )
 
 
-def _verdict(
-    best: Refit, close: Sequence[Refit], held: Sequence[Held], looked: Sequence[Score]
-) -> tuple[str, list[str]]:
-    reasons = [f"{best.name}: rms over noise {best.adequacy.rms_over_noise:.3f}, p = {best.adequacy.p_value:.2g}"]
-    if not best.adequacy.fine:
-        return "unknown", [*reasons, "no registered effect, nor two of them, brings the residuals down to noise"]
-    if any(not r.hypothesis.effects for r in close):
-        seen = [s for s in looked if s.detectable < interesting(s)]
-        if 2 * len(seen) >= len(looked):
-            return "none", [*reasons, "the baseline leaves noise alone"]
+def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score]) -> tuple[str, list[str]]:
+    if not best.fine:
+        return "unknown", [f"{best.name}: {reason}" for reason in best.against]
+    reasons = [f"{best.name}: nothing is left that a test finds"]
+    if any(not f.hypothesis.reported for f in close):
+        seen = [s for s in scores if s.detectable < interesting(s)]
+        if 2 * len(seen) >= len(scores):
+            return "none", [*reasons, "the baseline explains the recordings"]
         return "inconclusive", [
             *reasons,
             "nothing is needed, and most effects of interesting size could not have been seen",
         ]
-    gain = sum(h.gain for h in held)
-    if held and gain < 0:
-        return "unknown", [
-            *reasons,
-            f"held-out runs are predicted worse than by the baseline: log likelihood {gain:+.1f}",
-        ]
-    if len({frozenset(r.hypothesis.reported) for r in close}) > 1:
-        return "ambiguous", [*reasons, "several hypotheses do equally well: " + ", ".join(r.name for r in close)]
+    if len({frozenset(f.hypothesis.reported) for f in close}) > 1:
+        return "ambiguous", [*reasons, "several models do equally well: " + ", ".join(f.name for f in close)]
     return "identified", reasons
+
+
+def _refused(best: Fitted, baseline: Fitted, held: Sequence[Held]) -> str:
+    """Return why held-out runs refuse the best model; nothing where they do not."""
+    if not held:
+        return ""
+    if not all(h.augmented.whole for h in held):
+        return "held-out runs cannot be followed"
+    white = np.concatenate([h.augmented.white for h in held])
+    rms = float(np.sqrt(np.mean(white**2)))
+    if not rms < HELD:
+        return f"held-out runs are not predicted: innovations have an rms of {rms:.3f}"
+    gain = sum(h.gain for h in held)
+    if best is not baseline and gain < 0:
+        return f"held-out runs are predicted worse than by the baseline: log likelihood {gain:+.1f}"
+    return ""
 
 
 def interesting(score: Score) -> float:
     """Return the size of an effect that matters, in um, s, N: what its plugin gives as default, from its neutral value."""
     if not score.effect.sizes:
-        return 0.1
+        return float("inf") if "K" not in score.effect.frees else 0.1 * abs(score.values["K"])
     p = next(p for p in score.effect.parameters if p.name == score.effect.sizes[0])
     return abs(to_base(p.default, p.unit) - neutral_values(score.effect)[p.name])
 
 
-def _unidentifiable(scores: Sequence[Score]) -> list[Excluded]:
-    found = []
-    for s in scores:
-        if s.surviving < 2e-3 and s.detectable > interesting(s):
-            lost = 100 * (1 - s.surviving)
-            found.append(
-                Excluded(s.effect.reported, f"the baseline's parameters and the track absorb {lost:.2f} % of it")
-            )
-    return found
+def at_bounds(fitted: Fitted) -> list[str]:
+    """Return the model's parameters that stand at a bound, those of field and gauge left out."""
+    likelihood, x = fitted.fit.likelihood, fitted.fit.maximum.point.x
+    return [
+        name
+        for name, value, low, high in zip(likelihood.names, x, likelihood.lower, likelihood.upper, strict=True)
+        if name in likelihood.problem.names and (value <= low or value >= high)
+    ]
 
 
-def _confidence(ranked: Sequence[Refit], verdict: str) -> dict[str, float]:
-    """Return the stated confidence in each hypothesis, by evidence, and in `unknown`, by how often it was so in sealed cases."""
-    weights: dict[str, float] = {}
-    for r in ranked:
-        key = "+".join(sorted(r.hypothesis.reported)) or "none"
-        lacking = 0.0 if r.adequacy.fine else 40.0
-        if any(o.adequacy.fine and set(o.hypothesis.reported) < set(r.hypothesis.reported) for o in ranked):
-            lacking += CLOSE  # what a further effect has to earn, in the verdict too
-        weights[key] = max(weights.get(key, -np.inf), r.evidence - lacking)
-    top = max(weights.values())
-    share = {k: float(np.exp(max((w - top) / TEMPER, -60.0))) for k, w in weights.items()}
-    left, lost = SHARES.get(verdict, NAMED)
-    total = sum(share.values()) / (1 - left - lost)
-    found = {"unknown": left, **{k: v / total for k, v in share.items()}}
-    return dict(sorted(found.items(), key=lambda kv: -kv[1]))
-
-
-def _equivalent(scores: Sequence[Score], close: Sequence[Refit]) -> tuple[tuple[str, ...], ...]:
-    """Return the classes of effects whose signals no parameter change tells apart, and that matter here."""
-    names = {n for r in close for n in r.hypothesis.reported}
+def _equivalent(scores: Sequence[Score], close: Sequence[Fitted]) -> tuple[tuple[str, ...], ...]:
+    """Return the pairs of effects whose signals no parameter change tells apart, and that matter here."""
+    names = {n for f in close for n in f.hypothesis.reported}
     found = []
     for i, a in enumerate(scores):
         for b in scores[i + 1 :]:
-            alike = abs(float(a.direction @ b.direction)) if a.direction.size == b.direction.size else 0.0
-            if (
-                alike > SAME
-                and a.effect.reported != b.effect.reported
-                and (not names or {a.effect.reported, b.effect.reported} & names)
-            ):
+            told = {a.effect.reported, b.effect.reported}
+            if (told & names or not names) and abs(float(a.direction @ b.direction)) > SAME:
                 found.append((a.effect.reported, b.effect.reported))
     return tuple(found)
 
 
-def judge_held(search: Search, best: Refit, baseline: Refit, experiment: Experiment) -> tuple[Held, ...]:
-    """Return how the final model and the baseline predict the held-out runs; a rough track there is integrated out."""
-    found = []
-    for run in (r for r in experiment.runs if r.holdout):
-        answers = [_predicted(search, refit, experiment, run) for refit in (baseline, best)]
-        (y0, l0, a0), (y1, l1, a1) = answers
-        level = _noise_for(search, run).level
-        found.append(Held(run, y0, y1, l1 - l0, a0.rms_over_noise, a1.rms_over_noise, _alone(a1, [run]), level))
-    return tuple(found)
+def _confidence(ranked: Sequence[Fitted], verdict: str) -> dict[str, float]:
+    """Return the stated confidence in each model, by evidence, and in `unknown`."""
+    weights = {f.name: f.evidence - (0.0 if f.fine else LACKING) for f in ranked}
+    weights["unknown"] = max(weights.values()) + (LACKING if verdict == "unknown" else TEMPER * np.log(UNEXPLAINED))
+    top = max(weights.values())
+    share = {name: float(np.exp(max((w - top) / TEMPER, -60.0))) for name, w in weights.items()}
+    total = sum(share.values())
+    return dict(sorted(((n, v / total) for n, v in share.items()), key=lambda item: -item[1]))
 
 
-def _alone(left: Adequacy, runs: Sequence[Run]) -> bool:
-    """Return whether noise is all that is left of some runs, which may be short."""
-    samples = sum(int(r.used.sum()) for r in runs)
-    return bool(left.p_value > DOUBT and left.rms_over_noise < SURE + FEW / np.sqrt(2 * max(samples, 1)))
+def parameters_of(fitted: Fitted) -> dict[str, dict[str, Any]]:
+    """Return the free parameters in their declared units with standard errors; a stiffness also as a ratio to the stated one."""
+    problem, values, k = fitted.fit.likelihood.problem, fitted.fit.values, len(fitted.fit.likelihood.problem.names)
+    units = {q.name: q.unit for q in problem.experiment.parameters}
+    errors = np.sqrt(np.maximum(np.diag(fitted.fit.covariance)[:k], 0.0))
+    found: dict[str, dict[str, Any]] = {}
+    for name, error in zip(problem.names, errors.tolist(), strict=True):
+        unit = units.get(name, "1")
+        found[name] = {"value": from_base(values[name], unit), "stderr": from_base(error, unit), "unit": unit}
+    if "K" in found:
+        number, unit = split_quantity(problem.experiment.stiffness_text, name="stiffness")
+        stated = from_base(number * find_unit(unit).factor, found["K"]["unit"])
+        found["ratio"] = {k: found["K"][k] / stated for k in ("value", "stderr")} | {"unit": "1"}
+    return found
 
 
-def _refused(search: Search, best: Refit, experiment: Experiment, held: Sequence[Held]) -> str:
-    """Return why no parameters of the final model fit all runs, the held-out ones too; nothing where some may do so.
-
-    A prediction that leaves more than noise may owe it to its parameters' errors. At the margin of stability cycles come and go
-    with less than these, and a fit does not find them again: where it is lost, what is left under a hold is asked.
-    """
-    if all(h.noise_alone for h in held):
-        return ""
-    every = replace(experiment, runs=tuple(replace(r, holdout=False) for r in experiment.runs))
-    noise = {r.name: search.noise.get(r.name) or _noise_for(search, r) for r in every.runs}
-    point, names = best.fit.point, {h.run.name for h in held}
-
-    def left(problem: Problem) -> tuple[Adequacy, bool]:
-        tracks = tracks_for(problem.runs, shared=point.tracks.shared) if point.tracks.splines else None
-        roughness = point.roughness if tracks else None
-        fitted = fit_latent(problem, problem.start, noise, tracks=tracks, roughness=roughness, known_noise=True)
-        runs = [r for r in fitted.problem.runs if r.name in names]
-        adequacy = judge_fit(fitted, noise, runs)
-        return adequacy, _alone(adequacy, runs)
-
-    values = best.fit.values
-    found, alone = left(
-        best.hypothesis.problem(search.registry, every, rough=best.rough, at=values, trend=search.trend)
-    )
-    if found.rms_over_noise > NEAR and not best.rough:
-        held_fast = Follower(search.registry, every, search.trend).problem(best.hypothesis, values, LOOSE)
-        alone = left(held_fast)[0].rms_over_noise < HALFWAY
-    if alone:
-        return ""
-    return (
-        f"no parameters of {best.name} fit the held-out runs along with the others: rms over noise {found.rms_over_noise:.3f} "
-        f"there, p = {found.p_value:.2g}"
-    )
-
-
-def _predicted(search: Search, refit: Refit, experiment: Experiment, run: Run) -> tuple[Array, float, Adequacy]:
-    """Return prediction, log likelihood and what is left of a held-out run at the fitted parameters."""
-    problem = refit.fit.problem
-    as_fitted = replace(run, holdout=False)
-    fixed = tuple(replace(q, value=refit.fit.values.get(q.name, q.value)) for q in problem.experiment.parameters)
-    alone = replace(experiment, runs=(as_fitted,), parameters=fixed)
-    held = {n: v for n, v in refit.fit.values.items() if "." not in n}
-    own = Hypothesis(refit.hypothesis.effects).problem(
-        search.registry, alone, rough=refit.rough, at=held, trend=search.trend
-    )
-    names = [i for i, n in enumerate(own.names) if "." in n]  # only a free start and a trend are estimated
-    small = replace(
-        own,
-        names=tuple(own.names[i] for i in names),
-        start=own.start[names],
-        lower=own.lower[names],
-        upper=own.upper[names],
-        held=held,
-    )
-    noise = {run.name: _noise_for(search, run)}
-    rough = refit.rough and refit.fit.point.roughness.amplitude > 0
-    tracks = tracks_for([as_fitted], shared=False) if rough else None
-    fitted = fit_latent(small, small.start, noise, tracks=tracks, known_noise=True)
-    return fitted.point.predictions[run.name].y, fitted.log_likelihood, judge_fit(fitted, noise)
-
-
-def _noise_for(search: Search, run: Run) -> Noise:
-    """Return the noise of a run that was not fitted: that of fitted stretches sampled most nearly as often, piece by piece."""
-    fitted = [r for r in search.experiment.runs if r.name in search.noise]
-    like = [r for r in fitted if r.observable == run.observable]
-    known = [(step, search.noise[r.name].at(a)) for r in like or fitted for step, a, _ in sampled(r)]
-
-    def nearest(step: float) -> Noise:
-        return min(known, key=lambda k: abs(np.log(max(k[0], 1e-12) / max(step, 1e-12))))[1]
-
-    return joined([(b - a, a, replace(nearest(step), pieces=())) for step, a, b in sampled(run)])
+def brought(diagnosis: Diagnosis) -> Mapping[str, Mapping[str, Any]]:
+    """Return the parameters that the final model adds to the baseline's."""
+    own = {q.name for q in diagnosis.baseline.fit.likelihood.problem.experiment.parameters}
+    return {n: v for n, v in parameters_of(diagnosis.final).items() if n not in own and "." not in n}

@@ -16,7 +16,7 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.values import Experiment, Run
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
-from srfcli.inference.prediction import RTOL, Hold, Prediction, own_names, own_start, predict, run_parameters
+from srfcli.inference.prediction import RTOL, Prediction, own_names, own_start, predict, run_parameters
 
 # Covariances from information matrices that may be nearly singular.
 
@@ -126,7 +126,6 @@ class Problem:
     upper: Array
     trend: str | None = None
     held: Mapping[str, float] = field(default_factory=dict)
-    hold: Hold | None = None
     rtol: float = RTOL
 
     def named(self, theta: Array) -> dict[str, float]:
@@ -144,7 +143,6 @@ class Problem:
             by=by,
             until=until,
             trend=None if run.holdout else self.trend,
-            hold=self.hold,
             rtol=self.rtol,
         )
 

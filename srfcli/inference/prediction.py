@@ -149,18 +149,6 @@ RTOL = 1e-6  # errors of some 1e-5 um after minutes of stick-slip, a thousandth 
 
 
 @dataclass(frozen=True)
-class Hold:
-    """A second spring, to where the slider was: by run its stiffness (N/um), the recording as a spline over time (um, N).
-
-    `table` is what a model has for it behind its other tables: the force on the slider gains hold (u - recorded).
-    """
-
-    table: tuple[str, str]
-    stiffness: Mapping[str, float]
-    records: Mapping[str, Spline]
-
-
-@dataclass(frozen=True)
 class Prediction:
     """The observable `y` (n,) of a run in um, N or 1, and `J` (n, k), its derivatives by the names asked for; x (n, states)."""
 
@@ -252,18 +240,14 @@ def predict(
     trend: str | None = None,
     tables: Sequence[Spline] = (),
     by_tables: Sequence[int] = (),
-    hold: Hold | None = None,
 ) -> Prediction:
     """Return the observable of `run` at its sample times up to `until` s, with derivatives by the parameters `by`.
 
     Of a model with tables, J goes on with a column for each number of the tables in `by_tables`.
 
     It starts in steady sliding, or where `values` say (see `nuisance`). A trend is added to the observable: values["RUN.trend"]
-    times displacement or time. With a `hold`, whose table the model has last, the slider is held to the recording. Values are
-    in um, s, N.
+    times displacement or time. Values are in um, s, N.
     """
-    if hold is not None:
-        tables, values = (*tables, hold.records[run.name]), {**values, "hold": hold.stiffness[run.name]}
     p = run_parameters(model, experiment, run, values)
     if tables:
         p = appended(p, tables)

@@ -27,7 +27,16 @@ from srfcli.data.values import Experiment, Run
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
 from srfcli.inference.kalman import GAUGE_PROCESSES, Dual, Innovations, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, stretches
-from srfcli.inference.prediction import TINY, Prediction, basis, run_parameters, start_state, stiffness_share
+from srfcli.inference.prediction import (
+    TINY,
+    Prediction,
+    basis,
+    own_names,
+    own_start,
+    run_parameters,
+    start_state,
+    stiffness_share,
+)
 
 T = TypeVar("T")
 RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
@@ -324,6 +333,24 @@ class Likelihood:
             keep=keep, most=most,
         )  # fmt: skip
         return replace(found, names=tuple(own) if slopes else ())
+
+    def held_out(self, run: Run, values: Mapping[str, float]) -> Filtered:
+        """Return a run that was not fitted, filtered; what belongs to it alone, a free start or a trend, is estimated."""
+        problem = self.problem
+        own = own_names(problem.model, run, problem.trend)
+        if not own:
+            return self.filtered(run, values)
+        p = run_parameters(problem.model, problem.experiment, run, values)
+        start, lower, upper = np.array([own_start(problem.model, run, p, n, problem.trend) for n in own]).T
+        held = {n: values[n] for n in (*problem.held, *problem.names) if "." not in n}
+        alone = replace(
+            problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held
+        )
+        likelihood = Likelihood(alone, smooth=self.smooth, processes=self.processes, rtol=self.rtol)
+        known = {local: values[n] for local, n in self.gauge(run).items()} | {n: values[n] for n in FIELD}
+        x = likelihood.coordinates(known)
+        found = maximise(likelihood, x, held=[n for n in likelihood.names if n not in own])
+        return replace(found.point.runs[0], run=run)
 
     def over_runs(self, work: Callable[[Run], T]) -> list[T]:
         """Return what `work` makes of each run, on several threads where that was asked for."""
@@ -754,7 +781,7 @@ def as_fit(found: StateSpaceFit) -> Fit:
     """
     likelihood, maximum = found.likelihood, found.maximum
     problem, values, k = likelihood.problem, found.values, len(likelihood.problem.names)
-    held = [likelihood.filtered(run, values) for run in problem.experiment.runs if run.holdout]
+    held = [likelihood.held_out(run, values) for run in problem.experiment.runs if run.holdout]
     pairs, runs = [gauge_process(j + 1) for j in range(likelihood.processes)], []
     for f in (*maximum.point.runs, *held):
         gauge = likelihood.gauge(f.run)

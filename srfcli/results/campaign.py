@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from srfcli.core.errors import SrfError, Status
-from srfcli.results.base import Result, own_figure
-from srfcli.results.tables import Column, Table
+from srfcli.results.tables import Column, Result, Table, own_figure
 
 PAIRS = (("A", "B"), ("A", "D0"), ("B", "D0"))  # whose covariances a fit of a velocity step is quoted with
 LEADING = (

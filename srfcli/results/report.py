@@ -69,7 +69,7 @@ SHADED = (
     "Shaded are the times at which the baseline parts from the recording, the darker the more; that its parameters may have been "
     "bent to follow elsewhere is allowed for, so a residual may also be large outside."
 )
-FILES = ("answer.json", "prediction-*.csv", "augmented/**/*", "parting/**/*", "figures/*.svg")
+FILES = ("answer.json", "prediction-*.csv", "missing-*.csv", "augmented/**/*", "parting/**/*", "figures/*.svg")
 
 
 @dataclass(frozen=True)
@@ -246,6 +246,8 @@ def _run(matter: Matter, one: Trace) -> Markup:
     where = f"; they part at the shaded times, furthest from {spans([one.worst])}" if one.worst else ""
     alt = f"Run {one.name}: recording, simulations and residuals over time{where}."
     caption = f"{one.name}: residual over noise {fell}{where}. Dotted lines: two standard deviations of the noise."
+    if one.unexplained is not None:
+        caption += " Random friction is what each model, left to itself, takes for the track's."
     return matter.figure(f"run {one.name}", alt, caption)
 
 
@@ -304,18 +306,17 @@ def hypotheses(matter: Matter) -> Markup:
             chosen.append(k)
         if verdict in ("none", "inconclusive") and r["name"] == "none":
             chosen.append(k)
-        label = ("the baseline alone" if r["name"] == "none" else r["name"]) + (
-            ", rough track" if r.get("rough") else ""
-        )
+        label = "the baseline alone" if r["name"] == "none" else r["name"]
         sure = confidence.get("+".join(sorted(names)), r.get("confidence"))
         rows.append(
-            [label, number(r["evidence"] - top), rms(r["rms_over_noise"]), probability(r["p_value"]), percent(sure)]
+            [label, number(r["evidence"] - top), rms(r["rms_over_noise"]), number(r.get("field") or 0.0, 2), percent(sure),
+             r.get("against") or ""]
         )
     caption = (
-        "Everything that was fitted in full, best first: log evidence against the best, the residual, and whether noise may be "
-        "all that is left."
+        "Everything that was fitted in full, best first: log evidence against the best, innovations over noise, the amplitude of "
+        "the random friction that it needs besides, and what speaks against it."
     )
-    heads = ["hypothesis", "log evidence", "residual / noise", "p of noise", "confidence"]
+    heads = ["hypothesis", "log evidence", "innovations / noise", "random friction", "confidence", "against it"]
     return table(heads, rows, caption=caption, numeric=(1, 2, 3, 4), chosen=chosen)
 
 

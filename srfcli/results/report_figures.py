@@ -51,7 +51,10 @@ SAME = 1e-9  # of the noise: predictions that differ by less are one
 
 @dataclass(frozen=True)
 class Trace:
-    """One run as it is drawn: arrays (n,) of the samples that are compared, residuals `before`, `after` over the noise."""
+    """One run as it is drawn: arrays (n,) of the samples that are compared, residuals `before`, `after` over the noise.
+
+    `white` has these two where each sample has a noise of its own, `unexplained` the friction that each model leaves to chance.
+    """
 
     name: str
     holdout: bool
@@ -65,16 +68,18 @@ class Trace:
     W: Array = field(repr=False)
     windows: tuple[tuple[float, float], ...]
     load_unit: str = "N"
+    white: tuple[Array, Array] | None = field(default=None, repr=False)
+    unexplained: tuple[Array, Array] | None = field(default=None, repr=False)
 
     @property
     def before(self) -> Array:
         """Return the baseline's residual over the noise."""
-        return np.asarray((self.observed - self.baseline) / self.noise)
+        return self.white[0] if self.white else np.asarray((self.observed - self.baseline) / self.noise)
 
     @property
     def after(self) -> Array:
         """Return the augmented model's residual over the noise."""
-        return np.asarray((self.observed - self.augmented) / self.noise)
+        return self.white[1] if self.white else np.asarray((self.observed - self.augmented) / self.noise)
 
     @property
     def same(self) -> bool:
@@ -103,9 +108,16 @@ def trace(run: Mapping[str, Any]) -> Trace:
     good = np.asarray(run.get("used", np.ones(t.shape, dtype=bool)), dtype=bool).copy()
     for values in arrays.values():
         good &= np.isfinite(values)
+    pairs: dict[str, tuple[Array, Array] | None] = {"white": None, "friction": None}
+    for key in pairs:
+        if run.get(key) is not None and all(x is not None for x in run[key]):
+            first, second = (np.asarray(x, dtype=float) for x in run[key])
+            good &= np.isfinite(first) & np.isfinite(second)
+            pairs[key] = first, second
     windows = tuple((float(a), float(b)) for a, b in run.get("windows", ()))
     noise = float(run.get("noise_level") or 0.0)
     kept = {k: values[good] for k, values in arrays.items()}
+    white, unexplained = (None if pair is None else (pair[0][good], pair[1][good]) for pair in pairs.values())
     return Trace(
         str(run["name"]),
         bool(run.get("holdout")),
@@ -114,6 +126,8 @@ def trace(run: Mapping[str, Any]) -> Trace:
         noise=noise if noise > 0 else max(float(np.std(kept["observed"])) * 1e-3, 1e-12) if kept["t"].size else 1.0,
         windows=windows,
         load_unit=str(run.get("load_unit") or "N"),
+        white=white,
+        unexplained=unexplained if unexplained is not None and any(np.any(x) for x in unexplained) else None,
     )
 
 
@@ -189,7 +203,7 @@ def _plain_log(axis: Any, top: float, *, most: int) -> None:
 
 
 def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
-    """Return a run: recording and both simulations, the residuals in units of noise, local rms, what was imposed; a close-up.
+    """Return a run: recording and both models, residuals over noise, local rms, random friction, what was imposed; a close-up.
 
     `narrow` leaves the close-up out and gives the legend a row of its own, for a small screen.
     """
@@ -199,7 +213,8 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
 
     imposed = [k for k in ("V", "W") if np.ptp(getattr(one, k)) > VARIES * float(np.abs(getattr(one, k)).max())]
     piece = None if narrow else close_up(one)
-    heights = [3.0, 2.2, 1.1, *[0.75] * len(imposed)]
+    friction = one.unexplained is not None
+    heights = [3.0, 2.2, 1.1, *[1.3] * friction, *[0.75] * len(imposed)]
     with house_style():
         figure = Figure(figsize=(NARROW_FIGURE if narrow else 10.4 if piece else 9.0, 0.72 * sum(heights) + 1.1))
         FigureCanvasAgg(figure)
@@ -208,7 +223,9 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
         axes = _column(figure, grid, 0, [slice(i, i + 1) for i in range(len(heights))])
         _shade(axes, one)
         _whole(axes, one, narrow=narrow)
-        for axis, key in zip(axes[3:], imposed, strict=True):
+        if one.unexplained is not None:
+            _unexplained(axes[3], one)
+        for axis, key in zip(axes[3 + friction :], imposed, strict=True):
             _imposed_panel(axis, one, key, slice(None))
         _end_column(axes)
         if piece:
@@ -311,6 +328,19 @@ def _residual(axis: Axes, one: Trace) -> None:
             axis.fill_between(one.t[edges], low, high, color=colour, alpha=alpha, linewidth=0.3)
     _noise_band(axis)
     axis.set_ylabel("residual\n/ noise")
+
+
+def _unexplained(axis: Axes, one: Trace) -> None:
+    """Draw the friction that each model leaves to its random field, in thousandths."""
+    assert one.unexplained is not None
+    before, after = one.unexplained
+    sets = [(before, BEFORE, "-"), (after, AFTER, (0, (4, 1.2)))]
+    for values, colour, dash in [(before, AFTER, "-")] if one.same else sets:
+        for a, b in _pieces(one.t):
+            axis.plot(*_thinned(one.t[a:b], 1e3 * values[a:b]), color=colour, linewidth=1.1, linestyle=dash)
+    axis.axhline(0.0, color="#777777", linewidth=0.8)
+    axis.set_ylabel("random\nfriction\n[10$^{-3}$]")
+    axis.margins(y=0.1)
 
 
 def _noise_band(axis: Axes) -> None:

@@ -203,8 +203,10 @@ def remedy(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
 def gain_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     """Return what is gained by the better model, and on what that rests."""
     verdict = answer.get("verdict")
+    track = _random_friction(answer)
     if verdict in ("none", "inconclusive"):
-        return f"With the model as it is{_level(answer, 'baseline')}." if _level(answer, "baseline") else ""
+        level = _level(answer, "baseline")
+        return f"With the model as it is{level}{f'; {track}' if track else ''}." if level else ""
     ranked = [r for r in material.get("ranked", ()) if finite(r.get("evidence"))]
     zero = next((r["evidence"] for r in ranked if r.get("name") == "none"), None)
     name = "+".join(sorted(str(e) for e in answer.get("effects", ())))
@@ -213,6 +215,7 @@ def gain_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str
     parts = [f"{'With the best that was tried, ' if verdict in ('unknown', 'ambiguous') else ''}{_fell(answer)}"]
     if verdict == "identified" and zero is not None and best is not None and best > zero:
         parts.append(f"the log evidence rises by {number(best - zero)}")
+    parts += [track] if track else []
     sure = (answer.get("confidence") or {}).get(name)
     if verdict == "identified" and finite(sure):
         parts.append(f"confidence {percent(sure)}")
@@ -314,6 +317,19 @@ def _fell(answer: Mapping[str, Any]) -> str:
         return text
     verb = "from" if held[1] <= held[0] else "rise from"
     return f"{text}, and {verb} {rms(held[0])} to {rms(held[1])} times in runs that the fit never saw"
+
+
+def _random_friction(answer: Mapping[str, Any]) -> str:
+    """Return how the random friction changes that each model needs besides; nothing where neither needs any."""
+    if any("field" not in (answer.get(side) or {}) for side in ("baseline", "augmented")):
+        return ""
+    before, after = ((answer[side]["field"] or {}).get("amplitude", 0.0) for side in ("baseline", "augmented"))
+    if not (before or after):
+        return ""
+    if before == after:
+        return f"the random friction that it takes for the track's is {number(before, 2)}"
+    said = [number(x, 2) if x else "nothing" for x in (before, after)]
+    return f"the random friction that the model takes for the track's goes from {said[0]} to {said[1]}"
 
 
 def rms_of(answer: Mapping[str, Any], model: str, part: str) -> float | None:

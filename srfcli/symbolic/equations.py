@@ -12,7 +12,7 @@ from sympy.solvers.solveset import NonlinearError
 from srfcli.core.errors import SrfError
 from srfcli.laws.expression import symbol
 from srfcli.laws.values import ExtraState
-from srfcli.symbolic.system import FOLLOWED, System, state_rate
+from srfcli.symbolic.system import System, state_rate
 
 AUXILIARY = {"slip": "v", "stage": "V", "time": "1"}  # unknowns that an effect may name, um, um, s, and their rates
 MAX_CANCEL = 80  # operations: beyond it a common denominator takes a minute to find and shortens nothing
@@ -95,7 +95,7 @@ def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
             return guess
     try:
         roots = [r for r in sp.solve(reduced, y) if not r.has(sp.I)]
-    except NotImplementedError:
+    except (NotImplementedError, TypeError):  # the latter where sympy compares symbols on its way
         roots = []
     if not roots:
         raise SrfError(
@@ -137,20 +137,8 @@ def parts_of(system: System) -> Parts:
             found[slot] = formula.xreplace({symbol(slot): found[slot]})
     for number, (slot, argument) in enumerate(system.tables):
         value = lut(sp.Integer(number), symbol(argument))
-        if slot in FOLLOWED:
-            found["force"] -= symbol("hold") * behind_the_gauge(system, value / FOLLOWED[slot])
-            continue
         found[slot] = found[slot] * (1 + value) if slot == "V" else found[slot] + value
     return Parts(**{slot: _modulated(f) for slot, f in found.items()}, **({} if "kappa" in found else {"kappa": None}))
-
-
-def behind_the_gauge(system: System, shown: sp.Expr) -> sp.Expr:
-    """Return the elongation at which the gauge shows `shown`, a function of time; `shown` itself where that has no one answer."""
-    gauge = next((e for effect in system.effects for e in effect.states if e.name == effect.observed), None)
-    if gauge is None:
-        return shown
-    rate = sp.diff(shown, symbol("time")) - gauge.rate.subs(symbol(gauge.name), shown)
-    return sp.solve(rate, symbol("u"))[0] if sp.Poly(rate, symbol("u")).degree() == 1 else shown
 
 
 def check_slots(system: System, parts: Parts) -> None:
@@ -215,16 +203,13 @@ class _Builder:
         }:
             self.slip_t = sp.Symbol("S_t_")
         self.force, self.force_dot, self.W_dot = sp.symbols("F_ F_dot_ We_dot_")
-        held = any(slot in FOLLOWED for slot, _ in system.tables)
-        # stiffness of the spring to the stage, and of the one to where the slider was recorded
-        self.K = symbol("K") + symbol("hold") if held else symbol("K")
         self.tangent = sp.tan(symbol("angle")) if system.loading == "inclined" else sp.S.Zero
 
     def equations(self) -> Equations:
         system, s, aux = self.system, symbol, self.aux
         solution, u_rate = self.solved()
         meaning = self.meaning()
-        mu_ss, K, V = self.mu_ss(), self.K, s("V")
+        mu_ss, K, V = self.mu_ss(), s("K"), s("V")
         z_rate = (K * s("u") - self.load * self.mu + self.force) / s("M")
         names, unknowns, rates = list(system.states), [s("v"), *self.phis], []
         if system.inertia:
@@ -353,9 +338,9 @@ class _Builder:
             stretched = self.slip * mu_dot + mu * self.slip_W * W_rate + mu * self.slip_t
             balance.append(stretched - ((z if system.inertia else x_rate) - v))
         if system.inertia and not system.elastic:
-            balance.append(M * v * self.d_ln_v - (self.K * u - load * mu + self.force))
+            balance.append(M * v * self.d_ln_v - (symbol("K") * u - load * mu + self.force))
         if not system.inertia:
-            balance.append(self.K * u_rate - load * mu_dot - mu * W_rate + self.force_dot)
+            balance.append(symbol("K") * u_rate - load * mu_dot - mu * W_rate + self.force_dot)
             if system.elastic:
                 wanted.append(x_rate)
         return solve_linear(balance, wanted, system), u_rate

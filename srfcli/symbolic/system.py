@@ -39,7 +39,6 @@ RUN = (  # of one run: what an effect may ask of the recording
     Parameter("rise0", 0.02, "s", about="time scale of the switch-on of the modulation"),
     Parameter("onset0", -1e6, "s", about="when half of the load modulation was switched on"),
 )
-HOLD = Parameter("hold", 0.0, "N/um", 0.0, 1e9, "stiffness of a second spring, to where the slider was recorded")
 _ALONG = sp.sqrt(3) * symbol("v") / symbol("field_length")  # slip rate in the units of a Matern covariance
 RANDOM_FIELD = Effect(  # correlation (1 + r) exp(-r), r = sqrt(3) d/length (Matern 3/2): two states, driven by white noise
     "random-field",
@@ -63,7 +62,6 @@ RANDOM_FIELD = Effect(  # correlation (1 + r) exp(-r), r = sqrt(3) d/length (Mat
     ),
     neutral=(("field_amplitude", 0.0),),
 )  # fmt: skip
-FOLLOWED = {"elongation": 1, "force": symbol("K")}  # what a table of a recording holds, over the spring's elongation
 EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "kappa", "force", "rate", "V")
 LOADINGS = ("vertical", "inclined")
 
@@ -103,8 +101,6 @@ class System:
             own.append(ANGLE)
         if self.effects or self.tables:
             own += RUN
-        if any(slot in FOLLOWED for slot, _ in self.tables):
-            own.append(HOLD)
         seen = {p.name for p in own}
         for law in self.laws:
             for parameter in law.parameters:

@@ -19,8 +19,7 @@ from srfcli.inference.noise import lag_one
 from srfcli.laws.registry import load_registry
 from srfcli.results.campaign import PAIRS, CampaignResult
 from srfcli.results.fit import FitResult, unit_of
-from srfcli.tasks.fit import fit
-from srfcli.tasks.recordings import read_experiment
+from srfcli.tasks.recordings import fit, read_experiment
 
 TAIL = 1 / 3  # of a segment, at its end, that is looked at for steady sliding
 LONG = 2.0  # slip lengths in that part, and a time constant of the spring's: a shorter one tells nothing
@@ -63,7 +62,7 @@ def fit_campaign(
     plugins : sequence of path
         Folders in which laws and readers are looked for, too.
     run : callable, optional
-        Spreads the work, as `srfcli.parallel` does; one after the other in this process if left out.
+        Spreads the work, as `srfcli.core.parallel` does; one after the other in this process if left out.
     done : callable
         Told the rows so far after each experiment.
 

@@ -24,9 +24,7 @@ from srfcli.core.files import parse_json, read_text, write_atomic
 
 if TYPE_CHECKING:
     from srfcli.diagnosis.answer import RunView
-    from srfcli.diagnosis.hypotheses import Refit
-    from srfcli.diagnosis.search import Fitted, Held
-    from srfcli.diagnosis.staged_search import Search
+    from srfcli.diagnosis.search import Fitted, ModelSearch
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.laws.registry import Registry
 
@@ -155,63 +153,26 @@ def failed(case: str, why: str) -> Answer:
     return Answer(case, FAILED, failure=" ".join(why.split()))
 
 
-def diagnose_case(folder: Path, plugins: tuple[Path, ...], *, by: type[Search] | None = None) -> Answer:
+def diagnose_case(folder: Path, plugins: tuple[Path, ...], *, by: type[ModelSearch] | None = None) -> Answer:
     """Return what the tool's own diagnosis, or one `by` another search, says of the experiment in `folder`.
 
     Held-out runs are read when it is done.
     """
     from srfcli.data.experiment import read_experiment
-    from srfcli.diagnosis.staged_search import Search
+    from srfcli.diagnosis.search import ModelSearch
     from srfcli.diagnosis.verdict import conclude
 
     registry = _registry(plugins)
-    search = (by or Search)(registry, read_experiment(folder, registry=registry, holdout=False))
+    search = (by or ModelSearch)(registry, read_experiment(folder, registry=registry, holdout=False))
     search.run()
     return told(conclude(search, read_experiment(folder, registry=registry)), case=folder.name)
 
 
-def diagnose_by_state_space(folder: Path, plugins: tuple[Path, ...]) -> Answer:
-    """Return what the best-first search over state-space fits says of the experiment in `folder`."""
-    from srfcli.data.experiment import read_experiment
-    from srfcli.diagnosis.search import ModelSearch, conclude
-
-    registry = _registry(plugins)
-    search = ModelSearch(registry, read_experiment(folder, registry=registry, holdout=False))
-    search.run()
-    verdict = conclude(search, read_experiment(folder, registry=registry))
-    shown, same = verdict.shown, verdict.shown is verdict.baseline
-
-    def errors(held: Held) -> Mapping[str, float | None]:
-        sides = {"baseline": held.baseline, "augmented": held.baseline if same else held.augmented}
-        rms = {n: _finite(float(np.sqrt(np.mean(f.found.nu[f.run.used] ** 2)))) for n, f in sides.items()}
-        return rms | {f"{n}_over_noise": _finite(float(np.sqrt(np.mean(f.white**2)))) for n, f in sides.items()}
-
-    def kept(fit: Fitted) -> Mapping[str, float]:
-        likelihood = fit.fit.likelihood
-        return {
-            "log_likelihood": round(fit.fit.log_likelihood, 3), "parameters": len(likelihood.names),
-            "samples": likelihood.samples, "evidence": round(fit.evidence, 3), "fine": int(fit.fine),
-        }  # fmt: skip
-
-    return Answer(
-        folder.name, verdict.verdict, tuple(verdict.effects), dict(verdict.confidence), (),
-        tuple(dict.fromkeys(x.effect for x in verdict.excluded)),
-        {name: {k: _finite(v) for k, v in value.items()} for name, value in verdict.brought().items()},
-        {"baseline": _finite(verdict.baseline.fit.maximum.point.rms), "augmented": _finite(shown.fit.maximum.point.rms)},
-        {h.baseline.run.name: errors(h) for h in verdict.held}, {f.model.name: kept(f) for f in reversed(verdict.ranked)},
-        verdict.ungated,
-    )  # fmt: skip
-
-
-SEARCHES: Mapping[str, Diagnose] = {"staged": diagnose_case, "state-space": diagnose_by_state_space}
-
-
 def told(diagnosis: Diagnosis, *, case: str) -> Answer:
     """Return a diagnosis as an answer."""
-    from srfcli.diagnosis.answer import final, parameters_of, run_views
+    from srfcli.diagnosis.answer import run_views
+    from srfcli.diagnosis.verdict import brought
 
-    own = {q.name for q in diagnosis.baseline.fit.problem.experiment.parameters}
-    brought = {n: v for n, v in parameters_of(final(diagnosis).fit).items() if n not in own and "." not in n}
     return Answer(
         case,
         diagnosis.verdict,
@@ -219,26 +180,26 @@ def told(diagnosis: Diagnosis, *, case: str) -> Answer:
         {name: float(share) for name, share in diagnosis.confidence.items()},
         tuple(tuple(names) for names in diagnosis.equivalent),
         tuple(dict.fromkeys(x.effect for x in diagnosis.not_identifiable)),
-        {name: {k: _finite(v) for k, v in value.items()} for name, value in brought.items()},
+        {name: {k: _finite(v) for k, v in value.items()} for name, value in brought(diagnosis).items()},
         {
-            "baseline": _finite(diagnosis.baseline.adequacy.rms_over_noise),
-            "augmented": _finite(final(diagnosis).adequacy.rms_over_noise),
+            "baseline": _finite(diagnosis.shown.fit.maximum.point.rms),
+            "augmented": _finite(diagnosis.final.fit.maximum.point.rms),
         },
         {view.run.name: _errors(view) for view in run_views(diagnosis) if view.holdout},
-        {"+".join(sorted(r.hypothesis.reported)) or "none": _evidence(r) for r in reversed(diagnosis.ranked)},
+        {f.name: _evidence(f) for f in reversed(diagnosis.ranked)},
         diagnosis.ungated,
     )
 
 
-def _evidence(refit: Refit) -> Mapping[str, float]:
-    """Return what ranks a refit: log likelihood, how many parameters and samples it has, evidence, and whether noise is left."""
-    problem = refit.fit.problem
+def _evidence(fitted: Fitted) -> Mapping[str, float]:
+    """Return what ranks a model: log likelihood, counts of parameters and samples, evidence, whether it passes its tests."""
+    likelihood = fitted.fit.likelihood
     return {
-        "log_likelihood": round(float(refit.fit.log_likelihood), 3),
-        "parameters": len(problem.names) + 2 * refit.rough,
-        "samples": sum(int(run.used.sum()) for run in problem.runs),
-        "evidence": round(float(refit.evidence), 3),
-        "fine": int(refit.adequacy.fine),
+        "log_likelihood": round(float(fitted.fit.log_likelihood), 3),
+        "parameters": len(likelihood.names),
+        "samples": likelihood.samples,
+        "evidence": round(float(fitted.evidence), 3),
+        "fine": int(fitted.fine),
     }
 
 

@@ -20,7 +20,7 @@ from srfcli.core.errors import SrfError
 from srfcli.core.files import read_text, write_atomic
 from srfcli.core.parallel import run_processes
 from srfcli.data.experiment import read_experiment
-from srfcli.diagnosis.staged_search import CLOSE
+from srfcli.diagnosis.search import CLOSE
 from srfcli.laws.registry import load_registry
 from srfcli.results.tables import Column, Table
 from srfcli.validation.blind import FAILED, VERDICTS, Answer

@@ -1,0 +1,411 @@
+"""A diagnosis: its verdict, the tables that it rests on, its answer as data, and the folder with report and model."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from srfcli.core.errors import SrfError, Status
+from srfcli.core.files import parse_json, read_plain, recover, whole_folder, write_atomic
+from srfcli.core.units import split_quantity
+from srfcli.results.report_text import unit_text
+from srfcli.results.tables import Column, Result, Table, json_text, own_figure, plain_value
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from srfcli.data.values import Run
+    from srfcli.diagnosis.answer import RunView
+    from srfcli.diagnosis.design import Parting
+    from srfcli.diagnosis.residual_scan import Location
+    from srfcli.diagnosis.verdict import Diagnosis
+    from srfcli.laws.registry import Registry
+
+ANSWER = "answer.json"
+LARGEST = 2**28  # bytes of an answer
+FORM = "closed-form.toml"
+SCHEMA = "srf.diagnose/"
+
+
+HYPOTHESES = (
+    Column("hypothesis", "", "effects added to the baseline"),
+    Column("evidence", "", "log marginal likelihood over that of the baseline", ".1f"),
+    Column("rms_over_noise", "", "of the innovations: 1 where all but noise is explained", ".4f"),
+    Column("field", "", "amplitude of the random friction that it needs", ".2g"),
+    Column("confidence", "", "stated", ".3f"),
+    Column("against", "", "what speaks against it"),
+)
+PARAMETERS = (
+    Column("parameter", "", "name"),
+    Column("baseline", "", "estimate"),
+    Column("baseline_stderr", "", "its standard error", ".2g"),
+    Column("augmented", "", "estimate in the final model"),
+    Column("augmented_stderr", "", "its standard error", ".2g"),
+    Column("unit", "", "of the four before"),
+    Column("bent_by", "", "how far the baseline was off, in the final model's standard errors", ".1f"),
+)
+RUNS = (
+    Column("run", "", "name"),
+    Column("role", "", "fit, or held out"),
+    Column("baseline", "", "innovations over noise, rms", ".4f"),
+    Column("augmented", "", "innovations over noise, rms", ".4f"),
+    Column("share", "", "of the baseline's excess misfit", ".2f"),
+    Column("p_value", "", "adjusted for all that was looked at", ".1g"),
+    Column("where", "", "times (s) that hold most of it"),
+)
+SENTENCES = {
+    "none": "none: the baseline explains the recordings down to the noise",
+    "identified": "identified: {}",
+    "ambiguous": "ambiguous: {}: they do equally well",
+    "unknown": "unknown: something is missing that no registered effect explains",
+    "inconclusive": "inconclusive: nothing is needed, and effects of interesting size could not have been seen",
+}
+MOST = 8  # hypotheses that are shown
+
+
+@dataclass(frozen=True, repr=False)
+class DiagnosisResult(Result):
+    """What `srfcli.diagnose` found: `verdict`, `effects`, `confidence`, and the whole `answer` as `srf.diagnose/1` has it."""
+
+    diagnosis: Diagnosis = field(repr=False)
+    location: Location = field(repr=False)
+    registry: Registry = field(repr=False)
+    missing: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    parting: Parting | None = field(default=None, repr=False)
+    stopped: bool = False
+    reader: str | None = None
+    seed: int = 0
+    seconds: float = 0.0
+
+    @property
+    def verdict(self) -> str:
+        """Return none, identified, ambiguous, unknown or inconclusive."""
+        return self.diagnosis.verdict
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Return the effects, or the ageing law, that the verdict names."""
+        return self.diagnosis.effects
+
+    @property
+    def confidence(self) -> dict[str, float]:
+        """Return the stated confidence in each model that was fitted, and in `unknown`."""
+        return dict(self.diagnosis.confidence)
+
+    @property
+    def sentence(self) -> str:
+        """Return the verdict in a sentence."""
+        return SENTENCES[self.verdict].format(" and ".join(self.effects))
+
+    @property
+    def status(self) -> Status:
+        """Return whether the search was done; INTERRUPTED after Ctrl-C."""
+        return Status.INTERRUPTED if self.stopped else Status.OK
+
+    @cached_property
+    def answer(self) -> dict[str, Any]:
+        """Return the answer as plain data."""
+        from srfcli.diagnosis.answer import answer
+
+        found: dict[str, Any] = plain_value(answer(self.diagnosis, self.location, parting=self.parting))
+        if self.missing:
+            kept = {k: v for k, v in self.missing.items() if k not in ("force", "toml", "csv")}
+            found["missing"] = plain_value(kept)
+        if self.stopped:
+            found["status"] = self.status.value
+        return found
+
+    @property
+    def table(self) -> Table:
+        """Return the models that were fitted, best evidence first, and what is to be known."""
+        from srfcli.diagnosis.answer import ranked_rows
+
+        ranked = ranked_rows(self.diagnosis)
+        zero = next(r["evidence"] for r in ranked if r["name"] == "none")
+        rows = [
+            (r["name"], r["evidence"] - zero, r["rms_over_noise"], r["field"], r["confidence"], r["against"])
+            for r in ranked[:MOST]
+        ]
+        notes = tuple(_notes(self.answer))
+        return Table("srf.diagnose.hypotheses/1", HYPOTHESES, rows, "hypotheses", notes, status=self.status.value)
+
+    @property
+    def parameter_table(self) -> Table:
+        """Return each parameter under baseline and final model."""
+        from srfcli.diagnosis.answer import parameter_rows
+
+        keys = ("name", "baseline", "baseline_stderr", "augmented", "augmented_stderr", "unit", "shift_sigma")
+        rows = [tuple(r[k] for k in keys) for r in parameter_rows(self.diagnosis)]
+        return Table("srf.diagnose.parameters/1", PARAMETERS, rows, "parameters")
+
+    @property
+    def run_table(self) -> Table:
+        """Return what is left of each run, its part of the misfit, and where that is."""
+        from srfcli.diagnosis.answer import run_views
+
+        places, rows = {r.name: r for r in self.location.runs}, []
+        for v in run_views(self.diagnosis):
+            place = places.get(v.run.name)
+            where = "" if place is None else ", ".join(f"{a:.4g} to {b:.4g}" for a, b in place.windows)
+            told = (None, None, where) if place is None else (place.share, place.p_value, where)
+            rows.append((v.run.name, "held out" if v.holdout else "fit", *v.rms, *told))
+        return Table("srf.diagnose.runs/1", RUNS, rows, "runs", tuple(_places(self.location)))
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the run that the verdict rests on most: recording, both models, residuals, random friction, what was imposed.
+
+        Raises
+        ------
+        SrfError
+            Where Matplotlib is not installed, or an axes is given: the figure has several.
+        """
+        own_figure(ax, "a diagnosis")
+        from srfcli.diagnosis.answer import material
+        from srfcli.results.report_figures import run_figure, trace
+
+        shares = {r.name: r.share for r in self.location.runs}
+        runs = [r for r in material(self.diagnosis, self.location)["runs"] if not r["holdout"]]
+        return run_figure(trace(max(runs, key=lambda r: shares.get(r["name"], 0.0))))
+
+    def write(
+        self,
+        folder: Path | str,
+        *,
+        force: bool = False,
+        arguments: Sequence[str] = (),
+        told: Callable[[str], None] = lambda text: None,
+        debug: bool = False,
+    ) -> None:
+        """Write answer, predictions, report, figures and the augmented experiment to a folder, whole or not at all.
+
+        Parameters
+        ----------
+        folder : path
+            A new folder, or one with a diagnosis that `force` replaces.
+        arguments : sequence of str
+            Of the command, for the provenance.
+        told : callable
+            Told what could not be made, such as a report without Matplotlib.
+        debug : bool
+            Whether an error in the report is raised.
+
+        Raises
+        ------
+        SrfError
+            Where the folder holds something else, or cannot be written.
+        """
+        from srfcli.data.experiment import read_experiment
+        from srfcli.diagnosis.answer import material, run_views
+        from srfcli.diagnosis.augment import augment
+        from srfcli.diagnosis.diagram import stability
+        from srfcli.results.provenance import Provenance, write_sidecar
+
+        folder, diagnosis, last, found = Path(folder), self.diagnosis, self.diagnosis.final, self.answer
+        with whole_folder(folder, lambda: check_answer(folder, force=force)) as fresh:  # an hour may have passed
+            text = (json_text(found, indent=2) + "\n").encode("utf-8")
+            write_atomic(fresh / ANSWER, text)
+            runs = diagnosis.experiment.runs
+            made = Provenance(
+                arguments=tuple(arguments), laws=last.fit.likelihood.problem.model.laws,
+                inputs=(diagnosis.experiment.path, *dict.fromkeys(r.file for r in runs)), seed=self.seed,
+                timings={"diagnose": self.seconds},
+            )  # fmt: skip
+            write_sidecar(fresh / ANSWER, text, made)
+            views = run_views(diagnosis)
+            for name, view in zip(prediction_names([v.run.name for v in views]), views, strict=True):
+                write_atomic(fresh / name, prediction_csv(view))
+            augmented = augment(
+                self.registry, diagnosis.experiment, last.hypothesis, last.fit, folder=folder / "augmented", reader=self.reader
+            )
+            (fresh / "augmented").mkdir()
+            for name, content in augmented.files.items():
+                write_atomic(fresh / "augmented" / name, content)
+            for name, source in augmented.copies.items():
+                shutil.copyfile(source, fresh / "augmented" / name)
+            made_of = material(diagnosis, self.location)
+            made_of["diagram"] = stability(
+                self.registry, diagnosis.experiment, diagnosis.shown.fit.values,
+                read_experiment(fresh / "augmented", registry=self.registry, format=self.reader),
+            )  # fmt: skip
+            _in_shown_units(made_of, diagnosis)
+            if self.missing:
+                made_of["force"] = self.missing["force"]
+                names = prediction_names(list(self.missing["csv"]), "missing")
+                for name, content in zip(names, self.missing["csv"].values(), strict=True):
+                    write_atomic(fresh / name, content)
+                if self.missing["toml"] is not None:
+                    write_atomic(fresh / FORM, self.missing["toml"])
+            if self.parting is not None:
+                made_of["parting"] = _proposed(fresh, folder, found, self)
+            _report(fresh, found, made_of, told, debug)
+
+
+def _notes(found: dict[str, Any]) -> list[str]:
+    notes = list(found["reasons"])
+    for name, side in (("baseline", found["baseline"]), ("final model", found["augmented"])):
+        held = side["holdout"]["rms_over_noise"]
+        rest = "" if held is None else f", {held:.4g} in those held out"
+        field = side["field"]
+        track = "needs no random friction" if field is None else f"needs random friction of {field['amplitude']:.2g}"
+        like = " with the final model's" if name == "baseline" and found["baseline"] != found["augmented"] else ""
+        notes.append(f"{name}: {track};{like} rms over noise {side['fit']['rms_over_noise']:.4g} in the runs fitted{rest}")
+    notes += [f"{a} and {b} cannot be told apart by these recordings" for a, b in found["equivalent"]]
+    notes += [f"{x['effect']} is not identifiable: {x['reason']}" for x in found["not_identifiable"]]
+    notes += _missing(found.get("missing") or {})
+    notes += (found.get("experiment") or {}).get("sentences", [])
+    for effect, size in found.get("detectable", {}).items():
+        notes.append(f"{effect} could have been seen from a size of {size:.3g} on")
+    return notes
+
+
+def _missing(missing: dict[str, Any]) -> list[str]:
+    """Return what is known of a force that no registered effect explains."""
+    if not missing:
+        return []
+    latent = missing["latent"]
+    notes = [f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"]
+    for name, share in list(latent["coordinates"].items())[:1]:
+        notes[0] += f"; a function of {name} is {100 * share:.0f} % of it"
+    if missing["form"] is None:
+        return [*notes, "no closed form over the candidate terms is worth its parameters"]
+    gain, held = missing["gain"], missing["held_gain"]
+    told = "" if held is None else f", {held:+.1f} in held-out runs"
+    left = "" if missing["leaves_noise_alone"] else f"; it leaves {missing['rms_over_noise']:.3g} times the noise"
+    return [*notes, f"it behaves like {missing['form']}: log likelihood {gain:+.1f}{told}{left}"]
+
+
+def _places(location: Location) -> list[str]:
+    notes = []
+    if location.forcing_phase is not None:
+        notes.append(
+            "the misfit goes with the forcing: {:.2f} to {:.2f} rad after its maximum".format(*location.forcing_phase)
+        )
+    if location.frequencies:
+        notes.append(f"it has lines at {', '.join(f'{f:.4g}' for f in location.frequencies)} Hz")
+    if location.coordinate is not None:
+        name, share = location.coordinate
+        notes.append(f"a function of {name} explains {100 * share:.0f} % of it")
+    return notes
+
+
+def check_answer(folder: Path, *, force: bool) -> None:
+    """Raise SrfError now if a diagnosis could not be written to `folder` later."""
+    recover(folder)
+    parent = Path(os.path.realpath(folder)).parent
+    if not parent.is_dir():
+        raise SrfError(f"--out {folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
+    if not os.access(parent, os.W_OK):
+        raise SrfError(
+            f"--out {folder}: the directory {parent} is not writable", "Name a folder elsewhere.", exit_code=1
+        )
+    if not os.path.lexists(folder):
+        return
+    if not folder.is_dir() or folder.is_symlink():
+        raise SrfError(f"--out {folder} exists and is not a folder", "Name another folder.")
+    if not any(folder.iterdir()):
+        return
+    if not _is_diagnosis(folder):
+        raise SrfError(f"--out {folder} holds something else than a diagnosis", "It is never replaced; name another.")
+    if not force:
+        raise SrfError(f"--out {folder} holds a diagnosis already", "Replace it with --force, or name another folder.")
+
+
+def _is_diagnosis(folder: Path) -> bool:
+    try:
+        data = parse_json(read_plain(folder / ANSWER, limit=LARGEST), folder)
+    except (OSError, SrfError):
+        return False
+    return isinstance(data, dict) and str(data.get("schema", "")).startswith(SCHEMA)
+
+
+def _in_shown_units(made_of: dict[str, Any], diagnosis: Diagnosis) -> None:
+    """Put what the report shows into the units of the recordings, and add what the user stated and where the runs were made."""
+    experiment = diagnosis.experiment
+    runs = {run.name: run for run in experiment.runs}
+    for shown in made_of["runs"]:
+        run = runs[shown["name"]]
+        unit = f"  [{unit_text(run.unit)}]" if run.unit != "1" else ""
+        shown |= {"label": f"{run.quantity}{unit}", "load_unit": run.load_unit}
+    for row in made_of["parameters"]:
+        row["unit"], factor = experiment.shown(str(row["unit"]))
+        for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
+            row[key] = row[key] and row[key] * factor
+    number, unit = split_quantity(experiment.stiffness_text, name="stiffness")
+    shown_unit, factor = experiment.shown(unit) if unit in ("N/um", "1/um") else (unit, 1.0)
+    made_of["stated"] = {"stiffness": f"{number * factor:.4g} {unit_text(shown_unit)}"}
+    made_of["own"] = {
+        effect.reported: [*(p.name for p in effect.parameters), *effect.frees]
+        for ranked in diagnosis.ranked for effect in ranked.hypothesis.effects
+    }  # fmt: skip
+    if made_of.get("diagram"):
+        marks = {(float(f"{V:.3g}"), float(f"{np.mean(r.load(r.t)[0]):.3g}"))
+                 for r in experiment.runs for V, share in _velocities(r) if share > 0.1}  # fmt: skip
+        made_of["diagram"] |= {"marks": sorted(marks), "load_unit": "MPa" if experiment.stress else "N"}
+
+
+def _velocities(run: Run) -> list[tuple[float, float]]:
+    """Return the velocities at which a run was driven forward, to three digits, and the share of its time for each."""
+    V, counts = np.unique(
+        [float(f"{v:.3g}") for v in run.drive(run.t[:: max(run.t.size // 2000, 1)])], return_counts=True
+    )
+    return [(float(v), float(c) / float(counts.sum())) for v, c in zip(V, counts, strict=True) if v > 0]
+
+
+def _proposed(fresh: Path, folder: Path, found: Mapping[str, Any], result: DiagnosisResult) -> list[str]:
+    """Write what each hypothesis foretells of the run that would part them, and return what the report says of it."""
+    from srfcli.diagnosis.design import parting_files
+
+    told = found["experiment"]
+    assert result.parting is not None
+    if not told["parts"]:
+        return list(told["sentences"])
+    files = parting_files(result.registry, result.diagnosis, result.parting, folder=folder, reader=result.reader)
+    for place, text in files.items():
+        (fresh / place).parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(fresh / place, text)
+    return [*told["sentences"], told["run"]]
+
+
+def _report(folder: Path, found: dict[str, Any], made: dict[str, Any], told: Callable[[str], None], debug: bool) -> None:
+    try:
+        from srfcli.results.report import write_report
+
+        write_report(folder, found, made)
+    except ModuleNotFoundError as error:
+        told(f"Note: no report and no figures, as {error.name} is not installed")
+    except Exception as error:  # minutes of computing are not to be lost for a figure
+        if debug:
+            raise
+        told(f"Warning: no report: {type(error).__name__}: {error}")
+
+
+def prediction_names(runs: list[str], word: str = "prediction") -> list[str]:
+    """Return one file name per run, none twice even where case does not count; they begin with `word`."""
+    names: list[str] = []
+    for run in runs:
+        stem = re.sub(r"[^\w .-]+", "-", run).strip(" .") or "run"
+        name, number = f"{word}-{stem}.csv", 2
+        while name.lower() in (other.lower() for other in names):
+            name, number = f"{word}-{stem}-{number}.csv", number + 1
+        names.append(name)
+    return names
+
+
+def prediction_csv(view: RunView) -> str:
+    """Return a run as recorded and as predicted by both models, in full precision; empty where there is nothing."""
+    unit = view.run.unit
+    lines = [f"time [s],observed [{unit}],baseline [{unit}],augmented [{unit}]"]
+    observed = np.where(view.run.used, view.run.observed, np.nan)
+    columns = (view.run.t, observed, view.baseline, view.augmented)
+    for row in zip(*(c.tolist() for c in columns), strict=True):
+        lines.append(",".join(repr(x) if np.isfinite(x) else "" for x in row))
+    return "\n".join(lines) + "\n"

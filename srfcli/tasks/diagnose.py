@@ -1,0 +1,128 @@
+"""`diagnose`: where recordings and their model differ, which physics is missing, and the model that has it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from srfcli.codegen.c_source import GET_COMPILER, compiler
+from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.data.experiment import read_experiment
+from srfcli.data.values import Experiment
+from srfcli.diagnosis.design import parting_experiment
+from srfcli.diagnosis.discrepancy import explain_unknown
+from srfcli.diagnosis.residual_scan import locate
+from srfcli.diagnosis.search import ModelSearch
+from srfcli.diagnosis.verdict import conclude
+from srfcli.inference.fit import Interrupted
+from srfcli.laws.registry import Registry, load_registry
+from srfcli.laws.values import Effect
+from srfcli.results.diagnosis import DiagnosisResult
+
+
+def diagnose(
+    experiment: Experiment | Path | str,
+    *,
+    effects: Sequence[str] = (),
+    trend: str | None = None,
+    reader: str | None = None,
+    seed: int = 0,
+    registry: Registry | None = None,
+    progress: Callable[[str, float | None], None] = lambda text, share: None,
+) -> DiagnosisResult:
+    """Return which physics an experiment's model lacks, as far as its recordings tell.
+
+    The baseline is fitted with a random friction field and the gauge's noise; every registered effect is scored against it, those
+    that promise most are fitted, and held-out runs judge the best.
+
+    Parameters
+    ----------
+    experiment : path or Experiment
+        A folder with experiment.toml, or that file: its held-out recordings are opened only when the models are final.
+    effects : sequence of str
+        Effects, or ageing laws, to look for; all that are registered if left out.
+    trend : {'slip', 'time'}, optional
+        Let each run's observable drift.
+    reader : str, optional
+        How every data file is read.
+    seed : int
+        Of the noise that is simulated for p-values, and of runs that are tried.
+    registry : Registry, optional
+        Laws and effects, where they are at hand already.
+    progress : callable
+        Told what is done, and which share of the search's budget is used where that is known.
+
+    Returns
+    -------
+    DiagnosisResult
+        Ctrl-C is a status once the baseline is fitted: the verdict on what was fitted until then.
+
+    Raises
+    ------
+    SrfError
+        For what cannot be read, an unknown effect, or without a C compiler.
+    KeyboardInterrupt
+        Before the baseline is fitted.
+
+    References
+    ----------
+    Durbin and Koopman 2012; Kennedy and O'Hagan 2001.
+    """
+    begun = time.perf_counter()
+    registry = registry or load_registry()
+    _check_effects(registry, effects)
+    given = isinstance(experiment, Experiment)
+    path = experiment.path if isinstance(experiment, Experiment) else Path(experiment)
+    fitted = read_experiment(path, registry=registry, format=reader, holdout=False) if not given else experiment
+    assert isinstance(fitted, Experiment)
+    fitted = replace(fitted, runs=tuple(r for r in fitted.runs if not r.holdout))
+    if compiler() is None:
+        raise SrfError("srf diagnose needs a C compiler: it fits dozens of models", GET_COMPILER)
+    stopped = searching = False
+
+    def told(text: str) -> None:
+        progress(text, search.share if searching else None)
+
+    search = ModelSearch(registry, fitted, told, effects or None, trend)
+    searching = True
+    try:
+        search.run()
+    except (KeyboardInterrupt, Interrupted):
+        if not search.fitted:
+            raise KeyboardInterrupt from None
+        stopped = True
+    searching = False
+    told("held-out runs")
+    whole = experiment if isinstance(experiment, Experiment) else read_experiment(path, registry=registry, format=reader)
+    diagnosis = conclude(search, whole)
+    told("location")
+    last = diagnosis.final if diagnosis.final is not diagnosis.baseline and diagnosis.final.fine else None
+    location = locate(diagnosis.baseline, last=last, seed=seed)
+    missing, parting = {}, None
+    if not stopped and diagnosis.verdict == "unknown":
+
+        def interrupted() -> None:
+            nonlocal stopped
+            stopped = True
+
+        told("unknown: what is missing")
+        missing = explain_unknown(search, diagnosis, stopped=interrupted)
+    if not stopped and diagnosis.verdict == "ambiguous":
+        told("ambiguous: the run that would tell them apart")
+        parting = parting_experiment(registry, diagnosis, seed=seed)
+    return DiagnosisResult(
+        diagnosis, location, registry, missing, parting, stopped, reader, seed, time.perf_counter() - begun
+    )
+
+
+def _check_effects(registry: Registry, effects: Sequence[str]) -> None:
+    """Raise for an effect that nothing is registered under, and none is reported as."""
+    if not effects:
+        return
+    known = {e.name for e in (*registry.entries("effect"), *registry.entries("ageing"))}
+    known |= {law.reported for e in registry.entries("effect") if isinstance(law := registry.load(e), Effect)}
+    for name in effects:
+        if name not in known:
+            raise SrfError(f"unknown effect '{name}'", did_you_mean(name, sorted(known)))
