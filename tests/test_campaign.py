@@ -74,7 +74,7 @@ def test_a_row_for_each_experiment_and_a_reason_for_those_without_a_fit() -> Non
     assert one["load"] == pytest.approx(LOAD) and one["rms_over_noise"] == pytest.approx(1.0, abs=0.15)
     # steady sliding at the end of a segment, and friction that goes on rising with slip
     assert one["segments"] == one["steady"] == 1 and not rows["one"]["flags"]
-    assert float(rows["drifts"]["slope"]) == pytest.approx(0.04, rel=0.2)
+    assert float(rows["drifts"]["final_slope"]) == pytest.approx(0.04, rel=0.2)
     assert "friction still changes with slip at the end of 1 of 1 segments" in rows["drifts"]["flags"]
 
 

@@ -18,13 +18,13 @@ LEADING = (
     Column("law", "", "friction and ageing law"),
     Column("runs", "", "that were fitted"),
     Column("samples", "", "compared in them"),
-    Column("V_low", "um/s", "lowest velocity of the drive"),
-    Column("V_high", "um/s", "highest one"),
+    Column("V_min", "um/s", "lowest velocity of the drive"),
+    Column("V_max", "um/s", "highest velocity of the drive"),
     Column("load", "", "mean of the fitted runs, in the unit beside it"),
     Column("load_unit", "", "N or MPa"),
     Column("segments", "", "of constant velocity, one slip length D0 or longer"),
     Column("steady", "", "of them, those that end in steady sliding"),
-    Column("slope", "1/mm", "largest change of friction with slip at the end of a segment, over its error 3 or more"),
+    Column("final_slope", "1/mm", "largest change of friction with slip at the end of a segment, over its error 3 or more"),
     Column("rms_over_noise", "", "1 where the model explains all but the noise"),
 )
 DERIVED = (

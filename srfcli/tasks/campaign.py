@@ -154,7 +154,7 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
         "covariances": {f"cov_{a}_{b}": shared(a, b) for a, b in PAIRS},
     }  # fmt: skip
     V = np.concatenate([np.abs(run.drive(run.t)) for run in runs])
-    row |= {"V_low": float(V.min()), "V_high": float(V.max())}
+    row |= {"V_min": float(V.min()), "V_max": float(V.max())}
     if {"A", "B"} <= values.keys():
         variances = [covariance[place[n], place[n]] if n in place else 0.0 for n in ("A", "B")]
         both = 2 * float(covariance[place["A"], place["B"]]) if {"A", "B"} <= place.keys() else 0.0
@@ -170,7 +170,7 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     found_slopes = [s for run in runs for s in _slopes(run, length)]
     steady = [not (abs(slope) > SURE * error and abs(slope) > allowed) for slope, error in found_slopes]
     sure = [slope for slope, error in found_slopes if abs(slope) > SURE * error]
-    row |= {"segments": len(steady), "steady": sum(steady), "slope": 1e3 * max(sure, key=abs) if sure else None}
+    row |= {"segments": len(steady), "steady": sum(steady), "final_slope": 1e3 * max(sure, key=abs) if sure else None}
     row["flags"] = "; ".join(_flags(row, found))
     return row
 
