@@ -451,7 +451,8 @@ class Node:
             return self.number()
         try:
             name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
-            number = parse_quantity(self.value, unit, name=name, geometry=geometry)
+            number, written = split_quantity(self.value, name=name, example=f"0.5 {unit}" if unit != "1" else "0.5")
+            number *= unit_factor(written, unit, geometry) if written else 1.0
             if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
                 self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g} {unit}")
             return number

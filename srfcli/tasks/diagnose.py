@@ -68,7 +68,18 @@ def diagnose(
 
     References
     ----------
-    Durbin and Koopman 2012; Kennedy and O'Hagan 2001.
+    Durbin and Koopman (2012), Time Series Analysis by State Space Methods. Rao (1948): score tests.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> found = srf.diagnose("experiment")  # doctest: +SKIP
+    >>> found.verdict, found.effects  # doctest: +SKIP
+    ('identified', ('linker-dieterich',))
+    >>> srf.diagnose("experiment", effects=["linker-dietrich"])
+    Traceback (most recent call last):
+        ...
+    srfcli.core.errors.SrfError: unknown effect 'linker-dietrich'
     """
     begun = time.perf_counter()
     registry = registry or load_registry()
