@@ -96,7 +96,8 @@ def test_the_binary_and_the_reduced_recording_agree(shared: Path, tmp_path: Path
 
 def test_the_basalt_step(shared: Path, tmp_path: Path) -> None:
     path = shared / "data" / "basalt-b819-velocity-step" / "velstep4_BRAVA_expb819_basalt.txt"
-    done = json.loads(srf("check", str(real(tmp_path / "b", path, columns=BASALT, run='corrections = ["reset"]')), "--json").stdout)
+    place = real(tmp_path / "b", path, columns=BASALT, run='corrections = ["reset"]')
+    done = json.loads(srf("check", str(place), "--json").stdout)
     row, run = done["rows"][0], done["meta"]["runs"][0]
     assert row["samples"] == 5849 and row["resets"] == 1
     assert [run["drive"][k]["velocity"] for k in (0, -1)] == pytest.approx([3.0, 10.0], rel=5e-3)

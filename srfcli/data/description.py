@@ -18,7 +18,6 @@ from srfcli.core.units import (
     Geometry,
     find_unit,
     is_stress,
-    parse_quantity,
     same_dimension,
     split_quantity,
     unit_factor,

@@ -161,12 +161,15 @@ REMEDIES = {  # what is wrong, and what to do; {value} is the size with its erro
         "friction changes with the heat that sliding makes: {value}",
         "slide slower, or use the augmented model, which has the heat",
     ),
-    "rate-cutoff": ("friction stops to depend on velocity at the ends of its range: {value}", "use a law with cut-off velocities"),
+    "rate-cutoff": ("friction depends on velocity within limits only: {value}", "use a law with cut-off velocities"),
     "load-lag": (
         "the load reaches the interface late: {value}",
         "record the load at the interface, or use the augmented model",
     ),
-    "dilatancy": ("the layer widens and narrows with its age: {value}", "record the layer's thickness, or use the augmented model"),
+    "dilatancy": (
+        "the layer widens and narrows with its age: {value}",
+        "record the layer's thickness, or use the augmented model",
+    ),
     "sensor-lag": (
         "the gauge lags behind: {value}",
         "undo its filter of first order in the recording, or take a faster gauge",
