@@ -31,6 +31,7 @@ from srfcli.diagnosis.search import Fitted
 from srfcli.diagnosis.verdict import Diagnosis
 from srfcli.inference.fit import Problem
 from srfcli.inference.prediction import of_run, predict, run_parameters, stiffness_share
+from srfcli.inference.random_field import solve_scaled
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 
@@ -167,7 +168,7 @@ class Loss:
         """Return the log likelihood lost in the first `samples`, in a run made `times` times."""
         w, X = self.w[:samples], self.X[:samples]
         b = times * (X.T @ w)
-        return 0.5 * max(times * float(w @ w) - float(b @ _solved(times * (X.T @ X) + self.Q, b)), 0.0)
+        return 0.5 * max(times * float(w @ w) - float(b @ solve_scaled(times * (X.T @ X) + self.Q, b)), 0.0)
 
 
 @dataclass(frozen=True)
@@ -314,7 +315,7 @@ class Design:
         for _ in range(ROUNDS):
             A, b = X.T @ X + Q, X.T @ r - Q @ z
             A[np.diag_indices_from(A)] *= 1 + damping
-            step = _solved(A, b)
+            step = solve_scaled(A, b)
             if float(b @ step) < 0.02 * (1 + float(r @ r + z @ Q @ z)) and not damping:
                 break
             trial = wrong.filtered(run, y, z + step)
@@ -326,12 +327,6 @@ class Design:
             else:
                 damping = max(10 * damping, 1e-2)
         return Loss(r + X @ z, X, Q, left)
-
-
-def _solved(A: Array, b: Array) -> Array:
-    """Return A^-1 b, after scaling; a direction of which nothing is known stays where it is."""
-    d = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    return np.asarray(np.linalg.lstsq(A / np.outer(d, d), b / d, rcond=1e-12)[0] / d)
 
 
 def _cost(r: Array, z: Array, Q: Array) -> float:

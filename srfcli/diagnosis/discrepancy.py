@@ -28,7 +28,7 @@ from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base
 from srfcli.diagnosis.hypotheses import own_parameters
 from srfcli.diagnosis.search import CLOSE, Fitted, ModelSearch
-from srfcli.diagnosis.verdict import HELD, Diagnosis, Held, at_bounds, held_out
+from srfcli.diagnosis.verdict import Diagnosis, Held, at_bounds, held_out, refusal
 from srfcli.inference.fit import root
 from srfcli.inference.recordings import slip_along
 from srfcli.laws.effect_file import formula_text
@@ -166,21 +166,13 @@ def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
         if not terms or best.evidence < least:
             continue
         held = held_out(diagnosis.baseline, best, diagnosis.experiment)
-        if at_bounds(best) or not _predicted(held):
+        if at_bounds(best) or refusal(best, diagnosis.baseline, held):
             search.progress(f"{best.name} is not offered: held-out runs refuse it, or it stands at a bound")
             continue
         beside = tuple(e for e in best.hypothesis.effects if e.name not in names)
         gain = best.fit.log_likelihood - diagnosis.baseline.fit.log_likelihood
         return ClosedForm(tuple(_fitted(e, best) for e in terms), beside, best, gain, held)
     return None
-
-
-def _predicted(held: Sequence[Held]) -> bool:
-    """Return whether held-out runs are followed, and no worse than by the baseline."""
-    if not all(h.augmented.whole for h in held):
-        return False
-    white = np.concatenate([h.augmented.white for h in held]) if held else np.zeros(1)
-    return float(np.sqrt(np.mean(white**2))) < HELD and sum(h.gain for h in held) >= 0
 
 
 def _fitted(effect: Effect, fitted: Fitted) -> FittedTerm:

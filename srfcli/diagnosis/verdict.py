@@ -100,7 +100,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     held = held_out(baseline, best, whole, shown)
     scores = tuple(baseline.promised)
     ungated, reasons = _said(best, close, scores)
-    refused = _refused(best, baseline, held) if ungated != "unknown" else ""
+    refused = refusal(best, baseline, held) if ungated != "unknown" else ""
     verdict = "unknown" if refused else ungated
     reasons += [refused] if refused else []
     reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]
@@ -160,7 +160,7 @@ def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score]) -> tup
     return "identified", reasons
 
 
-def _refused(best: Fitted, baseline: Fitted, held: Sequence[Held]) -> str:
+def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held]) -> str:
     """Return why held-out runs refuse the best model; nothing where they do not."""
     if not held:
         return ""

@@ -84,10 +84,13 @@ def diagnose(
     begun = time.perf_counter()
     registry = registry or load_registry()
     _check_effects(registry, effects)
-    given = isinstance(experiment, Experiment)
-    path = experiment.path if isinstance(experiment, Experiment) else Path(experiment)
-    fitted = read_experiment(path, registry=registry, format=reader, holdout=False) if not given else experiment
-    assert isinstance(fitted, Experiment)
+
+    def read(*, holdout: bool) -> Experiment:
+        if isinstance(experiment, Experiment):
+            return experiment
+        return read_experiment(Path(experiment), registry=registry, format=reader, holdout=holdout)
+
+    fitted = read(holdout=False)
     fitted = replace(fitted, runs=tuple(r for r in fitted.runs if not r.holdout))
     if compiler() is None:
         raise SrfError("srf diagnose needs a C compiler: it fits dozens of models", GET_COMPILER)
@@ -106,8 +109,7 @@ def diagnose(
         stopped = True
     searching = False
     told("held-out runs")
-    whole = experiment if isinstance(experiment, Experiment) else read_experiment(path, registry=registry, format=reader)
-    diagnosis = conclude(search, whole)
+    diagnosis = conclude(search, read(holdout=True))
     told("location")
     last = diagnosis.final if diagnosis.final is not diagnosis.baseline and diagnosis.final.fine else None
     location = locate(diagnosis.baseline, last=last, seed=seed)
