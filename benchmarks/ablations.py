@@ -47,7 +47,7 @@ class WithoutField(ModelSearch):
 class WithoutColour(ModelSearch):
     """The search with white gauge noise."""
 
-    options: ClassVar[Mapping[str, Any]] = {"processes": 0}
+    options: ClassVar[Mapping[str, Any]] = {"processes": ()}
 
 
 class Bare(Remainder):

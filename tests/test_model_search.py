@@ -79,7 +79,7 @@ def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(tmp_path):
     candidates, _ = applicable(SHIPPED, experiment, FEW)
     problem = Hypothesis().problem(SHIPPED, experiment)
     begun = Likelihood(problem)
-    fitted = fit_state_space(problem, start=begun.values(begun.start), processes=0, close=1e3)
+    fitted = fit_state_space(problem, start=begun.values(begun.start), processes=(), close=1e3)
     scores = Scores(SHIPPED, experiment, Remainder(fitted), (), candidates)
     assert "slip-evolution" in {x.effect for x in scores.excluded}
     assert "closed form" in next(x.reason for x in scores.excluded if x.effect == "slip-evolution")
@@ -91,7 +91,7 @@ def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
     """The column of an effect against the likelihood of the model that has it, a little from its neutral value."""
     experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
     problem = Hypothesis().problem(SHIPPED, experiment)
-    fitted = fit_state_space(problem, processes=0)
+    fitted = fit_state_space(problem, processes=())
     effect = SHIPPED.get("effect", name)
     scores = Scores(SHIPPED, experiment, Remainder(fitted), (), [effect])
     column = scores.columns[len(scores.columns) // 2]
@@ -116,7 +116,7 @@ def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
 def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, shared):
     """The gain of a shared field against a Gaussian density with its covariance written out, and its sign."""
     experiment = read_experiment(recorded(tmp_path, Physics(), shared=shared), registry=SHIPPED, holdout=False)
-    fitted = fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=0)
+    fitted = fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=())
     remainder = Remainder(fitted)
     assert (remainder.shared.gain > CLOSE) == shared
     if shared:
@@ -134,12 +134,13 @@ def test_coloured_gauge_noise_is_not_taken_for_a_fine_field(tmp_path):
     problem = Hypothesis().problem(SHIPPED, experiment)
     found = fit_state_space(problem)
     drawn = {"field_amplitude": 3e-4, "field_length": 6.0 * np.sqrt(3)}
-    assert found.log_likelihood > fit_state_space(problem, start=drawn, processes=1, smooth=False).log_likelihood - 1.0
+    other = fit_state_space(problem, start=drawn, processes=("relaxation",), smooth=False)
+    assert found.log_likelihood > other.log_likelihood - 1.0
     assert correlated(found.maximum.point) < COLOUR
 
 
 def test_evidence_charges_for_what_is_free(tmp_path):
     experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
     problem = Hypothesis().problem(SHIPPED, experiment)
-    fitted = fit_state_space(problem, processes=0)
+    fitted = fit_state_space(problem, processes=())
     assert log_evidence(fitted) < fitted.log_likelihood - 10.0

@@ -288,6 +288,12 @@ def test_load_and_its_rate_agree():
             assert load(s)[1] == pytest.approx(slope, abs=2e-5 * (1 + abs(slope)))
 
 
+def test_a_track_is_each_runs_own_or_one_for_all():
+    for own in (False, True):
+        first, second = (Track(3e-4, 10.0, 5, own).under(name).profile(100.0)(50.0) for name in ("steps", "strong"))
+        assert (first == second) is not own
+
+
 def test_tracks_have_the_size_and_the_length_they_say():
     x = np.arange(0, 3000, 1.0)
     heights, products = [], []

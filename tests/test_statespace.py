@@ -370,7 +370,7 @@ def test_coloured_gauge_noise_is_found(make_model):
             colour[i] = keep * colour[i - 1] + 4e-4 * np.sqrt(1 - keep**2) * rng.standard_normal()
         spoilt.append(replace(run, observed=run.observed + colour))
     found = fit_state_space(fit_problem(model, replace(experiment, runs=tuple(spoilt))))
-    assert found.likelihood.processes == 1 and found.smooth
+    assert found.likelihood.processes == ("relaxation",) and found.smooth
     assert found.values["gauge_colour1"] == pytest.approx(4e-4, rel=0.3)
     assert found.values["gauge_time1"] == pytest.approx(0.5, rel=0.5)
     errors = np.sqrt(np.diag(found.covariance))

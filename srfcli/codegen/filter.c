@@ -9,8 +9,9 @@
    Jazwinski, Stochastic Processes and Filtering Theory, 1970; Griewank and Walther, Evaluating Derivatives, 2008. */
 
 #define MODES 3                             /* of white noise in a step; as many as stages can tell apart */
-#define NG 3                                /* processes of coloured gauge noise, at most */
-#define NA (NX + NG)
+#define NG 3                                /* processes of coloured gauge noise, at most, of one or two states */
+#define NA (NX + 2 * NG)
+#define NRATES 8                            /* of sampling in a run, at most */
 #define NC (NX + MODES)
 #define UNSTABLE 1e150                      /* a variance that is none any more */
 
@@ -22,7 +23,8 @@ typedef struct {
 typedef struct {
     const double *p;
     const dual *q;
-    int slopes, ng;
+    int slopes, ng, na;                     /* processes of gauge noise; states with theirs */
+    const int *order;                       /* how many states each of these has */
     double rtol, longest, h;                /* h: the step that the last one suggests */
     const double *atol;
     double Z[NZ], before;                   /* increments and length of the last step, 0 for none */
@@ -102,7 +104,7 @@ static double moments(Imposed *force, Course *course, Belief *b, double t, doubl
     }
     double M[NX * NA], P[NX * NX];
     lanes dM[NX * NA];
-    int na = NX + course->ng;
+    int na = course->na;
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < na; c++) {
             double sum = 0.0, through = 0.0;
@@ -223,56 +225,127 @@ static int advance(Imposed *force, Course *course, Belief *belief, double a, dou
     return 1;
 }
 
-/* the processes of gauge noise over dt: e' = -e / tau + s sqrt(2 / tau) w */
+/* what a process of gauge noise does over dt, F (w, w). Of one state, e' = -e / tau + noise. Of two, an oscillator of frequency f and
+   quality q, e'' + (omega / q) e' + omega^2 e = noise with omega = 2 pi f; its second state is e' / omega, so that both have the
+   variance s^2. `gauge` holds tau, s or f, s, q. Foreman-Mackey, Agol, Ambikasaran and Angus, Astron. J. 154 (2017). */
+static void gauge_step(int w, double dt, const dual *gauge, dual *F) {
+    if (w == 1) {
+        double e = exp(-dt / gauge[0].v);
+        F[0] = srf_scaled(e, e * dt / (gauge[0].v * gauge[0].v), gauge[0]);
+        return;
+    }
+    const dual f = gauge[0], q = gauge[2];
+    const dual b = srf_mul_c(f, 6.283185307179586 * dt), a = srf_div(srf_mul_c(b, 0.5), q);
+    const dual z = srf_sub(srf_mul(a, a), srf_mul(b, b));
+    double c, s, s_z, root = sqrt(fabs(z.v)); /* exp(-a) times cosh(root), and times sinh(root) / root */
+    if (fabs(z.v) < 1e-3) {
+        double e = exp(-a.v);
+        c = e * (1.0 + z.v * (1.0 / 2 + z.v * (1.0 / 24 + z.v / 720)));
+        s = e * (1.0 + z.v * (1.0 / 6 + z.v * (1.0 / 120 + z.v / 5040)));
+        s_z = e * (1.0 / 6 + z.v * (1.0 / 60 + z.v / 1680));
+    } else {
+        if (z.v > 0.0) {
+            double slow = exp(-b.v * b.v / (a.v + root)), fast = exp(-a.v - root);
+            c = 0.5 * (slow + fast);
+            s = 0.5 * (slow - fast) / root;
+        } else {
+            c = exp(-a.v) * cos(root);
+            s = exp(-a.v) * sin(root) / root;
+        }
+        s_z = 0.5 * (c - s) / z.v;
+    }
+    const dual C_ = {c, -c * a.d + 0.5 * s * z.d}, S_ = {s, -s * a.d + s_z * z.d};
+    F[0] = srf_add(C_, srf_mul(a, S_));
+    F[1] = srf_mul(b, S_);
+    F[2] = srf_mul_c(F[1], -1.0);
+    F[3] = srf_sub(C_, srf_mul(a, S_));
+}
+
+/* F times w numbers that lie `stride` apart */
+static void gauge_turn(int w, const dual *F, double *v, lanes *d, int stride) {
+    dual old[2], sum;
+    for (int r = 0; r < w; r++) old[r].v = v[r * stride], old[r].d = d[r * stride];
+    for (int r = 0; r < w; r++) {
+        sum = srf_mul(F[r * w], old[0]);
+        if (w == 2) sum = srf_add(sum, srf_mul(F[r * w + 1], old[1]));
+        v[r * stride] = sum.v;
+        d[r * stride] = sum.d;
+    }
+}
+
+/* the processes of gauge noise over dt */
 static void age_gauge(Course *course, Belief *b, double dt, const dual *gauge) {
-    int na = NX + course->ng;
-    dual decay[NG];
+    int na = course->na, at = NX;
     for (int j = 0; j < course->ng; j++) {
-        const dual tau = gauge[2 * j], s = gauge[2 * j + 1];
-        double e = exp(-dt / tau.v);
-        decay[j] = srf_scaled(e, e * dt / (tau.v * tau.v), tau);
-        b->xd[NX + j] = b->xd[NX + j] * e + b->x[NX + j] * decay[j].d;
-        b->x[NX + j] *= e;
-        for (int c = 0; c < na; c++) b->T[(NX + j) * NA + c] *= e;
-        for (int c = 0; c < na; c++)
-            for (int side = 0; side < 2; side++) { /* its row, then its column */
-                int at = side ? c * NA + NX + j : (NX + j) * NA + c;
-                b->Pd[at] = b->Pd[at] * e + b->P[at] * decay[j].d;
-                b->P[at] *= e;
+        int w = course->order[j];
+        const dual s = gauge[3 * j + 1], variance = srf_mul(s, s);
+        dual F[4];
+        gauge_step(w, dt, gauge + 3 * j, F);
+        gauge_turn(w, F, b->x + at, b->xd + at, 1);
+        for (int c = 0; c < na; c++) gauge_turn(w, F, b->P + at * NA + c, b->Pd + at * NA + c, NA);
+        for (int c = 0; c < na; c++) gauge_turn(w, F, b->P + c * NA + at, b->Pd + c * NA + at, 1);
+        for (int c = 0; c < na; c++) {
+            double old[2] = {b->T[at * NA + c], w == 2 ? b->T[(at + 1) * NA + c] : 0.0};
+            for (int r = 0; r < w; r++) b->T[(at + r) * NA + c] = F[r * w].v * old[0] + (w == 2 ? F[r * w + 1].v * old[1] : 0.0);
+        }
+        for (int r = 0; r < w; r++)
+            for (int c = 0; c < w; c++) {
+                dual kept = srf_mul(F[r * w], F[c * w]);
+                if (w == 2) kept = srf_add(kept, srf_mul(F[r * w + 1], F[c * w + 1]));
+                int own = (at + r) * NA + at + c;
+                const dual fresh = srf_mul(variance, srf_sub(srf_plain(r == c ? 1.0 : 0.0), kept));
+                b->P[own] += fresh.v;
+                b->Pd[own] += fresh.d;
             }
-        int own = (NX + j) * NA + NX + j;
-        double fresh = -expm1(-2.0 * dt / tau.v);
-        b->P[own] += s.v * s.v * fresh;
-        b->Pd[own] += 2.0 * s.v * fresh * s.d - s.v * s.v * 2.0 * e * decay[j].d;
+        at += w;
+    }
+}
+
+/* the processes of gauge noise as they are where nothing was read yet */
+static void fresh_gauge(Course *course, Belief *b, const dual *gauge) {
+    static const lanes none = {0.0};
+    int at = NX;
+    for (int i = 0; i < course->na; i++)
+        for (int g = NX; g < course->na; g++) {
+            b->P[g * NA + i] = b->P[i * NA + g] = b->T[g * NA + i] = b->T[i * NA + g] = 0.0;
+            b->Pd[g * NA + i] = b->Pd[i * NA + g] = none;
+        }
+    for (int j = 0; j < course->ng; j++) {
+        const dual variance = srf_mul(gauge[3 * j + 1], gauge[3 * j + 1]);
+        for (int r = 0; r < course->order[j]; r++, at++) {
+            b->x[at] = 0.0;
+            b->xd[at] = none;
+            b->P[at * NA + at] = variance.v;
+            b->Pd[at * NA + at] = variance.d;
+        }
     }
 }
 
 /* One run: innovations nu (nt), their variances S (nt) and the derivatives of both (nt, LANES), at the samples where `used`; all
    samples get the mean (nt, NA), covariance (nt, NA, NA), transition (nt, NA, NA) from the last sample and the reading's gradient
    (nt, NA), before they are used, where those are wanted (`keep`). The reading is `factor` times elongation plus offset plus gauge
-   noise of variance R. p holds dual numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge (ng, 2),
-   factor, offset and R (nt). Returns how many samples were reached; stats: steps, rejected. */
-int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const double *gauge, int slopes, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
+   noise of variance R. The processes of coloured noise have `order` (ng) states each, and parameters gauge (rates, ng, 3); which of
+   the rates holds at a sample is `rate` (nt): where it changes, a noise begins that owes nothing to the one before.
+   p holds dual numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset and R (nt). Returns how many samples were reached; stats: steps, rejected. */
+int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, int rates, const double *gauge, const int *rate, int slopes, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
     double values[NP];
-    dual q[NP], colour[2 * NG], y[NX], one, g[NX];
+    dual q[NP], colour[NRATES * 3 * NG], y[NX], one, g[NX];
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values};
-    Course course = {values, q, slopes, ng, rtol, longest, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, 0, 0, max_steps, stop};
+    Course course = {values, q, slopes, ng, NX, order, rtol, longest, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, 0, 0, max_steps, stop};
     Belief b;
-    int na = NX + ng, segment_ = -1, filled = 0;
+    int na, segment_ = -1, filled = 0, begins[NA] = {0};
     double now = t[0], last = t[0];
     const size_t wide = 1 + LANES;
 #define TAKE(to, from) ((to).v = *(from), memcpy(&(to).d, (from) + 1, sizeof(lanes)))
     memset(&b, 0, sizeof b);
     for (int i = 0; i < NP; i++) TAKE(q[i], p + i * wide), values[i] = q[i].v;
-    for (int i = 0; i < 2 * ng; i++) TAKE(colour[i], gauge + i * wide);
+    for (int j = 0; j < ng; j++) begins[course.na] = 1, course.na += order[j];
+    na = course.na;
+    for (int i = 0; i < rates * 3 * ng; i++) TAKE(colour[i], gauge + i * wide);
     for (int i = 0; i < NX; i++) TAKE(one, x0 + i * wide), b.x[i] = one.v, b.xd[i] = one.d;
     for (int i = 0; i < NX; i++)
         for (int j = 0; j < NX; j++) TAKE(one, P0 + (i * NX + j) * wide), b.P[i * NA + j] = one.v, b.Pd[i * NA + j] = one.d;
-    for (int j = 0; j < ng; j++) {
-        int own = (NX + j) * NA + NX + j;
-        b.P[own] = colour[2 * j + 1].v * colour[2 * j + 1].v;
-        b.Pd[own] = 2.0 * colour[2 * j + 1].v * colour[2 * j + 1].d;
-    }
+    fresh_gauge(&course, &b, colour + rate[0] * 3 * ng);
     for (int i = 0; i < na; i++) b.T[i * NA + i] = 1.0;
     for (int k = 0; k < nt; k++) {
         while (now < t[k] || segment_ < 0) {
@@ -292,7 +365,8 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
             if (!advance(&force, &course, &b, now, to)) goto end;
             now = to;
         }
-        if (k) age_gauge(&course, &b, t[k] - last, colour);
+        if (k && rate[k] != rate[k - 1]) fresh_gauge(&course, &b, colour + rate[k] * 3 * ng);
+        else if (k) age_gauge(&course, &b, t[k] - last, colour + rate[k] * 3 * ng);
         last = t[k];
         double V, W, W_dot, PH[NA], H[NA];
         lanes dPH[NA], dH[NA];
@@ -309,10 +383,10 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
         TAKE(noise, R + k * wide);
         reading = srf_add(srf_mul(scale, reading), shift);
         for (int i = 0; i < na; i++) {
-            one = i < NX ? srf_mul(scale, g[i]) : srf_plain(1.0);
+            one = i < NX ? srf_mul(scale, g[i]) : srf_plain(begins[i]);
             H[i] = one.v;
             dH[i] = one.d;
-            if (i >= NX) reading.v += b.x[i], reading.d += b.xd[i];
+            if (begins[i]) reading.v += b.x[i], reading.d += b.xd[i];
         }
         for (int i = 0; i < na; i++) {
             PH[i] = 0.0;

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from srfcli.codegen.model import Array
 from srfcli.core.units import factor_between, find_unit, split_quantity
 from srfcli.motion.imposed import Drive, Load
 
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
+ANOTHER_RATE = 1.5  # ratio of spacings beyond which a run is sampled at another rate; uneven sampling is one rate
+FEWEST = 60  # samples at a rate: the fewest whose noise can be told from that at another
+MOST_RATES = 8  # in one run
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,14 @@ class FitParameter:
 
 
 @dataclass(frozen=True)
+class Sampling:
+    """Which of the `spacings` (s), rising, each sample (n,) of a run was taken at."""
+
+    at: NDArray[np.intc] = field(repr=False)
+    spacings: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Run:
     """One recording: times (n,) in s that rise strictly, the observable (n,) in um, N or 1, and what was imposed.
 
@@ -88,6 +101,24 @@ class Run:
     def unit(self) -> str:
         """Return the unit of the observable as it is shown: um, N, MPa or 1."""
         return shown_unit(OBSERVABLES[self.observable], stress=self.stress)
+
+    @cached_property
+    def sampling(self) -> Sampling:
+        """Return the rates at which the run was sampled, by the running median of its spacings."""
+        gaps = np.diff(self.t, append=2 * self.t[-1] - self.t[-2])
+        one = Sampling(np.zeros(self.t.size, dtype=np.intc), (float(np.median(gaps)),))
+        if self.t.size < 2 * FEWEST:
+            return one
+        local = np.log(median_filter(gaps, FEWEST // 2 + 1, mode="nearest"))
+        rising = np.sort(local)
+        rate = np.searchsorted(rising[1:][np.diff(rising) > np.log(ANOTHER_RATE)], local, side="right")
+        count = np.bincount(rate)
+        often = np.sort(np.argsort(-count, kind="stable")[:MOST_RATES][np.sort(-count)[:MOST_RATES] <= -FEWEST])
+        if often.size < 2:
+            return one
+        middle = np.array([np.median(local[rate == k]) for k in often])
+        near = np.argmin(np.abs(local[:, None] - middle), axis=1)
+        return Sampling(near.astype(np.intc), tuple(np.exp(middle).tolist()))
 
     @property
     def load_unit(self) -> str:

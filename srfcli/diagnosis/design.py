@@ -288,7 +288,7 @@ class Design:
             if lost is None:
                 return None
             losses[true.name, wrong.name] = lost
-        wrongs = {s.name: float(s.values()[s.fitted.fit.likelihood.gauge(trial.run)["gauge_white"]]) for s in self.sides}
+        wrongs = {s.name: float(s.values()[s.fitted.fit.likelihood.gauges(trial.run)[0]["gauge_white"]]) for s in self.sides}
         worth = {pair: lost.gain() for pair, lost in losses.items()}
         true_name, wrong_name = min(worth, key=lambda pair: worth[pair])
         seconds, repeats = _enough(list(losses.values()), trial)

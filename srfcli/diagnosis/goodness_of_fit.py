@@ -10,11 +10,12 @@ from __future__ import annotations
 import numpy as np
 
 from srfcli.inference.noise import stretches, white_level
-from srfcli.inference.state_space import StateSpaceFit, correlated, typical_friction
+from srfcli.inference.state_space import StateSpaceFit, correlated, correlation, typical_friction
 
 DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
 PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
 LOST = 3.0  # standard errors from its maximum at which a fit is none
+SYSTEMATIC = 2.5  # standard deviations of a correlation below which a loud stretch is a burst of noise, not a misfit
 LOUD = 1.15  # gauge noise over that which differences of the recording show, beyond which it holds something else
 
 
@@ -46,6 +47,8 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
             m = piece.size
             loud = (float(np.sum(np.clip(piece, -6, 6) ** 2)) - m) / np.sqrt(2 * m)
             shifted = abs(float(np.sum(piece))) / np.sqrt(m)
+            if correlation([piece]) < SYSTEMATIC:
+                loud = 0.0
             tests.append((max(loud, shifted) / (DEVIATION + 1.0), f"a stretch of {f.run.name} is off"))
         if not found.smooth and "field_amplitude" in f.names:
             k = f.names.index("field_amplitude")
@@ -60,10 +63,12 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
         tests.append((share, f"the field's amplitude is {values['field_amplitude']:.2g}"))
     levels: dict[str, list[float]] = {}
     for f in point.runs:
-        name = found.likelihood.gauge(f.run)["gauge_white"]
-        levels.setdefault(name, []).append(white_level(f.run.observed, stretches(f.run.t, f.run.used)))
-    for name, seen in levels.items():
+        rate = f.run.sampling.at
+        for k, own in enumerate(found.likelihood.gauges(f.run)):
+            seen = white_level(f.run.observed, stretches(f.run.t, f.run.used & (rate == k)))
+            levels.setdefault(own["gauge_white"], []).append(seen)
+    for name, shown in levels.items():
         quantum = max(f.run.quantum for f in point.runs) / np.sqrt(12)
-        ratio = float(np.hypot(values[name], quantum)) / max(min(seen), 1e-300)
+        ratio = float(np.hypot(values[name], quantum)) / max(min(shown), 1e-300)
         tests.append((ratio / LOUD, f"the gauge's noise is {ratio:.2f} times what the recording shows"))
     return [text for size, text in sorted(tests, reverse=True) if size > 1.0]

@@ -197,13 +197,13 @@ class Scores:
         likelihood = self.fitted.likelihood
 
         def block(run: Run) -> Array:
-            local = {own: values[n] for own, n in likelihood.gauge(run).items()}
             found = filter_run(
                 model,
                 self.experiment,
                 run,
-                {**values, **local},
+                values,
                 by=by,
+                gauges=likelihood.gauges(run),
                 trend=likelihood.problem.trend,
                 rtol=likelihood.rtol,
             )

@@ -126,7 +126,7 @@ class ModelSearch:
         self.fitted: dict[str, Fitted] = {}
         self.queue: list[_Move] = []
         self.count = 0
-        self.processes = 0
+        self.processes: tuple[str, ...] = ()
 
     # ------------------------------------------------------------------ models and their fits
 

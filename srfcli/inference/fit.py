@@ -52,7 +52,8 @@ HUGE = 1e100  # a slope that is no slope any more: its square would overflow
 class RunFit:
     """How one run is fitted: residual (n,), its noise model, the part of its samples that took part.
 
-    `colours` are correlation time (s) and standard deviation of the gauge's coloured noise, of a state-space fit.
+    `colours` are the gauge's coloured noise, of a state-space fit: correlation time (s) and standard deviation of a relaxation,
+    frequency (Hz), standard deviation and quality of an oscillation.
     """
 
     name: str
@@ -62,7 +63,7 @@ class RunFit:
     parts: list[tuple[int, int]]
     noise: Noise
     white: float  # standard deviation of white noise, from differences of the residual
-    colours: tuple[tuple[float, float], ...] = ()
+    colours: tuple[tuple[float, ...], ...] = ()
 
     @property
     def rms(self) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,9 @@ from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.integrators import doubles, imposed_arguments, interruptible, rtol_of_estimate
 
 STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
-GAUGE_PROCESSES = 3  # of coloured gauge noise, at most
+GAUGE_PROCESSES = 3  # of coloured gauge noise, at most, of one state or two
+
+_INTS = ctypes.POINTER(ctypes.c_int)
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,8 @@ def kalman_filter(
     start: Dual,
     covariance: Dual,
     gauge: Dual,
+    order: Sequence[int] = (),
+    rate: NDArray[np.intc] | None = None,
     factor: Dual,
     offset: Dual,
     R: Dual,
@@ -94,7 +99,10 @@ def kalman_filter(
     """Return the innovations of the readings `observed` (n,) at the rising times `t` (s), of which those `used` are taken up.
 
     A reading is `factor` (n,) times the elongation (or the gauge's own state) plus `offset` (n,) plus gauge noise: white of
-    variance `R` (n,), and processes e' = -e/tau + s sqrt(2/tau) w whose (tau, s) are the rows of `gauge` (g, 2), g <= 3.
+    variance `R` (n,), and g <= 3 processes of as many states as `order` (g,) says. `gauge` (rates, g, 3) has their parameters: of
+    one state, e' = -e/tau + s sqrt(2/tau) w, (tau, s, -); of two, an oscillator of frequency f (Hz), quality q and standard
+    deviation s, (f, s, q). `rate` (n,) says which row holds at a sample, the first if left out; where it changes, a new noise
+    begins.
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
     numbers in the same k directions. After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a
     compiler, or for a model without a random friction field.
@@ -105,7 +113,8 @@ def kalman_filter(
     if not hasattr(library, "srf_filter"):
         raise SrfError(f"{model.title} has no random friction field", "open_model(..., random_field=True)")
     n, k, states = t.size, p.d.shape[-1], len(model.states)
-    wide = states + GAUGE_PROCESSES
+    wide, own = states + 2 * GAUGE_PROCESSES, np.array([*order, 0], dtype=np.intc)
+    rates = np.ascontiguousarray(np.zeros(n) if rate is None else rate, dtype=np.intc)
     nu, S = np.full(n, np.nan), np.full(n, np.nan)
     nu_d, S_d = np.full((n, k), np.nan), np.full((n, k), np.nan)
     shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide)) if keep else ((1,),) * 4
@@ -119,7 +128,8 @@ def kalman_filter(
         keeping = keep and first == 0
         arguments = (
             *imposed, doubles(p.packed(first)), doubles(start.packed(first)), doubles(covariance.packed(first)),
-            gauge.v.shape[0], doubles(gauge.packed(first)), int(k > 0), ctypes.c_double(size), doubles(allowed),
+            len(order), own.ctypes.data_as(_INTS), gauge.v.shape[0], doubles(gauge.packed(first)), rates.ctypes.data_as(_INTS),
+            int(k > 0), ctypes.c_double(size), doubles(allowed),
             ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(most), n,
             doubles(t), doubles(observed), ctypes.c_void_p(use.ctypes.data), doubles(factor.packed(first)),
             doubles(offset.packed(first)), doubles(R.packed(first)), int(keeping), doubles(nu), doubles(S), doubles(own_nu),
@@ -130,7 +140,7 @@ def kalman_filter(
         nu_d[:, first : first + count], S_d[:, first : first + count] = own_nu[:, :count], own_S[:, :count]
     kept = None
     if keep:
-        a = states + gauge.v.shape[0]
+        a = states + sum(order)
         mean, P, T, H = arrays
         kept = Kept(mean[:, :a], P[:, :a, :a], T[:, :a, :a], H[:, :a])
     return Innovations(nu, S, nu_d, S_d, reached, int(stats[0]), kept)

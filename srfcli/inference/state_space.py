@@ -19,7 +19,7 @@ from itertools import product
 from typing import TypeVar
 
 import numpy as np
-from scipy.signal import lfilter
+from scipy.signal import lfilter, welch
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
@@ -42,6 +42,7 @@ T = TypeVar("T")
 RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
+PROCESSES = ("relaxation", "oscillation")  # of coloured gauge noise: e' = -e / tau + w, or e'' + (omega / q) e' + omega^2 e = w
 # A fit begins with the likeliest of nine fields: amplitudes over the friction of the recordings, lengths over that of PIECES
 WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
 SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
@@ -58,6 +59,10 @@ CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
 TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
+QUALITIES = (0.5, 3.0, 30.0)  # of an oscillation, where it begins: smooth noise, a broad line and a narrow one
+QUALITY = (0.2, 1000.0)  # of an oscillation: one of a smaller quality is a relaxation
+SEGMENT = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
+FASTEST = 1.0  # frequency of an oscillation times the spacing: smooth noise may end beyond half of the sampling rate
 DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
 
@@ -87,10 +92,12 @@ class Filtered:
     @property
     def log_likelihood(self) -> float:
         """Return the log likelihood of the readings used; minus infinity where the motion could not be followed."""
-        if not self.whole:
-            return -np.inf
-        S, white = self.found.S[self.run.used], self.white
-        return -0.5 * float(np.sum(white**2) + np.sum(np.log(2 * np.pi * S)))
+        return float(np.sum(self.log_density)) if self.whole else -np.inf
+
+    @property
+    def log_density(self) -> Array:
+        """Return the log density (m,) of each reading given those before it."""
+        return np.asarray(-0.5 * (self.white**2 + np.log(2 * np.pi * self.found.S[self.run.used])))
 
     @property
     def score(self) -> Array:
@@ -119,6 +126,7 @@ def filter_run(
     values: Mapping[str, float],
     *,
     by: Sequence[str] = (),
+    gauges: Sequence[Mapping[str, str]] = (),
     trend: str | None = None,
     rtol: float = RTOL,
     keep: bool = False,
@@ -127,8 +135,10 @@ def filter_run(
     """Return `run` filtered under `values` (um, s, N), with derivatives by the parameters `by`.
 
     `values` hold those of the model, field_amplitude and field_length among them, `gauge_white`, the standard deviation of white
-    gauge noise in the observable's unit, `gauge_colour1` and `gauge_time1` (s) of an exponentially correlated part, and so on up
-    to 3 of these, and what belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. After `most` steps it is given up.
+    gauge noise in the observable's unit, `gauge_colour1` of a coloured part with `gauge_time1` (s) if its correlation falls off
+    exponentially or `gauge_frequency1` (Hz) and `gauge_quality1` if it is an oscillator's, and so on up to 3 of these, and what
+    belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. `gauges` say by which names they have those of the gauge, one for
+    each of the run's sampling rates. After `most` steps it is given up.
     """
     k, n = len(by), run.t.size
     p = run_parameters(model, experiment, run, values)
@@ -145,19 +155,19 @@ def filter_run(
     if trend:
         along, name = basis(run, trend), f"{run.name}.trend"
         offset = Dual(values.get(name, 0.0) * along, np.outer(along, [float(b == name) for b in by]))
-    sd = values["gauge_white"]
-    R = Dual(np.full(n, sd**2 + run.quantum**2 / 12), np.outer(np.ones(n), [2 * sd * (b == "gauge_white") for b in by]))
-    own = [gauge_process(j) for j in range(1, GAUGE_PROCESSES + 1) if gauge_process(j)[0] in values]
-    gauge = Dual(
-        np.array([[values[name] for name in pair] for pair in own]).reshape(len(own), 2),
-        np.array([[[float(b == name) for b in by] for name in pair] for pair in own]).reshape(len(own), 2, k),
-    )
+    gauges, rate = gauges or [{n: n for n in values if n.startswith("gauge_")}] * len(run.sampling.spacings), run.sampling.at
+    white, white_d = _named([own["gauge_white"] for own in gauges], values, by)
+    R = Dual((white**2)[rate] + run.quantum**2 / 12, (2 * white[:, None] * white_d)[rate])
+    every = (gauge_process(j, kind) for j, kind in product(range(1, GAUGE_PROCESSES + 1), PROCESSES))
+    rows = [row for row in every if row[0] in gauges[0]]
+    colour = Dual(*_named([own[n] if n else "" for own in gauges for row in rows for n in (*row, "")[:3]], values, by))
+    gauge = Dual(colour.v.reshape(len(gauges), len(rows), 3), colour.d.reshape(len(gauges), len(rows), 3, k))
     size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
     fine = np.array([max(values["field_amplitude"], 1e-3) if s.startswith("field") else 1.0 for s in model.states])
     found = kalman_filter(
         model, Dual(p, d), drive=run.drive, load=run.load, t=run.t, observed=run.observed, used=run.used, start=start,
-        covariance=P0, gauge=gauge, factor=factor, offset=offset, R=R, rtol=rtol, atol=rtol * size * fine, keep=keep,
-        most=most,
+        covariance=P0, gauge=gauge, order=[len(row) - 1 for row in rows], rate=rate, factor=factor, offset=offset,
+        R=R, rtol=rtol, atol=rtol * size * fine, keep=keep, most=most,
     )  # fmt: skip
     return Filtered(run, tuple(by), found)
 
@@ -171,9 +181,20 @@ def field_columns(likelihood: Likelihood, run: Run, values: Mapping[str, float])
     return _field_columns(model, run, p, x0)[:, 0]
 
 
-def gauge_process(number: int) -> tuple[str, str]:
-    """Return the names of correlation time (s) and standard deviation of a process of coloured gauge noise; the first is 1."""
-    return f"gauge_time{number}", f"gauge_colour{number}"
+def gauge_process(number: int, kind: str) -> tuple[str, ...]:
+    """Return the names of the parameters of a process of coloured gauge noise, the first is 1; `kind` is one of PROCESSES.
+
+    The second is its standard deviation.
+    """
+    if kind == "relaxation":
+        return f"gauge_time{number}", f"gauge_colour{number}"
+    return f"gauge_frequency{number}", f"gauge_colour{number}", f"gauge_quality{number}"
+
+
+def _named(names: Sequence[str], values: Mapping[str, float], by: Sequence[str]) -> tuple[Array, Array]:
+    """Return values (m,) by name, 0 for no name, and their derivatives (m, k) by those in `by`."""
+    d = np.array([[float(b == n) for b in by] for n in names])
+    return np.array([values[n] if n else 0.0 for n in names]), d.reshape(len(names), len(by))
 
 
 def _belief(
@@ -250,24 +271,22 @@ class Likelihood:
     """The log likelihood of a problem's runs; its model has a random friction field.
 
     Coordinates x are the problem's parameters, then field_amplitude and field_length unless the track is `smooth`, gauge_white,
-    and correlation time and standard deviation of each of the gauge's coloured `processes`; those with a positive lower bound by
-    their logarithms, in which friction laws are nearly linear. Runs of another observable or sampling rate have a gauge noise of
-    their own; their names then end in `[kind]`.
+    and the parameters of the gauge's coloured `processes`, each a word of PROCESSES; those with a positive lower bound by
+    their logarithms, in which friction laws are nearly linear. Another observable or sampling rate has a gauge noise of its own,
+    within a run too; names then end in `[kind]`.
     """
 
     def __init__(
-        self, problem: Problem, *, smooth: bool = False, processes: int = 0, rtol: float = RTOL, threads: int = 1
+        self, problem: Problem, *, smooth: bool = False, processes: Sequence[str] = (), rtol: float = RTOL, threads: int = 1
     ) -> None:
-        self.problem, self.smooth, self.processes = problem, smooth, processes
+        self.problem, self.smooth, self.processes = problem, smooth, tuple(processes)
         self.rtol = FREE_RUNNING * rtol if smooth else rtol
         self.threads, self.evaluations = threads, 0
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs)
-        gauge = ["gauge_white", *(n for j in range(processes) for n in gauge_process(j + 1))]
-        kinds = {run.name: _kind(run) for run in problem.runs}
-        several = len(set(kinds.values())) > 1
-        self.own = {name: {g: f"{g}[{kind}]" if several else g for g in gauge} for name, kind in kinds.items()}
-        wanted = [*(() if smooth else FIELD), *dict.fromkeys(n for own in self.own.values() for n in own.values())]
+        self._gauge = ["gauge_white", *(n for j, kind in enumerate(processes) for n in gauge_process(j + 1, kind))]
+        self.kinds = list(dict.fromkeys((run.observable, dt) for run in problem.runs for dt in _spacings(run)))
+        wanted = [*(() if smooth else FIELD), *(n for kind in self.kinds for n in self.own(kind).values())]
         own = [(n, *scales[n.partition("[")[0].rstrip("123")]) for n in wanted]
         self.names = (*problem.names, *(row[0] for row in own))
         rows = [*zip(problem.start, problem.lower, problem.upper, strict=True), *(row[1:] for row in own)]
@@ -302,15 +321,17 @@ class Likelihood:
                 x[i] = np.log(max(values[name], 1e-300)) if self.logarithmic[i] else values[name]
         return np.clip(x, self.lower, self.upper)
 
-    def gauge(self, run: Run) -> dict[str, str]:
-        """Return the names of a run's gauge noise as they are here, by those that `filter_run` has for them."""
-        if run.name in self.own:
-            return self.own[run.name]
-        near = [r for r in self.problem.runs if r.observable == run.observable] or list(self.problem.runs)
-        step = np.log(_spacing(run))
-        return self.own[
-            min(near, key=lambda r: abs(np.log(_spacing(r)) - step)).name
-        ]  # held out: that sampled most alike
+    def own(self, kind: tuple[str, float]) -> dict[str, str]:
+        """Return the names of the gauge noise of a kind, an observable and a spacing, by those that `filter_run` has."""
+        return {n: n if len(self.kinds) == 1 else f"{n}[{kind[0]}, {kind[1]:g} s]" for n in self._gauge}
+
+    def gauges(self, run: Run) -> list[dict[str, str]]:
+        """Return the names of a run's gauge noise at each of its sampling rates, by those that `filter_run` has for them.
+
+        A run that was held out has those of what was sampled most alike.
+        """
+        near = [kind for kind in self.kinds if kind[0] == run.observable] or self.kinds
+        return [self.own(min(near, key=lambda kind: abs(np.log(kind[1] / dt)))) for dt in _spacings(run)]
 
     def filtered(
         self,
@@ -322,17 +343,13 @@ class Likelihood:
         most: int | None = None,
     ) -> Filtered:
         """Return one run filtered under values by name, with derivatives by the names that it depends on."""
-        gauge, problem = self.gauge(run), self.problem
-        back = {name: local for local, name in gauge.items()}
-        own = [
-            n for n in self.names if n in back or (("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
-        ]
-        found = filter_run(
-            problem.model, problem.experiment, run, {**values, **{local: values[n] for local, n in gauge.items()}},
-            by=[back.get(n, n) for n in own] if slopes else (), trend=None if run.holdout else problem.trend, rtol=self.rtol,
-            keep=keep, most=most,
+        gauges, problem = self.gauges(run), self.problem
+        gauge = {n for own in gauges for n in own.values()}
+        by = [n for n in self.names if n in gauge or (("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)]
+        return filter_run(
+            problem.model, problem.experiment, run, values, by=by if slopes else (), gauges=gauges,
+            trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
         )  # fmt: skip
-        return replace(found, names=tuple(own) if slopes else ())
 
     def held_out(self, run: Run, values: Mapping[str, float]) -> Filtered:
         """Return a run that was not fitted, filtered; what belongs to it alone, a free start or a trend, is estimated."""
@@ -347,10 +364,26 @@ class Likelihood:
             problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held
         )
         likelihood = Likelihood(alone, smooth=self.smooth, processes=self.processes, rtol=self.rtol)
-        known = {local: values[n] for local, n in self.gauge(run).items()} | {n: values[n] for n in FIELD}
+        known = {n: values[n] for n in FIELD}
+        for alone_names, names in zip(likelihood.gauges(alone.runs[0]), self.gauges(run), strict=True):
+            known |= {name: values[names[local]] for local, name in alone_names.items()}
         x = likelihood.coordinates(known)
         found = maximise(likelihood, x, held=[n for n in likelihood.names if n not in own])
         return replace(found.point.runs[0], run=run)
+
+    def pieces(self, point: Point) -> Iterator[tuple[Array, Array, tuple[str, float]]]:
+        """Yield standardised innovations, their log densities, and the kind of gauge noise, of each run at each of its rates."""
+        for f in point.runs:
+            rate = f.run.sampling.at[f.run.used]
+            for k, dt in enumerate(_spacings(f.run)):
+                yield f.white[rate == k], f.log_density[rate == k], (f.run.observable, dt)
+
+    def by_kind(self, point: Point) -> list[float]:
+        """Return what each kind of gauge noise has of the log likelihood."""
+        total = dict.fromkeys(self.kinds, 0.0 if np.isfinite(point.log_likelihood) else -np.inf)
+        for _, density, kind in self.pieces(point):
+            total[kind] += float(np.sum(density))
+        return list(total.values())
 
     def over_runs(self, work: Callable[[Run], T]) -> list[T]:
         """Return what `work` makes of each run, on several threads where that was asked for."""
@@ -388,7 +421,7 @@ def _scales(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
     friction = max(float(np.median([typical_friction(r) for r in runs])), 1e-6)
     slid = max(float(np.sum(np.abs(r.drive(r.t[1:])) * np.diff(r.t))) for r in runs)
     level = float(np.median([first_level(r) for r in runs]))
-    spacing = float(np.median([_spacing(r) for r in runs]))
+    spacing = min(dt for r in runs for dt in r.sampling.spacings)
     longest = max(float(r.t[-1] - r.t[0]) for r in runs)
     length = max(slid, 1e-6) / PIECES
     return {
@@ -397,6 +430,8 @@ def _scales(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
         "gauge_white": (level, level / 30, 100 * level),
         "gauge_colour": (level, level / 100, 100 * level),
         "gauge_time": (10 * spacing, spacing, longest),
+        "gauge_frequency": (0.1 / spacing, 1 / longest, FASTEST / spacing),
+        "gauge_quality": (0.5, *QUALITY),
     }
 
 
@@ -404,9 +439,9 @@ def _spacing(run: Run) -> float:
     return float(np.median(np.diff(run.t)))
 
 
-def _kind(run: Run) -> str:
-    """Return what runs that share a gauge noise have in common: the observable, and the sampling to two digits."""
-    return f"{run.observable}, {_spacing(run):.2g} s"
+def _spacings(run: Run) -> list[float]:
+    """Return the spacings (s) at which a run was sampled, to two digits: runs that agree in them share a gauge noise."""
+    return [float(f"{dt:.2g}") for dt in run.sampling.spacings]
 
 
 def typical_friction(run: Run) -> float:
@@ -521,7 +556,7 @@ def fit_state_space(
     *,
     start: Mapping[str, float] | None = None,
     smooth: bool | None = None,
-    processes: int | None = None,
+    processes: Sequence[str] | None = None,
     thorough: bool = True,
     close: float = CONVERGED,
     threads: int = 1,
@@ -531,13 +566,13 @@ def fit_state_space(
     """Return the maximum-likelihood fit of parameters, random friction field and gauge noise, `close` standard errors or nearer.
 
     From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
-    `smooth` says whether there is no field; left out, there is one where it gains 2 in log likelihood. `processes` says how many
-    of coloured noise the gauge has; left out, Schwarz's criterion decides, early and, if the fit is to be `thorough`, again at
-    the maximum. The status is that of the last maximisation.
+    `smooth` says whether there is no field; left out, there is one where it gains 2 in log likelihood. `processes` says which
+    of coloured noise the gauge has, words of PROCESSES; left out, Schwarz's criterion decides, early and, if the fit is to be
+    `thorough`, again at the maximum. The status is that of the last maximisation.
     """
     tried: list[Likelihood] = []
 
-    def likelihood(smooth: bool, processes: int) -> Likelihood:
+    def likelihood(smooth: bool, processes: Sequence[str]) -> Likelihood:
         tried.append(Likelihood(problem, smooth=smooth, processes=processes, rtol=rtol, threads=threads))
         return tried[-1]
 
@@ -552,7 +587,7 @@ def stopped(problem: Problem, values: Mapping[str, float], *, threads: int = 1) 
     """Return the state of a fit that was stopped: its parameters, with errors as if they were the maximum."""
     smooth, processes = (
         not values.get("field_amplitude"),
-        sum(any(n.startswith(f"gauge_colour{j}") for n in values) for j in (1, 2, 3)),
+        [kind for j in (1, 2, 3) for kind in PROCESSES if any(n.startswith(gauge_process(j, kind)[0]) for n in values)],
     )
     likelihood = Likelihood(problem, smooth=smooth, processes=processes, threads=threads)
     point = likelihood.at(likelihood.coordinates(values))
@@ -560,15 +595,15 @@ def stopped(problem: Problem, values: Mapping[str, float], *, threads: int = 1) 
 
 
 def _fitted(
-    likelihood: Callable[[bool, int], Likelihood],
+    likelihood: Callable[[bool, Sequence[str]], Likelihood],
     start: Mapping[str, float],
     smooth: bool | None,
-    processes: int | None,
+    processes: Sequence[str] | None,
     thorough: bool,
     close: float,
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
-    wide = likelihood(False, processes or 0)
+    wide = likelihood(False, processes or ())
     found = maximise(wide, _widest(wide, start, progress), steps=8, close=1.0, progress=progress)
     best = StateSpaceFit(wide, found, wide.evaluations)
     if found.status is Status.INTEGRATION:
@@ -578,11 +613,12 @@ def _fitted(
     best = _with_or_without(best, smooth, likelihood, close, progress)
     if thorough and processes is None:
         wider = _with_colour(best, likelihood, progress)
-        if wider.likelihood.processes > best.likelihood.processes:
+        if len(wider.likelihood.processes) > len(best.likelihood.processes):
             return _with_or_without(wider, smooth, likelihood, close, progress)
         best = wider
-        if smooth is None and not best.smooth and not best.likelihood.processes:  # colour in place of the field?
-            other = _coloured(best, likelihood(True, 1), progress)
+        known = best.likelihood.processes
+        if smooth is None and not best.smooth and (not known or (fine(best) and len(known) < GAUGE_PROCESSES)):
+            other = _coloured(best, likelihood(True, (*known, "relaxation")), progress)  # colour in place of the field?
             if other.criterion > best.criterion - CLOSE_CALL:
                 own = maximise(other.likelihood, other.maximum.point.x, close=close, progress=progress)
                 other = StateSpaceFit(other.likelihood, own, other.likelihood.evaluations)
@@ -591,28 +627,48 @@ def _fitted(
     return best
 
 
+def fine(fitted: StateSpaceFit) -> bool:
+    """Return whether the field is as short as a field may be: along slip then as the gauge's noise is in time."""
+    at = fitted.likelihood.names.index("field_length")
+    return bool(fitted.maximum.point.x[at] < fitted.likelihood.lower[at] + 0.1)
+
+
 def _with_colour(
-    best: StateSpaceFit, likelihood: Callable[[bool, int], Likelihood], progress: Callable[[str], None]
+    best: StateSpaceFit, likelihood: Callable[[bool, Sequence[str]], Likelihood], progress: Callable[[str], None]
 ) -> StateSpaceFit:
-    """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants."""
-    while best.likelihood.processes < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
-        wider = _coloured(best, likelihood(best.smooth, best.likelihood.processes + 1), progress)
-        if wider.criterion < best.criterion:
-            return _counted(best, wider.evaluations)
-        best = _counted(wider, best.evaluations)
+    """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants.
+
+    One whose correlation falls off exponentially is tried first, an oscillation where that leaves the innovations correlated.
+    """
+    while len(best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
+        found, spent = best, best.evaluations
+        for kind in PROCESSES:
+            wider = _coloured(best, likelihood(best.smooth, (*best.likelihood.processes, kind)), progress)
+            spent += wider.evaluations
+            found = max(found, wider, key=lambda f: f.criterion)
+            if correlated(wider.maximum.point) < COLOUR:
+                break
+        if found is best:
+            return StateSpaceFit(best.likelihood, best.maximum, spent)
+        best = StateSpaceFit(found.likelihood, found.maximum, spent)
     return best
 
 
 def correlated(point: Point) -> float:
-    """Return how far the innovations are correlated with exponential means of those before, in standard deviations, at most.
+    """Return how far the innovations are correlated with those before, in standard deviations; see `correlation`."""
+    return correlation([f.white for f in point.runs])
 
-    That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of a run.
+
+def correlation(pieces: Sequence[Array]) -> float:
+    """Return how far innovations (m,) are correlated with exponential means of those before, in standard deviations, at most.
+
+    That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of the longest.
     """
-    worst, longest = 0.0, max(f.white.size for f in point.runs)
+    worst, longest = 0.0, max(white.size for white in pieces)
     for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
         product, square = 0.0, 0.0
-        for f in point.runs:
-            white = np.clip(f.white, -5.0, 5.0)
+        for piece in pieces:
+            white = np.clip(piece, -5.0, 5.0)
             before = lfilter([0.0, 1.0], [1.0, -np.exp(-1.0 / span)], white)
             product, square = product + float(white @ before), square + float(before @ before)
         worst = max(worst, abs(product) / np.sqrt(square) if square else 0.0)
@@ -622,7 +678,7 @@ def correlated(point: Point) -> float:
 def _with_or_without(
     begun: StateSpaceFit,
     smooth: bool | None,
-    likelihood: Callable[[bool, int], Likelihood],
+    likelihood: Callable[[bool, Sequence[str]], Likelihood],
     close: float,
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
@@ -702,35 +758,48 @@ def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
 
 
 def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str], None]) -> StateSpaceFit:
-    """Return the fit with one more process of gauge noise, from the likeliest correlation time and share of each kind of run."""
-    time, size = gauge_process(wider.processes)
-    kinds = {
-        own[time]: [wider.names.index(own[name]) for name in ("gauge_white", time, size)] for own in wider.own.values()
-    }
-    wide, x = wider.upper - wider.lower, wider.coordinates(fitted.values)
+    """Return the fit with one more process of gauge noise, from the likeliest of a few starts for each kind of noise."""
+    kind, number = wider.processes[-1], len(wider.processes)
+    row = gauge_process(number, kind)
+    x = wider.coordinates(fitted.values)
+    owns = [{n: wider.names.index(name) for n, name in wider.own(of).items()} for of in wider.kinds]
+    if kind == "relaxation":
+        low, high = (float(side[owns[0][row[0]]]) for side in (wider.lower, wider.upper))
+        starts: list[list[tuple[float, ...]]] = [[(low + share * (high - low),) for share in TIMES]] * len(owns)
+    else:
+        starts = [[*product(np.log(peaks), np.log(QUALITIES))] for peaks in _peaks(fitted, wider.kinds)]
     best = -np.inf
     for base in _slow_fields(wider, x):
-        likeliest: dict[str, tuple[float, Array]] = {}  # each kind of run has its own noise
-        for share, part in product(TIMES, COLOURED):
+        likeliest = [(-np.inf, base)] * len(owns)
+        for place, part in product(range(len(starts[0])), COLOURED):
             trial = base.copy()
-            for white, at, colour in kinds.values():
-                trial[at] = wider.lower[at] + share * wide[at]
-                trial[white], trial[colour] = base[white] + 0.5 * np.log([1 - part, part])
+            for own, start in zip(owns, starts, strict=True):
+                levels = [own["gauge_white"], *(own[f"gauge_colour{j}"] for j in range(1, number))]
+                trial[own[row[1]]] = 0.5 * np.log(part * np.sum(np.exp(2 * base[levels])))
+                trial[levels] += 0.5 * np.log(1 - part)
+                trial[[own[n] for n in (row[0], *row[2:])]] = start[place]
             trial = np.clip(trial, wider.lower, wider.upper)
-            found = dict.fromkeys(kinds, 0.0)
-            for f in wider.at(trial, slopes=False).runs:
-                found[wider.own[f.run.name][time]] += f.log_likelihood
-            for kind, likelihood in found.items():
-                if kind not in likeliest or likelihood > likeliest[kind][0]:
-                    likeliest[kind] = likelihood, trial[kinds[kind]]
-        total = sum(likelihood for likelihood, _ in likeliest.values())
+            found = wider.by_kind(wider.at(trial, slopes=False))
+            likeliest = [max(known, (own, trial), key=lambda c: c[0]) for known, own in zip(likeliest, found, strict=True)]
+        total = sum(likelihood for likelihood, _ in likeliest)
         if total > best:
             best, x = total, base
-            for kind, (_, noise) in likeliest.items():
-                x[kinds[kind]] = noise
-    progress(f"coloured gauge noise: {wider.processes}")
+            for own, (_, trial) in zip(owns, likeliest, strict=True):
+                x[list(own.values())] = trial[list(own.values())]
+    progress(f"coloured gauge noise: {', '.join(wider.processes)}")
     maximum = maximise(wider, x, steps=20, close=1.0, progress=progress)
     return StateSpaceFit(wider, maximum, wider.evaluations)
+
+
+def _peaks(fitted: StateSpaceFit, kinds: Sequence[tuple[str, float]]) -> list[list[float]]:
+    """Return, for each kind, frequencies (Hz) at which an oscillation may be: where innovations are strongest, and two others."""
+    found = []
+    for of in kinds:
+        pieces = [white for white, _, own in fitted.likelihood.pieces(fitted.maximum.point) if own == of]
+        power = [welch(w, fs=1 / of[1], nperseg=SEGMENT)[1][1:] * w.size for w in pieces if w.size >= SEGMENT]
+        peak = (1 + int(np.argmax(sum(power)))) / (SEGMENT * of[1]) if power else 0.05 / of[1]
+        found.append([peak, 0.03 / of[1], 0.15 / of[1]])
+    return found
 
 
 def _slow_fields(wider: Likelihood, x: Array) -> Iterator[Array]:
@@ -782,13 +851,14 @@ def as_fit(found: StateSpaceFit) -> Fit:
     likelihood, maximum = found.likelihood, found.maximum
     problem, values, k = likelihood.problem, found.values, len(likelihood.problem.names)
     held = [likelihood.held_out(run, values) for run in problem.experiment.runs if run.holdout]
-    pairs, runs = [gauge_process(j + 1) for j in range(likelihood.processes)], []
+    own_names, runs = [gauge_process(j + 1, kind) for j, kind in enumerate(likelihood.processes)], []
     for f in (*maximum.point.runs, *held):
-        gauge = likelihood.gauge(f.run)
-        colours = tuple((values[gauge[time]], values[gauge[size]]) for time, size in pairs)
-        level = float(np.hypot(values[gauge["gauge_white"]], f.run.quantum / np.sqrt(12)))
+        gauges, rate = likelihood.gauges(f.run), f.run.sampling.at
+        colours = tuple(tuple(values[own[n]] for n in row) for own in gauges for row in own_names)
+        levels = np.array([np.hypot(values[own["gauge_white"]], f.run.quantum / np.sqrt(12)) for own in gauges])
+        level = float(np.sqrt(np.mean(levels[rate] ** 2)))
         with np.errstate(invalid="ignore"):
-            residual = f.found.nu / np.sqrt(f.found.S) * level
+            residual = f.found.nu / np.sqrt(f.found.S) * levels[rate]
         y = f.run.observed - f.found.nu
         parts = stretches(f.run.t, f.run.used & np.isfinite(residual))
         prediction = Prediction(y, np.zeros((y.size, 0)), np.zeros((y.size, 0)), Status.OK, float(f.run.t[-1]))

@@ -285,10 +285,11 @@ def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float
     notes.append("intervals: " + (whose if intervals else "1.96 standard errors; --profile refits") + ", 95 %")
     if len(starts) > 1:
         notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
-    for time, size in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):
-        notes.append(
-            f"gauge noise: {size:.3g} correlated over {time:.3g} s besides white noise, or physics that is missing"
-        )
+    for colour in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):
+        told = f"{colour[1]:.3g} correlated over {colour[0]:.3g} s"
+        if len(colour) == 3:  # an oscillation of a quality of a half is noise that is smooth, of a large one a line
+            told = f"{colour[1]:.3g} about {colour[0]:.3g} Hz, of quality {colour[2]:.2g},"
+        notes.append(f"gauge noise: {told} besides white noise, or physics that is missing")
     coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
     if coloured:
         notes.append(

@@ -133,6 +133,7 @@ USUAL_ONLY = {
     "age-saturation",
 }
 ROUGH_SHARE, WHITE_SHARE = 0.4, 0.6
+OWN_SHARE = 0.5  # of rough tracks: each run has its own
 ROUGHNESS, CORRELATION = (5e-5, 4e-4), (3.0, 30.0)  # of mu0; um
 SIGMA, QUANTUM, REDDEST = 0.02, 0.005, 0.85
 
@@ -184,6 +185,8 @@ def draw_recipe(
     plans = draw_protocol(rng)
     lag1 = float(rng.uniform(0.3, REDDEST))
     gauge = Gauge(lag1=0.0 if rng.uniform() < WHITE_SHARE else lag1)
+    if rng.uniform() < OWN_SHARE and track.size:
+        physics, baseline = (replace(p, track=replace(track, own=True)) for p in (physics, baseline))
     return Recipe(chosen, sizes, physics, baseline, plans, gauge)
 
 
@@ -446,6 +449,7 @@ def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
         "physics": asdict(recipe.physics),
         "baseline": asdict(recipe.baseline),
         "rough": recipe.physics.track.size,
+        "own_track": recipe.physics.track.own,
         "gauge": asdict(recipe.gauge),
         "runs": [asdict(plan) for plan in recipe.plans],
         "seed": _whole(seed),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from math import log
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,7 @@ class Mark:
     missing. `top` is the hypothesis with most confidence, `stated` that confidence, `hit` whether it is the truth; `error` the
     held-out rms of the final model over that of the true one, `baseline_error` that of the baseline; `deviation` is the
     distance of an effect's size from the true one, where it was named rightly and alone: in standard errors, and relative.
+    `own_track`: each run has a rough track of its own.
     """
 
     case: str
@@ -62,6 +63,7 @@ class Mark:
     baseline_error: float | None
     deviation: tuple[float, float] | None = None
     accepted: Accepted = frozenset()
+    own_track: bool = False
 
     @property
     def visible(self) -> bool:
@@ -112,6 +114,7 @@ def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
         _ratio(answer, sight, "baseline"),
         deviation(truth, answer),
         allowed,
+        truth.get("own_track", False),
     )
 
 
@@ -391,16 +394,19 @@ def _cells(found: Rate) -> tuple[Any, ...]:
     return (found.hits, found.count, found.share, *found.interval)
 
 
+TRACKS = ((False, False, "smooth"), (True, False, "rough track"), (True, True, "a rough track of each run's own"))
+
+
 def confusion(marks: Sequence[Mark]) -> Table:
     """Return true kinds against verdicts; `right` counts the effects too, where they are named."""
     columns = (Column("concealed"), Column("cases"), *map(Column, VERDICTS), Column("right"), Column("class_right"))
     rows = []
-    for kind, rough in [(k, r) for k in KINDS for r in (False, True)]:
-        chosen = [m for m in marks if m.kind == kind and m.rough == rough]
+    for kind, (rough, own, told) in product(KINDS, TRACKS):
+        chosen = [m for m in marks if m.kind == kind and m.rough == rough and m.own_track == own]
         if chosen:
             counts = [sum(m.answer.verdict == v for m in chosen) for v in VERDICTS]
             sums = (sum(m.right for m in chosen), sum(m.class_right for m in chosen))
-            rows.append((f"{kind}, rough track" if rough else kind, len(chosen), *counts, *sums))
+            rows.append((f"{kind}, {told}" if rough else kind, len(chosen), *counts, *sums))
     return Table(SCHEMA, columns, rows, "What was concealed, and the verdict on it")
 
 
@@ -419,6 +425,7 @@ def rates(marks: Sequence[Mark]) -> Table:
     add("right", marks, lambda m: m.right, ">= 0.9")
     add("right, smooth tracks", [m for m in marks if not m.rough], lambda m: m.right)
     add("right, rough tracks", [m for m in marks if m.rough], lambda m: m.right)
+    add("right, a track of each run's own", [m for m in marks if m.own_track], lambda m: m.right)
     add("right, or ambiguous and listed", marks, lambda m: m.class_right)
     add("false alarm where nothing is concealed", none, lambda m: m.alarm, "< 0.05")
     add("false alarm, smooth tracks", [m for m in none if not m.rough], lambda m: m.alarm)

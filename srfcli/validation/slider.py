@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
+from zlib import crc32
 
 import numpy as np
 from scipy.integrate import ode
@@ -25,11 +26,17 @@ class Track:
     """The deviation of mu0 along a track: a Gaussian process of standard deviation `size` and correlation length `length` (um).
 
     `seed` fixes it; its correlation is (1 + r) exp(-r), r = distance/length, that of a rough but differentiable profile.
+    Where it is each run's `own`, the slider is set down anew before each.
     """
 
     size: float = 0.0
     length: float = 10.0
     seed: int = 0
+    own: bool = False
+
+    def under(self, run: str) -> Track:
+        """Return the track that is under the slider in a run."""
+        return replace(self, seed=self.seed ^ crc32(run.encode())) if self.own else self
 
     def profile(self, longest: float) -> Callable[[float], float]:
         """Return mu0's deviation as a function of position (um) from 0 to `longest`; beyond it stays at its last value."""
@@ -409,7 +416,7 @@ class Slider:
         self.p, self.plan = p, plan
         self.contact: Contact = build_contact(p)
         self._felt = felt_load(p, plan)
-        self._terms = at_unit_velocity(p, plan.distance + OVERSHOOT)
+        self._terms = at_unit_velocity(replace(p, track=p.track.under(plan.name)), plan.distance + OVERSHOOT)
         self._aged = ageing(p)
         extra = {"ln_phi2": p.B2, "Wm": p.memory, "gauge": p.lag, "stage": p.drive_tau, "X": p.ripple}
         self.names = (*self.contact.names, "ln_phi", "s", *(name for name, size in extra.items() if size))
