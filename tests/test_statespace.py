@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.stats import multivariate_normal
 
 from srfcli.codegen.c_source import compiler
 from srfcli.core.errors import SrfError, Status
@@ -148,6 +149,46 @@ def test_derivatives_are_those_of_the_likelihood(rig):
                 worst[name] = max(worst.get(name, 0.0), np.abs(ours - theirs).max() / scale)
     assert len(worst) >= len(by) - 2
     assert max(worst.values()) < 1e-3, worst  # stick-slip is the worst, and there the differences are
+
+
+def test_gauge_noise_has_the_density_of_its_covariance(make_model):
+    """Two sampling rates with a noise each: smooth, two relaxations in one, and a line; readings are missing. Dense algebra."""
+    model, own = make_model(**ROCK, random_field=True), RIGS["rock, free start and trend"]
+    t = np.r_[0.1 * np.arange(80), 8.0 + 0.01 * np.arange(90)]
+    run = recording(t, "friction", Drive.constant(3.0), ConstantLoad(20.0), stiffness=0.2)
+    run = replace(run, used=np.r_[np.ones(40, bool), np.zeros(7, bool), np.ones(123, bool)])
+    assert run.sampling.spacings == pytest.approx((0.01, 0.1))
+    assert np.abs(run.sampling.at - np.repeat([1, 0], [80, 90])).sum() < 3
+    values = {n: v for n, v in own.values.items() if "." not in n} | {"field_amplitude": 0.0, "field_length": 4.0}
+    steady = predict(model, replace(own, run=run).experiment, run, values, rtol=1e-9).y
+    rng = np.random.default_rng(4)
+    run = replace(run, observed=steady + 1e-3 * rng.standard_normal(t.size))
+    noises = [(2e-4, 0.03, 3e-4, 9.0, 5e-4, 0.5), (3e-4, 0.2, 2e-4, 2.3, 4e-4, 0.3), (1e-4, 1.0, 1e-4, 8.0, 5e-4, 40.0)]
+    local = ("gauge_white", "gauge_time1", "gauge_colour1", "gauge_frequency2", "gauge_colour2", "gauge_quality2")
+    for pair in ((0, 1), (2, 0), (1, 2)):
+        gauges = [{n: f"{n}[{k}]" for n in local} for k in range(2)]
+        noise = {f"{n}[{k}]": v for k, i in enumerate(pair) for n, v in zip(local, noises[i], strict=True)}
+        by = list(noise)
+
+        def whole(changed, slopes=(), gauges=gauges, run=run):
+            return filter_run(model, replace(own, run=run).experiment, run, values | changed, by=slopes, gauges=gauges, rtol=1e-9)
+
+        found = whole(noise, by)
+        expected = 0.0
+        for k, i in enumerate(pair):
+            white, tau, s, f, a, q = noises[i]
+            at = run.used & (run.sampling.at == k)
+            lag, omega = np.abs(np.subtract.outer(t[at], t[at])), 2 * np.pi * f
+            fast = np.sqrt(complex(0.25 / q**2 - 1))  # kernel of e'' + (omega / q) e' + omega^2 e = noise, by its two rates
+            roots = omega * np.array([-0.5 / q + fast, -0.5 / q - fast]) * (1 + 1e-7 * np.array([1, -1]))
+            kernel = (roots[0] * np.exp(roots[1] * lag) - roots[1] * np.exp(roots[0] * lag)) / (roots[0] - roots[1])
+            C = s**2 * np.exp(-lag / tau) + a**2 * kernel.real + white**2 * np.eye(at.sum())
+            expected += multivariate_normal(np.zeros(at.sum()), C).logpdf((run.observed - steady)[at])
+        assert found.log_likelihood == pytest.approx(expected, abs=2e-3)
+        for name, slope in zip(by, found.score, strict=True):
+            step = 1e-5 * noise[name]
+            up, down = (whole(noise | {name: noise[name] + e}).log_likelihood for e in (step, -step))
+            assert slope == pytest.approx((up - down) / (2 * step), rel=1e-4, abs=1e-3 / noise[name]), name
 
 
 def test_a_linear_model_agrees_with_statsmodels(make_model):
