@@ -10,12 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from srfcli.inference.noise import stretches, white_level
-from srfcli.inference.state_space import StateSpaceFit, correlated, correlation, typical_friction
+from srfcli.inference.state_space import SYSTEMATIC, StateSpaceFit, correlated, cut, portmanteau, typical_friction
 
 DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
 PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
 LOST = 3.0  # standard errors from its maximum at which a fit is none
-SYSTEMATIC = 2.5  # standard deviations of a correlation below which a loud stretch is a burst of noise, not a misfit
 LOUD = 1.15  # gauge noise over that which differences of the recording show, beyond which it holds something else
 
 
@@ -43,11 +42,11 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
         n = white.size
         off = abs(float(np.sum(white**2)) - n) / np.sqrt(2 * n)
         tests.append((off / DEVIATION, f"innovations of {f.run.name} have an rms of {np.sqrt(np.mean(white**2)):.3f}"))
-        for piece in np.array_split(white, max(min(20, n // 50), 1)):
+        for piece in cut(white):
             m = piece.size
             loud = (float(np.sum(np.clip(piece, -6, 6) ** 2)) - m) / np.sqrt(2 * m)
             shifted = abs(float(np.sum(piece))) / np.sqrt(m)
-            if correlation([piece]) < SYSTEMATIC:
+            if portmanteau(piece) < SYSTEMATIC:  # a burst of noise, no misfit
                 loud = 0.0
             tests.append((max(loud, shifted) / (DEVIATION + 1.0), f"a stretch of {f.run.name} is off"))
         if not found.smooth and "field_amplitude" in f.names:

@@ -56,6 +56,8 @@ PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 
 STEPS = 40  # of Fisher scoring
 PATIENCE = 5  # times the steps of integration of the point before, after which a trial is given up
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
+SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
+LAGS = 5  # of that statistic
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
 TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
@@ -638,7 +640,8 @@ def _with_colour(
 ) -> StateSpaceFit:
     """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants.
 
-    One whose correlation falls off exponentially is tried first, an oscillation where that leaves the innovations correlated.
+    One whose correlation falls off exponentially is tried first, an oscillation where that leaves most stretches correlated: what
+    the physics lack leaves a few.
     """
     while len(best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
         found, spent = best, best.evaluations
@@ -646,7 +649,7 @@ def _with_colour(
             wider = _coloured(best, likelihood(best.smooth, (*best.likelihood.processes, kind)), progress)
             spent += wider.evaluations
             found = max(found, wider, key=lambda f: f.criterion)
-            if correlated(wider.maximum.point) < COLOUR:
+            if not steadily_coloured(wider.maximum.point):
                 break
         if found is best:
             return StateSpaceFit(best.likelihood, best.maximum, spent)
@@ -655,24 +658,40 @@ def _with_colour(
 
 
 def correlated(point: Point) -> float:
-    """Return how far the innovations are correlated with those before, in standard deviations; see `correlation`."""
-    return correlation([f.white for f in point.runs])
+    """Return how far the innovations are correlated with exponential means of those before, in standard deviations, at most.
 
-
-def correlation(pieces: Sequence[Array]) -> float:
-    """Return how far innovations (m,) are correlated with exponential means of those before, in standard deviations, at most.
-
-    That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of the longest.
+    That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of a run.
     """
-    worst, longest = 0.0, max(white.size for white in pieces)
+    worst, longest = 0.0, max(f.white.size for f in point.runs)
     for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
         product, square = 0.0, 0.0
-        for piece in pieces:
-            white = np.clip(piece, -5.0, 5.0)
+        for f in point.runs:
+            white = np.clip(f.white, -5.0, 5.0)
             before = lfilter([0.0, 1.0], [1.0, -np.exp(-1.0 / span)], white)
             product, square = product + float(white @ before), square + float(before @ before)
         worst = max(worst, abs(product) / np.sqrt(square) if square else 0.0)
     return worst
+
+
+def steadily_coloured(point: Point) -> bool:
+    """Return whether the innovations are correlated all along, as a gauge's noise is, and not in a few stretches."""
+    if correlated(point) < COLOUR:
+        return False
+    found = [portmanteau(piece) > SYSTEMATIC for f in point.runs for piece in cut(f.white)]
+    return 2 * sum(found) > len(found)
+
+
+def portmanteau(white: Array) -> float:
+    """Return how far the correlations at the first LAGS lags are from those of white noise: Ljung and Box's Q, standardised."""
+    n, c = white.size, np.clip(white, -5.0, 5.0)
+    square = float(c @ c)
+    Q = sum(n * (n + 2) / (n - k) * (float(c[k:] @ c[:-k]) / square) ** 2 for k in range(1, LAGS + 1)) if square else 0.0
+    return (Q - LAGS) / np.sqrt(2 * LAGS)
+
+
+def cut(white: Array) -> list[Array]:
+    """Return innovations (m,) in stretches that are long enough to be judged each, at most 20."""
+    return np.array_split(white, max(min(20, white.size // 50), 1))
 
 
 def _with_or_without(
