@@ -10,7 +10,7 @@ import pytest
 
 from srfcli.codegen.splines import Spline
 from srfcli.data.experiment import read_experiment
-from srfcli.inference.random_field import AMPLITUDES, LENGTHS, Point, Roughness, Tracks, evenness, marginal
+from srfcli.inference.random_field import AMPLITUDES, LENGTHS, Roughness, Tracks, marginal
 from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import load_registry
 
@@ -70,18 +70,6 @@ def test_no_roughness_is_found_where_there_is_none() -> None:
     A = np.column_stack([J, C])
     found = marginal(A.T @ A, A.T @ r, [0, 1], range(2, A.shape[1]), tracks, -0.5 * float(r @ r))
     assert found.log_likelihood - found.smooth < 4.0
-
-
-@pytest.mark.parametrize(("first", "second", "even"), [(1e-4, 1e-4, True), (1e-5, 1e-3, False)])
-def test_one_roughness_for_all_runs_is_put_to_the_test(first: float, second: float, even: bool) -> None:
-    rng = np.random.default_rng(3)
-    _, _, C, tracks = _linear(0.0, 4)
-    length, parts = LENGTHS[1], []
-    for spline, amplitude in zip(tracks.splines, (first, second), strict=True):
-        parts.append(Roughness(amplitude, length).root(spline.nodes) @ rng.normal(size=spline.numbers.size))
-    r = C @ np.concatenate(parts) + rng.normal(size=C.shape[0])
-    point = Point(np.zeros(0), tracks, Roughness(1e-4, length), {}, C.T @ C, C.T @ r, 0.0, 0.0)
-    assert (evenness(point) > 1e-4) is even
 
 
 @pytest.mark.slow

@@ -26,9 +26,11 @@ from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, appli
 from srfcli.diagnosis.scores import Remainder, Score, Scores
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
+    COLOUR,
     NEEDED,
     Likelihood,
     StateSpaceFit,
+    correlated,
     fit_state_space,
     maximise,
 )
@@ -134,7 +136,7 @@ class ModelSearch:
         """Return a model fitted from where its parent stands, and judged; the baseline from the file's own start values."""
         hypothesis = move.hypothesis if move else Hypothesis()
         values = self._started(move) if move else None
-        options = {"processes": self.processes if move else None, **self.options}
+        options = {"processes": self.processes if move else None, "cautious": True, **self.options}
         found = fit_state_space(
             self._problem(hypothesis, values or {}), start=values, close=NEAR, rtol=COARSE, threads=self.threads,
             progress=self.progress, **options,
@@ -191,9 +193,9 @@ class ModelSearch:
         base = self._record(self.fit(None))
         base = self._expand(base)
         self._search()
-        for further in (self._together, self._swap):  # dearer, or less likely
+        for further in (self._recolour, self._together, self._swap):  # dearer, or less likely
             if not self.best().fine and not self.spent:
-                further(base)
+                further(self.baseline)
                 self._search()
         self._eliminate()
         return self.best()
@@ -359,6 +361,26 @@ class ModelSearch:
         values = dict(found.point.values)
         expected = node.evidence + gain + WORTH
         return _Move(-expected, self.count, node.hypothesis, values, self._sizes(node, values), again=True)
+
+    def _recolour(self, base: Fitted) -> None:
+        """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""
+        best = self.best()
+        if "processes" in self.options or correlated(best.fit.maximum.point) < COLOUR:
+            return
+        self.processes = self._refitted(best, None).fit.likelihood.processes
+        if self.processes != best.fit.likelihood.processes:
+            for node in {f.name: f for f in (base, *self.ranked()[:SINGLES])}.values():
+                if node.fit.likelihood.processes != self.processes:
+                    self._refitted(node, self.processes)
+            self.queue.clear()
+
+    def _refitted(self, node: Fitted, processes: Sequence[str] | None) -> Fitted:
+        """Return a fitted model with other gauge noise, which takes its place."""
+        found = fit_state_space(
+            node.fit.likelihood.problem, start=_followable(node.fit.values, node.fit.likelihood.problem), close=NEAR, rtol=COARSE,
+            threads=self.threads, progress=self.progress, **{**self.options, "processes": processes},
+        )  # fmt: skip
+        return self._record(self._judged(node.hypothesis, found), anew=True)
 
     def _together(self, node: Fitted) -> None:
         """Push the pairs of effects that promise more together than the best alone."""

@@ -16,7 +16,6 @@ from srfcli.diagnosis.scores import Score
 from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, Fitted, ModelSearch
 from srfcli.inference.state_space import Filtered, Likelihood, StateSpaceFit, maximise
 
-VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
 NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
 HELD = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
 SAME = 0.97  # likeness of two effects' projected columns beyond which they are one class

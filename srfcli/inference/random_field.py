@@ -298,27 +298,6 @@ def marginal(
     return Marginal(best[0], best[1], smooth)
 
 
-def evenness(point: Point) -> float:
-    """Return the p-value of one roughness for all runs, by the likelihood ratio against a roughness for each of them."""
-    from scipy.stats import chi2
-
-    splines, n = point.tracks.splines, point.theta.size
-    if len(splines) < 2 or not point.roughness.amplitude:
-        return 1.0
-    amplitudes, at, curves = np.geomspace(1e-5, 5e-3, 40), n, []
-    for spline in splines:
-        c = slice(at, at + spline.numbers.size)
-        at = c.stop
-        unit = Roughness(1.0, point.roughness.length).root(spline.nodes)
-        G = point.N[c, c]
-        values, vectors = np.linalg.eigh(unit.T @ G @ unit)
-        values, along = np.maximum(values, 0.0), vectors.T @ (unit.T @ (point.g[c] + G @ spline.numbers))
-        s2 = amplitudes[:, None] ** 2
-        curves.append(0.5 * np.sum(s2 * along**2 / (1 + s2 * values) - np.log1p(s2 * values), axis=1))
-    each = np.array(curves)
-    return float(chi2.sf(2 * (each.max(axis=1).sum() - each.sum(axis=0).max()), len(splines) - 1))
-
-
 def solve_scaled(A: Array, b: Array) -> Array:
     """Return the solution of symmetric equations, scaled; directions that nothing determines do not move."""
     d = np.sqrt(np.maximum(np.diag(A), 1e-300))

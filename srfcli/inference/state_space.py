@@ -559,6 +559,7 @@ def fit_state_space(
     start: Mapping[str, float] | None = None,
     smooth: bool | None = None,
     processes: Sequence[str] | None = None,
+    cautious: bool = False,
     thorough: bool = True,
     close: float = CONVERGED,
     threads: int = 1,
@@ -570,7 +571,8 @@ def fit_state_space(
     From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
     `smooth` says whether there is no field; left out, there is one where it gains 2 in log likelihood. `processes` says which
     of coloured noise the gauge has, words of PROCESSES; left out, Schwarz's criterion decides, early and, if the fit is to be
-    `thorough`, again at the maximum. The status is that of the last maximisation.
+    `thorough`, again at the maximum; where it is `cautious`, more than one only if innovations are correlated all along, as those
+    of a model that lacks something are not. The status is that of the last maximisation.
     """
     tried: list[Likelihood] = []
 
@@ -579,7 +581,7 @@ def fit_state_space(
         return tried[-1]
 
     try:
-        return _fitted(likelihood, start or {}, smooth, processes, thorough, close, progress)
+        return _fitted(likelihood, start or {}, smooth, processes, cautious, thorough, close, progress)
     except KeyboardInterrupt as error:
         last = next((own.best for own in reversed(tried) if own.best is not None), None)
         raise Interrupted(last.values if last else problem.named(problem.start)) from error
@@ -601,6 +603,7 @@ def _fitted(
     start: Mapping[str, float],
     smooth: bool | None,
     processes: Sequence[str] | None,
+    cautious: bool,
     thorough: bool,
     close: float,
     progress: Callable[[str], None],
@@ -611,10 +614,10 @@ def _fitted(
     if found.status is Status.INTEGRATION:
         return best
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
-    best = _with_colour(best, likelihood, progress) if processes is None else best
+    best = _with_colour(best, likelihood, progress, cautious) if processes is None else best
     best = _with_or_without(best, smooth, likelihood, close, progress)
     if thorough and processes is None:
-        wider = _with_colour(best, likelihood, progress)
+        wider = _with_colour(best, likelihood, progress, cautious)
         if len(wider.likelihood.processes) > len(best.likelihood.processes):
             return _with_or_without(wider, smooth, likelihood, close, progress)
         best = wider
@@ -636,17 +639,22 @@ def fine(fitted: StateSpaceFit) -> bool:
 
 
 def _with_colour(
-    best: StateSpaceFit, likelihood: Callable[[bool, Sequence[str]], Likelihood], progress: Callable[[str], None]
+    best: StateSpaceFit,
+    likelihood: Callable[[bool, Sequence[str]], Likelihood],
+    progress: Callable[[str], None],
+    cautious: bool = False,
 ) -> StateSpaceFit:
-    """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants.
+    """Return the fit with as many processes of coloured gauge noise as Schwarz's criterion wants; if `cautious`, see there.
 
     One whose correlation falls off exponentially is tried first, an oscillation where that leaves most stretches correlated: what
     the physics lack leaves a few.
     """
-    while len(best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
+    while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
+        if cautious and known and not steadily_coloured(best.maximum.point):
+            break
         found, spent = best, best.evaluations
         for kind in PROCESSES:
-            wider = _coloured(best, likelihood(best.smooth, (*best.likelihood.processes, kind)), progress)
+            wider = _coloured(best, likelihood(best.smooth, (*known, kind)), progress)
             spent += wider.evaluations
             found = max(found, wider, key=lambda f: f.criterion)
             if not steadily_coloured(wider.maximum.point):

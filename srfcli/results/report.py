@@ -614,7 +614,6 @@ def page(title: str, *body: Any) -> str:
 PAGE = "report.html"
 FIGURES = "figures"
 ARRAYS = ("force", "diagram")  # parts of the material that figures take as they are
-VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive")
 
 Drawing = tuple[str, Callable[..., "Figure | None"]]
 
@@ -732,7 +731,7 @@ def _page(matter: Matter) -> str:
     ]
     head = [
         tag("p", title, class_="of"),
-        tag("h1", tag("span", verdict, class_=f"verdict {verdict if verdict in VERDICTS else 'unknown'}"), sentence),
+        tag("h1", tag("span", verdict, class_=f"verdict {verdict}"), sentence),
         tag("p", tag("strong", "What to do. "), remedy(matter.answer, matter.tables), class_="lead"),
         tag("p", gain_sentence(matter.answer, matter.tables), class_="lead"),
         first_picture(matter),
