@@ -881,9 +881,10 @@ def as_fit(found: StateSpaceFit) -> Fit:
     own_names, runs = [gauge_process(j + 1, kind) for j, kind in enumerate(likelihood.processes)], []
     for f in (*maximum.point.runs, *held):
         gauges, rate = likelihood.gauges(f.run), f.run.sampling.at
-        colours = tuple(tuple(values[own[n]] for n in row) for own in gauges for row in own_names)
         levels = np.array([np.hypot(values[own["gauge_white"]], f.run.quantum / np.sqrt(12)) for own in gauges])
         level = float(np.sqrt(np.mean(levels[rate] ** 2)))
+        every = (tuple(values[own[n]] for n in row) for own in gauges for row in own_names)
+        colours = tuple(colour for colour in every if colour[1] > 0.1 * level)
         with np.errstate(invalid="ignore"):
             residual = f.found.nu / np.sqrt(f.found.S) * levels[rate]
         y = f.run.observed - f.found.nu
