@@ -3,21 +3,18 @@
     python examples/real_steps.py DATA
 
 DATA holds the folders psu-p655-ghost-rocks and basalt-b819-velocity-step; the recordings are no part of this project. Experiments
-are written to a temporary folder and fitted through the same functions as `srf fit --trend slip` uses.
+are written to a temporary folder and fitted as `srf fit --trend slip` does.
 """
 
 from __future__ import annotations
 
 import sys
 import tempfile
-from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
-from srfcli.codegen.model import open_model
 from srfcli.data.experiment import read_experiment
-from srfcli.inference.fit import Problem, fit, fit_problem
+from srfcli.data.values import Experiment
+from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import load_registry
 
 EXPERIMENT = """format = "srf-experiment/1"
@@ -40,25 +37,29 @@ D0 = {{ value = {D0}, lower = 1.0, upper = 100.0 }}
 V0 = {{ value = {V0}, fixed = true }}
 {K}
 [columns]
-time = {{ name = "{time}", unit = "s" }}
-friction = {{ name = "{friction}", unit = "1" }}
+{columns}
 
 [[runs]]
 name = "step"
 file = "{file}"
 window = {window}
-load = "{load} N"
-drive = {drive}
+{imposed}
 """
 P655 = {
-    "title": "p655, 2.3 to 23 um/s at 100 MPa", "mu0": 0.487, "V0": 2.286, "time": "time_s", "friction": "friction", "load": 100,
+    "title": "p655, 2.3 to 23 um/s at 100 MPa", "mu0": "0.487", "V0": "2.286",
+    "columns": 'time = { name = "time_s", unit = "s" }\nfriction = { name = "friction", unit = "1" }',
     "window": "[3830.0, 3875.0]", "file": "psu-p655-ghost-rocks/p655_reduced.csv",
-    "drive": "[{ duration = 3851.36, velocity = 2.286 }, { duration = 100.0, velocity = 22.86 }]",
+    "imposed": 'load = "100 N"\ndrive = [{ duration = 3851.36, velocity = 2.286 }, { duration = 100.0, velocity = 22.86 }]',
 }  # fmt: skip
 BASALT = {
-    "title": "b819, 3 to 10 um/s at 20 MPa", "mu0": 0.6, "V0": 3.0, "time": "Time(s)", "friction": "Friction", "load": 20,
+    "title": "b819, 3 to 10 um/s at 20 MPa", "mu0": "0.6", "V0": "3.0",
+    "columns": 'time = { name = "Time(s)", unit = "s" }\nfriction = { name = "Friction", unit = "1" }',
     "window": "[11650.0, 11720.0]", "file": "basalt-b819-velocity-step/velstep4_BRAVA_expb819_basalt.txt",
-    "drive": "[{ duration = 68.7, velocity = 3.0 }, { duration = 100.0, velocity = 10.1 }]",
+    "imposed": 'load = "20 N"\ndrive = [{ duration = 68.7, velocity = 3.0 }, { duration = 100.0, velocity = 10.1 }]',
+}  # fmt: skip
+TILL = {
+    "title": "p446, till, 3 to 10 um/s at 20 MPa", "mu0": "0.59", "V0": "3.0", "columns": "", "window": "[640.0, 739.0]",
+    "file": "psu-p446-20MPa/p446_20MPa.csv", "imposed": "",
 }  # fmt: skip
 FREE_K = "K = {{ value = {0}, lower = 5e-4, upper = 5e-2 }}"
 CASES = [
@@ -68,51 +69,22 @@ CASES = [
     (P655, "ruina", "1.6e-3", "free", 15.0, "the data want 1.6e-3 above the calibrated 1.0e-3"),
     (BASALT, "ruina", "5.4e-3", "free", 10.0, ".0073 .0079 10, k 5.4e-3 (quick fit)"),
     (BASALT, "dieterich", "9.6e-3", "free", 7.0, ".0085 .0088 6.7, k 9.6e-3 (quick fit)"),
-]
+    (TILL, "ruina", "2.6e-3", "", 20.0, ".0058(3) .0038(3) 24(3) (quick fit)"),
+    (TILL | {"title": "p446, 10 to 30 um/s", "window": "[705.0, 753.0]"}, "ruina", "2.1e-3", "", 20.0,
+     ".0063(5) .0041(4) 31(6) (quick fit)"),
+    (TILL | {"title": "p446, 30 to 10 um/s", "window": "[766.0, 815.0]"}, "ruina", "2.6e-3", "", 20.0,
+     ".0056(4) .0043(3) 25(4) (quick fit)"),
+]  # fmt: skip
 
 
-BEYOND = [(BASALT, "ruina", "5.4e-3", 10.0, (11685.0, 11700.0))]  # fitted up to so many seconds, predicted to the end
-
-
-def problem_of(
-    data: Path, case: dict[str, object], ageing: str, stiffness: str, K: str, D0: float, until: float | None = None
-) -> Problem:
-    """Return the fit of one recording with a slip trend, up to a time if one is given; K is "free" or empty."""
-    window = str(case["window"])
-    values = {
-        **case,
-        "file": (data / str(case["file"])).resolve(),
-        "window": window if until is None else f"{window.split(',')[0]}, {until}]",
-        "ageing": ageing,
-        "stiffness": stiffness,
-        "D0": D0,
-    }
+def experiment_of(data: Path, case: dict[str, str], ageing: str, stiffness: str, K: str, D0: float) -> Experiment:
+    """Return the experiment of one recording; K is "free" or empty."""
+    values = {**case, "file": (data / case["file"]).resolve(), "ageing": ageing, "stiffness": stiffness, "D0": D0}
     text = EXPERIMENT.format(**values, K=FREE_K.format(stiffness) if K else "")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "experiment.toml"
         path.write_text(text, encoding="utf-8")
-        registry = load_registry()
-        experiment = read_experiment(path, registry=registry)
-    return fit_problem(open_model(registry, **asdict(experiment.choice)), experiment, trend="slip")
-
-
-def beyond(data: Path, case: dict[str, object], ageing: str, stiffness: str, D0: float, until: float) -> str:
-    """Return how what comes after a time is predicted by a fit of what came before: scatter, and how far it is off on average.
-
-    The standard error of that is of the fit's parameters, its slip trend above all, and of noise with its colour.
-    """
-    found = fit(problem_of(data, case, ageing, stiffness, "", D0, until))
-    whole = problem_of(data, case, ageing, stiffness, "", D0)
-    run, noise = whole.runs[0], found.runs[0].noise
-    predicted = whole.predicted(run, np.array([found.values[n] for n in whole.names]))
-    late = run.used & (run.t > until)
-    left, slope = (run.observed - predicted.y)[late], predicted.J[late].mean(axis=0)
-    slow = noise.innovation / (1 - sum(noise.coefficients)) / np.sqrt(left.size)
-    error = float(np.sqrt(slope @ found.covariance @ slope + slow**2))
-    return (
-        f"to {until:g} s, then {left.size} samples: scatter {left.std() / found.runs[0].rms:.2f} times what the fit leaves, "
-        f"{left.mean():+.1e}({error:.1e}) off"
-    )
+        return read_experiment(path, registry=load_registry())
 
 
 def main() -> None:
@@ -120,22 +92,12 @@ def main() -> None:
     if len(sys.argv) != 2:
         raise SystemExit("usage: python examples/real_steps.py DATA")
     for case, ageing, stiffness, K, D0, published in CASES:
-        found = fit(problem_of(Path(sys.argv[1]), case, ageing, stiffness, K, D0))
-        cells = [
-            f"{n} {found.values[n]:.5g} ({found.stderr[n]:.2g})" for n in found.names if n in ("A", "B", "D0", "K")
-        ]
-        run = found.runs[0]
+        found = fit_recordings(load_registry(), experiment_of(Path(sys.argv[1]), case, ageing, stiffness, K, D0), trend="slip")
+        fit = found.fit
+        cells = [f"{n} {fit.values[n]:.5g} ({fit.stderr[n]:.2g})" for n in fit.names if n in ("A", "B", "D0", "K")]
         print(f"{case['title']}, {ageing}, k {stiffness}{' free' if K else ''}: {', '.join(cells)}")
-        print(
-            f"    published {published}; rms {run.rms:.2e}, noise of order {run.noise.order}, {found.status.value}",
-            flush=True,
-        )
-    for case, ageing, stiffness, D0, ends in BEYOND:
-        for until in ends:
-            print(
-                f"{case['title']}, {ageing}, {beyond(Path(sys.argv[1]), case, ageing, stiffness, D0, until)}",
-                flush=True,
-            )
+        noise = [f"{c[1]:.2g} " + (f"about {c[0]:.3g} Hz" if c[2:] else f"over {c[0]:.2g} s") for c in fit.runs[0].colours]
+        print(f"    published {published}; {found.track}; noise {', '.join(noise)}; {found.status.value}", flush=True)
 
 
 if __name__ == "__main__":

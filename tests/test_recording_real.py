@@ -107,6 +107,25 @@ def test_the_basalt_step(shared: Path, tmp_path: Path) -> None:
     assert [1 / s["interval"] for s in run["sampling"]] == pytest.approx([10, 100], rel=1e-6)
 
 
+@pytest.mark.slow
+def test_a_velocity_step_of_p655_is_fitted_and_diagnosed(shared: Path, tmp_path: Path) -> None:
+    """Three sampling rates, each with a noise of its own: published values, and a stiffness 40 % too low is named."""
+    name = shared / "data" / "psu-p655-ghost-rocks" / "p655_reduced.csv"
+    columns = 'time = { name = "time_s", unit = "s" }\nfriction = { name = "friction", unit = "1" }'
+    run = """window = [3830.0, 3875.0]
+load = "100 N"
+drive = [{ duration = 3851.36, velocity = 2.286 }, { duration = 100.0, velocity = 22.86 }]"""
+    place = real(tmp_path / "p", name, columns=columns, run=run)
+    found = json.loads(srf("fit", str(place), "--trend", "slip", "--json").stdout)
+    rows = {row["parameter"]: row for row in found["rows"]}
+    for parameter, value, error in (("A", 0.006005, 5.3e-5), ("B", 0.004230, 5.1e-5), ("D0", 17.745, 0.334)):
+        assert abs(rows[parameter]["value"] - value) < 2 * np.hypot(rows[parameter]["stderr"], error), parameter
+    place = real(tmp_path / "q", name, columns=columns, run=run, stiffness="1.0e-3 1/um")
+    answer = json.loads(srf("diagnose", str(place), "--trend", "slip", "--json").stdout)
+    assert answer["verdict"] == "identified" and "stiffness-error" in answer["effects"]
+    assert 1.25e-3 < answer["augmented"]["parameters"]["K"]["value"] < 1.75e-3
+
+
 def test_paper_on_paper(shared: Path, tmp_path: Path) -> None:
     path = shared / "data" / "paper-on-paper-stickslip" / "k168Nm_v1100.mat"
     columns = 'time = { name = "t", unit = "s" }\nfriction = { name = "Fnorm", unit = "1" }'
