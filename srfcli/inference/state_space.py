@@ -55,6 +55,7 @@ HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters
 PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
 STEPS = 40  # of Fisher scoring
 PATIENCE = 5  # times the steps of integration of the point before, after which a trial is given up
+FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
@@ -482,20 +483,22 @@ def maximise(
     point, damping = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper)), 1e-3
     if not np.isfinite(point.log_likelihood):
         return Maximum(point, np.inf, Status.INTEGRATION, np.full((x.size, x.size), np.nan))
-    away, sure, slow = np.inf, True, 0
+    away, sure, slow, more = np.inf, True, 0, np.zeros((x.size, x.size))
     for _ in range(steps):
         low, high = point.x <= likelihood.lower, point.x >= likelihood.upper
         moving = np.nonzero(free & ~(low & (point.score < 0)) & ~(high & (point.score > 0)))[0]
-        g, I = point.score[moving], point.information[np.ix_(moving, moving)]
+        g, I = point.score[moving], (point.information + more)[np.ix_(moving, moving)]
         d = np.sqrt(np.maximum(np.diag(I), 1e-300))
-        scaled = I / np.outer(d, d)
-        away = np.sqrt(max(float(g @ inverse(I) @ g), 0.0)) if moving.size else 0.0
+        size, directions = np.linalg.eigh(I / np.outer(d, d))
+        size, directions = size[size > FLAT], directions[:, size > FLAT]
+        steep = directions.T @ (g / d)
+        away = float(np.sqrt(np.sum(steep**2 / size)))
         progress(f"log likelihood {point.log_likelihood:.1f}, {away:.2g} standard errors from the maximum")
         if away < close or slow == 2:
             break
         while damping < 1e8:
             x = point.x.copy()
-            move = np.linalg.solve(scaled + damping * np.eye(moving.size), g / d) / d
+            move = directions @ (steep / (size + damping)) / d
             move = np.where(likelihood.logarithmic[moving], np.clip(move, -1.5, 1.5), move)
             x[moving] += move
             trial = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper), slopes=sure, like=point)
@@ -503,7 +506,8 @@ def maximise(
             if gain > 0:
                 share = gain / max(float(g @ move - 0.5 * move @ I @ move), 1e-300)  # of what the model of it promised
                 damping = max(damping * (0.1 if share > 0.5 else 1.0 if share > 0.25 else 2.0), 1e-9)
-                point, sure = trial if sure else likelihood.at(trial.x), share > 0.25
+                last, point, sure = point, trial if sure else likelihood.at(trial.x), share > 0.25
+                more = _curvature_beyond(last, point)
                 slow = slow + 1 if gain < close**2 / 8 else 0
                 break
             damping, sure = (
@@ -516,6 +520,19 @@ def maximise(
     covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound)[0]
     covariance[np.ix_(inner, inner)] = inverse(point.information[np.ix_(inner, inner)])
     return Maximum(point, away, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE, covariance)
+
+
+def _curvature_beyond(last: Point, point: Point) -> Array:
+    """Return what the curvature along the last step has beyond the information (k, k), by the change of the score (SR1).
+
+    Scoring by the information alone overshoots there, to and fro. A smaller curvature is left alone: it makes no step too long.
+    """
+    step = point.x - last.x
+    missed = last.score - point.score - point.information @ step
+    along = float(missed @ step)
+    if not along > 1e-8 * float(np.linalg.norm(missed) * np.linalg.norm(step)):
+        return np.zeros_like(point.information)
+    return np.outer(missed, missed) / along
 
 
 @dataclass(frozen=True)
