@@ -147,7 +147,9 @@ def verdict(arguments: list[str]) -> tuple[str, str]:
         return ("failed" if "at these values" in done.stderr else "not converged"), f"{said} names no parameter"
     found = json.loads(done.stdout)
     for row in found["rows"]:
-        missing = [n for n in NEEDED.get(arguments[0], ()) if row.get("status", "ok") == "ok" and row[n] is None]
+        missing = [
+            n for n in NEEDED.get(arguments[0], ()) if row.get("status", found["status"]) == "ok" and row[n] is None
+        ]
         if missing:
             return "failed", f"no number for {missing} in a row that is ok: {row}"
     if nothing := [note for note in found["notes"] if re.search(r"\b(nan|inf)\b", note)]:
