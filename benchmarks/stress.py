@@ -41,7 +41,7 @@ from brute import Slider, shoot, steady
 
 NEEDED = {  # the columns that have a number in a row that is ok
     "linear": ("V", "K_over_W0", "W0", "Omega_c"),
-    "floquet": ("re", "im", "modulus", "theta", "growth_rate", "error"),
+    "floquet": ("re", "im", "modulus", "theta", "error"),  # no rate of growth where a multiplier is 0
     "critical": ("eps", "V", "K_over_W0", "W0", "theta", "W0_low", "W0_high", "error", "residual", "slope", "others"),
     "simulate": ("t", "V", "W", "u", "v", "phi", "mu", "tau"),
 }
