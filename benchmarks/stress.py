@@ -112,7 +112,7 @@ def over_the_ends(registry: Registry) -> collections.Counter[str]:
                 done = CliRunner().invoke(cli, [*command, "--json"], prog_name="srf")
                 for row in json.loads(done.stdout)["rows"]:
                     counts[f"{' '.join(words[:2])}: {row['status']}"] += 1
-                    numbers = [row[n] for n in ("W0", "friction_gain", "force") if n in row]
+                    numbers = [row[n] for n in ("W0", "friction_gain", "mean_force") if n in row]
                     if (row["status"] == "ok") != (None not in numbers) and "Lyapunov" not in row["status"]:
                         print(f"FAILED srf {' '.join(command)}: {row}", flush=True)
     return counts
@@ -138,13 +138,13 @@ def verdict(arguments: list[str]) -> tuple[str, str]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         done = CliRunner().invoke(cli, [*arguments, "--json"], prog_name="srf")
-    said = done.stderr.strip().splitlines()[:1]
+    said = done.stderr.strip().splitlines()
     if done.exit_code not in (0, 2, 3) or "unexpected" in done.stderr:
-        return "failed", f"exit {done.exit_code}: {said}"
+        return "failed", f"exit {done.exit_code}: {said[:1]}"
     if done.exit_code == 2:
-        return "refused", str(said)
+        return "refused", str(said[:1])
     if not done.stdout:
-        return ("failed" if "at these values" in done.stderr else "not converged"), f"{said} names no parameter"
+        return ("failed" if "at these values" in done.stderr else "not converged"), f"{said[:1]} names no parameter"
     found = json.loads(done.stdout)
     for row in found["rows"]:
         missing = [
@@ -154,7 +154,7 @@ def verdict(arguments: list[str]) -> tuple[str, str]:
             return "failed", f"no number for {missing} in a row that is ok: {row}"
     if nothing := [note for note in found["notes"] if re.search(r"\b(nan|inf)\b", note)]:
         return "failed", f"no number in the notes: {nothing}"
-    return ("ok" if done.exit_code == 0 else "not converged"), ""
+    return ("ok", "") if done.exit_code == 0 else ("not converged", said[-1].partition(": ")[2].partition(";")[0])
 
 
 def stable_by_hand(s: Slider) -> bool | None:
@@ -269,7 +269,7 @@ def main() -> None:
     given = asked.parse_args()
     chance = random.Random(given.seed)
     counts: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
-    reasons: collections.Counter[str] = collections.Counter()
+    reasons: collections.Counter[tuple[str, str]] = collections.Counter()
     registry, begun = bundled_registry(), time.monotonic()
     for number in range(given.draws):
         for names in systems():
@@ -283,17 +283,19 @@ def main() -> None:
                     continue
                 said, why = verdict([*arguments, *named, *options])
                 counts[command][said] += 1
-                if command == "floquet" and said == "not converged":
-                    reasons[why_not(open_model(registry, **names), values | point)] += 1
+                if said == "not converged":
+                    reasons[
+                        command, why_not(open_model(registry, **names), values | point) if command == "floquet" else why
+                    ] += 1
                 if said == "failed":
                     print(f"FAILED draw {number}: srf {' '.join([*arguments, *named, *options])}: {why}", flush=True)
     print("| command | draws | ok | not converged | refused | failed |\n|---|---|---|---|---|---|")
     for command, count in counts.items():
         cells = " | ".join(str(count[n]) for n in ("ok", "not converged", "refused", "failed"))
         print(f"| {command} | {count.total()} | {cells} |")
-    print("\n| what kept floquet from a state | draws |\n|---|---|")
-    for name, value in reasons.most_common():
-        print(f"| {name} | {value} |")
+    print("\n| not converged | why | draws |\n|---|---|---|")
+    for (command, name), value in sorted(reasons.items()):
+        print(f"| {command} | {name} | {value} |")
     if given.ends:
         print("\n| over the ends of each parameter | rows |\n|---|---|")
         for name, value in sorted(over_the_ends(registry).items()):
