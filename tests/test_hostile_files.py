@@ -192,6 +192,20 @@ def test_what_is_written_to_a_device_or_a_pipe() -> None:
 # sizes and numbers
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "map --eps 0.1 --over V=1:100:100000 --over K/W0=0.01:0.03:100000",
+        "compare --law srf-vsat --law log-log --eps 0.1 --over V=1:100:100000 --over K/W0=0.01:0.03:100000",
+        "linear --over V=1:100:100000 --over A=0.01:0.02:100000",
+    ],
+)
+def test_grids_beyond_reason(command: str) -> None:
+    done = srf(*command.split())
+    assert done.exit_code == 2 and done.stdout == "", done.stderr
+    assert "Error: a grid of 100000 x 100000 points has 1e+10\nTry: Ask for fewer: 1e+07 is the limit." in done.stderr
+
+
 LONG = "9" * 5000
 TOMLS = {
     "arrays in arrays": "a = " + "[" * 900 + "]" * 900,
