@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -100,7 +101,109 @@ def test_what_is_no_file_is_not_opened(kind: Callable[[Path], None]) -> None:
     assert srf("map", "--eps", "0.1", "--resume", "kept").exit_code in (1, 2)
 
 
+FOLDER = "no file {}, but a folder"
+PIPE = "no file {}, but a FIFO"
+DEVICE = "no file {}, but a device"
+SYSTEM = "no file {}, but a part of the running system"
+LINKED = "{}: cannot be read: Too many levels of symbolic links"
+ABSENT = "no file {}"
+SAID = {"pipe": PIPE, "zero": DEVICE, "memory": SYSTEM, "itself": LINKED, "folder": FOLDER, "absent": ABSENT}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what lies in /proc and /dev is told of Linux")
+@pytest.mark.parametrize("kind", SAID)
+def test_what_is_no_law_file_is_told_by_its_kind(kind: str) -> None:
+    for name in (f"{kind}.toml", f"{kind}.py"):
+        if kind == "pipe":
+            os.mkfifo(name)
+        elif kind == "folder":
+            Path(name).mkdir()
+        elif kind != "absent":
+            Path(name).symlink_to({"zero": "/dev/zero", "memory": "/proc/self/mem", "itself": name}[kind])
+        for command in (["linear", "--law", name], ["law", "check", name], ["law", "show", name]):
+            done = srf(*command)
+            told = done.stderr + done.stdout
+            assert done.exit_code == 2 and SAID[kind].format(name) in told, (command, told)
+            assert told.count("Try: ") == 1 and "Traceback" not in told
+    if kind in ("pipe", "zero", "memory"):
+        done = srf("laws", "--plugins", f"{kind}.toml")
+        assert done.exit_code == 2 and done.stdout == "" and SAID[kind].format(f"{kind}.toml") in done.stderr
+        Path("laws").mkdir()
+        Path("laws/a.toml").symlink_to(f"../{kind}.toml")
+        done = srf("laws", "--plugins", "laws")
+        told = f"Not listed (--plugins): {SAID[kind].format('laws/a.toml')}"
+        assert done.exit_code == 0 and told in done.stderr and "srf-vsat" in done.stdout
+
+
+NOT_OF_FILES = "/dev/zero", "/dev/null", "/dev/stdin", "/proc/self/environ", "/proc/cpuinfo"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="what lies in /proc and /dev is told of Linux")
+@pytest.mark.parametrize("place", [*NOT_OF_FILES, "/dev", "/proc"])
+def test_parts_of_the_system_are_no_input(place: str) -> None:
+    for command in ("check", "fit", "diagnose", "new", "report", "linear --law", "linear --set", "law check"):
+        done = srf(*command.split(), place)
+        assert done.exit_code == 2 and done.stdout == "" and done.stderr.count("Error: ") == 1, (command, done.stderr)
+        assert place in done.stderr
+    done = srf("laws", "--plugins", place)
+    if place in NOT_OF_FILES:
+        assert done.exit_code == 2 and f"{place} is neither a folder nor a law's file" in done.stderr
+    else:
+        assert done.exit_code == 0 and f"Not listed (--plugins): {place} holds no law" in done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")
+def test_what_may_not_be_read_is_told() -> None:
+    Path("closed").mkdir()
+    for name in ("x.toml", "y.py", "closed/z.toml"):
+        Path(name).write_text("")
+        Path(name).chmod(0)
+    for name in ("x.toml", "y.py"):
+        for command in (["linear", "--law", name], ["law", "check", name], ["law", "show", name]):
+            done = srf(*command)
+            assert done.exit_code == 2 and f"{name}: cannot be read: Permission denied" in done.stderr + done.stdout
+    done = srf("laws", "--plugins", "closed")
+    assert done.exit_code == 0 and "closed/z.toml: cannot be read: Permission denied" in done.stderr
+    Path("closed").chmod(0)
+    try:
+        done = CliRunner().invoke(cli, ["laws"], env={"SRF_PLUGINS": "closed", "SRF_DATA": "closed"}, prog_name="srf")
+        assert done.exit_code == 0 and "Not listed (SRF_PLUGINS): closed: cannot be read" in done.stderr
+        assert "Not listed (user): closed: cannot be read" in done.stderr and "srf-vsat" in done.stdout
+    finally:
+        Path("closed").chmod(0o700)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the device is one of Linux")
+def test_what_is_written_to_a_device_or_a_pipe() -> None:
+    command = "linear", "--over", "V=8", "--csv"
+    expected = srf(*command).stdout
+    os.mkfifo("pipe")
+    done = srf(*command, "--out", "pipe")
+    assert done.exit_code == 1 and "pipe: nobody reads this pipe" in done.stderr
+    reader = os.open("pipe", os.O_RDONLY | os.O_NONBLOCK)
+    assert srf(*command, "--out", "pipe").exit_code == 0
+    assert os.read(reader, 2**20).decode() == expected
+    os.close(reader)
+    assert srf(*command, "--out", "/dev/null").exit_code == 0
+    done = srf(*command, "--out", "/dev/full")
+    assert done.exit_code == 1 and "/dev/full cannot be written: No space left on device" in done.stderr
+
+
 # sizes and numbers
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "map --eps 0.1 --over V=1:100:100000 --over K/W0=0.01:0.03:100000",
+        "compare --law srf-vsat --law log-log --eps 0.1 --over V=1:100:100000 --over K/W0=0.01:0.03:100000",
+        "linear --over V=1:100:100000 --over A=0.01:0.02:100000",
+    ],
+)
+def test_grids_beyond_reason(command: str) -> None:
+    done = srf(*command.split())
+    assert done.exit_code == 2 and done.stdout == "", done.stderr
+    assert "Error: a grid of 100000 x 100000 points has 1e+10\nTry: Ask for fewer: 1e+07 is the limit." in done.stderr
 
 
 LONG = "9" * 5000

@@ -152,6 +152,8 @@ def test_figures(tmp_path, mode):
         (("--eps", "0.1"), "no part in the linear response"),
         (("--over", "V=1:10", "--V", "3"), "swept and has a value"),
         (("--over", "V=1:10", "--over", "f=1:10"), "given 2 times"),
+        (("--over", "eps=0,0.1"), "eps is not swept"),
+        (("--over", "eps=0,0.1", "--mean", "--eps", "0.1"), "eps is not swept"),
     ],
 )
 def test_misuse_is_told(arguments, said):

@@ -107,7 +107,9 @@ def test_where_nothing_can_be_computed(command: list[str], ageing: str) -> None:
 
 
 def test_a_jacobian_that_overflows() -> None:
-    words = "linear --over V=0.027 --law rice-regularized --set A=0.000366 --set B=0.00959 --set V0=163 --set mu0=0.0177"
+    words = (
+        "linear --over V=0.027 --law rice-regularized --set A=0.000366 --set B=0.00959 --set V0=163 --set mu0=0.0177"
+    )
     (row,) = json.loads(srf(*words.split(), "--set", "lambda=337", "--set", "D0=29.2", "--json").stdout)["rows"]
     assert row["W0"] > 0 and row["lyapunov"] is None and row["criticality"] is None
     assert row["status"] == "no Lyapunov coefficient: the Jacobian overflows"
@@ -144,6 +146,12 @@ def test_over_the_ends_of_a_parameter(system: tuple[str, str]) -> None:
         for row in rows:
             found = row["status"] in ("ok", "no Lyapunov coefficient: the Jacobian overflows")
             assert found == (row["W0"] is not None) and (found or row["status"].startswith(REASONS)), row
+        done = srf("response", "--over", over, f"--{kind}", name, "--json")
+        rows = json.loads(done.stdout)["rows"]
+        assert [row[p.name] for row in rows] == ends
+        for row in rows:
+            assert row["status"] == ("no-value" if None in row.values() else "ok"), row
+        assert done.exit_code == (0 if all(row["status"] == "ok" for row in rows) else 3), done.stderr
 
 
 REASONS = ("no Hopf", "velocity strengthening: ", "no value: ")
@@ -167,6 +175,31 @@ def test_response_where_a_formula_has_no_value(words: str, without: list[int]) -
         for i, row in enumerate(rows):
             # only steady friction, which needs no rates, may be known
             assert i in without or None not in row.values(), row
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "nan",
+        "inf",
+        "-inf",
+        "1e400",
+        "1" * 400,
+        "abc",
+        "",
+        "0:1:3:log",
+        "1:2:0",
+        "1:nan",
+        "1,,2",
+        "1,nan",
+        "1:2:3:lin:x",
+    ],
+    ids=lambda text: text[:12],
+)
+def test_what_is_no_range_is_told(text: str) -> None:
+    for p in open_model(bundled_registry()).parameters:
+        done = srf("response", "--over", f"{p.name}={text}")
+        assert done.exit_code == 2 and done.stdout == "" and done.stderr.count("Error: ") == 1, (p.name, done.stderr)
 
 
 def test_a_map_with_an_edge_that_has_no_value() -> None:

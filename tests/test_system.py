@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import mpmath
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 
 from srfcli.core.errors import SrfError
+from srfcli.laws.law_file import template
 from srfcli.laws.registry import bundled_registry
 from srfcli.symbolic.system import build_system
 
@@ -160,3 +163,17 @@ def test_cycle_is_rates_over_one_period(model: Any) -> None:
 def test_unknown_loading_is_named() -> None:
     with pytest.raises(SrfError, match="unknown loading 'tilted'"):
         build_system(REGISTRY, loading="tilted")
+
+
+@pytest.mark.parametrize(("name", "unit"), [("velocity", "um/s"), ("length", "mm")])
+def test_one_name_in_two_units_is_refused(name: str, unit: str, tmp_path: Path) -> None:
+    """The interface's lambda is a length: a law's lambda that is a velocity cannot have the same value."""
+    text = template("friction", name, python=False).replace("Vsat*phi", "lambda*phi").replace("\nVsat =", "\nlambda =")
+    file = tmp_path / f"{name}.toml"
+    file.write_text(re.sub(r'(lambda = .*)"um/s"', rf'\1"{unit}"', text))
+    if unit == "um/s":
+        with pytest.raises(SrfError, match="'lambda' is in um/s in velocity and in um in elastic"):
+            build_system(REGISTRY, law=str(file))
+    assert (
+        build_system(REGISTRY, law=str(file), interface="rigid" if unit == "um/s" else "elastic").friction.name == name
+    )

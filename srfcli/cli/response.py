@@ -77,6 +77,8 @@ def command(
         raise SrfError("--eps has no part in the linear response", "Leave it out, or ask for --mean.")
     model = system.model()
     swept = over[0]
+    if swept.name == "eps":
+        raise SrfError("eps is not swept", "Give amplitudes: --mean --eps 0.05,0.1,0.2; the linear response has none.")
     resolved = system.resolve(model.parameters, V=V, W0=W0)
     for name, value in (("V", V), ("W0", W0)):
         if value is not None and name == swept.name:
@@ -205,7 +207,11 @@ def _mean_columns(name: str, unit: str) -> tuple[Column, ...]:
         Column("mean_force", "1", "mean friction force over W0"),
         Column("force_drop", "1", "what modulation takes off the mean friction force, over W0"),
         Column("mean_friction", "1", "mean friction coefficient"),
-        Column("growth_per_period", "1", "ln of the leading multiplier's modulus; the forced state is stable where negative"),
+        Column(
+            "growth_per_period",
+            "1",
+            "ln of the leading multiplier's modulus; the forced state is stable where negative",
+        ),
         Column("error", "1", "estimated error of the mesh", ".2g"),
         Column("status", "", STATUS),
     )

@@ -180,8 +180,10 @@ def _source(registry: Registry, kind: str, name: str) -> tuple[Law, str]:
         registry.check_trusted(name)
         try:
             return Law(name, source=name), hashlib.sha256(read_plain(Path(name), what="a law")).hexdigest()
+        except FileNotFoundError:
+            raise SrfError(f"no file {name}", "Give the path of a .toml or .py file.") from None
         except OSError as error:
-            raise SrfError(f"cannot read the law file '{name}': {error.strerror}", "check the path") from error
+            raise SrfError(f"{name}: cannot be read: {error.strerror}", "Check path and permissions.") from error
     entry = registry.find(kind, name)
     return Law(entry.name, about=entry.about, source=str(entry.location)), registry.fingerprint(entry)
 

@@ -8,6 +8,7 @@ next writer to the same place removes it, or, where the process died between two
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import os
@@ -20,7 +21,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import tomli
 
@@ -52,8 +53,12 @@ def check_plain(path: Path) -> os.stat_result:
         kind = next((name for is_kind, name in _KINDS if is_kind(found.st_mode)), "no regular file")
         hint = "Name a file in it." if kind == "a folder" else "Name a file; save first what comes through a pipe."
         raise SrfError(f"no file {path}, but {kind}", hint)
-    if path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix":  # said to be files; reading may wait or fail
-        raise SrfError(f"no file {path}, but a part of the running system", "Name a file; copy what is meant to one first.")
+    if (
+        path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix"
+    ):  # said to be files; reading may wait or fail
+        raise SrfError(
+            f"no file {path}, but a part of the running system", "Name a file; copy what is meant to one first."
+        )
     return found
 
 
@@ -374,6 +379,20 @@ def write_atomic(path: Path, content: str | bytes) -> None:
     """Write `content` to `path` so that a reader, or a crash, finds the old file or the new one and nothing between."""
     data = content.encode("utf-8") if isinstance(content, str) else content
     if is_special(path):
-        path.write_bytes(data)
+        with _told(path), _open_special(path) as stream:
+            stream.write(data)
     else:
         write_files({path: data})
+
+
+def _open_special(path: Path) -> BinaryIO:
+    """Open a device or a pipe for writing; raises SrfError for a pipe that nobody reads, which would keep its writer waiting."""
+    try:
+        handle = os.open(path, os.O_WRONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0))
+    except OSError as error:
+        if error.errno == errno.ENXIO:
+            raise SrfError(f"{path}: nobody reads this pipe", "Start its reader first.", exit_code=1) from None
+        raise
+    if hasattr(os, "O_NONBLOCK"):
+        os.set_blocking(handle, True)
+    return os.fdopen(handle, "wb")

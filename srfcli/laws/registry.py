@@ -18,13 +18,15 @@ from types import ModuleType
 
 from srfcli.core.cache import header_key, known_headers
 from srfcli.core.errors import SrfError, did_you_mean
-from srfcli.core.files import check_plain, read_plain
+from srfcli.core.files import check_plain, open_plain, read_plain
 from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, read_header, read_toml, valid_name
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Law, Reader
 
 # Names of laws to files and entry points: a listing imports nothing, a broken plugin stops nobody but its user.
 
 GROUP = "srf.laws"
+ASKED = ("--plugins", "SRF_PLUGINS")
+CHECK_PATH = "Check path and permissions."
 
 
 @dataclass(frozen=True)
@@ -188,14 +190,19 @@ def load_registry(
             collect.entry_point(point)
     if user and user_folder().is_dir():
         collect.folder("user", user_folder())
-    asked = [(p, "--plugins") for p in plugins]
-    asked += [(Path(p), "SRF_PLUGINS") for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
+    by_option, by_environment = ASKED
+    asked = [(p, by_option) for p in plugins]
+    asked += [(Path(p), by_environment) for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
     for path, origin in asked:
         path = path.expanduser()
         if not path.exists():
             raise SrfError(f"{origin}: no folder {path}", "Give a folder that holds law files.")
-        if not path.is_dir() and path.suffix not in (".toml", ".py"):
-            raise SrfError(f"{origin}: {path} is neither a folder nor a law's file", "A law's file ends in .toml or .py.")
+        if not path.is_dir():
+            if path.suffix not in (".toml", ".py"):
+                raise SrfError(
+                    f"{origin}: {path} is neither a folder nor a law's file", "A law's file ends in .toml or .py."
+                )
+            check_plain(path)
         collect.folder(origin, path)
     return Registry(collect.entries, collect.problems, named=named, trust=trust)
 
@@ -237,12 +244,16 @@ def read_law(path: Path) -> Law:
 
 def read_file(path: Path) -> tuple[Law, ...]:
     """Return the laws in one file, TOML or Python; a Python file is run."""
-    if not path.is_file():
-        raise SrfError(f"no file {path}", "Give the path of a .toml or .py file.")
+    if path.suffix not in (".toml", ".py"):
+        raise SrfError(f"{path}: neither .toml nor .py", "Laws are written as TOML or Python.")
+    try:
+        open_plain(path).close()
+    except FileNotFoundError:
+        raise SrfError(f"no file {path}", "Give the path of a .toml or .py file.") from None
+    except OSError as error:
+        raise SrfError(f"{path}: cannot be read: {error.strerror}", CHECK_PATH) from None
     if path.suffix == ".toml":
         return (read_law(path),)
-    if path.suffix != ".py":
-        raise SrfError(f"{path}: neither .toml nor .py", "Laws are written as TOML or Python.")
     laws = tuple(laws_in(load_module(path, None)))
     if not laws:
         raise SrfError(f"{path}: holds no law", f"Decorate a function with @friction_law(...) from {API}.")
@@ -266,7 +277,16 @@ class _Collector:
         self.seen: set[Path] = set()
 
     def folder(self, origin: str, folder: Path) -> None:
-        for path in _law_files(folder):
+        try:
+            paths = list(_law_files(folder))
+        except OSError as error:
+            message = f"{folder}: cannot be read: {error.strerror}"
+            self.problems.append(Problem(folder.name, origin, str(folder), message, CHECK_PATH))
+            return
+        if not paths and origin in ASKED:
+            message = f"{folder} holds no law: no file there ends in .toml or .py"
+            self.problems.append(Problem(folder.name, origin, str(folder), message, "Name the folder that holds them."))
+        for path in paths:
             self.file(origin, path)
 
     def file(self, origin: str, path: Path, module: str | None = None, only: str | None = None) -> None:
@@ -306,7 +326,7 @@ class _Collector:
 
 def _law_files(folder: Path) -> Iterator[Path]:
     """Yield the law files of a folder and of its subfolders friction, ageing, modifier, interface and readers."""
-    if folder.is_file():
+    if not folder.is_dir():
         yield folder
         return
     for place in (folder, *(folder / kind for kind in (*PLUGIN_KINDS, "readers"))):

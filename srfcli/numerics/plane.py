@@ -6,6 +6,7 @@ Tiles share their last row and column with the next one: every cell belongs to o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -152,8 +153,19 @@ class MapGrid:
         return p
 
 
+MOST_POINTS = 10_000_000  # of a grid: an hour and more, and a GB
+
+
+def check_count(*counts: int) -> None:
+    """Raise SrfError for a grid of so many points along its axes that it would neither end nor fit into memory."""
+    if (total := math.prod(counts)) > MOST_POINTS:
+        size = " x ".join(map(str, counts))
+        raise SrfError(f"a grid of {size} points has {total:.3g}", f"Ask for fewer: {MOST_POINTS:.0e} is the limit.")
+
+
 def check_grid(model: GeneratedModel, grid: MapGrid) -> None:
     """Raise SrfError where the axes do not move two different parameters, or a ratio's fixed one is not fixed."""
+    check_count(grid.x.count, grid.y.count)
     for axis in (grid.x, grid.y):
         for name in filter(None, (axis.moved, axis.held)):
             model.index(name)

@@ -139,7 +139,7 @@ class PeriodicResult(Result):
             Column("im", "1", "imaginary part", ".9g"),
             Column("modulus", "1", "of the multiplier", ".9g"),
             Column("theta", "rad", "angle over one forcing period", ".9g"),
-            Column("growth_rate", "1/s", "ln|multiplier| times the forcing frequency"),
+            Column("growth_rate", "1/s", "ln|multiplier| times the forcing frequency; none for a multiplier of 0"),
             Column("error", "1", "estimated error of the multipliers", ".2g"),
         )
         rows = []

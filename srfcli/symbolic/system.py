@@ -14,6 +14,7 @@ import sympy as sp
 
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
+from srfcli.core.units import dimension
 from srfcli.laws.expression import symbol
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Effect, ExtraState, FrictionLaw, Interface, Law, State
 
@@ -234,7 +235,16 @@ def _check_symbols(system: System) -> None:
 
 
 def _check_apart(system: System) -> None:
-    """Raise where an effect brings a parameter or an unknown that a law has already: one symbol would mean two things."""
+    """Raise where one symbol would mean two things: in two laws with unlike units, or in a law and an effect."""
+    first: dict[str, tuple[Parameter, str]] = {}
+    for law in system.laws:
+        for parameter in () if isinstance(law, Effect) else law.parameters:
+            other, whose = first.setdefault(parameter.name, (parameter, law.name))
+            if dimension(parameter.unit) != dimension(other.unit):
+                raise SrfError(
+                    f"'{other.name}' is in {other.unit} in {whose} and in {parameter.unit} in {law.name}",
+                    "they are two parameters: give one of them another name",
+                )
     own = {p.name for law in system.laws if not isinstance(law, Effect) for p in law.parameters}
     own |= {state.name for state in system.friction.states}
     for effect in system.effects:

@@ -30,7 +30,7 @@ from srfcli.numerics.compare import (
 from srfcli.numerics.continuation import Atlas, AtlasSettings
 from srfcli.numerics.map import StabilityMap, compute_map
 from srfcli.numerics.map_boundaries import find_boundaries
-from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings, check_grid
+from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings, check_count, check_grid
 from srfcli.numerics.special_points import SpecialPoint, branch_coefficients, criticality_points, special_points
 from srfcli.results.map import ComparisonResult, MapResult
 
@@ -229,7 +229,9 @@ def compare(
 
     names, models = tuple(systems), [s.model for s in systems.values()]
     if len(names) < 2:
-        raise SrfError("one law is nothing to compare", "Name more, such as srf-vsat and log-log, or several ageing laws.")
+        raise SrfError(
+            "one law is nothing to compare", "Name more, such as srf-vsat and log-log, or several ageing laws."
+        )
     wanted = sorted({float(e) for e in np.atleast_1d(np.asarray(eps, float)) if e > 0})
     if not wanted:
         raise SrfError("`eps` 0 leaves nothing to compare", "Give an amplitude above 0, such as 0.18.")
@@ -244,6 +246,7 @@ def compare(
     if not (V[0] > 0 and loads[0] > 0):
         raise SrfError("the window begins at 0", "The window is logarithmic: begin above 0.")
     window = Window(V=V, W0=loads, **(points or {}))
+    check_count(window.columns, window.rows)
     usable = [k for k, m in enumerate(matches) if m.status.ok]
     tasks = [LawTask(models[k].source, models[k].key, matches[k].p, amplitudes, window) for k in usable]
     parts = [part for task in tasks for part in law_parts(task)]

@@ -18,7 +18,7 @@ from srfcli.numerics.continuation import Atlas, AtlasSettings, find_components
 from srfcli.numerics.critical import LoadWindow, critical_line, found_window
 from srfcli.numerics.floquet import solve_floquet
 from srfcli.numerics.hopf import HopfPoint, closed_forms, hopf_points, steady_is_stable, weakening
-from srfcli.numerics.plane import Axis, Plane
+from srfcli.numerics.plane import Axis, Plane, check_count
 from srfcli.results.stability import BoundaryResult, CriticalResult, LinearResult, PeriodicResult
 
 if TYPE_CHECKING:
@@ -87,6 +87,7 @@ def linear(
     for name in set(grid) & {"W0", "eps", "f"}:
         what = "is what is found" if name == "W0" else "has no part in steady sliding under constant load"
         raise SrfError(f"{name} is swept and {what}", "Sweep another parameter, or use `srf critical`.")
+    check_count(*map(len, grid.values()))
     points: list[dict[str, Any]] = []
     for values in itertools.product(*grid.values()):
         points += _rows(system, dict(zip(grid, values, strict=True)), all_roots)
