@@ -276,7 +276,7 @@ def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Pat
     assert places[-1] < first.index("residual / noise") < first.index("What was left out")
     nothing = verdict in ("none", "inconclusive")
     assert ("No place stands out beyond what noise does." in page.text) == nothing
-    place = "61 % of the excess misfit is in the run “onset”, from 1.00 to 1.50 s."
+    place = "61 % of the excess misfit is in the run “onset”, most from 1.00 to 1.50 s."
     assert (place in page.text) != nothing
     assert ("bent B by 10 standard errors" in page.text) != nothing
     assert ("leave the same trace" in page.text) == (verdict == "ambiguous")
@@ -453,3 +453,20 @@ def test_text_is_escaped_unless_it_is_markup() -> None:
         tag("br") == "<br>"
         and tag("span", class_="n", aria_hidden="true") == '<span class="n" aria-hidden="true"></span>'
     )
+
+
+@pytest.mark.usefixtures("bare")
+def test_residuals_that_read_alike_do_not_fall(tmp_path: Path) -> None:
+    answer = made_answer("unknown")
+    answer["baseline"]["fit"]["rms_over_noise"], answer["augmented"]["fit"]["rms_over_noise"] = 1.004, 1.001
+    write_report(tmp_path, answer, made_material("unknown"))
+    assert "residuals stay at 1.00 times the noise in the fitted runs" in read(tmp_path).text
+
+
+def test_a_boundary_is_drawn_once_where_nothing_was_added() -> None:
+    from srfcli.results.report_figures import diagram_figure
+
+    same = {"V": [1.0, 10.0, 100.0], "W0_hopf_baseline": [7.0, 8.0, 13.0], "W0_hopf_augmented": [7.0, 8.0, 13.0]}
+    for augmented, curves in (([7.0, 8.0, 13.0], 1), ([7.0, 9.0, 13.0], 2)):
+        figure = diagram_figure({**same, "W0_hopf_augmented": augmented})
+        assert figure is not None and len(figure.axes[0].get_lines()) == curves

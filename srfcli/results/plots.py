@@ -7,6 +7,7 @@ import importlib.util
 import io
 import itertools
 import logging
+import math
 import sys
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -471,14 +472,17 @@ def decade_ticks(ax: Axes) -> None:
     """Write 1, 10, 100 rather than powers of ten on logarithmic axes, and more between where they span few decades."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-    for axis, (low, high), scale in (
-        (ax.xaxis, ax.get_xlim(), ax.get_xscale()),
-        (ax.yaxis, ax.get_ylim(), ax.get_yscale()),
+    across, up = (size / ax.figure.dpi for size in (ax.bbox.width, ax.bbox.height))
+    for axis, (low, high), scale, room in (
+        (ax.xaxis, ax.get_xlim(), ax.get_xscale(), across / 0.45),
+        (ax.yaxis, ax.get_ylim(), ax.get_yscale(), up / 0.2),
     ):
         if scale != "log" or not 1e-4 <= low <= high <= 1e5:
             continue
         ratio = high / low
         between = (1.0,) if ratio >= 2e3 else (1.0, 2.0, 5.0) if ratio > 8 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+        if ratio > 30 and len(between) * math.log10(ratio) > room:
+            between = (1.0,)
         narrow = ratio < 3  # a few ticks of such a list at best
         axis.set_major_locator(MaxNLocator(6) if narrow else LogLocator(subs=between))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

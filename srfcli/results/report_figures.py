@@ -729,6 +729,8 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
     curves = [("W0_baseline", "baseline", BEFORE, "-"), ("W0_augmented", "augmented model", AFTER, (0, (5, 1.5)))]
     curves += [("W0_hopf_baseline", "baseline, constant load", BEFORE, DOTTED)]
     curves += [("W0_hopf_augmented", "augmented model, constant load", AFTER, DOTTED)]
+    if all(_equal(diagram, key) for key in ("V", "W0", "W0_hopf")):  # nothing was added: one curve would hide the other
+        curves = [(key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]]
     drawn = [c for c in curves if diagram.get(c[0]) is not None and np.isfinite(_gaps(diagram[c[0]])).any()]
     if not drawn or diagram.get("V") is None:
         return None
@@ -758,3 +760,14 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
         decade_ticks(axis)
         _settle(figure)
         return figure
+
+
+def _equal(diagram: Mapping[str, Any], quantity: str) -> bool:
+    """Return whether the augmented model's curve is the baseline's."""
+    baseline, augmented = diagram.get(f"{quantity}_baseline", diagram.get(quantity)), diagram.get(f"{quantity}_augmented")
+    if augmented is None:
+        return quantity == "V" or baseline is None
+    if baseline is None:
+        return False
+    a, b = (np.asarray(_gaps(values)) for values in (baseline, augmented))
+    return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True))
