@@ -755,7 +755,8 @@ def _page(matter: Matter) -> str:
 MOST_ROWS, MOST_COLUMNS = 40, 7  # of a table on the page; the file has all
 KINDS = {
     "fit": "Fit of recordings",
-    "thresholds": "Fit of critical loads",
+    "fit-thresholds": "Fit of critical loads",
+    "campaign": "Campaign of fits",
     "map": "Stability map",
     "compare": "Laws compared",
     "continue": "Stability boundary",
@@ -812,15 +813,18 @@ def _kind(data: Mapping[str, Any]) -> str:
 def _headline(data: Mapping[str, Any]) -> str:
     """Return what was found, in a sentence."""
     notes, rows = [str(n) for n in data.get("notes") or ()], list(data.get("rows") or ())
-    if str(data["schema"]).startswith("srf.fit/"):
+    if _kind(data) in (KINDS["fit"], KINDS["fit-thresholds"]):
+        best = min((data.get("meta") or {}).get("methods") or [{}], key=lambda m: m.get("chi2", 0.0))  # of critical loads
         told = []
         for row in rows:
-            unit = unit_text(row.get("unit"))
-            told.append(
-                f"{row['parameter']} = {bracketed(row.get('value'), row.get('stderr'))}" + (f" {unit}" if unit else "")
-            )
+            if row.get("method") == best.get("method"):
+                unit = unit_text(row.get("unit"))
+                value = bracketed(row.get("value"), row.get("stderr"))
+                told.append(f"{row['parameter']} = {value}" + (f"{NO_BREAK}{unit}" if unit else ""))
         ratio = ((data.get("meta") or {}).get("rms_over_noise") or {}).get("fit")
         tail = f"; residuals are {number(ratio)} times the noise" if finite(ratio) else ""
+        if finite(best.get("chi2")):
+            tail = f"; χ² is {number(best['chi2'])} on {best.get('freedom')} degrees of freedom"
         return ", ".join(told) + tail + _state(data)
     return (
         f"{notes[0][:1].upper()}{notes[0][1:]}{_state(data)}"
@@ -844,7 +848,7 @@ def _result(folder: Path, path: Path, data: Mapping[str, Any]) -> Markup:
             parts.append(picture(figure.read_bytes(), suffix, alt=alt, caption=f"{figure.name}"))
             break
     parts.append(_table(data))
-    flagged = [r for r in data.get("rows") or () if r.get("flag")]
+    flagged = [r for r in data.get("rows") or () if r.get("flag") not in (None, "", "ok")]
     if flagged:
         parts.append(
             tag(
