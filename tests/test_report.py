@@ -135,12 +135,6 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
     return material
 
 
-@pytest.fixture
-def bare(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No matplotlib: what is written does not depend on it, but for the figures."""
-    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
-
-
 @pytest.fixture(scope="module", params=["identified", "unknown"])
 def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
     """A report with all its figures, beside an augmented experiment."""
@@ -263,7 +257,7 @@ def test_errors_in_brackets(value: float | None, error: float, text: str) -> Non
     assert report_text.bracketed(value, error) == text
 
 
-@pytest.mark.usefixtures("bare")
+@pytest.mark.usefixtures("without_matplotlib")
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Path) -> None:
     material = made_material(verdict)
@@ -287,7 +281,7 @@ def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Pat
     assert not (tmp_path / "figures").exists()
 
 
-@pytest.mark.usefixtures("bare")
+@pytest.mark.usefixtures("without_matplotlib")
 def test_the_run_with_most_of_the_misfit_comes_first(tmp_path: Path) -> None:
     write_report(tmp_path, made_answer("identified"), made_material("identified"))
     text = read(tmp_path).text.partition("p of noise stands out at")[2]
@@ -329,7 +323,7 @@ def test_two_runs_whose_names_make_one_file_name_keep_both_figures(
     assert found == {"run-a-b.svg": "a b.svg", "run-A-b-2.svg": "A/b.svg"}
 
 
-@pytest.mark.usefixtures("bare")
+@pytest.mark.usefixtures("without_matplotlib")
 def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "report.html").write_text("old")
 
@@ -343,7 +337,7 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkey
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
-@pytest.mark.usefixtures("bare")
+@pytest.mark.usefixtures("without_matplotlib")
 def test_what_is_absent_is_left_out(tmp_path: Path) -> None:
     answer = {"schema": "srf.diagnose/1", "verdict": "inconclusive", "effects": [], "location": None, "model": None}
     write_report(tmp_path, answer, {"runs": []})
@@ -455,7 +449,7 @@ def test_text_is_escaped_unless_it_is_markup() -> None:
     )
 
 
-@pytest.mark.usefixtures("bare")
+@pytest.mark.usefixtures("without_matplotlib")
 def test_residuals_that_read_alike_do_not_fall(tmp_path: Path) -> None:
     answer = made_answer("unknown")
     answer["baseline"]["fit"]["rms_over_noise"], answer["augmented"]["fit"]["rms_over_noise"] = 1.004, 1.001
