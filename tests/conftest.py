@@ -14,7 +14,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--runslow", action="store_true", help="run the long proofs too")
 
 
+# Files of long tests: what takes longest is begun first, so that no worker is left alone with it at the end.
+LONG = (
+    "test_unknown.py", "test_readme.py", "test_diagnose_command.py", "test_parting.py", "test_prove.py", "test_map.py",
+    "test_effects.py", "test_fit.py", "test_model_search.py", "test_proof_generator.py",
+)  # fmt: skip
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: LONG.index(item.path.name) if item.path.name in LONG else len(LONG))
     if not config.getoption("--runslow"):
         for item in items:
             if "slow" in item.keywords:
@@ -31,6 +39,15 @@ def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     folder.mkdir()
     monkeypatch.chdir(folder)
     return folder
+
+
+@pytest.fixture
+def without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without figures, which cost more to draw than all else of them; what is written depends on them in nothing else."""
+    import importlib.util
+
+    find, place = importlib.util.find_spec, "srfcli.results.report.importlib.util.find_spec"
+    monkeypatch.setattr(place, lambda name: None if name == "matplotlib" else find(name))
 
 
 @pytest.fixture(scope="session")

@@ -119,7 +119,8 @@ def test_from_python_and_what_is_refused() -> None:
     assert [row["status"] for row in found.rows] == ["ok", "failed"] and found.failed == 1
     frame = found.to_dataframe()
     assert frame["A"].notna().tolist() == [True, False] and "mu0" not in frame
-    assert "A - B" in {axes.get_ylabel().split(",")[0] for axes in found.plot().axes}
+    (panel,) = found.plot().axes
+    assert panel.get_ylabel().startswith("A − B") and [label.get_text() for label in panel.get_xticklabels()] == ["one"]
     Path("out.csv").write_text("mine")
     srf("fit", "one", "--table", "out.csv", code=2)
     assert Path("out.csv").read_text() == "mine"

@@ -237,6 +237,7 @@ def test_held_out_files_are_opened_when_the_models_are_final(
     assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".*.part"))
 
 
+@pytest.mark.usefixtures("without_matplotlib")
 def test_interrupted_it_keeps_what_it_has(experiment: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def expand(self: ModelSearch, node: Fitted) -> Fitted:
         raise KeyboardInterrupt
@@ -259,6 +260,7 @@ def test_interrupted_before_there_is_anything_it_writes_nothing(
     assert done.stdout == "" and not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("without_matplotlib")
 def test_where_nothing_is_missing_the_augmented_model_is_the_baseline(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "again"
     found = json.loads(

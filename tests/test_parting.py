@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 from dataclasses import replace
@@ -41,7 +40,6 @@ from srfcli.inference.state_space import Likelihood, fit_state_space
 from srfcli.laws.registry import bundled_registry
 from srfcli.motion.imposed import ConstantLoad, Drive
 from srfcli.motion.integrators import integrate
-from srfcli.results import report
 from srfcli.validation.cases import Gauge, case_files, read_gauge
 from srfcli.validation.slider import Physics, Plan, move
 
@@ -320,10 +318,9 @@ def test_words_and_numbers_agree(diagnosis: Diagnosis, found: parting.Parting) -
     assert " N (" in force and "noise" not in force
 
 
-def test_the_command_says_it(folder: Path, found: parting.Parting, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("without_matplotlib")
+def test_the_command_says_it(folder: Path, found: parting.Parting) -> None:
     """The answer has the experiment; what each hypothesis foretells is an experiment that `srf simulate` repeats."""
-    find = importlib.util.find_spec
-    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find(name))
     out = folder.parent / "found"
     chosen = [x for name in RIVALS for x in ("--effect", name)]
     result = CliRunner().invoke(cli, ["diagnose", str(folder), *chosen, "--out", str(out)])

@@ -135,12 +135,6 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
     return material
 
 
-@pytest.fixture
-def bare(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No matplotlib: what is written does not depend on it, but for the figures."""
-    monkeypatch.setattr(report.importlib.util, "find_spec", lambda name: None)
-
-
 @pytest.fixture(scope="module", params=["identified", "unknown"])
 def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
     """A report with all its figures, beside an augmented experiment."""
@@ -263,7 +257,7 @@ def test_errors_in_brackets(value: float | None, error: float, text: str) -> Non
     assert report_text.bracketed(value, error) == text
 
 
-@pytest.mark.usefixtures("bare")
+@pytest.mark.usefixtures("without_matplotlib")
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Path) -> None:
     material = made_material(verdict)
@@ -276,7 +270,7 @@ def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Pat
     assert places[-1] < first.index("residual / noise") < first.index("What was left out")
     nothing = verdict in ("none", "inconclusive")
     assert ("No place stands out beyond what noise does." in page.text) == nothing
-    place = "61 % of the excess misfit is in the run “onset”, from 1.00 to 1.50 s."
+    place = "61 % of the excess misfit is in the run “onset”, most from 1.00 to 1.50 s."
     assert (place in page.text) != nothing
     assert ("bent B by 10 standard errors" in page.text) != nothing
     assert ("leave the same trace" in page.text) == (verdict == "ambiguous")
@@ -287,7 +281,7 @@ def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Pat
     assert not (tmp_path / "figures").exists()
 
 
-@pytest.mark.usefixtures("bare")
+@pytest.mark.usefixtures("without_matplotlib")
 def test_the_run_with_most_of_the_misfit_comes_first(tmp_path: Path) -> None:
     write_report(tmp_path, made_answer("identified"), made_material("identified"))
     text = read(tmp_path).text.partition("p of noise stands out at")[2]
@@ -329,7 +323,7 @@ def test_two_runs_whose_names_make_one_file_name_keep_both_figures(
     assert found == {"run-a-b.svg": "a b.svg", "run-A-b-2.svg": "A/b.svg"}
 
 
-@pytest.mark.usefixtures("bare")
+@pytest.mark.usefixtures("without_matplotlib")
 def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "report.html").write_text("old")
 
@@ -343,7 +337,7 @@ def test_a_page_that_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkey
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
-@pytest.mark.usefixtures("bare")
+@pytest.mark.usefixtures("without_matplotlib")
 def test_what_is_absent_is_left_out(tmp_path: Path) -> None:
     answer = {"schema": "srf.diagnose/1", "verdict": "inconclusive", "effects": [], "location": None, "model": None}
     write_report(tmp_path, answer, {"runs": []})
@@ -453,3 +447,20 @@ def test_text_is_escaped_unless_it_is_markup() -> None:
         tag("br") == "<br>"
         and tag("span", class_="n", aria_hidden="true") == '<span class="n" aria-hidden="true"></span>'
     )
+
+
+@pytest.mark.usefixtures("without_matplotlib")
+def test_residuals_that_read_alike_do_not_fall(tmp_path: Path) -> None:
+    answer = made_answer("unknown")
+    answer["baseline"]["fit"]["rms_over_noise"], answer["augmented"]["fit"]["rms_over_noise"] = 1.004, 1.001
+    write_report(tmp_path, answer, made_material("unknown"))
+    assert "residuals stay at 1.00 times the noise in the fitted runs" in read(tmp_path).text
+
+
+def test_a_boundary_is_drawn_once_where_nothing_was_added() -> None:
+    from srfcli.results.report_figures import diagram_figure
+
+    same = {"V": [1.0, 10.0, 100.0], "W0_hopf_baseline": [7.0, 8.0, 13.0], "W0_hopf_augmented": [7.0, 8.0, 13.0]}
+    for augmented, curves in (([7.0, 8.0, 13.0], 1), ([7.0, 9.0, 13.0], 2)):
+        figure = diagram_figure({**same, "W0_hopf_augmented": augmented})
+        assert figure is not None and len(figure.axes[0].get_lines()) == curves

@@ -51,6 +51,22 @@ def test_a_folder_of_results_becomes_one_page(results: Path) -> None:
     assert srf("report", "results", "--force", "--title", "May").exit_code == 0
 
 
+def test_a_fit_of_critical_loads_is_headed_by_the_better_method() -> None:
+    rows = [
+        {"method": method, "parameter": "D0", "value": value, "stderr": 0.008, "unit": "um", "flag": "ok"}
+        for method, value in (("powell", 0.41), ("least-squares", 0.4))
+    ]
+    methods = [{"method": "powell", "chi2": 30.0, "freedom": 15}, {"method": "least-squares", "chi2": 28.5, "freedom": 15}]
+    columns = {name: {"unit": "", "about": ""} for name in rows[0]}
+    told = {"schema": "srf.fit-thresholds/2", "title": "loads.csv", "status": "ok", "columns": columns, "rows": rows}
+    Path("loads").mkdir()
+    Path("loads/fit.json").write_text(json.dumps({**told, "meta": {"methods": methods}, "notes": ["a note"]}), encoding="utf-8")
+    srf("report", "loads")
+    page = Page(Path("loads/report.html").read_text(encoding="utf-8"))
+    assert "D0 = 0.400(8) µm; χ² is 28.5 on 15 degrees of freedom." in page.text
+    assert "Fit of critical loads: loads.csv" in page.text and "To be known" not in page.text
+
+
 def test_it_reads_well_at_three_widths(results: Path) -> None:
     if BROWSER is None:
         pytest.skip("BROWSER ABSENT: no headless Chromium, the page is not laid out")

@@ -145,6 +145,19 @@ def test_figures(tmp_path, mode):
     assert code == 0 and (tmp_path / "a.svg").stat().st_size > 5000
 
 
+def test_every_axis_of_a_narrow_response_has_ticks_in_plain_numbers():
+    from srfcli.results.figures import gains
+
+    x = np.linspace(1.0, 1.4, 5)
+    figure = gains(x, {"mu": 0.5 * np.exp(2.3j) * x**0.1, "x  [µm]": np.exp(2.2j) * x**0.05}, xlabel="f  [Hz]", logx=True)
+    figure.canvas.draw()
+    for axes in figure.axes:
+        low, high = axes.get_ylim()
+        ticks = zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
+        seen = [label.get_text() for place, label in ticks if low <= place <= high]
+        assert len(seen) > 1 and not any("10^" in text for text in seen)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -56,19 +55,23 @@ def searched(folder: Path, effects: tuple[str, ...] = ("viscous-drag",)) -> tupl
     return search, conclude(search, read_experiment(folder, registry=SHIPPED))
 
 
-@lru_cache(maxsize=4)
-def answered(base: Path, which: str):
-    """Return search, diagnosis and explanation of a small concealed case, made once in a session."""
-    p = {"age": replace(Physics(), p_age=1.7), "bump": replace(Physics(), bump=0.004, bump_x=14.0, bump_w=1.2)}[which]
-    folder = base / which
-    folder.mkdir()
-    search, diagnosis = searched(recorded(folder, p))
-    return search, diagnosis, explain_unknown(search, diagnosis)
+@pytest.fixture(scope="module")
+def bump(tmp_path_factory):
+    """Diagnosis and explanation of a bump of 0.004 on 14 um of the track."""
+    p = replace(Physics(), bump=0.004, bump_x=14.0, bump_w=1.2)
+    search, diagnosis = searched(recorded(tmp_path_factory.mktemp("bump"), p))
+    return diagnosis, explain_unknown(search, diagnosis)
 
 
-@pytest.fixture(scope="session")
-def base(tmp_path_factory):
-    return tmp_path_factory.mktemp("unknown")
+@pytest.fixture(scope="module")
+def age(tmp_path_factory):
+    """The folder that `srf diagnose` writes where contacts age by another power, which no effect that is named describes."""
+    folder = tmp_path_factory.mktemp("age")
+    out = folder / "found"
+    arguments = ["diagnose", str(recorded(folder, replace(Physics(), p_age=1.7))), "--effect", "viscous-drag"]
+    result = CliRunner().invoke(cli, [*arguments, "--out", str(out), "--json"])
+    assert result.exit_code == 0, result.output
+    return out
 
 
 # ---- the candidates
@@ -99,9 +102,9 @@ def test_terms_join_the_registry_and_give_way_to_a_registered_effect():
 # ---- the force
 
 
-def test_the_force_stands_where_the_track_is_rough(base):
-    """A bump of 0.004 on 14 um of the track: found in both runs at that place, though neither place nor form is assumed."""
-    _, diagnosis, _ = answered(base, "bump")
+def test_the_force_stands_where_the_track_is_rough(bump):
+    """Found in both runs at that place, though neither place nor form is assumed."""
+    diagnosis, _ = bump
     found = unexplained_friction(diagnosis.baseline)
     assert set(found) == {"steps", "down"}
     for run in found.values():
@@ -124,35 +127,44 @@ def test_no_force_where_nothing_is_missing(tmp_path):
 # ---- the closed form
 
 
-BUMP = {"place_height": 0.004, "place": 14.0, "place_width": 1.2}
-
-
-@pytest.mark.parametrize(
-    ("which", "name", "truth"), [("age", "age-power", {"age_power": 1.7}), ("bump", "track-place", BUMP)]
-)
-def test_the_form_is_the_generator_s(base, which, name, truth):
-    """One term, the right one, with its numbers within four standard errors; it predicts what was not fitted."""
-    _, _, found = answered(base, which)
+def is_the_truth(found, name, truth):
+    """One term was found, the right one, with its numbers within four standard errors; it predicts what was not fitted."""
     assert [t["name"] for t in found["terms"]] == [name]
     for parameter, value in truth.items():
         got = found["terms"][0]["parameters"][parameter]
         assert abs(got["value"] - value) < 4 * got["stderr"] < 0.5 * abs(value) + 0.2 * (name == "track-place")
     assert found["gain"] > 20 and found["held_gain"] > 5 and found["leaves_noise_alone"]
     assert abs(found["held_rms_over_noise"]["form"] - 1) < 0.06
-    assert found["force"]["form"] == found["form"] and name.split("-")[1] in found["form"]
+    assert name.split("-")[1] in found["form"]
+
+
+def test_the_form_is_the_generator_s(bump):
+    found = bump[1]
+    is_the_truth(found, "track-place", {"place_height": 0.004, "place": 14.0, "place_width": 1.2})
+    assert found["force"]["form"] == found["form"]
     run = found["force"]["steps"]
     assert run["band"].shape == (2, run["t"].size) and np.all(run["low"] <= run["high"])
 
 
-def test_the_form_is_offered_as_an_effect(base, tmp_path):
+def test_the_command_says_it(age):
+    """`unknown` comes with the force in the report and the form as an effect that the next search takes."""
+    found = json.loads((age / "answer.json").read_text())
+    assert found["verdict"] == "unknown"
+    assert max(found["confidence"], key=found["confidence"].get) == "unknown"
+    assert sum(found["confidence"].values()) == pytest.approx(1.0)
+    is_the_truth(found["missing"], "age-power", {"age_power": 1.7})
+    assert "latent" in found["missing"] and "age_power" in (age / "report.html").read_text()
+    heads, *rows = (age / "missing-steps.csv").read_text().splitlines()
+    assert heads.startswith("time [s],friction,low,high,v [um/s]") and len(rows) == 800
+
+
+def test_the_form_is_offered_as_an_effect(age):
     """The file reads, keeps every check, and a model with it says what the fitted one says."""
-    _, _, found = answered(base, "age")
-    path = tmp_path / "closed-form.toml"
-    path.write_text(found["toml"])
-    effect = read_law(path)
+    effect = read_law(age / "closed-form.toml")
     assert {o.verdict for o in check_law(effect)} == {"ok"}
-    assert dict(effect.neutral) == {"age_power": 1.0}
-    assert effect.parameters[0].default == pytest.approx(found["terms"][0]["parameters"]["age_power"]["value"])
+    assert dict(effect.neutral) == {"age_power": 1.0} and effect.sizes == ("age_power",)
+    (term,) = json.loads((age / "answer.json").read_text())["missing"]["terms"]
+    assert effect.parameters[0].default == pytest.approx(term["parameters"]["age_power"]["value"])
     assert formula_text(effect.changes[0][1]) == formula_text(read_law(FOLDER / "age-power.toml").changes[0][1])
 
 
@@ -191,24 +203,3 @@ def test_terms_together_are_one_effect(tmp_path):
 )
 def test_values_carry_two_digits_of_their_error(value, error, text):
     assert with_error(value, error) == text
-
-
-def test_the_command_says_it(tmp_path):
-    """`unknown` comes with the force in the report and the form as an effect that the next search takes."""
-    folder = tmp_path / "case"
-    folder.mkdir()
-    recorded(folder, replace(Physics(), p_age=1.7))
-    out = tmp_path / "found"
-    arguments = ["diagnose", str(folder), "--effect", "viscous-drag", "--out", str(out), "--json"]
-    result = CliRunner().invoke(cli, arguments)
-    assert result.exit_code == 0, result.output
-    found = json.loads((out / "answer.json").read_text())
-    assert found["verdict"] == "unknown"
-    assert max(found["confidence"], key=found["confidence"].get) == "unknown"
-    assert sum(found["confidence"].values()) == pytest.approx(1.0)
-    assert [t["name"] for t in found["missing"]["terms"]] == ["age-power"]
-    assert set(found["missing"]) >= {"form", "gain", "held_gain", "latent", "leaves_noise_alone"}
-    assert read_law(out / "closed-form.toml").sizes == ("age_power",)
-    assert "age_power" in (out / "report.html").read_text()
-    heads, *rows = (out / "missing-steps.csv").read_text().splitlines()
-    assert heads.startswith("time [s],friction,low,high,v [um/s]") and len(rows) == 800

@@ -484,16 +484,41 @@ def _loads(fit: ThresholdFit) -> Table:
 
 
 def _threshold_figure(fit: ThresholdFit, title: str) -> Figure:
-    """Return the lowest chi2 so far against evaluations of the whole cost, one curve a method."""
+    """Return the measured critical loads beside those of the best fit over V, and the lowest chi2 against evaluations."""
+    import numpy as np
+
     from srfcli.results import plots
 
-    with plots.one_panel(None, title=f"{plots.name_text(str(fit.table.source))}: {title}") as (figure, ax):
+    table, best = fit.table, min(fit.methods, key=lambda m: m.cost)
+    there = [crossing is not None for crossing in best.match.crossings]
+    loads = np.where(there, best.match.loads, np.nan)
+    mark: dict[str, Any] = {"fmt": "o", "markersize": 5, "markerfacecolor": "none"}
+    with plots.house_style():
+        figure = plots.bare_figure((6.0, 7.2))
+        above, below = figure.subplots(2, 1, height_ratios=(3, 2))
+        for index, eps in enumerate(np.unique(table.eps)):
+            colour, dash = plots.COLOURS[index % len(plots.COLOURS)], plots.DASHES[index % len(plots.DASHES)]
+            here = np.flatnonzero(table.eps == eps)
+            here = here[np.argsort(table.V[here], kind="stable")]
+            above.errorbar(table.V[here], table.W0c[here], yerr=table.sigma[here], color=colour, **mark)
+            above.plot(table.V[here], loads[here], color=colour, linestyle=dash, label=f"fit, ε = {eps:g}")
+        above.errorbar([], [], yerr=[], color="#555555", label="measured, ± σ", **mark)
+        above.set(xscale="log", yscale="log", xlabel="V  [µm/s]", ylabel="critical W$_0$  [N]")
         for index, m in enumerate(fit.methods):
+            look = {"color": ("#000000", "#777777")[index], "linestyle": plots.DASHES[index]}
             count = range(1, len(m.trace) + 1)
-            ax.step(count, m.trace.best, where="post", color=plots.COLOURS[index], linestyle=plots.DASHES[index])
-            ax.plot(count[-1:], m.trace.best[-1:], "o", color=plots.COLOURS[index], label=m.method)
-        freedom = len(fit.table) - len(fit.scale)
+            below.step(count, m.trace.best, where="post", label=m.method, **look)
+            below.plot(count[-1:], m.trace.best[-1:], "o", color=look["color"])
+        freedom = len(table) - len(fit.scale)
         if freedom:
-            ax.axhline(freedom, color="#555555", linestyle=plots.DOTTED, label="degrees of freedom")
-        ax.set(xscale="log", yscale="log", xlabel="evaluations of the whole cost", ylabel="lowest χ² so far")
+            below.axhline(freedom, color="#555555", linestyle=plots.DOTTED, label="degrees of freedom")
+        below.set(xscale="log", yscale="log", xlabel="evaluations of the whole cost", ylabel="lowest χ² so far")
+        found = ", ".join(
+            plots.valued(q.name, q.declared(float(best.values[i])), q.parameter.unit) for i, q in enumerate(fit.scale)
+        )
+        plots.heading(figure, f"{plots.name_text(str(table.source))}: {title}\nfit: {found}")
+        for ax in (above, below):
+            plots.decade_ticks(ax)
+            ax.legend(loc="best", fontsize=plots.NAME, handlelength=2.8)
+        figure.align_ylabels([above, below])
         return figure

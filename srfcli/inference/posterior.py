@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError
-from srfcli.inference.fit import Fit, Problem, Search
+from srfcli.inference.fit import Fit, Problem, Search, root
 from srfcli.inference.noise import whiten
 from srfcli.inference.state_space import CLOSER, StateSpaceFit, maximise
 
@@ -149,13 +149,18 @@ def _of_residuals(problem: Problem, fit: Fit) -> _Valley:
 
 # Draws from the posterior by Markov chains, under flat priors within the bounds, and what they are worth.
 
-FEWEST, EARLY = 50, 40  # steps of burn-in, and draws in it for each parameter, from whose spread the proposals are made
+EARLY, FEWEST = (
+    250,
+    50,
+)  # draws for each parameter, and steps, after which the burn-in makes its proposals anew; steps kept
 TIMES = 5.0  # correlation times that are left out at the beginning
-LONGEST = 400  # steps of burn-in
-INDEPENDENT = 0.6  # share of proposals that do not depend on where a chain is; the others stretch the ensemble
+AGREED = 1.03  # R-hat at which the burn-in may end
+LONGEST = 1000  # steps of burn-in
+INDEPENDENT = 0.85  # share of proposals that do not depend on where a chain is; the others stretch the ensemble
 WIDER = 1.2  # than the burn-in's draws: chains get stuck where proposals are rarer than the posterior
 MISSED = 2.0  # of log posterior, for a standard error that ends beyond a bound
-HEAVY = 5.0  # degrees of freedom of those proposals, so that no tail of the posterior is left out
+HEAVY = 10.0  # degrees of freedom of those proposals, so that no tail of the posterior is left out
+ENOUGH_EACH = 8  # draws of the burn-in for each coefficient of the ridge's bend
 
 
 @dataclass(frozen=True)
@@ -185,13 +190,18 @@ class Posterior:
     @property
     def r_hat(self) -> Array:
         """Return the split R-hat of each parameter, halves of chains against each other (Gelman and others 2013); NaN of few."""
-        half = self.chains.shape[0] // 2
-        if half < 2:
-            return np.full(len(self.names), np.nan)
-        parts = np.concatenate([self.chains[:half], self.chains[half : 2 * half]], axis=1)
-        within = parts.var(axis=0, ddof=1).mean(axis=0)
-        between = parts.mean(axis=0).var(axis=0, ddof=1)
-        return np.asarray(np.sqrt((half - 1) / half + between / within))
+        return r_hat(self.chains)
+
+
+def r_hat(chains: Array) -> Array:
+    """Return the split R-hat (k,) of chains (steps, chains, k); NaN of few."""
+    half = chains.shape[0] // 2
+    if half < 2:
+        return np.full(chains.shape[-1], np.nan)
+    parts = np.concatenate([chains[:half], chains[half : 2 * half]], axis=1)
+    within = parts.var(axis=0, ddof=1).mean(axis=0)
+    between = parts.mean(axis=0).var(axis=0, ddof=1)
+    return np.asarray(np.sqrt((half - 1) / half + between / within))
 
 
 def effective_size(chains: Array) -> Array:
@@ -226,51 +236,76 @@ def sample(
     seed: int = 0,
     progress: Callable[[str, float], None] = lambda text, share: None,
 ) -> Posterior:
-    """Return at least `count` draws of the parameters in problem.names.
+    """Return at least `count` draws of the parameters in problem.names, as `draw` makes them.
 
     Field and gauge noise are held at what the fit found: those of the state-space likelihood `rough`, without it the residuals'.
-    Proposals are drawn about the maximum with the fit's covariance and heavy tails, mixed with stretch moves of the ensemble;
-    the burn-in ends when it is five correlation times long, and then centre and covariance are those of its later draws.
-    `progress` is told what is done and which share of it. Ctrl-C ends it with the draws so far.
+    """
+    best = np.array([fit.values[n] for n in problem.names])
+    return draw(
+        _log_posterior(problem, fit, rough), problem.names, best, fit.covariance, (problem.lower, problem.upper), count,
+        seed=seed, progress=progress,
+    )  # fmt: skip
+
+
+def draw(
+    log_posterior: Callable[[Array], float],
+    names: tuple[str, ...],
+    best: Array,
+    covariance: Array,
+    bounds: tuple[Array, Array],
+    count: int,
+    *,
+    seed: int = 0,
+    progress: Callable[[str, float], None] = lambda text, share: None,
+) -> Posterior:
+    """Return at least `count` draws of a posterior whose maximum is at `best` (k,) with `covariance` (k, k).
+
+    Most proposals are drawn along the ridge of the posterior as the burn-in's draws show it (`_Ridge`), the others stretch the
+    ensemble. The burn-in ends when it is five correlation times long. `progress` is told what is done and which share of it.
+    Ctrl-C ends it with the draws so far.
+
+    References
+    ----------
+    Goodman and Weare (2010), Comm. App. Math. Comp. Sci. 5, 65: stretch moves. Parno and Marzouk (2018), SIAM/ASA J. Uncertainty
+    Quantification 6, 645: proposals through a triangular polynomial map.
     """
     try:
         import emcee
     except ImportError as error:
         raise SrfError("`sample` needs emcee, which is not installed", 'pip install "srfcli[sample]"') from error
-    k = len(problem.names)
+    k, (lower, upper) = len(names), bounds
     chains = 2 * k + 4
+    every = max(FEWEST, -(-EARLY * k // chains))
     rng = np.random.default_rng(seed)
-    best = np.array([fit.values[n] for n in problem.names])
-    log_posterior = _log_posterior(problem, fit, rough)
-    scale = _straight(log_posterior, best, fit.covariance, problem.lower)
+    width = upper - lower
+    best = np.clip(best, lower + 1e-9 * width, upper - 1e-9 * width)
+    covariance = _with_bounded(log_posterior, best, covariance, bounds)
+    scale = _straight(log_posterior, best, covariance, lower)
 
     def log_density(y: Array) -> float:
         theta = scale.back(y)
         return log_posterior(theta) + float(np.sum(np.log(theta[scale.logarithmic])))
 
     over = np.where(scale.logarithmic, best, 1.0)
-    covariance = fit.covariance / np.outer(over, over)
-    factor = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
-    independent = _Independent(scale.there(best), factor)
-    moves = [
-        (emcee.moves.MHMove(independent), INDEPENDENT),
-        (emcee.moves.StretchMove(), 1.0 - INDEPENDENT),
-    ]
-    width = problem.upper - problem.lower
-    drawn = scale.back(scale.there(best) + rng.standard_normal((chains, k)) @ factor.T)
-    start = scale.there(np.clip(drawn, problem.lower + 1e-9 * width, problem.upper - 1e-9 * width))
+    ridge = _Ridge(scale.there(best), root(covariance / np.outer(over, over)))
+    moves = [(emcee.moves.MHMove(ridge), INDEPENDENT), (emcee.moves.StretchMove(), 1.0 - INDEPENDENT)]
+    drawn = scale.back(ridge.back(rng.standard_normal((chains, k))))
+    start = scale.there(np.clip(drawn, lower + 1e-9 * width, upper - 1e-9 * width))
     sampler = emcee.EnsembleSampler(chains, k, log_density, moves=moves)
     sampler._random = np.random.RandomState(seed)
-    steps, burnt, interrupted = -(-count // chains), 0, False
+    steps, burnt, interrupted = (
+        max(-(-count // chains), FEWEST),
+        0,
+        False,
+    )  # of fewer steps nobody could say what they are worth
     try:
         for number, _ in enumerate(sampler.sample(start, iterations=LONGEST + steps), 1):
-            if not burnt:
-                fewest = max(FEWEST, -(-EARLY * k // chains))
-                done = number >= fewest and number >= TIMES * _slowness(sampler.get_chain(discard=number // 3))
-                burnt = number if done or number == LONGEST else 0
-                if burnt:
-                    independent.learn(sampler.get_chain(discard=burnt // 3, flat=True))
-            progress(f"posterior: step {number}", number / (max(burnt, FEWEST) + steps))
+            if not burnt and number % every == 0:
+                later = sampler.get_chain(discard=number // 3)
+                ridge.learn(later.reshape(-1, k))
+                mixed = number >= TIMES * _slowness(later) and r_hat(later).max() <= AGREED
+                burnt = number if mixed or number >= LONGEST else 0
+            progress(f"posterior: step {number}", number / (max(burnt, every) + steps))
             if burnt and number == burnt + steps:
                 break
     except KeyboardInterrupt:
@@ -279,13 +314,30 @@ def sample(
             raise
         burnt = burnt or sampler.iteration // 2
     accepted = float(np.mean(sampler.acceptance_fraction))
-    return Posterior(problem.names, scale.back(sampler.get_chain(discard=burnt)), burnt, accepted, interrupted)
+    return Posterior(names, scale.back(sampler.get_chain(discard=burnt)), burnt, accepted, interrupted)
 
 
 def _slowness(chains: Array) -> float:
     """Return after how many steps the slowest parameter's draws are independent."""
     steps, count, _ = chains.shape
     return float(steps * count / np.nanmin(np.maximum(effective_size(chains), 1e-9)))
+
+
+def _with_bounded(
+    log_posterior: Callable[[Array], float], best: Array, covariance: Array, bounds: tuple[Array, Array]
+) -> Array:
+    """Return the covariance with a spread where the fit left a parameter at a bound: there the posterior falls by a half."""
+    base, full = log_posterior(best), covariance.copy()
+    for k in np.flatnonzero(~(np.diag(covariance) > 0)):
+        inwards = 1.0 if best[k] - bounds[0][k] < bounds[1][k] - best[k] else -1.0
+        reach, theta = bounds[1][k] - bounds[0][k], best.copy()
+        for _ in range(60):
+            reach /= 2
+            theta[k] = best[k] + inwards * reach
+            if log_posterior(theta) >= base - 0.5:
+                break
+        full[k], full[:, k], full[k, k] = 0.0, 0.0, reach**2
+    return full
 
 
 @dataclass(frozen=True)
@@ -323,30 +375,68 @@ def _straight(log_posterior: Callable[[Array], float], best: Array, covariance: 
     return _Scale(logarithmic)
 
 
-class _Independent:
-    """A proposal of Student's t about `centre` with the scale `factor` (k, k), wherever a chain is."""
+class _Ridge:
+    """Proposals of Student's t, wherever a chain is, in coordinates z in which a bent ridge of the posterior is straight.
+
+    Along directions in which the posterior is Gaussian with unit spread, y = centre + factor w, the coordinate w_j is z_j times a
+    spread, and a quadratic function of the w before it. That map is triangular, so that densities in y and in z are
+    proportional. It begins as that of the covariance at the maximum: centre (k,), factor (k, k).
+    """
 
     def __init__(self, centre: Array, factor: Array) -> None:
-        self.centre, self.factor = centre, factor
+        k = centre.size
+        self.centre, self.factor, self.spread = centre, factor, np.ones(k)
+        self.bends: list[Array | None] = [None] * k
+        self._maximum = factor
+        self._pairs = np.triu_indices(k)
+
+    def _terms(self, w: Array, j: int) -> Array:
+        """Return the products (n, ...) of two of the first j coordinates w (n, k), and ones."""
+        first, second = (index[self._pairs[1] < j] for index in self._pairs)
+        return np.column_stack([w[:, first] * w[:, second], np.ones(len(w))])
 
     def learn(self, draws: Array) -> None:
-        """Take centre and scale from draws (n, k), where these have a spread in every direction."""
-        covariance = np.atleast_2d(np.cov(draws.T))
-        try:
-            self.factor = WIDER * np.linalg.cholesky(covariance)
-        except np.linalg.LinAlgError:
-            return
-        self.centre = draws.mean(axis=0)
+        """Take the map from draws (n, k), where these have a spread in every direction.
 
-    def log_density(self, x: Array) -> Array:
-        """Return the logarithm of the proposal's density at x (n, k), up to a constant."""
-        z = np.linalg.solve(self.factor, (x - self.centre).T)
-        return np.asarray(-0.5 * (HEAVY + self.centre.size) * np.log1p(np.sum(z**2, axis=0) / HEAVY))
+        First come the directions in which they are narrowest, in units of the spread at the maximum: a ridge that bends is wider
+        there than at its maximum in the direction into which it bends.
+        """
+        straight = np.linalg.solve(self._maximum, (draws - draws.mean(axis=0)).T)
+        values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(straight)))
+        if not values[0] > 1e-12 * values[-1]:
+            return
+        self.centre, self.factor = draws.mean(axis=0), self._maximum @ vectors * np.sqrt(values)
+        w = np.linalg.solve(self.factor, (draws - self.centre).T).T
+        self.spread = np.full(self.centre.size, WIDER)
+        for j in range(1, self.centre.size):
+            terms = self._terms(w, j)
+            self.bends[j] = None
+            if len(w) >= ENOUGH_EACH * terms.shape[1]:
+                self.bends[j] = bend = np.linalg.lstsq(terms, w[:, j], rcond=None)[0]
+                self.spread[j] = WIDER * np.std(w[:, j] - terms @ bend)
+
+    def there(self, y: Array) -> Array:
+        """Return z at y (n, k)."""
+        w = np.linalg.solve(self.factor, (y - self.centre).T).T
+        bent = [0.0 if bend is None else self._terms(w, j) @ bend for j, bend in enumerate(self.bends)]
+        return (w - np.column_stack(np.broadcast_arrays(*bent, w[:, 0])[:-1])) / self.spread
+
+    def back(self, z: Array) -> Array:
+        """Return y at z (n, k)."""
+        w = z * self.spread
+        for j, bend in enumerate(self.bends):
+            if bend is not None:
+                w[:, j] += self._terms(w, j) @ bend
+        return self.centre + w @ self.factor.T
+
+    def log_density(self, y: Array) -> Array:
+        """Return the logarithm of the proposals' density at y (n, k), up to a constant."""
+        return np.asarray(-0.5 * (HEAVY + y.shape[1]) * np.log1p(np.sum(self.there(y) ** 2, axis=1) / HEAVY))
 
     def __call__(self, x: Array, random: Any) -> tuple[Array, Array]:
         """Return where chains at x (n, k) may go, and the logarithms of the ratios of densities."""
         normal, scale = random.standard_normal(x.shape), random.chisquare(HEAVY, size=(x.shape[0], 1)) / HEAVY
-        moved = self.centre + (normal / np.sqrt(scale)) @ self.factor.T
+        moved = self.back(normal / np.sqrt(scale))
         return moved, self.log_density(x) - self.log_density(moved)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from srfcli.core.errors import SrfError, Status
 from srfcli.results.tables import Column, Result, Table, own_figure
 
+ROOM = 60  # letters of the experiments' names that stand upright below the figure
 PAIRS = (("A", "B"), ("A", "D0"), ("B", "D0"))  # whose covariances a fit of a velocity step is quoted with
 LEADING = (
     Column("experiment", "", "folder or file"),
@@ -98,14 +99,27 @@ class CampaignResult(Result):
         known = [row for row in self.rows if row.get("A_minus_B") is not None]
         if not known:
             raise SrfError("no experiment of the campaign has A and B: there is nothing to draw", "Leave --plot out.")
-        with plots.one_panel(None, title="A - B of each experiment") as (figure, axes):
+        laws = list(dict.fromkeys(str(row["law"]) for row in known))
+        title = plots.name_text("; ".join(laws), wide=True)
+        with plots.one_panel(None, title=title, size=(max(6.0, 1.0 + 0.3 * len(known)), 4.2)) as (figure, axes):
             place = range(len(known))
             values, errors = ([row[key] for row in known] for key in ("A_minus_B", "A_minus_B_stderr"))
             errors = [e if e is not None and math.isfinite(e) else 0.0 for e in errors]
-            axes.errorbar(place, values, yerr=[1.96 * e for e in errors], fmt="o", color=plots.COLOURS[0])
+            axes.errorbar(place, values, yerr=[1.96 * e for e in errors], fmt="o", capsize=3, color=plots.COLOURS[0])
             axes.axhline(0.0, color="#555555", linestyle=plots.DOTTED)
-            axes.set(xticks=list(place), ylabel="A - B, with 95 %")
-            axes.set_xticklabels(
-                [plots.name_text(Path(row["experiment"]).name) for row in known], rotation=30, ha="right"
-            )
+            axes.set(xticks=list(place), ylabel="A − B, and 95 % intervals", xlabel="experiment")
+            names = _short([str(row["experiment"]) for row in known])
+            turn: dict[str, Any] = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"}
+            upright = sum(map(len, names)) <= ROOM and len(known) < 10
+            axes.set_xticklabels([plots.name_text(name) for name in names], **({} if upright else turn))
+            axes.margins(x=0.5 / len(known) if len(known) > 1 else 0.5)
         return figure
+
+
+def _short(places: Sequence[str]) -> list[str]:
+    """Return the names of folders or files, those of their folders where all are called alike, whole where two are the same."""
+    named = [
+        Path(place).parent.name or place if Path(place).name == "experiment.toml" else Path(place).name
+        for place in places
+    ]
+    return [name if named.count(name) == 1 else place for name, place in zip(named, places, strict=True)]

@@ -11,8 +11,8 @@ from srfcli.results.plots import (
     DASHES,
     QUANTITY,
     Values,
-    _decade_ticks,
     bare_figure,
+    decade_ticks,
     heading,
     house_style,
     load_matplotlib,
@@ -91,7 +91,7 @@ def stability_map(
             heading(figure, title)
         else:
             ax.set_title(title.split("\n")[0])
-        _decade_ticks(ax)
+        decade_ticks(ax)
         return figure
 
 
@@ -177,7 +177,7 @@ def _draw_marks(ax: Axes, special: Sequence[Mapping[str, Any]]) -> None:
 def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title: str = "") -> Figure:
     """Return gain and phase of complex transfer functions `parts`, {label: values}, over one x; `[unit]` in a label: an axis."""
     import numpy as np
-    from matplotlib.ticker import MultipleLocator
+    from matplotlib.ticker import MaxNLocator, MultipleLocator
 
     measured = [label for label in parts if "[" in label]  # what has a unit has an axis of its own
     with house_style():
@@ -194,13 +194,17 @@ def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title
         below.set_xscale("log" if logx else "linear")
         above.set_ylabel("gain for ε = 1")
         below.set_ylabel("phase  [deg]")
-        below.yaxis.set_major_locator(MultipleLocator(90))
+        span = -np.subtract(*below.get_ylim())
+        step = next((s for s in (90, 45, 15, 5) if span >= 2 * s), None)
+        below.yaxis.set_major_locator(MaxNLocator(5) if step is None else MultipleLocator(step))
         below.set_xlabel(xlabel)
         heading(figure, title)
         names_below(figure, *below.get_legend_handles_labels())
-        below.margins(x=0.0)
         figure.align_ylabels(axes)
-        _decade_ticks(below)
+        for axis in axes:
+            axis.margins(x=0.0)
+        for axis in axes:
+            decade_ticks(axis)
         return figure
 
 
@@ -430,7 +434,7 @@ def _velocities(ax: Axes, record: Mapping[str, Any]) -> None:
     low, high = np.nanmin(v, initial=np.inf), np.nanmax(v, initial=-np.inf)
     if high < 1.02 * low:
         ax.set_ylim(low / 2, high * 2)  # steady sliding is a level line, not the noise of integration
-    _decade_ticks(ax)
+    decade_ticks(ax)
 
 
 def _load(ax: Axes, record: Mapping[str, Any]) -> None:

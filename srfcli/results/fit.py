@@ -223,12 +223,15 @@ def _described(posterior: Posterior) -> dict[str, Any]:
 def _posterior_notes(posterior: Posterior) -> list[str]:
     worth, worst = float(posterior.effective.min()), float(posterior.r_hat.max())
     count, chains = posterior.draws.shape[0], posterior.chains.shape[1]
+    made = f"posterior: {count} draws of {chains} chains after {posterior.burn_in} steps of burn-in"
+    interrupted = ["posterior: interrupted; the draws so far are kept"] if posterior.interrupted else []
+    if not (math.isfinite(worth) and math.isfinite(worst)):
+        return [f"{made}, too few steps to tell what they are worth", *interrupted]
     notes = [
-        f"posterior: {count} draws of {chains} chains after {posterior.burn_in} steps of burn-in, worth {worth:.0f} independent "
-        f"ones or more; R-hat up to {worst:.3f}; {posterior.accepted:.0%} of the proposals taken"
+        f"{made}, worth {worth:.0f} independent ones or more; R-hat up to {worst:.3f}; "
+        f"{posterior.accepted:.0%} of the proposals taken",
+        *interrupted,
     ]
-    if posterior.interrupted:
-        notes.append("posterior: interrupted; the draws so far are kept")
     if not (worth >= ENOUGH and worst <= MIXED):
         more = max(math.ceil(1.2 * count * ENOUGH / max(worth, 1.0) / 100) * 100, 2 * count if worst > MIXED else 0)
         notes.append(

@@ -7,6 +7,7 @@ import importlib.util
 import io
 import itertools
 import logging
+import math
 import sys
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -268,7 +269,7 @@ def stability_diagram(
             folded = any(_folds(b["V"]) for b in branches)
             text = "stable above, and right of a fold" if folded else "stable above each curve"
             ax.annotate(text, (0.99, 0.985), xycoords="axes fraction", ha="right", va="top", color="#555555")
-        _decade_ticks(ax)
+        decade_ticks(ax)
         return figure
 
 
@@ -302,7 +303,7 @@ def critical_points(points: Sequence[Mapping[str, Any]], *, title: str = "", ax:
         ax.set(xlabel="V  [µm/s]", ylabel="critical K/W$_0$  [1/µm]")
         ax.margins(x=0.06)
         ax.set_ylim(0.0, 1.12 * max((p["K_over_W0"] for p in points), default=1.0))
-        _decade_ticks(ax)
+        decade_ticks(ax)
         return figure
 
 
@@ -322,7 +323,7 @@ def boundaries(
         ax.set_yscale("log" if logy else "linear")
         _draw_branches(ax, branches)
         ax.set(xlabel=xlabel, ylabel=ylabel)
-        _decade_ticks(ax)
+        decade_ticks(ax)
         return figure
 
 
@@ -426,7 +427,7 @@ def lines(
             ax.set_yscale("log")
         ax.margins(x=0.0 if len(x) > 1 else 0.05)
         ax.set(xlabel=xlabel, ylabel=ylabel)
-        _decade_ticks(ax)
+        decade_ticks(ax)
         return figure
 
 
@@ -455,7 +456,7 @@ def orbit(
                 ax.ticklabel_format(axis="y", useOffset=False)
             ax.set_ylabel(label)
             ax.margins(x=0.0, y=0.12)
-            _decade_ticks(ax)
+            decade_ticks(ax)
         heading(figure, title)
         axes[-1].set_xlim(0.0, 1.0)
         axes[-1].set_xlabel("time  [periods of the load]")
@@ -467,19 +468,24 @@ def _greek(name: str) -> str:
     return name.replace("phi", "φ").replace("_", " ")
 
 
-def _decade_ticks(ax: Axes) -> None:
+def decade_ticks(ax: Axes) -> None:
     """Write 1, 10, 100 rather than powers of ten on logarithmic axes, and more between where they span few decades."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-    for axis, (low, high), scale in (
-        (ax.xaxis, ax.get_xlim(), ax.get_xscale()),
-        (ax.yaxis, ax.get_ylim(), ax.get_yscale()),
+    across, up = (size / ax.figure.dpi for size in (ax.bbox.width, ax.bbox.height))
+    for axis, (low, high), scale, room in (
+        (ax.xaxis, ax.get_xlim(), ax.get_xscale(), across / 0.45),
+        (ax.yaxis, ax.get_ylim(), ax.get_yscale(), up / 0.2),
     ):
         if scale != "log" or not 1e-4 <= low <= high <= 1e5:
             continue
-        between = (
-            (1.0,) if high / low >= 2e3 else (1.0, 2.0, 5.0) if high / low > 8 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
-        )
-        axis.set_major_locator(LogLocator(subs=between))
+        ratio = high / low
+        between = (1.0,) if ratio >= 2e3 else (1.0, 2.0, 5.0) if ratio > 8 else (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)
+        if ratio > 30 and len(between) * math.log10(ratio) > room:
+            between = (1.0,)
+        narrow = ratio < 3  # a few ticks of such a list at best
+        axis.set_major_locator(MaxNLocator(6) if narrow else LogLocator(subs=between))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_formatter(NullFormatter())
+        if narrow:
+            axis.set_minor_locator(NullLocator())

@@ -197,8 +197,9 @@ def _location_sentences(matter: Matter) -> list[str]:
         return ["No place stands out beyond what noise does."]
     worst = max(standing, key=lambda r: r.get("share") or 0.0)
     if (worst.get("share") or 0.0) > 0:
+        darkest = next((one.worst for one in matter.fitted if one.name == worst["name"]), None)
         where = spans(merged(worst.get("windows") or ()), 2)
-        tail = f", from {where}" if where else ""
+        tail = f", most from {spans([darkest])}" if darkest else f", from {where}" if where else ""
         found.append(f"{percent(worst['share'])} of the excess misfit is in the run “{worst['name']}”{tail}.")
     coordinate = location.get("coordinate")
     if coordinate and finite(coordinate.get("r2")):
@@ -413,12 +414,13 @@ def diagram(matter: Matter) -> Markup:
     note, drawn = (matter.tables.get("diagram") or {}).get("note"), "diagram" in matter.pictures
     if not (note or drawn):
         return Markup("")
-    caption = "Critical load against driving velocity, baseline and augmented model."
+    caption = "Critical load against driving velocity" + ("." if matter.same else ", baseline and augmented model.")
     marks = (matter.tables.get("diagram") or {}).get("marks") or ()
     if marks:
         caption += " Crosses: the velocities and loads of your runs."
     figure = matter.figure("diagram", caption, caption, small=True) if drawn else ""
-    return section("diagram", "What it does to the stability diagram", tag("p", str(note)) if note else "", figure)
+    title = "Your runs in the stability diagram" if matter.same else "What it does to the stability diagram"
+    return section("diagram", title, tag("p", str(note)) if note else "", figure)
 
 
 def onward(matter: Matter) -> Markup:
@@ -513,6 +515,9 @@ thead th, thead th.n { white-space: normal; overflow-wrap: anywhere; }
   h2, h3 { break-after: avoid; } tr, figure { break-inside: avoid; } a { color: inherit; text-decoration: none; }
   pre { white-space: pre-wrap; overflow-wrap: anywhere; } .wide { overflow: visible; } table { font-size: 8.5pt; }
   th, td { padding-right: 0.5rem; overflow-wrap: anywhere; } .n { white-space: normal; }
+  thead th, thead th.n { overflow-wrap: break-word; } table { break-inside: avoid; } tbody th { min-width: 4.5rem; }
+  h2 + p, h3 + p { break-after: avoid; } .numbers { break-inside: avoid; }
+  thead, tbody tr:first-child, tbody tr:nth-last-child(2) { break-after: avoid; }
 }
 """
 
@@ -749,7 +754,8 @@ def _page(matter: Matter) -> str:
 MOST_ROWS, MOST_COLUMNS = 40, 7  # of a table on the page; the file has all
 KINDS = {
     "fit": "Fit of recordings",
-    "thresholds": "Fit of critical loads",
+    "fit-thresholds": "Fit of critical loads",
+    "campaign": "Campaign of fits",
     "map": "Stability map",
     "compare": "Laws compared",
     "continue": "Stability boundary",
@@ -806,15 +812,18 @@ def _kind(data: Mapping[str, Any]) -> str:
 def _headline(data: Mapping[str, Any]) -> str:
     """Return what was found, in a sentence."""
     notes, rows = [str(n) for n in data.get("notes") or ()], list(data.get("rows") or ())
-    if str(data["schema"]).startswith("srf.fit/"):
+    if _kind(data) in (KINDS["fit"], KINDS["fit-thresholds"]):
+        best = min((data.get("meta") or {}).get("methods") or [{}], key=lambda m: m.get("chi2", 0.0))  # of critical loads
         told = []
         for row in rows:
-            unit = unit_text(row.get("unit"))
-            told.append(
-                f"{row['parameter']} = {bracketed(row.get('value'), row.get('stderr'))}" + (f" {unit}" if unit else "")
-            )
+            if row.get("method") == best.get("method"):
+                unit = unit_text(row.get("unit"))
+                value = bracketed(row.get("value"), row.get("stderr"))
+                told.append(f"{row['parameter']} = {value}" + (f"{NO_BREAK}{unit}" if unit else ""))
         ratio = ((data.get("meta") or {}).get("rms_over_noise") or {}).get("fit")
         tail = f"; residuals are {number(ratio)} times the noise" if finite(ratio) else ""
+        if finite(best.get("chi2")):
+            tail = f"; χ² is {number(best['chi2'])} on {best.get('freedom')} degrees of freedom"
         return ", ".join(told) + tail + _state(data)
     return (
         f"{notes[0][:1].upper()}{notes[0][1:]}{_state(data)}"
@@ -838,7 +847,7 @@ def _result(folder: Path, path: Path, data: Mapping[str, Any]) -> Markup:
             parts.append(picture(figure.read_bytes(), suffix, alt=alt, caption=f"{figure.name}"))
             break
     parts.append(_table(data))
-    flagged = [r for r in data.get("rows") or () if r.get("flag")]
+    flagged = [r for r in data.get("rows") or () if r.get("flag") not in (None, "", "ok")]
     if flagged:
         parts.append(
             tag(

@@ -16,8 +16,8 @@ from srfcli.results.plots import (
     COLOURS,
     DASHES,
     DOTTED,
-    _decade_ticks,
     _gaps,
+    decade_ticks,
     house_style,
     load_matplotlib,
     name_text,
@@ -571,7 +571,7 @@ def _bins(axis: Axes, found: Sequence[Spot]) -> None:
             axis.vlines(spot.low, 0, spot.height, color=colour, alpha=alpha, linewidth=1.6)
     if log:
         axis.set_xscale("log")
-        _decade_ticks(axis)
+        decade_ticks(axis)
     axis.margins(x=0.01)
     axis.locator_params(axis="y", nbins=4)
 
@@ -658,7 +658,7 @@ def force_figure(name: str, force: Mapping[str, Any], *, unit: str = "N", narrow
             axis.set_ylabel(label)
             if key == "v" and known.min() > 0 and known.max() > WIDE_QUANTITY * known.min():
                 axis.set_yscale("log")
-                _decade_ticks(axis)
+                decade_ticks(axis)
         axes[-1].set_xlabel("t  [s]")
         axes[-1].set_xlim(t[0] - 0.01 * np.ptp(t), t[-1] + 0.01 * np.ptp(t))
         figure.align_ylabels(axes)
@@ -699,7 +699,7 @@ def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, unit: str = "N", 
             axis.set_xlabel(label)
             if log:
                 axis.set_xscale("log")
-                _decade_ticks(axis)
+                decade_ticks(axis)
         axes[0].set_ylabel(f"missing force  [{unit}]" if unit != "1" else "missing friction coefficient")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
         _settle(figure)
@@ -729,6 +729,8 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
     curves = [("W0_baseline", "baseline", BEFORE, "-"), ("W0_augmented", "augmented model", AFTER, (0, (5, 1.5)))]
     curves += [("W0_hopf_baseline", "baseline, constant load", BEFORE, DOTTED)]
     curves += [("W0_hopf_augmented", "augmented model, constant load", AFTER, DOTTED)]
+    if all(_equal(diagram, key) for key in ("V", "W0", "W0_hopf")):  # nothing was added: one curve would hide the other
+        curves = [(key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]]
     drawn = [c for c in curves if diagram.get(c[0]) is not None and np.isfinite(_gaps(diagram[c[0]])).any()]
     if not drawn or diagram.get("V") is None:
         return None
@@ -755,6 +757,17 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
             loc="best", handlelength=2.8, title="sliding is steady below the first boundary", alignment="left"
         )
         legend.get_title().set_color("#555555")
-        _decade_ticks(axis)
+        decade_ticks(axis)
         _settle(figure)
         return figure
+
+
+def _equal(diagram: Mapping[str, Any], quantity: str) -> bool:
+    """Return whether the augmented model's curve is the baseline's."""
+    baseline, augmented = diagram.get(f"{quantity}_baseline", diagram.get(quantity)), diagram.get(f"{quantity}_augmented")
+    if augmented is None:
+        return quantity == "V" or baseline is None
+    if baseline is None:
+        return False
+    a, b = (np.asarray(_gaps(values)) for values in (baseline, augmented))
+    return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True))
