@@ -72,7 +72,7 @@ CASES = [
     (TILL, "ruina", "2.6e-3", "", 20.0, ".0058(3) .0038(3) 24(3) (quick fit)"),
     (TILL | {"title": "p446, 10 to 30 um/s", "window": "[705.0, 753.0]"}, "ruina", "2.1e-3", "", 20.0,
      ".0063(5) .0041(4) 31(6) (quick fit)"),
-    (TILL | {"title": "p446, 30 to 10 um/s", "window": "[766.0, 815.0]"}, "ruina", "2.6e-3", "", 20.0,
+    (TILL | {"title": "p446, 30 to 10 um/s", "window": "[772.5, 815.0]"}, "ruina", "2.6e-3", "", 20.0,
      ".0056(4) .0043(3) 25(4) (quick fit)"),
 ]  # fmt: skip
 

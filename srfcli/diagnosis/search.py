@@ -141,6 +141,11 @@ class ModelSearch:
             self._problem(hypothesis, values or {}), start=values, close=NEAR, rtol=COARSE, threads=self.threads,
             progress=self.progress, **options,
         )  # fmt: skip
+        if found.maximum.status is Status.INTEGRATION:
+            raise SrfError(
+                f"{hypothesis.name if move else 'the model'} cannot be followed along the recordings",
+                "Give start values, or bounds, between which it slides as the recordings do.",
+            )
         self.processes = found.likelihood.processes
         return self._judged(hypothesis, found)
 

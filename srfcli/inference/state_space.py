@@ -45,6 +45,7 @@ FIELD = ("field_amplitude", "field_length")
 PROCESSES = ("relaxation", "oscillation")  # of coloured gauge noise: e' = -e / tau + w, or e'' + (omega / q) e' + omega^2 e = w
 # A fit begins with the likeliest of nine fields: amplitudes over the friction of the recordings, lengths over that of PIECES
 WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
+ELSEWHERE = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
 SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
 FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
 BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
@@ -383,7 +384,9 @@ class Likelihood:
 
     def by_kind(self, point: Point) -> list[float]:
         """Return what each kind of gauge noise has of the log likelihood."""
-        total = dict.fromkeys(self.kinds, 0.0 if np.isfinite(point.log_likelihood) else -np.inf)
+        if not np.isfinite(point.log_likelihood):
+            return [-np.inf] * len(self.kinds)
+        total = dict.fromkeys(self.kinds, 0.0)
         for _, density, kind in self.pieces(point):
             total[kind] += float(np.sum(density))
         return list(total.values())
@@ -883,6 +886,26 @@ def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[s
             )
             if found > best[0]:
                 best = found, trial
+    return best[1] if np.isfinite(best[0]) else _elsewhere(rough, x, progress)
+
+
+def _elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> Array:
+    """Return the likeliest of ELSEWHERE starts over the bounds under a wide field, x where none can be followed.
+
+    A model that slips without end at the file's start values, as one without inertia may, is followed from others.
+    """
+    from scipy.stats import qmc
+
+    k = len(rough.problem.names)
+    best = (-np.inf, x)
+    for share in qmc.Sobol(k, seed=0).random(ELSEWHERE):
+        trial = x.copy()
+        trial[:k] = rough.lower[:k] + share * (rough.upper - rough.lower)[:k]
+        trial = _under_field(rough, trial, WIDE[-1], SHORT[1])
+        found = rough.at(trial, slopes=False).log_likelihood
+        progress(f"from elsewhere: log likelihood {found:.1f}")
+        if found > best[0]:
+            best = found, trial
     return best[1]
 
 
