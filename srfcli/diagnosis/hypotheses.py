@@ -83,7 +83,8 @@ def _unseen(effect: Effect, experiment: Experiment) -> str:
     if ("W_dot" in used or "W" in formulas or "force" in formulas) and spread < 1e-3:
         return f"the load varies by {100 * spread:.2g} %" if spread > 0 else "the load is constant"
     if {"kappa", "W"} & (used | set(formulas)) and "W" in used and max(spread, between) < 1e-3:
-        return f"the loads of all runs lie within {100 * max(spread, between):.2g} %"
+        wide = 100 * max(spread, between)
+        return f"the loads of all runs lie within {wide:.2g} %" if wide else "the load is constant, the same in all runs"
     calm = not any(of_run(run)["modulated"] for run in experiment.runs)
     if calm and formulas and all(f.subs(UNMODULATED) == symbol(slot) for slot, f in formulas.items()):
         return "no run has a modulated load"
