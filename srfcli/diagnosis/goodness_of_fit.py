@@ -16,6 +16,8 @@ from srfcli.inference.state_space import LAGS, StateSpaceFit, correlated, cut, t
 DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
 PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
 LOST = 3.0  # standard errors from its maximum at which a fit is none
+STEADY = 2.0  # gauge's noise: a stretch whose readings are expected to vary by less is one of steady sliding
+LEVELS = ("gauge_white", "gauge_colour")
 LOUD = 1.15  # gauge noise over that which differences of the recording show, beyond which it holds something else
 
 
@@ -43,11 +45,16 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
         n = white.size
         off = abs(float(np.sum(white**2)) - n) / np.sqrt(2 * n)
         tests.append((off / DEVIATION, f"innovations of {f.run.name} have an rms of {np.sqrt(np.mean(white**2)):.3f}"))
-        for piece in cut(white):
+        gauges = [[values[n] for local, n in own.items() if local.startswith(LEVELS)] for own in found.likelihood.gauges(f.run)]
+        level = np.linalg.norm(np.array(gauges), axis=1)[f.run.sampling.at][f.run.used]
+        expected = (f.run.observed - f.found.nu)[f.run.used]
+        for piece, y, noise in zip(cut(white), cut(expected), cut(level), strict=True):
             m = piece.size
             loud = (float(np.sum(np.clip(piece, -6, 6) ** 2)) - m) / np.sqrt(2 * m)
             shifted = abs(float(np.sum(piece))) / np.sqrt(m)
-            tests.append((max(loud * _smooth_share(piece), shifted) / (DEVIATION + 1.0), f"a stretch of {f.run.name} is off"))
+            if np.std(y) < STEADY * np.mean(noise):
+                loud *= _smooth_share(piece)
+            tests.append((max(loud, shifted) / (DEVIATION + 1.0), f"a stretch of {f.run.name} is off"))
         if not found.smooth and "field_amplitude" in f.names:
             k = f.names.index("field_amplitude")
             information = float(f.information[k, k])
@@ -75,7 +82,7 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
 def _smooth_share(white: Array) -> float:
     """Return how much of the variance beyond 1 in a stretch of innovations (m,) goes on from sample to sample, from 0 to 1.
 
-    All of it does where the model is off; a burst of noise leaves innovations that are loud and white.
+    In steady sliding all of it does where the model is off; a burst of noise leaves innovations that are loud and white.
     """
     c = np.clip(white, -6, 6)
     power = float(c @ c) / c.size
