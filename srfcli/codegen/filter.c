@@ -13,7 +13,7 @@
 #define NA (NX + 2 * NG)
 #define NRATES 8                            /* of sampling in a run, at most */
 #define NC (NX + MODES)
-#define UNSTABLE 1e150                      /* a variance that is none any more */
+#define NO_VARIANCE 1e150                   /* a variance that is none any more */
 
 typedef struct {
     double x[NA], P[NA * NA], T[NA * NA];   /* mean and covariance of state and gauge noise; transition since the last sample */
@@ -122,7 +122,7 @@ static double moments(Imposed *force, Course *course, Belief *b, double t, doubl
             double sum = 0.0;
             for (int k = 0; k < NX; k++) sum += M[r * NA + k] * Phi[c * NC + k];
             for (int k = NX; k < NC; k++) sum += Phi[r * NC + k] * Phi[c * NC + k];
-            if (!(fabs(sum) < UNSTABLE)) return INFINITY;
+            if (!(fabs(sum) < NO_VARIANCE)) return INFINITY;
             P[r * NX + c] = sum;
         }
     double share = 0.0;
