@@ -2,8 +2,8 @@
 
     python examples/real_steps.py DATA
 
-DATA holds the folders psu-p655-ghost-rocks and basalt-b819-velocity-step; the recordings are no part of this project. Experiments
-are written to a temporary folder and fitted as `srf fit --trend slip` does.
+DATA holds the folders psu-p655-ghost-rocks, basalt-b819-velocity-step and psu-p446-20MPa; the recordings are no part of this
+project. Experiments are written to a temporary folder and fitted as `srf fit --trend slip` does.
 """
 
 from __future__ import annotations

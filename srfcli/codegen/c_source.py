@@ -303,6 +303,7 @@ DUAL_FUNCTIONS = {
 }  # fmt: skip
 ORBIT_FUNCTIONS = {"cycle": "srf_cycle", "cycle_jacobian": "srf_cycle_jacobian", "cycle_bilinear": "srf_bilinear"}
 LANES = 8  # derivatives that the filter carries along at a time
+GAUGE_PROCESSES = 3  # of coloured gauge noise, at most, of one state or two
 TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
 
 
@@ -354,7 +355,7 @@ def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_
 def _filter_source(model: GeneratedModel) -> str:
     """Return the C text of the filter, which follows that of the integrator."""
     gauge = model.namespace.get("OBSERVED")
-    text = f"#define LANES {LANES}\n" + dual_arithmetic(model.source)
+    text = f"#define LANES {LANES}\n#define GAUGE_PROCESSES {GAUGE_PROCESSES}\n" + dual_arithmetic(model.source)
     text += c_function(model.source, "field_gain", label="srf_gain")
     for name, label in DUAL_FUNCTIONS.items():
         if gauge and name.startswith("elongation"):

@@ -9,9 +9,7 @@
    Jazwinski, Stochastic Processes and Filtering Theory, 1970; Griewank and Walther, Evaluating Derivatives, 2008. */
 
 #define MODES 3                             /* of white noise in a step; as many as stages can tell apart */
-#define NG 3                                /* processes of coloured gauge noise, at most, of one or two states */
-#define NA (NX + 2 * NG)
-#define NRATES 8                            /* of sampling in a run, at most */
+#define NA (NX + 2 * GAUGE_PROCESSES)
 #define NC (NX + MODES)
 #define NO_VARIANCE 1e150                   /* a variance that is none any more */
 
@@ -327,9 +325,9 @@ static void fresh_gauge(Course *course, Belief *b, const dual *gauge) {
    noise of variance R. The processes of coloured noise have `order` (ng) states each, and parameters gauge (rates, ng, 3); which of
    the rates holds at a sample is `rate` (nt): where it changes, a noise begins that owes nothing to the one before.
    p holds dual numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset and R (nt). Returns how many samples were reached; stats: steps, rejected. */
-int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, int rates, const double *gauge, const int *rate, int slopes, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
+int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const double *gauge, const int *rate, int slopes, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
     double values[NP];
-    dual q[NP], colour[NRATES * 3 * NG], y[NX], one, g[NX];
+    dual q[NP], colour[3 * GAUGE_PROCESSES], y[NX], one, g[NX];
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values};
     Course course = {values, q, slopes, ng, NX, order, rtol, longest, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, 0, 0, max_steps, stop};
     Belief b;
@@ -337,15 +335,16 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
     double now = t[0], last = t[0];
     const size_t wide = 1 + LANES;
 #define TAKE(to, from) ((to).v = *(from), memcpy(&(to).d, (from) + 1, sizeof(lanes)))
+#define TAKE_COLOUR(at) for (int i_ = 0; i_ < 3 * ng; i_++) TAKE(colour[i_], gauge + ((size_t)(at) * 3 * ng + i_) * wide)
     memset(&b, 0, sizeof b);
     for (int i = 0; i < NP; i++) TAKE(q[i], p + i * wide), values[i] = q[i].v;
     for (int j = 0; j < ng; j++) begins[course.na] = 1, course.na += order[j];
     na = course.na;
-    for (int i = 0; i < rates * 3 * ng; i++) TAKE(colour[i], gauge + i * wide);
     for (int i = 0; i < NX; i++) TAKE(one, x0 + i * wide), b.x[i] = one.v, b.xd[i] = one.d;
     for (int i = 0; i < NX; i++)
         for (int j = 0; j < NX; j++) TAKE(one, P0 + (i * NX + j) * wide), b.P[i * NA + j] = one.v, b.Pd[i * NA + j] = one.d;
-    fresh_gauge(&course, &b, colour + rate[0] * 3 * ng);
+    TAKE_COLOUR(rate[0]);
+    fresh_gauge(&course, &b, colour);
     for (int i = 0; i < na; i++) b.T[i * NA + i] = 1.0;
     for (int k = 0; k < nt; k++) {
         while (now < t[k] || segment_ < 0) {
@@ -365,8 +364,10 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
             if (!advance(&force, &course, &b, now, to)) goto end;
             now = to;
         }
-        if (k && rate[k] != rate[k - 1]) fresh_gauge(&course, &b, colour + rate[k] * 3 * ng);
-        else if (k) age_gauge(&course, &b, t[k] - last, colour + rate[k] * 3 * ng);
+        if (k && rate[k] != rate[k - 1]) {
+            TAKE_COLOUR(rate[k]);
+            fresh_gauge(&course, &b, colour);
+        } else if (k) age_gauge(&course, &b, t[k] - last, colour);
         last = t[k];
         double V, W, W_dot, PH[NA], H[NA];
         lanes dPH[NA], dH[NA];

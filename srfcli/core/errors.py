@@ -1,10 +1,11 @@
-"""Errors that a user can act on, and numerical outcomes: what, where, what instead."""
+"""Errors that a user can act on, notices of what was found in data, and numerical outcomes: what, where, what instead."""
 
 from __future__ import annotations
 
 import difflib
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import Enum
 
 # Errors that a user can act on: what, where, what instead.
@@ -89,6 +90,18 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     guess = exact or (lowered[close[0]] if close else None)
     tail = f"Known: {', '.join(names)}" if names else "None are known"
     return f"Did you mean '{guess}'? {tail}" if guess else tail
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something that was found in the data: its kind, the place, and one sentence on what it is and what was done."""
+
+    kind: str
+    where: str
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.kind}: {self.where}: {self.what}"
 
 
 # Numerical outcomes: a failure is a value whose text is advice.

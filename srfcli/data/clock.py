@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import SrfError
-from srfcli.data.values import Notice
+from srfcli.core.errors import Notice, SrfError
 
 Mask = NDArray[np.bool_]
 
@@ -21,6 +21,7 @@ CHANGE = 1.25  # of the sampling interval
 GAP = 2.5  # sampling intervals
 _BRIDGED = "drive and load are bridged, nothing is compared in it"
 SHORTEST = 8  # samples that make a rate
+TOLD_APART = 60  # samples at a rate from which its noise can be told from that at another
 MOST_NOTICES = 8  # of one kind before they are told together
 
 
@@ -39,6 +40,32 @@ class Sampling:
 
     rates: tuple[Rate, ...]
     gaps: NDArray[np.int64]
+
+    @cached_property
+    def _groups(self) -> list[list[Rate]]:
+        """Rates in groups of like intervals, rising; uneven sampling is one rate, and so is one with those in between."""
+        groups: list[list[Rate]] = []
+        for rate in sorted(self.rates, key=lambda r: r.interval):
+            if groups and rate.interval < CHANGE * groups[-1][-1].interval:
+                groups[-1].append(rate)
+            else:
+                groups.append([rate])
+        size = [sum(r.last - r.first for r in group) for group in groups]
+        return [g for g, n in zip(groups, size, strict=True) if n >= min(TOLD_APART, max(size))]
+
+    @cached_property
+    def spacings(self) -> tuple[float, ...]:
+        """Return the sampling intervals (s), rising, that are told apart: at each there are enough samples for a noise."""
+        return tuple(max(g, key=lambda r: r.last - r.first).interval for g in self._groups)
+
+    @cached_property
+    def at(self) -> NDArray[np.intc]:
+        """Return which of the spacings each sample (n,) was taken at; the nearest, where there are few such samples."""
+        logs = np.log(self.spacings)
+        near = [int(np.argmin(np.abs(np.log(r.interval) - logs))) for r in self.rates]
+        count = [r.last - r.first for r in self.rates]
+        count[-1] += 1
+        return np.repeat(near, count).astype(np.intc)
 
 
 def span(path: Path, rows: NDArray[np.int64], t: Array, first: int, last: int) -> str:

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.files import open_plain
 from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit
 from srfcli.data.description import ROLES, ColumnSpec, RunDescription, check_unit
-from srfcli.data.values import OBSERVABLES, Notice
+from srfcli.data.values import OBSERVABLES
 from srfcli.laws.registry import Entry, Registry
 from srfcli.laws.values import Reader, Source
 

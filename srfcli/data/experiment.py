@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.settings import Parameter
 from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
 from srfcli.data.clock import Mask, Rate, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
@@ -43,7 +43,7 @@ from srfcli.data.noise import (
     white_level,
 )
 from srfcli.data.scales import own_bounds
-from srfcli.data.values import OBSERVABLES, Experiment, FitParameter, ModelChoice, Notice, Run
+from srfcli.data.values import OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation

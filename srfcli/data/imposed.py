@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import SrfError
+from srfcli.core.errors import Notice, SrfError
 from srfcli.data.clock import kept_samples, span, spots
 from srfcli.data.columns import LIMIT, Columns, open_source, split_heading
 from srfcli.data.description import ROLES, RunDescription, check_unit
 from srfcli.data.noise import quantisation, saturation, spikes, white_level
-from srfcli.data.values import Notice
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Source
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad

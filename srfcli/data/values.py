@@ -9,28 +9,14 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from srfcli.codegen.model import Array
+from srfcli.core.errors import Notice
 from srfcli.core.units import factor_between, find_unit, split_quantity
+from srfcli.data.clock import Sampling, find_sampling
 from srfcli.motion.imposed import Drive, Load
 
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
-ANOTHER_RATE = 1.5  # ratio of spacings beyond which a run is sampled at another rate; uneven sampling is one rate
-FEWEST = 60  # samples at a rate: the fewest whose noise can be told from that at another
-MOST_RATES = 8  # in one run
-
-
-@dataclass(frozen=True)
-class Notice:
-    """Something that was found in the data: its kind, the place, and one sentence on what it is and what was done."""
-
-    kind: str
-    where: str
-    what: str
-
-    def __str__(self) -> str:
-        return f"{self.kind}: {self.where}: {self.what}"
 
 
 @dataclass(frozen=True)
@@ -58,14 +44,6 @@ class FitParameter:
     upper: float
     fixed: bool
     unit: str
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """Which of the `spacings` (s), rising, each sample (n,) of a run was taken at."""
-
-    at: NDArray[np.intc] = field(repr=False)
-    spacings: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -104,21 +82,8 @@ class Run:
 
     @cached_property
     def sampling(self) -> Sampling:
-        """Return the rates at which the run was sampled, by the running median of its spacings."""
-        gaps = np.diff(self.t, append=2 * self.t[-1] - self.t[-2])
-        one = Sampling(np.zeros(self.t.size, dtype=np.intc), (float(np.median(gaps)),))
-        if self.t.size < 2 * FEWEST:
-            return one
-        local = np.log(median_filter(gaps, FEWEST // 2 + 1, mode="nearest"))
-        rising = np.sort(local)
-        rate = np.searchsorted(rising[1:][np.diff(rising) > np.log(ANOTHER_RATE)], local, side="right")
-        count = np.bincount(rate)
-        often = np.sort(np.argsort(-count, kind="stable")[:MOST_RATES][np.sort(-count)[:MOST_RATES] <= -FEWEST])
-        if often.size < 2:
-            return one
-        middle = np.array([np.median(local[rate == k]) for k in often])
-        near = np.argmin(np.abs(local[:, None] - middle), axis=1)
-        return Sampling(near.astype(np.intc), tuple(np.exp(middle).tolist()))
+        """Return the rates at which the run was sampled."""
+        return find_sampling(self.t)
 
     @property
     def load_unit(self) -> str:

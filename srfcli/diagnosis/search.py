@@ -51,9 +51,7 @@ BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
 FAR = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
 AGAIN = 6  # of them, about the best, whose other parameters are fitted too where the model fails a test
 HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
-FOLLOWED = (
-    0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
-)
+FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
 
 @dataclass(frozen=True)
@@ -141,11 +139,6 @@ class ModelSearch:
             self._problem(hypothesis, values or {}), start=values, close=NEAR, rtol=COARSE, threads=self.threads,
             progress=self.progress, **options,
         )  # fmt: skip
-        if found.maximum.status is Status.INTEGRATION:
-            raise SrfError(
-                f"{hypothesis.name if move else 'the model'} cannot be followed along the recordings",
-                "Give start values, or bounds, between which it slides as the recordings do.",
-            )
         self.processes = found.likelihood.processes
         return self._judged(hypothesis, found)
 
@@ -180,6 +173,12 @@ class ModelSearch:
         return best[1]
 
     def _judged(self, hypothesis: Hypothesis, found: StateSpaceFit) -> Fitted:
+        if found.maximum.status is Status.INTEGRATION:
+            name = "the model" if hypothesis == Hypothesis() else hypothesis.name
+            raise SrfError(
+                f"{name} cannot be followed along the recordings",
+                "Give start values, or bounds, between which it slides as the recordings do.",
+            )
         remainder = self.remainder(found)
         evidence = log_evidence(found) + self._prior(hypothesis)
         if not any((shape := along_table(e)) and shape.argument == "slip" for e in hypothesis.effects):
@@ -385,7 +384,10 @@ class ModelSearch:
             node.fit.likelihood.problem, start=_followable(node.fit.values, node.fit.likelihood.problem), close=NEAR, rtol=COARSE,
             threads=self.threads, progress=self.progress, **{**self.options, "processes": processes},
         )  # fmt: skip
-        return self._record(self._judged(node.hypothesis, found), anew=True)
+        try:
+            return self._record(self._judged(node.hypothesis, found), anew=True)
+        except SrfError:  # it stays as it was
+            return node
 
     def _together(self, node: Fitted) -> None:
         """Push the pairs of effects that promise more together than the best alone."""

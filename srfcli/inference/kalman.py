@@ -14,14 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.codegen.c_source import LANES, compiled
+from srfcli.codegen.c_source import GAUGE_PROCESSES, LANES, compiled
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError
 from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.integrators import doubles, imposed_arguments, interruptible, rtol_of_estimate
 
 STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
-GAUGE_PROCESSES = 3  # of coloured gauge noise, at most, of one state or two
 
 _INTS = ctypes.POINTER(ctypes.c_int)
 
@@ -128,7 +127,7 @@ def kalman_filter(
         keeping = keep and first == 0
         arguments = (
             *imposed, doubles(p.packed(first)), doubles(start.packed(first)), doubles(covariance.packed(first)),
-            len(order), own.ctypes.data_as(_INTS), gauge.v.shape[0], doubles(gauge.packed(first)), rates.ctypes.data_as(_INTS),
+            len(order), own.ctypes.data_as(_INTS), doubles(gauge.packed(first)), rates.ctypes.data_as(_INTS),
             int(k > 0), ctypes.c_double(size), doubles(allowed),
             ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(most), n,
             doubles(t), doubles(observed), ctypes.c_void_p(use.ctypes.data), doubles(factor.packed(first)),

@@ -149,11 +149,9 @@ def _of_residuals(problem: Problem, fit: Fit) -> _Valley:
 
 # Draws from the posterior by Markov chains, under flat priors within the bounds, and what they are worth.
 
-EARLY, FEWEST = (
-    250,
-    50,
-)  # draws for each parameter, and steps, after which the burn-in makes its proposals anew; steps kept
-TIMES = 5.0  # correlation times that are left out at the beginning
+EARLY = 250  # draws for each parameter after which the burn-in makes its proposals anew
+FEWEST_STEPS = 50  # between two of these, and of those kept: of fewer nobody could say what they are worth
+LEFT_OUT = 5.0  # correlation times that are left out at the beginning
 AGREED = 1.03  # R-hat at which the burn-in may end
 LONGEST = 1000  # steps of burn-in
 INDEPENDENT = 0.85  # share of proposals that do not depend on where a chain is; the others stretch the ensemble
@@ -275,7 +273,7 @@ def draw(
         raise SrfError("`sample` needs emcee, which is not installed", 'pip install "srfcli[sample]"') from error
     k, (lower, upper) = len(names), bounds
     chains = 2 * k + 4
-    every = max(FEWEST, -(-EARLY * k // chains))
+    every = max(FEWEST_STEPS, -(-EARLY * k // chains))
     rng = np.random.default_rng(seed)
     width = upper - lower
     best = np.clip(best, lower + 1e-9 * width, upper - 1e-9 * width)
@@ -293,17 +291,13 @@ def draw(
     start = scale.there(np.clip(drawn, lower + 1e-9 * width, upper - 1e-9 * width))
     sampler = emcee.EnsembleSampler(chains, k, log_density, moves=moves)
     sampler._random = np.random.RandomState(seed)
-    steps, burnt, interrupted = (
-        max(-(-count // chains), FEWEST),
-        0,
-        False,
-    )  # of fewer steps nobody could say what they are worth
+    steps, burnt, interrupted = max(-(-count // chains), FEWEST_STEPS), 0, False
     try:
         for number, _ in enumerate(sampler.sample(start, iterations=LONGEST + steps), 1):
             if not burnt and number % every == 0:
                 later = sampler.get_chain(discard=number // 3)
                 ridge.learn(later.reshape(-1, k))
-                mixed = number >= TIMES * _slowness(later) and r_hat(later).max() <= AGREED
+                mixed = number >= LEFT_OUT * _slowness(later) and r_hat(later).max() <= AGREED
                 burnt = number if mixed or number >= LONGEST else 0
             progress(f"posterior: step {number}", number / (max(burnt, every) + steps))
             if burnt and number == burnt + steps:

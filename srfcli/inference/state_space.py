@@ -12,7 +12,7 @@ Kristensen, Madsen and Jorgensen, Automatica 40 (2004); Hartikainen and Sarkka 2
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -21,11 +21,12 @@ from typing import TypeVar
 import numpy as np
 from scipy.signal import lfilter, welch
 
+from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.data.values import Experiment, Run
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
-from srfcli.inference.kalman import GAUGE_PROCESSES, Dual, Innovations, Smoothed, kalman_filter, smooth
+from srfcli.inference.kalman import Dual, Innovations, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, stretches
 from srfcli.inference.prediction import (
     TINY,
@@ -45,7 +46,7 @@ FIELD = ("field_amplitude", "field_length")
 PROCESSES = ("relaxation", "oscillation")  # of coloured gauge noise: e' = -e / tau + w, or e'' + (omega / q) e' + omega^2 e = w
 # A fit begins with the likeliest of nine fields: amplitudes over the friction of the recordings, lengths over that of PIECES
 WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
-ELSEWHERE = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
+SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
 SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
 FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
 BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
@@ -61,11 +62,11 @@ CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
-TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
+CORRELATION_TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
 QUALITIES = (0.5, 3.0, 30.0)  # of an oscillation, where it begins: smooth noise, a broad line and a narrow one
 QUALITY = (0.2, 1000.0)  # of an oscillation: one of a smaller quality is a relaxation
-SEGMENT = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
+PERIODOGRAM = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
 FASTEST = 1.0  # frequency of an oscillation times the spacing: smooth noise may end beyond half of the sampling rate
 DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
@@ -160,11 +161,10 @@ def filter_run(
         along, name = basis(run, trend), f"{run.name}.trend"
         offset = Dual(values.get(name, 0.0) * along, np.outer(along, [float(b == name) for b in by]))
     gauges, rate = gauges or [{n: n for n in values if n.startswith("gauge_")}] * len(run.sampling.spacings), run.sampling.at
-    white, white_d = _named([own["gauge_white"] for own in gauges], values, by)
-    R = Dual((white**2)[rate] + run.quantum**2 / 12, (2 * white[:, None] * white_d)[rate])
-    every = (gauge_process(j, kind) for j, kind in product(range(1, GAUGE_PROCESSES + 1), PROCESSES))
-    rows = [row for row in every if row[0] in gauges[0]]
-    colour = Dual(*_named([own[n] if n else "" for own in gauges for row in rows for n in (*row, "")[:3]], values, by))
+    white = _dual([own["gauge_white"] for own in gauges], values, by)
+    R = Dual((white.v**2)[rate] + run.quantum**2 / 12, (2 * white.v[:, None] * white.d)[rate])
+    rows = gauge_rows(processes_in(gauges[0]))
+    colour = _dual([own[n] if n else "" for own in gauges for row in rows for n in (*row, "")[:3]], values, by)
     gauge = Dual(colour.v.reshape(len(gauges), len(rows), 3), colour.d.reshape(len(gauges), len(rows), 3, k))
     size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
     fine = np.array([max(values["field_amplitude"], 1e-3) if s.startswith("field") else 1.0 for s in model.states])
@@ -185,20 +185,25 @@ def field_columns(likelihood: Likelihood, run: Run, values: Mapping[str, float])
     return _field_columns(model, run, p, x0)[:, 0]
 
 
-def gauge_process(number: int, kind: str) -> tuple[str, ...]:
-    """Return the names of the parameters of a process of coloured gauge noise, the first is 1; `kind` is one of PROCESSES.
+def gauge_rows(processes: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return the names of the parameters of each process of coloured gauge noise; the second is its standard deviation."""
+    forms = {
+        "relaxation": "gauge_time{0} gauge_colour{0}",
+        "oscillation": "gauge_frequency{0} gauge_colour{0} gauge_quality{0}",
+    }
+    return [tuple(forms[kind].format(j + 1).split()) for j, kind in enumerate(processes)]
 
-    The second is its standard deviation.
-    """
-    if kind == "relaxation":
-        return f"gauge_time{number}", f"gauge_colour{number}"
-    return f"gauge_frequency{number}", f"gauge_colour{number}", f"gauge_quality{number}"
+
+def processes_in(names: Container[str]) -> list[str]:
+    """Return the processes of coloured gauge noise whose parameters are among the names."""
+    every = [(kind, gauge_rows([kind] * GAUGE_PROCESSES)) for kind in PROCESSES]
+    return [kind for j in range(GAUGE_PROCESSES) for kind, rows in every if rows[j][0] in names]
 
 
-def _named(names: Sequence[str], values: Mapping[str, float], by: Sequence[str]) -> tuple[Array, Array]:
-    """Return values (m,) by name, 0 for no name, and their derivatives (m, k) by those in `by`."""
+def _dual(names: Sequence[str], values: Mapping[str, float], by: Sequence[str]) -> Dual:
+    """Return values (m,) by name, 0 for no name, with their derivatives by those in `by`."""
     d = np.array([[float(b == n) for b in by] for n in names])
-    return np.array([values[n] if n else 0.0 for n in names]), d.reshape(len(names), len(by))
+    return Dual(np.array([values[n] if n else 0.0 for n in names]), d.reshape(len(names), len(by)))
 
 
 def _belief(
@@ -288,9 +293,9 @@ class Likelihood:
         self.threads, self.evaluations = threads, 0
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs)
-        self._gauge = ["gauge_white", *(n for j, kind in enumerate(processes) for n in gauge_process(j + 1, kind))]
+        self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
         self.kinds = list(dict.fromkeys((run.observable, dt) for run in problem.runs for dt in _spacings(run)))
-        wanted = [*(() if smooth else FIELD), *(n for kind in self.kinds for n in self.own(kind).values())]
+        wanted = [*(() if smooth else FIELD), *(n for kind in self.kinds for n in self.gauge_names(kind).values())]
         own = [(n, *scales[n.partition("[")[0].rstrip("123")]) for n in wanted]
         self.names = (*problem.names, *(row[0] for row in own))
         rows = [*zip(problem.start, problem.lower, problem.upper, strict=True), *(row[1:] for row in own)]
@@ -325,7 +330,7 @@ class Likelihood:
                 x[i] = np.log(max(values[name], 1e-300)) if self.logarithmic[i] else values[name]
         return np.clip(x, self.lower, self.upper)
 
-    def own(self, kind: tuple[str, float]) -> dict[str, str]:
+    def gauge_names(self, kind: tuple[str, float]) -> dict[str, str]:
         """Return the names of the gauge noise of a kind, an observable and a spacing, by those that `filter_run` has."""
         return {n: n if len(self.kinds) == 1 else f"{n}[{kind[0]}, {kind[1]:g} s]" for n in self._gauge}
 
@@ -335,7 +340,7 @@ class Likelihood:
         A run that was held out has those of what was sampled most alike.
         """
         near = [kind for kind in self.kinds if kind[0] == run.observable] or self.kinds
-        return [self.own(min(near, key=lambda kind: abs(np.log(kind[1] / dt)))) for dt in _spacings(run)]
+        return [self.gauge_names(min(near, key=lambda kind: abs(np.log(kind[1] / dt)))) for dt in _spacings(run)]
 
     def filtered(
         self,
@@ -513,10 +518,7 @@ def maximise(
                 more = _curvature_beyond(last, point)
                 slow = slow + 1 if gain < close**2 / 8 else 0
                 break
-            damping, sure = (
-                max(10 * damping, 1e-3),
-                False,
-            )  # what may fail is tried without derivatives: a quarter of the work
+            damping, sure = max(10 * damping, 1e-3), False  # what may fail is tried without derivatives: a quarter of the work
         else:
             break
     at_bound = ((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0))
@@ -609,11 +611,8 @@ def fit_state_space(
 
 def stopped(problem: Problem, values: Mapping[str, float], *, threads: int = 1) -> StateSpaceFit:
     """Return the state of a fit that was stopped: its parameters, with errors as if they were the maximum."""
-    smooth, processes = (
-        not values.get("field_amplitude"),
-        [kind for j in (1, 2, 3) for kind in PROCESSES if any(n.startswith(gauge_process(j, kind)[0]) for n in values)],
-    )
-    likelihood = Likelihood(problem, smooth=smooth, processes=processes, threads=threads)
+    processes = processes_in({name.partition("[")[0] for name in values})
+    likelihood = Likelihood(problem, smooth=not values.get("field_amplitude"), processes=processes, threads=threads)
     point = likelihood.at(likelihood.coordinates(values))
     return StateSpaceFit(likelihood, Maximum(point, np.inf, Status.INTERRUPTED, inverse(point.information)), 1)
 
@@ -642,17 +641,17 @@ def _fitted(
             return _with_or_without(wider, smooth, likelihood, close, progress)
         best = wider
         known = best.likelihood.processes
-        if smooth is None and not best.smooth and (not known or (fine(best) and len(known) < GAUGE_PROCESSES)):
+        if smooth is None and not best.smooth and (not known or (_short_field(best) and len(known) < GAUGE_PROCESSES)):
             other = _coloured(best, likelihood(True, (*known, "relaxation")), progress)  # colour in place of the field?
             if other.criterion > best.criterion - CLOSE_CALL:
                 own = maximise(other.likelihood, other.maximum.point.x, close=close, progress=progress)
                 other = StateSpaceFit(other.likelihood, own, other.likelihood.evaluations)
             better, worse = (other, best) if other.criterion > best.criterion else (best, other)
-            best = _counted(better, worse.evaluations)
+            best = replace(better, evaluations=better.evaluations + worse.evaluations)
     return best
 
 
-def fine(fitted: StateSpaceFit) -> bool:
+def _short_field(fitted: StateSpaceFit) -> bool:
     """Return whether the field is as short as a field may be: along slip then as the gauge's noise is in time."""
     at = fitted.likelihood.names.index("field_length")
     return bool(fitted.maximum.point.x[at] < fitted.likelihood.lower[at] + 0.1)
@@ -680,8 +679,8 @@ def _with_colour(
             if not steadily_coloured(wider.maximum.point):
                 break
         if found is best:
-            return StateSpaceFit(best.likelihood, best.maximum, spent)
-        best = StateSpaceFit(found.likelihood, found.maximum, spent)
+            return replace(best, evaluations=spent)
+        best = replace(found, evaluations=spent)
     return best
 
 
@@ -807,12 +806,12 @@ def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
 def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str], None]) -> StateSpaceFit:
     """Return the fit with one more process of gauge noise, from the likeliest of a few starts for each kind of noise."""
     kind, number = wider.processes[-1], len(wider.processes)
-    row = gauge_process(number, kind)
+    row = gauge_rows(wider.processes)[-1]
     x = wider.coordinates(fitted.values)
-    owns = [{n: wider.names.index(name) for n, name in wider.own(of).items()} for of in wider.kinds]
+    owns = [{n: wider.names.index(name) for n, name in wider.gauge_names(of).items()} for of in wider.kinds]
     if kind == "relaxation":
         low, high = (float(side[owns[0][row[0]]]) for side in (wider.lower, wider.upper))
-        starts: list[list[tuple[float, ...]]] = [[(low + share * (high - low),) for share in TIMES]] * len(owns)
+        starts: list[list[tuple[float, ...]]] = [[(low + share * (high - low),) for share in CORRELATION_TIMES]] * len(owns)
     else:
         starts = [[*product(np.log(peaks), np.log(QUALITIES))] for peaks in _peaks(fitted, wider.kinds)]
     best = -np.inf
@@ -843,8 +842,8 @@ def _peaks(fitted: StateSpaceFit, kinds: Sequence[tuple[str, float]]) -> list[li
     found = []
     for of in kinds:
         pieces = [white for white, _, own in fitted.likelihood.pieces(fitted.maximum.point) if own == of]
-        power = [welch(w, fs=1 / of[1], nperseg=SEGMENT)[1][1:] * w.size for w in pieces if w.size >= SEGMENT]
-        peak = (1 + int(np.argmax(sum(power)))) / (SEGMENT * of[1]) if power else 0.05 / of[1]
+        power = [welch(w, fs=1 / of[1], nperseg=PERIODOGRAM)[1][1:] * w.size for w in pieces if w.size >= PERIODOGRAM]
+        peak = (1 + int(np.argmax(sum(power)))) / (PERIODOGRAM * of[1]) if power else 0.05 / of[1]
         found.append([peak, 0.03 / of[1], 0.15 / of[1]])
     return found
 
@@ -864,10 +863,6 @@ def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Arra
     found = x.copy()
     found[amplitude], found[length] = rough.lower[amplitude] + np.log(wide / SMALL), rough.start[length] + np.log(short)
     return found
-
-
-def _counted(fitted: StateSpaceFit, more: int) -> StateSpaceFit:
-    return StateSpaceFit(fitted.likelihood, fitted.maximum, fitted.evaluations + more)
 
 
 def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Array:
@@ -890,7 +885,7 @@ def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[s
 
 
 def _elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> Array:
-    """Return the likeliest of ELSEWHERE starts over the bounds under a wide field, x where none can be followed.
+    """Return the likeliest of SOBOL_STARTS starts over the bounds under a wide field, x where none can be followed.
 
     A model that slips without end at the file's start values, as one without inertia may, is followed from others.
     """
@@ -898,7 +893,7 @@ def _elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> 
 
     k = len(rough.problem.names)
     best = (-np.inf, x)
-    for share in qmc.Sobol(k, seed=0).random(ELSEWHERE):
+    for share in qmc.Sobol(k, seed=0).random(SOBOL_STARTS):
         trial = x.copy()
         trial[:k] = rough.lower[:k] + share * (rough.upper - rough.lower)[:k]
         trial = _under_field(rough, trial, WIDE[-1], SHORT[1])
@@ -918,12 +913,12 @@ def as_fit(found: StateSpaceFit) -> Fit:
     likelihood, maximum = found.likelihood, found.maximum
     problem, values, k = likelihood.problem, found.values, len(likelihood.problem.names)
     held = [likelihood.held_out(run, values) for run in problem.experiment.runs if run.holdout]
-    own_names, runs = [gauge_process(j + 1, kind) for j, kind in enumerate(likelihood.processes)], []
+    rows, runs = gauge_rows(likelihood.processes), []
     for f in (*maximum.point.runs, *held):
         gauges, rate = likelihood.gauges(f.run), f.run.sampling.at
         levels = np.array([np.hypot(values[own["gauge_white"]], f.run.quantum / np.sqrt(12)) for own in gauges])
         level = float(np.sqrt(np.mean(levels[rate] ** 2)))
-        every = (tuple(values[own[n]] for n in row) for own in gauges for row in own_names)
+        every = (tuple(values[own[n]] for n in row) for own in gauges for row in rows)
         colours = tuple(colour for colour in every if colour[1] > 0.1 * level)
         with np.errstate(invalid="ignore"):
             residual = f.found.nu / np.sqrt(f.found.S) * levels[rate]

@@ -325,18 +325,18 @@ def _fell(answer: Mapping[str, Any]) -> str:
     before, after = rms_of(answer, "baseline", "fit"), rms_of(answer, "augmented", "fit")
     if before is None or after is None:
         return "the residuals change as shown below"
-    text = f"residuals {_changed(before, after, 'fall')} times the noise in the fitted runs"
+    text = f"residuals {_changed(before, after)} times the noise in the fitted runs"
     held = rms_of(answer, "baseline", "holdout"), rms_of(answer, "augmented", "holdout")
     if held[0] is None or held[1] is None:
         return text
-    return f"{text}, and {_changed(held[0], held[1], '')} times in runs that the fit never saw".replace("  ", " ")
+    return f"{text}, and {_changed(held[0], held[1])} times in runs that the fit never saw"
 
 
-def _changed(before: float, after: float, verb: str) -> str:
-    """Return `fall from 1.20 to 1.00`, or `stay at 1.00` where both read alike; `verb` is for what falls."""
+def _changed(before: float, after: float) -> str:
+    """Return `fall from 1.20 to 1.00`, or `stay at 1.00` where both read alike."""
     if rms(before) == rms(after):
         return f"stay at {rms(after)}"
-    return f"{verb if after < before else 'rise'} from {rms(before)} to {rms(after)}"
+    return f"{'fall' if after < before else 'rise'} from {rms(before)} to {rms(after)}"
 
 
 def _random_friction(answer: Mapping[str, Any]) -> str:
