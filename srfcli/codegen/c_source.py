@@ -292,8 +292,11 @@ def _(node: ast.Call) -> str:
 
 # Integrator, filter and periodic orbits in C, compiled with a model's own rates by what C compiler there is, kept by content.
 
-FLAGS = (  # no contraction: the digits are the same whatever the processor
-    "-O3", "-std=c99", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off", "-Wno-psabi",
+# no contraction: the digits are the same whatever the processor; vectors and peeled loops are what makes -O3 fast here, in 0.6
+# of the time to compile
+FLAGS = (
+    "-O2", "-ftree-vectorize", "-fpeel-loops",
+    "-std=c99", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off", "-Wno-psabi",
 )  # fmt: skip
 VECTORS = ("avx512f", "avx2")  # instruction sets that carry derivatives several at a time, the widest first
 FUNCTIONS = {"rates": "srf_rates", "rates_jacobian": "srf_jacobian", "rates_parameters": "srf_parameters"}
@@ -302,7 +305,7 @@ DUAL_FUNCTIONS = {
     "elongation_gradient": "srf_d_gradient",
 }  # fmt: skip
 ORBIT_FUNCTIONS = {"cycle": "srf_cycle", "cycle_jacobian": "srf_cycle_jacobian", "cycle_bilinear": "srf_bilinear"}
-LANES = 8  # derivatives that the filter carries along at a time
+LANES = 16  # derivatives that the filter carries along at a time: a run has 11 to 14
 GAUGE_PROCESSES = 3  # of coloured gauge noise, at most, of one state or two
 TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
 

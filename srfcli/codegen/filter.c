@@ -37,6 +37,41 @@ static double legendre(int k, double s) {
     return k == 0 ? 1.0 : k == 1 ? sqrt(3.0) * y : sqrt(5.0) * 0.5 * (3.0 * y * y - 1.0);
 }
 
+/* how the end of a step answers to rates at each of its stages, out (NX, NZ): the last rows of the stages' inverse, times h A */
+static void answers(const double *a, const int *pivot, double h, double *out) {
+    for (int r = 0; r < NX; r++) {
+        double w[NZ] = {0.0};
+        w[2 * NX + r] = 1.0;
+        for (int k = 2 * NX + r; k < NZ; k++) {
+            w[k] /= a[k * NZ + k];
+            for (int i = k + 1; i < NZ; i++) w[i] -= a[k * NZ + i] * w[k];
+        }
+        for (int k = NZ - 1; k >= 0; k--)
+            for (int i = 0; i < k; i++) w[i] -= a[k * NZ + i] * w[k];
+        for (int k = NZ - 1; k >= 0; k--) {
+            double swap = w[k];
+            w[k] = w[pivot[k]];
+            w[pivot[k]] = swap;
+        }
+        for (int i = 0; i < 3; i++)
+            for (int c = 0; c < NX; c++)
+                out[r * NZ + i * NX + c] = h * (A[0][i] * w[c] + A[1][i] * w[NX + c] + A[2][i] * w[2 * NX + c]);
+    }
+}
+
+/* out (n) += k times x (n): derivatives lie one after the other, and are taken as plain numbers */
+static inline void add_scaled(int n, double k, const void *x, void *out) {
+    const double *from = x;
+    double *to = out;
+    for (int i = 0; i < n; i++) to[i] += k * from[i];
+}
+
+static int nonzero(const lanes *d) {
+    int some = 0;
+    for (int i = 0; i < LANES; i++) some |= (*d)[i] != 0.0;
+    return some;
+}
+
 /* Covariance and tangents across one step whose stages are solved; the mean is moved too. Returns the error of the covariance
    over what is allowed, by the share that the last polynomial has in the variances; nothing is changed unless it is below 1. */
 static double moments(Imposed *force, Course *course, Belief *b, double t, double h, const double *Z) {
@@ -72,9 +107,11 @@ static double moments(Imposed *force, Course *course, Belief *b, double t, doubl
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < NC; c++) Phi[r * NC + c] = B[(2 * NX + r) * m + c] + (r == c ? 1.0 : 0.0);
     if (!finite_all(Phi, NX * NC)) return INFINITY;
-    static const lanes none = {0.0};
-    lanes dG[NZ * NC], dB[NZ * NC], *dPhi = dB + 2 * NX * NC;
+    lanes dPhi[NX * NC];
     if (course->slopes) {
+        double K[NX * NZ];
+        answers(matrix, pivot, h, K);
+        memset(dPhi, 0, sizeof dPhi);
         for (int i = 0; i < 3; i++) {
             dual dJ[NX * NX], dgain[NX];
             for (int r = 0; r < NX; r++) {
@@ -87,18 +124,17 @@ static double moments(Imposed *force, Course *course, Belief *b, double t, doubl
             memset(dgain, 0, sizeof dgain);
             srf_d_jacobian(y, V[i], W[i], W_dot[i], course->q, dJ);
             srf_d_gain(y, V[i], W[i], W_dot[i], course->q, dgain);
-            for (int r = 0; r < NX; r++)
-                for (int c = 0; c < NC; c++) {
-                    lanes sum = none;
-                    if (c >= NX) sum = dgain[r].d * (legendre(c - NX, C[i]) / sqrt(h));
-                    for (int k = 0; k < NX; k++) sum += dJ[r * NX + k].d * (B[(i * NX + k) * m + c] + (k == c ? 1.0 : 0.0));
-                    dG[(i * NX + r) * NC + c] = sum;
-                }
+            for (int r = 0; r < NX; r++) {
+                lanes dG[NC];
+                memset(dG, 0, sizeof dG);
+                for (int k = 0; k < MODES; k++) add_scaled(LANES, legendre(k, C[i]) / sqrt(h), &dgain[r].d, dG + NX + k);
+                for (int k = 0; k < NX; k++)
+                    if (nonzero(&dJ[r * NX + k].d))
+                        for (int c = 0; c < NC; c++)
+                            add_scaled(LANES, B[(i * NX + k) * m + c] + (k == c ? 1.0 : 0.0), &dJ[r * NX + k].d, dG + c);
+                for (int s = 0; s < NX; s++) add_scaled(NC * LANES, K[s * NZ + i * NX + r], dG, dPhi + s * NC);
+            }
         }
-        for (int i = 0; i < 3; i++)
-            for (int r = 0; r < NX * NC; r++)
-                dB[i * NX * NC + r] = (h * A[i][0]) * dG[r] + (h * A[i][1]) * dG[NX * NC + r] + (h * A[i][2]) * dG[2 * NX * NC + r];
-        solve(NZ, matrix, pivot, (double *)dB, NC * LANES);
     }
     double M[NX * NA], P[NX * NX];
     lanes dM[NX * NA];
@@ -109,12 +145,15 @@ static double moments(Imposed *force, Course *course, Belief *b, double t, doubl
             for (int k = 0; k < NX; k++) sum += Phi[r * NC + k] * b->P[k * NA + c], through += Phi[r * NC + k] * b->T[k * NA + c];
             M[r * NA + c] = sum;
             G[r * NA + c] = through;
-            if (course->slopes) {
-                lanes slope = none;
-                for (int k = 0; k < NX; k++) slope += dPhi[r * NC + k] * b->P[k * NA + c] + Phi[r * NC + k] * b->Pd[k * NA + c];
-                dM[r * NA + c] = slope;
-            }
         }
+    if (course->slopes) {
+        memset(dM, 0, sizeof dM);
+        for (int r = 0; r < NX; r++)
+            for (int k = 0; k < NX; k++) {
+                for (int c = 0; c < na; c++) add_scaled(LANES, b->P[k * NA + c], dPhi + r * NC + k, dM + r * NA + c);
+                add_scaled(na * LANES, Phi[r * NC + k], b->Pd + k * NA, dM + r * NA);
+            }
+    }
     for (int r = 0; r < NX; r++)
         for (int c = 0; c <= r; c++) {
             double sum = 0.0;
@@ -147,9 +186,15 @@ static double moments(Imposed *force, Course *course, Belief *b, double t, doubl
         for (int c = 0; c <= r; c++) {
             b->P[r * NA + c] = b->P[c * NA + r] = P[r * NX + c];
             if (course->slopes) {
-                lanes slope = none;
-                for (int k = 0; k < NX; k++) slope += dM[r * NA + k] * Phi[c * NC + k] + M[r * NA + k] * dPhi[c * NC + k];
-                for (int k = NX; k < NC; k++) slope += dPhi[r * NC + k] * Phi[c * NC + k] + Phi[r * NC + k] * dPhi[c * NC + k];
+                lanes slope = {0.0};
+                for (int k = 0; k < NX; k++) {
+                    add_scaled(LANES, Phi[c * NC + k], dM + r * NA + k, &slope);
+                    add_scaled(LANES, M[r * NA + k], dPhi + c * NC + k, &slope);
+                }
+                for (int k = NX; k < NC; k++) {
+                    add_scaled(LANES, Phi[c * NC + k], dPhi + r * NC + k, &slope);
+                    add_scaled(LANES, Phi[r * NC + k], dPhi + c * NC + k, &slope);
+                }
                 b->Pd[r * NA + c] = b->Pd[c * NA + r] = slope;
             }
         }
@@ -394,7 +439,9 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
             dPH[i] = none;
             for (int j = 0; j < na; j++) {
                 PH[i] += b.P[i * NA + j] * H[j];
-                dPH[i] += b.Pd[i * NA + j] * H[j] + b.P[i * NA + j] * dH[j];
+                if (!slopes) continue;
+                add_scaled(LANES, H[j], b.Pd + i * NA + j, dPH + i);
+                add_scaled(LANES, b.P[i * NA + j], dH + j, dPH + i);
             }
         }
         double variance = noise.v, miss = observed[k] - reading.v;
@@ -419,10 +466,11 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
         for (int i = 0; i < na; i++) {
             double gain = PH[i] / variance;
             lanes dgain = (dPH[i] - gain * dvariance) / variance;
-            for (int j = 0; j < na; j++) {
-                b.Pd[i * NA + j] -= dgain * PH[j] + gain * dPH[j];
-                b.P[i * NA + j] -= gain * PH[j];
+            if (slopes) {
+                for (int j = 0; j < na; j++) add_scaled(LANES, -PH[j], &dgain, b.Pd + i * NA + j);
+                add_scaled(na * LANES, -gain, dPH, b.Pd + i * NA);
             }
+            for (int j = 0; j < na; j++) b.P[i * NA + j] -= gain * PH[j];
             b.xd[i] += dgain * miss + gain * dmiss;
             b.x[i] += gain * miss;
         }
