@@ -22,9 +22,11 @@ srf prove --out proof                                      ten cases: a first lo
 srf prove --cases 200 --seed 4 --workers 0 --out proof     two hundred cases on all cores
 srf prove --out proof --resume                             go on with what was interrupted
 srf prove --cases 40 --kind none --out nulls               false alarms alone
+srf prove --cases 40 --track own --out rough               every run on a rough track of its own
 srf prove --report-only proof --json | jq .meta.rates      the tables again
 """
 KINDS = ("none", "single", "pair", "outside")
+TRACKS = ("smooth", "shared", "own")
 
 
 @click.command("prove", cls=SrfCommand, epilog=EXAMPLES)
@@ -36,6 +38,11 @@ KINDS = ("none", "single", "pair", "outside")
     multiple=True,
     type=click.Choice(KINDS),
     help="Make cases of this kind only; may be given several times.",
+)
+@click.option(
+    "--track",
+    type=click.Choice(TRACKS),
+    help="Make cases on such tracks only: smooth, a rough one that all runs share, or one of each run's own.",
 )
 @click.option(
     "--workers", type=click.IntRange(0, 4096), default=1, show_default=True, help="Processes, 0 for all cores."
@@ -65,6 +72,7 @@ def command(
     cases: int | None,
     seed: int | None,
     kinds: tuple[str, ...],
+    track: str | None,
     workers: int,
     out: Path | None,
     resume: bool,
@@ -96,9 +104,15 @@ def command(
     count = workers or os.cpu_count() or 1
     if report is None:
         assert out is not None
-        trial = _answered(out, cases, seed, kinds, resume, unfinished, count, limit, plugins)
+        trial = _answered(out, cases, seed, kinds, track, resume, unfinished, count, limit, plugins)
     else:
-        given = {"--cases": cases is not None, "--seed": seed is not None, "--kind": bool(kinds), "--resume": resume}
+        given = {
+            "--cases": cases is not None,
+            "--seed": seed is not None,
+            "--kind": bool(kinds),
+            "--track": track is not None,
+            "--resume": resume,
+        }
         for option in (name for name, present in given.items() if present):
             raise SrfError(f"{option} has no meaning with --report-only", "Leave it out.")
         trial = Trial(report)
@@ -111,6 +125,7 @@ def _answered(
     cases: int | None,
     seed: int | None,
     kinds: tuple[str, ...],
+    track: str | None,
     resume: bool,
     unfinished: bool,
     workers: int,
@@ -135,6 +150,7 @@ def _answered(
                 cases=cases,
                 seed=seed,
                 kinds=kinds,
+                track=track,
                 resume=resume,
                 workers=workers,
                 told=lambda k, n: progress.advance(),

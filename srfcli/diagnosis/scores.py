@@ -10,7 +10,7 @@ Rao 1948; de Jong and Penzer, JASA 93 (1998).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -35,6 +35,7 @@ from srfcli.laws.values import Effect
 
 NODES, MOST_NODES = 0.4, 400  # of a shared field: correlation lengths between them; how many
 NOTHING = 1e-100  # of a column's squares: a bump beyond the ends of all runs, say
+TOGETHER = 32  # columns that are projected at a time
 FINE = 20  # points between samples at which a function of slip or stage is averaged
 
 
@@ -67,12 +68,18 @@ class PairScore:
 
 @dataclass(frozen=True)
 class _Column:
-    """Columns (2 m, q) of an effect by the size called `name`, at given inner values; names are the effect's own."""
+    """Columns (2 m, q) of an effect by the size called `name`, at given inner values; names are the effect's own.
+
+    Projected, they are free of what was fitted, `whole` is their square before that, and `along` (r, q) what they have of the
+    field that all runs share.
+    """
 
     effect: Effect
     name: str
     inner: dict[str, float]
     columns: Array
+    whole: float = 0.0
+    along: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -159,16 +166,17 @@ class Scores:
         self.remainder, self.fitted = remainder, remainder.fitted
         self.excluded: list[Excluded] = []
         self.shared = self.remainder.shared
-        self.columns = self._all(candidates)
+        self.columns = self._projected(self._all(candidates))
         self.singles = self._singles()
 
     def _all(self, candidates: Sequence[Effect]) -> list[_Column]:
         shapes = {e.name: shape for e in candidates if (shape := along_table(e)) is not None}
         found: list[_Column] = []
         regular = [e for e in candidates if e.sizes and not e.settings and not e.observed and e.name not in shapes]
-        found += self._plain([e for e in regular if not e.scans])
-        for effect in (e for e in regular if e.scans):
-            found += self._scanned(effect)
+        stateful = [e for e in regular if e.states]  # at most one in a model: what a pass costs grows as its states cubed
+        found += self._derived([e for e in regular if not e.states] + stateful[:1])
+        for effect in stateful[1:]:
+            found += self._derived([effect])
         along = [e for e in candidates if e.name in shapes]
         if along:
             found += self._along(along, shapes)
@@ -211,8 +219,11 @@ class Scores:
 
         return np.concatenate(likelihood.over_runs(block))
 
-    def _plain(self, effects: Sequence[Effect]) -> list[_Column]:
-        """Return the columns of effects without inner parameters, all from one model where they go together."""
+    def _derived(self, effects: Sequence[Effect]) -> list[_Column]:
+        """Return the columns of effects from one model that has them all, in parts where they do not go together.
+
+        Each has its inner parameters at the values of its own grid; at neutral sizes none sees those of another.
+        """
         if not effects:
             return []
         try:
@@ -222,26 +233,25 @@ class Scores:
                 self.excluded.append(Excluded(effects[0].reported, error.message))
                 return []
             half = len(effects) // 2
-            return self._plain(effects[:half]) + self._plain(effects[half:])
-        sizes = [(e, long) for e in effects for long, p in own_parameters(e, model).items() if p.name in e.sizes]
-        columns = self._run_columns(model, self._neutral(model, effects), [long for _, long in sizes])
-        return [_Column(e, e.sizes[0], {}, columns[:, [j]]) for j, (e, _) in enumerate(sizes)]
-
-    def _scanned(self, effect: Effect) -> list[_Column]:
-        try:
-            model = self._model([effect])
-        except SrfError as error:
-            self.excluded.append(Excluded(effect.reported, error.message))
-            return []
-        longs = {p.name: long for long, p in own_parameters(effect, model).items()}
-        base, found = self._neutral(model, [effect]), []
-        for group in _phases(inner_grid(effect)):
-            parts = []
-            for inner in group:
-                values = base | {longs[n]: v for n, v in inner.items()}
-                parts.append(self._run_columns(model, values, [longs[effect.sizes[0]]]))
-            found.append(_Column(effect, effect.sizes[0], group[0], np.concatenate(parts, axis=1)))
-        return found
+            return self._derived(effects[:half]) + self._derived(effects[half:])
+        longs = {e.name: {p.name: long for long, p in own_parameters(e, model).items()} for e in effects}
+        grids = {e.name: [inner for group in _phases(inner_grid(e)) for inner in group] for e in effects}
+        columns: dict[str, list[Array]] = {e.name: [] for e in effects}
+        for j in range(max(len(grid) for grid in grids.values())):
+            some = [e for e in effects if j < len(grids[e.name])]
+            inner = {longs[e.name][n]: v for e in some for n, v in grids[e.name][j].items()}
+            sizes = [longs[e.name][e.sizes[0]] for e in some]
+            found = self._run_columns(model, self._neutral(model, effects) | inner, sizes)
+            for k, e in enumerate(some):
+                columns[e.name].append(found[:, k])
+        made = []
+        for e in effects:
+            at = 0
+            for group in _phases(inner_grid(e)):
+                block = np.stack(columns[e.name][at : at + len(group)], axis=1)
+                made.append(_Column(e, e.sizes[0], group[0], block))
+                at += len(group)
+        return made
 
     def _freed(self, effect: Effect) -> list[_Column]:
         columns = self._run_columns(self.fitted.likelihood.problem.model, self.fitted.values, ["K"])
@@ -270,18 +280,38 @@ class Scores:
             at += len(group)
         return found
 
-    def _judge(self, columns: Array) -> tuple[float, Array, Array, Array]:
-        """Return gain, sizes, their covariance and the free columns."""
-        free = self.remainder.free(columns)
+    def _projected(self, columns: Sequence[_Column]) -> list[_Column]:
+        """Return the columns that do something here, projected off what was fitted, many at a time."""
+        found: list[_Column] = []
+        for first in range(0, len(columns), TOGETHER):
+            size = [float(np.sum(c.columns**2)) for c in columns[first : first + TOGETHER]]
+            some = [
+                replace(c, whole=whole)
+                for c, whole in zip(columns[first : first + TOGETHER], size, strict=True)
+                if whole > NOTHING and np.isfinite(whole)
+            ]
+            if not some:
+                continue
+            free = self.remainder.free(np.concatenate([c.columns for c in some], axis=1))
+            along = self.shared.u.T @ free if self.shared.gain else None
+            at = 0
+            for c in some:
+                part = slice(at, at := at + c.columns.shape[1])
+                found.append(replace(c, columns=free[:, part], along=None if along is None else along[:, part]))
+        return found
+
+    def _judge(self, *several: _Column) -> tuple[float, Array, Array]:
+        """Return what columns gain together, their sizes, and the covariance of these."""
+        free = np.concatenate([c.columns for c in several], axis=1)
         gram, g = free.T @ free, free.T @ self.remainder.left
         plain = self._solved(gram, g)
         if not self.shared.gain:
-            return (*plain, free)
-        along = self.shared.u.T @ free
+            return plain
+        along = np.concatenate([c.along for c in several if c.along is not None], axis=1)
         kept = along * self.shared.absorbed[:, None]
         beside = self._solved(gram - along.T @ kept, g - kept.T @ self.shared.left)
         gain = max(plain[0] - self.shared.gain, beside[0])
-        return (gain, *(beside if gain == beside[0] else plain)[1:], free)
+        return (gain, *(beside if gain == beside[0] else plain)[1:])
 
     def _solved(self, gram: Array, g: Array) -> tuple[float, Array, Array]:
         d = np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -294,21 +324,19 @@ class Scores:
     def _singles(self) -> list[Score]:
         best: dict[str, Score] = {}
         for column in self.columns:
-            whole = float(np.sum(column.columns**2))
-            if not whole > NOTHING or not np.isfinite(whole):
-                continue  # it does nothing here
-            gain, size, covariance, free = self._judge(column.columns)
+            gain, size, covariance = self._judge(column)
             effect = column.effect
             if not self._possible(column, size):
                 gain = 0.0
             if effect.reported in best and best[effect.reported].gain >= gain:
                 continue
             error = float(np.sqrt(max(covariance[0, 0], 0.0)))
+            free = float(np.sum(column.columns**2)) / column.whole
             values = self._expected(column, size)
-            direction = free @ size
+            direction = column.columns @ size
             norm = float(np.linalg.norm(direction))
             best[effect.reported] = Score(
-                effect, gain, values, float(size[0]), error, error * np.sqrt(24.0), float(np.sum(free**2)) / whole,
+                effect, gain, values, float(size[0]), error, error * np.sqrt(24.0), free,
                 direction / norm if norm > 0 else direction,
             )  # fmt: skip
         return sorted(best.values(), key=lambda s: -s.gain)
@@ -340,12 +368,11 @@ class Scores:
         """Return what any two of the foremost effects could explain together, largest gain first."""
         chosen: dict[str, list[tuple[float, _Column]]] = {}
         for column in self.columns:
-            if np.isfinite(column.columns).all() and np.sum(column.columns**2) > NOTHING:
-                chosen.setdefault(column.effect.reported, []).append((self._judge(column.columns)[0], column))
+            chosen.setdefault(column.effect.reported, []).append((self._judge(column)[0], column))
         foremost = [max(found, key=lambda f: f[0])[1] for found in chosen.values()]
         found = []
         for a, b in combinations(foremost, 2):
-            gain, size, _, _ = self._judge(np.concatenate([a.columns, b.columns], axis=1))
+            gain, size, _ = self._judge(a, b)
             cut = a.columns.shape[1]
             if not (self._possible(a, size[:cut]) and self._possible(b, size[cut:])):
                 continue

@@ -120,6 +120,7 @@ def variants(name: str) -> tuple[Effect, ...]:
 # What a case is made of, drawn from its seed: laws around those of the examples, effects, protocol, track and gauge.
 
 KINDS = ("none", "single", "pair", "outside")
+TRACKS = {"smooth": (False, False), "shared": (True, False), "own": (True, True)}  # whether rough, and each run's own
 SHARES = (0.25, 0.4, 0.15, 0.2)  # of the kinds, where none is asked for
 SPREAD = {"A": 0.05, "B": 0.05, "D0": 0.05, "lam": 0.05, "Vsat": 0.13, "mu0": 0.01}  # relative standard deviations
 ODD = ("rigid", "massless", "bare")  # baselines other than the usual one
@@ -166,10 +167,12 @@ def draw_recipe(
     effects: Sequence[str] | None = None,
     size: float | None = None,
     rough: bool | float | None = None,
+    own: bool | None = None,
 ) -> Recipe:
     """Return the case that `rng` gives; what is asked for is not drawn.
 
-    `size` from 0 to 1 is how strong the effects are, `rough` whether the track is, or the standard deviation of its mu0.
+    `size` from 0 to 1 is how strong the effects are, `rough` whether the track is, or the standard deviation of its mu0, `own`
+    whether each run has a rough track of its own.
     """
     chosen = _chosen(rng, kind, effects)
     drawn = rng.uniform(0, 1, size=len(chosen)).tolist()
@@ -185,7 +188,8 @@ def draw_recipe(
     plans = draw_protocol(rng)
     lag1 = float(rng.uniform(0.3, REDDEST))
     gauge = Gauge(lag1=0.0 if rng.uniform() < WHITE_SHARE else lag1)
-    if rng.uniform() < OWN_SHARE and track.size:
+    drawn_own = rng.uniform() < OWN_SHARE
+    if track.size and (drawn_own if own is None else own):
         physics, baseline = (replace(p, track=replace(track, own=True)) for p in (physics, baseline))
     return Recipe(chosen, sizes, physics, baseline, plans, gauge)
 
@@ -374,6 +378,7 @@ def make_case(
     effects: Sequence[str] | None = None,
     size: float | None = None,
     rough: bool | float | None = None,
+    own: bool | None = None,
     strengths: bool = True,
 ) -> Truth:
     """Write a concealed experiment to the new folder `folder` and return the truth about it, ready for JSON.
@@ -384,7 +389,7 @@ def make_case(
     """
     if folder.exists():
         raise SrfError(f"{folder} exists already", "A case is never overwritten; name another folder.")
-    recipe, motions, attempt = _moving(seed, {"kind": kind, "effects": effects, "size": size, "rough": rough})
+    recipe, motions, attempt = _moving(seed, {"kind": kind, "effects": effects, "size": size, "rough": rough, "own": own})
     rng = np.random.default_rng([*_whole(seed), attempt, 1])
     readings = {plan: read_gauge(u, recipe.gauge, rng, backlash=recipe.physics.backlash) for plan, u in motions.items()}
     truth = _truth(recipe, attempt, seed)
@@ -602,12 +607,13 @@ def make_bank(
     workers: int = 1,
     strengths: bool = True,
     kinds: Sequence[str] | None = None,
+    track: str | None = None,
     told: Callable[[int, int], None] | None = None,
 ) -> Bank:
     """Write `n` cases to the new folder `folder`, their truths to `apart` (default: beside it), and the seal between them.
 
-    Does not depend on the number of workers. `kinds` are the kinds of cases, default all of KINDS; `told` is called with how many
-    are done, of how many. Raises SrfError for a folder that exists and for an unknown kind.
+    Does not depend on the number of workers. `kinds` are the kinds of cases, default all of KINDS, `track` one of TRACKS, default
+    all; `told` is called with how many are done, of how many. Raises SrfError for a folder that exists and for an unknown kind.
     """
     if n < 1:
         raise SrfError(f"{n} cases", "make one or more")
@@ -618,7 +624,7 @@ def make_bank(
         raise SrfError(f"{apart} exists already", "Truths are never overwritten; name another file.")
     folder.mkdir(parents=True)
     tasks = [
-        (folder / f"case-{i:03d}", (seed, i), names, strengths)
+        (folder / f"case-{i:03d}", (seed, i), names, track, strengths)
         for i, names in enumerate(plan_bank(n, seed, kinds=kinds))
     ]
     truths: dict[str, Truth] = {}
@@ -656,9 +662,10 @@ def _counts(n: int, kinds: Sequence[str]) -> list[int]:
     return counts
 
 
-Task = tuple[Path, tuple[int, int], tuple[str, ...], bool]
+Task = tuple[Path, tuple[int, int], tuple[str, ...], str | None, bool]
 
 
 def _make(task: Task) -> tuple[str, Truth]:
-    folder, seed, names, strengths = task
-    return folder.name, make_case(folder, seed, effects=names, strengths=strengths)
+    folder, seed, names, track, strengths = task
+    rough, own = TRACKS[track] if track else (None, None)
+    return folder.name, make_case(folder, seed, effects=names, rough=rough, own=own, strengths=strengths)

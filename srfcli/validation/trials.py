@@ -63,7 +63,7 @@ class Trial:
         return self.folder / "unsealed.json"
 
     def asked(self) -> dict[str, Any]:
-        """Return what was asked for: cases, seed and kinds; SrfError where the folder is none of a trial."""
+        """Return what was asked for: cases, seed, kinds and track; SrfError where the folder is none of a trial."""
         try:
             found = parse_json(read_plain(self.note), self.note)
         except (OSError, SrfError) as error:
@@ -71,7 +71,7 @@ class Trial:
                            "Name the folder that --out of srf prove has made.") from None  # fmt: skip
         if not isinstance(found, dict) or found.get("schema") != SCHEMA:
             raise SrfError(f"{self.note}: expected schema {SCHEMA!r}", "Name the folder that srf prove has made.")
-        return {name: found[name] for name in ("cases", "seed", "kinds")}
+        return {name: found.get(name) for name in ("cases", "seed", "kinds", "track")}
 
     def digest(self) -> str:
         """Return the digest of the truths, as it was published with the cases."""
@@ -84,8 +84,8 @@ class Trial:
                 if name not in answered]  # fmt: skip
 
 
-def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[str], resume: bool, workers: int,
-          told: Callable[[int, int], None] | None = None) -> Trial:  # fmt: skip
+def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[str], track: str | None = None, resume: bool,
+          workers: int, told: Callable[[int, int], None] | None = None) -> Trial:  # fmt: skip
     """Return the trial in `folder`, its bank made and sealed; with `resume` one that is there goes on.
 
     Raises SrfError for a folder that exists where nothing is resumed, and for a trial of other cases.
@@ -95,7 +95,7 @@ def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[
         clear(folder)
     if trial.note.exists() and resume:
         asked = trial.asked()
-        given = {"cases": cases, "seed": seed, "kinds": sorted(kinds) or None}
+        given = {"cases": cases, "seed": seed, "kinds": sorted(kinds) or None, "track": track}
         other = [n for n, v in given.items() if v is not None and v != asked[n]]
         if other:
             raise SrfError(f"{folder} is a trial of {other[0]} {asked[other[0]]}, not {given[other[0]]}",
@@ -103,7 +103,12 @@ def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[
     else:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise SrfError(f"{folder} exists already", "Go on with it by --resume, or name another folder.")
-        asked = {"cases": 10 if cases is None else cases, "seed": 1 if seed is None else seed, "kinds": sorted(kinds)}
+        asked = {
+            "cases": 10 if cases is None else cases,
+            "seed": 1 if seed is None else seed,
+            "kinds": sorted(kinds),
+            "track": track,
+        }
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(trial.note, json.dumps({"schema": SCHEMA, **asked}, indent=1) + "\n")
     if not trial.bank.exists():
@@ -126,6 +131,7 @@ def _make(trial: Trial, asked: dict[str, Any], *, workers: int, told: Callable[[
             workers=workers,
             told=told,
             kinds=asked["kinds"] or None,
+            track=asked["track"],
             strengths=False,
         )
     made.folder.rename(trial.bank)
