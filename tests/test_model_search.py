@@ -14,6 +14,7 @@ from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.scores import Remainder, Scores
 from srfcli.diagnosis.search import CLOSE, ModelSearch
 from srfcli.diagnosis.verdict import conclude
+from srfcli.inference import state_space
 from srfcli.inference.state_space import COLOUR, Likelihood, correlated, fit_state_space
 from srfcli.laws.registry import bundled_registry
 from srfcli.validation.cases import Gauge, case_files, read_gauge
@@ -64,6 +65,20 @@ def test_what_is_missing_is_named_on_rough_tracks(tmp_path):
     assert sum(h.gain for h in found.held) > 0
 
 
+def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(tmp_path, monkeypatch):
+    """A search that takes every third reading says what one of all does; its fits are to all, at the same maximum."""
+    experiment = read_experiment(recorded(tmp_path, Physics(alpha=0.03)), registry=SHIPPED, holdout=False)
+    every = fit_state_space(Hypothesis().problem(SHIPPED, experiment))
+    monkeypatch.setattr(state_space, "LONG", every.likelihood.samples // 3)
+    parts = fit_state_space(Hypothesis().problem(SHIPPED, experiment))
+    assert parts.likelihood.samples == every.likelihood.samples
+    assert parts.log_likelihood == pytest.approx(every.log_likelihood, abs=0.1)
+    found = said(tmp_path)
+    assert (found.verdict, found.effects) == ("identified", ("linker-dieterich",))
+    assert {f.fit.likelihood.samples for f in found.ranked} == {every.likelihood.samples}
+    assert found.best.fit.values["alpha"] == pytest.approx(0.03, abs=0.005)
+
+
 def test_another_ageing_law_has_its_name(tmp_path):
     """Data of the slip law under a stated ageing law: the registered law, or the effect that is the same at its full size."""
     found = said(recorded(tmp_path, Physics(slip_share=1.0)))
@@ -108,7 +123,7 @@ def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
         gained.append(likelihood.at(x, slopes=False).log_likelihood)
     slope = (gained[0] - gained[1]) / (2 * size)
     first = float(column.columns[:, 0] @ scores.remainder.rest)
-    spread = float(np.linalg.norm(column.columns[:, 0]))  # standard deviation of the slope
+    spread = np.sqrt(column.whole / column.columns.shape[1])  # standard deviation of the slope, the others' share in it
     assert abs(slope - first) < 0.15 * spread
 
 

@@ -85,6 +85,11 @@ class Run:
         """Return the rates at which the run was sampled."""
         return find_sampling(self.t)
 
+    def thinned(self, every: int) -> Run:
+        """Return every so-many-th reading of the run; drive and load are as they were."""
+        own = {n: getattr(self, n)[::every] for n in ("t", "observed", "used")}
+        return replace(self, **own, proposed=None if self.proposed is None else self.proposed[::every])
+
     @property
     def load_unit(self) -> str:
         """Return the unit of the load as it is shown: N or MPa."""

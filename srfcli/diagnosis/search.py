@@ -33,6 +33,7 @@ from srfcli.inference.state_space import (
     correlated,
     fit_state_space,
     maximise,
+    thinned,
 )
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
@@ -102,6 +103,7 @@ class _Move:
 class ModelSearch:
     """One diagnosis on its way; `experiment` holds no held-out runs.
 
+    Of long recordings every so-many-th reading is searched, and what comes close is then fitted to all.
     `options` of every fit and what scores are taken from, `remainder`, are what an ablation changes.
     """
 
@@ -119,7 +121,8 @@ class ModelSearch:
         budget: float = BUDGET,
         threads: int = 1,
     ) -> None:
-        self.registry, self.experiment, self.progress, self.trend = registry, experiment, progress, trend
+        self.registry, self.whole, self.progress, self.trend = registry, experiment, progress, trend
+        self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs))
         self.candidates, self.excluded = applicable(registry, experiment, effects)
         self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]
         self.budget, self.threads, self.begun = budget, threads, time.process_time()
@@ -202,7 +205,25 @@ class ModelSearch:
                 further(self.baseline)
                 self._search()
         self._eliminate()
+        if self.experiment.runs is not self.whole.runs:
+            self._fit_all()
         return self.best()
+
+    def _fit_all(self) -> None:
+        """Fit the baseline, and what comes close to the best, to all readings; the others were not."""
+        close = [f for f in self.ranked() if self.best().evidence - f.evidence < CLOSE][:SINGLES]
+        parts = {f.name: f for f in (*close, self.baseline)}
+        self.experiment, fitted = self.whole, {}
+        options = {"processes": None, "cautious": True, **self.options}
+        for node in parts.values():
+            self.progress(f"{node.name}: all readings")
+            found = fit_state_space(
+                self._problem(node.hypothesis, node.fit.values), part=node.fit, close=NEAR, rtol=COARSE,
+                threads=self.threads, progress=self.progress, **options,
+            )  # fmt: skip
+            fitted[node.name] = replace(self._judged(node.hypothesis, found), scores=node.scores)
+            options["processes"] = self.processes = found.likelihood.processes
+        self.fitted = fitted
 
     def extend(self, nodes: Sequence[Fitted]) -> None:
         """Search on from models that another search has fitted."""

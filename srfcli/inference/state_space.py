@@ -16,7 +16,7 @@ from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.signal import lfilter, welch
@@ -56,6 +56,7 @@ CLOSE_CALL = 50.0  # in log likelihood, by which a fit that was broken off early
 HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters, when one is not worth a fit
 PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
 STEPS = 40  # of Fisher scoring
+LONG = 20_000  # readings, of all runs, beyond which a fit begins with a part of them: it finds the field and the first digits
 PATIENCE = 5  # times the steps of integration of the point before, after which a trial is given up
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
@@ -339,8 +340,12 @@ class Likelihood:
 
         A run that was held out has those of what was sampled most alike.
         """
-        near = [kind for kind in self.kinds if kind[0] == run.observable] or self.kinds
-        return [self.gauge_names(min(near, key=lambda kind: abs(np.log(kind[1] / dt)))) for dt in _spacings(run)]
+        return [self.gauge_like((run.observable, dt)) for dt in _spacings(run)]
+
+    def gauge_like(self, kind: tuple[str, float]) -> dict[str, str]:
+        """Return the names of the gauge noise of the kind that is most like this one."""
+        near = [known for known in self.kinds if known[0] == kind[0]] or self.kinds
+        return self.gauge_names(min(near, key=lambda known: abs(np.log(known[1] / kind[1]))))
 
     def filtered(
         self,
@@ -581,6 +586,7 @@ def fit_state_space(
     problem: Problem,
     *,
     start: Mapping[str, float] | None = None,
+    part: StateSpaceFit | None = None,
     smooth: bool | None = None,
     processes: Sequence[str] | None = None,
     cautious: bool = False,
@@ -593,6 +599,8 @@ def fit_state_space(
     """Return the maximum-likelihood fit of parameters, random friction field and gauge noise, `close` standard errors or nearer.
 
     From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
+    More than LONG readings are fitted in two steps: every so-many-th of them, then all from there; `part` is the first step's fit
+    where it is known.
     `smooth` says whether there is no field; left out, there is one where it gains 2 in log likelihood. `processes` says which
     of coloured noise the gauge has, words of PROCESSES; left out, Schwarz's criterion decides, early and, if the fit is to be
     `thorough`, again at the maximum; where it is `cautious`, more than one only if innovations are correlated all along, as those
@@ -604,8 +612,17 @@ def fit_state_space(
         tried.append(Likelihood(problem, smooth=smooth, processes=processes, rtol=rtol, threads=threads))
         return tried[-1]
 
+    choice: dict[str, Any] = {
+        "smooth": smooth, "processes": processes, "cautious": cautious, "close": close, "progress": progress,
+    }  # fmt: skip
     try:
-        return _fitted(likelihood, start or {}, smooth, processes, cautious, thorough, close, progress)
+        if part is None and start is None and (runs := thinned(problem.runs)) is not problem.runs:
+            part = fit_state_space(
+                replace(problem, runs=runs), thorough=thorough, threads=threads, rtol=rtol, **choice
+            )
+        if part is not None and part.maximum.status is not Status.INTEGRATION:
+            return _on_all(part, likelihood, **choice)
+        return _fitted(likelihood, start or {}, thorough=thorough, **choice)
     except KeyboardInterrupt as error:
         last = next((own.best for own in reversed(tried) if own.best is not None), None)
         raise Interrupted(last.values if last else problem.named(problem.start)) from error
@@ -619,9 +636,51 @@ def stopped(problem: Problem, values: Mapping[str, float], *, threads: int = 1) 
     return StateSpaceFit(likelihood, Maximum(point, np.inf, Status.INTERRUPTED, inverse(point.information)), 1)
 
 
+def thinned(runs: tuple[Run, ...]) -> tuple[Run, ...]:
+    """Return the runs with LONG readings at most; the same runs where they have no more."""
+    if sum(run.t.size for run in runs) <= LONG:
+        return runs
+    return tuple(run.thinned(-(-run.t.size * len(runs) // LONG)) for run in runs)
+
+
+def _carried(found: StateSpaceFit, likelihood: Likelihood) -> dict[str, float]:
+    """Return the values of a fit, by name, with those of its gauge noise under the names that another likelihood has."""
+    values, own = dict(found.values), found.likelihood
+    for kind in likelihood.kinds:
+        known = own.gauge_like(kind)
+        values |= {name: values[known[n]] for n, name in likelihood.gauge_names(kind).items() if n in known}
+    return values
+
+
+def _on_all(
+    part: StateSpaceFit,
+    likelihood: Callable[[bool, Sequence[str]], Likelihood],
+    smooth: bool | None,
+    processes: Sequence[str] | None,
+    cautious: bool,
+    close: float,
+    progress: Callable[[str], None],
+) -> StateSpaceFit:
+    """Return the fit to all readings from that to a part of them; a small field and further colours may show in all alone."""
+    whole = likelihood(part.smooth, part.likelihood.processes)
+    x = whole.coordinates(_carried(part, whole))
+    best = StateSpaceFit(whole, maximise(whole, x, close=close, progress=progress), whole.evaluations)
+    if processes is None:
+        best = _with_colour(best, likelihood, progress, cautious)
+    if smooth is None and best.smooth:
+        rough = likelihood(False, best.likelihood.processes)
+        small = _small_field(rough, best.maximum.point)
+        best = replace(best, evaluations=best.evaluations + rough.evaluations)
+        if small is not None:
+            best = StateSpaceFit(rough, replace(best.maximum, point=small), best.evaluations)
+    settled = best.likelihood is whole and best.maximum.away < close
+    return best if settled else _with_or_without(best, smooth, likelihood, close, progress)
+
+
 def _fitted(
     likelihood: Callable[[bool, Sequence[str]], Likelihood],
     start: Mapping[str, float],
+    *,
     smooth: bool | None,
     processes: Sequence[str] | None,
     cautious: bool,
