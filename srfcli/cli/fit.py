@@ -37,6 +37,7 @@ EXAMPLES = """
 srf fit EXPERIMENT                                  a folder with experiment.toml, or that file
 srf fit EXPERIMENT --profile --starts 5 --json
 srf fit EXPERIMENT --trend slip --free A,B,D0
+srf fit EXPERIMENT --vary mu0,D0                    each run has its own; how they scatter, and whether they do
 srf fit EXPERIMENT --sample 4000 --draws draws.nc    the posterior; the draws for ArviZ
 srf fit EXPERIMENT --track smooth                   no random friction field, whatever the recording says
 srf fit A B C --table out.csv --workers 3           a campaign: each by itself, a row each
@@ -63,6 +64,10 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
 )
 @click.option("--profile", is_flag=True, help="Profile-likelihood intervals.")
 @click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
+@click.option(
+    "--vary", multiple=True, metavar="NAMES", help="Parameters with a value of their own in each run, or for each --by."
+)
+@click.option("--by", type=click.Choice(["run", "load"]), default="run", show_default=True, help="What --vary goes by.")
 @click.option(
     "--track",
     type=click.Choice(["smooth", "rough", "shared"]),
@@ -110,7 +115,7 @@ def command(
                 f"{source}: a recording, and no experiment yet",
                 f"`srf new {source}` writes the experiment.toml to fit.",
             )
-        _refuse(options, ("starts", "profile", "trend", "track", "sample", "draws", "reader"), "recordings")
+        _refuse(options, ("starts", "profile", "trend", "vary", "by", "track", "sample", "draws", "reader"), "recordings")
         fit_thresholds(
             source, system=system, output=output, free=options["free"], bounds=options["bounds"],
             methods=options["method"], tol=options["tol"], max_evaluations=options["max_evaluations"],
@@ -129,6 +134,11 @@ def command(
     _fit_recordings(
         source, system, output, **{k: v for k, v in options.items() if k not in ("bounds", "method", "tol")}
     )
+
+
+def _listed(texts: Sequence[str]) -> list[str]:
+    """Return the names in `A,B` and the like, given once or several times."""
+    return [n.strip() for text in texts for n in text.split(",") if n.strip()]
 
 
 def _refuse(options: dict[str, Any], names: tuple[str, ...], purpose: str) -> None:
@@ -150,7 +160,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
 
     registry = system.registry()
     experiment = read_experiment(source, format=options["reader"], registry=registry)
-    free = [n.strip() for text in options["free"] for n in text.split(",") if n.strip()] or None
+    free = _listed(options["free"]) or None
     kept = _draws_file(options["draws"], options["sample"], output)
     warn_uncompiled("the fit has no random friction field, and takes up to 34 times as long")
     begun, done = time.perf_counter(), FitShare(options["starts"])
@@ -161,13 +171,14 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
             progress.advance(note=text, share=done.after(text) if stage == "fit" else share)
 
         found = fit(
-            experiment, free=free, trend=options["trend"], track=options["track"], starts=options["starts"],
+            experiment, free=free, trend=options["trend"], vary=_listed(options["vary"]), by=options["by"],
+            track=options["track"], starts=options["starts"],
             profile=options["profile"], sample=options["sample"], seed=options["seed"], registry=registry, progress=report,
         )  # fmt: skip
     for run in experiment.runs:
         for notice in run.notices:
             Session.current().detail(f"{run.name}: {notice}")
-    more = [t for t in (found.runs, found.draws) if t is not None]
+    more = [t for t in (found.varied, found.runs, found.draws) if t is not None]
     emit(
         found.table, output, more=more, laws=found.found.problem.model.laws,
         inputs=[experiment.path, *(r.file for r in experiment.runs)], seed=options["seed"],
@@ -194,14 +205,14 @@ def _fit_campaign(
     from srfcli.core.files import check_target, write_atomic
     from srfcli.tasks.campaign import fit_campaign
 
-    _refuse(options, ("profile", "sample", "draws"), "one experiment")
+    _refuse(options, ("profile", "sample", "draws", "vary", "by"), "one experiment")
     target = None if place is None else Path(place).expanduser()
     if target is not None:
         if target.suffix.lower() != ".csv":
             raise SrfError(f"--table {place} is no .csv file", f"End it in .csv: --table {target.with_suffix('.csv')}")
         check_target(target, force=output.force or spread.resume is not None, what="--table")
     warn_uncompiled("the fits have no random friction field, and take up to 34 times as long")
-    free = [n.strip() for text in options["free"] for n in text.split(",") if n.strip()] or None
+    free = _listed(options["free"]) or None
     begun = time.perf_counter()
     with Progress("fit", total=len(sources)) as progress:
 

@@ -128,6 +128,7 @@ class Problem:
     trend: str | None = None
     held: Mapping[str, float] = field(default_factory=dict)
     rtol: float = RTOL
+    varying: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # run -> parameter -> its name for that run's group
 
     def named(self, theta: Array) -> dict[str, float]:
         """Return parameters by name, those that are held among them."""
@@ -149,9 +150,18 @@ class Problem:
 
 
 def fit_problem(
-    model: GeneratedModel, experiment: Experiment, *, free: Sequence[str] | None = None, trend: str | None = None
+    model: GeneratedModel,
+    experiment: Experiment,
+    *,
+    free: Sequence[str] | None = None,
+    trend: str | None = None,
+    vary: Sequence[str] = (),
+    by: str = "run",
 ) -> Problem:
-    """Return the problem that an experiment states; `free` replaces its own choice of parameters, `trend` is slip or time."""
+    """Return the problem that an experiment states; `free` replaces its own choice of parameters, `trend` is slip or time.
+
+    Parameters in `vary` have a value for each run, or, `by` load, for each load; B of a run up is then called B[up].
+    """
     listed = {q.name: q for q in experiment.parameters}
     names = list(free) if free is not None else [q.name for q in experiment.parameters if not q.fixed]
     for name in names:
@@ -162,7 +172,10 @@ def fit_problem(
         raise SrfError("every run is held out", "set holdout = false for those that are to be fitted")
     if not names:
         raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
-    rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names]
+    varying = _varying(experiment, runs, names, vary, by)
+    groups = {n: list(dict.fromkeys(varying[run.name][n] for run in runs)) for n in vary}
+    rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names for _ in groups.get(n, [n])]
+    names = [own for n in names for own in groups.get(n, [n])]
     for run in runs:
         own = own_names(model, run, trend)
         p = run_parameters(model, experiment, run, {})
@@ -172,7 +185,59 @@ def fit_problem(
     for name, low, high in zip(names, lower, upper, strict=True):
         if not (np.isfinite(low) and np.isfinite(high)):
             raise SrfError(f"'{name}' has no bounds", "give lower and upper in [parameters]")
-    return Problem(model, experiment, runs, tuple(names), start, lower, upper, trend)
+    return Problem(model, experiment, runs, tuple(names), start, lower, upper, trend, varying=varying)
+
+
+def _varying(
+    experiment: Experiment, runs: Sequence[Run], names: Sequence[str], vary: Sequence[str], by: str
+) -> dict[str, dict[str, str]]:
+    """Return what the parameters that vary are called in each run of an experiment."""
+    if not vary:
+        return {}
+    for name in vary:
+        if name not in names:
+            raise SrfError(f"'{name}' is to vary, and is not free", did_you_mean(name, names))
+    loads = {run.name: f"{run.load.rest(float(run.t[0])):.3g} {run.load_unit}" for run in experiment.runs}
+    label = loads if by == "load" else {run.name: run.name for run in experiment.runs}
+    if len({label[run.name] for run in runs}) < 2:
+        raise SrfError(f"{', '.join(vary)} cannot vary by {by}: the runs fitted have only one", "Leave `vary` out.")
+    return {run.name: {n: f"{n}[{label[run.name]}]" for n in vary} for run in experiment.runs}
+
+
+@dataclass(frozen=True)
+class BetweenGroups:
+    """Values of one parameter in several groups: their mean, its error, how they scatter beyond their errors, p of no scatter."""
+
+    mean: float
+    stderr: float
+    scatter: float
+    p_value: float
+
+
+def between_groups(values: Array, covariance: Array) -> BetweenGroups:
+    """Return the random-effects summary of a parameter's values (k,) in k groups with their covariance (k, k).
+
+    The scatter is that of restricted maximum likelihood (Patterson and Thompson, Biometrika 58, 1971); p is that of chi-squared,
+    k - 1 degrees of freedom, about the mean weighted by the covariance.
+    """
+    from scipy.optimize import minimize_scalar
+    from scipy.stats import chi2
+
+    k = values.size
+    most = 3.0 * float(np.ptp(values)) + 1e-300
+
+    def about(scatter: float) -> tuple[float, float, float, float]:
+        """Return mean, its variance, chi-squared and the restricted likelihood's cost."""
+        V = covariance + scatter**2 * np.eye(k)
+        weight = np.linalg.solve(V, np.ones(k))
+        mean = float(weight @ values / weight.sum())
+        square = float((values - mean) @ np.linalg.solve(V, values - mean))
+        return mean, float(1 / weight.sum()), square, float(np.linalg.slogdet(V)[1] + np.log(weight.sum()) + square)
+
+    found = minimize_scalar(lambda s: about(s)[3], bounds=(0.0, most), method="bounded", options={"xatol": 1e-6 * most})
+    scatter = float(found.x) if found.fun < about(0.0)[3] else 0.0
+    mean, variance = about(scatter)[:2]
+    return BetweenGroups(mean, float(np.sqrt(variance)), scatter, float(chi2.sf(about(0.0)[2], k - 1)))
 
 
 def fit(

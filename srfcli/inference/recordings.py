@@ -60,22 +60,27 @@ def fit_recordings(
     *,
     free: Sequence[str] | None = None,
     trend: str | None = None,
+    vary: Sequence[str] = (),
+    by: str = "run",
     track: str | None = None,
     ask_shared: bool = True,
     starts: int = 1,
     seed: int = 0,
     progress: Callable[[str], None] = lambda text: None,
 ) -> RecordingFit:
-    """Return the maximum-likelihood fit of all runs together.
+    """Return the maximum-likelihood fit of all runs together; parameters that `vary` have a value for each run or load.
 
     `track` is "smooth" for no random friction field, "rough" for one in each run, "shared" for one that all runs share; left out,
     the recordings decide, whether it is shared only with `ask_shared`. Without a C compiler there is no field, and noise is
     autoregressive. A fit stopped by Ctrl-C is a status; SrfError is raised for what cannot be fitted.
     """
+    if vary and (track == "shared" or compiler() is None):
+        why = "needs a C compiler" if compiler() is None else "does not go with `track` shared"
+        raise SrfError(f"`vary` {why}", "Leave it out.")
     if compiler() is None:
         return _without_compiler(registry, experiment, free, trend, track, starts, seed, progress)
     model = open_model(registry, **asdict(experiment.choice), random_field=True)
-    problem = fit_problem(model, experiment, free=free, trend=trend)
+    problem = fit_problem(model, experiment, free=free, trend=trend, vary=vary, by=by)
     threads = min(len(problem.runs), os.cpu_count() or 1)
     smooth = None if track is None else track == "smooth"
 
@@ -94,7 +99,7 @@ def fit_recordings(
     if several.interrupted or len(problem.runs) < 2:
         return result
     try:
-        if not (track == "shared" or (ask_shared and track is None and shared_field(found) > ALIKE)):
+        if not (track == "shared" or (ask_shared and track is None and not vary and shared_field(found) > ALIKE)):
             return result
         tabled = open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),))
         shared = fit_shared(replace(problem, model=tabled), several.best, progress=progress)

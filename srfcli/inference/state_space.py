@@ -358,22 +358,41 @@ class Likelihood:
     ) -> Filtered:
         """Return one run filtered under values by name, with derivatives by the names that it depends on."""
         gauges, problem = self.gauges(run), self.problem
-        gauge = {n for own in gauges for n in own.values()}
-        by = [n for n in self.names if n in gauge or (("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)]
-        return filter_run(
-            problem.model, problem.experiment, run, values, by=by if slopes else (), gauges=gauges,
+        varying = problem.varying.get(run.name, {})
+        own = {name: n for n, name in varying.items()} | {n: n for gauge in gauges for n in gauge.values()}
+        others = {name for names in problem.varying.values() for name in names.values()}
+        by = {
+            n: own.get(n, n)
+            for n in self.names
+            if n in own or (n not in others and ("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
+        }
+        found = filter_run(
+            problem.model, problem.experiment, run, {**values, **{n: values[name] for n, name in varying.items()}},
+            by=tuple(by.values()) if slopes else (), gauges=gauges,
             trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
         )  # fmt: skip
+        return replace(found, names=tuple(by) if slopes else ())
 
     def held_out(self, run: Run, values: Mapping[str, float]) -> Filtered:
-        """Return a run that was not fitted, filtered; what belongs to it alone, a free start or a trend, is estimated."""
+        """Return a run that was not fitted, filtered; what belongs to it alone, a free start, a trend, is estimated.
+
+        So is what varies, if no run that was fitted is of its group.
+        """
         problem = self.problem
         own = own_names(problem.model, run, problem.trend)
-        if not own:
+        varying = {name: n for n, name in problem.varying.get(run.name, {}).items() if name not in values}
+        if not (own or varying):
             return self.filtered(run, values)
         p = run_parameters(problem.model, problem.experiment, run, values)
-        start, lower, upper = np.array([own_start(problem.model, run, p, n, problem.trend) for n in own]).T
-        held = {n: values[n] for n in (*problem.held, *problem.names) if "." not in n}
+        rows = [own_start(problem.model, run, p, n, problem.trend) for n in own]
+        listed = {q.name: q for q in problem.experiment.parameters}
+        for name, n in varying.items():
+            others = [values[other] for other in {names[n] for names in problem.varying.values()} if other in values]
+            rows.append((float(np.mean(others)), listed[n].lower, listed[n].upper))
+            own.append(name)
+        start, lower, upper = np.array(rows).T
+        of_group = set(problem.varying.get(run.name, {}).values()) - set(own)
+        held = {n: values[n] for n in (*problem.held, *problem.names) if "." not in n or n in of_group}
         alone = replace(
             problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held
         )

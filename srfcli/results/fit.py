@@ -53,6 +53,14 @@ POSTERIOR = (
     Column("effective", "", "independent draws that these are worth", ".0f"),
     Column("r_hat", "", "spread over all chains to that within them; 1 where they agree", ".4f"),
 )
+VARIED = (
+    Column("parameter", "", "name"),
+    Column("value", "", "mean over runs or loads, in the unit beside it"),
+    Column("stderr", "", "of that mean", ".3g"),
+    Column("scatter", "", "standard deviation between runs or loads beyond their errors", ".3g"),
+    Column("unit", "", "of the three columns before"),
+    Column("p_equal", "1", "that all share one value", ".3g"),
+)
 ENOUGH, MIXED = 400.0, 1.01  # independent draws and R-hat that intervals should rest on (Vehtari and others 2021)
 ADVICE = {
     Status.NO_CONVERGENCE: "the likelihood's maximum was not reached. Try --starts 5, other start values or bounds, or hold a "
@@ -106,6 +114,11 @@ class FitResult(Result):
     def runs(self) -> Table:
         """Return a row for each run, fitted or held out: residual, noise, and what is left of them."""
         return run_table(self.found.fit, self.experiment)
+
+    @cached_property
+    def varied(self) -> Table | None:
+        """Return a row for each parameter that varies between runs or loads, None where none does."""
+        return varied_table(self.found.problem, self.found.fit)
 
     @cached_property
     def draws(self) -> Table | None:
@@ -255,10 +268,35 @@ def run_table(fit: Fit, experiment: Experiment) -> Table:
     return Table("srf.fit.runs/1", RUNS, rows, "runs")
 
 
+def varied_table(problem: Problem, fit: Fit) -> Table | None:
+    """Return mean and scatter of what varies between runs or loads, and how likely that scatter is by chance."""
+    import numpy as np
+
+    from srfcli.inference.fit import between_groups
+
+    parts: dict[str, list[int]] = {}
+    for names in problem.varying.values():
+        for n, name in names.items():
+            if name in fit.names and fit.names.index(name) not in parts.setdefault(n, []):
+                parts[n].append(fit.names.index(name))
+    rows: list[tuple[Any, ...]] = []
+    for name, places in parts.items():
+        declared = unit_of(problem, name)
+        unit, factor = problem.experiment.shown(declared)
+        covariance = np.asarray(fit.covariance)[np.ix_(places, places)]
+        if not (np.diag(covariance) > 0).all():
+            rows.append((name, None, None, None, unit, None))  # one is at its bound: its error is not known
+            continue
+        found = between_groups(np.array([fit.values[fit.names[k]] for k in places]), covariance)
+        shown = [from_base(x, declared) * factor for x in (found.mean, found.stderr, found.scatter)]
+        rows.append((name, *shown, unit, found.p_value))
+    return Table("srf.fit.varied/1", VARIED, rows, "what varies") if rows else None
+
+
 def unit_of(problem: Problem, name: str) -> str:
     """Return the unit that a parameter is declared in; K that of the stated stiffness, what belongs to a run 1 or s."""
     listed = {q.name: q.unit for q in problem.experiment.parameters}
-    return listed.get(name, "1")
+    return listed.get(name, listed.get(name.partition("[")[0], "1"))
 
 
 def flag(fit: Fit, k: int) -> str:

@@ -78,6 +78,8 @@ def fit(
     *,
     free: Sequence[str] | None = None,
     trend: str | None = None,
+    vary: Sequence[str] = (),
+    by: str = "run",
     track: str | None = None,
     starts: int = 1,
     profile: bool = False,
@@ -99,6 +101,10 @@ def fit(
         Parameters to fit; those that the experiment leaves free if left out.
     trend : {'slip', 'time'}, optional
         Let each run's observable drift.
+    vary : sequence of str
+        Free parameters that have a value of their own in each run or under each load: B in a run up is B[up].
+    by : {'run', 'load'}
+        What they vary with.
     track : {'smooth', 'rough', 'shared'}, optional
         Random friction field along slip: none, one for each run, one for all; the recordings decide if left out.
     starts : int
@@ -161,7 +167,7 @@ def fit(
     if track == "shared" and (profile or sample):
         raise SrfError("`track` shared does not go with `profile` or `sample`", "Leave it out, or name rough.")
     found = fit_recordings(
-        registry or load_registry(), experiment, free=free, trend=trend, track=track,
+        registry or load_registry(), experiment, free=free, trend=trend, vary=vary, by=by, track=track,
         ask_shared=not (profile or sample), starts=starts, seed=seed, progress=lambda text: progress("fit", text, None),
     )  # fmt: skip
     status = found.status
