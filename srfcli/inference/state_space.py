@@ -472,10 +472,6 @@ def _scales(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
     }
 
 
-def _spacing(run: Run) -> float:
-    return float(np.median(np.diff(run.t)))
-
-
 def _spacings(run: Run) -> list[float]:
     """Return the spacings (s) at which a run was sampled, to two digits: runs that agree in them share a gauge noise."""
     return [float(f"{dt:.2g}") for dt in run.sampling.spacings]
