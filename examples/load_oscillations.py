@@ -29,21 +29,21 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize, signal
 
 from srfcli.core.errors import SrfError
 from srfcli.core.units import split_quantity
 from srfcli.data.experiment import read_experiment
-from srfcli.data.imposed import find_modulation
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.goodness_of_fit import log_evidence, shortcomings
-from srfcli.inference.prediction import of_run
 from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import load_registry
 from srfcli.validation.slider import Physics, Plan, Trace, move
 
 Array = NDArray[np.float64]
-SMALLEST, FEWEST = 0.005, 12  # amplitude over the mean, and periods, below which a recording shows nothing of either
+SMALLEST, FEWEST = 0.005, 3  # amplitude over the mean, and periods, below which a recording shows nothing
 DENSEST = 8  # samples per period, of which there must be as many
+SHARE = Path(__file__).resolve().parent / "share-of-load.toml"  # load-transmission of all that the load does
 FORMAT = """format = "srf-experiment/1"
 title = "load oscillations"
 
@@ -83,7 +83,7 @@ MODELS = (
     Model("ageing law", "dieterich"),
     Model("linker-dieterich", "dieterich+linker-dieterich", (), "alpha = { value = 0.1, lower = 0.0, upper = 1.0 }", "alpha"),
     Model("nagata", "nagata", (), "c = { value = 0.5, lower = 0.0, upper = 20.0 }", "c"),
-    Model("load-transmission", "dieterich", ("load-transmission",), "rho = { value = 0.9, lower = 0.0, upper = 2.0 }", "rho"),
+    Model("load-transmission", "dieterich", (str(SHARE),), "rho = { value = 0.9, lower = 0.0, upper = 2.0 }", "rho"),
 )
 
 
@@ -101,41 +101,75 @@ class Fitted:
 # ---- what a recording has to be
 
 
+@dataclass(frozen=True)
+class Oscillation:
+    """A load's oscillation: mean and amplitude (MPa), period and onset (s), the number of its periods and samples in each."""
+
+    mean: float
+    amplitude: float
+    period: float
+    onset: float
+    periods: float
+    samples: float
+
+
+def oscillation(t: Array, W: Array) -> Oscillation | None:
+    """Return the sine in the normal stress W (n,), None where none has more than half of its variance once it is switched on."""
+    begun = np.abs(W - np.median(W[: max(W.size // 50, 3)])) > 0.25 * np.ptp(W)
+    first = int(np.argmax(begun)) if begun.any() and np.ptp(W) > 0 else W.size
+    s, x = t[first:], W[first:]
+    if s.size < 4 * DENSEST:
+        return None
+    even = np.linspace(s[0], s[-1], s.size)
+    spectrum = np.abs(np.fft.rfft(signal.detrend(np.interp(even, s, x)), 8 * s.size))
+    coarse = (int(np.argmax(spectrum[4:])) + 4) / (8 * s.size * (even[1] - even[0]))
+
+    def fitted(f: float) -> tuple[float, float]:
+        waves = [np.ones_like(s), s - s.mean(), np.cos(2 * np.pi * f * s), np.sin(2 * np.pi * f * s)]
+        solution = np.linalg.lstsq(np.column_stack(waves), x, rcond=None)[0]
+        rest = x - np.column_stack(waves) @ solution
+        return float(rest @ rest), float(np.hypot(*solution[2:]))
+
+    near = 0.5 / float(np.ptp(s))
+    f = float(optimize.minimize_scalar(lambda f: fitted(f)[0], bounds=(max(coarse - near, near / 2), coarse + near)).x)
+    rest, amplitude = fitted(f)
+    if rest > 0.5 * float(np.sum(signal.detrend(x) ** 2)) or amplitude < SMALLEST * float(x.mean()):
+        return None
+    step = float(np.median(np.diff(t)))
+    return Oscillation(float(x.mean()), amplitude, 1 / f, float(s[0]), f * float(np.ptp(s)), 1 / (f * step))
+
+
 def check(experiment: Experiment) -> list[str]:
     """Return a line on each run's oscillation; SrfError where a run has none, too few periods or too few samples of one."""
     lines = []
     for run in experiment.runs:
         W = run.load(run.t)[0]
-        found = find_modulation(run.t, W)
-        where = f"{run.file.name}: the normal load"
-        if found is None or found.amplitude < SMALLEST:
-            size = 100 * float(np.std(W)) / float(W.mean())
+        found, where = oscillation(run.t, W), f"{run.file.name}: the normal stress"
+        if found is None:
             raise SrfError(
-                f"{where} does not oscillate: no line stands out of its spectrum, and it scatters by {size:.2g} %",
+                f"{where} does not oscillate: no sine has half of its variance, a scatter of {100 * np.std(W) / W.mean():.2g} %",
                 "Choose the stretch that does by --window BEGIN END, and the column by --normal.",
             )
-        on = float(run.t[-1]) - max(found.onset, float(run.t[0]))
-        if on * found.frequency < FEWEST:
+        said = f"{found.amplitude:.3g} MPa in {found.period:.4g} s"
+        if found.periods < FEWEST:
             raise SrfError(
-                f"{where} oscillates for {on * found.frequency:.1f} periods of {1 / found.frequency:.3g} s; {FEWEST} are needed",
-                "Take a longer stretch.",
+                f"{where} oscillates by {said} for {found.periods:.2g} periods; {FEWEST} are needed", "Take a longer stretch."
             )
-        each = 1 / (found.frequency * float(np.median(np.diff(run.t))))
-        if each < DENSEST:
-            raise SrfError(f"{where} has {each:.1f} samples a period; {DENSEST} are needed", "Take data that are not thinned.")
-        mu = float(np.median(run.observed)) * (1.0 if run.observable == "friction" else 1 / float(W.mean()))
+        if found.samples < DENSEST:
+            raise SrfError(
+                f"{where} oscillates by {said}: {found.samples:.2g} samples a period; {DENSEST} are needed",
+                "Take data that are not thinned.",
+            )
+        mu = float(np.median(run.observed / (1.0 if run.observable == "friction" else W)))
         if not 0.05 < mu < 1.5:
             raise SrfError(
                 f"{run.file.name}: shear over normal stress is {mu:.3g}, which is no friction coefficient",
-                "Are the columns of --shear and --normal the right ones, and in the same unit?",
+                "Are the columns of --shear and --normal the right ones, and in the right unit?",
             )
         lines.append(
-            f"{run.name}: {W.mean():.4g} MPa, oscillating by {found.amplitude * W.mean():.3g} MPa in {1 / found.frequency:.4g} s"
-            + (f" from {found.onset:.4g} s on" if np.isfinite(found.onset) else "")
-            + f", {run.t.size} samples, mu = {mu:.3f}"
+            f"{run.name}: {found.mean:.4g} MPa, oscillating by {said} from {found.onset:.4g} s on for {found.periods:.1f} periods"
+            f"; {run.t.size} samples, mu = {mu:.3f}"
         )
-        if not of_run(run)["modulated"]:
-            raise SrfError(f"{where}: the oscillation cannot be told from the rest", "Choose a stretch of one oscillation.")
     return lines
 
 
@@ -180,8 +214,10 @@ def experiment_of(options: argparse.Namespace, model: Model, mu: float = 0.6) ->
 # ---- the models against each other
 
 
-def compare(options: argparse.Namespace, told: list[str] | None = None) -> list[Fitted]:
-    """Return the fits of all models, best evidence first; what the recordings are is appended to `told`."""
+def compare(
+    options: argparse.Namespace, told: list[str] | None = None, *, models: Sequence[Model] = MODELS
+) -> list[Fitted]:
+    """Return the fits of the models, best evidence first; what the recordings are is appended to `told`."""
     plain = experiment_of(options, MODELS[0])
     lines = check(plain)
     if told is not None:
@@ -190,7 +226,7 @@ def compare(options: argparse.Namespace, told: list[str] | None = None) -> list[
     W = first.load(first.t)[0]
     mu = float(np.median(first.observed / (1.0 if first.observable == "friction" else W)))
     fits = []
-    for model in MODELS:
+    for model in models:
         print(f"{model.name} ...", file=sys.stderr, flush=True)
         found = fit_recordings(load_registry(), experiment_of(options, model, mu), track=options.track)
         if found.state_space is None:
@@ -247,11 +283,13 @@ def stand_in(
 ) -> tuple[Trace, Array]:
     """Return time and shear stress, and the normal stress (n,) that is imposed, MPa: steady sliding, then oscillations.
 
+    These begin where the sine rises through 0, after `steady` s or up to a period later.
     Raises SrfError where the slider cannot be followed.
     """
-    duration = steady + periods * period
+    onset = (np.ceil(steady / period) + 0.75) * period
+    duration = float(onset + periods * period)
     plan = Plan("oscillating", ((duration, velocity),), normal, min(period / 40, 0.05), eps=amplitude / normal, f=1 / period,
-                onset=steady)  # fmt: skip
+                onset=onset)  # fmt: skip
     trace = move(physics, plan)
     if not trace.complete:
         raise SrfError("the slider cannot be followed to the end", "Choose a smaller amplitude, or a stiffer spring.")
