@@ -180,7 +180,8 @@ def test_every_shipped_effect_passes_its_checks(name):
         assert skipped <= ({"acts"} if found.observed else {"steady start"})
     assert found.about and all(p.about for p in (*found.parameters, *found.constants))
     assert all(np.isfinite([p.lower, p.upper]).all() for p in found.parameters)  # a search has to end
-    assert {n for n, _ in found.neutral} | {n for n, _ in found.scans} == {p.name for p in found.parameters}
+    named = [*(n for n, _ in (*found.neutral, *found.scans)), *found.fixed]
+    assert sorted(named) == sorted(p.name for p in found.parameters)
 
 
 def test_the_table_of_the_docs_is_the_plugins():
