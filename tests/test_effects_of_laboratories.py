@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from srfcli.codegen.c_source import compiler
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import FitParameter
+from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import load_registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, SampledLoad
 from srfcli.motion.integrators import Motion, integrate
+from srfcli.validation.slider import Physics, Plan, move
 
 REGISTRY = load_registry(user=False, entry_points=False)
 GOUGE = {"mu0": 0.6, "A": 0.009, "B": 0.006, "D0": 10.0, "V0": 1.0, "K": 0.1, "W0": 20.0, "V": 1.0}
@@ -278,3 +281,48 @@ def test_faults_of_a_spring_s_effect_are_told(old: str, new: str, said: str, tmp
     with pytest.raises(SrfError) as caught:
         open_model(load_registry((tmp_path,), user=False, entry_points=False), effects=("mine",))
     assert said in f"{caught.value.message} {caught.value.hint}"
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
+def test_a_fit_of_a_load_cell_under_three_loads_finds_how_the_spring_stiffens(tmp_path: Path) -> None:
+    """Recorded by the generator of concealed cases, whose equations are its own: the force is that of the stiffer spring."""
+    slider = Physics(
+        K=6e-3, mu0=0.6, A=0.006, B=0.009, D0=8.0, V0=10.0, Vsat=50.0, rigid=True, massless=True, K_power=0.4, Wref=7.0
+    )
+    lines, rng = [FORCES], np.random.default_rng(1)
+    for W0 in (4.0, 7.0, 10.0):
+        plan = Plan(f"at{W0:g}", ((8, 10.0), (8, 30.0), (10, 10.0)), W0, 0.05, steps=((20.0, 0.1 * W0),))
+        trace, W = move(slider, plan), np.array([plan.load()(t)[0] for t in plan.times().tolist()])
+        force = np.array([slider.spring_under(w) for w in W.tolist()]) * trace.u + 2e-3 * rng.standard_normal(W.size)
+        V = np.where((trace.t > 7.99) & (trace.t < 15.99), 30.0, 10.0)
+        rows = [f"{a:.3f},{b:g},{c:.6f},{d:.6f}" for a, b, c, d in zip(trace.t, V, W, force, strict=True)]
+        head = "time [s],load_point_velocity [um/s],normal_load [N],force [N]"
+        (tmp_path / f"{plan.name}.csv").write_text("\n".join([head, *rows]))
+        lines.append(f'[[runs]]\nname = "{plan.name}"\nfile = "{plan.name}.csv"')
+    (tmp_path / "experiment.toml").write_text("\n".join(lines))
+    found = fit_recordings(REGISTRY, read_experiment(tmp_path, registry=REGISTRY)).fit
+    errors = dict(zip(found.names, np.sqrt(np.diag(found.covariance)), strict=True))
+    for name, true in {"m": 0.4, "mu0": 0.6, "A": 0.006, "B": 0.009, "D0": 8.0}.items():
+        assert abs(found.values[name] - true) < 4 * errors[name], name
+    assert errors["m"] < 2e-3 and "Wref" not in found.names
+
+
+FORCES = """format = "srf-experiment/1"
+[apparatus]
+stiffness = "0.006 N/um"
+[model]
+law = "srf-vsat"
+ageing = "dieterich"
+interface = "rigid"
+inertia = false
+effects = ["load-stiffening"]
+[parameters]
+mu0 = { value = 0.58, lower = 0.3, upper = 0.9 }
+A = { value = 0.007, lower = 0.001, upper = 0.03 }
+B = { value = 0.008, lower = 0.001, upper = 0.03 }
+D0 = { value = 9.0, lower = 1.0, upper = 50.0 }
+Vsat = { value = 50.0, fixed = true }
+V0 = { value = 10.0, fixed = true }
+m = { value = 0.0 }
+Wref = { value = 7.0 }
+"""
