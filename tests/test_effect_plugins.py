@@ -83,9 +83,9 @@ def test_a_new_effect_passes_as_it_is(tmp_path, python):
 def test_a_python_effect_may_bring_an_unknown():
     @effect(name="late-gauge", parameters=[Parameter("tau_g", 0.01, "s", 1e-4, 1.0)], neutral={"tau_g": 0.0},
             states=["reading"], observed="reading")  # fmt: skip
-    def late(u, reading, p):
+    def late(gauge, reading, p):
         """The gauge lags"""
-        return {"reading": ExtraState("reading", (u - reading) / p.tau_g, u)}
+        return {"reading": ExtraState("reading", (gauge - reading) / p.tau_g, gauge)}
 
     assert late.about == "The gauge lags" and late.sizes == ("tau_g",)
     assert {o.check: o.verdict for o in check_law(late)}["derivatives"] == "ok"

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from srfcli.codegen.c_source import compiler
 from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.core.errors import SrfError
+from srfcli.data.experiment import read_experiment
+from srfcli.data.values import FitParameter
+from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import load_registry
-from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, SampledLoad
 from srfcli.motion.integrators import Motion, integrate
+from srfcli.validation.slider import Physics, Plan, move
 
 REGISTRY = load_registry(user=False, entry_points=False)
 GOUGE = {"mu0": 0.6, "A": 0.009, "B": 0.006, "D0": 10.0, "V0": 1.0, "K": 0.1, "W0": 20.0, "V": 1.0}
@@ -137,6 +144,185 @@ def test_suction_is_the_change_of_age_undrained_and_nothing_drained() -> None:
 
 
 def test_they_are_searched_for_only_where_they_are_named() -> None:
-    for name in ("slip-hardening", "frictional-heating", "rate-cutoff", "load-lag", "dilatancy"):
+    named = ("slip-hardening", "frictional-heating", "rate-cutoff", "load-lag", "dilatancy")
+    for name in (*named, "load-servo", "pore-pressure", "gauge-creep"):
         assert REGISTRY.get("effect", name).on_request  # type: ignore[union-attr]
     assert not REGISTRY.get("effect", "second-state").on_request  # type: ignore[union-attr]
+
+
+RAMP = LoadSteps.sequence([(10.0, 20.0, 20.0), (20.0, 20.0, 24.0), (30.0, 24.0, 24.0)], rise=0.5)  # 0.2 MPa/s for 20 s
+
+
+def test_a_spring_stiffer_under_more_load_is_stretched_less_and_weighs_the_same() -> None:
+    """After a ramp friction is mu W whatever the spring is: the elongation says K, a load cell does not."""
+    own, drive = {"m": 0.5, "Wref": 20.0}, Drive.constant(1.0)
+    model, t, motion = moved("load-stiffening", own, drive=drive, load=RAMP, end=90.0)
+    p = model.vector({**GOUGE, **own})
+    said = 24.0 * 0.6 / (0.1 * np.sqrt(24.0 / 20.0))  # um
+    args = (motion.x[-1], 1.0, 24.0, 0.0)
+    assert float(model.elongation(*args, p)) == pytest.approx(said, rel=1e-4)
+    assert float(model.reading(*args, p)) == pytest.approx(said, rel=1e-4)
+    weighed = model.vector({**GOUGE, **own, "weighed": 1.0})
+    assert float(model.reading(*args, weighed)) * 0.1 == pytest.approx(24.0 * 0.6, rel=1e-4)
+    # and at every moment what the stage moves and the slider does not stretches the spring, whose stiffness rises
+    W, v = RAMP(t)[0], np.exp(state(model, motion, "ln_v"))
+    mu = np.array([float(model.friction(x, 1.0, w, 0.0, p)) for x, w in zip(motion.x, W, strict=True)])
+    u = W * mu / (0.1 * np.sqrt(W / 20.0))
+    slid = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t))])
+    assert u - u[0] == pytest.approx(t - slid, abs=5e-3)
+
+
+def test_blocks_that_bulge_move_the_contact_and_no_force() -> None:
+    """On a ramp of the load the contact slides by shift W' more; at rest nothing is left, where a crosstalk leaves a force."""
+    shift, drive = 2.0, Drive.constant(1.0)
+    speeds = {}
+    for size in (shift, 0.0):
+        model, t, motion = moved("poisson-coupling", {"shift": size}, drive=drive, load=RAMP, end=120.0)
+        speeds[size] = np.exp(state(model, motion, "ln_v"))
+        u = np.asarray(model.elongation(motion.x[-1], 1.0, 24.0, 0.0, model.vector({**GOUGE, "shift": size})))
+        assert float(u) == pytest.approx(24.0 * 0.6 / 0.1, rel=1e-4)
+    gained = np.trapezoid(speeds[shift] - speeds[0.0], t)
+    assert gained == pytest.approx(shift * 4.0, rel=0.03)  # um; mu differs by what is left of A and B
+    crosstalk, _, pulled = moved("tangential-crosstalk", {"share": 0.01}, drive=drive, load=RAMP, end=120.0)
+    p = crosstalk.vector({**GOUGE, "share": 0.01})
+    stretched = float(crosstalk.elongation(pulled.x[-1], 1.0, 24.0, 0.0, p))
+    assert stretched - 24.0 * 0.6 / 0.1 == pytest.approx(0.01 * 4.0 / 0.1, rel=1e-2)
+
+
+def test_a_servo_rings_as_an_oscillator_does() -> None:
+    own = {"share": 1.0, "natural": 0.2, "damping": 0.3}
+    load = LoadSteps.sequence([(10.0, 20.0, 20.0), (50.0, 22.0, 22.0)], rise=0.01)
+    model, t, motion = moved("load-servo", own, drive=Drive.constant(1.0), load=load)
+    w, z, since = 2 * np.pi * 0.2, 0.3, np.maximum(t - 10.005, 0.0)
+    ringing = w * np.sqrt(1 - z**2)
+    step = 1 - np.exp(-z * w * since) * (np.cos(ringing * since) + z * w / ringing * np.sin(ringing * since))
+    assert state(model, motion, "served") == pytest.approx(20.0 + 2.0 * step, abs=2e-3)
+    overshoot = np.exp(-np.pi * z / np.sqrt(1 - z**2))
+    assert state(model, motion, "served").max() == pytest.approx(22.0 + 2.0 * overshoot, abs=5e-3)
+
+
+def test_a_pore_pressure_lowers_friction_in_the_contact_and_a_drained_one_is_a_late_load() -> None:
+    model, t, motion = moved("pore-pressure", {"pressure": 2.0}, drive=Drive.constant(1.0), load=RAMP, end=120.0)
+    p = model.vector({**GOUGE, "pressure": 2.0})
+    assert float(model.elongation(motion.x[-1], 1.0, 24.0, 0.0, p)) == pytest.approx(22.0 * 0.6 / 0.1, rel=1e-5)
+    # Skempton's B of 0.6 and a drainage in 5 s: p' = B W' - p/5, which is what `load-lag` says of W - B (W - late)
+    own = {"share": 0.6, "lag_time": 5.0}
+    late, t, pressed = moved("load-lag", own, drive=Drive.constant(1.0), load=RAMP)
+    W, pore = RAMP(t)[0], 0.6 * 0.2 * 5.0 * (1 - np.exp(-(t - 10.25) / 5.0))
+    felt = W - 0.6 * (W - state(late, pressed, "late"))
+    rising = (t > 12) & (t < 29)
+    assert (W - felt)[rising] == pytest.approx(pore[rising], abs=2e-3)
+
+
+def test_a_cell_that_creeps_shows_a_part_at_once_and_the_rest_late() -> None:
+    own = {"share": 0.2, "creep_time": 4.0}
+    model, t, motion = moved("gauge-creep", own)
+    p = model.vector({**GOUGE, **own})
+    ones = np.ones_like(t)
+    W, V = 20.0 * ones, STEP(t)
+    u, shown = (np.asarray(f(motion.x, V, W, 0 * ones, p)) for f in (model.elongation, model.reading))
+    late = u[0] * 1.0
+    crept = [late]
+    h = t[1] - t[0]
+    decay = np.exp(-h / 4.0)
+    for a, b in pairwise(u):
+        slope = (b - a) / h
+        crept.append(b - slope * 4.0 + (crept[-1] - a + slope * 4.0) * decay)
+    assert shown == pytest.approx(u + 0.2 * (np.array(crept) - u), abs=1e-3)
+    assert np.abs(shown - u).max() > 0.1 and shown[-1] == pytest.approx(u[-1], abs=1e-4)
+
+
+def test_what_is_never_fitted_follows_the_recording(tmp_path: Path) -> None:
+    """The load under which the stiffness holds is that of the recording, is no free parameter, and may be stated."""
+    rows = [f"{0.1 * k},{20 + 0.02 * k},{12 + 0.01 * k}" for k in range(100)]
+    (tmp_path / "a.csv").write_text("\n".join(["time [s],normal_load [N],force [N]", *rows]))
+    text = '''format = "srf-experiment/1"
+[apparatus]
+stiffness = "0.1 N/um"
+[model]
+law = "dieterich-ruina"
+ageing = "dieterich"
+interface = "rigid"
+effects = ["load-stiffening"]
+[parameters]
+m = { value = 0.0 }
+%s
+[[runs]]
+name = "ramp"
+file = "a.csv"
+drive = [{ duration = 10.0, velocity = 3.0 }]
+'''
+
+    def held(stated: str = "") -> FitParameter:
+        (tmp_path / "experiment.toml").write_text(text % stated)
+        experiment = read_experiment(tmp_path, registry=REGISTRY)
+        assert not next(q for q in experiment.parameters if q.name == "m").fixed
+        return next(q for q in experiment.parameters if q.name == "Wref")
+
+    assert (held().value, held().fixed) == (pytest.approx(20.99, abs=0.01), True)
+    assert (held('Wref = { value = "15 N" }').value, held('Wref = { value = "15 N" }').fixed) == (15.0, True)
+    assert not held("Wref = { value = 15.0, fixed = false }").fixed
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("fixed = true", "fixed = 1", "expected true or false"),
+        ("fixed = true", "fixed = true, scan = 3", "given together with fixed"),
+        ("neutral = 0.0,", "neutral = 0.0, fixed = true,", "given together with neutral"),
+        ('"K*(W/Wref)**m"', '"K*(v/V0)**m*(W/Wref)**m"', "K may not hold"),
+        ('"K*(W/Wref)**m"', '"K*(gauge/u)**m*(W/Wref)**m"', "K may not hold"),
+    ],
+)
+def test_faults_of_a_spring_s_effect_are_told(old: str, new: str, said: str, tmp_path: Path) -> None:
+    text = Path(REGISTRY.find("effect", "load-stiffening").location).read_text(encoding="utf-8")
+    assert old in text
+    (tmp_path / "mine.toml").write_text(text.replace(old, new).replace("load-stiffening", "mine"))
+    with pytest.raises(SrfError) as caught:
+        open_model(load_registry((tmp_path,), user=False, entry_points=False), effects=("mine",))
+    assert said in f"{caught.value.message} {caught.value.hint}"
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
+def test_a_fit_of_a_load_cell_under_three_loads_finds_how_the_spring_stiffens(tmp_path: Path) -> None:
+    """Recorded by the generator of concealed cases, whose equations are its own: the force is that of the stiffer spring."""
+    slider = Physics(
+        K=6e-3, mu0=0.6, A=0.006, B=0.009, D0=8.0, V0=10.0, Vsat=50.0, rigid=True, massless=True, K_power=0.4, Wref=7.0
+    )
+    lines, rng = [FORCES], np.random.default_rng(1)
+    for W0 in (4.0, 7.0, 10.0):
+        plan = Plan(f"at{W0:g}", ((8, 10.0), (8, 30.0), (10, 10.0)), W0, 0.05, steps=((20.0, 0.1 * W0),))
+        trace, W = move(slider, plan), np.array([plan.load()(t)[0] for t in plan.times().tolist()])
+        force = np.array([slider.spring_under(w) for w in W.tolist()]) * trace.u + 2e-3 * rng.standard_normal(W.size)
+        V = np.where((trace.t > 7.99) & (trace.t < 15.99), 30.0, 10.0)
+        rows = [f"{a:.3f},{b:g},{c:.6f},{d:.6f}" for a, b, c, d in zip(trace.t, V, W, force, strict=True)]
+        head = "time [s],load_point_velocity [um/s],normal_load [N],force [N]"
+        (tmp_path / f"{plan.name}.csv").write_text("\n".join([head, *rows]))
+        lines.append(f'[[runs]]\nname = "{plan.name}"\nfile = "{plan.name}.csv"')
+    (tmp_path / "experiment.toml").write_text("\n".join(lines))
+    found = fit_recordings(REGISTRY, read_experiment(tmp_path, registry=REGISTRY)).fit
+    errors = dict(zip(found.names, np.sqrt(np.diag(found.covariance)), strict=True))
+    for name, true in {"m": 0.4, "mu0": 0.6, "A": 0.006, "B": 0.009, "D0": 8.0}.items():
+        assert abs(found.values[name] - true) < 4 * errors[name], name
+    assert errors["m"] < 2e-3 and "Wref" not in found.names
+
+
+FORCES = """format = "srf-experiment/1"
+[apparatus]
+stiffness = "0.006 N/um"
+[model]
+law = "srf-vsat"
+ageing = "dieterich"
+interface = "rigid"
+inertia = false
+effects = ["load-stiffening"]
+[parameters]
+mu0 = { value = 0.58, lower = 0.3, upper = 0.9 }
+A = { value = 0.007, lower = 0.001, upper = 0.03 }
+B = { value = 0.008, lower = 0.001, upper = 0.03 }
+D0 = { value = 9.0, lower = 1.0, upper = 50.0 }
+Vsat = { value = 50.0, fixed = true }
+V0 = { value = 10.0, fixed = true }
+m = { value = 0.0 }
+Wref = { value = 7.0 }
+"""

@@ -52,12 +52,16 @@ OTHER = [
     {"effects": ("load-distortion",), "inertia": False, "interface": "rigid"},
     {"effects": ("second-state", "friction-drift-slip"), "law": "dieterich-ruina"},
     {"effects": ("viscous-drag",), "law": "two-state"},
+    {"effects": ("load-stiffening",), "inertia": False},
+    {"effects": ("poisson-coupling",), "inertia": False},
 ]
 PAIRS = [
     {"effects": ("linker-dieterich", "tangential-crosstalk")},
     {"effects": ("load-distortion", "stiffness-exponent"), "ageing": "ruina"},
     {"effects": ("drive-ripple", "track-topography")},
     {"effects": ("adhesion-offset", "sensor-lag", "slip-evolution"), "inertia": False},
+    {"effects": ("load-stiffening", "gauge-creep", "tangential-crosstalk"), "inertia": False, "interface": "rigid"},
+    {"effects": ("load-servo", "load-stiffening", "poisson-coupling", "linker-dieterich")},
 ]
 OWN = Path(__file__).resolve().parent / "effects"
 HEARD = str(OWN / "hearsay.toml")  # friction, stiffness, force and ageing hear of an unknown, of u, slip and the clock
@@ -129,8 +133,10 @@ class Balance:
                 u = (imposed - tangent * self.p["K"] * rest) * mu(load) / self.p["K"] / (1 - tangent * mu(load))
             load = imposed + tangent * self.p["K"] * (u - rest)
         friction = mu(load)
+        K = self.changed("K", self.p["K"], {**known, "W": imposed})
         if u is None:
-            u = (load * friction - force) / self.p["K"]
+            u = (load * friction - force) / K
+        gauge = u * K / self.p["K"] if self.p.get("weighed") else u
         kappa = None
         if system.interface.kappa is not None:
             kappa = self.changed("kappa", evaluate(system.interface.kappa, {**known, "W": load}), {**known, "W": load})
@@ -141,7 +147,9 @@ class Balance:
             "force": force,
             "u": u,
             "F": load * friction,
-            "V": self.changed("V", given["V"], known),
+            "V": self.changed("V", given["V"], {**known, "W_dot": given["W_dot"]}),
+            "spring": K,
+            "gauge": gauge,
             "S": 0.0 if kappa is None else load * friction / kappa,
         }
 
@@ -174,6 +182,7 @@ def prepared(make_model: Any, names: dict[str, Any]) -> tuple[System, Any, np.nd
         "rise0": 0.2,
         "modulated": 1.0,
         "start": 2.0,
+        "weighed": 1.0,
     }
     return system, model, model.vector({n: v for n, v in run.items() if n in model.names})
 
@@ -181,7 +190,7 @@ def prepared(make_model: Any, names: dict[str, Any]) -> tuple[System, Any, np.nd
 @pytest.mark.parametrize("names", PLAIN + WITH, ids=name_of)
 def test_the_rates_fulfil_the_balance(make_model, names):
     system, model, p = prepared(make_model, names)
-    K, names_of = p[model.index("K")], list(model.states)
+    names_of = list(model.states)
     for x, point in random_points(model, p):
         balance = Balance(system, model, point, p)
         r = np.asarray(model.rates(x, point["V"], point["W"], point["W_dot"], p))
@@ -197,7 +206,7 @@ def test_the_rates_fulfil_the_balance(make_model, names):
         assert rate["u"] == pytest.approx(now["V"] - slip, rel=1e-8, abs=1e-8 * now["v"])
         if system.inertia:
             moved = r[names_of.index("z")] if system.elastic else now["v"] * r[names_of.index("ln_v")]
-            pull = K * now["u"] - now["F"] + now["force"]
+            pull = now["spring"] * now["u"] - now["F"] + now["force"]
             assert p[model.index("M")] * moved == pytest.approx(pull, abs=1e-9 * now["F"])
         for state in system.friction.states:
             own = {"phi": now[state.name], "D0": now[state.length], "B": now[state.weight]}
@@ -211,6 +220,14 @@ def test_the_rates_fulfil_the_balance(make_model, names):
             assert grown == pytest.approx(
                 evaluate(extra.rate, {**now, "W": point["W"], "V": point["V"]}), rel=1e-9, abs=1e-9
             )
+        shown = now["gauge"]
+        for effect in system.effects:
+            shown = now[effect.observed] if effect.observed else shown
+            for slot, formula in effect.changes:
+                shown = evaluate(formula, {**now, "gauge": shown}) if slot == "gauge" else shown
+        given = (point["V"], point["W"], point["W_dot"])
+        if system.effects:
+            assert float(model.reading(x, *given, p)) == pytest.approx(shown, rel=1e-10)
         for auxiliary, expected in (("slip", now["v"]), ("stage", point["V"]), ("time", 1.0)):
             if auxiliary in names_of:
                 assert r[names_of.index(auxiliary)] == expected
@@ -227,7 +244,7 @@ def test_a_run_begins_in_steady_sliding(make_model, names):
     assert now.get("z", 9.0) == pytest.approx(9.0)
     aged = {**now, "mu_dot": 0.0, "W_dot": 0.0, "F_dot_over_W": 0.0}
     assert balance.changed("rate", evaluate(system.ageing.rate, aged), aged) == pytest.approx(0.0, abs=1e-12)
-    assert p[model.index("K")] * now["u"] == pytest.approx(now["F"] - now["force"], rel=1e-12)
+    assert now["spring"] * now["u"] == pytest.approx(now["F"] - now["force"], rel=1e-12)
     assert [now[n] for n in ("slip", "stage", "time") if n in now] == [
         {"slip": 2.0, "stage": 0.0, "time": 0.0}[n] for n in ("slip", "stage", "time") if n in now
     ]

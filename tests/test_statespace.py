@@ -17,7 +17,7 @@ from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
 from srfcli.inference.fit import Interrupted, fit_problem
 from srfcli.inference.prediction import predict
 from srfcli.inference.state_space import Likelihood, as_fit, filter_run, fit_state_space, stopped
-from srfcli.motion.imposed import ConstantLoad, Drive, Modulation
+from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps, Modulation
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
 
@@ -85,6 +85,18 @@ RIGS = {
     "two states, nagata, power": Rig(
         {"law": "two-state", "ageing": "nagata", "interface": "power", "inertia": True}, {},
         recording(np.linspace(0, 0.8, 121), "elongation", STEPS, ConstantLoad(5.0)), "0.21 N/um", 2.37e-6,
+    ),
+    "a load that a servo follows, blocks that bulge": Rig(
+        ROCK | {"effects": ("load-servo", "poisson-coupling", "linker-dieterich")},
+        ROCK_VALUES | {"share": 0.8, "natural": 0.4, "damping": 0.3, "shift": 0.4, "alpha": 0.2},
+        recording(np.linspace(0, 30, 151), "friction", Drive.steps([(0.0, 3.0), (15.0, 9.0)]),
+                  LoadSteps.sequence([(8.0, 20.0, 20.0), (12.0, 22.0, 22.0)], rise=0.5), stiffness=0.2),
+        "0.2 N/um",
+    ),
+    "a stiffer spring, a cell that creeps": Rig(
+        PMMA | {"effects": ("load-stiffening", "gauge-creep", "pore-pressure")},
+        PMMA_VALUES | {"m": 0.3, "Wref": 4.0, "share": 0.1, "creep_time": 0.1, "pressure": 0.4},
+        recording(np.linspace(0, 0.8, 161), "force", STEPS, Modulation(5.0, 0.1, 20.0, 0.3)), "0.21 N/um", 2.37e-6,
     ),
     "lag of the gauge": Rig(
         PMMA | {"effects": ("sensor-lag",)}, PMMA_VALUES | {"time_constant": 0.01},

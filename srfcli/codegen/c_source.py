@@ -301,8 +301,8 @@ FLAGS = (
 VECTORS = ("avx512f", "avx2")  # instruction sets that carry derivatives several at a time, the widest first
 FUNCTIONS = {"rates": "srf_rates", "rates_jacobian": "srf_jacobian", "rates_parameters": "srf_parameters"}
 DUAL_FUNCTIONS = {
-    "rates": "srf_d_rates", "rates_jacobian": "srf_d_jacobian", "field_gain": "srf_d_gain", "elongation": "srf_d_reading",
-    "elongation_gradient": "srf_d_gradient",
+    "rates": "srf_d_rates", "rates_jacobian": "srf_d_jacobian", "field_gain": "srf_d_gain", "reading": "srf_d_reading",
+    "reading_gradient": "srf_d_gradient",
 }  # fmt: skip
 ORBIT_FUNCTIONS = {"cycle": "srf_cycle", "cycle_jacobian": "srf_cycle_jacobian", "cycle_bilinear": "srf_bilinear"}
 LANES = 16  # derivatives that the filter carries along at a time: a run has 11 to 14
@@ -357,19 +357,10 @@ def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_
 
 def _filter_source(model: GeneratedModel) -> str:
     """Return the C text of the filter, which follows that of the integrator."""
-    gauge = model.namespace.get("OBSERVED")
     text = f"#define LANES {LANES}\n#define GAUGE_PROCESSES {GAUGE_PROCESSES}\n" + dual_arithmetic(model.source)
     text += c_function(model.source, "field_gain", label="srf_gain")
     for name, label in DUAL_FUNCTIONS.items():
-        if gauge and name.startswith("elongation"):
-            place = model.states.index(gauge)
-            shown = f"out[{place}] = srf_plain(1.0)" if name.endswith("gradient") else f"out[0] = x[{place}]"
-            arguments = "const dual *x, double V, double W, double W_dot, const dual *p, dual *out"
-            text += (
-                f"static void {label}({arguments}) {{ (void)x; (void)V; (void)W; (void)W_dot; (void)p; {shown}; }}\n"
-            )
-        else:
-            text += c_function(model.source, name, label=label, dual=True)
+        text += c_function(model.source, name, label=label, dual=True)
     return text + (files("srfcli") / "codegen" / "filter.c").read_text(encoding="utf-8")
 
 

@@ -77,7 +77,7 @@ static int nonzero(const lanes *d) {
 static double moments(Imposed *force, Course *course, Belief *b, double t, double h, const double *Z) {
     int m = NC + (course->slopes ? LANES : 0), pivot[NZ];
     double J[3][NX * NX], V[3], W[3], W_dot[3], x[NX], gain[NX], matrix[NZ * NZ];
-    double G[NZ * (NC + LANES)], B[NZ * (NC + LANES)];
+    double G[NZ * (NC + LANES)] __attribute__((aligned(64))), B[NZ * (NC + LANES)] __attribute__((aligned(64)));
     dual y[NX], f[NX];
     for (int i = 0; i < 3; i++) {
         imposed(force, t + C[i] * h, &V[i], &W[i], &W_dot[i]);

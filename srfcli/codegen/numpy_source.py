@@ -484,12 +484,15 @@ def generate_motion(system: System) -> str:
     ]
     writer.function("steady", "Steady sliding at V under W0.", steady, shape=f"({len(steady)},)", state=False)
     rates = rates_functions(writer, eq)
+    unknown = {s: name for s, name in zip(eq.unknowns, eq.names, strict=True) if str(s) == name}
+    inputs = ("V", "W", "W_dot")
+    writer.function("reading", "What the gauge shows of the elongation.", [("", eq.reading)], tail=inputs)
+    writer.function("stiffness", "Stiffness of the spring.", [("", eq.stiffness)], tail=inputs)
     if RANDOM_FIELD in system.effects:
         _write_filter(writer, eq, rates)
     if system.tables:
         _write_tables(writer, system)
     body = "\n\n\n".join(writer.parts)
-    observed = next((e.observed for e in system.effects if e.observed), "")
     return (
         _MOTION_HEAD.format(
             title=system.title,
@@ -498,7 +501,7 @@ def generate_motion(system: System) -> str:
             states=tuple_text(eq.names),
             logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
             arguments=repr(system.tables),
-            observed=observed,
+            observed=unknown.get(eq.reading, ""),
             parameters=parameter_rows(system),
             helpers="".join(h for name, h in HELPERS.items() if f"{name}(" in body)
             + ("\nlut, lut1, lut2 = tables_after(len(PARAMETERS))\n" if system.tables else ""),
@@ -509,12 +512,12 @@ def generate_motion(system: System) -> str:
 
 
 def _write_filter(writer: Writer, eq: Equations, rates: Staged) -> None:
-    """Write what a Kalman filter asks for besides: where the field's white noise enters, and the gradient of the elongation."""
+    """Write what a Kalman filter asks for besides: where the field's white noise enters, and the gradient of the reading."""
     inputs, shape = ("V", "W", "W_dot"), f"({len(eq.unknowns)},)"
     gain = rates.derivative({symbol("field_noise"): sp.S.One})
     writer.vector("field_gain", "d(rates)/d(field_noise).", gain, tail=inputs, shape=shape)
-    gradient = [(str(j), eq.derivative(eq.spring, j)) for j in range(len(eq.unknowns))]
-    writer.function("elongation_gradient", "d(elongation)/dx.", gradient, tail=inputs, shape=shape)
+    gradient = [(str(j), eq.derivative(eq.reading, j)) for j in range(len(eq.unknowns))]
+    writer.function("reading_gradient", "d(reading)/dx.", gradient, tail=inputs, shape=shape)
 
 
 def _write_tables(writer: Writer, system: System) -> None:

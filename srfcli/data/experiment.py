@@ -75,11 +75,11 @@ def read_experiment(
         return read_run(run, described.apparatus, described.columns, registry=registry, format=format, limit=limit)
 
     runs = tuple(read(run) for run in described.runs if holdout or not run.holdout)
-    if choice.effects and runs and described.parameters is not None:
+    if choice.effects and runs:
         from srfcli.symbolic.system import apart  # only for a description that has effects
 
         own = [registry.get("effect", name) for name in choice.effects]
-        stated = described.parameters.value
+        stated = described.parameters.value if described.parameters is not None else {}
         parameters = own_bounds(parameters, apart([e for e in own if isinstance(e, Effect)]), runs, stated)
     return Experiment(
         described.path,

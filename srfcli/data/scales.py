@@ -61,14 +61,23 @@ def own_bounds(
 ) -> tuple[FitParameter, ...]:
     """Return the parameters of an experiment with the bounds that the recording gives those of its effects.
 
-    `stated` has by name which of lower and upper the experiment says itself: these stay. Bounds make room for the start value.
+    `stated` has by name which of lower, upper and fixed the experiment says itself: these stay. Bounds make room for the start
+    value. What an effect never fits is added where the experiment does not list it, and held where it does not say otherwise.
     """
-    scales, found = scales_of(runs, parameters), dict[str, Parameter]()
+    scales, found, out = scales_of(runs, parameters), dict[str, Parameter](), []
+    held = {name for effect in effects for name in effect.fixed}
+    listed = {q.name for q in parameters}
     for effect in effects:
         named = {name for name, which, _ in effect.scaled if which != "default"}
-        found |= {p.name: p for p in at_scale(effect, scales).parameters if p.name in named}
-    out = []
+        for p in at_scale(effect, scales).parameters:
+            if p.name in named:
+                found[p.name] = p
+            if p.name in held - listed:
+                value, low, high = (to_base(x, p.unit) for x in (p.default, p.lower, p.upper))
+                out.append(FitParameter(p.name, value, low, high, True, p.unit))
     for q in parameters:
+        if q.name in held and "fixed" not in stated.get(q.name, ()):
+            q = replace(q, fixed=True)
         if q.name not in found:
             out.append(q)
             continue

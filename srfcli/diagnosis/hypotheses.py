@@ -80,13 +80,16 @@ def _unseen(effect: Effect, experiment: Experiment) -> str:
     loads = [run.load(run.t)[0] for run in experiment.runs]
     spread = max(float(np.ptp(np.log(W))) for W in loads)
     between = float(np.ptp([np.log(W.mean()) for W in loads])) if len(loads) > 1 else 0.0
-    if ("W_dot" in used or "W" in formulas or "force" in formulas) and spread < 1e-3:
+    calm = {symbol("W"): symbol("W0")} | {symbol(s.name): s.steady for s in effect.states} | UNMODULATED
+    still = {symbol("W"): symbol("W0"), symbol("force"): symbol("force")}
+    pressed = [f.subs(calm) != still[symbol(slot)] for slot, f in formulas.items() if slot in ("W", "force")]
+    if ("W_dot" in used or (pressed and not any(pressed))) and spread < 1e-3:
         return f"the load varies by {100 * spread:.2g} %" if spread > 0 else "the load is constant"
-    if {"kappa", "W"} & (used | set(formulas)) and "W" in used and max(spread, between) < 1e-3:
+    if "W" in used and not effect.states and max(spread, between) < 1e-3:
         wide = 100 * max(spread, between)
         return f"the loads of all runs lie within {wide:.2g} %" if wide else "the load is constant, the same in all runs"
-    calm = not any(of_run(run)["modulated"] for run in experiment.runs)
-    if calm and formulas and all(f.subs(UNMODULATED) == symbol(slot) for slot, f in formulas.items()):
+    unmodulated = not any(of_run(run)["modulated"] for run in experiment.runs)
+    if unmodulated and formulas and all(f.subs(UNMODULATED) == symbol(slot) for slot, f in formulas.items()):
         return "no run has a modulated load"
     return ""
 
@@ -164,7 +167,7 @@ def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment
     for name, p in own_parameters(effect, model).items():
         low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
         value = float(np.clip(neutral.get(p.name, to_base(p.default, p.unit)), low, high))
-        found.append(FitParameter(name, value, low, high, False, p.unit))
+        found.append(FitParameter(name, value, low, high, p.name in effect.fixed, p.unit))
     for name in effect.frees:
         if name == "K":
             size, unit = split_quantity(experiment.stiffness_text, name="stiffness")

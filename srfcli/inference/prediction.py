@@ -90,7 +90,7 @@ def _balanced(
 ) -> tuple[Array, Array]:
     states, t0 = list(model.states), float(run.t[0])
     V, W = float(run.drive(run.t[:1])[0]), run.load.rest(t0)
-    K, ages, iv = p[model.index("K")], _ages(model), states.index("ln_v")
+    ages, iv = _ages(model), states.index("ln_v")
     mu = values[f"{run.name}.mu"]
     x = np.asarray(model.steady(p)).astype(complex)
     for age in ages:
@@ -125,8 +125,14 @@ def _balanced(
         elif name in places:
             S[iv, k] = -friction_slope(places[name], None) / by_ln_v
     if "u" in states:
-        x[states.index("u")] = W * mu / K
-        S[states.index("u")] = [W / K if n == f"{run.name}.mu" else -W * mu / K**2 if n == "K" else 0.0 for n in by]
+        stiffness = model.namespace.get("stiffness") or (lambda x, V, W, W_dot, p: p[model.index("K")])
+        K, u = float(stiffness(x, V, W, 0.0, p)), states.index("u")
+        x[u] = W * mu / K
+        for k, name in enumerate(by):
+            if name == f"{run.name}.mu":
+                S[u, k] = W / K
+            elif name in places:
+                S[u, k] = -W * mu / K**2 * _slope(lambda q: stiffness(x, V, W, 0.0, q), p, places[name])
     if "z" in states:
         x[states.index("z")] = np.exp(x[iv])
         S[states.index("z")] = np.exp(x[iv]) * S[iv]
@@ -177,7 +183,8 @@ def run_parameters(model: GeneratedModel, experiment: Experiment, run: Run, valu
 
 def of_run(run: Run) -> dict[str, float]:
     """Return what effects ask of a recording: where and when it begins, and the load's modulation as it is in the data."""
-    return {"start": run.start, "begin": float(run.t[0]), **_modulation(run)}
+    weighed = float(run.observable != "elongation")
+    return {"start": run.start, "begin": float(run.t[0]), "weighed": weighed, **_modulation(run)}
 
 
 def _modulation(run: Run) -> dict[str, float]:
@@ -281,22 +288,23 @@ def _observe(
     K = p[model.index("K")]
     factor = {"elongation": np.ones_like(W), "force": np.full_like(W, K), "friction": K / W}[run.observable]
     J = np.zeros((t.size, len(places)))
-    recorded = model.namespace.get("OBSERVED") or "u"
+    recorded = model.namespace.get("OBSERVED", "u")
     if recorded in model.states:
         i = model.states.index(recorded)
         u, J = x[:, i], S[:, i, :].copy()
     else:
+        reading = model.namespace.get("reading") or model.elongation
         with np.errstate(all="ignore"):
-            u = np.asarray(model.elongation(x, V, W, W_dot, p))
+            u = np.asarray(reading(x, V, W, W_dot, p))
             for j in range(x.shape[1] if places else 0):
                 moved = x.astype(complex)
                 moved[:, j] += 1j * TINY
-                J += (np.asarray(model.elongation(moved, V, W, W_dot, p)).imag / TINY)[:, None] * S[:, j, :]
+                J += (np.asarray(reading(moved, V, W, W_dot, p)).imag / TINY)[:, None] * S[:, j, :]
             for k, i in enumerate(places):
                 if i >= 0:
                     q = p.astype(complex)
                     q[i] += 1j * TINY
-                    J[:, k] += np.asarray(model.elongation(x.astype(complex), V, W, W_dot, q)).imag / TINY
+                    J[:, k] += np.asarray(reading(x.astype(complex), V, W, W_dot, q)).imag / TINY
     if run.observable != "elongation" and model.index("K") in places:
         J[:, list(places).index(model.index("K"))] += u / K
     return factor * u, factor[:, None] * J

@@ -16,7 +16,7 @@ from srfcli.laws.values import Effect, ExtraState
 if TYPE_CHECKING:
     import sympy
 
-SLOTS = ("mu", "rate", "kappa", "W", "force", "V")
+SLOTS = ("mu", "rate", "kappa", "W", "force", "V", "K", "gauge")
 PLACES = ("slip", "stage", "time", "theta", "envelope")  # unknowns and abbreviations that formulas of effects may hold
 RUN_NAMES = ("W0", "eps", "f", "K", "V", "modulated")
 KEYS = (
@@ -25,8 +25,9 @@ KEYS = (
 )  # fmt: skip
 MOST = 1000  # values of an inner parameter
 SCAN = 8  # values at which an inner parameter is tried where its author says nothing
-_TAKEN = {*PLACES, *RUN_NAMES, *COMMON, "mu", "W", "v", "phi", "u", "kappa", "force", "start", "begin"}
-_PARAMETER = ("default", "unit", "lower", "upper", "bounds", "about", "neutral", "scan", "within", "typical")
+_TAKEN = {*PLACES, *RUN_NAMES, *COMMON, "mu", "W", "v", "phi", "u", "kappa", "force", "gauge", "start", "begin"}
+_OWN = ("neutral", "scan", "within", "typical", "fixed")  # keys of a parameter that an effect has and a law has not
+_PARAMETER = ("default", "unit", "lower", "upper", "bounds", "about", *_OWN)
 SCALES = {  # of a recording, which bounds and sizes may be stated in, with their units
     "segment": "um", "track": "um", "duration": "s", "interval": "s", "V_low": "um/s", "V_high": "um/s", "load": "N", "D0": "um",
     "V0": "um/s",
@@ -37,7 +38,7 @@ _STATE = ("name", "rate", "steady", "logarithmic")
 
 def known_names(own: Iterable[str], states: Iterable[str] = (), needs: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the names that the formulas of an effect may hold, but for that of the slot itself."""
-    return tuple(dict.fromkeys([*own, *states, *needs, *PLACES, *RUN_NAMES, *COMMON, *AGEING_SYMBOLS, "u"]))
+    return tuple(dict.fromkeys([*own, *states, *needs, *PLACES, *RUN_NAMES, *COMMON, *AGEING_SYMBOLS, "u", "gauge"]))
 
 
 def check_names(parameters: Sequence[Parameter], constants: Sequence[Parameter] = ()) -> None:
@@ -134,6 +135,7 @@ class EffectReader(LawReader):
             needs=self.listed("needs"), lacks=self.listed("lacks"), observed=self.text("observed"),
             constitutive=self.flag("constitutive", True), answers=self.text("answers"), constants=constants,
             scaled=tuple(self.scaled(parameters)), on_request=self.flag("on_request", False),
+            fixed=tuple(n for n, e in self.table.get("parameters", {}).items() if e.get("fixed")),
         )  # fmt: skip
         try:
             return finished(effect)
@@ -151,7 +153,13 @@ class EffectReader(LawReader):
                     self.fail(
                         f"{where}.scan", "given together with neutral", "A size is fitted; only others are tried."
                     )
+                if entry.get("fixed"):
+                    self.fail(f"{where}.fixed", "given together with neutral", "A size is fitted.")
                 neutral.append((name, self.number(f"{where}.neutral", entry["neutral"])))
+                continue
+            if entry.get("fixed"):
+                if "scan" in entry:
+                    self.fail(f"{where}.scan", "given together with fixed", "What is never fitted is tried at no values.")
                 continue
             count = self.number(f"{where}.scan", entry.get("scan", SCAN))
             if not (count.is_integer() and 1 <= count <= MOST):
@@ -189,7 +197,9 @@ class EffectReader(LawReader):
         """Return one parameter."""
         if isinstance(entry, dict):
             self.keys(f"parameters.{name}", entry, _PARAMETER)
-            entry = {k: v for k, v in entry.items() if k not in ("neutral", "scan", "within", "typical")}
+            if not isinstance(entry.get("fixed", False), bool):
+                self.fail(f"parameters.{name}.fixed", "expected true or false")
+            entry = {k: v for k, v in entry.items() if k not in _OWN}
         return super().parameter(name, entry)
 
     def constants(self) -> tuple[Parameter, ...]:

@@ -92,11 +92,13 @@ class ExtraState:
 class Effect(Law):
     """A piece of physics nested in a baseline: at the `neutral` values of its parameters the model is the baseline.
 
-    `changes` holds (slot, formula): mu, rate, kappa, W (the load on the asperities), force (along the track, on the slider) or V;
-    in a formula the slot's own name is what was there before. `settings` replace choices of the model (interface, inertia),
+    `changes` holds (slot, formula): mu, rate, kappa, W (the load on the asperities), force (along the track, on the slider), V,
+    K (the spring's stiffness) or gauge (what it shows of the elongation); in a formula the slot's own name is what was there
+    before. `settings` replace choices of the model (interface, inertia),
     `frees` names parameters of the apparatus that are fitted instead. `neutral` holds the sizes' neutral values, `scans` the
     inner parameters (unseen at neutral sizes) with the number of values to try. `answers` is the name under which it is reported.
     `scaled` holds (parameter, lower, upper or default, formula in the scales of a recording) for what takes a number's place.
+    Those in `fixed` are never fitted: a reference load, say.
     One `on_request` is searched for only where it is named.
     `constants` are numbers with units that formulas in `written` name; in `changes` and `states` their values stand, um, s, N.
     """
@@ -116,6 +118,7 @@ class Effect(Law):
     written: tuple[tuple[str, sympy.Expr], ...] = field(default=(), compare=False)
     scaled: tuple[tuple[str, str, sympy.Expr], ...] = ()
     on_request: bool = False
+    fixed: tuple[str, ...] = ()
 
     @property
     def reported(self) -> str:

@@ -75,8 +75,13 @@ def observe(model: GeneratedModel, job: Job, trace: Trace) -> Array:
 
     The elongation is the one that a gauge shows, where an effect stands between the two.
     """
-    K, shown = float(job.p[model.index("K")]), model.namespace.get("OBSERVED") or "u"
-    u = trace.state(shown) if shown in model.states else trace.u
+    import numpy as np
+
+    K, u, reading = float(job.p[model.index("K")]), trace.u, model.namespace.get("reading")
+    if reading is not None:
+        W0 = dict.fromkeys(["W0"], job.load.rest(float(job.t[0])))
+        p = model.vector(dict(zip(model.names, job.p.tolist(), strict=True)) | W0)
+        u = np.asarray(reading(trace.x, trace.V, trace.W, np.zeros_like(trace.W), p))
     if job.observable == "elongation":
         return u
     return K * u if job.observable == "force" else K * u / trace.W

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import sympy as sp
@@ -22,7 +22,8 @@ MAX_CANCEL = 80  # operations: beyond it a common denominator takes a minute to 
 class Equations:
     """x' = rates(x, t): `unknowns` are the symbols that stand in the formulas (v, not ln v), `logarithmic` says which.
 
-    `load` is W as a function of the imposed load `W` and its rate `W_dot`; `spring` is the elongation u, an unknown or a formula.
+    `load` is W as a function of the imposed load `W` and its rate `W_dot`; `spring` is the elongation u, an unknown or a formula;
+    `reading` is what the gauge shows of it, `stiffness` the spring's.
     """
 
     names: tuple[str, ...]
@@ -30,6 +31,8 @@ class Equations:
     logarithmic: tuple[bool, ...]
     rates: tuple[sp.Expr, ...]
     spring: sp.Expr
+    reading: sp.Expr
+    stiffness: sp.Expr
     load: sp.Expr
     mu: sp.Expr
     steady: tuple[sp.Expr, ...]
@@ -114,21 +117,34 @@ class Parts:
     W: sp.Expr
     force: sp.Expr
     V: sp.Expr
+    K: sp.Expr
+    gauge: sp.Expr
+    shown: tuple[sp.Expr, ...] = ()  # by the gauge, before the effect of each further unknown
 
     def formulas(self) -> tuple[sp.Expr, ...]:
         """Return all of them."""
-        return tuple(f for f in (self.mu, self.kappa, self.W, self.force, self.V) if f is not None)
+        found = (self.mu, self.kappa, self.W, self.force, self.V, self.K, self.gauge)
+        return tuple(f for f in found if f is not None)
 
 
 def parts_of(system: System) -> Parts:
-    """Return friction coefficient, contact stiffness, load on the asperities, extra force and stage velocity of `system`.
+    """Return friction coefficient, contact stiffness, load on the asperities, extra force, stage velocity and so on of `system`.
 
-    Each effect's formula takes the place of what was there before; the tables come last.
+    Each effect's formula takes the place of what was there before; the tables come last. A gauge that weighs shows the spring's
+    force over the stated K.
     """
-    found = {"mu": system.friction.mu, "W": symbol("W"), "force": sp.S.Zero, "V": symbol("V")}
+    found = {"mu": system.friction.mu, "W": symbol("W"), "force": sp.S.Zero, "V": symbol("V"), "K": symbol("K")}
+    stiffness, shown = symbol("K"), list[sp.Expr]()
+    for slot, formula in (change for effect in system.effects for change in effect.changes):
+        if slot == "K":
+            stiffness = formula.xreplace({symbol("K"): stiffness})
+    found["gauge"] = symbol("u") * (1 + symbol("weighed") * (stiffness / symbol("K") - 1))
     if system.interface.kappa is not None:
         found["kappa"] = system.interface.kappa
     for effect in system.effects:
+        shown += [found["gauge"]] * len(effect.states)
+        if effect.observed:
+            found["gauge"] = symbol(effect.observed)
         for slot, formula in effect.changes:
             if slot == "rate":
                 continue
@@ -138,7 +154,8 @@ def parts_of(system: System) -> Parts:
     for number, (slot, argument) in enumerate(system.tables):
         value = lut(sp.Integer(number), symbol(argument))
         found[slot] = found[slot] * (1 + value) if slot == "V" else found[slot] + value
-    return Parts(**{slot: _modulated(f) for slot, f in found.items()}, **({} if "kappa" in found else {"kappa": None}))
+    parts = {slot: _modulated(f) for slot, f in found.items()}
+    return Parts(**{"kappa": None, **parts}, shown=tuple(map(_modulated, shown)))
 
 
 def check_slots(system: System, parts: Parts) -> None:
@@ -146,9 +163,11 @@ def check_slots(system: System, parts: Parts) -> None:
     moving = {"v", "mu", *(state.name for state in system.friction.states)}
     refused = {
         "mu": {"V"},
-        "kappa": moving | {"V"},
-        "W": moving | {"V"},
-        "force": {"V"} if system.inertia else moving | {"V"},
+        "kappa": moving | {"V", "gauge"},
+        "W": moving | {"V", "gauge"},
+        "force": {"V", "gauge"} | (set() if system.inertia else moving),
+        "K": moving | {"V", "gauge"} | (set() if system.inertia else {"u"}),
+        "gauge": moving | {"V", "W_dot"},
     }
     for slot, names in refused.items():
         formula = getattr(parts, slot)
@@ -190,6 +209,10 @@ class _Builder:
     def __init__(self, system: System) -> None:
         self.system, self.parts = system, parts_of(system)
         check_slots(system, self.parts)
+        self.extras = tuple(
+            replace(e, rate=e.rate.subs(symbol("gauge"), shown), steady=e.steady.subs(symbol("gauge"), shown))
+            for e, shown in zip(system.extra_states, self.parts.shown, strict=True)
+        )
         self.aux = auxiliary(system, self.parts)
         self.phis = [symbol(state.name) for state in system.friction.states]
         self.steady = steady_states(system)
@@ -203,13 +226,15 @@ class _Builder:
         }:
             self.slip_t = sp.Symbol("S_t_")
         self.force, self.force_dot, self.W_dot = sp.symbols("F_ F_dot_ We_dot_")
+        plain = symbol("K") == self.parts.K
+        self.K, self.K_dot = (symbol("K"), sp.S.Zero) if plain else sp.symbols("K_ K_dot_")
         self.tangent = sp.tan(symbol("angle")) if system.loading == "inclined" else sp.S.Zero
 
     def equations(self) -> Equations:
         system, s, aux = self.system, symbol, self.aux
         solution, u_rate = self.solved()
         meaning = self.meaning()
-        mu_ss, K, V = self.mu_ss(), s("K"), s("V")
+        mu_ss, K, V = self.mu_ss(), self.K, s("V")
         z_rate = (K * s("u") - self.load * self.mu + self.force) / s("M")
         names, unknowns, rates = list(system.states), [s("v"), *self.phis], []
         if system.inertia:
@@ -218,10 +243,10 @@ class _Builder:
         rates += [solution[r] for r in (self.d_ln_v, *self.d_ln_phi)]
         spring = s("u") if system.inertia else (self.load * self.mu - self.force) / K
         at_drive = [e.subs(s("v"), V) for e in (s("v"), *self.steady)]
-        u_rest = (self.load_at_rest(mu_ss) * mu_ss - self.parts.force) / K
+        u_rest = (self.load_at_rest(mu_ss) * mu_ss - self.parts.force) / self.parts.K
         resting = [u_rest, V][: len(unknowns) - len(at_drive)]
         steady = [self.settled(e, u_rest, mu_ss) for e in (*resting, *at_drive)]
-        for extra in system.extra_states:
+        for extra in self.extras:
             names.append(f"ln_{extra.name}" if extra.logarithmic else extra.name)
             unknowns.append(s(extra.name))
             rate = self.extra_rate(extra)
@@ -236,12 +261,18 @@ class _Builder:
         filled = [_modulated(r.subs(meaning)) for r in rates]
         self.check_known(filled, {*map(str, unknowns), "V", "W", "W_dot"})
         self.check_known(steady, set())
+        reading = self.parts.gauge
+        if not system.inertia:
+            spring, reading = spring.subs(meaning), reading.subs(meaning)
+        self.check_known([reading], {*map(str, unknowns), "W"})
         return Equations(
             names=tuple(names),
             unknowns=tuple(unknowns),
             logarithmic=tuple(n.startswith("ln_") for n in names),
             rates=tuple(filled),
-            spring=spring.subs(meaning) if not system.inertia else spring,
+            spring=spring,
+            reading=reading,
+            stiffness=self.parts.K,
             load=self.total_load(),
             mu=self.parts.mu,
             steady=tuple(steady),
@@ -250,7 +281,7 @@ class _Builder:
     def settled(self, formula: sp.Expr, u_rest: sp.Expr, mu_ss: sp.Expr) -> sp.Expr:
         """Return the value of a formula where a run begins: in steady sliding at V under W0, with elongation `u_rest`."""
         s = symbol
-        own = {s(e.name): e.steady for e in self.system.extra_states}
+        own = {s(e.name): e.steady for e in self.extras}
         at_rest = {
             s("W"): s("W0"),
             s("W_dot"): sp.S.Zero,
@@ -279,7 +310,7 @@ class _Builder:
         """Return the unknowns beside v and the ages that a formula may hold, and their rates."""
         s, system = symbol, self.system
         found = [(s(a), self.aux_rate(a)) for a in self.aux] + [
-            (s(e.name), self.extra_rate(e)) for e in system.extra_states
+            (s(e.name), self.extra_rate(e)) for e in self.extras
         ]
         if system.inertia:
             found.append((s("u"), self.V - (s("z") if system.elastic else s("v"))))
@@ -291,7 +322,7 @@ class _Builder:
     def mu_ss(self) -> sp.Expr:
         """Return the friction coefficient in steady sliding at V; under W0 where it depends on the load."""
         s = symbol
-        extra = {s(e.name): e.steady for e in self.system.extra_states}
+        extra = {s(e.name): e.steady for e in self.extras}
         mu = self.parts.mu.subs(extra).subs(dict(zip(self.phis, self.steady, strict=True))).subs(s("v"), s("V"))
         return mu.subs(s("W"), self.parts.W) if self.system.effects else mu
 
@@ -338,9 +369,10 @@ class _Builder:
             stretched = self.slip * mu_dot + mu * self.slip_W * W_rate + mu * self.slip_t
             balance.append(stretched - ((z if system.inertia else x_rate) - v))
         if system.inertia and not system.elastic:
-            balance.append(M * v * self.d_ln_v - (symbol("K") * u - load * mu + self.force))
+            balance.append(M * v * self.d_ln_v - (self.K * u - load * mu + self.force))
         if not system.inertia:
-            balance.append(symbol("K") * u_rate - load * mu_dot - mu * W_rate + self.force_dot)
+            moved = self.K * u_rate + self.K_dot * u
+            balance.append(moved - load * mu_dot - mu * W_rate + self.force_dot)
             if system.elastic:
                 wanted.append(x_rate)
         return solve_linear(balance, wanted, system), u_rate
@@ -352,12 +384,13 @@ class _Builder:
         S = sp.simplify(s("W") / kappa) if kappa is not None else sp.S.Zero
         W = s("W")
         on_load = (lambda e: e.subs(W, load)) if mu.has(W) or S.has(W) else (lambda e: e)
-        explicit, imposed, pushed, stretched = (
+        explicit, imposed, pushed, stretched, stiffened = (
             sum((sp.diff(part, name) * rate for name, rate in self.along()), sp.S.Zero)
-            for part in (mu, parts.W, parts.force, S)
+            for part in (mu, parts.W, parts.force, S, parts.K)
         )
         imposed += sp.diff(parts.W, W) * s("W_dot")
         pushed += sp.diff(parts.force, W) * s("W_dot")
+        stiffened += sp.diff(parts.K, W) * s("W_dot")
         v = s("v")
         return [
             *([(self.slip_t, on_load(stretched))] if self.slip_t else []),
@@ -372,6 +405,7 @@ class _Builder:
             (self.force_dot, pushed),
             (self.W_dot, imposed),
             (self.V, parts.V),
+            *([(self.K_dot, stiffened), (self.K, parts.K)] if self.K_dot else []),
             (load, self.total_load()),
             (self.imposed, W),
         ]

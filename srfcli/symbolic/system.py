@@ -39,6 +39,7 @@ RUN = (  # of one run: what an effect may ask of the recording
     Parameter("modulated", 0.0, "1", about="1 where the load is modulated"),
     Parameter("rise0", 0.02, "s", about="time scale of the switch-on of the modulation"),
     Parameter("onset0", -1e6, "s", about="when half of the load modulation was switched on"),
+    Parameter("weighed", 0.0, "1", about="1 where the spring's force is recorded, 0 where its elongation is"),
 )
 _ALONG = sp.sqrt(3) * symbol("v") / symbol("field_length")  # slip rate in the units of a Matern covariance
 RANDOM_FIELD = Effect(  # correlation (1 + r) exp(-r), r = sqrt(3) d/length (Matern 3/2): two states, driven by white noise
@@ -63,7 +64,7 @@ RANDOM_FIELD = Effect(  # correlation (1 + r) exp(-r), r = sqrt(3) d/length (Mat
     ),
     neutral=(("field_amplitude", 0.0),),
 )  # fmt: skip
-EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "kappa", "force", "rate", "V")
+EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "gauge", "kappa", "force", "rate", "V")
 LOADINGS = ("vertical", "inclined")
 
 
@@ -198,6 +199,7 @@ def _renamed(effect: Effect, names: Mapping[str, str]) -> Effect:
         neutral=tuple((names.get(n, n), v) for n, v in effect.neutral),
         scans=tuple((names.get(n, n), v) for n, v in effect.scans),
         scaled=tuple((names.get(n, n), which, formula) for n, which, formula in effect.scaled),
+        fixed=tuple(names.get(n, n) for n in effect.fixed),
     )
 
 

@@ -259,7 +259,9 @@ def _complex_step(formula: sympy.Expr, name: str, point: Mapping[str, float]) ->
 
 # What `srf law check` asks of an effect: units, a neutral value at which the model is its baseline, derivatives.
 
-SLOT_UNITS = {"mu": "1", "rate": "1", "kappa": "N/um", "W": "N", "force": "N", "V": "um/s"}
+SLOT_UNITS = {
+    "mu": "1", "rate": "1", "kappa": "N/um", "W": "N", "force": "N", "V": "um/s", "K": "N/um", "gauge": "um"
+}  # fmt: skip
 PLACE_UNITS = {"slip": "um", "stage": "um", "time": "s", "theta": "1", "envelope": "1", "u": "um"}
 MOVING = {"slip", "stage", "time", "theta", "envelope"}  # an effect of these is steady nowhere
 POINTS = 24
@@ -420,6 +422,8 @@ class _Check:
         """Raise SrfError where nothing changes at the default values."""
         if self.effect.settings or self.effect.frees or self.effect.observed:
             raise Skipped("it is what is fitted or observed that changes")
+        if {slot for slot, _ in self.effect.changes} == {"gauge"}:
+            return self._shown()
         points, own = self._points(), len(self.plain.states)
         away = points.rates(self.model, self._vector())[:, :own]
         at = points.rates(self.model, self._vector(self._neutral_values()))[:, :own]
@@ -431,6 +435,21 @@ class _Check:
                 "at the default values the effect changes nothing", "Give the size a default off its neutral value."
             )
         return f"at the default values a rate moves by up to {moved:.2g} of the largest"
+
+    def _shown(self) -> str:
+        """Return how far the reading moves at the default values; SrfError where it does not, or moves at the neutral ones."""
+        points = self._points()
+
+        def read(model: GeneratedModel, p: Array) -> Array:
+            return np.asarray(model.reading(points.x[:, : len(model.states)], points.V, points.W, points.W_dot, p))
+
+        plain = read(self.plain, self.plain.vector(self._values(self.plain)))
+        if not (off := _difference(read(self.model, self._vector(self._neutral_values())), plain)) < RTOL:
+            raise SrfError(f"at the neutral values the reading differs by {off:.2g} of its size", "It must be gauge there.")
+        moved = _difference(read(self.model, self._vector()), plain)
+        if moved < 1e-12:
+            raise SrfError("at the default values the gauge shows what it did", "Give the size a default off its neutral value.")
+        return f"at the default values the reading moves by up to {moved:.2g} of the largest"
 
     def steady_start(self) -> str:
         formulas = [*(f for _, f in self.effect.changes), *(f for s in self.effect.states for f in (s.rate, s.steady))]

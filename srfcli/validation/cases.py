@@ -87,6 +87,8 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("sensor-lag", "lag", 5e-4, 0.02),
     Effect("stiffness-error", "ratio", 0.03, 0.3, BOTH, neutral=1.0),
     Effect("inertia", "M", 0.2, 4.0, scale=1e-6, absent={"massless": True}),  # kg
+    Effect("load-stiffening", "K_power", 0.05, 0.6, BOTH),
+    Effect("poisson-coupling", "poisson", 0.003, 0.1, BOTH),
 )
 OUTSIDE: tuple[Effect, ...] = (
     Effect("age-exponent", "p_age", 0.15, 1.0, neutral=1.0, listed=False, resembles=("slip-evolution",)),
@@ -104,6 +106,12 @@ OUTSIDE: tuple[Effect, ...] = (
     Effect("interface-damping", "eta", 5e-4, 0.02, listed=False),
     Effect("drive-lag", "drive_tau", 0.005, 0.15, listed=False, resembles=("sensor-lag",)),
     Effect("gauge-backlash", "backlash", 0.015, 0.2, listed=False, resembles=("sensor-lag",)),
+    Effect(
+        "load-servo", "servo", 0.1, 1.0, beside={"servo_f": (2.0, 20.0), "servo_damping": (0.2, 0.9)}, listed=False,
+        resembles=("load-transmission", "linker-dieterich"),
+    ),
+    Effect("pore-pressure", "pore", 0.02, 0.6, listed=False, resembles=("adhesion-offset",)),
+    Effect("gauge-creep", "creep", 0.003, 0.1, beside={"creep_tau": (0.1, 3.0)}, listed=False, resembles=("sensor-lag",)),
 )  # fmt: skip
 NAMES = tuple(dict.fromkeys(e.name for e in EFFECTS))
 OUTSIDE_NAMES = tuple(e.name for e in OUTSIDE)

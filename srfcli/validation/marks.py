@@ -312,6 +312,8 @@ SIZES: Mapping[str, tuple[Size, ...]] = {
     "sensor-lag": (Size("lag", "time_constant", "s"),),
     "stiffness-error": (Size("ratio", "ratio"),),
     "inertia": (Size("M", "M", "kg", factor=1e6),),
+    "load-stiffening": (Size("K_power", "m"),),
+    "poisson-coupling": (Size("poisson", "shift", "um/N"),),
 }
 
 

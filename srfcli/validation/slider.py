@@ -125,6 +125,8 @@ class Physics:
     ripple_p: float = 10.0
     ripple_phase: float = 0.0
     lag: float = 0.0  # s, of the gauge
+    poisson: float = 0.0  # um/N: the load point is carried along by poisson (W - W0)
+    K_power: float = 0.0  # spring K ratio (W/Wref)^K_power
     ratio: float = 1.0  # the spring's stiffness over K, which is what is stated
     # what is in no table
     p_age: float = 1.0  # phi' = 1 - q^p
@@ -140,13 +142,24 @@ class Physics:
     eta: float = 0.0  # N s/um, a dashpot beside kappa
     drive_tau: float = 0.0  # s, the stage follows its nominal velocity with this lag
     backlash: float = 0.0  # um, half the gauge's dead band
+    servo: float = 0.0  # share of the load that a servo of second order controls, W'' = w^2 (command - W) - 2 damping w W'
+    servo_f: float = 5.0  # Hz, w/(2 pi)
+    servo_damping: float = 0.5
+    pore: float = 0.0  # N, carried by a fluid: the asperities feel W - pore
+    creep: float = 0.0  # share of the elongation that the gauge shows late
+    creep_tau: float = 1.0
+    nagata: float = 0.0  # phi' loses (nagata/B) phi F'/W, F the friction force
     # the track itself, which is no effect
     track: Track = SMOOTH
 
     @property
     def spring(self) -> float:
-        """Return the stiffness in N/um that the spring really has."""
+        """Return the stiffness in N/um that the spring really has, under the load Wref where it depends on that."""
         return self.K * self.ratio
+
+    def spring_under(self, W: float) -> float:
+        """Return the stiffness in N/um of the spring under an imposed load in N."""
+        return self.spring * (W / self.Wref) ** self.K_power if self.K_power else self.spring
 
 
 # What is done to the slider: seven runs, two of them held out, with drives and loads drawn around those of the examples.
@@ -233,11 +246,13 @@ FASTEST = 60.0  # of ln(v/V0): what a solver's trial step may ask for is kept fi
 
 @dataclass(frozen=True)
 class Felt:
-    """The load at the asperities and its rate, N and N/s, beside W - W0 of the imposed one."""
+    """The load at the asperities and its rate, N and N/s, beside the imposed one, its W - W0 and its rate."""
 
     W: float
     rate: float
     excess: float
+    imposed: float
+    imposed_rate: float
 
 
 def felt_load(p: Physics, plan: Plan) -> Callable[[float], Felt]:
@@ -248,12 +263,12 @@ def felt_load(p: Physics, plan: Plan) -> Callable[[float], Felt]:
     def felt(t: float) -> Felt:
         W, rate = imposed(t)
         if not plan.eps:
-            return Felt(W, rate, W - W0)  # a slow step of the load is no modulation: it arrives in full
+            return Felt(W - p.pore, rate, W - W0, W, rate)  # a slow step of the load is no modulation: it arrives in full
         s, s_dot = switched(t)
         angle = omega * t + p.distortion_phase
         here = W0 + p.rho * (W - W0) + height * s * math.cos(angle)
         slope = p.rho * rate + height * (s_dot * math.cos(angle) - s * omega * math.sin(angle))
-        return Felt(here, slope, W - W0)
+        return Felt(here - p.pore, slope, W - W0, W, rate)
 
     return felt
 
@@ -300,16 +315,16 @@ def log_velocity(R: float, a: float, c: float) -> float:
     return x
 
 
-def ageing(p: Physics) -> Callable[[float, float, float, float], float]:
-    """Return f(v, ln phi, W, W') -> d(ln phi)/dt."""
+def ageing(p: Physics) -> Callable[..., float]:
+    """Return f(v, ln phi, W, W', F' = 0) -> d(ln phi)/dt, F the friction force."""
 
-    def rate(v: float, ln_phi: float, W: float, W_dot: float) -> float:
+    def rate(v: float, ln_phi: float, W: float, W_dot: float, F_dot: float = 0.0) -> float:
         phi = math.exp(ln_phi)
         D = p.D0 * (v / p.V_D) ** p.D_power if p.D_power else p.D0
         q = max(v * phi / D, 1e-300)
         worn = q if p.p_age == 1.0 else q**p.p_age
         grown = (1 - p.slip_share) * (1 - worn) - (p.slip_share * q * math.log(q) if p.slip_share else 0.0)
-        return grown / phi - p.alpha / p.B * W_dot / W - p.age_rate
+        return grown / phi - p.alpha / p.B * W_dot / W - p.nagata / p.B * F_dot / W - p.age_rate
 
     return rate
 
@@ -333,8 +348,8 @@ def stiffness(p: Physics) -> Callable[[float], float]:
 # Where friction force, slip velocity and spring elongation come from: three kinds of slider.
 
 Sliding = tuple[float, float, float]  # slip velocity um/s, elongation of the spring um, friction force N
-Slide = Callable[[list[float], float, float, float, float], Sliding]  # of states, m, a, load, force along the drive
-Push = Callable[[list[float], Sliding, float, float], list[float]]  # of states, the above, stage velocity, force along
+Slide = Callable[[list[float], float, float, float, float, float], Sliding]  # of states, m, a, load, force along, spring's K
+Push = Callable[[list[float], Sliding, float, float, float], list[float]]  # of states, the above, stage velocity, force, K
 
 
 @dataclass(frozen=True)
@@ -344,7 +359,7 @@ class Contact:
     names: tuple[str, ...]
     slide: Slide
     push: Push
-    steady: Callable[[float, float, float], list[float]]  # of velocity, friction force, load
+    steady: Callable[[float, float, float, float], list[float]]  # of velocity, friction force, load, spring's K
 
 
 def build_contact(p: Physics) -> Contact:
@@ -356,47 +371,47 @@ def _elastic(p: Physics) -> Contact:
     """The stretch e of the interface is a state: kappa e + eta (z - v) = F = (W + Wa) mu(v, phi) gives v."""
     kappa = stiffness(p)
 
-    def slide(y: list[float], m: float, a: float, W: float, aside: float) -> Sliding:
+    def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
         weight = W + p.Wa
         pull = kappa(W) * y[2] + p.eta * y[1]
         v = p.V0 * math.exp(log_velocity(pull / weight - m, a, p.drag + p.eta * p.V0 / weight))
         return v, y[0], pull - p.eta * v
 
-    def push(y: list[float], sliding: Sliding, V: float, aside: float) -> list[float]:
+    def push(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
         v, u, F = sliding
-        return [V - y[1], (p.spring * u + aside - F) / p.M, y[1] - v]
+        return [V - y[1], (K * u + aside - F) / p.M, y[1] - v]
 
-    return Contact(("u", "z", "e"), slide, push, lambda V, F, W: [F / p.spring, V, F / kappa(W)])
+    return Contact(("u", "z", "e"), slide, push, lambda V, F, W, K: [F / K, V, F / kappa(W)])
 
 
 def _rigid(p: Physics) -> Contact:
     """There is nothing to stretch: ln v is a state, which inertia moves."""
 
-    def slide(y: list[float], m: float, a: float, W: float, aside: float) -> Sliding:
+    def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
         x = min(y[1], FASTEST)
         v = p.V0 * math.exp(x)
         return v, y[0], (W + p.Wa) * (m + a * x + p.drag * v / p.V0)
 
-    def push(y: list[float], sliding: Sliding, V: float, aside: float) -> list[float]:
+    def push(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
         v, u, F = sliding
-        return [V - v, (p.spring * u + aside - F) / (p.M * v)]
+        return [V - v, (K * u + aside - F) / (p.M * v)]
 
-    return Contact(("u", "ln_v"), slide, push, lambda V, F, W: [F / p.spring, math.log(V / p.V0)])
+    return Contact(("u", "ln_v"), slide, push, lambda V, F, W, K: [F / K, math.log(V / p.V0)])
 
 
 def _massless(p: Physics) -> Contact:
     """Spring and interface in series carry the friction force; their joint stretch D is the state."""
     kappa = stiffness(p)
 
-    def slide(y: list[float], m: float, a: float, W: float, aside: float) -> Sliding:
-        yielding = 1 / p.spring + (0.0 if p.rigid else 1 / kappa(W))
-        F = (y[0] + aside / p.spring) / yielding
-        return p.V0 * math.exp(log_velocity(F / (W + p.Wa) - m, a, p.drag)), (F - aside) / p.spring, F
+    def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
+        yielding = 1 / K + (0.0 if p.rigid else 1 / kappa(W))
+        F = (y[0] + aside / K) / yielding
+        return p.V0 * math.exp(log_velocity(F / (W + p.Wa) - m, a, p.drag)), (F - aside) / K, F
 
-    def push(y: list[float], sliding: Sliding, V: float, aside: float) -> list[float]:
+    def push(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
         return [V - sliding[0]]
 
-    return Contact(("D",), slide, push, lambda V, F, W: [F / p.spring + (0.0 if p.rigid else F / kappa(W))])
+    return Contact(("D",), slide, push, lambda V, F, W, K: [F / K + (0.0 if p.rigid else F / kappa(W))])
 
 
 # The run of a slider from steady sliding: states joined, integrated by backward differentiation formulas, read by a gauge.
@@ -413,16 +428,21 @@ class Slider:
     """The first-order system of one run. States: the contact's, ln phi, slip, then only what the effects at work need."""
 
     def __init__(self, p: Physics, plan: Plan) -> None:
+        if p.nagata and not (p.rigid and p.massless and not p.cross and not p.K_power):
+            raise ValueError("nagata: the rate of the friction force is that of a plain spring's, rigid and massless")
         self.p, self.plan = p, plan
         self.contact: Contact = build_contact(p)
         self._felt = felt_load(p, plan)
         self._terms = at_unit_velocity(replace(p, track=p.track.under(plan.name)), plan.distance + OVERSHOOT)
         self._aged = ageing(p)
-        extra = {"ln_phi2": p.B2, "Wm": p.memory, "gauge": p.lag, "stage": p.drive_tau, "X": p.ripple}
+        extra = {
+            "ln_phi2": p.B2, "Wm": p.memory, "gauge": p.lag, "stage": p.drive_tau, "X": p.ripple, "Ws": p.servo,
+            "Ws_dot": p.servo, "late": p.creep,
+        }  # fmt: skip
         self.names = (*self.contact.names, "ln_phi", "s", *(name for name, size in extra.items() if size))
         self._age = len(self.contact.names)
         where = [self.names.index(name) if name in self.names else 0 for name in extra]  # 0 is always mechanical
-        self._age2, self._delay, self._gauge, self._stage, self._X = where
+        self._age2, self._delay, self._gauge, self._stage, self._X, self._servo, _, self._late = where
 
     def sliding(self, t: float, y: list[float]) -> tuple[Sliding, Felt]:
         """Return slip velocity, elongation and friction force, and the load at the asperities, at time t in s."""
@@ -431,9 +451,13 @@ class Slider:
             late = y[self._delay]
             rate = (felt.W - late) / p.memory_tau
             W = felt.W + p.memory * (late - felt.W)
-            felt = Felt(W, felt.rate + p.memory * (rate - felt.rate), felt.excess)
+            felt = replace(felt, W=W, rate=felt.rate + p.memory * (rate - felt.rate))
+        if self._servo:
+            W, rate = y[self._servo], y[self._servo + 1]
+            felt = replace(felt, W=felt.W + p.servo * (W - felt.W), rate=felt.rate + p.servo * (rate - felt.rate))
         m, a = self._terms(t, y[self._age + 1], y[self._age], y[self._age2] if self._age2 else 0.0, felt.W)
-        return self.contact.slide(y, m, a, felt.W, -p.cross * felt.excess), felt
+        K = p.spring_under(felt.imposed)
+        return self.contact.slide(y, m, a, felt.W, -p.cross * felt.excess, K), felt
 
     def rates(self, t: float, states: Array, V: float) -> list[float]:
         """Return the rates of the states at time t in s, where the stage's nominal velocity is V um/s."""
@@ -444,8 +468,10 @@ class Slider:
             V = y[self._stage]
         if self._X:
             V *= 1 + p.ripple * math.cos(2 * math.pi * y[self._X] / p.ripple_p + p.ripple_phase)
-        out = self.contact.push(y, sliding, V, -p.cross * felt.excess)
-        out += (self._aged(v, y[self._age], felt.W, felt.rate), v)
+        V += p.poisson * felt.imposed_rate
+        out = self.contact.push(y, sliding, V, -p.cross * felt.excess, p.spring_under(felt.imposed))
+        F_dot = p.spring * out[0] if p.nagata else 0.0
+        out += (self._aged(v, y[self._age], felt.W, felt.rate, F_dot), v)
         if self._age2:
             out.append(math.exp(-y[self._age2]) - v / p.D2)
         if self._delay:
@@ -456,20 +482,28 @@ class Slider:
             out.append((nominal - y[self._stage]) / p.drive_tau)
         if self._X:
             out.append(nominal)
+        if self._servo:
+            w = 2 * math.pi * p.servo_f
+            W, rate = y[self._servo], y[self._servo + 1]
+            out += (rate, w * (w * (self._felt(t).W - W) - 2 * p.servo_damping * rate))
+        if self._late:
+            out.append((u - y[self._late]) / p.creep_tau)
         return out
 
     def shown(self, t: float, y: list[float]) -> float:
         """Return the elongation in um that the gauge shows."""
-        return y[self._gauge] if self._gauge else self.sliding(t, y)[0][1]
+        u = y[self._gauge] if self._gauge else self.sliding(t, y)[0][1]
+        return u + self.p.creep * (y[self._late] - u) if self._late else u
 
     def steady(self) -> list[float]:
         """Return the states of steady sliding at the run's first velocity and load."""
-        p, V, W = self.p, self.plan.drive[0][1], self._felt(0.0).W
+        p, V, felt = self.p, self.plan.drive[0][1], self._felt(0.0)
+        W, K = felt.W, self.p.spring_under(felt.imposed)
         ln_phi, ln_phi2 = steady_age(p, V), math.log(p.D2 / V)
         m, a = self._terms(0.0, 0.0, ln_phi, ln_phi2, W)
         F = (W + p.Wa) * (m + a * math.log(V / p.V0) + p.drag * V / p.V0)
-        extra = {"ln_phi2": ln_phi2, "Wm": W, "gauge": F / p.spring, "stage": V, "X": 0.0}
-        mechanical = self.contact.steady(V, F, W)
+        extra = {"ln_phi2": ln_phi2, "Wm": W, "gauge": F / K, "stage": V, "X": 0.0, "Ws": W, "Ws_dot": 0.0, "late": F / K}
+        mechanical = self.contact.steady(V, F, W, K)
         return [*mechanical, ln_phi, 0.0, *(extra[name] for name in self.names[len(mechanical) + 2 :])]
 
 
