@@ -73,7 +73,7 @@ def linearise_boundary(
     rho = np.take_along_axis(values, chosen[..., None], -1)[..., 0]
     if growth is None:
         r = np.take_along_axis(right_vectors, chosen[..., None, None], -1)[..., 0]
-        left = _left_vector(M, rho, r)
+        left = left_vector(M, rho, r)
         library = kernel(model)
         if condensed.pivots is None or library is None:
             growth = _growth_row(model, p, orbit, condensed, names, rho, r, left)
@@ -88,7 +88,7 @@ def linearise_boundary(
     return BoundaryLinear(condensed, end, growth, rho, np.log(np.abs(rho)), values)
 
 
-def _left_vector(M: Array, rho: Array, r: Array) -> ComplexArray:
+def left_vector(M: Array, rho: Array, r: Array) -> ComplexArray:
     """Return the left eigenvector l (..., n) of M (..., n, n) for its simple eigenvalue rho with right eigenvector r; l . r = 1.
 
     The bordered system needs nothing of the other eigenvectors, which may coincide where multipliers underflow.
@@ -104,23 +104,29 @@ def _left_vector(M: Array, rho: Array, r: Array) -> ComplexArray:
     return np.linalg.solve(matrix, right)[..., :n, 0]
 
 
+def weights_backwards(c: Condensed, l: Array) -> ComplexArray:
+    """Return w (..., N, m, n): sum(w * source) is l (..., n) times what y' = J y + source, y(0) = 0, has come to at tau = 1.
+
+    `c` holds the stage matrices themselves, see `condense_plainly`.
+    """
+    m, n = c.local.shape[-3:-1]
+    # l carried backwards: l_{i+1} = (l G_{N-1} ... G_{i+1}); G_i is the n x n corner of the interval's map
+    backwards = running_products(np.swapaxes(c.maps[..., ::-1, :n, :n], -1, -2))  # transposes, from the end
+    l_mesh = (backwards[..., -2::-1, :, :] @ l[..., None, :, None])[..., 0]
+    seed = (gauss(m).step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
+    w = np.linalg.solve(np.swapaxes(c.block, -1, -2), np.stack([seed.real, seed.imag], axis=-1))
+    return np.asarray((w[..., 0] + 1j * w[..., 1]).reshape(*l_mesh.shape[:-1], m, n))
+
+
 def _growth_row(
     model: GeneratedModel, p: Array, orbit: Discretisation, c: Condensed, names: Names, rho: Array, r: Array, l: Array
 ) -> Array:
     """Return the derivative of ln |rho| in (dx_0, residual, dq) as a row (..., n+1+k)."""
     n, k = orbit.x.shape[-1], len(names)
-    m = orbit.stages.shape[-2]
-    scheme = gauss(m)
     tau, ps = orbit.phases, stage_parameters(p)
     v_mesh = (c.prefix[..., :-1, :n, :n] @ r[..., None, :, None])[..., 0]  # (..., N, n)
     v = (c.local[..., :n] @ v_mesh[..., None, :, None])[..., 0]  # (..., N, m, n)
-    # l carried backwards: l_{i+1} = (l G_{N-1} ... G_{i+1}); G_i is the n x n corner of the interval's map
-    backwards = running_products(np.swapaxes(c.maps[..., ::-1, :n, :n], -1, -2))  # transposes, from the end
-    l_mesh = (backwards[..., -2::-1, :, :] @ l[..., None, :, None])[..., 0]
-    seed = (scheme.step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
-    both = np.stack([seed.real, seed.imag], axis=-1)
-    w = np.linalg.solve(np.swapaxes(c.block, -1, -2), both)
-    w = (w[..., 0] + 1j * w[..., 1]).reshape(v.shape)
+    w = weights_backwards(c, l)
     gradient = model.cycle_bilinear(tau, orbit.stages, ps, w, v)  # (..., N, m, n)
     scale = 1 / rho
     weight = (scale[..., None, None, None] * gradient).real

@@ -556,28 +556,34 @@ class _Points:
 
     def __init__(self, samples: Samples, unit: int) -> None:
         self.samples, self.unit = samples, unit
-        self.place = {(int(a), int(b)): k for k, (a, b) in enumerate(np.rint(samples.at * unit))}
+        self.place = {key: k for k, key in enumerate(self.keys(np.rint(samples.at * unit)))}
+
+    @staticmethod
+    def keys(at: Array) -> list[int]:
+        """Return one number for each of the places (B, 2)."""
+        whole = at.astype(np.int64)
+        return (whole[:, 0] * 2**32 + whole[:, 1]).tolist()
 
     def index(self, at: Array) -> Array:
         """Return the samples at places (..., 2)."""
-        flat = [self.place[int(a), int(b)] for a, b in at.reshape(-1, 2)]
-        return np.array(flat, dtype=int).reshape(at.shape[:-1])
+        found = [self.place[key] for key in self.keys(at.reshape(-1, 2))]
+        return np.array(found, dtype=int).reshape(at.shape[:-1])
 
     def add(self, task: TileTask, model: GeneratedModel, at: Array, parents: list[Array]) -> None:
         """Solve the orbits at places `at` (B, 2) that are not known yet, each from the mean of its parents' orbits."""
-        fresh: dict[tuple[int, int], Array] = {}
-        for (a, b), above in zip(at.tolist(), parents, strict=True):
-            if (a, b) not in self.place:
-                fresh.setdefault((a, b), above)
+        fresh: dict[int, tuple[Array, Array]] = {}
+        for key, place, above in zip(self.keys(at), at, parents, strict=True):
+            if key not in self.place:
+                fresh.setdefault(key, (place, above))
         if not fresh:
             return
-        old, places = self.samples, np.array(list(fresh)) / self.unit
+        old, places = self.samples, np.array([place for place, _ in fresh.values()]) / self.unit
+        sources = [above for _, above in fresh.values()]
         xs, ys = _quantities(task, places)
         p = task.grid.points(model, xs, ys)
-        x = np.stack([old.orbit.x[k].mean(axis=0) for k in fresh.values()])
-        stages = np.stack([old.orbit.stages[k].mean(axis=0) for k in fresh.values()])
+        x = np.stack([old.orbit.x[k].mean(axis=0) for k in sources])
+        stages = np.stack([old.orbit.stages[k].mean(axis=0) for k in sources])
         batch = regular_orbits(model, p, Discretisation(x, stages, old.orbit.edges), task.settings.tol)
-        sources = list(fresh.values())
         for k in range(4):  # where the mean leads nowhere, each of the parents
             lost = np.array([b for b in np.nonzero(~batch.converged)[0] if k < len(sources[b])], dtype=int)
             if lost.size:
@@ -785,9 +791,9 @@ def _sides(done: Refined, unit: int, wanted: Between) -> Array:
         corners = points.index(cells.corners())
         for a, b, axis in SIDES:
             i, j = corners[:, a], corners[:, b]
-            middle = cells.corners()[:, a] + np.eye(2, dtype=int)[axis] * (cells.size // 2)
-            for k in np.nonzero(wanted(i, j))[0]:
-                split = cells.size > 1 and (int(middle[k, 0]), int(middle[k, 1])) in points.place
-                if not split:  # a finer cell next to it has the two halves
+            here = np.nonzero(wanted(i, j))[0]
+            middle = cells.corners()[here, a] + np.eye(2, dtype=int)[axis] * (cells.size // 2)
+            for k, key in zip(here, points.keys(middle), strict=True):
+                if cells.size == 1 or key not in points.place:  # a finer cell next to it has the two halves
                     sides[int(i[k]), int(j[k])] = axis
     return np.array([(i, j, axis) for (i, j), axis in sorted(sides.items())], dtype=int).reshape(-1, 3)
