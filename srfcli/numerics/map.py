@@ -22,7 +22,16 @@ from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
 from srfcli.numerics.collocation import STAGES, Discretisation, condense, join, kernel, mesh_error
 from srfcli.numerics.critical import robust_orbits
-from srfcli.numerics.orbit import CHUNK, OrbitBatch, interpolate, ordered_eigenvalues, solve_orbits, uniform_mesh
+from srfcli.numerics.orbit import (
+    CHUNK,
+    OrbitBatch,
+    interpolate,
+    levels,
+    neighbours,
+    ordered_eigenvalues,
+    solve_orbits,
+    uniform_mesh,
+)
 from srfcli.numerics.plane import MapGrid, MapSettings, TileTask, tile_tasks
 
 # Stability maps: the leading Floquet multiplier over a grid of two parameters, put together from its tiles.
@@ -233,8 +242,6 @@ def _tile_seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
 
 # One tile of a stability map: orbits on a coarse grid, the others from their neighbours, cells refined where it matters.
 
-STRIDE = 8  # orbits solved without neighbours are this many rows and columns apart
-NEIGHBOURS = 6  # through which a first guess is interpolated
 GRAIN = 4  # meshes are multiples of this many intervals
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # to the points beside a point, in columns and rows
 SETTLING = 1000  # periods of a simulation: just beyond a fold the motion lingers
@@ -277,7 +284,7 @@ def solve_block(task: TileTask) -> Samples:
     """Return the orbits at all grid points of a tile, columns first."""
     model, xs, ys, p = tile_points(task)
     shape, settings = (len(xs), len(ys)), task.settings
-    columns, rows = (_levels(count) for count in shape)
+    columns, rows = (levels(count) for count in shape)
     first = np.ix_(columns[0], rows[0])
     start = _coarse(model, p[:, first[0], first[1]].reshape(len(p), -1), task)
     block = _Block.empty(model, p, start.orbit.edges)
@@ -298,19 +305,6 @@ def solve_block(task: TileTask) -> Samples:
     n = len(model.states)
     multipliers = ordered_eigenvalues(block.monodromy.reshape(count, n, n), block.converged.reshape(count))
     return Samples(at.astype(float), p.reshape(len(p), -1), flat, multipliers)
-
-
-def _levels(count: int) -> list[Array]:
-    """Return indices 0..count-1 in the order in which they are filled: every STRIDE-th with the last, halved until all."""
-    seen = np.zeros(count, bool)
-    levels, stride = [], STRIDE
-    while stride >= 1:
-        wanted = np.zeros(count, bool)
-        wanted[::stride] = wanted[-1] = True
-        levels.append(np.nonzero(wanted & ~seen)[0])
-        seen |= wanted
-        stride //= 2
-    return [level for level in levels if level.size]
 
 
 def _coarse(model: GeneratedModel, p: Array, task: TileTask) -> OrbitBatch:
@@ -374,16 +368,19 @@ class _Block:
 
     def along_rows(self, columns: Array, known: Array, new: Array) -> Discretisation:
         """Return guesses at rows `new` of `columns` from the rows `known`."""
-        index, weights = neighbours(np.sort(known), new)
-        x = np.einsum("rk,crkNn->crNn", weights, self.x[columns[:, None, None], index[None]])
-        stages = np.einsum("rk,crkNmn->crNmn", weights, self.stages[columns[:, None, None], index[None]])
+        known = np.sort(known)
+        index, weights = neighbours(known, new)
+        place = columns[:, None, None], known[index][None]
+        x = np.einsum("rk,crkNn->crNn", weights, self.x[place])
+        stages = np.einsum("rk,crkNmn->crNmn", weights, self.stages[place])
         return Discretisation(x.reshape(-1, *x.shape[2:]), stages.reshape(-1, *stages.shape[2:]), self.edges)
 
     def along_columns(self, known: Array, new: Array) -> Discretisation:
         """Return guesses at all rows of columns `new` from the columns `known`."""
-        index, weights = neighbours(np.sort(known), new)
-        x = np.einsum("ck,ckrNn->crNn", weights, self.x[index])
-        stages = np.einsum("ck,ckrNmn->crNmn", weights, self.stages[index])
+        known = np.sort(known)
+        index, weights = neighbours(known, new)
+        x = np.einsum("ck,ckrNn->crNn", weights, self.x[known[index]])
+        stages = np.einsum("ck,ckrNmn->crNmn", weights, self.stages[known[index]])
         return Discretisation(x.reshape(-1, *x.shape[2:]), stages.reshape(-1, *stages.shape[2:]), self.edges)
 
     def fill(self, columns: Array, rows: Array, guess: Discretisation, tol: float) -> None:
@@ -497,19 +494,6 @@ def regular(batch: OrbitBatch) -> OrbitBatch:
     M = batch.monodromy[batch.converged]
     batch.converged[batch.converged] = np.linalg.det(np.eye(M.shape[-1]) - M) > 0
     return batch
-
-
-def neighbours(known: Array, new: Array) -> tuple[Array, Array]:
-    """Return, for each position `new`, up to NEIGHBOURS of the rising positions `known` around it and their Lagrange weights."""
-    width = min(NEIGHBOURS, len(known))
-    first = np.clip(np.searchsorted(known, new) - width // 2, 0, len(known) - width)
-    index = known[first[:, None] + np.arange(width)]  # (new, width)
-    weights = np.ones(index.shape)
-    for i in range(width):
-        for j in range(width):
-            if j != i:
-                weights[:, i] *= (new - index[:, j]) / (index[:, i] - index[:, j])
-    return index, weights
 
 
 # Cells of a map tile halved where a boundary could hide in them, and every sign change that the points then show.
