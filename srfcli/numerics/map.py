@@ -20,7 +20,8 @@ from srfcli.codegen.model import Array, ComplexArray, GeneratedModel, load_sourc
 from srfcli.core.parallel import run_here
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
-from srfcli.numerics.collocation import STAGES, Discretisation, condense, join, kernel, mesh_error
+from srfcli.numerics.boundary import periodic_map
+from srfcli.numerics.collocation import STAGES, Discretisation, join, kernel, mesh_error
 from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.orbit import (
     CHUNK,
@@ -721,8 +722,8 @@ def _unlike(model: GeneratedModel, samples: Samples, names: tuple[str, str], i: 
     slopes = np.full((len(every), n, len(names)), np.nan)
     for a in range(0, len(every), CHUNK):
         part = every[a : a + CHUNK]
-        end = condense(model, samples.p[:, part], samples.orbit.part(part), names).prefix[:, -1, :n]
-        slopes[a : a + CHUNK] = np.linalg.solve(np.eye(n) - end[..., :n], end[..., n + 1 :])
+        end = periodic_map(model, samples.p[:, part], samples.orbit.part(part), names)
+        slopes[a : a + CHUNK] = np.linalg.solve(-end[..., :n], end[..., n + 1 :])
     rows = [model.index(name) for name in names]
     step = (samples.p[rows][:, j] - samples.p[rows][:, i]).T
     told = 0.5 * ((slopes[place[: len(i)]] + slopes[place[len(i) :]]) @ step[..., None])[..., 0]

@@ -19,7 +19,7 @@ from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind, left_vecto
 from srfcli.numerics.collocation import (
     Condensed,
     Discretisation,
-    condense_plainly,
+    condense,
     gauss,
     join,
     mesh_error,
@@ -315,7 +315,7 @@ def cubic_coefficient(model: GeneratedModel, p: Array, orbit: Discretisation, rh
 
 def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> tuple[Array, ComplexArray]:
     """Return d (...,) and the critical eigenvectors at tau = 0 (..., n), in the unit that d is in."""
-    c, rho = condense_plainly(model, p, orbit), np.asarray(rho, dtype=complex)
+    c, rho = condense(model, p, orbit), np.asarray(rho, dtype=complex)
     M, identity = c.monodromy, np.eye(orbit.x.shape[-1])
     values, vectors = np.linalg.eig(M)
     chosen = pick_multiplier(values.astype(complex), rho.real + 1j * np.abs(rho.imag))[..., None]
