@@ -338,6 +338,7 @@ static int eigenpair(const double *M, const double *target, double *rho, double 
         rho[1] = -rho[1];
         for (int i = 0; i < NX; i++) v[0][NX + i] = -v[0][NX + i];
     }
+    if (rho[1] < 1e-13 * fabs(rho[0])) rho[1] = 0.0;
     sigma[0] = rho[0] * (1 + 1e-14);
     sigma[1] = rho[1] * (1 + 1e-14);
     for (int i = 0; i < 2 * NX; i++) v[1][i] = i < NX ? v[0][i] : -v[0][i];

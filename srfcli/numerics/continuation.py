@@ -636,7 +636,7 @@ def crossing_numbers(model: GeneratedModel, atlas: Atlas) -> list[list[int | Non
             number = first + below
             losing = point.slope > 0
             if (number % 2 == 1) != losing:
-                number += 1 if _nearest_from_below(lines, b, i) else -1
+                number += 1 if _other_side_below(branch, own, i) else -1
             told = np.isfinite(point.slope) and point.slope != 0 and point.kind != "fold"
             row.append(max(number, 1) if told else None)
         numbers.append(row)
@@ -655,8 +655,9 @@ def _crossings_below(q: Array, at: Array, *, skip: int | None) -> int:
     return int(count.sum())
 
 
-def _nearest_from_below(lines: list[Array], b: int, i: int) -> bool:
-    """Return whether the other side of a fold next to point i of branch b lies below it, so that it was not counted."""
-    q = lines[b]
-    window = q[max(i - 2, 0) : i + 3]
-    return bool(np.mean(window[:, 1]) < q[i, 1])
+def _other_side_below(branch: Branch, q: Array, i: int) -> bool:
+    """Return whether the other side of the fold next to point i of a branch lies below it, where it was not counted."""
+    losing = [point.slope > 0 for point in branch.points]
+    others = [k for k in range(len(q)) if losing[k] != losing[i]]
+    nearest = min(others, key=lambda k: abs(k - i) + float(np.linalg.norm(q[k] - q[i])), default=i)
+    return bool(q[nearest, 1] < q[i, 1])
