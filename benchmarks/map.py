@@ -4,16 +4,21 @@ The map is V = 1 to 100 um/s, K/W0 = 0.005 to 0.03 /um at eps = 0.18, with its r
 of the map, in the same run. One orbit at a time from scratch: `solve_floquet`, which finds its own mesh, to a multiplier error of
 1e-4; and `solve_orbits` from the linear response, to the map's own tolerance on the mesh that the map found, which is given.
 Shooting with SciPy's Radau, DOP853 and LSODA (benchmarks/orbit.py) at the loosest tolerance that is as good as the map. CPU
-seconds, one thread. Memory is the peak of a fresh process.
+seconds, one thread. Memory is the peak of a fresh process. Two workers: the tiles' CPU seconds as two processes share them, and
+the whole command with one and with two.
 """
 
 from __future__ import annotations
 
 import cProfile
 import pstats
+import resource
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
+from statistics import median
+from typing import Any
 
 import common  # before NumPy: it fixes the number of threads
 import numpy as np
@@ -106,13 +111,58 @@ def shots(model: GeneratedModel, found: StabilityMap, rng: np.random.Generator, 
 
 
 PARTS = {
-    "solves of the intervals' blocks": ("solve",),
-    "setting them up": ("condense", "_frame"),
-    "generated field and Jacobian": ("cycle", "cycle_jacobian", "steady"),
-    "products of the maps": ("running_products",),
-    "corrections": ("respond", "expand", "newton_step", "_solve_chunk", "step_limit"),
-    "first guesses": ("along_rows", "along_columns", "neighbours", "forced_guess"),
+    "Newton's equations, compiled": ("newton_orbits", "linearised"),
+    "generated field and Jacobian in NumPy": ("cycle", "cycle_jacobian", "steady"),
+    "multipliers": ("eigvals", "ordered_eigenvalues", "det"),
+    "first guesses": ("along_rows", "along_columns", "neighbours", "forced_guess", "put", "fill"),
 }
+
+
+def two_workers(report: Report) -> None:
+    """Say how two workers share the tiles of 24,000 points, and what the whole command takes with one and with two."""
+    model, seconds = open_model(load_registry()), []
+
+    def timed(solve: Callable[..., Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        for task in tasks:
+            begun = time.process_time()
+            tile = solve(task)
+            seconds.append(time.process_time() - begun)
+            yield task.index, tile
+
+    compute_map(model, grid_of(model, 120, 200), run=timed)
+    loads = [0.0, 0.0]
+    for spent in seconds:  # whoever is free takes the next tile
+        loads[int(loads[1] < loads[0])] += spent
+    report.say()
+    report.say(
+        f"{len(seconds)} tiles of 24,000 points: {sum(seconds):.2f} s of CPU; two workers get {loads[0]:.2f} and {loads[1]:.2f} s"
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "srfcli",
+        "map",
+        "--eps",
+        str(EPS),
+        "--over",
+        "V=1:100:120",
+        "--over",
+        "K/W0=0.005:0.03:200",
+    ]
+    for count in (1, 2):
+        spent, wall = [], []
+        for _ in range(3):
+            before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+            subprocess.run(
+                [*command, "--csv", "--workers", str(count)], check=True, capture_output=True, cwd=common.ROOT
+            )
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            wall.append(time.monotonic() - begun)
+            spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+        report.say(
+            f"srf map with its boundaries, special points and criticality, --workers {count}: {median(spent):.2f} s of CPU, "
+            f"{min(wall):.2f} s by the clock at a load of {common.load():.1f}"
+        )
 
 
 def shares(model: GeneratedModel) -> list[tuple[str, float]]:
@@ -137,8 +187,6 @@ def peak(columns: int, rows: int) -> float:
 
 def say_peak() -> None:
     """Compute a map and print this process's peak memory in MiB."""
-    import resource
-
     model = open_model(load_registry())
     compute_map(model, grid_of(model, int(sys.argv[2]), int(sys.argv[3])))
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
@@ -179,6 +227,7 @@ def main() -> None:
         f"to 1e-6, {curves:.2f} s more"
     )
     report.say("where the time goes: " + ", ".join(f"{what} {share:.0%}" for what, share in shares(model)))
+    two_workers(report)
     p = found.points(model)
     i, j = rng.integers(found.leading.shape[0], size=500), rng.integers(found.leading.shape[1], size=500)
     fine = robust_orbits(model, p[:, i, j], None, uniform_mesh(64), tol=1e-10)

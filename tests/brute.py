@@ -127,10 +127,10 @@ def shoot(s: Slider, start: np.ndarray, *, rtol: float = 1e-11, tol: float = 1e-
     raise AssertionError(f"shooting did not converge at V = {s.V}, W0 = {s.W0}, eps = {s.eps}: {gap:.1e}")
 
 
-def error_of_load(s: Slider, start: np.ndarray, *, apart: float = 1e-4) -> tuple[float, Orbit]:
+def error_of_load(s: Slider, start: np.ndarray, *, apart: float = 1e-4, tol: float = 1e-9) -> tuple[float, Orbit]:
     """How far, relatively, s.W0 lies from a load at which |rho| = 1 (a secant through s.W0 and its neighbour), and the orbit."""
-    here = shoot(s, start)
-    there = shoot(replace(s, W0=s.W0 * (1 + apart)), here.start)
+    here = shoot(s, start, tol=tol)
+    there = shoot(replace(s, W0=s.W0 * (1 + apart)), here.start, tol=tol)
     slope = (there.growth - here.growth) / apart
     return here.growth / slope, here
 

@@ -143,7 +143,8 @@ def test_boundary_points_of_reference(model, shared):
         assert nearest.theta == pytest.approx(row["theta_rad"], abs=1e-8), row
 
 
-def test_gradient_of_the_growth_against_finite_differences(model):
+@pytest.mark.parametrize("how", ["compiled", "plain"])
+def test_gradient_of_the_growth_against_finite_differences(model, how):
     """The growth row of a boundary: by the state at tau = 0, by V and by W0, against central differences at fixed stages.
 
     With the stages slaved to (x_0, q) the derivative along the orbit's own response is that of solved orbits.
@@ -153,10 +154,15 @@ def test_gradient_of_the_growth_against_finite_differences(model):
     target = batch.multipliers[0, 0]
     target = target.real + 1j * abs(target.imag)
     single = Discretisation(batch.orbit.x[0], batch.orbit.stages[0], batch.orbit.edges)
-    linear = linearise_boundary(model, p[:, 0], single, names, np.asarray(target))
+    if how == "compiled":  # a batch, where there is a compiler
+        linear = linearise_boundary(model, p, batch.orbit, names, np.array([target]))
+        periodic, row = linear.periodic[0], linear.growth[0]
+    else:
+        linear = linearise_boundary(model, p[:, 0], single, names, np.asarray(target))
+        periodic, row = linear.periodic, linear.growth
     n = len(model.states)
-    response = np.linalg.solve(linear.periodic[:, :n], -linear.periodic[:, n + 1 :])
-    predicted = linear.growth[:n] @ response + linear.growth[n + 1 :]
+    response = np.linalg.solve(periodic[:, :n], -periodic[:, n + 1 :])
+    predicted = row[:n] @ response + row[n + 1 :]
     for column, name in enumerate(names):
         h = 1e-5 * p[model.index(name), 0]
         values = []

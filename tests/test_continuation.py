@@ -39,7 +39,7 @@ def test_two_components_at_eps_018(model, atlas):
     small, large = sorted(atlas.branches, key=lambda b: column(model, b, "V").max())
     V = column(model, small, "V")
     assert (V[0], V[-1]) == (1.0, 1.0)
-    assert V.max() == pytest.approx(27.387, abs=0.01)
+    assert 27.387 * (1 - 1e-3) < V.max() < 27.388  # the point next to the fold
     assert folds(V) == 1
     V = column(model, large, "V")
     assert sorted((V[0], V[-1])) == pytest.approx([1.0, 100.0], rel=1e-13)
@@ -132,7 +132,7 @@ def test_parity_and_number_of_crossings(model, atlas):
             assert number is None or (number % 2 == 1) == (point.slope > 0)
     checked = 0
     for branch, row in zip(atlas.branches, numbers, strict=True):
-        for i in range(5, len(row), 25):
+        for i in range(5, len(row), 20):
             V, W0 = (branch.points[i].value(model, name) for name in ("V", "W0"))
             line = critical_line(model, model.vector({"eps": 0.18, "V": V}), lo=4.0, hi=400.0, tol=1e-6)
             if abs(branch.points[i].slope) > STEEP:

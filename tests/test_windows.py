@@ -61,7 +61,8 @@ def test_the_edge_of_a_narrow_tongue_is_a_boundary_point(model):
     line = critical_line(model, model.vector({"V": 0.1, "eps": 0.3}), lo=27.0, hi=28.0, samples=4)
     assert line.status is Status.OK and len(line.points) == 2
     for point in line.points:
-        error, _ = error_of_load(Slider(0.1, point.value(model, "W0"), 0.3), point.orbit.x[0, 0])
+        slider = Slider(0.1, point.value(model, "W0"), 0.3)
+        error, _ = error_of_load(slider, point.orbit.x[0, 0], tol=5e-8)  # v runs over eight decades: shooting's noise is 1e-8
         assert abs(error) < 1e-6
 
 

@@ -118,7 +118,7 @@ def command(
     begun = time.perf_counter()
     sliders = _sliders(laws, ageings, system)
     window = _window(next(iter(sliders.values())).model, over)
-    warn_uncompiled("boundaries take about twice as long")
+    warn_uncompiled("boundaries take about three times as long")
     with Progress("compare") as progress:
         found = compare(
             sliders, eps=eps, at=_velocity(at), adjust=adjust.split(","), matched=matched, **window, run=spread.run,

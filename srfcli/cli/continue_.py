@@ -112,7 +112,7 @@ def command(
             log=[r.name for r in ranges if r.spacing == "log"], settings=settings,
             progress=lambda said: progress.advance(0, note=said),
         )  # fmt: skip
-        warn_uncompiled("boundaries take about twice as long")
+        warn_uncompiled("boundaries take about three times as long")
         system.say_defaults(slider.resolved, {"V", "W0"} - spanned)
         begun = time.perf_counter()
         *_, found = growing

@@ -115,7 +115,7 @@ def command(
     place = None if boundary is None else _boundary_output(boundary, output)
     slider, grid = _slider_grid(system, over, {"eps": eps, "V": V, "W0": W0})
     settings = AtlasSettings(tol=system.tolerance(tol).value, max_mesh=max_mesh, steps=StepSettings(largest=step))
-    warn_uncompiled("a map takes about twice as long")
+    warn_uncompiled("a map takes about three times as long")
     begun, mapped = time.perf_counter(), 0.0
     with Progress("map") as progress:
 

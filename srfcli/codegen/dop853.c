@@ -2,8 +2,8 @@
    Ordinary Differential Equations I, II.5 and II.6: DOP853), for stretches of a smooth segment that are not stiff.
 
    Compiled after radau.c, whose types and functions it uses. Sensitivities are carried through the same stages, which differentiates
-   each step exactly. The method hands over to Radau IIA where its steps are as long as stability allows, and does not come back before
-   the next segment. */
+   each step exactly. At first, ever more seldom later, and where its steps are as long as stability allows, the method asks for some
+   time how long a step of Radau IIA would be; where these would cost less it hands over until the next segment. */
 
 static const double EX_C[16] = {
     0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726, 0.3333333333333333, 0.25,
@@ -56,12 +56,17 @@ static const double EX_D[4][16] = {
      -37.45832313645163, 104.0996495089623, 29.8402934266605, -43.53345659001114, 96.32455395918828, -39.17726167561544,
      -149.72683625798564}};
 
-#define EX_SHARE 0.03                        /* of the bound on the states: an estimate this small leaves errors like those of radau.c */
+#define EX_SHARE 0.03                       /* of the bound on the states: an estimate this small leaves errors like those of radau.c */
 #define STIFF 4.0                           /* h times the rate at which the last two stages part; the method is stable up to about 6 */
-#define STIFF_STEPS 6                       /* so many in a row hand over, */
-#define UNSTABLE 12.0                       /* and a single one beyond this */
-#define STEEPENING 5.0                      /* of the Jacobian within a step, likewise */
+#define STIFF_STEPS 6                       /* so many in a row ask for Radau's steps, later ever more */
+#define UNSTABLE 6.0                        /* a step beyond this is not taken */
+#define EACH 4                              /* of so many steps one is compared with Radau's, */
+#define SAMPLES 16                          /* so often before it is decided, over a period of the load at least: LONGEST times `longest` */
+#define LONGEST 4.0
+#define CLEARLY 4.0                         /* so many times dearer than Radau it is decided at once: at rest a period would take for ever */
+#define STEEPENING 5.0                      /* of the Jacobian within a step: hands over */
 #define DAMAGED 12                          /* so many rejected steps in a row, too */
+#define DEARER 1.5                          /* a step of Radau, times one of this method */
 
 /* x at a stage, and the slopes of x and S there into k and K */
 static void ex_slopes(const History *q, Imposed *force, double t, const double *x, const double *S, double *k, double *K) {
@@ -146,7 +151,9 @@ static int explicit_steps(Imposed *force, History *q, double b, double rtol, con
     const int ns = q->ns, wide = NX * ns;
     double k[16][NX], x[NX], stage[NX], bound[NX], own_rtol = EX_SHARE * pow(10.0 * rtol, 1.5);
     double share = own_rtol / rtol, *K = q->explicit_work, *S_stage = K + (size_t)16 * wide, *S_after = S_stage + wide;
-    int rejected = 0, stiff = 0;
+    int rejected = 0, stiff = 0, patience = STIFF_STEPS, asked = 0;
+    long taken = 0, ask = 0, pause = EACH * SAMPLES;
+    double cost = 0.0, since = now->t; /* of the asked steps by Radau, in steps of this method */
     double carry = 0.0, steep = ex_steepness(force, now->t, now->x);
     ex_slopes(q, force, now->t, now->x, q->S, k[0], K);
     double h = fmin(first_step(force, now, b - now->t, own_rtol, atol), longest);
@@ -188,8 +195,14 @@ static int explicit_steps(Imposed *force, History *q, double b, double rtol, con
         }
         double stiffness = apart > 0.0 ? h * sqrt(parted / apart) : 0.0;
         double steep_after = ex_steepness(force, now->t + h, x);
-        /* such a step is taken again, implicitly: what lies within it is not to be relied on */
-        if (stiffness > UNSTABLE || !(steep_after < STEEPENING * steep)) break;
+        /* such a step is taken again, implicitly or shorter: what lies within it is not to be relied on */
+        if (!(steep_after < STEEPENING * steep)) break;
+        if (stiffness > UNSTABLE) {
+            stats[1] += 1;
+            h *= STIFF / stiffness;
+            if (++rejected > DAMAGED) break;
+            continue;
+        }
         steep = steep_after;
         stiff = stiffness > STIFF ? stiff + 1 : 0;
         stats[0] += 1;
@@ -215,7 +228,24 @@ static int explicit_steps(Imposed *force, History *q, double b, double rtol, con
             memcpy(q->S, S_after, wide * sizeof(double));
             memcpy(K, K + (size_t)12 * wide, wide * sizeof(double));
         }
-        if (stiff >= STIFF_STEPS) break;
+        memcpy(now->f, k[0], sizeof now->f);
+        if (stiff >= patience && taken < ask) {
+            ask = taken;
+            patience *= 2;
+        }
+        if (taken++ >= ask && (taken - ask) % EACH == 0) {
+            double tried = fmin(h, b - now->t);
+            since = asked ? since : now->t;
+            cost += DEARER * tried / fmax(implicit_reach(force, now, tried, rtol, atol), DBL_MIN);
+            if (++asked >= SAMPLES && cost < asked / CLEARLY) break;
+            if (asked >= SAMPLES && (now->t - since >= LONGEST * longest || LONGEST * longest > b - now->t)) {
+                if (cost < asked) break;
+                ask = taken + pause;
+                pause *= 2;
+                asked = 0;
+                cost = 0.0;
+            }
+        }
         double growth = error > 0.0 ? 0.9 * pow(error, -0.125) : 6.0;
         h = fmin(h * fmin(rejected ? 1.0 : 6.0, fmax(0.333, growth)), longest);
         rejected = 0;

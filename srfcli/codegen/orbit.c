@@ -280,98 +280,254 @@ EXPORT int srf_orbits(int B, int N, const double *tau, const double *h, const do
     return most;
 }
 
-/* The linearisation about B orbits with k parameter columns: factored stage matrices lu (B, N, S, S) with pivots (B, N, S), local
-   (B, N, S, w), maps (B, N, w, w) and prefix (B, N + 1, w, w), w = NX + 1 + k. `good` (B) is 0 where a matrix is singular. */
-EXPORT void srf_condense(int B, int N, int k, const int *which, const double *tau, const double *h, const double *p, const double *x,
-                         const double *X, double *lu, int *pivot, double *local, double *maps, double *prefix, unsigned char *good) {
-    const int w = NX + 1 + k;
-    for (int b = 0; b < B; b++) {
-        const double *y = x + (size_t)b * N * NX, *Y = X + (size_t)b * N * S;
-        double *P = prefix + (size_t)b * (N + 1) * w * w;
-        memset(P, 0, sizeof(double) * (N + 1) * w * w);
-        for (int i = 0; i <= N; i++)
-            for (int a = i ? NX : 0; a < w; a++) P[(size_t)i * w * w + a * w + a] = 1.0;
-        good[b] = 1;
-        for (int i = 0; i < N && good[b]; i++) {
-            size_t at = (size_t)b * N + i;
-            double *map = maps + at * w * w;
-            memset(map, 0, sizeof(double) * w * w);
-            for (int a = NX; a < w; a++) map[a * w + a] = 1.0;
-            good[b] = interval(h[i], tau + i * MS, p + (size_t)b * NP, y + i * NX, Y + i * S, y + (i + 1 < N ? i + 1 : 0) * NX, k, which,
-                               lu + at * S * S, pivot + at * S, local + at * S * w, map);
-            chained(w, map, P + (size_t)i * w * w, P + (size_t)(i + 1) * w * w);
+/* (M - sigma)^-1 in real form, [M - re, im; -im, M - re], factored; M transposed where asked for */
+static int shifted(const double *M, int transposed, const double *sigma, double *a, int *pivot) {
+    const int m = 2 * NX;
+    memset(a, 0, sizeof(double) * m * m);
+    for (int i = 0; i < NX; i++) {
+        for (int j = 0; j < NX; j++) a[i * m + j] = a[(NX + i) * m + NX + j] = transposed ? M[j * NX + i] : M[i * NX + j];
+        a[i * m + i] -= sigma[0];
+        a[(NX + i) * m + NX + i] -= sigma[0];
+        a[i * m + NX + i] = sigma[1];
+        a[(NX + i) * m + i] = -sigma[1];
+    }
+    return orbit_factor(m, a, pivot);
+}
+
+/* One step of inverse iteration: v becomes the unit vector along (M - sigma)^-1 v, rho what the step says of the eigenvalue */
+static void iterated(const double *a, const int *pivot, const double *sigma, double *v, double *rho) {
+    double before[2 * NX], square = 0.0, re = 0.0, im = 0.0;
+    memcpy(before, v, sizeof before);
+    orbit_solve(2 * NX, 1, a, pivot, v);
+    for (int i = 0; i < NX; i++) {
+        square += v[i] * v[i] + v[NX + i] * v[NX + i];
+        re += v[i] * before[i] + v[NX + i] * before[NX + i];
+        im += v[i] * before[NX + i] - v[NX + i] * before[i];
+    }
+    rho[0] = sigma[0] + re / square; /* v^H before / v^H v is 1 / (that of the inverse) */
+    rho[1] = sigma[1] + im / square;
+    for (int i = 0; i < 2 * NX; i++) v[i] /= sqrt(square);
+}
+
+/* The eigenvalue rho of M next to `target`, above the real axis, with its right and left vectors (NX, 2) as pairs, l . r = 1:
+   inverse iteration with the target as shift, then with what it found. */
+static int eigenpair(const double *M, const double *target, double *rho, double *r, double *l) {
+    double a[4 * NX * NX], v[2][2 * NX], sigma[2] = {target[0], target[1]}, last[2];
+    int pivot[2 * NX];
+    for (int i = 0; i < NX; i++) {
+        v[0][i] = 1.0 / (1 + i);
+        v[0][NX + i] = 0.3 / (2 + i);
+    }
+    for (int round = 0; round < 6; round++) {
+        while (!shifted(M, 0, sigma, a, pivot)) {
+            if (!isfinite(sigma[0] + sigma[1]) || fabs(sigma[0]) > 1e100) return 0;
+            sigma[0] += 1e-15 + 1e-15 * fabs(sigma[0]); /* an exact eigenvalue */
         }
+        memcpy(rho, sigma, sizeof last);
+        for (int step = 0; step < (round ? 2 : 40); step++) {
+            memcpy(last, rho, sizeof last);
+            iterated(a, pivot, sigma, v[0], rho);
+            if (hypot(rho[0] - last[0], rho[1] - last[1]) < 1e-3 * hypot(rho[0] - sigma[0], rho[1] - sigma[1])) break;
+        }
+        if (!isfinite(rho[0] + rho[1])) return 0;
+        int settled = hypot(rho[0] - sigma[0], rho[1] - sigma[1]) < 1e-13 * hypot(rho[0], rho[1]);
+        memcpy(sigma, rho, sizeof last);
+        if (settled && round) break;
+    }
+    if (rho[1] < 0.0) { /* of a pair met from a real target */
+        rho[1] = -rho[1];
+        for (int i = 0; i < NX; i++) v[0][NX + i] = -v[0][NX + i];
+    }
+    if (rho[1] < 1e-13 * fabs(rho[0])) rho[1] = 0.0;
+    sigma[0] = rho[0] * (1 + 1e-14);
+    sigma[1] = rho[1] * (1 + 1e-14);
+    for (int i = 0; i < 2 * NX; i++) v[1][i] = i < NX ? v[0][i] : -v[0][i];
+    for (int side = 0; side < 2; side++) {
+        double found[2];
+        if (!shifted(M, side, sigma, a, pivot)) return 0;
+        for (int step = 0; step < 3; step++) iterated(a, pivot, sigma, v[side], found);
+    }
+    double re = 0.0, im = 0.0;
+    for (int i = 0; i < NX; i++) {
+        re += v[1][i] * v[0][i] - v[1][NX + i] * v[0][NX + i];
+        im += v[1][i] * v[0][NX + i] + v[1][NX + i] * v[0][i];
+    }
+    double square = re * re + im * im;
+    for (int i = 0; i < NX; i++) {
+        r[2 * i] = v[0][i];
+        r[2 * i + 1] = v[0][NX + i];
+        l[2 * i] = (v[1][i] * re + v[1][NX + i] * im) / square;
+        l[2 * i + 1] = (v[1][NX + i] * re - v[1][i] * im) / square;
+    }
+    return isfinite(square) && square > 0.0;
+}
+
+/* One orbit's linearisation with k parameter columns, w = NX + 1 + k: factored stage matrices, the stages' responses, the intervals'
+   maps (w, w) and their products from tau = 0 on */
+typedef struct {
+    double *lu, *local, *maps, *prefix;
+    int *pivot;
+} linearised;
+
+/* The derivative row `out` (w) of ln |rho| by (dx_0, residual, parameters), from a linearisation and the right and left eigenvectors r
+   and l (NX, 2) of the monodromy matrix for rho, l . r = 1; complex numbers as pairs. */
+static void growth_row(int N, int k, const int *which, const double *tau, const double *own, const double *X, const linearised *at,
+                       const double *rho, const double *r, const double *l, double *out) {
+    const int w = NX + 1 + k;
+    double back[2 * NX], square = rho[0] * rho[0] + rho[1] * rho[1];
+    double scale_re = rho[0] / square, scale_im = -rho[1] / square;
+    memset(out, 0, sizeof(double) * w);
+    for (int a = 0; a < NX; a++) { /* 1/rho goes with l */
+        double re = l[2 * a], im = l[2 * a + 1];
+        back[2 * a] = re * scale_re - im * scale_im;
+        back[2 * a + 1] = re * scale_im + im * scale_re;
+    }
+    for (int i = N - 1; i >= 0; i--) {
+        const double *here = at->prefix + (size_t)i * w * w, *L = at->local + (size_t)i * S * w, *map = at->maps + (size_t)i * w * w;
+        double v0[2 * NX], v[2][S], seed[2 * S], own_row[NX + 1 + k];
+        for (int a = 0; a < NX; a++)
+            for (int c = 0; c < 2; c++) {
+                double sum = 0.0;
+                for (int d = 0; d < NX; d++) sum += here[a * w + d] * r[2 * d + c];
+                v0[2 * a + c] = sum;
+            }
+        for (int s = 0; s < S; s++)
+            for (int c = 0; c < 2; c++) {
+                double sum = 0.0;
+                for (int d = 0; d < NX; d++) sum += L[s * w + d] * v0[2 * d + c];
+                v[c][s] = sum;
+                seed[2 * s + c] = STEP[s / NX] * back[2 * (s % NX) + c];
+            }
+        orbit_solve_transposed(S, at->lu + (size_t)i * S * S, at->pivot + i * S, seed);
+        memset(own_row, 0, sizeof(double) * w);
+        for (int j = 0; j < MS; j++) {
+            double w_re[NX], w_im[NX], g[NX], g_im[NX];
+            for (int a = 0; a < NX; a++) {
+                w_re[a] = seed[2 * (j * NX + a)];
+                w_im[a] = seed[2 * (j * NX + a) + 1];
+            }
+            const double *Y = X + (i * MS + j) * NX;
+            memset(g, 0, sizeof g);
+            memset(g_im, 0, sizeof g_im);
+            srf_bilinear(tau[i * MS + j], Y, own, w_re, v[0] + j * NX, g);
+            srf_bilinear(tau[i * MS + j], Y, own, w_im, v[1] + j * NX, g_im);
+            for (int a = 0; a < NX; a++) {
+                double weight = g[a] - g_im[a];
+                for (int c = 0; c < w; c++) own_row[c] += weight * L[(j * NX + a) * w + c];
+            }
+            for (int c = 0; c < k; c++)
+                out[NX + 1 + c] += srf_bilinear_parameter(which[c], tau[i * MS + j], Y, own, w_re, v[0] + j * NX) -
+                                   srf_bilinear_parameter(which[c], tau[i * MS + j], Y, own, w_im, v[1] + j * NX);
+        }
+        for (int c = 0; c < w; c++) {
+            double sum = c < NX ? 0.0 : own_row[c];
+            for (int d = 0; d < NX; d++) sum += own_row[d] * here[d * w + c];
+            out[c] += sum;
+        }
+        double before[2 * NX];
+        for (int a = 0; a < NX; a++)
+            for (int c = 0; c < 2; c++) {
+                double sum = 0.0;
+                for (int d = 0; d < NX; d++) sum += map[d * w + a] * back[2 * d + c];
+                before[2 * a + c] = sum;
+            }
+        memcpy(back, before, sizeof back);
     }
 }
 
-/* The derivative row (B, w) of ln |rho| by (dx_0, residual, parameters), from a linearisation and the right and left eigenvectors r
-   and l (B, NX, 2) of the monodromy matrix for rho (B, 2), l . r = 1; complex numbers as pairs. */
-EXPORT void srf_growth(int B, int N, int k, const int *which, const double *tau, const double *p, const double *X, const double *lu,
-                       const int *pivot, const double *local, const double *maps, const double *prefix, const double *rho,
-                       const double *r, const double *l, double *row) {
-    const int w = NX + 1 + k;
+/* Newton's equations of B points {periodic, ln |rho| = 0}, rho the multiplier next to `target` (B, 2), in the state at tau = 0 and d
+   distances along `rate` (B, k, d); `across` (B, d - 1, NX + d) closes them. Out: `periodic` (B, NX, w), the map over one period less
+   the state; rho and its row `growth` (B, w); and for each of the `columns` the solution `step` (NX + d) and the changes dx, dX of the orbit, column after column: the first is Newton's, the second moves along the null
+   direction of all rows but the last. Without a target there is but `periodic`, without distances no step. `good` (B) is 0 where a
+   matrix is singular. Returns 0 without memory. */
+EXPORT int srf_boundary(int B, int N, int k, const int *which, int d, int columns, const double *tau, const double *h,
+                        const double *p, const double *x, const double *X, const double *target, const double *rate,
+                        const double *across, double *periodic, double *rho, double *growth, double *step, double *dx, double *dX,
+                        unsigned char *good) {
+    const int w = NX + 1 + k, m = NX + d;
+    linearised c;
+    c.lu = malloc(sizeof(double) * ((size_t)N * (S * S + S * w + w * w) + (size_t)(N + 1) * w * w + (size_t)m * m + 2 * m));
+    c.pivot = malloc(sizeof(int) * ((size_t)N * S + m));
+    if (!c.lu || !c.pivot) {
+        free(c.lu);
+        free(c.pivot);
+        return 0;
+    }
+    c.local = c.lu + (size_t)N * S * S;
+    c.maps = c.local + (size_t)N * S * w;
+    c.prefix = c.maps + (size_t)N * w * w;
+    double *matrix = c.prefix + (size_t)(N + 1) * w * w, *right = matrix + (size_t)m * m;
     for (int b = 0; b < B; b++) {
-        const double *own = p + (size_t)b * NP, *P = prefix + (size_t)b * (N + 1) * w * w;
-        double *out = row + (size_t)b * w, back[2 * NX];
-        double square = rho[2 * b] * rho[2 * b] + rho[2 * b + 1] * rho[2 * b + 1];
-        double scale_re = rho[2 * b] / square, scale_im = -rho[2 * b + 1] / square;
-        memset(out, 0, sizeof(double) * w);
-        for (int a = 0; a < NX; a++) { /* 1/rho goes with l */
-            double re = l[(b * NX + a) * 2], im = l[(b * NX + a) * 2 + 1];
-            back[2 * a] = re * scale_re - im * scale_im;
-            back[2 * a + 1] = re * scale_im + im * scale_re;
+        const double *own = p + (size_t)b * NP, *y = x + (size_t)b * N * NX, *Y = X + (size_t)b * N * S;
+        double *end = periodic + (size_t)b * NX * w, *row = growth + (size_t)b * w, M[NX * NX], r[2 * NX], l[2 * NX];
+        good[b] = 1;
+        memset(c.maps, 0, sizeof(double) * N * w * w);
+        memset(c.prefix, 0, sizeof(double) * (N + 1) * w * w);
+        for (int i = 0; i <= N; i++)
+            for (int a = i ? NX : 0; a < w; a++) c.prefix[(size_t)i * w * w + a * w + a] = 1.0;
+        for (int i = 0; i < N && good[b]; i++) {
+            double *map = c.maps + (size_t)i * w * w;
+            good[b] = interval(h[i], tau + i * MS, own, y + i * NX, Y + i * S, y + (i + 1 < N ? i + 1 : 0) * NX, k, which,
+                               c.lu + (size_t)i * S * S, c.pivot + i * S, c.local + (size_t)i * S * w, map);
+            chained(w, map, c.prefix + (size_t)i * w * w, c.prefix + (size_t)(i + 1) * w * w);
         }
-        for (int i = N - 1; i >= 0; i--) {
-            size_t at = (size_t)b * N + i;
-            const double *here = P + (size_t)i * w * w, *L = local + at * S * w, *map = maps + at * w * w;
-            double v0[2 * NX], v[2][S], seed[2 * S], own_row[NX + 1 + k];
-            for (int a = 0; a < NX; a++)
-                for (int c = 0; c < 2; c++) {
-                    double sum = 0.0;
-                    for (int d = 0; d < NX; d++) sum += here[a * w + d] * r[(b * NX + d) * 2 + c];
-                    v0[2 * a + c] = sum;
-                }
-            for (int s = 0; s < S; s++)
-                for (int c = 0; c < 2; c++) {
-                    double sum = 0.0;
-                    for (int d = 0; d < NX; d++) sum += L[s * w + d] * v0[2 * d + c];
-                    v[c][s] = sum;
-                    seed[2 * s + c] = STEP[s / NX] * back[2 * (s % NX) + c];
-                }
-            orbit_solve_transposed(S, lu + at * S * S, pivot + at * S, seed);
-            memset(own_row, 0, sizeof(double) * w);
-            for (int j = 0; j < MS; j++) {
-                double w_re[NX], w_im[NX], g[NX], g_im[NX];
-                for (int a = 0; a < NX; a++) {
-                    w_re[a] = seed[2 * (j * NX + a)];
-                    w_im[a] = seed[2 * (j * NX + a) + 1];
-                }
-                const double *Y = X + (at * MS + j) * NX;
-                memset(g, 0, sizeof g);
-                memset(g_im, 0, sizeof g_im);
-                srf_bilinear(tau[i * MS + j], Y, own, w_re, v[0] + j * NX, g);
-                srf_bilinear(tau[i * MS + j], Y, own, w_im, v[1] + j * NX, g_im);
-                for (int a = 0; a < NX; a++) {
-                    double weight = g[a] - g_im[a];
-                    for (int c = 0; c < w; c++) own_row[c] += weight * L[(j * NX + a) * w + c];
-                }
-                for (int c = 0; c < k; c++)
-                    out[NX + 1 + c] += srf_bilinear_parameter(which[c], tau[i * MS + j], Y, own, w_re, v[0] + j * NX) -
-                                       srf_bilinear_parameter(which[c], tau[i * MS + j], Y, own, w_im, v[1] + j * NX);
+        for (int a = 0; a < NX; a++)
+            for (int j = 0; j < w; j++) {
+                double value = c.prefix[(size_t)N * w * w + a * w + j];
+                end[a * w + j] = value - (a == j);
+                if (j < NX) M[a * NX + j] = value;
+                good[b] &= isfinite(value) != 0;
             }
-            for (int c = 0; c < w; c++) {
-                double sum = c < NX ? 0.0 : own_row[c];
-                for (int d = 0; d < NX; d++) sum += own_row[d] * here[d * w + c];
-                out[c] += sum;
+        if (!good[b] || !target) continue;
+        good[b] = (unsigned char)eigenpair(M, target + 2 * b, rho + 2 * b, r, l);
+        if (!good[b]) continue;
+        growth_row(N, k, which, tau, own, Y, &c, rho + 2 * b, r, l, row);
+        if (!d) continue;
+        const double *ways = rate + (size_t)b * k * d;
+        for (int a = 0; a <= NX; a++) {
+            const double *from = a < NX ? end + a * w : row;
+            for (int j = 0; j < NX; j++) matrix[a * m + j] = from[j];
+            for (int e = 0; e < d; e++) {
+                double sum = 0.0;
+                for (int j = 0; j < k; j++) sum += from[NX + 1 + j] * ways[j * d + e];
+                matrix[a * m + NX + e] = sum;
             }
-            double before[2 * NX];
-            for (int a = 0; a < NX; a++)
-                for (int c = 0; c < 2; c++) {
-                    double sum = 0.0;
-                    for (int d = 0; d < NX; d++) sum += map[d * w + a] * back[2 * d + c];
-                    before[2 * a + c] = sum;
+        }
+        for (int i = 0; i < (d - 1) * m; i++) matrix[(NX + 1) * m + i] = across[(size_t)b * (d - 1) * m + i];
+        memset(right, 0, sizeof(double) * 2 * m);
+        for (int a = 0; a < NX; a++) right[a * columns] = -end[a * w + NX];
+        right[NX * columns] = -0.5 * log(rho[2 * b] * rho[2 * b] + rho[2 * b + 1] * rho[2 * b + 1]) - row[NX];
+        if (columns > 1) right[(m - 1) * columns + 1] = 1.0;
+        good[b] = (unsigned char)orbit_factor(m, matrix, c.pivot + (size_t)N * S);
+        if (!good[b]) continue;
+        orbit_solve(m, columns, matrix, c.pivot + (size_t)N * S, right);
+        for (int j = 0; j < columns; j++) {
+            const size_t at = (size_t)j * B + b;
+            double head[NX + 1 + k], full[NX + 1 + k], *to = dx + at * N * NX, *TO = dX + at * N * S;
+            for (int a = 0; a < m; a++) step[at * m + a] = right[a * columns + j];
+            for (int a = 0; a < NX; a++) head[a] = right[a * columns + j];
+            head[NX] = j ? 0.0 : 1.0;
+            for (int i = 0; i < k; i++) {
+                head[NX + 1 + i] = 0.0;
+                for (int e = 0; e < d; e++) head[NX + 1 + i] += ways[i * d + e] * right[(NX + e) * columns + j];
+            }
+            for (int i = 0; i < N; i++) {
+                const double *P = c.prefix + (size_t)i * w * w, *L = c.local + (size_t)i * S * w;
+                memcpy(full, head, sizeof full);
+                for (int a = 0; a < NX; a++) {
+                    full[a] = 0.0;
+                    for (int e = 0; e < w; e++) full[a] += P[a * w + e] * head[e];
+                    to[i * NX + a] = full[a];
                 }
-            memcpy(back, before, sizeof back);
+                for (int s = 0; s < S; s++) {
+                    double sum = 0.0;
+                    for (int e = 0; e < w; e++) sum += L[s * w + e] * full[e];
+                    TO[i * S + s] = sum;
+                }
+            }
         }
     }
+    free(c.lu);
+    free(c.pivot);
+    return 1;
 }

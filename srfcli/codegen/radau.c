@@ -511,6 +511,18 @@ static double first_step(Imposed *force, const Node *n, double span, double rtol
     return fmin(fmin(100.0 * h, second), span);
 }
 
+/* how long a step Radau IIA would make from a node, tried with h; 0 where Newton's method fails */
+static double implicit_reach(Imposed *force, const Node *from, double h, double rtol, const double *atol) {
+    double V, W, W_dot, Z[NZ], Z0[NZ], J[3][NX * NX], J0[NX * NX];
+    memset(Z0, 0, sizeof Z0);
+    if (!(h > 0.0) || !stages(force, from, h, Z0, rtol, atol, Z, J)) return 0.0;
+    imposed(force, from->t, &V, &W, &W_dot);
+    memset(J0, 0, sizeof J0);
+    srf_jacobian(from->x, V, W, W_dot, force->p, J0);
+    double error = fmax(estimate(force, from, from->f, h, Z, J0, rtol, atol, 1), between(from, h, Z, rtol, atol));
+    return h * fmin(8.0, 0.9 * pow(error, -0.25));
+}
+
 static int explicit_steps(Imposed *force, History *q, double b, double rtol, const double *atol, double longest, long max_steps, int next, int nt, const double *t, double *X, double *S, double *stats, const volatile int *stop);
 
 /* integrates one smooth segment [a, b], explicitly as far as it is not stiff; returns the next output index, or -1 - (it) where it stopped early */

@@ -16,39 +16,25 @@ import numpy as np
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.collocation import (
+    BoundaryLinear,
     Condensed,
     Discretisation,
     condense,
-    expand,
     gauss,
-    growth_compiled,
     join,
     kernel,
+    linearised,
     mesh_error,
+    respond,
     running_products,
     stage_parameters,
     wanted_mesh,
 )
-from srfcli.numerics.orbit import CHUNK, interpolate, newton_step, scales, step_limit, uniform_mesh
+from srfcli.numerics.orbit import CHUNK, interpolate, scales, step_limit, uniform_mesh
 
 # Points of a stability boundary: a forced periodic state one of whose multipliers lies on the unit circle.
 
 Names = tuple[str, ...]
-
-
-@dataclass
-class BoundaryLinear:
-    """Newton's equations of a batch of boundary points in (dx_0, dq): `periodic` (..., n, n+1+k) and `growth` (..., n+1+k).
-
-    Columns: n for dx_0, one for the residual, k for the parameters. `rho` is the multiplier, g = ln |rho| its growth.
-    """
-
-    condensed: Condensed
-    periodic: Array
-    growth: Array
-    rho: ComplexArray
-    g: Array
-    multipliers: ComplexArray
 
 
 def pick_multiplier(multipliers: Array, target: Array) -> Array:
@@ -58,37 +44,102 @@ def pick_multiplier(multipliers: Array, target: Array) -> Array:
 
 
 def linearise_boundary(
-    model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array, growth: Array | None = None
+    model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array
 ) -> BoundaryLinear:
-    """Return the linearisation of {periodicity, ln |rho| = 0}; rho is the multiplier nearest to `target` (...,).
+    """Return the linearisation of {periodicity, ln |rho| = 0}; rho is the multiplier nearest to `target` (...,)."""
+    batch = orbit.x.shape[:-2]
+    if kernel(model) is None or not batch:
+        return _linearise(model, p, orbit, names, target)[1]
+    found = _compiled(model, p, orbit, names, np.asarray(target, complex))
+    if not found.good.all():
+        raise np.linalg.LinAlgError("Singular matrix")
+    return found
 
-    A `growth` row from a nearby point, where given, is used in place of a new one: the step is then a chord step.
-    """
-    n = orbit.x.shape[-1]
+
+def periodic_map(model: GeneratedModel, p: Array, orbit: Discretisation, names: Names) -> Array:
+    """Return the linearised map over one period less the state, (B, n, n+1+k), of orbits (B, N, ...)."""
+    if kernel(model) is None:
+        return _less_state(condense(model, p, orbit, names))
+    return _compiled(model, p, orbit, names).periodic
+
+
+def _compiled(
+    model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array | None = None, **options: Any
+) -> BoundaryLinear:
+    library = kernel(model)
+    assert library is not None
+    which = np.array([model.index(name) for name in names], dtype=np.intc)
+    return linearised(library, (orbit.phases, orbit.steps), p, orbit, which, target, **options)
+
+
+def _less_state(condensed: Condensed) -> Array:
+    n = condensed.local.shape[-2]
+    end = condensed.prefix[..., -1, :n, :].copy()
+    end[..., range(n), range(n)] -= 1
+    return end
+
+
+def _linearise(
+    model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array
+) -> tuple[Condensed, BoundaryLinear]:
+    """Return what the compiled equations are, in NumPy."""
     condensed = condense(model, p, orbit, names)
-    M = condensed.monodromy
-    values, right_vectors = np.linalg.eig(M)
+    values, right_vectors = np.linalg.eig(condensed.monodromy)
     values, right_vectors = values.astype(complex), right_vectors.astype(complex)
     chosen = pick_multiplier(values, target)
     rho = np.take_along_axis(values, chosen[..., None], -1)[..., 0]
-    if growth is None:
-        r = np.take_along_axis(right_vectors, chosen[..., None, None], -1)[..., 0]
-        left = _left_vector(M, rho, r)
-        library = kernel(model)
-        if condensed.pivots is None or library is None:
-            growth = _growth_row(model, p, orbit, condensed, names, rho, r, left)
-        else:
-            which = np.array([model.index(name) for name in names], dtype=np.intc)
-            factored = condensed.block, condensed.pivots, condensed.local, condensed.maps, condensed.prefix
-            stages, frame = np.ascontiguousarray(orbit.stages), (orbit.phases, orbit.steps)
-            growth = growth_compiled(library, frame, p, stages, which, factored, (rho, r, left))
-    end = condensed.prefix[..., -1, :n, :].copy()
-    index = np.arange(n)
-    end[..., index, index] -= 1
-    return BoundaryLinear(condensed, end, growth, rho, np.log(np.abs(rho)), values)
+    r = np.take_along_axis(right_vectors, chosen[..., None, None], -1)[..., 0]
+    left = left_vector(condensed.monodromy, rho, r)
+    growth = _growth_row(model, p, orbit, condensed, names, rho, r, left)
+    periodic, nothing = _less_state(condensed), np.empty(0)
+    good = np.isfinite(periodic).all(axis=(-1, -2)) & np.isfinite(growth).all(axis=-1)
+    return condensed, BoundaryLinear(periodic, rho, growth, np.asarray(good), nothing, nothing, nothing)
 
 
-def _left_vector(M: Array, rho: Array, r: Array) -> ComplexArray:
+def solve_boundary(
+    model: GeneratedModel,
+    p: Array,
+    orbit: Discretisation,
+    names: Names,
+    target: Array,
+    rate: Array,
+    across: Array | None,
+    *,
+    columns: int = 1,
+) -> BoundaryLinear:
+    """Return Newton's equations of boundary points (B, ...), solved for the state at tau = 0 and distances by `rate` (B, k, d).
+
+    The rows `across` (B, d-1, n+d) close them. A second column is the direction along the curve.
+    """
+    with np.errstate(all="ignore"):
+        if kernel(model) is not None:
+            return _compiled(model, p, orbit, names, target, rate=rate, across=across, columns=columns)
+        (B, n), d = (len(orbit.x), orbit.x.shape[-1]), rate.shape[-1]
+        try:
+            condensed, linear = _linearise(model, p, orbit, names, target)
+            matrix, right = np.empty((B, n + d, n + d)), np.zeros((B, n + d, columns))
+            for row, full in ((np.s_[:, :n], linear.periodic), (np.s_[:, n : n + 1], linear.growth[:, None])):
+                matrix[row] = np.concatenate([full[..., :n], full[..., n + 1 :] @ rate], axis=-1)
+            if across is not None:
+                matrix[:, n + 1 :] = across
+            right[:, :n, 0] = -linear.periodic[..., n]
+            right[:, n, 0] = -(linear.g + linear.growth[:, n])
+            right[:, -1, 1:] = 1.0
+            linear.good &= np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=(-1, -2))
+            matrix[~linear.good] = np.eye(n + d)
+            solution = np.linalg.solve(matrix, right)
+        except np.linalg.LinAlgError:  # one singular point spoils the batch
+            lost = np.full((B, n, n + 1 + len(names)), np.nan)
+            shapes = (B, n + d), orbit.x.shape, orbit.stages.shape
+            blank = (np.full((columns, *shape), np.nan) for shape in shapes)
+            return BoundaryLinear(lost, lost[:, 0, 0] + 0j, lost[:, 0], np.full(B, False), *blank)
+        first = np.broadcast_to(np.eye(columns)[0], (B, 1, columns))
+        dx, dstages = respond(condensed, np.concatenate([solution[:, :n], first, rate @ solution[:, n:]], axis=1))
+        linear.solution, linear.dx, linear.dstages = (np.moveaxis(a, -1, 0) for a in (solution, dx, dstages))
+        return linear
+
+
+def left_vector(M: Array, rho: Array, r: Array) -> ComplexArray:
     """Return the left eigenvector l (..., n) of M (..., n, n) for its simple eigenvalue rho with right eigenvector r; l . r = 1.
 
     The bordered system needs nothing of the other eigenvectors, which may coincide where multipliers underflow.
@@ -104,23 +155,26 @@ def _left_vector(M: Array, rho: Array, r: Array) -> ComplexArray:
     return np.linalg.solve(matrix, right)[..., :n, 0]
 
 
+def weights_backwards(c: Condensed, l: Array) -> ComplexArray:
+    """Return w (..., N, m, n): sum(w * source) is l (..., n) times what y' = J y + source, y(0) = 0, has come to at tau = 1."""
+    m, n = c.local.shape[-3:-1]
+    # l carried backwards: l_{i+1} = (l G_{N-1} ... G_{i+1}); G_i is the n x n corner of the interval's map
+    backwards = running_products(np.swapaxes(c.maps[..., ::-1, :n, :n], -1, -2))  # transposes, from the end
+    l_mesh = (backwards[..., -2::-1, :, :] @ l[..., None, :, None])[..., 0]
+    seed = (gauss(m).step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
+    w = np.linalg.solve(np.swapaxes(c.block, -1, -2), np.stack([seed.real, seed.imag], axis=-1))
+    return np.asarray((w[..., 0] + 1j * w[..., 1]).reshape(*l_mesh.shape[:-1], m, n))
+
+
 def _growth_row(
     model: GeneratedModel, p: Array, orbit: Discretisation, c: Condensed, names: Names, rho: Array, r: Array, l: Array
 ) -> Array:
     """Return the derivative of ln |rho| in (dx_0, residual, dq) as a row (..., n+1+k)."""
     n, k = orbit.x.shape[-1], len(names)
-    m = orbit.stages.shape[-2]
-    scheme = gauss(m)
     tau, ps = orbit.phases, stage_parameters(p)
     v_mesh = (c.prefix[..., :-1, :n, :n] @ r[..., None, :, None])[..., 0]  # (..., N, n)
     v = (c.local[..., :n] @ v_mesh[..., None, :, None])[..., 0]  # (..., N, m, n)
-    # l carried backwards: l_{i+1} = (l G_{N-1} ... G_{i+1}); G_i is the n x n corner of the interval's map
-    backwards = running_products(np.swapaxes(c.maps[..., ::-1, :n, :n], -1, -2))  # transposes, from the end
-    l_mesh = (backwards[..., -2::-1, :, :] @ l[..., None, :, None])[..., 0]
-    seed = (scheme.step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
-    both = np.stack([seed.real, seed.imag], axis=-1)
-    w = np.linalg.solve(np.swapaxes(c.block, -1, -2), both)
-    w = (w[..., 0] + 1j * w[..., 1]).reshape(v.shape)
+    w = weights_backwards(c, l)
     gradient = model.cycle_bilinear(tau, orbit.stages, ps, w, v)  # (..., N, m, n)
     scale = 1 / rho
     weight = (scale[..., None, None, None] * gradient).real
@@ -152,10 +206,6 @@ def slope_in_last(linear: BoundaryLinear) -> Array:
 LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
 FINE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
 SHALLOW = 0.02  # slopes in ln|rho| per ln(parameter) below this are computed anew
-REGULAR = (
-    0.1  # from +1: where the critical multiplier is closer, an orbit at fixed parameters is not improved by itself
-)
-CHORD_GAIN = 0.02  # a chord step is taken to leave this share of the correction, until a second one shows its own
 
 
 @dataclass(frozen=True)
@@ -247,14 +297,13 @@ class _Polished:
     p: Array
     orbit: Discretisation
     rho: ComplexArray
-    growth: Array
     residual: Array
     others: Array
     slope: Array
     converged: Array
 
 
-_POINTWISE = ("rho", "growth", "residual", "others", "slope", "converged")
+_POINTWISE = ("rho", "residual", "others", "slope", "converged")
 
 
 def polish(
@@ -266,21 +315,18 @@ def polish(
     *,
     tol: float = 1e-8,
     max_mesh: int = 512,
-    growth: Array | None = None,
 ) -> list[BoundaryPoint]:
     """Return boundary points near `p` (n_parameters, B), moved along `direction`, each on a mesh whose error is below `tol`.
 
-    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess, `growth` (B, n+1+k) gradients of ln |rho| where
-    they are known. A point that does not converge, or whose estimated error stays above `tol` on `max_mesh` intervals,
-    says so in its status.
+    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess. A point that does not converge, or whose estimated
+    error stays above `tol` on `max_mesh` intervals, says so in its status.
     """
-    points: list[BoundaryPoint | None] = [None] * p.shape[1]
     count = p.shape[1]
-    rows = np.full((count, orbit.x.shape[-1] + 1 + len(direction.names)), np.nan) if growth is None else growth
+    points: list[BoundaryPoint | None] = [None] * count
     blank = (*(np.full(count, np.nan),) * 3, np.ones(count, bool))
-    waiting = [(np.arange(count), _Polished(p, orbit, target, rows, *blank), growth is not None)]
+    waiting = [(np.arange(count), _Polished(p, orbit, target, *blank))]
     while waiting:
-        index, coarse, known = waiting.pop()
+        index, coarse = waiting.pop()
         N = coarse.orbit.x.shape[-2]
         wanted = wanted_mesh(mesh_error(model, coarse.orbit), N, tol, max_mesh)
         for mesh in sorted(set(wanted.tolist())):  # np.unique imports numpy.ma
@@ -288,16 +334,16 @@ def polish(
             part = _select(coarse, here)
             start = part.orbit if mesh == N else interpolate(part.orbit, uniform_mesh(int(mesh)))
             lines = direction.part(index[here])
-            fine = _newton(model, part.p, start, part.rho, lines, part.growth if known else None, tol)
+            fine = _newton(model, part.p, start, part.rho, lines, tol)
             error = mesh_error(model, fine.orbit) + np.where(fine.converged, fine.residual, 0.0)
-            _renew_gradients(model, fine, lines, tol)
+            _renew(model, fine, lines, tol)
             done = (error <= tol) | ~fine.converged | (mesh >= max_mesh)
             for j in np.nonzero(done)[0]:
                 end = int(index[here[j]])
                 points[end] = _point(model, fine, int(j), direction.names[-1], float(error[j]), tol)
             again = np.nonzero(~done)[0]
             if again.size:
-                waiting.append((index[here[again]], _select(fine, again), True))
+                waiting.append((index[here[again]], _select(fine, again)))
     return [q for q in points if q is not None]
 
 
@@ -325,19 +371,12 @@ def _select(r: _Polished, keep: Array) -> _Polished:
 
 
 def _newton(
-    model: GeneratedModel,
-    p: Array,
-    orbit: Discretisation,
-    target: ComplexArray,
-    direction: Direction,
-    growth: Array | None,
-    tol: float,
+    model: GeneratedModel, p: Array, orbit: Discretisation, target: ComplexArray, direction: Direction, tol: float
 ) -> _Polished:
     parts = []
     for a in range(0, p.shape[1], CHUNK):
         cut = slice(a, a + CHUNK)
-        known = None if growth is None else growth[cut]
-        parts.append(_newton_chunk(model, p[:, cut], orbit.part(cut), target[cut], direction.part(cut), known, tol))
+        parts.append(_newton_chunk(model, p[:, cut], orbit.part(cut), target[cut], direction.part(cut), tol))
     if len(parts) == 1:
         return parts[0]
     fields = (np.concatenate([getattr(q, k) for q in parts]) for k in _POINTWISE)
@@ -350,139 +389,70 @@ def _newton_chunk(
     orbit: Discretisation,
     target: ComplexArray,
     direction: Direction,
-    growth: Array | None,
     tol: float,
     *,
     max_iterations: int = 14,
 ) -> _Polished:
-    """Solve {periodicity, ln |rho| = 0} in (orbit, distance along `direction`) for a batch on one mesh.
-
-    Known gradients `growth` make chord steps, which are kept up while they gain a factor of ten each.
-    """
-    B, n = p.shape[1], orbit.x.shape[-1]
-    rows = [model.index(name) for name in direction.names]
+    """Solve {periodicity, ln |rho| = 0} in (orbit, distance along `direction`) for a batch on one mesh."""
+    B = p.shape[1]
     r = _Polished(
         p.copy(),
         Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges),
         target.astype(complex).copy(),
-        np.full((B, n + 1 + len(rows)), np.nan) if growth is None else growth.copy(),
-        np.full(B, np.inf),
+        np.full(B, np.nan),
         np.full(B, np.nan),
         np.full(B, np.nan),
         np.zeros(B, bool),
     )
-    before, chord = np.full(B, np.inf), np.full(B, False)
-    if growth is not None:  # not where rho = 1: at fixed parameters the orbit is singular there
-        chord = np.abs(target - 1) > REGULAR
-        _orbits_only(model, r, np.nonzero(chord)[0])
     active = np.arange(B)
     for _ in range(max_iterations):
-        going = []
-        for by_chord in (True, False):
-            index = active[chord[active] == by_chord]
-            if index.size:
-                going.append(_step(model, r, index, direction.part(index), rows, by_chord, before, chord, tol))
-        active = np.concatenate(going) if going else active[:0]
+        active = _step(model, r, active, direction.part(active), tol)
         if not active.size:
             break
     return r
 
 
-def _orbits_only(model: GeneratedModel, r: _Polished, index: Array) -> None:
-    """Make one Newton step of the orbits `index` at fixed parameters: a gradient from elsewhere knows nothing of it."""
-    if not index.size:
-        return
-    with np.errstate(all="ignore"):
-        _, dx, dstages, finite = newton_step(model, r.p[:, index], r.orbit.part(index))
-        limit = step_limit(model, dx, dstages)
-    good = index[finite]
-    r.orbit.x[good] += limit[finite, None, None] * dx[finite]
-    r.orbit.stages[good] += limit[finite, None, None, None] * dstages[finite]
-
-
-def _step(
-    model: GeneratedModel,
-    r: _Polished,
-    index: Array,
-    direction: Direction,
-    rows: list[int],
-    by_chord: bool,
-    before: Array,
-    chord: Array,
-    tol: float,
-) -> Array:
-    """Make one Newton or chord step of the points `index` of `r`, in place, and return those that are not finished."""
+def _step(model: GeneratedModel, r: _Polished, index: Array, direction: Direction, tol: float) -> Array:
+    """Make one Newton step of the points `index` of `r`, in place, and return those that are not finished."""
+    rows = [model.index(name) for name in direction.names]
     n, part, q = r.orbit.x.shape[-1], r.orbit.part(index), r.p[:, index]
-    unit = direction.rates(q[rows])  # dp/d(distances), (B, k, d)
-    with np.errstate(all="ignore"):
-        try:
-            known = r.growth[index] if by_chord else None
-            linear = linearise_boundary(model, q, part, direction.names, r.rho[index], known)
-        except np.linalg.LinAlgError:
-            return index[:0]  # they stay marked as not converged
-        matrix, right = _bordered(linear, unit, direction.across, by_chord)
-        finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
-        matrix[~finite] = np.eye(matrix.shape[-1])
-        step = np.linalg.solve(matrix, np.where(finite[:, None], right, 0.0)[..., None])[..., 0]
-        dq = step[:, n:]
-        dq = dq * np.minimum(1.0, LARGEST_STEP / np.maximum(np.abs(dq).max(axis=1), 1e-300))[:, None]
-        dx, dstages = expand(linear.condensed, step[:, :n], np.einsum("bkd,bd->bk", unit, dq))
-        limit = step_limit(model, dx, dstages)
-        change = np.abs(dx / scales(model, q)[:, None, :]).max(axis=(-1, -2))
-    usable: Any = finite & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
-    limit = np.where(usable, limit, 0.0)
-    dq = np.where(usable[:, None], limit[:, None] * dq, 0.0)
-    r.rho[index], r.growth[index] = linear.rho, linear.growth
-    r.others[index] = _largest_other(linear.multipliers, linear.rho)
+    linear = solve_boundary(model, q, part, direction.names, r.rho[index], direction.rates(q[rows]), direction.across)
+    dq, dx, dstages = linear.solution[0, :, n:], linear.dx[0], linear.dstages[0]
+    usable: Any = linear.good & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
+    dq, dx, dstages = (np.where(usable[(slice(None), *[None] * (a.ndim - 1))], a, 0.0) for a in (dq, dx, dstages))
+    limit = np.minimum(step_limit(model, dx, dstages), LARGEST_STEP / np.maximum(np.abs(dq).max(axis=1), 1e-300))
+    dq = limit[:, None] * dq
+    size = np.maximum(0.1 * np.abs(dx / scales(model, q)[:, None, :]).max(axis=(-1, -2)), np.abs(dq).max(axis=1))
+    r.rho[index] = linear.rho
+    r.others[index] = largest_other(linear.multipliers, linear.rho)
     r.p[np.asarray(rows)[:, None], index] = direction.moved(q[rows], dq)
-    r.orbit.x[index] += np.where(usable[:, None, None], limit[:, None, None] * dx, 0.0)
-    r.orbit.stages[index] += np.where(usable[:, None, None, None], limit[:, None, None, None] * dstages, 0.0)
-    size = np.maximum(0.1 * change, np.abs(dq).max(axis=1))
-    gain = np.where(np.isfinite(before[index]), size / before[index], CHORD_GAIN)
-    left = size * np.clip(gain, size, 1.0) if by_chord else size * size  # what the step just made leaves behind
+    r.orbit.x[index] += limit[:, None, None] * dx
+    r.orbit.stages[index] += limit[:, None, None, None] * dstages
+    left = size * size  # what the step just made leaves behind
     enough = np.maximum(0.1 * tol, 0.1 * mesh_error(model, part))  # a tenth of the mesh's own error
     done = usable & (left < enough) & (size < 1e-3)
     r.residual[index] = np.where(done, left, np.abs(linear.g))
-    if done.any():
-        r.slope[index] = slope_in_last(linear) * q[rows[-1]]
+    r.slope[index] = slope_in_last(linear) * q[rows[-1]]
     r.converged[index[done]] = True
-    before[index] = size
-    chord[index] &= gain <= 0.3  # kept up while steps gain a factor of three
     return index[usable & ~done]
 
 
-def _renew_gradients(model: GeneratedModel, r: _Polished, direction: Direction, tol: float) -> None:
-    """Bring the multipliers and gradients up to date, in place, where a stale one would show.
+def _renew(model: GeneratedModel, r: _Polished, direction: Direction, tol: float) -> None:
+    """Bring multipliers and slopes up to date, in place, where those before the last step would show.
 
-    That is everywhere at a tight tolerance, and beside folds, where a gradient carried along may have the wrong sign.
+    That is everywhere at a tight tolerance, and beside folds, where the slope may have the wrong sign.
     """
     index = np.nonzero(r.converged & ((tol < FINE) | ~(np.abs(r.slope) > SHALLOW)))[0]
     for a in range(0, len(index), CHUNK):
         here = index[a : a + CHUNK]
         q = r.p[:, here]
         linear = linearise_boundary(model, q, r.orbit.part(here), direction.names, r.rho[here])
-        r.rho[here], r.growth[here] = linear.rho, linear.growth
-        r.others[here] = _largest_other(linear.multipliers, linear.rho)
+        r.rho[here] = linear.rho
+        r.others[here] = largest_other(linear.multipliers, linear.rho)
         r.slope[here] = slope_in_last(linear) * q[model.index(direction.names[-1])]
 
 
-def _bordered(linear: BoundaryLinear, unit: Array, across: Array | None, chord: bool) -> tuple[Array, Array]:
-    """Return Newton's matrix (B, n+d, n+d) and right side for dx_0 and the distances along `unit` (B, k, d)."""
-    B, _, d = unit.shape
-    n = linear.periodic.shape[-2]
-    matrix, right = np.empty((B, n + d, n + d)), np.zeros((B, n + d))
-    matrix[:, :n, :n] = linear.periodic[..., :n]
-    matrix[:, :n, n:] = linear.periodic[..., n + 1 :] @ unit
-    matrix[:, n, :n] = linear.growth[..., :n]
-    matrix[:, n, n:] = (linear.growth[..., None, n + 1 :] @ unit)[..., 0, :]
-    if across is not None:
-        matrix[:, n + 1 :] = across
-    right[:, :n] = -linear.periodic[..., n]
-    right[:, n] = -(linear.g + (0 if chord else linear.growth[..., n]))
-    return matrix, right
-
-
-def _largest_other(multipliers: ComplexArray, rho: ComplexArray) -> Array:
+def largest_other(multipliers: ComplexArray, rho: ComplexArray) -> Array:
     """Return the largest modulus among the multipliers other than `rho` and its conjugate."""
     pair = np.minimum(np.abs(multipliers - rho[:, None]), np.abs(multipliers - rho.conj()[:, None]))
     return np.where(pair < 1e-9 * np.abs(rho)[:, None], 0.0, np.abs(multipliers)).max(axis=-1)

@@ -13,12 +13,13 @@ import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.c_source import NoForm, compiler, library_of, orbit_source
-from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 
 # The Gauss-Legendre scheme of collocation, and the bound on a Newton step: what NumPy and compiled code must share.
 
@@ -63,7 +64,7 @@ def kernel(model: GeneratedModel) -> ctypes.CDLL | None:
     except NoForm:
         return None
     library.srf_orbits.restype = ctypes.c_int
-    library.srf_condense.restype = library.srf_growth.restype = None
+    library.srf_boundary.restype = ctypes.c_int
     return library
 
 
@@ -93,46 +94,76 @@ def newton_orbits(
     return monodromy, converged.astype(bool), used
 
 
-def condense_compiled(
-    library: ctypes.CDLL, frame: tuple[Array, Array], p: Array, x: Array, stages: Array, which: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return factored blocks, their pivots, local, maps and prefix as `Condensed` holds them; NaN where a block is singular."""
-    batch, (N, m, n), k = x.shape[:-2], stages.shape[-3:], len(which)
-    B, w, size = int(np.prod(batch)), n + 1 + k, m * n
-    lu, pivots = np.empty((*batch, N, size, size)), np.empty((*batch, N, size), dtype=np.intc)
-    local, maps = np.empty((*batch, N, m, n, w)), np.empty((*batch, N, w, w))
-    prefix, good = np.empty((*batch, N + 1, w, w)), np.empty(B, dtype=np.uint8)
-    parameters = np.ascontiguousarray(p.T)
-    library.srf_condense(
-        B, N, k, _at(which), *map(_at, frame), _at(parameters), _at(x), _at(stages), _at(lu), _at(pivots), _at(local), _at(maps),
-        _at(prefix), _at(good),
-    )  # fmt: skip
-    if not good.all():
-        bad = ~good.astype(bool).reshape(batch)
-        local[bad] = maps[bad] = prefix[bad] = np.nan
-    return lu, pivots, local, maps, prefix
+@dataclass
+class BoundaryLinear:
+    """Newton's equations of boundary points, and their solution where it was asked for.
+
+    `periodic` (..., n, n+1+k) is the map over one period less the state, `growth` (..., n+1+k) the row of g = ln |rho|, rho the
+    critical multiplier; columns: n for dx_0, one for the residual, k for the parameters. `solution` (c, B, n+d), `dx`
+    (c, B, N, n) and `dstages` (c, B, N, m, n) are Newton's step and, where c = 2, the direction in which all rows but the last
+    stay zero. `good` (B,) is false where nothing of it holds.
+    """
+
+    periodic: Array
+    rho: ComplexArray
+    growth: Array
+    good: Array
+    solution: Array
+    dx: Array
+    dstages: Array
+
+    @property
+    def g(self) -> Array:
+        """Return ln |rho|, (...,)."""
+        return np.asarray(np.log(np.abs(self.rho)))
+
+    @property
+    def multipliers(self) -> ComplexArray:
+        """Return all multipliers, (..., n), NaN where nothing holds."""
+        n = self.periodic.shape[-2]
+        usable: Any = np.isfinite(self.periodic).all(axis=(-1, -2), keepdims=True)
+        M = np.where(usable, self.periodic[..., :n], 0.0) + np.eye(n)
+        return np.where(usable[..., 0], np.linalg.eigvals(M).astype(complex), np.nan)
 
 
-def growth_compiled(
+def linearised(
     library: ctypes.CDLL,
     frame: tuple[Array, Array],
     p: Array,
-    stages: Array,
+    orbit: Discretisation,
     which: Array,
-    condensed: tuple[Array, Array, Array, Array, Array],
-    eigen: tuple[Array, Array, Array],
-) -> Array:
-    """Return the derivative of ln |rho| in (dx_0, residual, dq), (..., n+1+k); `eigen`: rho, its right and left vectors."""
-    lu, pivots, local, maps, prefix = condensed
-    N, w = stages.shape[-3], prefix.shape[-1]
-    batch = stages.shape[:-3]
-    row, parameters = np.empty((*batch, w)), np.ascontiguousarray(p.T)
-    pairs = [np.ascontiguousarray(np.asarray(e, dtype=complex)) for e in eigen]
-    library.srf_growth(
-        int(np.prod(batch)), N, len(which), _at(which), _at(frame[0]), _at(parameters), _at(stages), _at(lu), _at(pivots),
-        _at(local), _at(maps), _at(prefix), *map(_at, pairs), _at(row),
+    target: Array | None = None,
+    *,
+    rate: Array | None = None,
+    across: Array | None = None,
+    columns: int = 1,
+) -> BoundaryLinear:
+    """Return Newton's equations of boundary points, rho being the multiplier next to `target` (B,), solved by `rate` (B, k, d).
+
+    `across` (B, d-1, n+d) closes them. Without a target only `periodic` is found.
+    """
+    B, N, n = orbit.x.shape
+    k, d = len(which), 0 if rate is None else rate.shape[-1]
+    found = BoundaryLinear(
+        np.empty((B, n, n + 1 + k)),
+        np.full(B, np.nan + 0j),
+        np.full((B, n + 1 + k), np.nan),
+        np.empty(B, dtype=np.uint8),
+        np.full((columns, B, n + d), np.nan),
+        np.full((columns, *orbit.x.shape), np.nan) if d else np.empty(0),
+        np.full((columns, *orbit.stages.shape), np.nan) if d else np.empty(0),
+    )
+    x, stages, parameters = (np.ascontiguousarray(a) for a in (orbit.x, orbit.stages, p.T))
+    given = (None if a is None else np.ascontiguousarray(a) for a in (target, rate, across))
+    done = library.srf_boundary(
+        B, N, k, _at(which), d, columns, *map(_at, frame), _at(parameters), _at(x), _at(stages),
+        *[None if a is None else _at(a) for a in given], _at(found.periodic), _at(found.rho), _at(found.growth),
+        _at(found.solution), _at(found.dx), _at(found.dstages), _at(found.good),
     )  # fmt: skip
-    return row
+    if not done:
+        raise MemoryError
+    found.good = found.good.astype(bool)
+    return found
 
 
 def _at(array: Array) -> ctypes.c_void_p:
@@ -180,16 +211,14 @@ def join(parts: Sequence[Discretisation]) -> Discretisation:
 class Condensed:
     """A linearised orbit problem.
 
-    `block` (..., N, mn, mn) is the stage matrix, in compiled code its factors, with their `pivots` (..., N, mn);
-    `local` (..., N, m, n, n+1+k) the stages' response to the interval's first state, the residual and k parameters;
-    `prefix` (..., N+1, n+1+k, n+1+k) the affine maps from tau = 0 to each mesh point.
+    `block` (..., N, mn, mn) is the stage matrix; `local` (..., N, m, n, n+1+k) the stages' response to the interval's first
+    state, the residual and k parameters; `prefix` (..., N+1, n+1+k, n+1+k) the affine maps from tau = 0 to each mesh point.
     """
 
     block: Array
     local: Array
     maps: Array
     prefix: Array
-    pivots: Array | None = None
 
     @property
     def monodromy(self) -> Array:
@@ -227,19 +256,8 @@ def _frame(edges: bytes, m: int, n: int) -> _Frame:
 def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tuple[str, ...] = ()) -> Condensed:
     """Return the linearisation of the collocation equations about `orbit`, with columns for the parameters `names`.
 
-    `p` is (n_parameters, ...), in the model's order. Compiled where it can be: `block` then holds factors.
+    `p` is (n_parameters, ...), in the model's order.
     """
-    library = kernel(model) if orbit.stages.shape[-2] == STAGES else None
-    if library is None:
-        return condense_plainly(model, p, orbit, names)
-    which = np.array([model.index(name) for name in names], dtype=np.intc)
-    x, stages = np.ascontiguousarray(orbit.x), np.ascontiguousarray(orbit.stages)
-    lu, pivots, local, maps, prefix = condense_compiled(library, (orbit.phases, orbit.steps), p, x, stages, which)
-    return Condensed(lu, local, maps, prefix, pivots)
-
-
-def condense_plainly(model: GeneratedModel, p: Array, orbit: Discretisation, names: tuple[str, ...] = ()) -> Condensed:
-    """Return what `condense` does, in NumPy, the stage matrices as they are."""
     x, X = orbit.x, orbit.stages
     m, n = X.shape[-2:]
     k, size, batch = len(names), m * n, X.shape[:-2]  # batch includes the intervals

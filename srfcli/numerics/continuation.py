@@ -1,9 +1,9 @@
 """Pseudo-arclength continuation of a stability boundary, and all components of one in a window.
 
 The unknowns are the state at tau = 0 and the two unit coordinates q; a step predicts on the cubic through the last two points and
-their tangents, and corrects on the hyperplane through the prediction. The first correction is a full Newton step with the exact
-gradient; those after it reuse the gradient's row, which leaves an error far below the final polish. A step is as long as the
-prediction, the turn of the tangent and the distance of the curve from its chord allow; meshes grow and shrink on the way.
+their tangents, and corrects on the hyperplane through the prediction, by Newton steps with the exact gradient. Most points need
+but one, which leaves an error far below the final polish. A step is as long as the prediction, the turn of the tangent and the
+distance of the curve from its chord allow; meshes grow and shrink on the way.
 
 A curve followed from one point misses what closes on itself, so every sign change on a set of lines is accounted for: by a
 branch that passes through it, or by a new branch that starts there. What closes between two lines is not looked at.
@@ -18,8 +18,8 @@ import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.numerics.boundary import BoundaryLinear, BoundaryPoint, Direction, linearise_boundary, polish, slope_in_last
-from srfcli.numerics.collocation import Discretisation, mesh_error, respond
+from srfcli.numerics.boundary import BoundaryPoint, Direction, largest_other, polish, slope_in_last, solve_boundary
+from srfcli.numerics.collocation import Discretisation, mesh_error
 from srfcli.numerics.critical import INTERVALS, LineScan, locate_crossings, scan_line
 from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
 from srfcli.numerics.plane import Plane
@@ -64,7 +64,6 @@ class CurvePoint:
     others: float
     tangent_q: Array
     tangent_orbit: Discretisation
-    growth: Array
     slope_y: float = 0.0
     step: float = 0.0
     correction: float = 0.0
@@ -105,83 +104,55 @@ def correct(
     stale, and the linearisation is taken anew.
     """
     n = orbit.x.shape[-1]
-    q, orbit = q.copy(), Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges)
-    growth: Array | None = None  # kept between iterations where it is still good: a chord step
+    q, x, stages, edges = q.copy(), orbit.x.copy(), orbit.stages.copy(), orbit.edges
+    across = np.concatenate([normal_x, normal_q])[None, None]
     previous = first = np.inf
     for iteration in range(max_iterations):
         p = plane.point(model, q)
-        with np.errstate(all="ignore"):
-            try:
-                linear = linearise_boundary(model, p, orbit, plane.names, np.asarray(rho), growth)
-                matrix = _matrix(model, plane, p, linear, normal_q, normal_x)
-                right = np.zeros((n + 2, 2))
-                right[:n, 0] = -linear.periodic[:, n]
-                right[n, 0] = -(linear.g + (linear.growth[n] if growth is None else 0.0))
-                right[n + 1, 1] = 1.0
-                solution = np.linalg.solve(matrix, right)
-            except np.linalg.LinAlgError:
-                return None
-            if not np.isfinite(solution).all():
-                return None
-            rate = plane.rates(model, p)
-            head = np.zeros((n + 3, 2))
-            head[:n], head[n, 0], head[n + 1 :] = solution[:n], 1.0, solution[n:] * rate[:, None]
-            dxs, dall = respond(linear.condensed, head)
-            dx, dstages = dxs[..., 0], dall[..., 0]
-        change = change_size(model, p, solution[n:, 0], dx)
+        linear = solve_boundary(
+            model,
+            p[:, None],
+            Discretisation(x[None], stages[None], edges),
+            plane.names,
+            np.array([rho]),
+            np.diag(plane.rates(model, p))[None],
+            across,
+            columns=2,
+        )
+        if not (linear.good[0] and np.isfinite(linear.solution).all()):
+            return None
+        dq, dx = linear.solution[0, 0, n:], linear.dx[0, 0]
+        change = change_size(model, p, dq, dx)
         if iteration and change > 0.7 * previous:
             return None
         previous = change
         first = change if iteration == 0 else first
         if change > 0.5:
             return None
-        if growth is None:
-            tangent_full = solution[:, 1]
-            tangent_orbit = Discretisation(dxs[..., 1], dall[..., 1], orbit.edges)
-            growth, slope_y = linear.growth, float(slope_in_last(linear))
         small = change < min(np.sqrt(tol), STALE * reach)
-        q = q + solution[n:, 0]
-        orbit.x += dx
-        orbit.stages += dstages
-        rho = complex(linear.rho)
+        q = q + dq
+        x += dx
+        stages += linear.dstages[0, 0]
+        rho = complex(linear.rho[0])
         if change < tol or small:  # a full Newton step leaves an error of order change^2
-            moduli = np.abs(linear.multipliers)
-            pair = np.minimum(np.abs(linear.multipliers - rho), np.abs(linear.multipliers - np.conj(rho))) < 1e-9
-            others = float(np.where(pair, 0.0, moduli).max())
             point = CurvePoint(
                 q,
                 plane.point(model, q),
-                orbit,
+                Discretisation(x, stages, edges),
                 rho,
-                others,
-                tangent_full[n:],
-                tangent_orbit,
-                growth,
-                slope_y,
+                float(largest_other(linear.multipliers, linear.rho)[0]),
+                linear.solution[1, 0, n:],
+                Discretisation(linear.dx[1, 0], linear.dstages[1, 0], edges),
+                float(slope_in_last(linear)[0]),
                 correction=first,
             )
             return _normalised(model, point, orientation)
-        growth = None if change > STALE * reach or change > 0.05 else growth
     return None
 
 
 def change_size(model: GeneratedModel, p: Array, dq: Array, dx: Array) -> float:
     """Return the size of a change of unit coordinates `dq` (2,) and mesh values `dx` (N, n) at parameters `p`."""
     return max(float(np.abs(dq).max()), ORBIT_SHARE * float((np.abs(dx) / scales(model, p)).max()))
-
-
-def _matrix(
-    model: GeneratedModel, plane: Plane, p: Array, linear: BoundaryLinear, normal_q: Array, normal_x: Array
-) -> Array:
-    n = normal_x.shape[0]
-    matrix = np.empty((n + 2, n + 2))
-    rate = plane.rates(model, p)
-    matrix[:n, :n] = linear.periodic[:, :n]
-    matrix[:n, n:] = linear.periodic[:, n + 1 :] * rate
-    matrix[n, :n] = linear.growth[:n]
-    matrix[n, n:] = linear.growth[n + 1 :] * rate
-    matrix[n + 1, :n], matrix[n + 1, n:] = normal_x, normal_q
-    return matrix
 
 
 def state_size(model: GeneratedModel, p: Array, x: Array) -> Array:
@@ -587,7 +558,6 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
             direction.part(index),
             tol=settings.tol,
             max_mesh=settings.max_mesh,
-            growth=np.stack([pt.growth for pt in group]),
         )
         for i, located in zip(index, found, strict=True):
             polished[i] = located
@@ -666,7 +636,7 @@ def crossing_numbers(model: GeneratedModel, atlas: Atlas) -> list[list[int | Non
             number = first + below
             losing = point.slope > 0
             if (number % 2 == 1) != losing:
-                number += 1 if _nearest_from_below(lines, b, i) else -1
+                number += 1 if _other_side_below(branch, own, i) else -1
             told = np.isfinite(point.slope) and point.slope != 0 and point.kind != "fold"
             row.append(max(number, 1) if told else None)
         numbers.append(row)
@@ -685,8 +655,9 @@ def _crossings_below(q: Array, at: Array, *, skip: int | None) -> int:
     return int(count.sum())
 
 
-def _nearest_from_below(lines: list[Array], b: int, i: int) -> bool:
-    """Return whether the other side of a fold next to point i of branch b lies below it, so that it was not counted."""
-    q = lines[b]
-    window = q[max(i - 2, 0) : i + 3]
-    return bool(np.mean(window[:, 1]) < q[i, 1])
+def _other_side_below(branch: Branch, q: Array, i: int) -> bool:
+    """Return whether the other side of the fold next to point i of a branch lies below it, where it was not counted."""
+    losing = [point.slope > 0 for point in branch.points]
+    others = [k for k in range(len(q)) if losing[k] != losing[i]]
+    nearest = min(others, key=lambda k: abs(k - i) + float(np.linalg.norm(q[k] - q[i])), default=i)
+    return bool(q[nearest, 1] < q[i, 1])

@@ -24,7 +24,18 @@ from srfcli.core.errors import Status
 from srfcli.numerics.boundary import BoundaryPoint, along, pick_multiplier, polish
 from srfcli.numerics.collocation import Discretisation, join, mesh_error, wanted_mesh
 from srfcli.numerics.hopf import critical_point
-from srfcli.numerics.orbit import OrbitBatch, forced_guess, interpolate, solve_orbits, steady_guess, uniform_mesh
+from srfcli.numerics.orbit import (
+    NEIGHBOURS,
+    STRIDE,
+    OrbitBatch,
+    between,
+    forced_guess,
+    interpolate,
+    levels,
+    solve_orbits,
+    steady_guess,
+    uniform_mesh,
+)
 
 # Every critical value of one parameter on a line: scanned, bracketed, polished, numbered from the low end.
 
@@ -410,6 +421,31 @@ def robust_orbits(
     return batch
 
 
+def line_orbits(
+    model: GeneratedModel, p: Array, position: Array, guess: Discretisation | None, edges: Array
+) -> OrbitBatch:
+    """Return what `robust_orbits` does at points in order, at rising `position` (B,) along a line.
+
+    A few that are spread over the line come first; the others start from what was found around them.
+    """
+    count, orbits, stride = p.shape[1], None, STRIDE
+    while stride > 1 and count < stride * NEIGHBOURS:  # fewer to start from would foretell little
+        stride //= 2
+    for level in levels(count, stride):
+        if orbits is None:
+            first = robust_orbits(model, p[:, level], None if guess is None else guess.part(level), edges)
+            shape = first.orbit.x.shape[1:], first.orbit.stages.shape[1:], first.monodromy.shape[1:]
+            x, stages, monodromy = (np.full((count, *tail), np.nan) for tail in shape)
+            orbits = OrbitBatch(p, Discretisation(x, stages, edges), monodromy, np.zeros(count, bool), first.iterations)
+            orbits.replace(level, first)
+            continue
+        known = np.nonzero(orbits.converged)[0]
+        near = between(orbits.orbit.part(known), position[known], position[level]) if known.size else None
+        orbits.replace(level, robust_orbits(model, p[:, level], near, edges))
+    assert orbits is not None
+    return orbits
+
+
 def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7) -> OrbitBatch:
     """Return orbits at `p` (n_parameters, B) by raising eps from 0, each in steps of its own that are halved where one fails.
 
@@ -465,13 +501,12 @@ def scan_line(
     """
     p = np.repeat(base[:, None], len(values), axis=1)
     p[model.index(name)] = values
-    batch = _on_sufficient_mesh(
-        model, robust_orbits(model, p, guess, uniform_mesh(intervals) if guess is None else guess.edges)
-    )
+    coordinate = np.log if log else np.asarray
+    edges = uniform_mesh(intervals) if guess is None else guess.edges
+    batch = _on_sufficient_mesh(model, line_orbits(model, p, coordinate(values), guess, edges))
     multipliers, g = growth(batch)
     swing = swing_pair(model, p, batch.orbit, multipliers)
     scan = LineScan(name, p, np.asarray(values, float), multipliers, g, batch.orbit, swing, np.inf)
-    coordinate = np.log if log else np.asarray
     for count in itertools.count():
         position = coordinate(scan.values)
         tongues &= count < ROUNDS
@@ -565,12 +600,8 @@ def _with_samples(
     """Return `scan` with samples added in the intervals `left` (M,), each at its `share` (M,) of the interval."""
     a, b = scan.values[left], scan.values[left + 1]
     fresh = a * (b / a) ** share if log else a + share * (b - a)
-    lower, upper, t = scan.orbit.part(left), scan.orbit.part(left + 1), share[:, None, None]
-    guess = Discretisation(
-        (1 - t) * lower.x + t * upper.x,
-        (1 - t[..., None]) * lower.stages + t[..., None] * upper.stages,
-        scan.orbit.edges,
-    )
+    coordinate, known = np.log if log else np.asarray, np.nonzero(np.isfinite(scan.g))[0]
+    guess = between(scan.orbit.part(known), coordinate(scan.values[known]), coordinate(fresh), 4)
     p = np.repeat(base[:, None], len(fresh), axis=1)
     p[model.index(scan.name)] = fresh
     batch = robust_orbits(model, p, guess, scan.orbit.edges)

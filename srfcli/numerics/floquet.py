@@ -10,7 +10,7 @@ from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.collocation import (
     Discretisation,
-    condense_plainly,
+    condense,
     gauss,
     last_coefficient,
     log_determinant,
@@ -232,4 +232,4 @@ def _liouville(model: GeneratedModel, p: Array, orbit: Discretisation) -> float:
     exponents = (trace @ gauss(orbit.stages.shape[-2]).weights) * orbit.steps
     if np.abs(exponents).max() > STIFF:
         return float("nan")
-    return float(abs(np.expm1(log_determinant(condense_plainly(model, p, orbit), orbit) - exponents.sum())))
+    return float(abs(np.expm1(log_determinant(condense(model, p, orbit), orbit) - exponents.sum())))

@@ -20,9 +20,19 @@ from srfcli.codegen.model import Array, ComplexArray, GeneratedModel, load_sourc
 from srfcli.core.parallel import run_here
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
-from srfcli.numerics.collocation import STAGES, Discretisation, condense, join, kernel, mesh_error
+from srfcli.numerics.boundary import periodic_map
+from srfcli.numerics.collocation import STAGES, Discretisation, join, kernel, mesh_error
 from srfcli.numerics.critical import robust_orbits
-from srfcli.numerics.orbit import CHUNK, OrbitBatch, interpolate, ordered_eigenvalues, solve_orbits, uniform_mesh
+from srfcli.numerics.orbit import (
+    CHUNK,
+    OrbitBatch,
+    interpolate,
+    levels,
+    neighbours,
+    ordered_eigenvalues,
+    solve_orbits,
+    uniform_mesh,
+)
 from srfcli.numerics.plane import MapGrid, MapSettings, TileTask, tile_tasks
 
 # Stability maps: the leading Floquet multiplier over a grid of two parameters, put together from its tiles.
@@ -233,8 +243,6 @@ def _tile_seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
 
 # One tile of a stability map: orbits on a coarse grid, the others from their neighbours, cells refined where it matters.
 
-STRIDE = 8  # orbits solved without neighbours are this many rows and columns apart
-NEIGHBOURS = 6  # through which a first guess is interpolated
 GRAIN = 4  # meshes are multiples of this many intervals
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # to the points beside a point, in columns and rows
 SETTLING = 1000  # periods of a simulation: just beyond a fold the motion lingers
@@ -277,7 +285,7 @@ def solve_block(task: TileTask) -> Samples:
     """Return the orbits at all grid points of a tile, columns first."""
     model, xs, ys, p = tile_points(task)
     shape, settings = (len(xs), len(ys)), task.settings
-    columns, rows = (_levels(count) for count in shape)
+    columns, rows = (levels(count) for count in shape)
     first = np.ix_(columns[0], rows[0])
     start = _coarse(model, p[:, first[0], first[1]].reshape(len(p), -1), task)
     block = _Block.empty(model, p, start.orbit.edges)
@@ -298,19 +306,6 @@ def solve_block(task: TileTask) -> Samples:
     n = len(model.states)
     multipliers = ordered_eigenvalues(block.monodromy.reshape(count, n, n), block.converged.reshape(count))
     return Samples(at.astype(float), p.reshape(len(p), -1), flat, multipliers)
-
-
-def _levels(count: int) -> list[Array]:
-    """Return indices 0..count-1 in the order in which they are filled: every STRIDE-th with the last, halved until all."""
-    seen = np.zeros(count, bool)
-    levels, stride = [], STRIDE
-    while stride >= 1:
-        wanted = np.zeros(count, bool)
-        wanted[::stride] = wanted[-1] = True
-        levels.append(np.nonzero(wanted & ~seen)[0])
-        seen |= wanted
-        stride //= 2
-    return [level for level in levels if level.size]
 
 
 def _coarse(model: GeneratedModel, p: Array, task: TileTask) -> OrbitBatch:
@@ -374,16 +369,19 @@ class _Block:
 
     def along_rows(self, columns: Array, known: Array, new: Array) -> Discretisation:
         """Return guesses at rows `new` of `columns` from the rows `known`."""
-        index, weights = neighbours(np.sort(known), new)
-        x = np.einsum("rk,crkNn->crNn", weights, self.x[columns[:, None, None], index[None]])
-        stages = np.einsum("rk,crkNmn->crNmn", weights, self.stages[columns[:, None, None], index[None]])
+        known = np.sort(known)
+        index, weights = neighbours(known, new)
+        place = columns[:, None, None], known[index][None]
+        x = np.einsum("rk,crkNn->crNn", weights, self.x[place])
+        stages = np.einsum("rk,crkNmn->crNmn", weights, self.stages[place])
         return Discretisation(x.reshape(-1, *x.shape[2:]), stages.reshape(-1, *stages.shape[2:]), self.edges)
 
     def along_columns(self, known: Array, new: Array) -> Discretisation:
         """Return guesses at all rows of columns `new` from the columns `known`."""
-        index, weights = neighbours(np.sort(known), new)
-        x = np.einsum("ck,ckrNn->crNn", weights, self.x[index])
-        stages = np.einsum("ck,ckrNmn->crNmn", weights, self.stages[index])
+        known = np.sort(known)
+        index, weights = neighbours(known, new)
+        x = np.einsum("ck,ckrNn->crNn", weights, self.x[known[index]])
+        stages = np.einsum("ck,ckrNmn->crNmn", weights, self.stages[known[index]])
         return Discretisation(x.reshape(-1, *x.shape[2:]), stages.reshape(-1, *stages.shape[2:]), self.edges)
 
     def fill(self, columns: Array, rows: Array, guess: Discretisation, tol: float) -> None:
@@ -499,19 +497,6 @@ def regular(batch: OrbitBatch) -> OrbitBatch:
     return batch
 
 
-def neighbours(known: Array, new: Array) -> tuple[Array, Array]:
-    """Return, for each position `new`, up to NEIGHBOURS of the rising positions `known` around it and their Lagrange weights."""
-    width = min(NEIGHBOURS, len(known))
-    first = np.clip(np.searchsorted(known, new) - width // 2, 0, len(known) - width)
-    index = known[first[:, None] + np.arange(width)]  # (new, width)
-    weights = np.ones(index.shape)
-    for i in range(width):
-        for j in range(width):
-            if j != i:
-                weights[:, i] *= (new - index[:, j]) / (index[:, i] - index[:, j])
-    return index, weights
-
-
 # Cells of a map tile halved where a boundary could hide in them, and every sign change that the points then show.
 
 SAFETY = 1.5  # on an interpolation error, which is itself an estimate
@@ -556,28 +541,34 @@ class _Points:
 
     def __init__(self, samples: Samples, unit: int) -> None:
         self.samples, self.unit = samples, unit
-        self.place = {(int(a), int(b)): k for k, (a, b) in enumerate(np.rint(samples.at * unit))}
+        self.place = {key: k for k, key in enumerate(self.keys(np.rint(samples.at * unit)))}
+
+    @staticmethod
+    def keys(at: Array) -> list[int]:
+        """Return one number for each of the places (B, 2)."""
+        whole = at.astype(np.int64)
+        return (whole[:, 0] * 2**32 + whole[:, 1]).tolist()
 
     def index(self, at: Array) -> Array:
         """Return the samples at places (..., 2)."""
-        flat = [self.place[int(a), int(b)] for a, b in at.reshape(-1, 2)]
-        return np.array(flat, dtype=int).reshape(at.shape[:-1])
+        found = [self.place[key] for key in self.keys(at.reshape(-1, 2))]
+        return np.array(found, dtype=int).reshape(at.shape[:-1])
 
     def add(self, task: TileTask, model: GeneratedModel, at: Array, parents: list[Array]) -> None:
         """Solve the orbits at places `at` (B, 2) that are not known yet, each from the mean of its parents' orbits."""
-        fresh: dict[tuple[int, int], Array] = {}
-        for (a, b), above in zip(at.tolist(), parents, strict=True):
-            if (a, b) not in self.place:
-                fresh.setdefault((a, b), above)
+        fresh: dict[int, tuple[Array, Array]] = {}
+        for key, place, above in zip(self.keys(at), at, parents, strict=True):
+            if key not in self.place:
+                fresh.setdefault(key, (place, above))
         if not fresh:
             return
-        old, places = self.samples, np.array(list(fresh)) / self.unit
+        old, places = self.samples, np.array([place for place, _ in fresh.values()]) / self.unit
+        sources = [above for _, above in fresh.values()]
         xs, ys = _quantities(task, places)
         p = task.grid.points(model, xs, ys)
-        x = np.stack([old.orbit.x[k].mean(axis=0) for k in fresh.values()])
-        stages = np.stack([old.orbit.stages[k].mean(axis=0) for k in fresh.values()])
+        x = np.stack([old.orbit.x[k].mean(axis=0) for k in sources])
+        stages = np.stack([old.orbit.stages[k].mean(axis=0) for k in sources])
         batch = regular_orbits(model, p, Discretisation(x, stages, old.orbit.edges), task.settings.tol)
-        sources = list(fresh.values())
         for k in range(4):  # where the mean leads nowhere, each of the parents
             lost = np.array([b for b in np.nonzero(~batch.converged)[0] if k < len(sources[b])], dtype=int)
             if lost.size:
@@ -731,8 +722,8 @@ def _unlike(model: GeneratedModel, samples: Samples, names: tuple[str, str], i: 
     slopes = np.full((len(every), n, len(names)), np.nan)
     for a in range(0, len(every), CHUNK):
         part = every[a : a + CHUNK]
-        end = condense(model, samples.p[:, part], samples.orbit.part(part), names).prefix[:, -1, :n]
-        slopes[a : a + CHUNK] = np.linalg.solve(np.eye(n) - end[..., :n], end[..., n + 1 :])
+        end = periodic_map(model, samples.p[:, part], samples.orbit.part(part), names)
+        slopes[a : a + CHUNK] = np.linalg.solve(-end[..., :n], end[..., n + 1 :])
     rows = [model.index(name) for name in names]
     step = (samples.p[rows][:, j] - samples.p[rows][:, i]).T
     told = 0.5 * ((slopes[place[: len(i)]] + slopes[place[len(i) :]]) @ step[..., None])[..., 0]
@@ -785,9 +776,9 @@ def _sides(done: Refined, unit: int, wanted: Between) -> Array:
         corners = points.index(cells.corners())
         for a, b, axis in SIDES:
             i, j = corners[:, a], corners[:, b]
-            middle = cells.corners()[:, a] + np.eye(2, dtype=int)[axis] * (cells.size // 2)
-            for k in np.nonzero(wanted(i, j))[0]:
-                split = cells.size > 1 and (int(middle[k, 0]), int(middle[k, 1])) in points.place
-                if not split:  # a finer cell next to it has the two halves
+            here = np.nonzero(wanted(i, j))[0]
+            middle = cells.corners()[here, a] + np.eye(2, dtype=int)[axis] * (cells.size // 2)
+            for k, key in zip(here, points.keys(middle), strict=True):
+                if cells.size == 1 or key not in points.place:  # a finer cell next to it has the two halves
                     sides[int(i[k]), int(j[k])] = axis
     return np.array([(i, j, axis) for (i, j), axis in sorted(sides.items())], dtype=int).reshape(-1, 3)

@@ -24,6 +24,8 @@ from srfcli.numerics.collocation import (
 
 CHUNK = 48  # parameter points solved together: their blocks fit the cache
 LARGEST_SWING = 2.0  # of a logarithm in the linear response that is a first guess
+STRIDE = 8  # of points in order, orbits solved without neighbours are this many apart
+NEIGHBOURS = 6  # through which a first guess is interpolated
 
 
 @dataclass
@@ -130,6 +132,45 @@ def _lagrange(nodes: Array, s: Array) -> Array:
         others = np.delete(nodes, i)
         columns.append(np.prod((s[..., None] - others) / (node - others), axis=-1))
     return np.stack(columns, axis=-1)
+
+
+def levels(count: int, stride: int = STRIDE) -> list[Array]:
+    """Return indices 0..count-1 in the order in which they are filled: every `stride`-th with the last, halved until all."""
+    seen = np.zeros(count, bool)
+    found = []
+    while stride >= 1:
+        wanted = np.zeros(count, bool)
+        wanted[::stride] = wanted[-1] = True
+        found.append(np.nonzero(wanted & ~seen)[0])
+        seen |= wanted
+        stride //= 2
+    return [level for level in found if level.size]
+
+
+def neighbours(known: Array, new: Array, most: int = NEIGHBOURS) -> tuple[Array, Array]:
+    """Return, for each position `new`, which of the rising positions `known`, `most` of them, are around it, and their weights.
+
+    The weights are Lagrange's.
+    """
+    width = min(most, len(known))
+    first = np.clip(np.searchsorted(known, new) - width // 2, 0, len(known) - width)
+    index = first[:, None] + np.arange(width)  # (new, width)
+    weights, at = np.ones(index.shape), known[index]
+    for i in range(width):
+        for j in range(width):
+            if j != i:
+                weights[:, i] *= (new - at[:, j]) / (at[:, i] - at[:, j])
+    return index, weights
+
+
+def between(orbit: Discretisation, known: Array, new: Array, most: int = NEIGHBOURS) -> Discretisation:
+    """Return guesses at positions `new` through the orbits (B, N, ...) at the rising positions `known` (B,)."""
+    index, weights = neighbours(known, new, most)
+    return Discretisation(
+        np.einsum("bk,bkNn->bNn", weights, orbit.x[index]),
+        np.einsum("bk,bkNmn->bNmn", weights, orbit.stages[index]),
+        orbit.edges,
+    )
 
 
 def step_limit(model: GeneratedModel, dx: Array, stages: Array) -> Array:

@@ -15,8 +15,17 @@ import numpy as np
 
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind, pick_multiplier
-from srfcli.numerics.collocation import Condensed, Discretisation, condense_plainly, gauss, mesh_error, running_products
+from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind, left_vector, pick_multiplier, weights_backwards
+from srfcli.numerics.collocation import (
+    Condensed,
+    Discretisation,
+    condense,
+    gauss,
+    join,
+    mesh_error,
+    running_products,
+    stage_parameters,
+)
 from srfcli.numerics.continuation import Branch, CurvePoint, correct, metric
 from srfcli.numerics.orbit import interpolate
 from srfcli.numerics.plane import Plane
@@ -292,94 +301,86 @@ class _Chord:
 STEP = 1e-25  # of a complex step
 REAL = 1e-6  # a multiplier nearer to the real axis has no normal form of this kind
 CRITICALITY = "criticality"
+TOGETHER = 16  # points whose derivatives fit the cache
 
 
-def cubic_coefficient(model: GeneratedModel, p: Array, orbit: Discretisation, rho: complex) -> float:
-    """Return d of the critical multiplier `rho` at a point of a boundary, per forcing period; NaN where it is real.
+def cubic_coefficient(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> Array:
+    """Return d (...,) of the critical multipliers `rho` at points of a boundary, per forcing period; NaN where they are real.
 
-    `orbit` is one orbit (N, n). The unit of z is such that the disturbance of ln v, 2 Re(z q(tau)), has mean |q|^2 = 1 over
+    `p` is (n_parameters, ...). The unit of z is such that the disturbance of ln v, 2 Re(z q(tau)), has mean |q|^2 = 1 over
     the period. At the resonance 1:3 the coefficient has a pole; at 1:4 it does not tell the whole story.
     """
     return critical_mode(model, p, orbit, rho)[0]
 
 
-def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: complex) -> tuple[float, ComplexArray]:
-    """Return d and the critical eigenvector at tau = 0 (n,), in the unit that d is in."""
-    c = condense_plainly(model, p, orbit)
-    n = orbit.x.shape[-1]
-    values, vectors = np.linalg.eig(c.monodromy)
-    k = int(pick_multiplier(values.astype(complex), np.asarray(rho.real + 1j * abs(rho.imag))))
-    mu = complex(values[k])
-    if abs(mu.imag) < REAL * abs(mu):
-        return np.nan, np.full(n, np.nan + 0j)
-    wave = _carried(c, vectors[:, k])
+def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> tuple[Array, ComplexArray]:
+    """Return d (...,) and the critical eigenvectors at tau = 0 (..., n), in the unit that d is in."""
+    c, rho = condense(model, p, orbit), np.asarray(rho, dtype=complex)
+    M, identity = c.monodromy, np.eye(orbit.x.shape[-1])
+    values, vectors = np.linalg.eig(M)
+    chosen = pick_multiplier(values.astype(complex), rho.real + 1j * np.abs(rho.imag))[..., None]
+    mu = np.take_along_axis(values, chosen, -1)[..., 0].astype(complex)
+    right = np.take_along_axis(vectors, chosen[..., None], -1)[..., 0].astype(complex)
+    real = np.abs(mu.imag) < REAL * np.abs(mu)
+    wave = _carried(c, right)
     weight = orbit.steps[:, None] * gauss(orbit.stages.shape[-2]).weights
-    size = np.sqrt(float((weight * np.abs(wave[..., model.states.index("ln_v")]) ** 2).sum()))
-    q, left = vectors[:, k] / size, np.linalg.inv(vectors)[k] * size
-    wave = wave / size
-    field = _Field(model, p, orbit)
-    mean, mean_end = _forced(c, field.second(wave, wave.conj()))
-    double, double_end = _forced(c, field.second(wave, wave))
-    identity = np.eye(n)
-    mean = mean + _carried(c, np.linalg.solve(identity - c.monodromy, mean_end))
-    double = double + _carried(c, np.linalg.solve(mu * mu * identity - c.monodromy, double_end))
-    source = field.third(wave) + 2 * field.second(mean, wave) + field.second(double, wave.conj())
-    _, end = _forced(c, source)
-    return float((0.5 * (left @ end) / mu).real), q
-
-
-class _Field:
-    """Second and third derivatives of the cycle's field at the Gauss points of an orbit, in given directions (N, m, n)."""
-
-    def __init__(self, model: GeneratedModel, p: Array, orbit: Discretisation) -> None:
-        self.model, self.p, self.tau, self.x = model, p.tolist(), orbit.phases, orbit.stages
-        self.unit = np.eye(orbit.x.shape[-1])
-
-    def second(self, a: ComplexArray, b: ComplexArray) -> ComplexArray:
-        """Return F2(a, b), (N, m, n)."""
-        return self._second(self.x, a, b)
-
-    def _second(self, x: Array, a: Array, b: Array) -> Array:
-        gradient = self.model.cycle_bilinear(self.tau, x, self.p, self.unit[:, None, None, :], a)  # (n, N, m, n)
-        return np.asarray(np.moveaxis((gradient * b).sum(axis=-1), 0, -1))
-
-    def third(self, a: ComplexArray) -> ComplexArray:
-        """Return F3(a, a, conj(a)): with a = r + i s, F3(r,r,r) + F3(s,s,r) + i (F3(r,r,s) + F3(s,s,s))."""
-        r, s = a.real, a.imag
-        along_r, along_s = (self.x + 1j * STEP * c for c in (r, s))
-        real = (self._second(along_r, r, r) + self._second(along_r, s, s)).imag
-        imaginary = (self._second(along_s, r, r) + self._second(along_s, s, s)).imag
-        return np.asarray((real + 1j * imaginary) / STEP)
+    size = np.sqrt((weight * np.abs(wave[..., model.states.index("ln_v")]) ** 2).sum(axis=(-1, -2)))
+    q, wave = right / size[..., None], wave / size[..., None, None, None]
+    along = wave.real, wave.imag
+    nearby = orbit.stages + 1j * STEP * np.stack(along)  # (2, ..., N, m, n)
+    tau, ps = orbit.phases, stage_parameters(p)
+    slopes = model.cycle_jacobian(tau, nearby, ps).imag / STEP
+    F2 = slopes[0] + 1j * slopes[1]  # its product with a is the field's second derivative F2(a, wave)
+    sources = [np.einsum("...ij,...j->...i", F2, a) for a in (wave.conj(), wave)]
+    mean, double = (
+        own + _carried(c, np.linalg.solve(np.where(real[..., None, None], identity, s * identity - M), e[..., None])[..., 0])
+        for (own, e), s in zip(_forced(c, sources), (1.0, (mu * mu)[..., None, None]), strict=True)
+    )
+    weights = weights_backwards(c, left_vector(M, mu, q))
+    source = 2 * np.einsum("...ij,...j->...i", F2, mean) + np.einsum("...ij,...j->...i", F2.conj(), double)
+    third = np.zeros_like(wave)  # F3(wave, wave, conj(wave)) times the weights: F3(r, r, c) + F3(s, s, c) for c = r and i s
+    for part, unit in ((weights.real, 1.0), (weights.imag, 1j)):
+        for a in along:
+            gradient = model.cycle_bilinear(tau, nearby, ps, part, a).imag / STEP
+            third += unit * a * (gradient[0] + 1j * gradient[1])
+    total = (weights * source + third).sum(axis=(-1, -2, -3))
+    return np.where(real, np.nan, (0.5 * total / mu).real), np.where(real[..., None], np.nan, q)
 
 
 def _carried(c: Condensed, start: ComplexArray) -> ComplexArray:
-    """Return the solution of the variational equation from `start` (n,) at tau = 0, at the Gauss points (N, m, n)."""
-    n = start.shape[0]
-    mesh = c.prefix[:-1, :n, :n] @ start
-    return np.asarray((c.local[..., :n] @ mesh[:, None, :, None])[..., 0])
+    """Return the solution of the variational equation from `start` (..., n) at tau = 0, at the Gauss points (..., N, m, n)."""
+    n = start.shape[-1]
+    mesh = c.prefix[..., :-1, :n, :n] @ start[..., None, :, None]
+    return np.asarray((c.local[..., :n] @ mesh[..., None, :, :])[..., 0])
 
 
-def _forced(c: Condensed, source: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return the solution of y' = J y + source from y(0) = 0 at the Gauss points (N, m, n), and at tau = 1 (n,)."""
-    N, m, n = source.shape
-    both = np.stack([source.real, source.imag], axis=-1).reshape(N, m * n, 2)
-    alone = np.linalg.solve(c.block, both)
-    own = (alone[..., 0] + 1j * alone[..., 1]).reshape(N, m, n)
-    gain = np.einsum("m,Nmn->Nn", gauss(m).step, own)
-    maps = np.zeros((N, n + 1, n + 1), complex)
-    maps[:, :n, :n], maps[:, :n, n], maps[:, n, n] = c.maps[:, :n, :n], gain, 1.0
-    y = running_products(maps)[:, :n, n]
-    return own + (c.local[..., :n] @ y[:-1, None, :, None])[..., 0], y[-1]
+def _forced(c: Condensed, sources: Sequence[ComplexArray]) -> list[tuple[ComplexArray, ComplexArray]]:
+    """Return the solutions of y' = J y + source from y(0) = 0 at the Gauss points (..., N, m, n), and at tau = 1 (..., n)."""
+    *batch, m, n = sources[0].shape
+    parts = [part.reshape(*batch, m * n) for source in sources for part in (source.real, source.imag)]
+    alone = np.linalg.solve(c.block, np.stack(parts, axis=-1))
+    found = []
+    for k in range(len(sources)):
+        own = (alone[..., 2 * k] + 1j * alone[..., 2 * k + 1]).reshape(*batch, m, n)
+        maps = np.zeros((*batch, n + 1, n + 1), complex)
+        maps[..., :n, :n], maps[..., n, n] = c.maps[..., :n, :n], 1.0
+        maps[..., :n, n] = np.einsum("m,...mn->...n", gauss(m).step, own)
+        y = running_products(maps)[..., :n, n]
+        found.append((own + (c.local[..., :n] @ y[..., :-1, None, :, None])[..., 0], y[..., -1, :]))
+    return found
 
 
 def branch_coefficients(model: GeneratedModel, branch: Branch) -> Array:
     """Return d at every point of a branch, NaN where the critical multiplier is real."""
-    return np.array(
-        [
-            cubic_coefficient(model, pt.p, Discretisation(pt.orbit.x[0], pt.orbit.stages[0], pt.orbit.edges), pt.rho)
-            for pt in branch.points
-        ]
-    )
+    d, points = np.empty(len(branch.points)), branch.points
+    meshes = np.array([len(pt.orbit.edges) for pt in points])
+    for edges in sorted(set(meshes.tolist())):
+        index = np.nonzero(meshes == edges)[0]
+        for here in (index[a : a + TOGETHER] for a in range(0, len(index), TOGETHER)):
+            p = np.stack([points[i].p for i in here], axis=1)
+            rho = np.array([points[i].rho for i in here])
+            d[here] = cubic_coefficient(model, p, join([points[i].orbit for i in here]), rho)
+    return d
 
 
 def criticality_points(
@@ -392,6 +393,6 @@ def criticality_points(
             continue
 
         def coefficient(point: CurvePoint) -> float:
-            return cubic_coefficient(model, point.p, point.orbit, point.rho)
+            return float(cubic_coefficient(model, point.p, point.orbit, np.asarray(point.rho)))
 
         yield locate(model, plane, branch, (k, k + 1), coefficient, what=CRITICALITY)

@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cache
 from typing import TYPE_CHECKING, Any, TextIO
 
 from srfcli.core import __version__
@@ -175,14 +176,22 @@ def to_csv(table: Table) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([printable(c.name) for c in table.columns])
+    text = cache(_csv_cell)  # words recur in long tables, whose other cells are finite numbers, which csv writes in full
     for row in table.rows:
-        writer.writerow([_csv_cell(v) for v in row])
+        writer.writerow(
+            [
+                v
+                if (type(v) is float and -math.inf < v < math.inf) or type(v) is int
+                else text(v)
+                if type(v) is str
+                else _csv_cell(v)
+                for v in row
+            ]
+        )
     return buffer.getvalue()
 
 
 def _csv_cell(value: Any) -> str:
-    if type(value) is float:  # nearly all cells of long records
-        return repr(value) if math.isfinite(value) else ""
     simple = plain_value(value)
     if simple is None:
         return ""

@@ -14,9 +14,6 @@ from srfcli.codegen.model import GeneratedModel
 from srfcli.core.errors import SrfError, Status, worst
 from srfcli.core.settings import check_value, require_parameter
 from srfcli.core.units import to_base
-from srfcli.numerics.continuation import Atlas, AtlasSettings, find_components
-from srfcli.numerics.critical import LoadWindow, critical_line, found_window
-from srfcli.numerics.floquet import solve_floquet
 from srfcli.numerics.hopf import HopfPoint, closed_forms, hopf_points, steady_is_stable, weakening
 from srfcli.numerics.plane import Axis, Plane, check_count
 from srfcli.results.stability import BoundaryResult, CriticalResult, LinearResult, PeriodicResult
@@ -25,6 +22,8 @@ if TYPE_CHECKING:
     from srfcli.codegen.model import Array
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.boundary import BoundaryPoint
+    from srfcli.numerics.continuation import Atlas, AtlasSettings
+    from srfcli.numerics.critical import LoadWindow
 
 
 def swept(model: GeneratedModel, over: Mapping[str, Sequence[float] | float]) -> dict[str, tuple[float, ...]]:
@@ -171,6 +170,8 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
     """
     p = system.model.vector(system.resolved.values)
     system.model.check_changing_load(p)
+    from srfcli.numerics.floquet import solve_floquet  # costs a tenth of the start of `linear`, like the imports below
+
     found = solve_floquet(system.model, p, tol=tol, max_mesh=max_mesh, harmonics=harmonics)
     return PeriodicResult(system, found)
 
@@ -235,6 +236,8 @@ def critical(
     >>> srf.critical(srf.system(), eps=0.13, V=7).table.rows[0][6]  # doctest: +ELLIPSIS
     10.55524...
     """
+    from srfcli.numerics.critical import critical_line
+
     if not 1e-12 < tol < 0.1 or not 1e-8 < resolution < 1:
         raise SrfError(f"`tol` {tol:g} or `resolution` {resolution:g} is out of range", "Take 1e-8 and 1e-3.")
     model, own = system.model, system.resolved.values
@@ -328,6 +331,8 @@ def continue_boundary(
     >>> found.status.value, len(found.atlases[0].branches)
     ('ok', 1)
     """
+    from srfcli.numerics.continuation import AtlasSettings
+
     model, settings = system.model, settings or AtlasSettings()
     axes = _axes(model, over or {"V": (1.0, 100.0)}, log, eps is not None)
     model.check_changing_load(system.vector())
@@ -344,6 +349,8 @@ def _grown(
     settings: AtlasSettings,
     progress: Said,
 ) -> Iterator[BoundaryResult]:
+    from srfcli.numerics.continuation import find_components
+
     model = system.model
     done: list[Atlas] = []
     try:
@@ -395,6 +402,8 @@ def _axes(
 
 def _plane(system: SlidingSystem, axes: list[Axis], amplitude: float | None) -> tuple[Plane, LoadWindow | None]:
     """Return the plane of one amplitude, and the loads that were found for it, if any were; eps itself may be an axis."""
+    from srfcli.numerics.critical import found_window
+
     model, x = system.model, axes[0]
     base = model.vector(system.resolved.values | ({} if amplitude is None else {"eps": amplitude}))
     if len(axes) == 2:
