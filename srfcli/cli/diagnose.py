@@ -10,6 +10,7 @@ import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
 from srfcli.cli.law import plugins_option
+from srfcli.cli.options import listed, vary_options
 
 EXAMPLES = """
 srf diagnose EXPERIMENT                              a folder with experiment.toml, or that file
@@ -24,6 +25,7 @@ srf fit found/augmented                              the augmented model is an e
 @click.argument("source", metavar="EXPERIMENT", type=click.Path(path_type=Path))
 @click.option("--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable.")
 @click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
+@vary_options
 @plugins_option
 @click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
 @click.option(
@@ -62,8 +64,8 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
 
         try:
             found = diagnose(
-                source, effects=effects, trend=options["trend"], reader=options["reader"], seed=options["seed"],
-                registry=registry, progress=told,
+                source, effects=effects, trend=options["trend"], vary=listed(options["vary"]), by=options["by"],
+                reader=options["reader"], seed=options["seed"], registry=registry, progress=told,
             )  # fmt: skip
         except KeyboardInterrupt:
             raise SrfError(

@@ -14,9 +14,11 @@ from srfcli.cli.options import (
     OutputOptions,
     Spread,
     SystemOptions,
+    listed,
     output_options,
     parse_over,
     system_options,
+    vary_options,
     worker_options,
 )
 from srfcli.core.errors import SrfError, Status
@@ -64,10 +66,7 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
 )
 @click.option("--profile", is_flag=True, help="Profile-likelihood intervals.")
 @click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
-@click.option(
-    "--vary", multiple=True, metavar="NAMES", help="Parameters with a value of their own in each run, or for each --by."
-)
-@click.option("--by", type=click.Choice(["run", "load"]), default="run", show_default=True, help="What --vary goes by.")
+@vary_options
 @click.option(
     "--track",
     type=click.Choice(["smooth", "rough", "shared"]),
@@ -136,11 +135,6 @@ def command(
     )
 
 
-def _listed(texts: Sequence[str]) -> list[str]:
-    """Return the names in `A,B` and the like, given once or several times."""
-    return [n.strip() for text in texts for n in text.split(",") if n.strip()]
-
-
 def _refuse(options: dict[str, Any], names: tuple[str, ...], purpose: str) -> None:
     """Raise where an option is given that has no meaning for this kind of source."""
     context = click.get_current_context()
@@ -160,7 +154,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
 
     registry = system.registry()
     experiment = read_experiment(source, format=options["reader"], registry=registry)
-    free = _listed(options["free"]) or None
+    free = listed(options["free"]) or None
     kept = _draws_file(options["draws"], options["sample"], output)
     warn_uncompiled("the fit has no random friction field, and takes up to 34 times as long")
     begun, done = time.perf_counter(), FitShare(options["starts"])
@@ -171,7 +165,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
             progress.advance(note=text, share=done.after(text) if stage == "fit" else share)
 
         found = fit(
-            experiment, free=free, trend=options["trend"], vary=_listed(options["vary"]), by=options["by"],
+            experiment, free=free, trend=options["trend"], vary=listed(options["vary"]), by=options["by"],
             track=options["track"], starts=options["starts"],
             profile=options["profile"], sample=options["sample"], seed=options["seed"], registry=registry, progress=report,
         )  # fmt: skip
@@ -212,7 +206,7 @@ def _fit_campaign(
             raise SrfError(f"--table {place} is no .csv file", f"End it in .csv: --table {target.with_suffix('.csv')}")
         check_target(target, force=output.force or spread.resume is not None, what="--table")
     warn_uncompiled("the fits have no random friction field, and take up to 34 times as long")
-    free = _listed(options["free"]) or None
+    free = listed(options["free"]) or None
     begun = time.perf_counter()
     with Progress("fit", total=len(sources)) as progress:
 
@@ -311,7 +305,7 @@ def fit_thresholds(
     resolved = system.resolve(parameters)
     scale = free_parameters(
         parameters,
-        [name.strip() for text in free for name in text.split(",") if name.strip()],
+        listed(free),
         start=resolved.values,
         bounds=dict(_bounds(text, parameters) for text in bounds),
         largest_eps=float(table.eps.max()),

@@ -563,3 +563,19 @@ def worker_options(function: F) -> F:
     for option in reversed(options):
         wrapper = option(wrapper)
     return wrapper  # type: ignore[return-value]
+
+
+def listed(texts: Sequence[str]) -> list[str]:
+    """Return the names in `A,B` and the like, given once or several times."""
+    return [name.strip() for text in texts for name in text.split(",") if name.strip()]
+
+
+def vary_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --vary and --by, which fits of recordings have in common."""
+    by = click.option(
+        "--by", type=click.Choice(["run", "load"]), default="run", show_default=True, help="What --vary goes by."
+    )
+    vary = click.option(
+        "--vary", multiple=True, metavar="NAMES", help="Parameters with a value of their own in each run, or for each --by."
+    )
+    return vary(by(command))

@@ -154,7 +154,7 @@ def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
     registry = with_terms(search.registry)
     names = {e.name for e in registry.entries("effect") if e.origin == ORIGIN}
     own = ModelSearch(
-        registry, search.experiment, search.progress, sorted(names), search.trend, budget=BUDGET, threads=search.threads
+        registry, search.experiment, search.progress, sorted(names), **search.choice, budget=BUDGET, threads=search.threads
     )
     start = [diagnosis.baseline]
     if diagnosis.best is not diagnosis.baseline and not diagnosis.best.fine:

@@ -173,9 +173,10 @@ class Scores:
         shapes = {e.name: shape for e in candidates if (shape := along_table(e)) is not None}
         found: list[_Column] = []
         regular = [e for e in candidates if e.sizes and not e.settings and not e.observed and e.name not in shapes]
-        stateful = [e for e in regular if e.states]  # at most one in a model: what a pass costs grows as its states cubed
-        found += self._derived([e for e in regular if not e.states] + stateful[:1])
-        for effect in stateful[1:]:
+        # a pass costs as its states cubed, and rates that are scanned together may have no steady state
+        alone = [e for e in regular if e.states or (e.scans and "rate" in dict(e.changes))]
+        found += self._derived([e for e in regular if e not in alone])
+        for effect in alone:
             found += self._derived([effect])
         along = [e for e in candidates if e.name in shapes]
         if along:
@@ -209,7 +210,7 @@ class Scores:
                 model,
                 self.experiment,
                 run,
-                values,
+                likelihood.problem.local(run, values),
                 by=by,
                 gauges=likelihood.gauges(run),
                 trend=likelihood.problem.trend,
@@ -458,7 +459,8 @@ def _elongation_rate(run: Run, x: Array, model: GeneratedModel, fitted: StateSpa
     from srfcli.inference.prediction import run_parameters
 
     states = list(model.states)
-    p = run_parameters(model, fitted.likelihood.problem.experiment, run, fitted.values)
+    problem = fitted.likelihood.problem
+    p = run_parameters(model, problem.experiment, run, problem.local(run, fitted.values))
     W, W_dot = run.load(run.t)
     V = run.drive(run.t)
     if "u" in states:
@@ -475,7 +477,8 @@ def _elongation_rate(run: Run, x: Array, model: GeneratedModel, fitted: StateSpa
 def _rates_by_V(model: GeneratedModel, fitted: StateSpaceFit, run: Run, x: Array) -> Array:
     from srfcli.inference.prediction import run_parameters
 
-    p = run_parameters(model, fitted.likelihood.problem.experiment, run, fitted.values)
+    problem = fitted.likelihood.problem
+    p = run_parameters(model, problem.experiment, run, problem.local(run, fitted.values))
     W, W_dot = run.load(run.t)
     V = run.drive(run.t) + 1e-30j
     return np.asarray(model.rates(x.astype(complex), V, W, W_dot, p)).imag / 1e-30

@@ -222,7 +222,7 @@ def parameters_of(fitted: Fitted) -> dict[str, dict[str, Any]]:
     errors = np.sqrt(np.maximum(np.diag(fitted.fit.covariance)[:k], 0.0))
     found: dict[str, dict[str, Any]] = {}
     for name, error in zip(problem.names, errors.tolist(), strict=True):
-        unit = units.get(name, "1")
+        unit = units.get(name, units.get(name.partition("[")[0], "1"))
         found[name] = {"value": from_base(values[name], unit), "stderr": from_base(error, unit), "unit": unit}
     if "K" in found:
         number, unit = split_quantity(problem.experiment.stiffness_text, name="stiffness")

@@ -134,6 +134,11 @@ class Problem:
         """Return parameters by name, those that are held among them."""
         return {**self.held, **dict(zip(self.names, np.asarray(theta).tolist(), strict=True))}
 
+    def local(self, run: Run, values: Mapping[str, float]) -> dict[str, float]:
+        """Return parameters by name with those that vary under their own names, at what they are in this run."""
+        own = self.varying.get(run.name, {})
+        return {**values, **{n: values[name] for n, name in own.items() if name in values}}
+
     def predicted(self, run: Run, theta: Array, *, until: float = np.inf, slopes: bool = True) -> Prediction:
         """Return the prediction of a run, with derivatives by the free parameters."""
         by = self.names if slopes else ()

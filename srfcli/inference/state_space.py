@@ -181,7 +181,7 @@ def field_columns(likelihood: Likelihood, run: Run, values: Mapping[str, float])
     """Return how the state at the first sample (n,) answers to a field of 1 there."""
     problem = likelihood.problem
     model = problem.model
-    p = run_parameters(model, problem.experiment, run, {**values, "field_amplitude": 1.0})
+    p = run_parameters(model, problem.experiment, run, {**problem.local(run, values), "field_amplitude": 1.0})
     x0, _ = start_state(model, run, p, values, [])
     return _field_columns(model, run, p, x0)[:, 0]
 
@@ -317,6 +317,8 @@ class Likelihood:
         found = self.problem.named(plain[: len(self.problem.names)]) | dict(
             zip(self.names, plain.tolist(), strict=True)
         )
+        for n in {n for own in self.problem.varying.values() for n in own}:  # where no run is asked for, it is the mean
+            found[n] = float(np.mean([found[name] for name in self.names if name.startswith(f"{n}[")]))
         return found | ({"field_amplitude": 0.0, "field_length": 1.0} if self.smooth else {})
 
     def unit(self, x: Array) -> Array:
@@ -367,8 +369,8 @@ class Likelihood:
             if n in own or (n not in others and ("." not in n or n.startswith(f"{run.name}.")) and "gauge_" not in n)
         }
         found = filter_run(
-            problem.model, problem.experiment, run, {**values, **{n: values[name] for n, name in varying.items()}},
-            by=tuple(by.values()) if slopes else (), gauges=gauges,
+            problem.model, problem.experiment, run, problem.local(run, values), by=tuple(by.values()) if slopes else (),
+            gauges=gauges,
             trend=None if run.holdout else problem.trend, rtol=self.rtol, keep=keep, most=most,
         )  # fmt: skip
         return replace(found, names=tuple(by) if slopes else ())

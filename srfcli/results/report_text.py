@@ -170,6 +170,23 @@ REMEDIES = {  # what is wrong, and what to do; {value} is the size with its erro
         "the layer widens and narrows with its age: {value}",
         "record the layer's thickness, or use the augmented model",
     ),
+    "poisson-coupling": (
+        "blocks bulge under the load and carry the contact along: {value}",
+        "give the load point's displacement at the contact, or use the augmented model",
+    ),
+    "load-stiffening": (
+        "the apparatus is stiffer under more load: {value}",
+        "measure the stiffness under each load, or use the augmented model, which has it",
+    ),
+    "load-servo": (
+        "the load follows its command late, and overshoots: {value}",
+        "give the load that was measured, not its command",
+    ),
+    "gauge-creep": ("the gauge creeps: {value}", "calibrate it over the times of the experiment, or use the augmented model"),
+    "pore-pressure": (
+        "a pore pressure carries a part of the load: {value}",
+        "record the pressure, and give the effective load",
+    ),
     "sensor-lag": (
         "the gauge lags behind: {value}",
         "undo its filter of first order in the recording, or take a faster gauge",

@@ -27,6 +27,8 @@ def diagnose(
     *,
     effects: Sequence[str] = (),
     trend: str | None = None,
+    vary: Sequence[str] = (),
+    by: str = "run",
     reader: str | None = None,
     seed: int = 0,
     registry: Registry | None = None,
@@ -45,6 +47,10 @@ def diagnose(
         Effects, or ageing laws, to look for; all that are registered if left out.
     trend : {'slip', 'time'}, optional
         Let each run's observable drift.
+    vary : sequence of str
+        Free parameters that have a value of their own in each run or under each load.
+    by : {'run', 'load'}
+        What they vary with.
     reader : str, optional
         How every data file is read.
     seed : int
@@ -99,7 +105,7 @@ def diagnose(
     def told(text: str) -> None:
         progress(text, search.share if searching else None)
 
-    search = ModelSearch(registry, fitted, told, effects or None, trend)
+    search = ModelSearch(registry, fitted, told, effects or None, trend, vary=vary, by=by)
     searching = True
     try:
         search.run()
