@@ -56,6 +56,27 @@ def test_a_rough_track_is_no_missing_physics(tmp_path):
     assert [h.baseline.run.name for h in found.held] == ["again"]
 
 
+def test_a_friction_of_each_runs_own_is_no_missing_physics(tmp_path):
+    """Runs whose mu0 differ by up to 4e-3: where it may vary, nothing is missing, held out or not."""
+    rng, readings, off = np.random.default_rng(3), {}, (0.0, 2e-3, -2e-3, 1e-3)
+    for number, plan in enumerate(PLANS):
+        own = replace(Physics(), mu0=Physics().mu0 + off[number], track=Track(3e-4, 6.0, 40 + number))
+        readings[plan] = read_gauge(move(own, plan).u, Gauge(), rng)
+    for name, text in case_files("small", Physics(), readings).items():
+        (tmp_path / name).write_text(text)
+    search = ModelSearch(
+        SHIPPED, read_experiment(tmp_path, registry=SHIPPED, holdout=False), effects=FEW, vary=("mu0",)
+    )
+    search.run()
+    found = conclude(search, read_experiment(tmp_path, registry=SHIPPED))
+    assert found.verdict in ("none", "inconclusive") and found.best is found.baseline
+    values = found.best.fit.values
+    apart = [values[f"mu0[{plan.name}]"] - values["mu0[steps]"] for plan in PLANS[1:3]]
+    assert apart == pytest.approx(off[1:3], abs=1e-3)
+    white = found.held[0].baseline.white
+    assert 0.8 < np.sqrt(np.mean(white**2)) < 1.2
+
+
 def test_what_is_missing_is_named_on_rough_tracks(tmp_path):
     found = said(recorded(tmp_path, Physics(alpha=0.03)))
     assert (found.verdict, found.effects) == ("identified", ("linker-dieterich",))
