@@ -87,6 +87,30 @@ def experiment_of(data: Path, case: dict[str, str], ageing: str, stiffness: str,
         return read_experiment(path, registry=load_registry())
 
 
+# The ladder of p446: what was driven, and when each step began, s; a run goes from halfway through the velocity before
+LADDER = [(10, 0.2), (1, 166.9), (3, 563.6), (10, 699.4), (30, 740.0), (100, 753.8), (300, 757.9), (100, 759.2), (30, 763.2),
+          (10, 776.4), (3, 816.2), (1, 949.2)]  # fmt: skip
+HELD_OUT = ("3 to 10", "10 to 3")
+
+
+def ladder(data: Path) -> Experiment:
+    """Return the eleven steps of p446 as runs of one experiment, two of them held out; the stiffness is free."""
+    case = TILL | {"title": "p446, eleven steps", "mu0": "0.59", "V0": "10.0", "file": (data / TILL["file"]).resolve()}
+    values = {**case, "ageing": "ruina", "stiffness": "2.6e-3", "D0": 25.0, "K": FREE_K.format("2.6e-3")}
+    head, run = EXPERIMENT.split("[[runs]]")
+    text = head.format(**values)
+    ends = [begin for _, begin in LADDER[1:]] + [1300.0]
+    for (before, begin), (after, at), end in zip(LADDER, LADDER[1:], ends[1:], strict=False):
+        name = f"{before} to {after}"
+        window = f"[{60.0 if begin < 60 else 0.5 * (begin + at):.2f}, {end - 0.02 * (end - at):.2f}]"
+        own = run.replace('"step"', f'"{name}"').format(**{**values, "window": window, "imposed": ""})
+        text += "[[runs]]" + own + f"holdout = {str(name in HELD_OUT).lower()}\n"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "experiment.toml"
+        path.write_text(text, encoding="utf-8")
+        return read_experiment(path, registry=load_registry())
+
+
 def main() -> None:
     """Print one line for each recording and law."""
     if len(sys.argv) != 2:
@@ -98,6 +122,10 @@ def main() -> None:
         print(f"{case['title']}, {ageing}, k {stiffness}{' free' if K else ''}: {', '.join(cells)}")
         noise = [f"{c[1]:.2g} " + (f"about {c[0]:.3g} Hz" if c[2:] else f"over {c[0]:.2g} s") for c in fit.runs[0].colours]
         print(f"    published {published}; {found.track}; noise {', '.join(noise)}; {found.status.value}", flush=True)
+    fit = fit_recordings(load_registry(), ladder(Path(sys.argv[1])), trend="slip", vary=["mu0"]).fit
+    cells = [f"{n} {fit.values[n]:.5g} ({fit.stderr[n]:.2g})" for n in fit.names if n in ("A", "B", "D0", "K")]
+    print(f"p446, all steps, mu0 and a trend for each, ruina: {', '.join(cells)}")
+    print(f"    rms over noise {fit.rms_over_noise():.3f}, of the steps held out {fit.rms_over_noise(holdout=True):.3f}")
 
 
 if __name__ == "__main__":

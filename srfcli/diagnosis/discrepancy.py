@@ -131,7 +131,6 @@ def coordinates_of(runs: Mapping[str, RunForce]) -> dict[str, float]:
 
 FOLDER = Path(__file__).parent / "terms"
 ORIGIN = "terms"
-BUDGET = 60.0  # s of CPU, of the search for a closed form
 
 
 def with_terms(registry: Registry) -> Registry:
@@ -154,7 +153,7 @@ def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
     registry = with_terms(search.registry)
     names = {e.name for e in registry.entries("effect") if e.origin == ORIGIN}
     own = ModelSearch(
-        registry, search.experiment, search.progress, sorted(names), **search.choice, budget=BUDGET, threads=search.threads
+        registry, search.experiment, search.progress, sorted(names), **search.choice
     )
     start = [diagnosis.baseline]
     if diagnosis.best is not diagnosis.baseline and not diagnosis.best.fine:

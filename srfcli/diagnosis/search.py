@@ -121,14 +121,13 @@ class ModelSearch:
         vary: Sequence[str] = (),
         by: str = "run",
         budget: float = BUDGET,
-        threads: int = 1,
     ) -> None:
         self.registry, self.whole, self.progress = registry, experiment, progress
         self.choice: dict[str, Any] = {"trend": trend, "vary": tuple(vary), "by": by}  # of every fit
         self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs))
         self.candidates, self.excluded = applicable(registry, experiment, effects)
         self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]
-        self.budget, self.threads, self.begun = budget, threads, time.process_time()
+        self.budget, self.begun, self.cut_short = budget, time.process_time(), False
         self.fitted: dict[str, Fitted] = {}
         self.queue: list[_Move] = []
         self.count = 0
@@ -142,8 +141,7 @@ class ModelSearch:
         values = self._started(move) if move else None
         options = {"processes": self.processes if move else None, "cautious": True, **self.options}
         found = fit_state_space(
-            self._problem(hypothesis, values or {}), start=values, close=NEAR, rtol=COARSE, threads=self.threads,
-            progress=self.progress, **options,
+            self._problem(hypothesis, values or {}), start=values, close=NEAR, rtol=COARSE, progress=self.progress, **options,
         )  # fmt: skip
         self.processes = found.likelihood.processes
         return self._judged(hypothesis, found)
@@ -168,7 +166,7 @@ class ModelSearch:
                     values[longs.get(name, name)] = value if still is None else still + part * (value - still)
             problem = self._problem(move.hypothesis, values)
             values = _followable(values, problem)
-            likelihood = Likelihood(problem, processes=self.processes, threads=self.threads, rtol=COARSE)
+            likelihood = Likelihood(problem, processes=self.processes, rtol=COARSE)
             found = likelihood.at(likelihood.coordinates(values), slopes=False).log_likelihood
             if found > best[0]:
                 best = found, values
@@ -207,6 +205,7 @@ class ModelSearch:
             if not self.best().fine and not self.spent:
                 further(self.baseline)
                 self._search()
+        self.cut_short = self.spent and bool(self.queue)
         self._eliminate()
         if self.experiment.runs is not self.whole.runs:
             self._fit_all()
@@ -222,7 +221,7 @@ class ModelSearch:
             self.progress(f"{node.name}: all readings")
             found = fit_state_space(
                 self._problem(node.hypothesis, node.fit.values), part=node.fit, close=NEAR, rtol=COARSE,
-                threads=self.threads, progress=self.progress, **options,
+                progress=self.progress, **options,
             )  # fmt: skip
             fitted[node.name] = replace(self._judged(node.hypothesis, found), scores=node.scores)
             options["processes"] = self.processes = found.likelihood.processes
@@ -341,7 +340,7 @@ class ModelSearch:
         except SrfError as error:
             self.excluded.append(Excluded(name, error.message))
             return None
-        return Likelihood(problem, processes=self.processes, threads=self.threads, rtol=COARSE)
+        return Likelihood(problem, processes=self.processes, rtol=COARSE)
 
     def _build(self, node: Fitted, effect: Effect, one: float) -> None:
         """Push an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
@@ -406,7 +405,7 @@ class ModelSearch:
         """Return a fitted model with other gauge noise, which takes its place."""
         found = fit_state_space(
             node.fit.likelihood.problem, start=_followable(node.fit.values, node.fit.likelihood.problem), close=NEAR, rtol=COARSE,
-            threads=self.threads, progress=self.progress, **{**self.options, "processes": processes},
+            progress=self.progress, **{**self.options, "processes": processes},
         )  # fmt: skip
         try:
             return self._record(self._judged(node.hypothesis, found), anew=True)

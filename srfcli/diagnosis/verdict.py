@@ -103,6 +103,8 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     verdict = "unknown" if refused else ungated
     reasons += [refused] if refused else []
     reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]
+    if search.cut_short:
+        reasons.append(f"the search ended at its budget of {search.budget:g} s of CPU, with models left to fit")
     absorbed = [
         Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.surviving):.2f} % of it")
         for s in scores
@@ -124,9 +126,7 @@ def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
     if best is baseline:
         return baseline
     old = baseline.fit.likelihood
-    likelihood = Likelihood(
-        old.problem, smooth=best.fit.smooth, processes=best.fit.likelihood.processes, rtol=COARSE, threads=old.threads
-    )
+    likelihood = Likelihood(old.problem, smooth=best.fit.smooth, processes=best.fit.likelihood.processes, rtol=COARSE)
     held = [n for n in likelihood.names if n not in old.problem.names]
     found = maximise(likelihood, likelihood.coordinates(best.fit.values), held=held, close=NEAR)
     if found.status is Status.INTEGRATION:

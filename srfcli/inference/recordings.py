@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
@@ -81,18 +80,17 @@ def fit_recordings(
         return _without_compiler(registry, experiment, free, trend, track, starts, seed, progress)
     model = open_model(registry, **asdict(experiment.choice), random_field=True)
     problem = fit_problem(model, experiment, free=free, trend=trend, vary=vary, by=by)
-    threads = min(len(problem.runs), os.cpu_count() or 1)
     smooth = None if track is None else track == "smooth"
 
     def one(start: Array, report: Callable[[str], None]) -> tuple[Fit, Any]:
         moved = replace(problem, start=start)
-        found = fit_state_space(moved, smooth=smooth, threads=threads, progress=report)
+        found = fit_state_space(moved, smooth=smooth, progress=report)
         return as_fit(found), found
 
     try:
         several = fit_from_several(problem, fitter=one, count=starts, seed=seed, progress=progress)
     except Interrupted as error:
-        found = stopped(problem, error.values, threads=threads)
+        found = stopped(problem, error.values)
         return RecordingFit(problem, as_fit(found), found, _track(found), (), Status.INTERRUPTED)
     found, status = several.beside, Status.INTERRUPTED if several.interrupted else several.best.status
     result = RecordingFit(problem, several.best, found, _track(found), tuple(several.rows), status)

@@ -12,6 +12,7 @@ Kristensen, Madsen and Jorgensen, Automatica 40 (2004); Hartikainen and Sarkka 2
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -58,6 +59,9 @@ PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 
 STEPS = 40  # of Fisher scoring
 LONG = 20_000  # readings, of all runs, beyond which a fit begins with a part of them: it finds the field and the first digits
 PATIENCE = 5  # times the steps of integration of the point before, after which a trial is given up
+WIDTHS = (0.1, 0.03, 0.01)  # of each parameter, within which a reading's derivatives are to hold, one after the other
+WIDEST = 1000.0  # times that width, in standard errors: what readings tell sharply together may still be uncertain
+ROUNDS = 12  # of weights and standard errors, each from the other
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
@@ -106,19 +110,25 @@ class Filtered:
         return np.asarray(-0.5 * (self.white**2 + np.log(2 * np.pi * self.found.S[self.run.used])))
 
     @property
+    def slopes(self) -> tuple[Array, Array]:
+        """Return the derivatives (m, k) of innovations over their standard deviations, and of the variances' logarithms."""
+        used, f = self.run.used, self.found
+        S = f.S[used][:, None]
+        with np.errstate(over="ignore"):
+            return f.nu_d[used] / np.sqrt(S), f.S_d[used] / S
+
+    @property
     def score(self) -> Array:
         """Return the gradient of the log likelihood (k,), exact."""
-        used, f = self.run.used, self.found
-        nu, S, nu_d, S_d = f.nu[used], f.S[used], f.nu_d[used], f.S_d[used]
-        return np.asarray(-(nu / S) @ nu_d + 0.5 * ((nu**2 / S - 1) / S) @ S_d)
+        a, b = self.slopes
+        return np.asarray(-self.white @ a + 0.5 * (self.white**2 - 1) @ b)
 
     @property
     def information(self) -> Array:
-        """Return Fisher's information (k, k), from the derivatives of innovations and variances."""
-        used, f = self.run.used, self.found
-        S = f.S[used]
-        a, b = f.nu_d[used] / np.sqrt(S)[:, None], f.S_d[used] / S[:, None]
-        return np.asarray(a.T @ a + 0.5 * b.T @ b)
+        """Return Fisher's information (k, k); infinite where it overflows."""
+        a, b = self.slopes
+        with np.errstate(over="ignore"):
+            return np.asarray(a.T @ a + 0.5 * b.T @ b)
 
     def smoothed(self) -> Smoothed:
         """Return states and field given all readings of the run; it was filtered with `keep`."""
@@ -287,11 +297,11 @@ class Likelihood:
     """
 
     def __init__(
-        self, problem: Problem, *, smooth: bool = False, processes: Sequence[str] = (), rtol: float = RTOL, threads: int = 1
+        self, problem: Problem, *, smooth: bool = False, processes: Sequence[str] = (), rtol: float = RTOL
     ) -> None:
         self.problem, self.smooth, self.processes = problem, smooth, tuple(processes)
         self.rtol = FREE_RUNNING * rtol if smooth else rtol
-        self.threads, self.evaluations = threads, 0
+        self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs)
         self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
@@ -423,11 +433,12 @@ class Likelihood:
         return list(total.values())
 
     def over_runs(self, work: Callable[[Run], T]) -> list[T]:
-        """Return what `work` makes of each run, on several threads where that was asked for."""
-        if self.threads > 1 and len(self.problem.runs) > 1:
-            with ThreadPoolExecutor(self.threads) as pool:
-                return list(pool.map(work, self.problem.runs))
-        return [work(run) for run in self.problem.runs]
+        """Return what `work` makes of each run, on as many threads as there are processors."""
+        count = min(len(self.problem.runs), os.cpu_count() or 1)
+        if count < 2:
+            return [work(run) for run in self.problem.runs]
+        with ThreadPoolExecutor(count) as pool:
+            return list(pool.map(work, self.problem.runs))
 
     def at(self, x: Array, *, slopes: bool = True, keep: bool = False, like: Point | None = None) -> Point:
         """Return log likelihood, score and information at x (k,); -inf where a run takes PATIENCE times the steps of `like`."""
@@ -449,6 +460,8 @@ class Likelihood:
                 at = [self.names.index(n) for n in f.names]
                 score[at] += f.score * unit[at]
                 information[np.ix_(at, at)] += f.information * np.outer(unit[at], unit[at])
+            if not (np.isfinite(score).all() and np.isfinite(information).all()):
+                total = -np.inf  # a motion that cannot be differentiated is none to go on from
         point = Point(x, values, total, score, information, runs)
         if slopes and (self.best is None or total > self.best.log_likelihood):
             self.best = point
@@ -503,10 +516,12 @@ def maximise(
     held: Sequence[str] = (),
     steps: int = STEPS,
     close: float = CONVERGED,
+    widths: Sequence[float] = WIDTHS,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Maximum:
     """Return the maximum from x (k,), by Fisher scoring with Levenberg's damping; parameters `held` stay where they are.
 
+    Readings are weighted first, by how far each tells something, `widths` one after the other, and then all count alike.
     It ends within `close` standard errors of the maximum, by the score, or where two steps running each gain less than a quarter
     of what that distance is worth. Parameters that a step would push out stay at their
     bounds. A likelihood that cannot be evaluated at x is a status.
@@ -515,18 +530,27 @@ def maximise(
     point, damping = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper)), 1e-3
     if not np.isfinite(point.log_likelihood):
         return Maximum(point, np.inf, Status.INTEGRATION, np.full((x.size, x.size), np.nan))
-    away, sure, slow, more = np.inf, True, 0, np.zeros((x.size, x.size))
+    away, sure, slow, more, left = np.inf, True, 0, np.zeros((x.size, x.size)), [*widths, 0.0]
     for _ in range(steps):
         low, high = point.x <= likelihood.lower, point.x >= likelihood.upper
-        moving = np.nonzero(free & ~(low & (point.score < 0)) & ~(high & (point.score > 0)))[0]
-        g, I = point.score[moving], (point.information + more)[np.ix_(moving, moving)]
-        d = np.sqrt(np.maximum(np.diag(I), 1e-300))
-        size, directions = np.linalg.eigh(I / np.outer(d, d))
-        size, directions = size[size > FLAT], directions[:, size > FLAT]
-        steep = directions.T @ (g / d)
-        away = float(np.sqrt(np.sum(steep**2 / size)))
-        progress(f"log likelihood {point.log_likelihood:.1f}, {away:.2g} standard errors from the maximum")
-        if away < close or slow == 2:
+        while True:
+            width = left[0]
+            score, information, weights = point.score, point.information, []
+            if width:
+                score, information, weights = _weighted(likelihood, point, width, free)
+            moving = np.nonzero(free & ~(low & (score < 0)) & ~(high & (score > 0)))[0]
+            g, I = score[moving], (information + more)[np.ix_(moving, moving)]
+            d = np.sqrt(np.maximum(np.diag(I), 1e-300))
+            size, directions = np.linalg.eigh(I / np.outer(d, d))
+            size, directions = size[size > FLAT], directions[:, size > FLAT]
+            steep = directions.T @ (g / d)
+            away = float(np.sqrt(np.sum(steep**2 / size)))
+            if not width or (away > np.sqrt(moving.size) and slow < 2):  # farther than chance would have it
+                break
+            left, slow, damping = left[1:], 0, 1e-3
+        within = f" by readings that hold within {100 * width:g} %" if width else ""
+        progress(f"log likelihood {point.log_likelihood:.1f}, {away:.2g} standard errors from the maximum{within}")
+        if not width and (away < close or slow == 2):
             break
         while damping < 1e8:
             x = point.x.copy()
@@ -534,21 +558,67 @@ def maximise(
             move = np.where(likelihood.logarithmic[moving], np.clip(move, -1.5, 1.5), move)
             x[moving] += move
             trial = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper), slopes=sure, like=point)
-            gain = trial.log_likelihood - point.log_likelihood
+            gain = _gain(trial, point, weights)
+            if gain > 0 and not sure:
+                trial = likelihood.at(trial.x)
+                gain = _gain(trial, point, weights)
             if gain > 0:
                 share = gain / max(float(g @ move - 0.5 * move @ I @ move), 1e-300)  # of what the model of it promised
                 damping = max(damping * (0.1 if share > 0.5 else 1.0 if share > 0.25 else 2.0), 1e-9)
-                last, point, sure = point, trial if sure else likelihood.at(trial.x), share > 0.25
-                more = _curvature_beyond(last, point)
-                slow = slow + 1 if gain < close**2 / 8 else 0
+                last, point, sure = point, trial, share > 0.25
+                more = more if width else _curvature_beyond(last, point)
+                slow = slow + 1 if gain < (1.0 if width else close**2 / 8) else 0
                 break
             damping, sure = max(10 * damping, 1e-3), False  # what may fail is tried without derivatives: a quarter of the work
         else:
-            break
+            if not width:
+                break
+            slow, damping = 2, 1e-3
+    away = np.inf if left[0] else away
     at_bound = ((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0))
     covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound)[0]
     covariance[np.ix_(inner, inner)] = inverse(point.information[np.ix_(inner, inner)])
     return Maximum(point, away, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE, covariance)
+
+
+def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -> tuple[Array, Array, list[Array]]:
+    """Return score and information with a weight (m,) for each reading, and the weights by run: those of effective variances.
+
+    Each parameter that is `free` (k,) is taken to be uncertain by the share `width` of itself, or by WIDEST times `width` of its
+    standard errors if that is less, and the variance of a reading to be larger by what that makes of it. So a reading has no say
+    on what it tells only next to the parameters where it was differentiated: each in the fall of a stick-slip cycle would give
+    the likelihood a narrow maximum for each way in which falls meet samples. A weight rests on earlier readings alone, so that
+    the weighted score is zero on average at the true parameters. Orear, Am. J. Phys. 50 (1982).
+    """
+    k, own = len(likelihood.names), free & np.isin(likelihood.names, likelihood.problem.names)
+    unit = likelihood.unit(point.x)
+    runs = []
+    for f in point.runs:
+        at = [likelihood.names.index(n) for n in f.names]
+        a, b = (slope * unit[at] for slope in f.slopes)
+        runs.append((at, a, b, 0.5 * (f.white**2 - 1)[:, None] * b - f.white[:, None] * a))
+    widest = np.where(own, width * np.where(likelihood.logarithmic, 1.0, np.abs(point.x)), 0.0)
+    uncertain = widest
+    for _ in range(ROUNDS):
+        score, information, weights = np.zeros(k), np.zeros((k, k)), []
+        for at, a, b, slope in runs:
+            w = 1 / (1 + (a**2 + 0.5 * b**2) @ uncertain[at] ** 2)
+            score[at] += w @ slope
+            information[np.ix_(at, at)] += a.T @ (a * w[:, None]) + 0.5 * b.T @ (b * w[:, None])
+            weights.append(w)
+        before, errors = uncertain, 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        uncertain = np.minimum(widest, WIDEST * width * errors)
+        if np.allclose(uncertain, before, rtol=0.1):
+            break
+    return score, information, weights
+
+
+def _gain(trial: Point, point: Point, weights: Sequence[Array]) -> float:
+    """Return what a trial gains in log likelihood, that of weighted readings if there are weights."""
+    if not weights or not np.isfinite(trial.log_likelihood):
+        return trial.log_likelihood - point.log_likelihood
+    pairs = zip(weights, trial.runs, point.runs, strict=True)
+    return float(sum(w @ (new.log_density - old.log_density) for w, new, old in pairs))
 
 
 def _curvature_beyond(last: Point, point: Point) -> Array:
@@ -557,11 +627,12 @@ def _curvature_beyond(last: Point, point: Point) -> Array:
     Scoring by the information alone overshoots there, to and fro. A smaller curvature is left alone: it makes no step too long.
     """
     step = point.x - last.x
-    missed = last.score - point.score - point.information @ step
-    along = float(missed @ step)
-    if not along > 1e-8 * float(np.linalg.norm(missed) * np.linalg.norm(step)):
-        return np.zeros_like(point.information)
-    return np.outer(missed, missed) / along
+    with np.errstate(all="ignore"):  # far from a maximum, of a run that nearly sticks
+        missed = last.score - point.score - point.information @ step
+        along = float(missed @ step)
+        beyond = np.outer(missed, missed) / along
+        curved = along > 1e-8 * float(np.linalg.norm(missed) * np.linalg.norm(step)) and bool(np.isfinite(beyond).all())
+    return np.asarray(beyond) if curved else np.zeros_like(point.information)
 
 
 @dataclass(frozen=True)
@@ -609,7 +680,6 @@ def fit_state_space(
     cautious: bool = False,
     thorough: bool = True,
     close: float = CONVERGED,
-    threads: int = 1,
     rtol: float = RTOL,
     progress: Callable[[str], None] = lambda text: None,
 ) -> StateSpaceFit:
@@ -626,7 +696,7 @@ def fit_state_space(
     tried: list[Likelihood] = []
 
     def likelihood(smooth: bool, processes: Sequence[str]) -> Likelihood:
-        tried.append(Likelihood(problem, smooth=smooth, processes=processes, rtol=rtol, threads=threads))
+        tried.append(Likelihood(problem, smooth=smooth, processes=processes, rtol=rtol))
         return tried[-1]
 
     choice: dict[str, Any] = {
@@ -634,9 +704,7 @@ def fit_state_space(
     }  # fmt: skip
     try:
         if part is None and start is None and (runs := thinned(problem.runs)) is not problem.runs:
-            part = fit_state_space(
-                replace(problem, runs=runs), thorough=thorough, threads=threads, rtol=rtol, **choice
-            )
+            part = fit_state_space(replace(problem, runs=runs), thorough=thorough, rtol=rtol, **choice)
         if part is not None and part.maximum.status is not Status.INTEGRATION:
             return _on_all(part, likelihood, **choice)
         return _fitted(likelihood, start or {}, thorough=thorough, **choice)
@@ -645,10 +713,10 @@ def fit_state_space(
         raise Interrupted(last.values if last else problem.named(problem.start)) from error
 
 
-def stopped(problem: Problem, values: Mapping[str, float], *, threads: int = 1) -> StateSpaceFit:
+def stopped(problem: Problem, values: Mapping[str, float]) -> StateSpaceFit:
     """Return the state of a fit that was stopped: its parameters, with errors as if they were the maximum."""
     processes = processes_in({name.partition("[")[0] for name in values})
-    likelihood = Likelihood(problem, smooth=not values.get("field_amplitude"), processes=processes, threads=threads)
+    likelihood = Likelihood(problem, smooth=not values.get("field_amplitude"), processes=processes)
     point = likelihood.at(likelihood.coordinates(values))
     return StateSpaceFit(likelihood, Maximum(point, np.inf, Status.INTERRUPTED, inverse(point.information)), 1)
 
@@ -706,7 +774,7 @@ def _fitted(
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
     wide = likelihood(False, processes or ())
-    found = maximise(wide, _widest(wide, start, progress), steps=8, close=1.0, progress=progress)
+    found = maximise(wide, _widest(wide, start, progress), steps=12, close=1.0, progress=progress)
     best = StateSpaceFit(wide, found, wide.evaluations)
     if found.status is Status.INTEGRATION:
         return best
@@ -822,10 +890,12 @@ def _with_or_without(
         return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
 
     tried: StateSpaceFit | None = None
+    if not np.isfinite(found.away):
+        found = maximise(rough, found.point.x, close=close, progress=progress)
     elsewhere = False  # a field finer than the samples, or one that is slow, may be a maximum of its own
     while rough.evaluations - before < STEPS:
         last = found.point.x
-        found = maximise(rough, last, steps=3, close=close, progress=progress)
+        found = maximise(rough, last, steps=3, close=close, widths=(), progress=progress)
         if found.away < close or np.array_equal(found.point.x, last):
             other = None if elsewhere else _small_field(rough, found.point)
             if other is None:
