@@ -516,12 +516,12 @@ def maximise(
     held: Sequence[str] = (),
     steps: int = STEPS,
     close: float = CONVERGED,
-    widths: Sequence[float] = WIDTHS,
+    widths: Sequence[float] | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Maximum:
     """Return the maximum from x (k,), by Fisher scoring with Levenberg's damping; parameters `held` stay where they are.
 
-    Readings are weighted first, by how far each tells something, `widths` one after the other, and then all count alike.
+    Readings are weighted first, by how far each tells something, `widths` one after the other (WIDTHS), and then all count alike.
     It ends within `close` standard errors of the maximum, by the score, or where two steps running each gain less than a quarter
     of what that distance is worth. Parameters that a step would push out stay at their
     bounds. A likelihood that cannot be evaluated at x is a status.
@@ -530,12 +530,13 @@ def maximise(
     point, damping = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper)), 1e-3
     if not np.isfinite(point.log_likelihood):
         return Maximum(point, np.inf, Status.INTEGRATION, np.full((x.size, x.size), np.nan))
-    away, sure, slow, more, left = np.inf, True, 0, np.zeros((x.size, x.size)), [*widths, 0.0]
+    away, sure, slow, more, left = np.inf, True, 0, np.zeros((x.size, x.size)), [*(WIDTHS if widths is None else widths), 0.0]
     for _ in range(steps):
         low, high = point.x <= likelihood.lower, point.x >= likelihood.upper
         while True:
             width = left[0]
-            score, information, weights = point.score, point.information, []
+            score, information = point.score, point.information
+            weights: list[Array] = []
             if width:
                 score, information, weights = _weighted(likelihood, point, width, free)
             moving = np.nonzero(free & ~(low & (score < 0)) & ~(high & (score > 0)))[0]
