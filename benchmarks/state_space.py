@@ -110,8 +110,8 @@ def main() -> None:
                  f"{np.median([a['cpu'] for a in answers]):.1f} s", f"{asked.repeats - alike} of {asked.repeats}",
                  f"{np.median([a['cpu_alike'] for a in answers]):.1f} s")
             )  # fmt: skip
-            print(rows[-1], [(a["seed"], round(a["missed"], 1), round(a["alike"], 1)) for a in answers if max(a["missed"], a["alike"]) > 1],
-                  file=sys.stderr, flush=True)  # fmt: skip
+            lost = [(a["seed"], round(a["missed"], 1), round(a["alike"], 1)) for a in answers]
+            print(rows[-1], [row for row in lost if max(row[1:]) > 1], file=sys.stderr, flush=True)
     report.table(
         ("field", "track", *NAMES, "all", "sd/stderr", "maximum found", "status ok", "no field", "CPU, median", "alike: found",
          "CPU, median"), rows

@@ -3,7 +3,8 @@
     python examples/real_steps.py DATA
 
 DATA holds the folders psu-p655-ghost-rocks, basalt-b819-velocity-step and psu-p446-20MPa; the recordings are no part of this
-project. Experiments are written to a temporary folder and fitted as `srf fit --trend slip` does.
+project. Experiments are written to a temporary folder and fitted as `srf fit --trend slip` does; the last line fits eleven steps
+of p446 together, as `srf fit --trend slip --vary mu0` does, and predicts two that are held out.
 """
 
 from __future__ import annotations

@@ -40,15 +40,16 @@ def held(rms, gain=1.0, whole=True):
 def concluded(monkeypatch):
     """Return the verdict on a search that ended with some fits; `held` are the held-out runs."""
 
-    def verdict(*fits, held=()):
+    def verdict(*fits, held=(), cut_short=False):
         monkeypatch.setattr(module, "held_out", lambda *_: tuple(held))
         monkeypatch.setattr(module, "on_the_track_of", lambda best, baseline: baseline)
         monkeypatch.setattr(module, "at_bounds", lambda best: [])
         ranked = sorted(fits, key=lambda f: -f.evidence)
         baseline = next(f for f in fits if f.name == "none")
-        return conclude(
-            SimpleNamespace(ranked=lambda: ranked, baseline=baseline, excluded=[]), SimpleNamespace(runs=())
+        search = SimpleNamespace(
+            ranked=lambda: ranked, baseline=baseline, excluded=[], cut_short=cut_short, budget=150.0
         )
+        return conclude(search, SimpleNamespace(runs=()))
 
     return verdict
 
@@ -65,6 +66,12 @@ def test_a_model_that_passes_is_taken_where_one_that_does_not_is_hardly_ahead_of
     )
     assert (found.verdict, found.effects) == said
     assert found.final is (found.best if said[1] else found.ranked[0])
+
+
+@pytest.mark.parametrize("cut_short", [False, True])
+def test_a_search_that_its_budget_ended_says_so(concluded, cut_short):
+    found = concluded(fitted("viscous-drag", evidence=100.0), LOST, cut_short=cut_short)
+    assert any("budget of 150 s" in r for r in found.reasons) is cut_short
 
 
 def test_a_further_effect_that_gains_little_is_not_named(concluded):
