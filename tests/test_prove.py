@@ -426,6 +426,21 @@ def test_a_shift_of_a_free_parameter_does_not_stand_out():
     assert left > 5  # a step of the load shows it
 
 
+def test_a_wrong_stiffness_does_not_stand_out_where_no_mass_is_known():
+    """Elongations of a stiffness r times the stated one are those of mu0, A, B over r and lambda times r."""
+    r, p = 1.2, replace(Physics(), massless=True)
+    stiffer, scaled = replace(p, ratio=r), replace(p, mu0=p.mu0 / r, A=p.A / r, B=p.B / r, lam=p.lam * r)
+    plan, wrong = SHORT[1], variants("stiffness-error")[0]
+    u = report.move(stiffer, plan).u
+    np.testing.assert_allclose(u, report.move(scaled, plan).u, rtol=1e-6)
+    left, raw = stands_out(wrong, [], stiffer, gauge=report.Gauge(), shown={plan: u})
+    assert left == 0 < 20 < raw
+    heavy = replace(stiffer, massless=False, M=4e-6)
+    shown = {plan: report.move(heavy, plan).u}
+    assert stands_out(wrong, [], heavy, gauge=report.Gauge(), shown=shown)[0] > 0
+    assert stands_out(wrong, list(variants("inertia")), heavy, gauge=report.Gauge(), shown=shown)[0] == 0
+
+
 def test_the_true_model_leaves_the_noise(quick, tmp_path):
     truth = make_case(tmp_path / "c", 5, effects=[ALPHA, "friction-drift"], size=0.9, rough=2e-4, strengths=False)
     found = see((tmp_path / "c", truth))

@@ -50,6 +50,7 @@ WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
 SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
 FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
+FIELD_STEPS = 6  # of the trial of a small field beside a fit without one: parameters that are off may hide it
 BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
 SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
 NEEDED = 2.0  # gain in log likelihood that keeps a field: without one that is there, errors are too small
@@ -62,6 +63,11 @@ PATIENCE = 5  # times the steps of integration of the point before, after which 
 WIDTHS = (0.1, 0.03, 0.01)  # of each parameter, within which a reading's derivatives are to hold, one after the other
 WIDEST = 1000.0  # times that width, in standard errors: what readings tell sharply together may still be uncertain
 ROUNDS = 12  # of weights and standard errors, each from the other
+PROBE, BENT = 10.0, 0.5  # standard errors along a ridge, and the share of what its curvature wants to be lost there, if it is one maximum
+STRIDE, REACH = 0.05, 0.5  # of a parameter: strides along its ridge, and how far they go
+DOWN = 10.0  # in log likelihood, by how much less a stride may find than the best on its side, and be followed
+FINE = 16  # steps of two standard errors to either side, where the maxima next to one are looked for
+HOPS = 4  # from one maximum to a likelier one
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
@@ -775,26 +781,33 @@ def _fitted(
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
     wide = likelihood(False, processes or ())
-    found = maximise(wide, _widest(wide, start, progress), steps=12, close=1.0, progress=progress)
+    fresh = "field_amplitude" not in start
+    steps = STEPS if fresh else 12
+    found = maximise(wide, _widest(wide, start, progress), steps=steps, close=1.0, progress=progress)
     best = StateSpaceFit(wide, found, wide.evaluations)
     if found.status is Status.INTEGRATION:
         return best
+    if fresh and found.away < 1.0:
+        best = replace(best, maximum=_likelier(wide, found, 1.0, progress), evaluations=wide.evaluations)
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
     best = _with_colour(best, likelihood, progress, cautious) if processes is None else best
     best = _with_or_without(best, smooth, likelihood, close, progress)
     if thorough and processes is None:
         wider = _with_colour(best, likelihood, progress, cautious)
-        if len(wider.likelihood.processes) > len(best.likelihood.processes):
-            return _with_or_without(wider, smooth, likelihood, close, progress)
-        best = wider
+        grown = len(wider.likelihood.processes) > len(best.likelihood.processes)
+        best = _with_or_without(wider, smooth, likelihood, close, progress) if grown else wider
         known = best.likelihood.processes
-        if smooth is None and not best.smooth and (not known or (_short_field(best) and len(known) < GAUGE_PROCESSES)):
+        if not grown and smooth is None and not best.smooth and (not known or (_short_field(best) and len(known) < GAUGE_PROCESSES)):
             other = _coloured(best, likelihood(True, (*known, "relaxation")), progress)  # colour in place of the field?
             if other.criterion > best.criterion - CLOSE_CALL:
                 own = maximise(other.likelihood, other.maximum.point.x, close=close, progress=progress)
                 other = StateSpaceFit(other.likelihood, own, other.likelihood.evaluations)
             better, worse = (other, best) if other.criterion > best.criterion else (best, other)
             best = replace(better, evaluations=better.evaluations + worse.evaluations)
+    if fresh:
+        before = best.likelihood.evaluations
+        likelier = _likelier(best.likelihood, best.maximum, close, progress)
+        best = replace(best, maximum=likelier, evaluations=best.evaluations + best.likelihood.evaluations - before)
     return best
 
 
@@ -802,6 +815,89 @@ def _short_field(fitted: StateSpaceFit) -> bool:
     """Return whether the field is as short as a field may be: along slip then as the gauge's noise is in time."""
     at = fitted.likelihood.names.index("field_length")
     return bool(fitted.maximum.point.x[at] < fitted.likelihood.lower[at] + 0.1)
+
+
+def _likelier(likelihood: Likelihood, maximum: Maximum, close: float, progress: Callable[[str], None]) -> Maximum:
+    """Return the likeliest maximum that is found along ridges from one, with what a ridge adds to its covariance.
+
+    A ridge is how the others follow one parameter, by the covariance. Where the likelihood falls off along it by less than its
+    curvature wants, it has maximum beside maximum: readings of an oscillation of the contact that is faster than the sampling
+    are alike for many compliances. Where none of these stands out, the parameter is as uncertain as all of them are together.
+    """
+    for _ in range(HOPS):
+        spread, best = np.zeros_like(maximum.covariance), maximum
+        for j in _ridges(likelihood, maximum):
+            walked = _walked(likelihood, maximum, j, close, progress)
+            beside, more = _beside(likelihood, walked, j)
+            spread += more
+            if beside.log_likelihood > walked.point.log_likelihood + NEEDED:
+                walked = maximise(likelihood, beside.x, close=close, widths=(), progress=progress)
+            best = max(best, walked, key=lambda m: m.point.log_likelihood)
+        if best.point.log_likelihood < maximum.point.log_likelihood + NEEDED:
+            break
+        progress(f"log likelihood {best.point.log_likelihood:.1f} along a ridge from {maximum.point.log_likelihood:.1f}")
+        maximum = best
+    return replace(maximum, covariance=maximum.covariance + spread)
+
+
+def _ridges(likelihood: Likelihood, maximum: Maximum) -> list[int]:
+    """Return the parameters along whose ridges the likelihood falls off by less than its curvature wants."""
+    found, point, variances = [], maximum.point, np.diag(maximum.covariance)
+    for j in np.nonzero(variances[: len(likelihood.problem.names)] > 0)[0].tolist():
+        d = PROBE * np.sqrt(variances[j])
+        if d < REACH * _size(likelihood, point, j):
+            lost = [point.log_likelihood - _along(likelihood, maximum, j, side * d).log_likelihood for side in (1, -1)]
+            if min(lost) < BENT * PROBE**2 / 2:
+                found.append(j)
+    return found
+
+
+def _size(likelihood: Likelihood, point: Point, j: int) -> float:
+    return 1.0 if likelihood.logarithmic[j] else abs(float(point.x[j]))
+
+
+def _along(likelihood: Likelihood, maximum: Maximum, j: int, d: float) -> Point:
+    """Return the point at which parameter j is moved by d, and the others as the covariance has it."""
+    column = maximum.covariance[:, j] / maximum.covariance[j, j]
+    x = np.clip(maximum.point.x + d * column, likelihood.lower, likelihood.upper)
+    return likelihood.at(x, slopes=False, like=maximum.point)
+
+
+def _walked(
+    likelihood: Likelihood, maximum: Maximum, j: int, close: float, progress: Callable[[str], None]
+) -> Maximum:
+    """Return the maximum next to the likeliest place on the ridge of parameter j, in strides, the others fitted at each."""
+    stride = STRIDE * _size(likelihood, maximum.point, j)
+    column = maximum.covariance[:, j] / maximum.covariance[j, j]
+    best = maximum.point
+    for side in (1, -1):
+        x, top = maximum.point.x, maximum.point.log_likelihood
+        for _ in range(int(REACH / STRIDE)):
+            x = np.clip(x + side * stride * column, likelihood.lower, likelihood.upper)
+            there = maximise(likelihood, x, held=[likelihood.names[j]], steps=2, widths=()).point
+            if not there.log_likelihood > top - DOWN:
+                break
+            x, top = there.x, max(top, there.log_likelihood)
+            best = max(best, there, key=lambda p: p.log_likelihood)
+    if best is maximum.point:
+        return maximum
+    found = maximise(likelihood, best.x, close=close, widths=(), progress=progress)
+    return max(maximum, found, key=lambda m: m.point.log_likelihood)
+
+
+def _beside(likelihood: Likelihood, maximum: Maximum, j: int) -> tuple[Point, Array]:
+    """Return the likeliest point on the ridge of parameter j, and what the points there add to the covariance (k, k)."""
+    column, s = maximum.covariance[:, j] / maximum.covariance[j, j], float(np.sqrt(maximum.covariance[j, j]))
+    points, places = [maximum.point], [0.0]
+    for side in (1, -1):
+        for k in range(1, FINE + 1):
+            points.append(_along(likelihood, maximum, j, side * 2 * k * s))
+            places.append(side * 2 * k * s)
+    found, at = np.array([p.log_likelihood for p in points]), np.array(places)
+    share = np.exp(found - found.max())
+    share /= share.sum()
+    beyond = max(float(share @ (at - share @ at) ** 2) - s**2, 0.0)
+    return points[int(np.argmax(found))], beyond * np.outer(column, column)
 
 
 def _with_colour(
@@ -929,15 +1025,18 @@ def _with_or_without(
 
 
 def _small_field(rough: Likelihood, bare: Point) -> Point | None:
-    """Return the likeliest of a few small fields beside a fit without one or with another, None where none gains enough."""
-    best: tuple[float, Array] | None = None
+    """Return where a few steps lead from the likeliest of a few small fields beside a fit, None where that gains too little."""
+    best: tuple[float, Array] = (-np.inf, bare.x)
     for share in (0.03, 0.1, 0.3, 1.0):
         for short in SHORT:
             x = _under_field(rough, rough.coordinates(bare.values), share * FAINT, short)
             found = rough.at(x, slopes=False).log_likelihood
-            if found > bare.log_likelihood + NEEDED and (best is None or found > best[0]):
+            if found > best[0]:
                 best = found, x
-    return None if best is None else rough.at(best[1])
+    if not np.isfinite(best[0]):
+        return None
+    point = maximise(rough, best[1], steps=FIELD_STEPS, widths=()).point
+    return point if point.log_likelihood > bare.log_likelihood + NEEDED else None
 
 
 def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:

@@ -221,7 +221,8 @@ def stands_out(effect: Effect, others: Sequence[Effect], p: Physics, *, gauge: G
     """Return how many standard errors an effect stands out of the runs `shown` (n,) um, with the baseline free and with it known.
 
     The baseline's parameters and the sizes of the `others` are free to first order, from the slider without the effect. A rough
-    track is taken as known: where it is not, less is seen.
+    track is taken as known: where it is not, less is seen. Where no mass is known, a wrong stiffness does not stand out at all:
+    elongations are those of mu0, A, B and M over the ratio and lambda times it.
     """
     less = effect.removed(p)
     free = [n for n in FITTED if not (n == "Vsat" and less.bare) and not (n == "lam" and less.rigid)]
@@ -235,6 +236,8 @@ def stands_out(effect: Effect, others: Sequence[Effect], p: Physics, *, gauge: G
         signals.append(_white(u - base, gauge))
         tangents.append(np.column_stack([_white((x - base) / STEP, gauge) for x in moved]))
     signal, tangent = np.concatenate(signals), np.concatenate(tangents)
+    if effect.varies == "ratio" and (less.massless or any(o.varies == "M" for o in others)):
+        return 0.0, float(np.linalg.norm(signal))
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=0), 1e-12)
     left = signal - tangent @ np.linalg.lstsq(tangent, signal, rcond=1e-10)[0]
     return float(np.linalg.norm(left)), float(np.linalg.norm(signal))
