@@ -63,11 +63,12 @@ PATIENCE = 5  # times the steps of integration of the point before, after which 
 WIDTHS = (0.1, 0.03, 0.01)  # of each parameter, within which a reading's derivatives are to hold, one after the other
 WIDEST = 1000.0  # times that width, in standard errors: what readings tell sharply together may still be uncertain
 ROUNDS = 12  # of weights and standard errors, each from the other
-PROBE, BENT = 10.0, 0.5  # standard errors along a ridge, and the share of what its curvature wants to be lost there, if it is one maximum
+PROBE = 10.0  # standard errors along a ridge, at which the likelihood is asked for
+BENT = 0.5  # share of what its curvature loses there, below which there are other maxima
 STRIDE, REACH = 0.05, 0.5  # of a parameter: strides along its ridge, and how far they go
 DOWN = 10.0  # in log likelihood, by how much less a stride may find than the best on its side, and be followed
 FINE = 16  # steps of two standard errors to either side, where the maxima next to one are looked for
-HOPS = 4  # from one maximum to a likelier one
+HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
@@ -787,8 +788,9 @@ def _fitted(
     best = StateSpaceFit(wide, found, wide.evaluations)
     if found.status is Status.INTEGRATION:
         return best
-    if fresh and found.away < 1.0:
-        best = replace(best, maximum=_likelier(wide, found, 1.0, progress), evaluations=wide.evaluations)
+    walked = fresh and found.away < 1.0
+    if walked:
+        best = StateSpaceFit(wide, _along_ridges(wide, found, 1.0, progress), wide.evaluations)
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
     best = _with_colour(best, likelihood, progress, cautious) if processes is None else best
     best = _with_or_without(best, smooth, likelihood, close, progress)
@@ -797,7 +799,8 @@ def _fitted(
         grown = len(wider.likelihood.processes) > len(best.likelihood.processes)
         best = _with_or_without(wider, smooth, likelihood, close, progress) if grown else wider
         known = best.likelihood.processes
-        if not grown and smooth is None and not best.smooth and (not known or (_short_field(best) and len(known) < GAUGE_PROCESSES)):
+        wanted = not grown and smooth is None and not best.smooth
+        if wanted and (not known or (_short_field(best) and len(known) < GAUGE_PROCESSES)):
             other = _coloured(best, likelihood(True, (*known, "relaxation")), progress)  # colour in place of the field?
             if other.criterion > best.criterion - CLOSE_CALL:
                 own = maximise(other.likelihood, other.maximum.point.x, close=close, progress=progress)
@@ -806,7 +809,8 @@ def _fitted(
             best = replace(better, evaluations=better.evaluations + worse.evaluations)
     if fresh:
         before = best.likelihood.evaluations
-        likelier = _likelier(best.likelihood, best.maximum, close, progress)
+        likelier = best.maximum if walked else _along_ridges(best.likelihood, best.maximum, close, progress)
+        likelier = _likelier(best.likelihood, likelier, close, progress)
         best = replace(best, maximum=likelier, evaluations=best.evaluations + best.likelihood.evaluations - before)
     return best
 
@@ -817,26 +821,26 @@ def _short_field(fitted: StateSpaceFit) -> bool:
     return bool(fitted.maximum.point.x[at] < fitted.likelihood.lower[at] + 0.1)
 
 
-def _likelier(likelihood: Likelihood, maximum: Maximum, close: float, progress: Callable[[str], None]) -> Maximum:
-    """Return the likeliest maximum that is found along ridges from one, with what a ridge adds to its covariance.
+def _likelier(
+    likelihood: Likelihood, maximum: Maximum, close: float, progress: Callable[[str], None]
+) -> Maximum:
+    """Return the likeliest of the maxima next to one along its ridges, with what these add to its covariance.
 
     A ridge is how the others follow one parameter, by the covariance. Where the likelihood falls off along it by less than its
     curvature wants, it has maximum beside maximum: readings of an oscillation of the contact that is faster than the sampling
     are alike for many compliances. Where none of these stands out, the parameter is as uncertain as all of them are together.
     """
     for _ in range(HOPS):
-        spread, best = np.zeros_like(maximum.covariance), maximum
+        spread, best = np.zeros_like(maximum.covariance), maximum.point
         for j in _ridges(likelihood, maximum):
-            walked = _walked(likelihood, maximum, j, close, progress)
-            beside, more = _beside(likelihood, walked, j)
+            beside, more = _beside(likelihood, maximum, j)
             spread += more
-            if beside.log_likelihood > walked.point.log_likelihood + NEEDED:
-                walked = maximise(likelihood, beside.x, close=close, widths=(), progress=progress)
-            best = max(best, walked, key=lambda m: m.point.log_likelihood)
-        if best.point.log_likelihood < maximum.point.log_likelihood + NEEDED:
+            best = max(best, beside, key=lambda p: p.log_likelihood)
+        if best.log_likelihood < maximum.point.log_likelihood + NEEDED:
             break
-        progress(f"log likelihood {best.point.log_likelihood:.1f} along a ridge from {maximum.point.log_likelihood:.1f}")
-        maximum = best
+        found = maximise(likelihood, best.x, close=close, widths=(), progress=progress)
+        progress(f"log likelihood {found.point.log_likelihood:.1f} beside {maximum.point.log_likelihood:.1f}")
+        maximum = found
     return replace(maximum, covariance=maximum.covariance + spread)
 
 
@@ -863,10 +867,18 @@ def _along(likelihood: Likelihood, maximum: Maximum, j: int, d: float) -> Point:
     return likelihood.at(x, slopes=False, like=maximum.point)
 
 
+def _along_ridges(
+    likelihood: Likelihood, maximum: Maximum, close: float, progress: Callable[[str], None]
+) -> Maximum:
+    """Return the maximum at the likeliest place that strides along ridges find, the other parameters fitted at each."""
+    for j in _ridges(likelihood, maximum):
+        maximum = _walked(likelihood, maximum, j, close, progress)
+    return maximum
+
+
 def _walked(
     likelihood: Likelihood, maximum: Maximum, j: int, close: float, progress: Callable[[str], None]
 ) -> Maximum:
-    """Return the maximum next to the likeliest place on the ridge of parameter j, in strides, the others fitted at each."""
     stride = STRIDE * _size(likelihood, maximum.point, j)
     column = maximum.covariance[:, j] / maximum.covariance[j, j]
     best = maximum.point
@@ -882,6 +894,7 @@ def _walked(
     if best is maximum.point:
         return maximum
     found = maximise(likelihood, best.x, close=close, widths=(), progress=progress)
+    progress(f"log likelihood {found.point.log_likelihood:.1f} along a ridge from {maximum.point.log_likelihood:.1f}")
     return max(maximum, found, key=lambda m: m.point.log_likelihood)
 
 
@@ -1081,7 +1094,8 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
             for own, (_, trial) in zip(owns, likeliest, strict=True):
                 x[list(own.values())] = trial[list(own.values())]
     progress(f"coloured gauge noise: {', '.join(wider.processes)}")
-    maximum = maximise(wider, x, steps=20, close=1.0, progress=progress)
+    steps = 20 if best > fitted.log_likelihood - HOPELESS else 0
+    maximum = maximise(wider, x, steps=steps, close=1.0, progress=progress)
     return StateSpaceFit(wider, maximum, wider.evaluations)
 
 
