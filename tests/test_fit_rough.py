@@ -112,3 +112,28 @@ def test_values_of_groups_are_summed_up_as_random_effects():
     assert found.stderr == pytest.approx(np.sqrt(values.var(ddof=1) / 5), rel=1e-3)
     together = between_groups(values, np.eye(5) + 0.5)  # an error that all share moves the mean alone
     assert together.scatter == 0.0 and together.stderr == pytest.approx(np.sqrt(0.5 + 1 / 5)) and together.p_value > 0.9
+
+
+def test_the_likeliest_of_many_maxima_is_found(tmp_path):
+    """The contact rings faster than it is sampled: next to the start values is a maximum 54 less likely, 229 errors off."""
+    rng = np.random.default_rng([13, 100, False])
+    spread = {"A": 0.05, "B": 0.05, "D0": 0.05, "lam": 0.05, "Vsat": 0.13, "mu0": 0.01}
+    usual = Physics()
+    base = replace(usual, **{n: getattr(usual, n) * float(np.exp(s * rng.standard_normal())) for n, s in spread.items()})
+    plans = (
+        Plan("steps", ((2, 5), (1, 20), (1, 50), (1, 10)), 5.0, 0.004),
+        Plan("stickslip", ((0.5, 12), (3.5, 8)), 9.0, 0.004),
+        Plan("loadstep", ((4, 10),), 5.0, 0.004, steps=((1.5, 1.5), (3, -1.5))),
+        Plan("holds", ((1, 10), (2, 0.1), (1.5, 10)), 5.0, 0.004),
+    )
+    tracks = rng.integers(2**31, size=4).tolist()
+    readings = {
+        q: read_gauge(move(replace(base, track=Track(1e-4, 6.0, track)), q).u, Gauge(), rng)
+        for q, track in zip(plans, tracks, strict=True)
+    }
+    for name, text in case_files("ringing", base, readings).items():
+        (tmp_path / name).write_text(text)
+    found = srf.fit(srf.read_experiment(tmp_path))
+    true = {"mu0": base.mu0, "A": base.A, "B": base.B, "D0": base.D0, "Vsat": base.Vsat, "lambda": base.lam}
+    for name, value in true.items():
+        assert abs(found.values[name] - value) < 4 * found.stderr[name] < 0.04 * value, name

@@ -67,7 +67,7 @@ PROBE = 10.0  # standard errors along a ridge, at which the likelihood is asked 
 BENT = 0.5  # share of what its curvature loses there, below which there are other maxima
 STRIDE, REACH = 0.05, 0.5  # of a parameter: strides along its ridge, and how far they go
 DOWN = 10.0  # in log likelihood, by how much less a stride may find than the best on its side, and be followed
-FINE = 16  # steps of two standard errors to either side, where the maxima next to one are looked for
+FINE = (16, 64)  # steps of two standard errors to either side, at least and at most, in which maxima next to one are looked for
 HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
@@ -508,12 +508,16 @@ def typical_friction(run: Run) -> float:
 
 @dataclass(frozen=True)
 class Maximum:
-    """Where Fisher scoring ended: the point, how far the maximum may still be in standard errors, the status, covariance by x."""
+    """Where Fisher scoring ended: the point, how far the maximum may still be in standard errors, the status, covariance by x.
+
+    The covariance is that of this maximum; `spread` (k, k) is what others beside it that are nearly as likely add.
+    """
 
     point: Point
     away: float
     status: Status
     covariance: Array = field(repr=False)
+    spread: Array | float = field(default=0.0, repr=False)
 
 
 def maximise(
@@ -665,7 +669,7 @@ class StateSpaceFit:
     def covariance(self) -> Array:
         """Return the covariance (k, k) of all parameters, in um, s, N; zero for one at a bound."""
         unit = self.likelihood.unit(self.maximum.point.x)
-        return np.asarray(self.maximum.covariance * np.outer(unit, unit))
+        return np.asarray((self.maximum.covariance + self.maximum.spread) * np.outer(unit, unit))
 
     @property
     def log_likelihood(self) -> float:
@@ -824,7 +828,7 @@ def _short_field(fitted: StateSpaceFit) -> bool:
 def _likelier(
     likelihood: Likelihood, maximum: Maximum, close: float, progress: Callable[[str], None]
 ) -> Maximum:
-    """Return the likeliest of the maxima next to one along its ridges, with what these add to its covariance.
+    """Return the likeliest of the maxima next to one along its ridges, with what these add to the covariance.
 
     A ridge is how the others follow one parameter, by the covariance. Where the likelihood falls off along it by less than its
     curvature wants, it has maximum beside maximum: readings of an oscillation of the contact that is faster than the sampling
@@ -841,7 +845,7 @@ def _likelier(
         found = maximise(likelihood, best.x, close=close, widths=(), progress=progress)
         progress(f"log likelihood {found.point.log_likelihood:.1f} beside {maximum.point.log_likelihood:.1f}")
         maximum = found
-    return replace(maximum, covariance=maximum.covariance + spread)
+    return replace(maximum, spread=spread)
 
 
 def _ridges(likelihood: Likelihood, maximum: Maximum) -> list[int]:
@@ -902,8 +906,9 @@ def _beside(likelihood: Likelihood, maximum: Maximum, j: int) -> tuple[Point, Ar
     """Return the likeliest point on the ridge of parameter j, and what the points there add to the covariance (k, k)."""
     column, s = maximum.covariance[:, j] / maximum.covariance[j, j], float(np.sqrt(maximum.covariance[j, j]))
     points, places = [maximum.point], [0.0]
+    count = int(np.clip(STRIDE * _size(likelihood, maximum.point, j) / (2 * s), *FINE))
     for side in (1, -1):
-        for k in range(1, FINE + 1):
+        for k in range(1, count + 1):
             points.append(_along(likelihood, maximum, j, side * 2 * k * s))
             places.append(side * 2 * k * s)
     found, at = np.array([p.log_likelihood for p in points]), np.array(places)
