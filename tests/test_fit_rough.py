@@ -133,7 +133,7 @@ def test_the_likeliest_of_many_maxima_is_found(tmp_path):
     }
     for name, text in case_files("ringing", base, readings).items():
         (tmp_path / name).write_text(text)
-    found = srf.fit(srf.read_experiment(tmp_path))
+    found = srf.fit(tmp_path)
     true = {"mu0": base.mu0, "A": base.A, "B": base.B, "D0": base.D0, "Vsat": base.Vsat, "lambda": base.lam}
     for name, value in true.items():
         assert abs(found.values[name] - value) < 4 * found.stderr[name] < 0.04 * value, name

@@ -1026,6 +1026,8 @@ def _with_or_without(
                 if small is None:
                     return tried
                 found = replace(found, point=small)
+    if found.away >= close:  # a longer run knows the curvature of its last step, by which scoring alone goes to and fro
+        found = maximise(rough, found.point.x, close=close, widths=(), progress=progress)
     best = StateSpaceFit(rough, found, count + rough.evaluations - before + plain.evaluations)
     if smooth is False:
         return best

@@ -74,7 +74,7 @@ def read_experiment(
 
 
 def fit(
-    experiment: Experiment,
+    experiment: Experiment | Path | str,
     *,
     free: Sequence[str] | None = None,
     trend: str | None = None,
@@ -95,8 +95,8 @@ def fit(
 
     Parameters
     ----------
-    experiment : Experiment
-        From `srfcli.read_experiment`.
+    experiment : path or Experiment
+        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`, which also takes a reader and plugins.
     free : sequence of str, optional
         Parameters to fit; those that the experiment leaves free if left out.
     trend : {'slip', 'time'}, optional
@@ -160,14 +160,17 @@ def fit(
     ... D0 = { value = 5.0, lower = 1.0, upper = 100.0 }
     ... '''
     >>> _ = Path("experiment.toml").write_text(described)
-    >>> found = srf.fit(srf.read_experiment("."), track="smooth")
+    >>> found = srf.fit(".", track="smooth")
     >>> found.status.ok, round(found.values["D0"]), found.stderr["D0"] < 0.2
     (True, 10, True)
     """
     if track == "shared" and (profile or sample):
         raise SrfError("`track` shared does not go with `profile` or `sample`", "Leave it out, or name rough.")
+    registry = registry or load_registry()
+    if not isinstance(experiment, Experiment):
+        experiment = read_experiment(experiment, registry=registry)
     found = fit_recordings(
-        registry or load_registry(), experiment, free=free, trend=trend, vary=vary, by=by, track=track,
+        registry, experiment, free=free, trend=trend, vary=vary, by=by, track=track,
         ask_shared=not (profile or sample), starts=starts, seed=seed, progress=lambda text: progress("fit", text, None),
     )  # fmt: skip
     status = found.status
