@@ -44,7 +44,8 @@ class Score:
     """One effect's score: `gain` in log likelihood at first order, the `values` expected of its parameters there.
 
     `size` and `stderr` are those of its first parameter, `detectable` the size that would gain 12 in log likelihood, `surviving`
-    the share of the effect's squared signal that what was fitted cannot absorb.
+    the share of the effect's squared signal that what was fitted cannot absorb. `shifts` are what it does to the parameters that
+    were fitted.
     """
 
     effect: Effect
@@ -55,6 +56,7 @@ class Score:
     detectable: float
     surviving: float
     direction: Array = field(repr=False, compare=False)
+    shifts: dict[str, float] = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,7 @@ class _Column:
     """Columns (2 m, q) of an effect by the size called `name`, at given inner values; names are the effect's own.
 
     Projected, they are free of what was fitted, `whole` is their square before that, and `along` (r, q) what they have of the
-    field that all runs share.
+    field that all runs share; `fitted` (p, q) is what a size of 1 does to the parameters that were fitted.
     """
 
     effect: Effect
@@ -79,6 +81,7 @@ class _Column:
     inner: dict[str, float]
     columns: Array
     whole: float = 0.0
+    fitted: Array | None = None
     along: Array | None = None
 
 
@@ -112,14 +115,20 @@ class Remainder:
             base[at : at + len(block), [fitted.likelihood.names.index(n) for n in f.names]] = block
             at += len(block)
         size = np.linalg.norm(base, axis=0)
-        base = base[:, size > 0] / size[size > 0]
-        u, s, _ = np.linalg.svd(base, full_matrices=False)
-        self.base = u[:, s > 1e-7 * s[0]]
+        u, s, v = np.linalg.svd(base[:, size > 0] / size[size > 0], full_matrices=False)
+        known = s > 1e-7 * s[0]
+        self.base = u[:, known]
+        self._back = np.zeros((size.size, int(known.sum())))
+        self._back[size > 0] = v[known].T / s[known] / size[size > 0][:, None]
         self.left = self.free(self.rest)
 
     def free(self, columns: Array) -> Array:
         """Return columns (2 m, k) projected off what was fitted."""
         return np.asarray(columns - self.base @ (self.base.T @ columns))
+
+    def shifts(self, columns: Array) -> Array:
+        """Return by how much the parameters that were fitted change (p, k) where what columns (2 m, k) say is added."""
+        return np.asarray(-self._back @ (self.base.T @ columns))
 
     @cached_property
     def runs(self) -> tuple[Filtered, ...]:
@@ -293,12 +302,14 @@ class Scores:
             ]
             if not some:
                 continue
-            free = self.remainder.free(np.concatenate([c.columns for c in some], axis=1))
+            whole_columns = np.concatenate([c.columns for c in some], axis=1)
+            free, fitted = self.remainder.free(whole_columns), self.remainder.shifts(whole_columns)
             along = self.shared.u.T @ free if self.shared.gain else None
             at = 0
             for c in some:
                 part = slice(at, at := at + c.columns.shape[1])
-                found.append(replace(c, columns=free[:, part], along=None if along is None else along[:, part]))
+                beside = None if along is None else along[:, part]
+                found.append(replace(c, columns=free[:, part], along=beside, fitted=fitted[:, part]))
         return found
 
     def _judge(self, *several: _Column) -> tuple[float, Array, Array]:
@@ -336,9 +347,11 @@ class Scores:
             values = self._expected(column, size)
             direction = column.columns @ size
             norm = float(np.linalg.norm(direction))
+            shifts = np.zeros(0) if column.fitted is None else column.fitted @ size
             best[effect.reported] = Score(
                 effect, gain, values, float(size[0]), error, error * np.sqrt(24.0), free,
                 direction / norm if norm > 0 else direction,
+                dict(zip(self.fitted.likelihood.names, shifts.tolist(), strict=False)),
             )  # fmt: skip
         return sorted(best.values(), key=lambda s: -s.gain)
 

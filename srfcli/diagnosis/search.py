@@ -98,6 +98,7 @@ class _Move:
     fresh: int = field(compare=False, default=0)  # how many of the last effects are at sizes that are only expected
     again: bool = field(compare=False, default=False)  # fitted before, from other sizes
     direction: Array | None = field(compare=False, default=None)  # of what its last effect is expected to explain
+    shifts: Mapping[str, float] = field(compare=False, default_factory=dict)  # of other parameters that go with that
 
 
 class ModelSearch:
@@ -150,31 +151,44 @@ class ModelSearch:
         return hypothesis.problem(self.registry, self.experiment, at=at, **self.choice)
 
     def _started(self, move: _Move) -> dict[str, float]:
-        """Return where a model is fitted from: the sizes that its scores expect, or a part of them where that is likelier."""
-        model = move.hypothesis.model(self.registry, self.experiment)
+        """Return where a model is fitted from: the sizes that its scores expect, or a part of them where that is likelier.
+
+        With the other parameters moved as the scores say, or as they were.
+        """
         best: tuple[float, dict[str, float]] = (-np.inf, {})
-        for share in SHARES:
-            values = dict(move.values)
-            for number, (effect, sizes) in enumerate(zip(move.hypothesis.effects, move.sizes, strict=True)):
-                part = share if number >= len(move.sizes) - move.fresh else 1.0
-                longs = {p.name: long for long, p in own_parameters(effect, model).items()}
-                neutral = neutral_values(effect)
-                for name, value in sizes.items():
-                    still = neutral.get(
-                        name, move.values.get("K", self.experiment.runs[0].stiffness) if name == "K" else None
-                    )
-                    values[longs.get(name, name)] = value if still is None else still + part * (value - still)
-            problem = self._problem(move.hypothesis, values)
-            values = _followable(values, problem)
-            likelihood = Likelihood(problem, processes=self.processes, rtol=COARSE)
-            found = likelihood.at(likelihood.coordinates(values), slopes=False).log_likelihood
-            if found > best[0]:
-                best = found, values
-            elif np.isfinite(best[0]):
-                break
+        for shifts in (move.shifts, {}) if move.shifts else ({},):
+            last = -np.inf
+            for share in SHARES:
+                values = self._sized(move, share, shifts)
+                problem = self._problem(move.hypothesis, values)
+                values = _followable(values, problem)
+                likelihood = Likelihood(problem, processes=self.processes, rtol=COARSE)
+                found = likelihood.at(likelihood.coordinates(values), slopes=False).log_likelihood
+                if found > best[0]:
+                    best = found, values
+                if np.isfinite(last) and found <= last:
+                    break
+                last = found
         if not best[0] > move.least:
             raise SrfError("no size of it follows the recordings from where its parent stands")
         return best[1]
+
+    def _sized(self, move: _Move, share: float, shifts: Mapping[str, float]) -> dict[str, float]:
+        """Return the parameters of a model where `share` of what its scores expect has been gone."""
+        model, values = move.hypothesis.model(self.registry, self.experiment), dict(move.values)
+        for name, shift in shifts.items():  # relative ones as powers: what is positive stays so
+            value = values[name]
+            values[name] = value * float(np.exp(share * shift / value)) if value > 0 else value + share * shift
+        for number, (effect, sizes) in enumerate(zip(move.hypothesis.effects, move.sizes, strict=True)):
+            part = share if number >= len(move.sizes) - move.fresh else 1.0
+            longs = {p.name: long for long, p in own_parameters(effect, model).items()}
+            neutral = neutral_values(effect)
+            for name, value in sizes.items():
+                still = neutral.get(
+                    name, move.values.get("K", self.experiment.runs[0].stiffness) if name == "K" else None
+                )
+                values[longs.get(name, name)] = value if still is None else still + part * (value - still)
+        return values
 
     def _judged(self, hypothesis: Hypothesis, found: StateSpaceFit) -> Fitted:
         if found.maximum.status is Status.INTEGRATION:
@@ -302,7 +316,8 @@ class ModelSearch:
         for score in [s for s in scores.singles if s.gain > least][:SINGLES]:
             hypothesis = Hypothesis((*present, score.effect), node.hypothesis.ageing)
             sizes = (*self._sizes(node), score.values)
-            self._push(node.evidence + score.gain + one, hypothesis, node, sizes, direction=score.direction)
+            own = {n: score.shifts[n] for n in node.fit.likelihood.problem.names if score.shifts.get(n)}
+            self._push(node.evidence + score.gain + one, hypothesis, node, sizes, direction=score.direction, shifts=own)
         if not node.fine:
             for effect in (e for e in joining if e.settings or e.observed):
                 self._build(node, effect, one)
@@ -324,13 +339,15 @@ class ModelSearch:
         parent: Fitted,
         sizes: tuple[dict[str, float], ...],
         direction: Array | None = None,
+        shifts: Mapping[str, float] | None = None,
     ) -> None:
         self.count += 1
         fresh = len(hypothesis.effects) - len(parent.hypothesis.effects)
         least = parent.fit.log_likelihood - ASTRAY
         move = _Move(
-            -expected, self.count, hypothesis, dict(parent.fit.values), sizes, least, fresh, direction=direction
-        )
+            -expected, self.count, hypothesis, dict(parent.fit.values), sizes, least, fresh, direction=direction,
+            shifts=shifts or {},
+        )  # fmt: skip
         heapq.heappush(self.queue, move)
 
     def _likelihood(self, hypothesis: Hypothesis, node: Fitted, name: str) -> Likelihood | None:
