@@ -153,7 +153,6 @@ def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
     if column.columns.shape[1] == 1:
         absorbed = column.whole - float(np.sum(column.columns**2))
         assert spared == pytest.approx(0.5 * size**2 * absorbed, rel=0.3, abs=0.02)
-    assert spared > 0
 
 
 @pytest.mark.parametrize("shared", [True, False])
