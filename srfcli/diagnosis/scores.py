@@ -56,7 +56,7 @@ class Score:
     detectable: float
     surviving: float
     direction: Array = field(repr=False, compare=False)
-    shifts: dict[str, float] = field(repr=False, compare=False)
+    shifts: dict[str, float] = field(repr=False, compare=False, default_factory=dict)
 
 
 @dataclass(frozen=True)
