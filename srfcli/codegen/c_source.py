@@ -302,11 +302,12 @@ VECTORS = ("avx512f", "avx2")  # instruction sets that carry derivatives several
 FUNCTIONS = {"rates": "srf_rates", "rates_jacobian": "srf_jacobian", "rates_parameters": "srf_parameters"}
 DUAL_FUNCTIONS = {
     "rates": "srf_d_rates", "rates_jacobian": "srf_d_jacobian", "field_gain": "srf_d_gain", "reading": "srf_d_reading",
-    "reading_gradient": "srf_d_gradient",
+    "reading_gradient": "srf_d_reading_gradient", "spring": "srf_d_spring", "spring_gradient": "srf_d_spring_gradient",
 }  # fmt: skip
 ORBIT_FUNCTIONS = {"cycle": "srf_cycle", "cycle_jacobian": "srf_cycle_jacobian", "cycle_bilinear": "srf_bilinear"}
 LANES = 16  # derivatives that the filter carries along at a time: a run has 11 to 14
 GAUGE_PROCESSES = 3  # of coloured gauge noise, at most, of one state or two
+SIGNALS = 3  # of a run, each with its own gauge noise, at most
 TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
 
 
@@ -357,10 +358,14 @@ def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_
 
 def _filter_source(model: GeneratedModel) -> str:
     """Return the C text of the filter, which follows that of the integrator."""
-    text = f"#define LANES {LANES}\n#define GAUGE_PROCESSES {GAUGE_PROCESSES}\n" + dual_arithmetic(model.source)
+    sizes = {"LANES": LANES, "GAUGE_PROCESSES": GAUGE_PROCESSES, "SIGNALS": SIGNALS}
+    text = "".join(f"#define {name} {size}\n" for name, size in sizes.items()) + dual_arithmetic(model.source)
     text += c_function(model.source, "field_gain", label="srf_gain")
     for name, label in DUAL_FUNCTIONS.items():
-        text += c_function(model.source, name, label=label, dual=True)
+        if name in model.namespace:
+            text += c_function(model.source, name, label=label, dual=True)
+        else:  # the spring as it is, where that is what the gauge shows
+            text += f"#define {label} {DUAL_FUNCTIONS[name.replace('spring', 'reading')]}\n"
     return text + (files("srfcli") / "codegen" / "filter.c").read_text(encoding="utf-8")
 
 

@@ -2,15 +2,18 @@
 
    Compiled behind radau.c with a model that has such a field:
      srf_gain(x, V, W, W_dot, p, out[NX])        where the field's white noise enters the rates
-     srf_d_rates, srf_d_jacobian, srf_d_gain, srf_d_reading, srf_d_gradient      the same and the gauge in dual numbers
+     srf_d_rates, srf_d_jacobian, srf_d_gain, srf_d_reading, srf_d_reading_gradient      the same and the gauge in dual numbers
+     srf_d_spring, srf_d_spring_gradient                                         the spring as it is, without the gauge's own lag
    The mean follows Radau IIA; the covariance follows the exact derivative of each of its steps, P -> Phi P Phi' + sum c c', where
    c are the responses to the MODES lowest Legendre polynomials of the white noise over the step. Everything is carried along in
    dual numbers, so that innovations and their variances have the derivatives of what was computed.
    Jazwinski, Stochastic Processes and Filtering Theory, 1970; Griewank and Walther, Evaluating Derivatives, 2008. */
 
 #define MODES 3                             /* of white noise in a step; as many as stages can tell apart */
-#define NA (NX + 2 * GAUGE_PROCESSES)
+#define NA (NX + 2 * GAUGE_PROCESSES * SIGNALS) /* states with those of gauge noise, at most; matrices are laid out for those there are */
 #define NC (NX + MODES)
+#define GAUGE -1
+#define SPRING -2
 #define NO_VARIANCE 1e150                   /* a variance that is none any more */
 
 typedef struct {
@@ -21,7 +24,7 @@ typedef struct {
 typedef struct {
     const double *p;
     const dual *q;
-    int slopes, ng, na;                     /* processes of gauge noise; states with theirs */
+    int slopes, ng, na;                     /* processes of gauge noise, of all signals; states with theirs */
     const int *order;                       /* how many states each of these has */
     double rtol, longest, h;                /* h: the step that the last one suggests */
     const double *atol;
@@ -75,7 +78,7 @@ static int nonzero(const lanes *d) {
 /* Covariance and tangents across one step whose stages are solved; the mean is moved too. Returns the error of the covariance
    over what is allowed, by the share that the last polynomial has in the variances; nothing is changed unless it is below 1. */
 static double moments(Imposed *force, Course *course, Belief *b, double t, double h, const double *Z) {
-    int m = NC + (course->slopes ? LANES : 0), pivot[NZ];
+    int m = NC + (course->slopes ? LANES : 0), na = course->na, pivot[NZ];
     double J[3][NX * NX], V[3], W[3], W_dot[3], x[NX], gain[NX], matrix[NZ * NZ];
     double G[NZ * (NC + LANES)] __attribute__((aligned(64))), B[NZ * (NC + LANES)] __attribute__((aligned(64)));
     dual y[NX], f[NX];
@@ -138,26 +141,25 @@ static double moments(Imposed *force, Course *course, Belief *b, double t, doubl
     }
     double M[NX * NA], P[NX * NX];
     lanes dM[NX * NA];
-    int na = course->na;
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < na; c++) {
             double sum = 0.0, through = 0.0;
-            for (int k = 0; k < NX; k++) sum += Phi[r * NC + k] * b->P[k * NA + c], through += Phi[r * NC + k] * b->T[k * NA + c];
-            M[r * NA + c] = sum;
-            G[r * NA + c] = through;
+            for (int k = 0; k < NX; k++) sum += Phi[r * NC + k] * b->P[k * na + c], through += Phi[r * NC + k] * b->T[k * na + c];
+            M[r * na + c] = sum;
+            G[r * na + c] = through;
         }
     if (course->slopes) {
         memset(dM, 0, sizeof dM);
         for (int r = 0; r < NX; r++)
             for (int k = 0; k < NX; k++) {
-                for (int c = 0; c < na; c++) add_scaled(LANES, b->P[k * NA + c], dPhi + r * NC + k, dM + r * NA + c);
-                add_scaled(na * LANES, Phi[r * NC + k], b->Pd + k * NA, dM + r * NA);
+                for (int c = 0; c < na; c++) add_scaled(LANES, b->P[k * na + c], dPhi + r * NC + k, dM + r * na + c);
+                add_scaled(na * LANES, Phi[r * NC + k], b->Pd + k * na, dM + r * na);
             }
     }
     for (int r = 0; r < NX; r++)
         for (int c = 0; c <= r; c++) {
             double sum = 0.0;
-            for (int k = 0; k < NX; k++) sum += M[r * NA + k] * Phi[c * NC + k];
+            for (int k = 0; k < NX; k++) sum += M[r * na + k] * Phi[c * NC + k];
             for (int k = NX; k < NC; k++) sum += Phi[r * NC + k] * Phi[c * NC + k];
             if (!(fabs(sum) < NO_VARIANCE)) return INFINITY;
             P[r * NX + c] = sum;
@@ -176,26 +178,26 @@ static double moments(Imposed *force, Course *course, Belief *b, double t, doubl
             memcpy(&moved, B + (2 * NX + r) * m + NC, sizeof moved);
             b->xd[r] += moved;
         }
-        memcpy(b->T + r * NA, G + r * NA, na * sizeof(double));
+        memcpy(b->T + r * na, G + r * na, na * sizeof(double));
     }
     for (int r = 0; r < NX; r++) {
         for (int c = NX; c < na; c++) {
-            b->P[r * NA + c] = b->P[c * NA + r] = M[r * NA + c];
-            if (course->slopes) b->Pd[r * NA + c] = b->Pd[c * NA + r] = dM[r * NA + c];
+            b->P[r * na + c] = b->P[c * na + r] = M[r * na + c];
+            if (course->slopes) b->Pd[r * na + c] = b->Pd[c * na + r] = dM[r * na + c];
         }
         for (int c = 0; c <= r; c++) {
-            b->P[r * NA + c] = b->P[c * NA + r] = P[r * NX + c];
+            b->P[r * na + c] = b->P[c * na + r] = P[r * NX + c];
             if (course->slopes) {
                 lanes slope = {0.0};
                 for (int k = 0; k < NX; k++) {
-                    add_scaled(LANES, Phi[c * NC + k], dM + r * NA + k, &slope);
-                    add_scaled(LANES, M[r * NA + k], dPhi + c * NC + k, &slope);
+                    add_scaled(LANES, Phi[c * NC + k], dM + r * na + k, &slope);
+                    add_scaled(LANES, M[r * na + k], dPhi + c * NC + k, &slope);
                 }
                 for (int k = NX; k < NC; k++) {
                     add_scaled(LANES, Phi[c * NC + k], dPhi + r * NC + k, &slope);
                     add_scaled(LANES, Phi[r * NC + k], dPhi + c * NC + k, &slope);
                 }
-                b->Pd[r * NA + c] = b->Pd[c * NA + r] = slope;
+                b->Pd[r * na + c] = b->Pd[c * na + r] = slope;
             }
         }
     }
@@ -325,17 +327,17 @@ static void age_gauge(Course *course, Belief *b, double dt, const dual *gauge) {
         dual F[4];
         gauge_step(w, dt, gauge + 3 * j, F);
         gauge_turn(w, F, b->x + at, b->xd + at, 1);
-        for (int c = 0; c < na; c++) gauge_turn(w, F, b->P + at * NA + c, b->Pd + at * NA + c, NA);
-        for (int c = 0; c < na; c++) gauge_turn(w, F, b->P + c * NA + at, b->Pd + c * NA + at, 1);
+        for (int c = 0; c < na; c++) gauge_turn(w, F, b->P + at * na + c, b->Pd + at * na + c, na);
+        for (int c = 0; c < na; c++) gauge_turn(w, F, b->P + c * na + at, b->Pd + c * na + at, 1);
         for (int c = 0; c < na; c++) {
-            double old[2] = {b->T[at * NA + c], w == 2 ? b->T[(at + 1) * NA + c] : 0.0};
-            for (int r = 0; r < w; r++) b->T[(at + r) * NA + c] = F[r * w].v * old[0] + (w == 2 ? F[r * w + 1].v * old[1] : 0.0);
+            double old[2] = {b->T[at * na + c], w == 2 ? b->T[(at + 1) * na + c] : 0.0};
+            for (int r = 0; r < w; r++) b->T[(at + r) * na + c] = F[r * w].v * old[0] + (w == 2 ? F[r * w + 1].v * old[1] : 0.0);
         }
         for (int r = 0; r < w; r++)
             for (int c = 0; c < w; c++) {
                 dual kept = srf_mul(F[r * w], F[c * w]);
                 if (w == 2) kept = srf_add(kept, srf_mul(F[r * w + 1], F[c * w + 1]));
-                int own = (at + r) * NA + at + c;
+                int own = (at + r) * na + at + c;
                 const dual fresh = srf_mul(variance, srf_sub(srf_plain(r == c ? 1.0 : 0.0), kept));
                 b->P[own] += fresh.v;
                 b->Pd[own] += fresh.d;
@@ -347,50 +349,54 @@ static void age_gauge(Course *course, Belief *b, double dt, const dual *gauge) {
 /* the processes of gauge noise as they are where nothing was read yet */
 static void fresh_gauge(Course *course, Belief *b, const dual *gauge) {
     static const lanes none = {0.0};
-    int at = NX;
-    for (int i = 0; i < course->na; i++)
-        for (int g = NX; g < course->na; g++) {
-            b->P[g * NA + i] = b->P[i * NA + g] = b->T[g * NA + i] = b->T[i * NA + g] = 0.0;
-            b->Pd[g * NA + i] = b->Pd[i * NA + g] = none;
+    int at = NX, na = course->na;
+    for (int i = 0; i < na; i++)
+        for (int g = NX; g < na; g++) {
+            b->P[g * na + i] = b->P[i * na + g] = b->T[g * na + i] = b->T[i * na + g] = 0.0;
+            b->Pd[g * na + i] = b->Pd[i * na + g] = none;
         }
     for (int j = 0; j < course->ng; j++) {
         const dual variance = srf_mul(gauge[3 * j + 1], gauge[3 * j + 1]);
         for (int r = 0; r < course->order[j]; r++, at++) {
             b->x[at] = 0.0;
             b->xd[at] = none;
-            b->P[at * NA + at] = variance.v;
-            b->Pd[at * NA + at] = variance.d;
+            b->P[at * na + at] = variance.v;
+            b->Pd[at * na + at] = variance.d;
         }
     }
 }
 
-/* One run: innovations nu (nt), their variances S (nt) and the derivatives of both (nt, LANES), at the samples where `used`; all
-   samples get the mean (nt, NA), covariance (nt, NA, NA), transition (nt, NA, NA) from the last sample and the reading's gradient
-   (nt, NA), before they are used, where those are wanted (`keep`). The reading is `factor` times elongation plus offset plus gauge
-   noise of variance R. The processes of coloured noise have `order` (ng) states each, and parameters gauge (rates, ng, 3); which of
-   the rates holds at a sample is `rate` (nt): where it changes, a noise begins that owes nothing to the one before.
-   p holds dual numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset and R (nt). Returns how many samples were reached; stats: steps, rejected. */
-int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const double *gauge, const int *rate, int slopes, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
+/* One run: innovations nu (nt), their variances S (nt) and the derivatives of both (nt, LANES), at the readings where `used`; all
+   get the mean (nt, na), covariance (nt, na, na), transition (nt, na, na) from the reading before and the reading's gradient
+   (nt, na), before they are used, where those are wanted (`keep`). Several signals may be read at one time: `t` (nt) does not fall,
+   and `signal` (nt) says which it is. A reading is `factor` times what it `shows` (nt) plus offset plus gauge noise of variance R:
+   GAUGE the elongation as the gauge has it, SPRING as it is, where spring weighs by `weighs` (nt), 0 or 1, with which parameter
+   `weighed` is replaced (-1 for none); from 0 on a state. The processes of coloured noise have `order` (ng) states each, belong to
+   the signal `owner` (ng), and have parameters gauge (rates, ng, 3); which of the rates holds at a reading is `rate` (nt): where it
+   changes, a noise begins that owes nothing to the one before. p holds dual numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and
+   P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset and R (nt). Returns how many readings were reached; stats: steps,
+   rejected. */
+int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
     double values[NP];
-    dual q[NP], colour[3 * GAUGE_PROCESSES], y[NX], one, g[NX];
+    dual q[NP], colour[3 * GAUGE_PROCESSES * SIGNALS], y[NX], one, g[NX];
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values};
     Course course = {values, q, slopes, ng, NX, order, rtol, longest, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, 0, 0, max_steps, stop};
     Belief b;
-    int na, segment_ = -1, filled = 0, begins[NA] = {0};
+    int na, segment_ = -1, filled = 0, begins[NA] = {0}; /* 1 + the signal of the process whose first state this is */
     double now = t[0], last = t[0];
     const size_t wide = 1 + LANES;
 #define TAKE(to, from) ((to).v = *(from), memcpy(&(to).d, (from) + 1, sizeof(lanes)))
 #define TAKE_COLOUR(at) for (int i_ = 0; i_ < 3 * ng; i_++) TAKE(colour[i_], gauge + ((size_t)(at) * 3 * ng + i_) * wide)
     memset(&b, 0, sizeof b);
     for (int i = 0; i < NP; i++) TAKE(q[i], p + i * wide), values[i] = q[i].v;
-    for (int j = 0; j < ng; j++) begins[course.na] = 1, course.na += order[j];
+    for (int j = 0; j < ng; j++) begins[course.na] = 1 + owner[j], course.na += order[j];
     na = course.na;
     for (int i = 0; i < NX; i++) TAKE(one, x0 + i * wide), b.x[i] = one.v, b.xd[i] = one.d;
     for (int i = 0; i < NX; i++)
-        for (int j = 0; j < NX; j++) TAKE(one, P0 + (i * NX + j) * wide), b.P[i * NA + j] = one.v, b.Pd[i * NA + j] = one.d;
+        for (int j = 0; j < NX; j++) TAKE(one, P0 + (i * NX + j) * wide), b.P[i * na + j] = one.v, b.Pd[i * na + j] = one.d;
     TAKE_COLOUR(rate[0]);
     fresh_gauge(&course, &b, colour);
-    for (int i = 0; i < na; i++) b.T[i * NA + i] = 1.0;
+    for (int i = 0; i < na; i++) b.T[i * na + i] = 1.0;
     for (int k = 0; k < nt; k++) {
         while (now < t[k] || segment_ < 0) {
             if (segment_ < 0 || (segment_ + 1 < n_segments && now >= edges[segment_ + 1])) {
@@ -412,7 +418,7 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
         if (k && rate[k] != rate[k - 1]) {
             TAKE_COLOUR(rate[k]);
             fresh_gauge(&course, &b, colour);
-        } else if (k) age_gauge(&course, &b, t[k] - last, colour);
+        } else if (t[k] > last) age_gauge(&course, &b, t[k] - last, colour);
         last = t[k];
         double V, W, W_dot, PH[NA], H[NA];
         lanes dPH[NA], dH[NA];
@@ -422,26 +428,37 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
         for (int i = 0; i < NX; i++) y[i].v = b.x[i], y[i].d = b.xd[i];
         memset(g, 0, sizeof g);
         memset(&reading, 0, sizeof reading);
-        srf_d_reading(y, V, W, W_dot, q, &reading);
-        srf_d_gradient(y, V, W, W_dot, q, g);
+        if (shows[k] >= 0) {
+            reading = y[shows[k]];
+            g[shows[k]].v = 1.0;
+        } else if (shows[k] == SPRING) {
+            if (weighed >= 0) q[weighed].v = weighs[k];
+            srf_d_spring(y, V, W, W_dot, q, &reading);
+            srf_d_spring_gradient(y, V, W, W_dot, q, g);
+            if (weighed >= 0) q[weighed].v = values[weighed];
+        } else {
+            srf_d_reading(y, V, W, W_dot, q, &reading);
+            srf_d_reading_gradient(y, V, W, W_dot, q, g);
+        }
         TAKE(scale, factor + k * wide);
         TAKE(shift, offset + k * wide);
         TAKE(noise, R + k * wide);
         reading = srf_add(srf_mul(scale, reading), shift);
         for (int i = 0; i < na; i++) {
-            one = i < NX ? srf_mul(scale, g[i]) : srf_plain(begins[i]);
+            int own = i >= NX && begins[i] == 1 + signal[k];
+            one = i < NX ? srf_mul(scale, g[i]) : srf_plain(own);
             H[i] = one.v;
             dH[i] = one.d;
-            if (begins[i]) reading.v += b.x[i], reading.d += b.xd[i];
+            if (own) reading.v += b.x[i], reading.d += b.xd[i];
         }
         for (int i = 0; i < na; i++) {
             PH[i] = 0.0;
             dPH[i] = none;
             for (int j = 0; j < na; j++) {
-                PH[i] += b.P[i * NA + j] * H[j];
+                PH[i] += b.P[i * na + j] * H[j];
                 if (!slopes) continue;
-                add_scaled(LANES, H[j], b.Pd + i * NA + j, dPH + i);
-                add_scaled(LANES, b.P[i * NA + j], dH + j, dPH + i);
+                add_scaled(LANES, H[j], b.Pd + i * na + j, dPH + i);
+                add_scaled(LANES, b.P[i * na + j], dH + j, dPH + i);
             }
         }
         double variance = noise.v, miss = observed[k] - reading.v;
@@ -455,22 +472,23 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
         memcpy(nu_d + (size_t)k * LANES, &dmiss, sizeof dmiss);
         memcpy(S_d + (size_t)k * LANES, &dvariance, sizeof dvariance);
         if (keep) {
-            for (int i = 0; i < na; i++) mean[(size_t)k * NA + i] = b.x[i], gradient[(size_t)k * NA + i] = H[i];
-            memcpy(covariance + (size_t)k * NA * NA, b.P, sizeof b.P);
-            memcpy(transition + (size_t)k * NA * NA, b.T, sizeof b.T);
+            memcpy(mean + (size_t)k * na, b.x, na * sizeof(double));
+            memcpy(gradient + (size_t)k * na, H, na * sizeof(double));
+            memcpy(covariance + (size_t)k * na * na, b.P, (size_t)na * na * sizeof(double));
+            memcpy(transition + (size_t)k * na * na, b.T, (size_t)na * na * sizeof(double));
         }
         filled = k + 1;
-        memset(b.T, 0, sizeof b.T);
-        for (int i = 0; i < na; i++) b.T[i * NA + i] = 1.0;
+        memset(b.T, 0, (size_t)na * na * sizeof(double));
+        for (int i = 0; i < na; i++) b.T[i * na + i] = 1.0;
         if (!used[k] || !(variance > 0.0)) continue;
         for (int i = 0; i < na; i++) {
             double gain = PH[i] / variance;
             lanes dgain = (dPH[i] - gain * dvariance) / variance;
             if (slopes) {
-                for (int j = 0; j < na; j++) add_scaled(LANES, -PH[j], &dgain, b.Pd + i * NA + j);
-                add_scaled(na * LANES, -gain, dPH, b.Pd + i * NA);
+                for (int j = 0; j < na; j++) add_scaled(LANES, -PH[j], &dgain, b.Pd + i * na + j);
+                add_scaled(na * LANES, -gain, dPH, b.Pd + i * na);
             }
-            for (int j = 0; j < na; j++) b.P[i * NA + j] -= gain * PH[j];
+            for (int j = 0; j < na; j++) b.P[i * na + j] -= gain * PH[j];
             b.xd[i] += dgain * miss + gain * dmiss;
             b.x[i] += gain * miss;
         }

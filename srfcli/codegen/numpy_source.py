@@ -512,12 +512,17 @@ def generate_motion(system: System) -> str:
 
 
 def _write_filter(writer: Writer, eq: Equations, rates: Staged) -> None:
-    """Write what a Kalman filter asks for besides: where the field's white noise enters, and the gradient of the reading."""
+    """Write what a Kalman filter asks for besides: where the field's white noise enters, and what a reading's gradient is."""
     inputs, shape = ("V", "W", "W_dot"), f"({len(eq.unknowns)},)"
     gain = rates.derivative({symbol("field_noise"): sp.S.One})
     writer.vector("field_gain", "d(rates)/d(field_noise).", gain, tail=inputs, shape=shape)
-    gradient = [(str(j), eq.derivative(eq.reading, j)) for j in range(len(eq.unknowns))]
-    writer.function("reading_gradient", "d(reading)/dx.", gradient, tail=inputs, shape=shape)
+    formulas = {"reading": eq.reading}
+    if eq.shown != eq.reading:  # an effect of the gauge
+        formulas["spring"] = eq.shown
+        writer.function("spring", "What a gauge without this effect shows of the elongation.", [("", eq.shown)], tail=inputs)
+    for name, formula in formulas.items():
+        gradient = [(str(j), eq.derivative(formula, j)) for j in range(len(eq.unknowns))]
+        writer.function(f"{name}_gradient", f"d({name})/dx.", gradient, tail=inputs, shape=shape)
 
 
 def _write_tables(writer: Writer, system: System) -> None:

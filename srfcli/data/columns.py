@@ -17,7 +17,7 @@ from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.files import open_plain
 from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit
 from srfcli.data.description import ROLES, ColumnSpec, RunDescription, check_unit
-from srfcli.data.values import OBSERVABLES
+from srfcli.data.values import BESIDE, OBSERVABLES
 from srfcli.laws.registry import Entry, Registry
 from srfcli.laws.values import Reader, Source
 
@@ -311,19 +311,22 @@ def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
             f'Head it `time [s]`, or write [columns] time = {{ name = "...", unit = "s" }}. {_near(["time"], names)}'.strip(),
         )
     roles = (*OBSERVABLES, "shear_stress")
-    observables = [c for role in roles if (c := finder.find(role))]
+    observables = _wanted(run, finder) or [c for role in roles if (c := finder.find(role))]
     if not observables:
         raise SrfError(
             f"{run.file}: none of the columns {', '.join(roles)}; found: {', '.join(finder.headings)}",
             f"One of them is needed; [columns] can name it. {_near(roles, names)}".strip(),
         )
     listed = [c for c in observables if c.role in finder.specs] or observables
-    if len(observables) > 1:
+    if run.observables:
+        listed = observables
+    elif len(observables) > 1:
         others = ", ".join(c.role for c in observables if c is not listed[0])
-        what = f"{listed[0].role} is what is compared; the file also has {others}, left aside"
+        every = ", ".join(f'"{c.role}"' for c in observables)
+        what = f"{listed[0].role} is what is compared; the file also has {others}, left aside (observables = [{every}] takes all)"
         finder.notices.append(Notice("observable", str(run.file), what))
-    observable = listed[0] if listed[0].role in OBSERVABLES else replace(listed[0], role="force")
-    channels = [time, observable]
+    seen = listed if run.observables else listed[:1]
+    channels = [time, *(replace(c, role="force") if c.role == "shear_stress" else c for c in seen)]
     moves = finder.find("load_point_velocity")
     if moves is None and run.drive is None:
         moves = finder.find("load_point_displacement")
@@ -336,15 +339,30 @@ def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
     if len(weights) > 1:
         what = "normal_load is what counts; the file also has normal_stress, left aside"
         finder.notices.append(Notice("load", str(run.file), what))
-    if not weights and run.load is None and listed[0].role != "friction":
+    if not weights and run.load is None and any(c.role != "friction" for c in seen):
         raise SrfError(
             f"{run.node.where}: the run has no load, and {run.file} no normal_load or normal_stress",
             f'Write load = "5 N", or name the column. {_near(["normal_load", "normal_stress"], names)}'.strip(),
         )
     if run.backward:
-        channels[1] = replace(observable, factor=-observable.factor)
+        channels[1:] = [c if c.role == "contact_area" else replace(c, factor=-c.factor) for c in channels[1:]]
         moves = replace(moves, factor=-moves.factor) if moves else None
     return [*channels, *([moves] if moves else []), *weights[:1]]
+
+
+def _wanted(run: RunDescription, finder: _Finder) -> list[Channel]:
+    """Return the channels of the observables that a run lists, one of the spring first."""
+    found = []
+    for number, role in enumerate(run.observables):
+        channel = finder.find(role)
+        if channel is None:
+            names = [name for name, _ in finder.parts]
+            run.node.child("observables").child(number).fail(
+                f"{run.file} has no column '{role}'; found: {', '.join(finder.headings)}",
+                f"[columns] can name it. {_near([role], names)}".strip(),
+            )
+        found.append(channel)
+    return sorted(found, key=lambda c: c.role in BESIDE)
 
 
 def _near(roles: Iterable[str], names: list[str]) -> str:

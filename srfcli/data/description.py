@@ -37,7 +37,11 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
     "force": "N",
     "shear_stress": "MPa",
     "friction": "1",
+    "slip": "um",
+    "contact_area": "1",
 }
+READABLE = ("elongation", "force", "shear_stress", "friction", "slip", "contact_area")  # what `observables` may list
+MOST_OBSERVABLES = 3  # of a run
 CORRECTIONS = ("reset", "spike")  # of a run: what is proposed, and made only where it is asked for
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
 _TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs")
@@ -55,6 +59,7 @@ _RUN = (
     "initial",
     "direction",
     "corrections",
+    "observables",
 )
 _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
 
@@ -104,6 +109,7 @@ class RunDescription:
     node: Node = field(repr=False, compare=False)
     backward: bool = False
     corrections: frozenset[str] = frozenset()
+    observables: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -298,6 +304,7 @@ def _run(node: Node, geometry: Geometry) -> RunDescription:
         node=node,
         backward=direction is not None and direction.text() == "backward",
         corrections=_corrections(node.get("corrections")),
+        observables=_observables(node.get("observables")),
     )
 
 
@@ -312,6 +319,26 @@ def _corrections(node: Node | None) -> frozenset[str]:
         if entry.text() not in CORRECTIONS:
             entry.fail(f"unknown correction '{entry.text()}'", did_you_mean(entry.text(), CORRECTIONS))
     return frozenset(node.value)
+
+
+def _observables(node: Node | None) -> tuple[str, ...]:
+    """Return which columns of a run are compared with the model together; none listed, the reader's rule chooses one."""
+    if node is None:
+        return ()
+    example = 'Write observables = ["elongation", "slip"].'
+    if not isinstance(node.value, list) or not node.value:
+        node.expected("a list of observables", example)
+    names = [node.child(index).text() for index in range(len(node.value))]
+    for index, name in enumerate(names):
+        if name not in READABLE:
+            node.child(index).fail(f"unknown observable '{name}'", did_you_mean(name, READABLE))
+        if name in names[:index] or ({"force", "shear_stress"} <= set(names)):
+            node.child(index).fail(f"'{name}' is the same observable as another one", "Name each once.")
+    if len(names) > MOST_OBSERVABLES:
+        node.fail(f"{len(names)} observables", f"A run has {MOST_OBSERVABLES} at most.")
+    if not set(names) - {"slip", "contact_area"}:
+        node.fail(f"{' and '.join(names)} without a force", "One of elongation, force, shear_stress, friction is needed besides.")
+    return tuple(names)
 
 
 def _window(node: Node) -> tuple[float, float]:

@@ -43,7 +43,7 @@ from srfcli.data.noise import (
     white_level,
 )
 from srfcli.data.scales import own_bounds
-from srfcli.data.values import OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
+from srfcli.data.values import BESIDE, OBSERVABLES, Experiment, FitParameter, ModelChoice, Run, Signal
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation
@@ -294,7 +294,7 @@ def read_run(
     drive, told = _drive(run, columns, t, arrays)
     load, weighed = _load(run, columns, rows, t, arrays)
     check_start(run, drive, float(t[0]))
-    role = next(r for r in OBSERVABLES if r in arrays)
+    role, *beside = [c.role for c in columns.channels.values() if c.role in OBSERVABLES | BESIDE]
     at_start = load.rest(float(t[0]))
     stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
     rise = np.abs(drive(t)) * {"elongation": 1.0, "force": stiffness, "friction": stiffness / at_start}[role]
@@ -306,6 +306,7 @@ def read_run(
     observed, used, quantum, flaws, proposed = clean_observable(
         place, arrays[role], rise=rise, load=load, corrections=run.corrections
     )
+    others = [_signal(run, columns, name, rows, t, arrays[name]) for name in beside]
     return Run(
         name=run.name,
         file=run.file,
@@ -321,10 +322,32 @@ def read_run(
         stiffness=stiffness,
         modulation=run.modulation,
         quantum=quantum,
-        notices=(*notices, *told, *weighed, *flaws),
+        notices=(*notices, *told, *weighed, *flaws, *(n for _, flaws in others for n in flaws)),
         stress=any(units.values()),
         proposed=proposed,
+        others=tuple(signal for signal, _ in others),
     )
+
+
+def _signal(
+    run: RunDescription, columns: Columns, role: str, rows: NDArray[np.int64], t: Array, x: Array
+) -> tuple[Signal, list[Notice]]:
+    """Return what was observed besides, as it is: spikes, resets and saturation are looked for in the first observable alone."""
+    place = Place(run.file, columns.channels[role].heading, rows, t)
+    known, filled = _numbers(place, x)
+    told = f"without a number in '{place.heading}', not compared"
+    return Signal(role, filled, known, quantisation(filled[known])), spots("nan", ~known, run.file, rows, t, told)
+
+
+def _numbers(place: Place, x: Array) -> tuple[Mask, Array]:
+    """Return which readings (n,) are numbers, and the readings with others in the place of what is none."""
+    known = np.isfinite(x)
+    if known.sum() < 8:
+        raise SrfError(
+            f"{place.path.name}: column '{place.heading}' has {int(known.sum())} numbers in {x.size} samples",
+            "A recording needs 8 or more.",
+        )
+    return known, np.interp(place.t, place.t[known], x[known])
 
 
 def moved(t: Array, arrays: Mapping[str, Array]) -> Array:
@@ -411,14 +434,8 @@ def clean_observable(
     Raises SrfError where nothing is left.
     """
     t, path, rows = place.t, place.path, place.rows
-    known = np.isfinite(x)
-    if known.sum() < 8:
-        raise SrfError(
-            f"{path.name}: column '{place.heading}' has {int(known.sum())} numbers in {x.size} samples",
-            "A recording needs 8 or more.",
-        )
+    known, filled = _numbers(place, x)
     notices = spots("nan", ~known, path, rows, t, f"without a number in '{place.heading}', not compared")
-    filled = np.interp(t, t[known], x[known])
     quantum = quantisation(filled[known])
     clipped = saturation(filled)
     if clipped.any():

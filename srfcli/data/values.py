@@ -17,6 +17,7 @@ from srfcli.data.clock import Sampling, find_sampling
 from srfcli.motion.imposed import Drive, Load
 
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
+BESIDE = {"slip": "um", "contact_area": "1"}  # what may be observed besides one of these
 
 
 @dataclass(frozen=True)
@@ -47,12 +48,23 @@ class FitParameter:
 
 
 @dataclass(frozen=True)
+class Signal:
+    """One observable of a run: its readings (n,) in um, N or 1, which of them are used, and the step by which it is quantised."""
+
+    observable: str
+    observed: Array = field(repr=False)
+    used: NDArray[np.bool_] = field(repr=False)
+    quantum: float
+
+
+@dataclass(frozen=True)
 class Run:
     """One recording: times (n,) in s that rise strictly, the observable (n,) in um, N or 1, and what was imposed.
 
     `observed` is finite everywhere; where `used` is False it is a placeholder and a notice says why. `drive` and `load` hold
     on all of [t[0], t[-1]]. `start` is the place on the track in um, `initial` "steady" or "free", `stiffness` K in N/um,
     `modulation` the declared frequency (Hz), relative amplitude and onset (s), `quantum` the quantisation step, or 0.
+    `others` are what was observed at the same times besides.
     `proposed` is the observable as the corrections that are proposed would make it, None where there are none.
     `stress` where stresses were recorded: a stress counts as the force on 1 mm^2, so that what is in N is in MPa.
     """
@@ -74,11 +86,21 @@ class Run:
     notices: tuple[Notice, ...]
     stress: bool = False
     proposed: Array | None = field(default=None, repr=False)
+    others: tuple[Signal, ...] = ()
+
+    @property
+    def signals(self) -> tuple[Signal, ...]:
+        """Return all that was observed, the observable first."""
+        return (Signal(self.observable, self.observed, self.used, self.quantum), *self.others)
 
     @property
     def unit(self) -> str:
         """Return the unit of the observable as it is shown: um, N, MPa or 1."""
-        return shown_unit(OBSERVABLES[self.observable], stress=self.stress)
+        return self.unit_of(self.observable)
+
+    def unit_of(self, observable: str) -> str:
+        """Return the unit in which an observable of this run is shown: um, N, MPa or 1."""
+        return shown_unit((OBSERVABLES | BESIDE)[observable], stress=self.stress)
 
     @cached_property
     def sampling(self) -> Sampling:
@@ -88,7 +110,8 @@ class Run:
     def thinned(self, every: int) -> Run:
         """Return every so-many-th reading of the run; drive and load are as they were."""
         own = {n: getattr(self, n)[::every] for n in ("t", "observed", "used")}
-        return replace(self, **own, proposed=None if self.proposed is None else self.proposed[::every])
+        others = tuple(replace(s, observed=s.observed[::every], used=s.used[::every]) for s in self.others)
+        return replace(self, **own, others=others, proposed=None if self.proposed is None else self.proposed[::every])
 
     @property
     def load_unit(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from srfcli.core.errors import SrfError
 from srfcli.core.files import SIDECAR, clear, parse_toml, read_text, recover, whole_folder
 from srfcli.core.units import find_unit
 from srfcli.data.description import LARGEST
-from srfcli.data.values import OBSERVABLES, Experiment, FitParameter, Run
+from srfcli.data.values import BESIDE, OBSERVABLES, Experiment, FitParameter, Run
 from srfcli.motion.imposed import Drive
 
 DESCRIPTION = "experiment.toml"
@@ -99,42 +99,35 @@ def write_folder(files: Mapping[str, str], folder: Path, *, force: bool = False)
 
 
 def run_csv(run: Run) -> str:
-    """Return the recording of one run as CSV: time, load-point velocity, normal load and the observable, in full precision.
+    """Return the recording of one run as CSV: time, load-point velocity, normal load and all observables, in full precision.
 
     A sample that is not to be compared becomes an empty cell.
     """
-    if run.observable not in OBSERVABLES:
-        raise SrfError(f"run {run.name!r} records {run.observable!r}", f"known: {', '.join(OBSERVABLES)}")
     W, _ = run.load(run.t)
-    columns = (run.t, _velocity_column(run.drive, run.t), W)
-    texts = [map(repr, column.tolist()) for column in columns]
-    seen = (repr(u) if used else "" for u, used in zip(run.observed.tolist(), run.used.tolist(), strict=True))
-    weight, force = ("normal_stress [MPa]", "shear_stress [MPa]") if run.stress else ("normal_load [N]", "force [N]")
-    observable = {"elongation": "elongation [um]", "force": force, "friction": "friction [1]"}[run.observable]
-    header = f"time [s],load_point_velocity [um/s],{weight},{observable}"
-    return "\n".join([header, *map(",".join, zip(*texts, seen, strict=True))]) + "\n"
+    columns = [run.t, _velocity_column(run.drive, run.t), W]
+    texts: list[Iterable[str]] = [map(repr, column.tolist()) for column in columns]
+    header = ["time [s]", "load_point_velocity [um/s]", "normal_stress [MPa]" if run.stress else "normal_load [N]"]
+    for signal, name in zip(run.signals, observables(run), strict=True):
+        header.append(f"{name} [{run.unit_of(signal.observable)}]")
+        texts.append(repr(y) if used else "" for y, used in zip(signal.observed.tolist(), signal.used.tolist(), strict=True))
+    return "\n".join([",".join(header), *map(",".join, zip(*texts, strict=True))]) + "\n"
+
+
+def observables(run: Run) -> list[str]:
+    """Return the names of a run's columns of observables."""
+    for signal in run.signals:
+        if signal.observable not in OBSERVABLES | BESIDE:
+            known = ", ".join(OBSERVABLES | BESIDE)
+            raise SrfError(f"run {run.name!r} records {signal.observable!r}", f"known: {known}")
+    return ["shear_stress" if run.stress and s.observable == "force" else s.observable for s in run.signals]
 
 
 def _velocity_column(drive: Drive, t: np.ndarray) -> np.ndarray:
     if not any(drive.accelerations):
         return drive(t)
-    slipped = _displacement(drive, t)
+    slipped = drive.displacement(t)
     mean = np.diff(slipped) / np.diff(t)
     return np.append(mean, drive(t[-1:]))
-
-
-def _displacement(drive: Drive, t: np.ndarray) -> np.ndarray:
-    """Return the load point's displacement since t[0] at the times `t`, exactly: V is linear between the drive's breaks."""
-    inside = [b for b in drive.breaks if t[0] < b < t[-1]]
-    edges = np.array([t[0], *inside, t[-1]])
-    starts = [drive.piece(float(a)) for a in edges[:-1]]
-    V = np.array([v + rate * (a - since) for (v, rate, since), a in zip(starts, edges[:-1], strict=True)])
-    rates = np.array([rate for _, rate, _ in starts])
-    widths = np.diff(edges)
-    reached = np.concatenate(([0.0], np.cumsum(V * widths + 0.5 * rates * widths**2)))
-    i = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(V) - 1)
-    h = t - edges[i]
-    return np.asarray(reached[i] + h * (V[i] + 0.5 * rates[i] * h))
 
 
 def _description(experiment: Experiment, files: list[str]) -> str:
@@ -170,6 +163,8 @@ def _run_lines(run: Run, file: str) -> list[str]:
     if not any(run.drive.accelerations):
         steps = [f"{{ duration = {d!r}, velocity = {V!r} }}" for d, V in drive_steps(run.drive, run.t)]
         lines.append(f"drive = [{', '.join(steps)}]")
+    if run.others:
+        lines.append(f"observables = [{', '.join(map(_text, observables(run)))}]")
     if run.modulation is not None:
         f, eps, onset = map(float, run.modulation)
         lines.append(f"modulation = {{ frequency = {f!r}, amplitude = {eps!r}, onset = {onset!r} }}")

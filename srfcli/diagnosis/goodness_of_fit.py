@@ -7,11 +7,13 @@ readings. Laplace's method: Kass and Raftery, JASA 90 (1995); innovations: Durbi
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from srfcli.codegen.model import Array
 from srfcli.inference.noise import stretches, white_level
-from srfcli.inference.state_space import LAGS, StateSpaceFit, correlated, cut, typical_friction
+from srfcli.inference.state_space import LAGS, Filtered, StateSpaceFit, correlated, cut, typical_friction
 
 DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
 PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
@@ -41,20 +43,8 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
         return ["the fit did not converge"]
     tests: list[tuple[float, str]] = []
     for f in point.runs:
-        white = f.white
-        n = white.size
-        off = abs(float(np.sum(white**2)) - n) / np.sqrt(2 * n)
-        tests.append((off / DEVIATION, f"innovations of {f.run.name} have an rms of {np.sqrt(np.mean(white**2)):.3f}"))
-        gauges = [[values[n] for local, n in own.items() if local.startswith(LEVELS)] for own in found.likelihood.gauges(f.run)]
-        level = np.linalg.norm(np.array(gauges), axis=1)[f.run.sampling.at][f.run.used]
-        expected = (f.run.observed - f.found.nu)[f.run.used]
-        for piece, y, noise in zip(cut(white), cut(expected), cut(level), strict=True):
-            m = piece.size
-            loud = (float(np.sum(np.clip(piece, -6, 6) ** 2)) - m) / np.sqrt(2 * m)
-            shifted = abs(float(np.sum(piece))) / np.sqrt(m)
-            if np.std(y) < STEADY * np.mean(noise):
-                loud *= _smooth_share(piece)
-            tests.append((max(loud, shifted) / (DEVIATION + 1.0), f"a stretch of {f.run.name} is off"))
+        for number in range(len(f.run.signals)):
+            tests += _signal_tests(found, f, number)
         if not found.smooth and "field_amplitude" in f.names:
             k = f.names.index("field_amplitude")
             information = float(f.information[k, k])
@@ -66,17 +56,38 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
         friction = max(float(np.median([typical_friction(f.run) for f in point.runs])), 1e-6)
         share = values["field_amplitude"] / friction / PLAUSIBLE
         tests.append((share, f"the field's amplitude is {values['field_amplitude']:.2g}"))
-    levels: dict[str, list[float]] = {}
+    levels: dict[str, list[tuple[float, float]]] = {}
     for f in point.runs:
-        rate = f.run.sampling.at
-        for k, own in enumerate(found.likelihood.gauges(f.run)):
-            seen = white_level(f.run.observed, stretches(f.run.t, f.run.used & (rate == k)))
-            levels.setdefault(own["gauge_white"], []).append(seen)
+        rate, gauges = f.run.sampling.at, iter(found.likelihood.gauges(f.run))
+        for signal, k in product(f.run.signals, range(len(f.run.sampling.spacings))):
+            seen = white_level(signal.observed, stretches(f.run.t, signal.used & (rate == k)))
+            levels.setdefault(next(gauges)["gauge_white"], []).append((seen, signal.quantum))
     for name, shown in levels.items():
-        quantum = max(f.run.quantum for f in point.runs) / np.sqrt(12)
-        ratio = float(np.hypot(values[name], quantum)) / max(min(shown), 1e-300)
+        quantum = max(q for _, q in shown) / np.sqrt(12)
+        ratio = float(np.hypot(values[name], quantum)) / max(min(seen for seen, _ in shown), 1e-300)
         tests.append((ratio / LOUD, f"the gauge's noise is {ratio:.2f} times what the recording shows"))
     return [text for size, text in sorted(tests, reverse=True) if size > 1.0]
+
+
+def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[float, str]]:
+    """Return the tests of one signal of a run: how far each is from what noise would give, over what is allowed, in words."""
+    signal, white, rates = f.run.signals[number], f.parts[number], len(f.run.sampling.spacings)
+    name = f"{signal.observable} of {f.run.name}" if number else f.run.name
+    n = white.size
+    off = abs(float(np.sum(white**2)) - n) / np.sqrt(2 * n)
+    tests = [(off / DEVIATION, f"innovations of {name} have an rms of {np.sqrt(np.mean(white**2)):.3f}")]
+    owns = found.likelihood.gauges(f.run)[number * rates : (number + 1) * rates]
+    gauges = [[found.values[n] for local, n in own.items() if local.startswith(LEVELS)] for own in owns]
+    level = np.linalg.norm(np.array(gauges), axis=1)[f.run.sampling.at][signal.used]
+    expected = (signal.observed - f.of(number).nu)[signal.used]
+    for piece, y, noise in zip(cut(white), cut(expected), cut(level), strict=True):
+        m = piece.size
+        loud = (float(np.sum(np.clip(piece, -6, 6) ** 2)) - m) / np.sqrt(2 * m)
+        shifted = abs(float(np.sum(piece))) / np.sqrt(m)
+        if np.std(y) < STEADY * np.mean(noise):
+            loud *= _smooth_share(piece)
+        tests.append((max(loud, shifted) / (DEVIATION + 1.0), f"a stretch of {name} is off"))
+    return tests
 
 
 def _smooth_share(white: Array) -> float:

@@ -401,9 +401,8 @@ def _stacked(innovations: Array, variances: Array) -> Array:
 
 def _whitened(f: Filtered) -> tuple[Array, Array]:
     """Return the derivatives (m, k) whose product with [white, (white^2 - 1)/sqrt 2] is the score."""
-    used = f.run.used
-    S = f.found.S[used]
-    return -f.found.nu_d[used] / np.sqrt(S)[:, None], f.found.S_d[used] / S[:, None] / np.sqrt(2)
+    a, b = f.slopes
+    return -a, b / np.sqrt(2)
 
 
 def _phases(grid: Sequence[dict[str, float]]) -> list[list[dict[str, float]]]:
@@ -421,8 +420,8 @@ def _carried(
 
     With `late` a column is added for a gauge that shows the elongation of a moment before.
     """
-    run, kept, problem = f.run, f.found.kept, fitted.likelihood.problem
-    assert kept is not None
+    run, kept, every, problem = f.run, f.found.kept, f.every, fitted.likelihood.problem
+    assert kept is not None and every.kept is not None
     model, states = problem.model, list(problem.model.states)
     n, a = kept.mean.shape
     slip = slip_along(run, kept.mean, model.states)
@@ -453,17 +452,20 @@ def _carried(
             if by_V is None:
                 by_V = _rates_by_V(model, fitted, run, kept.mean[:, : len(states)])
             inputs[1:, : len(states), j] = 0.5 * (by_V[1:] + by_V[:-1]) * total[:, None]
-    c, out = np.zeros((a, inputs.shape[2])), np.zeros((n, inputs.shape[2]))
-    for k in range(n):
-        c = kept.transition[k] @ c + inputs[k] if k else inputs[0].copy()
-        seen = kept.gradient[k] @ c
-        if late:
-            seen[-1] += shown[k]
+    signals, used = len(run.signals), np.zeros(every.nu.size, dtype=bool)
+    used[f.used] = True
+    c, out = np.zeros((a, inputs.shape[2])), np.zeros((every.nu.size, inputs.shape[2]))
+    for k in range(every.nu.size):
+        if k % signals == 0:
+            at_sample = k // signals
+            c = every.kept.transition[k] @ c + inputs[at_sample] if k else inputs[0].copy()
+        seen = every.kept.gradient[k] @ c
+        if late and k % signals == 0:  # a delay is that of the first signal's gauge
+            seen[-1] += shown[at_sample]
         out[k] = seen
-        if run.used[k]:
-            c -= np.outer(kept.covariance[k] @ kept.gradient[k] / f.found.S[k], seen)
-    used = run.used
-    white = out[used] / np.sqrt(f.found.S[used])[:, None]
+        if used[k]:
+            c -= np.outer(every.kept.covariance[k] @ every.kept.gradient[k] / every.S[k], seen)
+    white = out[f.used] / np.sqrt(every.S[f.used])[:, None]
     return _stacked(white, np.zeros_like(white))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
-from srfcli.data.values import Experiment, Run
+from srfcli.data.values import Experiment, Run, Signal
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
 from srfcli.inference.prediction import RTOL, Prediction, own_names, own_start, predict, run_parameters
 
@@ -50,7 +50,7 @@ HUGE = 1e100  # a slope that is no slope any more: its square would overflow
 
 @dataclass(frozen=True)
 class RunFit:
-    """How one run is fitted: residual (n,), its noise model, the part of its samples that took part.
+    """How one observable of a run is fitted: residual (n,), its noise model, the part of its samples that took part.
 
     `colours` are the gauge's coloured noise, of a state-space fit: correlation time (s) and standard deviation of a relaxation,
     frequency (Hz), standard deviation and quality of an oscillation.
@@ -64,6 +64,7 @@ class RunFit:
     noise: Noise
     white: float  # standard deviation of white noise, from differences of the residual
     colours: tuple[tuple[float, ...], ...] = ()
+    observable: str = ""
 
     @property
     def rms(self) -> float:
@@ -74,7 +75,10 @@ class RunFit:
 
 @dataclass(frozen=True)
 class Fit:
-    """Estimates in um, s, N: `values` by name for the free parameters, `covariance` in their order; `fixed` the others."""
+    """Estimates in um, s, N: `values` by name for the free parameters, `covariance` in their order; `fixed` the others.
+
+    `runs` are how their observables are fitted, `others` how what was observed besides.
+    """
 
     names: tuple[str, ...]
     values: dict[str, float]
@@ -86,6 +90,7 @@ class Fit:
     status: Status
     evaluations: int
     trail: tuple[tuple[float, str], ...] = ()
+    others: tuple[RunFit, ...] = ()
 
     @property
     def stderr(self) -> dict[str, float]:
@@ -260,7 +265,7 @@ def fit(
     """
     search = Search(problem, progress)
     theta = np.clip(problem.start if start is None else start, problem.lower, problem.upper)
-    noise = {r.name: Noise(first_level(r)) for r in problem.runs} if noises is None else dict(noises)
+    noise = {r.name: Noise(first_level(r.t, r.signals[0])) for r in problem.runs} if noises is None else dict(noises)
     try:
         theta, status = search.grow(theta, noise)
         for _ in range(refinements if noises is None else 0):
@@ -274,10 +279,10 @@ def fit(
     return search.result(theta, noise, status)
 
 
-def first_level(run: Run) -> float:
-    """Return the standard deviation of white noise that the recording itself shows."""
-    level = white_level(run.observed, stretches(run.t, run.used))
-    return max(level, run.quantum / np.sqrt(12), 1e-9 * float(np.ptp(run.observed)), 1e-300)
+def first_level(t: Array, signal: Signal) -> float:
+    """Return the standard deviation of white noise that the readings of a signal at the times t (n,) show themselves."""
+    level = white_level(signal.observed, stretches(t, signal.used))
+    return max(level, signal.quantum / np.sqrt(12), 1e-9 * float(np.ptp(signal.observed)), 1e-300)
 
 
 def unreached(difference: Array, J: Array, noise: Noise) -> Array:
@@ -348,7 +353,7 @@ class Search:
         problem = self.problem
         base = problem.predicted(run, theta)
         self.evaluations += 1
-        amplitude = max(float(np.std(run.observed)), 10 * first_level(run))
+        amplitude = max(float(np.std(run.observed)), 10 * first_level(run.t, run.signals[0]))
         limit = float(run.t[-1])
         for d in directions.T:
             moved = np.clip(theta + d, problem.lower, problem.upper)

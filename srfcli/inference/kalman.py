@@ -14,13 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.codegen.c_source import GAUGE_PROCESSES, LANES, compiled
+from srfcli.codegen.c_source import GAUGE_PROCESSES, LANES, SIGNALS, compiled
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError
 from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.integrators import doubles, imposed_arguments, interruptible, rtol_of_estimate
 
 STEPS_A_SAMPLE = 50  # and as many as a thousand samples may take besides: parameters that are far off are given up
+
+GAUGE, SPRING = -1, -2  # what a reading shows: the elongation as the gauge has it, or as it is; from 0 on a state
 
 _INTS = ctypes.POINTER(ctypes.c_int)
 
@@ -48,8 +50,27 @@ class Dual:
 
 
 @dataclass(frozen=True)
+class Signals:
+    """Which of the signals that are read at the same times each reading (n,) is of, what it shows, and whether in force.
+
+    `shows` is GAUGE, SPRING, or the place of a state; of the SPRING, `weighs` (n,) is 1 where its force over the stated stiffness
+    is shown and 0 where its elongation is. `owner` (g,) are the signals that the processes of gauge noise belong to.
+    """
+
+    number: NDArray[np.intc]
+    shows: NDArray[np.intc]
+    weighs: Array
+    owner: tuple[int, ...]
+
+    @classmethod
+    def one(cls, n: int, processes: int) -> Signals:
+        """Return those of a run of one gauge."""
+        return cls(np.zeros(n, np.intc), np.full(n, GAUGE, np.intc), np.zeros(n), (0,) * processes)
+
+
+@dataclass(frozen=True)
 class Kept:
-    """What the smoother needs, before each sample is used: mean (n, a), covariance, transition since the last sample (n, a, a).
+    """What the smoother needs, before each reading is used: mean (n, a), covariance, transition since the one before (n, a, a).
 
     a is the number of states with those of the gauge noise after them; `gradient` (n, a) is that of the reading.
     """
@@ -62,7 +83,7 @@ class Kept:
 
 @dataclass(frozen=True)
 class Innovations:
-    """Innovations `nu` (n,), their variances `S` (n,), and the derivatives of both (n, k); NaN after `reached` samples."""
+    """Innovations `nu` (n,), their variances `S` (n,), and the derivatives of both (n, k); NaN after `reached` readings."""
 
     nu: Array
     S: Array
@@ -87,6 +108,7 @@ def kalman_filter(
     gauge: Dual,
     order: Sequence[int] = (),
     rate: NDArray[np.intc] | None = None,
+    signals: Signals | None = None,
     factor: Dual,
     offset: Dual,
     R: Dual,
@@ -95,10 +117,10 @@ def kalman_filter(
     keep: bool = False,
     most: int | None = None,
 ) -> Innovations:
-    """Return the innovations of the readings `observed` (n,) at the rising times `t` (s), of which those `used` are taken up.
+    """Return the innovations of the readings `observed` (n,) at times `t` (s) that do not fall; those `used` are taken up.
 
-    A reading is `factor` (n,) times the elongation (or the gauge's own state) plus `offset` (n,) plus gauge noise: white of
-    variance `R` (n,), and g <= 3 processes of as many states as `order` (g,) says. `gauge` (rates, g, 3) has their parameters: of
+    A reading is `factor` (n,) times the elongation, or what else `signals` say it shows, plus `offset` (n,) plus gauge noise: white
+    of variance `R` (n,), and g <= 3 processes a signal of as many states as `order` (g,) says. `gauge` (rates, g, 3) has theirs: of
     one state, e' = -e/tau + s sqrt(2/tau) w, (tau, s, -); of two, an oscillator of frequency f (Hz), quality q and standard
     deviation s, (f, s, q). `rate` (n,) says which row holds at a sample, the first if left out; where it changes, a new noise
     begins.
@@ -112,8 +134,13 @@ def kalman_filter(
     if not hasattr(library, "srf_filter"):
         raise SrfError(f"{model.title} has no random friction field", "open_model(..., random_field=True)")
     n, k, states = t.size, p.d.shape[-1], len(model.states)
-    wide, own = states + 2 * GAUGE_PROCESSES, np.array([*order, 0], dtype=np.intc)
+    signals = signals or Signals.one(n, len(order))
+    if len(order) > GAUGE_PROCESSES * SIGNALS or signals.number.max() >= SIGNALS:
+        raise SrfError(f"more than {GAUGE_PROCESSES} processes of gauge noise a signal, or more than {SIGNALS} signals")
+    wide, own, owner = states + sum(order), *(np.array([*a, 0], dtype=np.intc) for a in (order, signals.owner))
+    weighed = model.index("weighed") if "weighed" in model.names else -1
     rates = np.ascontiguousarray(np.zeros(n) if rate is None else rate, dtype=np.intc)
+    number, shows = (np.ascontiguousarray(a, dtype=np.intc) for a in (signals.number, signals.shows))
     nu, S = np.full(n, np.nan), np.full(n, np.nan)
     nu_d, S_d = np.full((n, k), np.nan), np.full((n, k), np.nan)
     shapes = ((n, wide), (n, wide, wide), (n, wide, wide), (n, wide)) if keep else ((1,),) * 4
@@ -127,7 +154,8 @@ def kalman_filter(
         keeping = keep and first == 0
         arguments = (
             *imposed, doubles(p.packed(first)), doubles(start.packed(first)), doubles(covariance.packed(first)),
-            len(order), own.ctypes.data_as(_INTS), doubles(gauge.packed(first)), rates.ctypes.data_as(_INTS),
+            len(order), own.ctypes.data_as(_INTS), owner.ctypes.data_as(_INTS), doubles(gauge.packed(first)),
+            rates.ctypes.data_as(_INTS), number.ctypes.data_as(_INTS), shows.ctypes.data_as(_INTS), doubles(signals.weighs), weighed,
             int(k > 0), ctypes.c_double(size), doubles(allowed),
             ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(most), n,
             doubles(t), doubles(observed), ctypes.c_void_p(use.ctypes.data), doubles(factor.packed(first)),
@@ -137,17 +165,13 @@ def kalman_filter(
         reached = min(reached, interruptible(lambda arguments=arguments: library.srf_filter(*arguments), stop))  # type: ignore[misc]
         count = min(LANES, k - first)
         nu_d[:, first : first + count], S_d[:, first : first + count] = own_nu[:, :count], own_S[:, :count]
-    kept = None
-    if keep:
-        a = states + sum(order)
-        mean, P, T, H = arrays
-        kept = Kept(mean[:, :a], P[:, :a, :a], T[:, :a, :a], H[:, :a])
+    kept = Kept(*arrays) if keep else None
     return Innovations(nu, S, nu_d, S_d, reached, int(stats[0]), kept)
 
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Mean (n, a) and covariance (n, a, a) of states and gauge noise at each sample, given all samples of the run.
+    """Mean (n, a) and covariance (n, a, a) of states and gauge noise at each reading, given all readings of the run.
 
     `r` (n, a) and `N` (n, a, a) are the smoother's own: the score of the log likelihood by a shift of the state just after the
     sample before, and its variance.

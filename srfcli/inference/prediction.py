@@ -1,6 +1,8 @@
 """What a model predicts for a run, with exact derivatives, and what belongs to one run alone.
 
-Names are RUN.mu (friction at the first sample), RUN.ln_PHI (logarithm of an age there, s) and RUN.trend (per um or per s).
+Names are RUN.mu (friction at the first sample), RUN.ln_PHI (logarithm of an age there, s), RUN.trend (per um or per s), and of what
+is observed besides RUN.slip (um, where its gauge stands at the first sample), RUN.area and RUN.area_growth: a contact area is
+W/W(t0) area (1 + area_growth ln(phi/1 s)), the growth by the logarithm of age of Dieterich and Kilgore, Pageoph 143 (1994).
 """
 
 from __future__ import annotations
@@ -22,13 +24,16 @@ from srfcli.motion.integrators import integrate
 # What belongs to one run alone and is estimated with the parameters: its unobserved initial state, a trend of its observable.
 
 TINY = 1e-30  # imaginary step: exact to rounding, as nothing is subtracted
+GAUGES = {"slip": ("slip",), "contact_area": ("area", "area_growth")}  # of an observable: what its gauge's reading depends on
+GROWTH = 0.05  # of a contact area by e-fold of its age: 0.02 to 0.1 for rock, glass and polymers
 UNLOADED = 0.1  # least distance of the bounds of a free start's friction: a run may begin without any
 
 
 def own_names(model: GeneratedModel, run: Run, trend: str | None) -> list[str]:
     """Return the names of what this run adds to the parameters."""
     initial = [f"{run.name}.mu", *(f"{run.name}.{s}" for s in _ages(model))] if run.initial == "free" else []
-    return initial + ([f"{run.name}.trend"] if trend else [])
+    gauges = [f"{run.name}.{n}" for s in run.others for n in GAUGES.get(s.observable, ())]
+    return initial + ([f"{run.name}.trend"] if trend else []) + gauges
 
 
 def own_start(
@@ -40,22 +45,37 @@ def own_start(
         steepest = 10 * float(np.ptp(run.observed)) / max(float(np.ptp(basis(run, trend or "slip"))), 1e-9)
         return 0.0, -max(steepest, 1e-9), max(steepest, 1e-9)
     if kind == "mu":
-        first = float(np.median(run.observed[run.used][:5]))
-        W = run.load.rest(float(run.t[0]))
-        mu = {"elongation": first * run.stiffness / W, "force": first / W, "friction": first}[run.observable]
+        mu = first_elongation(run) * run.stiffness / run.load.rest(float(run.t[0]))
         wide = max(0.5 * abs(mu), UNLOADED)
         return mu, mu - wide, mu + wide
+    if kind in {n for names in GAUGES.values() for n in names}:
+        return _gauge_start(run, kind)
     steady = float(np.asarray(model.steady(p))[model.states.index(kind)])
     return steady, steady - 15.0, steady + 15.0
 
 
+def first_elongation(run: Run) -> float:
+    """Return the spring's elongation (um) in the first readings of a run, by the stated stiffness."""
+    W = run.load.rest(float(run.t[0]))
+    over = {"elongation": 1.0, "force": run.stiffness, "friction": run.stiffness / W}[run.observable]
+    return float(np.median(run.observed[run.used][:5])) / over
+
+
+def _gauge_start(run: Run, kind: str) -> tuple[float, float, float]:
+    """Return a start value and bounds for what turns slip or contact area into what their gauges show."""
+    if kind == "area_growth":
+        return GROWTH, 1e-2 * GROWTH, 20 * GROWTH
+    signal = next(s for s in run.others if kind in GAUGES.get(s.observable, ()))
+    y = signal.observed[signal.used]
+    first, wide = float(np.median(y[:5])), max(float(np.ptp(y)), 1e-9)
+    if kind == "slip":
+        return first, first - 2 * wide, first + 2 * wide
+    return first, 0.2 * first, 5.0 * first
+
+
 def basis(run: Run, trend: str) -> Array:
     """Return what a trend is proportional to: the load point's displacement since the first sample (um), or time (s)."""
-    t = run.t - run.t[0]
-    if trend == "time":
-        return t
-    V = run.drive(run.t)
-    return np.concatenate([[0.0], np.cumsum(0.5 * (V[1:] + V[:-1]) * np.diff(run.t))])
+    return run.t - run.t[0] if trend == "time" else run.drive.displacement(run.t)
 
 
 def start_state(

@@ -73,6 +73,10 @@ def fit_recordings(
     the recordings decide, whether it is shared only with `ask_shared`. Without a C compiler there is no field, and noise is
     autoregressive. A fit stopped by Ctrl-C is a status; SrfError is raised for what cannot be fitted.
     """
+    beside = next((run.name for run in experiment.runs if run.others), "")
+    if beside and (track == "shared" or compiler() is None):
+        why = "needs a C compiler" if compiler() is None else "does not go with `track` shared"
+        raise SrfError(f"to fit several observables, as run '{beside}' has, {why}", "Leave `observables` out.")
     if vary and (track == "shared" or compiler() is None):
         why = "needs a C compiler" if compiler() is None else "does not go with `track` shared"
         raise SrfError(f"`vary` {why}", "Leave it out.")
@@ -97,7 +101,8 @@ def fit_recordings(
     if several.interrupted or len(problem.runs) < 2:
         return result
     try:
-        if not (track == "shared" or (ask_shared and track is None and not vary and shared_field(found) > ALIKE)):
+        asked = ask_shared and track is None and not (vary or any(run.others for run in problem.runs))
+        if not (track == "shared" or (asked and shared_field(found) > ALIKE)):
             return result
         tabled = open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),))
         shared = fit_shared(replace(problem, model=tabled), several.best, progress=progress)

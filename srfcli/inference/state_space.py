@@ -16,6 +16,7 @@ import os
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 from typing import Any, TypeVar
 
@@ -27,12 +28,13 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.data.values import Experiment, Run
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
-from srfcli.inference.kalman import Dual, Innovations, Smoothed, kalman_filter, smooth
+from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, stretches
 from srfcli.inference.prediction import (
     TINY,
     Prediction,
     basis,
+    first_elongation,
     own_names,
     own_start,
     run_parameters,
@@ -87,24 +89,46 @@ DIFFERENCE = 1e-5  # relative step of the central differences by which the start
 class Filtered:
     """One run filtered: what the innovations say of the parameters `names`.
 
-    `nu`, `S` (m,) are innovations and their variances at the samples used, `nu_d`, `S_d` (m, k) their derivatives.
+    `every` are those of all readings, signal by signal at each sample. Where a row is a reading that is used, those of the first
+    signal come first, then those of the second, and so on.
     """
 
     run: Run
     names: tuple[str, ...]
-    found: Innovations = field(repr=False)
+    every: Innovations = field(repr=False)
+
+    def of(self, signal: int) -> Innovations:
+        """Return innovations (n,), variances and derivatives of one signal, and what was kept where its readings are."""
+        f, k, c = self.every, len(self.run.signals), slice(signal, None, len(self.run.signals))
+        kept = f.kept and Kept(f.kept.mean[c], f.kept.covariance[c], f.kept.transition[c], f.kept.gradient[c])
+        return Innovations(f.nu[c], f.S[c], f.nu_d[c], f.S_d[c], (f.reached + k - 1 - signal) // k, f.steps, kept)
+
+    @cached_property
+    def found(self) -> Innovations:
+        """Return those of the run's observable."""
+        return self.of(0)
+
+    @cached_property
+    def used(self) -> Array:
+        """Return the places of the readings used (m,) among all, those of the first signal first."""
+        k = len(self.run.signals)
+        return np.concatenate([np.nonzero(s.used)[0] * k + i for i, s in enumerate(self.run.signals)])
 
     @property
     def whole(self) -> bool:
         """Return whether the motion was followed to the last sample, and every variance is one."""
-        f = self.found
-        return f.reached == self.run.t.size and bool(np.isfinite(f.nu).all() and (f.S > 0).all())
+        f = self.every
+        return f.reached == f.nu.size and bool(np.isfinite(f.nu).all() and (f.S > 0).all())
 
     @property
     def white(self) -> Array:
         """Return the innovations over their standard deviations (m,): white noise of variance 1 under the right model."""
-        used = self.run.used
-        return np.asarray(self.found.nu[used] / np.sqrt(self.found.S[used]))
+        return np.asarray(self.every.nu[self.used] / np.sqrt(self.every.S[self.used]))
+
+    @property
+    def parts(self) -> list[Array]:
+        """Return the same for each signal."""
+        return np.split(self.white, np.cumsum([int(s.used.sum()) for s in self.run.signals])[:-1])
 
     @property
     def log_likelihood(self) -> float:
@@ -114,12 +138,12 @@ class Filtered:
     @property
     def log_density(self) -> Array:
         """Return the log density (m,) of each reading given those before it."""
-        return np.asarray(-0.5 * (self.white**2 + np.log(2 * np.pi * self.found.S[self.run.used])))
+        return np.asarray(-0.5 * (self.white**2 + np.log(2 * np.pi * self.every.S[self.used])))
 
     @property
     def slopes(self) -> tuple[Array, Array]:
         """Return the derivatives (m, k) of innovations over their standard deviations, and of the variances' logarithms."""
-        used, f = self.run.used, self.found
+        used, f = self.used, self.every
         S = f.S[used][:, None]
         with np.errstate(over="ignore"):
             return f.nu_d[used] / np.sqrt(S), f.S_d[used] / S
@@ -138,8 +162,77 @@ class Filtered:
             return np.asarray(a.T @ a + 0.5 * b.T @ b)
 
     def smoothed(self) -> Smoothed:
-        """Return states and field given all readings of the run; it was filtered with `keep`."""
-        return smooth(self.found, self.run.used)
+        """Return states and field (n, ...) given all readings of the run; it was filtered with `keep`."""
+        used = np.zeros(self.every.nu.size, dtype=bool)
+        used[self.used] = True
+        found, k = smooth(self.every, used), len(self.run.signals)
+        return Smoothed(found.mean[::k], found.covariance[::k], found.r[::k], found.N[::k])
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """All readings of a run, signal by signal at each sample: times, values, which are used, what they show of the model.
+
+    A reading is `factor` times that plus `offset`; `variance` (signals,) is what rounding adds.
+    """
+
+    t: Array
+    observed: Array
+    used: Array
+    signals: Signals
+    factor: Dual
+    offset: Dual
+    rounding: Array
+
+
+def _rows(
+    model: GeneratedModel,
+    run: Run,
+    K: Dual,
+    values: Mapping[str, float],
+    by: Sequence[str],
+    processes: int,
+    trend: str | None,
+) -> _Rows:
+    n, k, c = run.t.size, len(by), len(run.signals)
+    W = run.load(run.t)[0]
+    factors, offsets, shows, weighs = [], [], [], []
+
+    def own(name: str) -> Dual:
+        return Dual(np.array(values[f"{run.name}.{name}"]), np.array([float(b == f"{run.name}.{name}") for b in by]))
+
+    for number, signal in enumerate(run.signals):
+        what = signal.observable
+        factor, offset = Dual.plain(np.ones(n), k), Dual.plain(np.zeros(n), k)
+        if what in ("force", "friction"):
+            over = np.ones(n) if what == "force" else 1 / W
+            factor = Dual(over * K.v, over[:, None] * K.d)
+        elif what == "slip":  # of the slider: what the spring does not take up of the drive's displacement
+            factor, at = Dual.plain(-np.ones(n), k), own("slip")
+            offset = Dual(run.drive.displacement(run.t) + first_elongation(run) + at.v, np.tile(at.d, (n, 1)))
+        elif what == "contact_area":
+            w, area, growth = W / run.load.rest(float(run.t[0])), own("area"), own("area_growth")
+            factor = Dual(w * area.v * growth.v, np.outer(w, area.v * growth.d + growth.v * area.d))
+            offset = Dual(w * area.v, np.outer(w, area.d))
+        factors.append(factor)
+        offsets.append(offset)
+        weighs.append(float(what in ("force", "friction")))
+        shows.append(model.states.index("ln_phi") if what == "contact_area" else SPRING if number else GAUGE)
+    if trend:
+        along = basis(run, trend)
+        moved, slope = values.get(f"{run.name}.trend", 0.0) * along, [float(b == f"{run.name}.trend") for b in by]
+        offsets[0] = Dual(offsets[0].v + moved, offsets[0].d + np.outer(along, slope))
+
+    def woven(duals: Sequence[Dual]) -> Dual:
+        return Dual(np.stack([a.v for a in duals], axis=1).ravel(), np.stack([a.d for a in duals], axis=1).reshape(n * c, k))
+
+    signals = Signals(
+        np.tile(np.arange(c, dtype=np.intc), n), np.tile(np.array(shows, dtype=np.intc), n), np.tile(weighs, n),
+        tuple(i for i in range(c) for _ in range(processes)),
+    )  # fmt: skip
+    observed, used = (np.stack([getattr(s, name) for s in run.signals], axis=1).ravel() for name in ("observed", "used"))
+    rounding = np.array([s.quantum**2 / 12 for s in run.signals])
+    return _Rows(np.repeat(run.t, c), observed, used, signals, woven(factors), woven(offsets), rounding)
 
 
 def filter_run(
@@ -160,10 +253,10 @@ def filter_run(
     `values` hold those of the model, field_amplitude and field_length among them, `gauge_white`, the standard deviation of white
     gauge noise in the observable's unit, `gauge_colour1` of a coloured part with `gauge_time1` (s) if its correlation falls off
     exponentially or `gauge_frequency1` (Hz) and `gauge_quality1` if it is an oscillator's, and so on up to 3 of these, and what
-    belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. `gauges` say by which names they have those of the gauge, one for
-    each of the run's sampling rates. After `most` steps it is given up.
+    belongs to the run alone: RUN.mu, RUN.ln_PHI, RUN.trend. `gauges` say by which names they have those of the gauge: for each
+    signal, one after the other, one for each of the run's sampling rates. After `most` steps it is given up.
     """
-    k, n = len(by), run.t.size
+    k, c, rates = len(by), len(run.signals), len(run.sampling.spacings)
     p = run_parameters(model, experiment, run, values)
     d = np.zeros((p.size, k))
     share = stiffness_share(experiment, run)
@@ -171,24 +264,22 @@ def filter_run(
         if name in model.names:
             d[model.index(name), j] = share if name == "K" else 1.0
     start, P0 = _belief(model, run, p, values, by, share)
-    K, W = Dual(p[[model.index("K")]], d[[model.index("K")]]), run.load(run.t)[0]
-    over = np.ones(n) if run.observable == "force" else 1 / W
-    factor = Dual.plain(np.ones(n), k) if run.observable == "elongation" else Dual(over * K.v, over[:, None] * K.d)
-    offset = Dual.plain(np.zeros(n), k)
-    if trend:
-        along, name = basis(run, trend), f"{run.name}.trend"
-        offset = Dual(values.get(name, 0.0) * along, np.outer(along, [float(b == name) for b in by]))
-    gauges, rate = gauges or [{n: n for n in values if n.startswith("gauge_")}] * len(run.sampling.spacings), run.sampling.at
-    white = _dual([own["gauge_white"] for own in gauges], values, by)
-    R = Dual((white.v**2)[rate] + run.quantum**2 / 12, (2 * white.v[:, None] * white.d)[rate])
+    gauges = gauges or [{n: n for n in values if n.startswith("gauge_")}] * (rates * c)
     rows = gauge_rows(processes_in(gauges[0]))
+    K = Dual(p[[model.index("K")]], d[[model.index("K")]])
+    read = _rows(model, run, K, values, by, len(rows), trend)
+    rate, which = np.repeat(run.sampling.at, c), read.signals.number
+    white = _dual([own["gauge_white"] for own in gauges], values, by)
+    at = which * rates + rate
+    R = Dual((white.v**2)[at] + read.rounding[which], (2 * white.v[:, None] * white.d)[at])
     colour = _dual([own[n] if n else "" for own in gauges for row in rows for n in (*row, "")[:3]], values, by)
-    gauge = Dual(colour.v.reshape(len(gauges), len(rows), 3), colour.d.reshape(len(gauges), len(rows), 3, k))
+    gauge = [a.reshape(c, rates, len(rows), 3, *a.shape[1:]).swapaxes(0, 1) for a in (colour.v, colour.d)]
     size = np.array([max(float(np.max(np.abs(run.drive.velocities))), 1e-3) if s == "z" else 1.0 for s in model.states])
     fine = np.array([max(values["field_amplitude"], 1e-3) if s.startswith("field") else 1.0 for s in model.states])
     found = kalman_filter(
-        model, Dual(p, d), drive=run.drive, load=run.load, t=run.t, observed=run.observed, used=run.used, start=start,
-        covariance=P0, gauge=gauge, order=[len(row) - 1 for row in rows], rate=rate, factor=factor, offset=offset,
+        model, Dual(p, d), drive=run.drive, load=run.load, t=read.t, observed=read.observed, used=read.used, start=start,
+        covariance=P0, gauge=Dual(gauge[0].reshape(rates, -1, 3), gauge[1].reshape(rates, c * len(rows), 3, k)),
+        order=[len(row) - 1 for row in rows] * c, rate=rate, signals=read.signals, factor=read.factor, offset=read.offset,
         R=R, rtol=rtol, atol=rtol * size * fine, keep=keep, most=most,
     )  # fmt: skip
     return Filtered(run, tuple(by), found)
@@ -312,9 +403,10 @@ class Likelihood:
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs)
         self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
-        self.kinds = list(dict.fromkeys((run.observable, dt) for run in problem.runs for dt in _spacings(run)))
-        wanted = [*(() if smooth else FIELD), *(n for kind in self.kinds for n in self.gauge_names(kind).values())]
-        own = [(n, *scales[n.partition("[")[0].rstrip("123")]) for n in wanted]
+        self.kinds = list(dict.fromkeys(kind for run in problem.runs for kind in _kinds(run)))
+        own = [(n, *scales[n]) for n in (() if smooth else FIELD)]
+        for kind in self.kinds:
+            own += [(name, *scales[n.rstrip("123"), kind[0]]) for n, name in self.gauge_names(kind).items()]
         self.names = (*problem.names, *(row[0] for row in own))
         rows = [*zip(problem.start, problem.lower, problem.upper, strict=True), *(row[1:] for row in own)]
         self.logarithmic = np.array([low > 0 for _, low, _ in rows])
@@ -355,11 +447,11 @@ class Likelihood:
         return {n: n if len(self.kinds) == 1 else f"{n}[{kind[0]}, {kind[1]:g} s]" for n in self._gauge}
 
     def gauges(self, run: Run) -> list[dict[str, str]]:
-        """Return the names of a run's gauge noise at each of its sampling rates, by those that `filter_run` has for them.
+        """Return the names of a run's gauge noise, by those that `filter_run` has for them, of each signal at each sampling rate.
 
         A run that was held out has those of what was sampled most alike.
         """
-        return [self.gauge_like((run.observable, dt)) for dt in _spacings(run)]
+        return [self.gauge_like(kind) for kind in _kinds(run)]
 
     def gauge_like(self, kind: tuple[str, float]) -> dict[str, str]:
         """Return the names of the gauge noise of the kind that is most like this one."""
@@ -424,11 +516,12 @@ class Likelihood:
         return replace(found.point.runs[0], run=run)
 
     def pieces(self, point: Point) -> Iterator[tuple[Array, Array, tuple[str, float]]]:
-        """Yield standardised innovations, their log densities, and the kind of gauge noise, of each run at each of its rates."""
+        """Yield standardised innovations, their log densities, and the kind of gauge noise, of each signal at each of its rates."""
         for f in point.runs:
-            rate = f.run.sampling.at[f.run.used]
-            for k, dt in enumerate(_spacings(f.run)):
-                yield f.white[rate == k], f.log_density[rate == k], (f.run.observable, dt)
+            kind = np.concatenate([i * len(f.run.sampling.spacings) + f.run.sampling.at[s.used] for i, s in enumerate(f.run.signals)])
+            white, density = f.white, f.log_density
+            for k, own in enumerate(_kinds(f.run)):
+                yield white[kind == k], density[kind == k], own
 
     def by_kind(self, point: Point) -> list[float]:
         """Return what each kind of gauge noise has of the log likelihood."""
@@ -475,23 +568,32 @@ class Likelihood:
         return point
 
 
-def _scales(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
-    """Return start value and bounds of the parameters of field and gauge, from the recordings."""
+def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
+    """Return start value and bounds of the parameters of the field, and of the gauge by parameter and observable."""
     friction = max(float(np.median([typical_friction(r) for r in runs])), 1e-6)
     slid = max(float(np.sum(np.abs(r.drive(r.t[1:])) * np.diff(r.t))) for r in runs)
-    level = float(np.median([first_level(r) for r in runs]))
     spacing = min(dt for r in runs for dt in r.sampling.spacings)
     longest = max(float(r.t[-1] - r.t[0]) for r in runs)
     length = max(slid, 1e-6) / PIECES
-    return {
+    found: dict[Any, tuple[float, float, float]] = {
         "field_amplitude": (WIDE[0] * friction, SMALL * friction, 0.3 * friction),
         "field_length": (length, length / 100, 10 * length),
-        "gauge_white": (level, level / 30, 100 * level),
-        "gauge_colour": (level, level / 100, 100 * level),
-        "gauge_time": (10 * spacing, spacing, longest),
-        "gauge_frequency": (0.1 / spacing, 1 / longest, FASTEST / spacing),
-        "gauge_quality": (0.5, *QUALITY),
     }
+    for what in {s.observable for r in runs for s in r.signals}:
+        level = float(np.median([first_level(r.t, s) for r in runs for s in r.signals if s.observable == what]))
+        found |= {
+            ("gauge_white", what): (level, level / 30, 100 * level),
+            ("gauge_colour", what): (level, level / 100, 100 * level),
+            ("gauge_time", what): (10 * spacing, spacing, longest),
+            ("gauge_frequency", what): (0.1 / spacing, 1 / longest, FASTEST / spacing),
+            ("gauge_quality", what): (0.5, *QUALITY),
+        }
+    return found
+
+
+def _kinds(run: Run) -> list[tuple[str, float]]:
+    """Return the kinds of gauge noise of a run: each signal at each of its sampling rates."""
+    return [(s.observable, dt) for s in run.signals for dt in _spacings(run)]
 
 
 def _spacings(run: Run) -> list[float]:
@@ -950,11 +1052,10 @@ def correlated(point: Point) -> float:
 
     That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of a run.
     """
-    worst, longest = 0.0, max(f.white.size for f in point.runs)
+    worst, longest = 0.0, max(white.size for f in point.runs for white in f.parts)
     for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
         product, square = 0.0, 0.0
-        for f in point.runs:
-            white = np.clip(f.white, -5.0, 5.0)
+        for white in (np.clip(w, -5.0, 5.0) for f in point.runs for w in f.parts):
             before = lfilter([0.0, 1.0], [1.0, -np.exp(-1.0 / span)], white)
             product, square = product + float(white @ before), square + float(before @ before)
         worst = max(worst, abs(product) / np.sqrt(square) if square else 0.0)
@@ -965,7 +1066,7 @@ def steadily_coloured(point: Point) -> bool:
     """Return whether the innovations are correlated all along, as a gauge's noise is, and not in a few stretches."""
     if correlated(point) < COLOUR:
         return False
-    found = [portmanteau(piece) > SYSTEMATIC for f in point.runs for piece in cut(f.white)]
+    found = [portmanteau(piece) > SYSTEMATIC for f in point.runs for white in f.parts for piece in cut(white)]
     return 2 * sum(found) > len(found)
 
 
@@ -1182,23 +1283,31 @@ def as_fit(found: StateSpaceFit) -> Fit:
     likelihood, maximum = found.likelihood, found.maximum
     problem, values, k = likelihood.problem, found.values, len(likelihood.problem.names)
     held = [likelihood.held_out(run, values) for run in problem.experiment.runs if run.holdout]
-    rows, runs = gauge_rows(likelihood.processes), []
+    runs, others = [], []
     for f in (*maximum.point.runs, *held):
-        gauges, rate = likelihood.gauges(f.run), f.run.sampling.at
-        levels = np.array([np.hypot(values[own["gauge_white"]], f.run.quantum / np.sqrt(12)) for own in gauges])
-        level = float(np.sqrt(np.mean(levels[rate] ** 2)))
-        every = (tuple(values[own[n]] for n in row) for own in gauges for row in rows)
-        colours = tuple(colour for colour in every if colour[1] > 0.1 * level)
-        with np.errstate(invalid="ignore"):
-            residual = f.found.nu / np.sqrt(f.found.S) * levels[rate]
-        y = f.run.observed - f.found.nu
-        parts = stretches(f.run.t, f.run.used & np.isfinite(residual))
-        prediction = Prediction(y, np.zeros((y.size, 0)), np.zeros((y.size, 0)), Status.OK, float(f.run.t[-1]))
-        runs.append(
-            RunFit(f.run.name, f.run.holdout, prediction, residual, parts, Noise(level, (), level), level, colours)
-        )
+        first, *beside = [_run_fit(likelihood, f, number, values) for number in range(len(f.run.signals))]
+        runs.append(first)
+        others += beside
     return Fit(
         problem.names, {**problem.held, **{n: values[n] for n in problem.names}}, found.covariance[:k, :k], problem.lower,
         problem.upper,
-        tuple(runs), found.log_likelihood, maximum.status, found.evaluations,
+        tuple(runs), found.log_likelihood, maximum.status, found.evaluations, others=tuple(others),
     )  # fmt: skip
+
+
+def _run_fit(likelihood: Likelihood, f: Filtered, number: int, values: Mapping[str, float]) -> RunFit:
+    """Return how one signal of a run is fitted."""
+    run, signal, found, rates = f.run, f.run.signals[number], f.of(number), len(f.run.sampling.spacings)
+    gauges, rate = likelihood.gauges(run)[number * rates : (number + 1) * rates], run.sampling.at
+    levels = np.array([np.hypot(values[own["gauge_white"]], signal.quantum / np.sqrt(12)) for own in gauges])
+    level = float(np.sqrt(np.mean(levels[rate] ** 2)))
+    every = (tuple(values[own[n]] for n in row) for own in gauges for row in gauge_rows(likelihood.processes))
+    colours = tuple(colour for colour in every if colour[1] > 0.1 * level)
+    with np.errstate(invalid="ignore"):
+        residual = found.nu / np.sqrt(found.S) * levels[rate]
+    y = signal.observed - found.nu
+    parts = stretches(run.t, signal.used & np.isfinite(residual))
+    prediction = Prediction(y, np.zeros((y.size, 0)), np.zeros((y.size, 0)), Status.OK, float(run.t[-1]))
+    return RunFit(
+        run.name, run.holdout, prediction, residual, parts, Noise(level, (), level), level, colours, signal.observable
+    )

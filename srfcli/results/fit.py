@@ -33,6 +33,7 @@ PARAMETERS = (
 )
 RUNS = (
     Column("run", "", "name"),
+    Column("observable", "", "elongation, force, friction, slip or contact_area"),
     Column("role", "", "fit, or held out"),
     Column("used", "1", "samples that are compared"),
     Column("rms", "", "of the residual, in the unit beside it"),
@@ -257,12 +258,14 @@ def run_table(fit: Fit, experiment: Experiment) -> Table:
     """Return one row for each run, fitted or held out."""
     from srfcli.inference.noise import lag_one
 
-    rows, units = [], {run.name: run.unit for run in experiment.runs}
-    for f in fit.runs:
+    rows, runs = [], {run.name: run for run in experiment.runs}
+    every = [f for first in fit.runs for f in (first, *(g for g in fit.others if g.name == first.name))]
+    for f in every:
+        observable = f.observable or runs[f.name].observable
         size = sum(b - a for a, b in f.parts)
         ratio = f.rms / f.white if f.white else None
         rows.append(
-            (f.name, "held out" if f.holdout else "fit", size, f.rms, f.white, units[f.name], ratio,
+            (f.name, observable, "held out" if f.holdout else "fit", size, f.rms, f.white, runs[f.name].unit_of(observable), ratio,
              lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
         )  # fmt: skip
     return Table("srf.fit.runs/1", RUNS, rows, "runs")

@@ -23,7 +23,7 @@ class Equations:
     """x' = rates(x, t): `unknowns` are the symbols that stand in the formulas (v, not ln v), `logarithmic` says which.
 
     `load` is W as a function of the imposed load `W` and its rate `W_dot`; `spring` is the elongation u, an unknown or a formula;
-    `reading` is what the gauge shows of it, `stiffness` the spring's.
+    `reading` is what the gauge shows of it, `shown` the same without what effects make of the gauge, `stiffness` the spring's.
     """
 
     names: tuple[str, ...]
@@ -32,6 +32,7 @@ class Equations:
     rates: tuple[sp.Expr, ...]
     spring: sp.Expr
     reading: sp.Expr
+    shown: sp.Expr
     stiffness: sp.Expr
     load: sp.Expr
     mu: sp.Expr
@@ -119,6 +120,7 @@ class Parts:
     V: sp.Expr
     K: sp.Expr
     gauge: sp.Expr
+    plain: sp.Expr  # the gauge before any effect
     shown: tuple[sp.Expr, ...] = ()  # by the gauge, before the effect of each further unknown
 
     def formulas(self) -> tuple[sp.Expr, ...]:
@@ -138,7 +140,7 @@ def parts_of(system: System) -> Parts:
     for slot, formula in (change for effect in system.effects for change in effect.changes):
         if slot == "K":
             stiffness = formula.xreplace({symbol("K"): stiffness})
-    found["gauge"] = symbol("u") * (1 + symbol("weighed") * (stiffness / symbol("K") - 1))
+    found["gauge"] = found["plain"] = symbol("u") * (1 + symbol("weighed") * (stiffness / symbol("K") - 1))
     if system.interface.kappa is not None:
         found["kappa"] = system.interface.kappa
     for effect in system.effects:
@@ -261,10 +263,10 @@ class _Builder:
         filled = [_modulated(r.subs(meaning)) for r in rates]
         self.check_known(filled, {*map(str, unknowns), "V", "W", "W_dot"})
         self.check_known(steady, set())
-        reading = self.parts.gauge
+        reading, shown = self.parts.gauge, self.parts.plain
         if not system.inertia:
-            spring, reading = spring.subs(meaning), reading.subs(meaning)
-        self.check_known([reading], {*map(str, unknowns), "W"})
+            spring, reading, shown = (e.subs(meaning) for e in (spring, reading, shown))
+        self.check_known([reading, shown], {*map(str, unknowns), "W"})
         return Equations(
             names=tuple(names),
             unknowns=tuple(unknowns),
@@ -272,6 +274,7 @@ class _Builder:
             rates=tuple(filled),
             spring=spring,
             reading=reading,
+            shown=shown,
             stiffness=self.parts.K,
             load=self.total_load(),
             mu=self.parts.mu,
