@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 
 from srfcli.codegen.c_source import compiler
 from srfcli.core.errors import SrfError, Status
-from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
+from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run, Signal
 from srfcli.inference.fit import Interrupted, fit_problem
 from srfcli.inference.prediction import predict
 from srfcli.inference.state_space import Likelihood, as_fit, filter_run, fit_state_space, stopped
@@ -203,7 +203,8 @@ def test_gauge_noise_has_the_density_of_its_covariance(make_model):
             assert slope == pytest.approx((up - down) / (2 * step), rel=1e-4, abs=1e-3 / noise[name]), name
 
 
-def test_a_linear_model_agrees_with_statsmodels(make_model):
+@pytest.mark.parametrize("beside", [(), ("slip", "contact_area"), ("force",)], ids=" ".join)
+def test_a_linear_model_agrees_with_statsmodels(make_model, beside):
     """About steady sliding at one velocity everything is linear: matrix exponentials and a filter of another library."""
     kalman = pytest.importorskip("statsmodels.tsa.statespace.kalman_smoother")
     own = RIGS["paper"]
@@ -212,46 +213,67 @@ def test_a_linear_model_agrees_with_statsmodels(make_model):
     run = recording(dt * np.arange(n), "elongation", Drive.constant(5.0), ConstantLoad(5.0))
     used = np.ones(n, bool)
     used[60:75] = False
-    values = own.values | FIELD | {"gauge_white": sd, "gauge_colour1": s, "gauge_time1": tau, "r.trend": 0.0}
-    steady = predict(model, replace(own, run=run).experiment, run, values | {"field_start": 0.0}, rtol=1e-10).y
-    run = replace(run, observed=steady, used=used)
+    seen = [used, *(np.roll(used, 20 * k) for k in range(1, 1 + len(beside)))]
+    run = replace(run, used=used, others=tuple(Signal(what, np.zeros(n), u, 0.0) for what, u in zip(beside, seen[1:], strict=True)))
+    noises = [(sd * f, s * f, tau * g) for f, g in ((1.0, 1.0), (2.0, 0.5), (0.3, 3.0))][: 1 + len(beside)]
+    gauges = [{m: f"{m}[{k}]" for m in ("gauge_white", "gauge_colour1", "gauge_time1")} for k in range(len(noises))]
+    noise = {name: v for own, row in zip(gauges, noises, strict=True) for name, v in zip(own.values(), row, strict=True)}
+    values = own.values | FIELD | noise | {"r.trend": 0.0, "r.slip": 3.0, "r.area": 1.2, "r.area_growth": 0.07}
+    run = replace(run, observed=predict(model, replace(own, run=run).experiment, run, values, rtol=1e-10).y)
+    still = replace(run, others=tuple(replace(s, used=np.zeros(n, bool)) for s in run.others))
+    steady = filter_run(model, own.experiment, still, values, gauges=gauges, rtol=1e-12)
+    others = [replace(s, observed=-steady.of(k).nu) for k, s in enumerate(run.others, 1)]  # so that all stays where it is linear
+    run = replace(run, others=tuple(others))
     own = replace(own, run=run)
-    found = filter_run(model, own.experiment, run, values, by=["r.trend"], trend="time", rtol=1e-12, keep=True)
+    found = filter_run(
+        model, own.experiment, run, values, by=["r.trend"], gauges=gauges, trend="time", rtol=1e-12, keep=True
+    )
 
     p = model.vector(
         {k: v for k, v in values.items() if k in model.names} | {"V": 5.0, "W0": 5.0, "K": 0.21, "M": 2.37e-6}
     )
     x0 = np.asarray(model.steady(p))
     J, g = np.asarray(model.rates_jacobian(x0, 5.0, 5.0, 0.0, p)), np.asarray(model.field_gain(x0, 5.0, 5.0, 0.0, p))
-    k = x0.size
+    k, c = x0.size, len(noises)
     block = expm(np.block([[-J, np.outer(g, g)], [np.zeros((k, k)), J.T]]) * dt)  # Van Loan 1978
-    T = np.zeros((k + 1, k + 1))
-    T[:k, :k], T[k, k] = block[k:, k:].T, np.exp(-dt / tau)
+    times, sizes = np.array([tau for *_, tau in noises]), np.array([s for _, s, _ in noises])
+    T = np.zeros((k + c, k + c))
+    T[:k, :k], T[k:, k:] = block[k:, k:].T, np.diag(np.exp(-dt / times))
     Q = np.zeros_like(T)
-    Q[:k, :k], Q[k, k] = T[:k, :k] @ block[:k, k:], s**2 * (1 - np.exp(-2 * dt / tau))
+    Q[:k, :k], Q[k:, k:] = T[:k, :k] @ block[:k, k:], np.diag(sizes**2 * (1 - np.exp(-2 * dt / times)))
     columns = np.zeros((k, 2))
     for j, name in enumerate(("field_start", "field_slope_start")):
         up, down = (model.steady(model.vector(dict(zip(model.names, p, strict=True)) | {name: e})) for e in (0.5, -0.5))
         columns[:, j] = np.asarray(up) - np.asarray(down)
     P0 = np.zeros_like(T)
-    P0[:k, :k], P0[k, k] = columns @ columns.T, s**2
+    P0[:k, :k], P0[k:, k:] = columns @ columns.T, np.diag(sizes**2)
+    shows = {"slip": (0, -1.0), "force": (0, 0.21), "contact_area": (3, 1.2 * 0.07)}  # a state, and by how much
 
-    filt = kalman.KalmanSmoother(k_endog=1, k_states=k + 1, loglikelihood_burn=0)
-    filt["design"] = np.r_[1.0, np.zeros(k - 1), 1.0][None, :]
-    filt["obs_cov"], filt["transition"], filt["selection"] = np.array([[sd**2]]), T, np.eye(k + 1)
+    filt = kalman.KalmanSmoother(k_endog=c, k_states=k + c, loglikelihood_burn=0)
+    design = np.hstack([np.zeros((c, k)), np.eye(c)])
+    for row, (state, size) in enumerate([(0, 1.0), *(shows[what] for what in beside)]):
+        design[row, state] = size
+    filt["design"], filt["obs_cov"] = design, np.diag([white**2 for white, *_ in noises])
+    filt["transition"], filt["selection"] = T, np.eye(k + c)
     filt["state_cov"] = 0.5 * (Q + Q.T)
-    filt.initialize_known(np.zeros(k + 1), P0)
+    filt.initialize_known(np.zeros(k + c), P0)
     filt.tolerance = 0.0
-    data = run.t.copy()
-    data[~used] = np.nan
-    filt.bind(data[:, None].copy())
+    filt.filter_univariate = True  # one reading after the other
+    data = np.column_stack([run.t, *np.zeros((c - 1, n))])
+    for column, own_used in enumerate(seen):
+        data[~own_used, column] = np.nan
+    filt.bind(data)
     theirs = filt.smooth()
-    S, nu = theirs.forecasts_error_cov[0, 0], theirs.forecasts_error[0]
-    assert np.abs(found.found.S / S - 1).max() < 1e-8
-    linear = -found.found.nu_d[:, 0]  # innovations that readings proportional to time would bring, as all is linear
-    assert np.abs(linear - nu)[used].max() < 1e-8 * np.abs(nu[used]).max()
-    ours = -0.5 * np.sum(np.log(2 * np.pi * found.found.S[used]) + linear[used] ** 2 / found.found.S[used])
-    assert ours == pytest.approx(float(theirs.llf), rel=1e-8)
+    every = np.all(seen, axis=0)  # elsewhere statsmodels puts what it has of them in another order; the likelihood counts all
+    for signal in range(c):
+        ours = found.of(signal)
+        S, nu = theirs.forecasts_error_cov[signal, signal], theirs.forecasts_error[signal]
+        assert np.abs(ours.S / S - 1)[every].max() < 1e-8
+        linear = -ours.nu_d[:, 0]  # innovations that readings proportional to time would bring, as all is linear
+        scale = np.abs(theirs.forecasts_error[0][used]).max() * (1.0 if signal == 0 else abs(shows[beside[signal - 1]][1]))
+        assert np.abs(linear - nu)[every].max() < 1e-8 * scale
+    nu, S = -found.every.nu_d[found.used, 0], found.every.S[found.used]
+    assert -0.5 * np.sum(np.log(2 * np.pi * S) + nu**2 / S) == pytest.approx(float(theirs.llf), rel=1e-8)
     assert np.abs(found.smoothed().covariance[:, 0, 0] / theirs.smoothed_state_cov[0, 0] - 1).max() < 1e-6
     assert np.abs(found.smoothed().covariance[:, 4, 4] / theirs.smoothed_state_cov[4, 4] - 1).max() < 1e-6
 

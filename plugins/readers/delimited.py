@@ -99,6 +99,8 @@ def _layout(head: bytes) -> _Layout | None:
         return None
     delimiter, decimal = _how(lines[begin])
     count = len(_cells(lines[begin], delimiter))
+    while begin and _is_row(_cells(lines[begin - 1], delimiter), count, decimal):  # a first row with an empty cell
+        begin -= 1
     above = [k for k in range(begin) if lines[k]]
     names, units = None, None
     for k in reversed(above[-4:]):
@@ -178,6 +180,12 @@ def _cells(line: str, delimiter: str, count: int = 0) -> list[str]:
 
 def _is_number(cell: str, decimal: str) -> bool:
     return bool(NUMBER.fullmatch(cell.replace(decimal, ".", 1))) or cell.lower() in NOTHING - {""}
+
+
+def _is_row(cells: Sequence[str], count: int, decimal: str) -> bool:
+    """Return whether these are the cells of a row of numbers, some of which may be empty."""
+    filled = [cell for cell in cells if cell]
+    return len(cells) == count and bool(filled) and all(_is_number(cell, decimal) for cell in filled)
 
 
 def _is_unit(cell: str) -> bool:

@@ -100,11 +100,14 @@ def _options(function: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--observe",
             "observable",
-            type=click.Choice(["elongation", "force", "friction"]),
-            help="What the apparatus records.  [default: elongation]",
+            metavar="NAMES",
+            help="What the apparatus records: elongation, force or friction, and besides it another, slip or contact_area, "
+            "as force,slip.  [default: elongation]",
         ),
         click.option(
-            "--noise", metavar="SIZE", help="Standard deviation of the gauge's noise, in the observable's unit."
+            "--noise",
+            metavar="SIZE",
+            help="Standard deviation of the gauge's noise, in the observable's unit; of several one for each, as 0.01,0.2.",
         ),
         click.option("--lag1", type=float, default=0.0, help="Correlation of the noise from sample to sample, as 0.8."),
         click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded."),
@@ -272,7 +275,7 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     """Return the one record that the options describe; raises SrfError for what cannot be simulated or written."""
     model = system.model()
     resolved = system.resolve(model.parameters, **{name: given[name] for name in ("V", "W0", "eps")})
-    values, observable = resolved.values, given["observable"] or "elongation"
+    values, (observable, *beside) = resolved.values, _observables(given["observable"])
     p = model.vector(values)
     model.check_changing_load(p)
     recorded, begin, span, found = _recorded_load(system, given["load_file"], given["reader"])
@@ -285,11 +288,11 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     load, modulation = _modulated(base, given["onset"], values, begin)
     load.check(float(t[0]), float(t[-1]))
     start = start_state(model, p, given["start"], drive=drive, load=load.rest(begin), begin=begin)
-    job, mover = Job(NAME, p, drive, load, t, start, observable, f, modulation), model
+    job, mover = Job(NAME, p, drive, load, t, start, observable, f, modulation, beside=tuple(beside)), model
     if (track := _track(system, given)) is not None:
         mover = system.model(tables=TABLES)
         job = on_track(model, mover, job, track, start=given["start"])
-    gauge = read_gauge(given, observable)
+    gauge, others = read_gauges(given, [observable, *beside])
     described = _own_parameters(resolved, given) | track_parameters(track, given)
     noted, told = track_notes(track)
     chosen = _free(model, given["free"])
@@ -300,7 +303,7 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
         )
 
     def experiment(records: Sequence[Record]) -> Experiment:
-        runs = tuple(simulated_run(mover, r, quantum=gauge.quantum) for r in records)
+        runs = tuple(simulated_run(mover, r, gauge, others) for r in records)
         fitted = fit_parameters(model, values, chosen)
         return _experiment(system, model, given["folder"], values, perturbed(fitted, spread, gauge.seed), runs)
 
@@ -309,22 +312,40 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     meta = {"rate_Hz": sorted(set(rates)), "rtol": given["rtol"], "onset": modulation and modulation[2], **told}
     taken = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
     system.say_defaults(resolved, [name for name, program in taken.items() if program is None])
-    return Work(mover, (job,), gauge, described, experiment, inputs, notes, meta)
+    return Work(mover, (job,), gauge, described, experiment, inputs, notes, meta, others)
 
 
-def read_gauge(given: Mapping[str, Any], observable: str) -> Gauge:
-    """Return the gauge that the options ask for, sizes in the observable's unit; raises SrfError for what no gauge does."""
+def _observables(text: str | None) -> list[str]:
+    from srfcli.tasks.simulate import check_observables
+
+    return check_observables([name.strip() for name in (text or "elongation").split(",")])
+
+
+def read_gauges(given: Mapping[str, Any], observables: Sequence[str]) -> tuple[Gauge, dict[str, Gauge]]:
+    """Return the gauge of the first observable and those of the others, by name, that the options ask for.
+
+    Sizes are in the observable's unit. Raises SrfError for what no gauge does.
+    """
     from srfcli.data.noise import check_gauge
-    from srfcli.data.values import OBSERVABLES
+    from srfcli.data.values import BESIDE, OBSERVABLES
 
-    texts = {name: given[name] for name in ("noise", "quantum")}
-    sizes = {
-        n: 0.0 if text is None else parse_quantity(text, OBSERVABLES[observable], name=f"--{n}")
-        for n, text in texts.items()
-    }
-    gauge = Gauge(sizes["noise"], given["lag1"], sizes["quantum"], given["seed"])
-    check_gauge(noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed)
-    return gauge
+    sizes: dict[str, list[float]] = {}
+    for name in ("noise", "quantum"):
+        texts = ["0"] * len(observables) if given[name] is None else given[name].split(",")
+        if len(texts) != len(observables):
+            raise SrfError(
+                f"--{name} {given[name]}: found {len(texts)}, expected one for each of {', '.join(observables)}",
+                f"Write --{name} {','.join(['0.01'] * len(observables))}.",
+            )
+        units = [(OBSERVABLES | BESIDE)[observable] for observable in observables]
+        sizes[name] = [parse_quantity(text, unit, name=f"--{name}") for text, unit in zip(texts, units, strict=True)]
+    silent = any(sizes["noise"])  # a gauge without noise beside others; of none, a colour is told
+    gauges = [
+        Gauge(n, given["lag1"] if n or not silent else 0.0, q, given["seed"]) for n, q in zip(*sizes.values(), strict=True)
+    ]
+    for gauge in gauges:
+        check_gauge(noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed)
+    return gauges[0], dict(zip(observables[1:], gauges[1:], strict=True))
 
 
 def _track(system: SystemOptions, given: Mapping[str, Any]) -> RoughTrack | None:
@@ -536,13 +557,13 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
     model = _open(registry, choice)
     flags = _flags(system, model)
     runs = _chosen(experiment, given["runs"])
-    observables = sorted({run.observable for run in runs})
+    observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in runs))
     if len(observables) > 1 and (given["noise"] or given["quantum"]):
         raise SrfError(
-            f"the runs record {' and '.join(observables)}: one --noise has no unit for all",
+            f"the runs record {' and '.join(', '.join(names) for names in sorted(observables))}: one --noise has no unit for all",
             "Choose runs that record the same, with --run.",
         )
-    gauge = read_gauge(given, runs[0].observable)
+    gauge, others = read_gauges(given, observables[0])
     spread = parse_spread(given["start_values"])
     jobs, mover = tuple(_job(model, experiment, run, flags, given["start"]) for run in runs), model
     if (track := read_track(given)) is not None:
@@ -550,7 +571,7 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
         jobs = tuple(on_track(model, mover, job, track, start=given["start"]) for job in jobs)
 
     def made(records: Sequence[Record]) -> Experiment:
-        again = tuple(simulated_run(mover, r, quantum=gauge.quantum) for r in records)
+        again = tuple(simulated_run(mover, r, gauge, others) for r in records)
         return _written(
             experiment, model, choice, flags, perturb=(spread, gauge.seed), runs=again, folder=given["folder"]
         )
@@ -561,7 +582,7 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
     free = [run.name for run in runs if run.initial == "free"]
     notes = (f"initial state of {', '.join(free)} not known: begun in steady sliding",) if free else ()
     meta = {"title": experiment.title, "rtol": given["rtol"], **told}
-    return Work(mover, jobs, gauge, described, made, inputs, (*notes, *noted), meta)
+    return Work(mover, jobs, gauge, described, made, inputs, (*notes, *noted), meta, others)
 
 
 def _choice(system: SystemOptions, choice: ModelChoice) -> ModelChoice:
@@ -619,7 +640,8 @@ def _job(model: GeneratedModel, experiment: Experiment, run: Run, flags: Mapping
     except SrfError as error:
         raise SrfError(f"run {run.name!r}: {error.message}", error.hint) from error
     ripple = run.modulation[0] if run.modulation else None
-    return Job(run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run)
+    beside = tuple(signal.observable for signal in run.others)
+    return Job(run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run, beside=beside)
 
 
 def _asked_by_effects(model: GeneratedModel, run: Run) -> dict[str, float]:

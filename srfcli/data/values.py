@@ -18,6 +18,7 @@ from srfcli.motion.imposed import Drive, Load
 
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
 BESIDE = {"slip": "um", "contact_area": "1"}  # what may be observed besides one of these
+AREA_GROWTH = 0.05  # of a contact area by e-fold of its age: 0.02 to 0.1 for rock, glass and polymers
 
 
 @dataclass(frozen=True)
@@ -120,9 +121,13 @@ class Run:
 
     @property
     def quantity(self) -> str:
-        """Return what is observed, in words: spring elongation, force, shear stress or friction coefficient."""
-        names = {"elongation": "elongation", "force": "shear stress" if self.stress else "force"}
-        return names.get(self.observable, "friction coefficient")
+        """Return what is observed, in words: elongation, force, shear stress or friction coefficient."""
+        return self.quantity_of(self.observable)
+
+    def quantity_of(self, observable: str) -> str:
+        """Return an observable of this run in words."""
+        names = {"force": "shear stress" if self.stress else "force", "friction": "friction coefficient"}
+        return names.get(observable, observable.replace("_", " "))
 
 
 @dataclass(frozen=True)

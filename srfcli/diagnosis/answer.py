@@ -36,6 +36,7 @@ class RunView:
     noise: float
     slip: Array
     white: tuple[Array, Array] = field(repr=False)
+    others: tuple[tuple[Array, Array], ...] = field(repr=False, default=())
 
 
 def run_views(diagnosis: Diagnosis) -> tuple[RunView, ...]:
@@ -52,9 +53,11 @@ def _view(before: Filtered, after: Filtered, holdout: bool) -> RunView:
     white = [f.found.nu / np.sqrt(f.found.S) for f in sides]
     rms = [float(np.sqrt(np.mean(w[run.used] ** 2))) for w in white]
     noise = float(np.median(np.sqrt(after.found.S[run.used])))
+    others = tuple((s.observed - before.of(i).nu, s.observed - after.of(i).nu) for i, s in enumerate(run.others, 1))
     return RunView(
-        replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), noise, slip_of(run, y[1]), (white[0], white[1])
-    )
+        replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), noise, slip_of(run, y[1]), (white[0], white[1]),
+        others,
+    )  # fmt: skip
 
 
 def slip_of(run: Run, predicted: Array) -> Array:

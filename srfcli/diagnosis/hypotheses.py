@@ -88,6 +88,8 @@ def _unseen(effect: Effect, experiment: Experiment) -> str:
     if "W" in used and not effect.states and max(spread, between) < 1e-3:
         wide = 100 * max(spread, between)
         return f"the loads of all runs lie within {wide:.2g} %" if wide else "the load is constant, the same in all runs"
+    if "V" in formulas and any(s.observable == "slip" for run in experiment.runs for s in run.others):
+        return "the slip that is observed is compared with the drive as it is stated"
     unmodulated = not any(of_run(run)["modulated"] for run in experiment.runs)
     if unmodulated and formulas and all(f.subs(UNMODULATED) == symbol(slot) for slot, f in formulas.items()):
         return "no run has a modulated load"

@@ -17,7 +17,7 @@ from srfcli.codegen.splines import Spline, appended
 from srfcli.core.errors import Status
 from srfcli.core.units import split_quantity
 from srfcli.data.imposed import find_modulation
-from srfcli.data.values import Experiment, Run
+from srfcli.data.values import AREA_GROWTH, Experiment, Run
 from srfcli.motion.imposed import Load
 from srfcli.motion.integrators import integrate
 
@@ -25,7 +25,6 @@ from srfcli.motion.integrators import integrate
 
 TINY = 1e-30  # imaginary step: exact to rounding, as nothing is subtracted
 GAUGES = {"slip": ("slip",), "contact_area": ("area", "area_growth")}  # of an observable: what its gauge's reading depends on
-GROWTH = 0.05  # of a contact area by e-fold of its age: 0.02 to 0.1 for rock, glass and polymers
 UNLOADED = 0.1  # least distance of the bounds of a free start's friction: a run may begin without any
 
 
@@ -64,7 +63,7 @@ def first_elongation(run: Run) -> float:
 def _gauge_start(run: Run, kind: str) -> tuple[float, float, float]:
     """Return a start value and bounds for what turns slip or contact area into what their gauges show."""
     if kind == "area_growth":
-        return GROWTH, 1e-2 * GROWTH, 20 * GROWTH
+        return AREA_GROWTH, 1e-2 * AREA_GROWTH, 20 * AREA_GROWTH
     signal = next(s for s in run.others if kind in GAUGES.get(s.observable, ()))
     y = signal.observed[signal.used]
     first, wide = float(np.median(y[:5])), max(float(np.ptp(y)), 1e-9)

@@ -402,10 +402,14 @@ def prediction_names(runs: list[str], word: str = "prediction") -> list[str]:
 
 def prediction_csv(view: RunView) -> str:
     """Return a run as recorded and as predicted by both models, in full precision; empty where there is nothing."""
-    unit = view.run.unit
-    lines = [f"time [s],observed [{unit}],baseline [{unit}],augmented [{unit}]"]
-    observed = np.where(view.run.used, view.run.observed, np.nan)
-    columns = (view.run.t, observed, view.baseline, view.augmented)
+    run, unit = view.run, view.run.unit
+    heads = ["time [s]", f"observed [{unit}]", f"baseline [{unit}]", f"augmented [{unit}]"]
+    columns = [run.t, np.where(run.used, run.observed, np.nan), view.baseline, view.augmented]
+    for signal, sides in zip(run.others, view.others, strict=True):
+        unit = run.unit_of(signal.observable)
+        heads += [f"{signal.observable} {side} [{unit}]" for side in ("observed", "baseline", "augmented")]
+        columns += [np.where(signal.used, signal.observed, np.nan), *sides]
+    lines = [",".join(heads)]
     for row in zip(*(c.tolist() for c in columns), strict=True):
         lines.append(",".join(repr(x) if np.isfinite(x) else "" for x in row))
     return "\n".join(lines) + "\n"

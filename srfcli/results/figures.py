@@ -483,11 +483,13 @@ def envelope(t: Any, y: Any, *, bins: int = BINS) -> tuple[Any, Any]:
 
 # A fit as a figure: each run's recording and prediction above its residual, in units of the noise.
 
-FitRow = tuple[str, bool, Any, Any, Any, float]
+FitRow = tuple[str, bool, str, Any, Any, Any, float]
 
 
-def fit_figure(rows: Sequence[FitRow], *, quantity: str, unit: str, title: str = "", found: str = "") -> Figure:
-    """Return a figure of two panels for each run; a row is (name, held out, t in s, recorded, predicted, noise level).
+def fit_figure(rows: Sequence[FitRow], *, title: str = "", found: str = "") -> Figure:
+    """Return a figure of two panels for each observable of a run.
+
+    A row is (name, held out, quantity with its unit, t in s, recorded, predicted, noise level).
 
     `title` names the laws, `found` the parameters with their errors.
     """
@@ -496,9 +498,8 @@ def fit_figure(rows: Sequence[FitRow], *, quantity: str, unit: str, title: str =
         lines = -(-len(rows) // columns)
         figure = bare_figure((6.0 * columns if columns == 1 else 5.2 * columns, 2.9 * lines + 0.9))
         grid = figure.add_gridspec(lines, columns)
-        label = quantity if unit == "1" else f"{quantity}\n[{unit.replace('um', 'µm')}]"
         handles: list[Any] = []
-        for place, (name, holdout, t, recorded, predicted, noise) in enumerate(rows):
+        for place, (name, holdout, label, t, recorded, predicted, noise) in enumerate(rows):
             cell = grid[place // columns, place % columns].subgridspec(2, 1, height_ratios=(2, 1), hspace=0.05)
             above = figure.add_subplot(cell[0])
             below = figure.add_subplot(cell[1], sharex=above)

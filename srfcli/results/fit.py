@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import Status
 from srfcli.core.units import from_base
+from srfcli.data.values import OBSERVABLES
 from srfcli.results.tables import Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from srfcli.data.values import Experiment
-    from srfcli.inference.fit import Fit, Problem
+    from srfcli.inference.fit import Fit, Problem, RunFit
     from srfcli.inference.posterior import Interval, Posterior
     from srfcli.inference.recordings import RecordingFit
 
@@ -158,8 +159,12 @@ class FitResult(Result):
         own_figure(ax, "a fit")
         problem, fit, experiment = self.found.problem, self.found.fit, self.experiment
         runs = {r.name: r for r in experiment.runs}
-        rows = [(f.name, f.holdout, runs[f.name].t, runs[f.name].observed, f.prediction.y, f.white) for f in fit.runs]
-        one, told = next(iter(runs.values())), []
+        rows, told = [], []
+        for f in every_observable(fit):
+            run, what = runs[f.name], f.observable or runs[f.name].observable
+            unit, signal = run.unit_of(what), next(s for s in run.signals if s.observable == what)
+            label = run.quantity_of(what) + ("" if unit == "1" else f"\n[{unit.replace('um', 'µm')}]")
+            rows.append((f.name, f.holdout, label, run.t, signal.observed, f.prediction.y, f.white))
         for name in fit.names:
             declared = unit_of(problem, name)
             unit, factor = experiment.shown(declared)
@@ -168,7 +173,7 @@ class FitResult(Result):
             told.append(f"{symbol_text(name)} = {bracketed(value, error)}{shown}")
         choice = experiment.choice
         title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
-        return fit_figure(rows, quantity=one.quantity, unit=one.unit, title=title, found=", ".join(told))
+        return fit_figure(rows, title=title, found=", ".join(told))
 
 
 def parameter_table(
@@ -254,13 +259,17 @@ def _posterior_notes(posterior: Posterior) -> list[str]:
     return notes
 
 
+def every_observable(fit: Fit) -> list[RunFit]:
+    """Return how each observable is fitted, run by run."""
+    return [f for first in fit.runs for f in (first, *(g for g in fit.others if g.name == first.name))]
+
+
 def run_table(fit: Fit, experiment: Experiment) -> Table:
     """Return one row for each run, fitted or held out."""
     from srfcli.inference.noise import lag_one
 
     rows, runs = [], {run.name: run for run in experiment.runs}
-    every = [f for first in fit.runs for f in (first, *(g for g in fit.others if g.name == first.name))]
-    for f in every:
+    for f in every_observable(fit):
         observable = f.observable or runs[f.name].observable
         size = sum(b - a for a, b in f.parts)
         ratio = f.rms / f.white if f.white else None
@@ -297,8 +306,13 @@ def varied_table(problem: Problem, fit: Fit) -> Table | None:
 
 
 def unit_of(problem: Problem, name: str) -> str:
-    """Return the unit that a parameter is declared in; K that of the stated stiffness, what belongs to a run 1 or s."""
+    """Return the unit that a parameter is declared in; K that of the stated stiffness, what belongs to a run 1, um or s."""
     listed = {q.name: q.unit for q in problem.experiment.parameters}
+    run = next((r for r in problem.experiment.runs if name.startswith(f"{r.name}.")), None)
+    if run is not None and name not in listed:
+        along = {"slip": "um", "time": "s"}.get(problem.trend or "", "")
+        unit = OBSERVABLES[run.observable]
+        return {f"{run.name}.slip": "um", f"{run.name}.trend": f"{unit}/{along}"}.get(name, "1")
     return listed.get(name, listed.get(name.partition("[")[0], "1"))
 
 

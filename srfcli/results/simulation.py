@@ -50,16 +50,21 @@ class Job:
     modulation: tuple[float, float, float] | None = None
     run: Run | None = None
     tables: tuple[Spline, ...] = ()
+    beside: tuple[str, ...] = ()  # observables besides
 
 
 @dataclass(frozen=True)
 class Record:
-    """A job done: its trace up to where it got, the clean observable and, where a gauge was asked for, its readings."""
+    """A job done: its trace up to where it got, the clean observable and, where a gauge was asked for, its readings.
+
+    `others` are, of each observable besides, the readings or, without a gauge, what it would show.
+    """
 
     job: Job
     trace: Trace
     observed: Array
     measured: Array | None
+    others: tuple[Array, ...] = ()
 
     @property
     def done(self) -> int:
@@ -70,21 +75,29 @@ class Record:
         return int(reached.size if reached.all() else np.argmin(reached))
 
 
-def observe(model: GeneratedModel, job: Job, trace: Trace) -> Array:
-    """Return what the apparatus would record: the spring's elongation (um), its force (N), or that over the load.
+def observe(model: GeneratedModel, job: Job, trace: Trace, observable: str) -> Array:
+    """Return what the apparatus would record: the spring's elongation (um), its force (N), that over the load, and the like.
 
-    The elongation is the one that a gauge shows, where an effect stands between the two.
+    The job's own observable is what a gauge shows, where an effect stands between the two. The slip (um)
+    is that of the slider since the first sample, the contact area grows by AREA_GROWTH by e-fold of its age in s.
     """
     import numpy as np
 
-    K, u, reading = float(job.p[model.index("K")]), trace.u, model.namespace.get("reading")
-    if reading is not None:
+    from srfcli.data.values import AREA_GROWTH
+
+    if observable == "contact_area":
+        return np.asarray(trace.W / trace.W[0] * (1 + AREA_GROWTH * trace.state("ln_phi")))
+    if observable == "slip":
+        return np.asarray(job.drive.displacement(trace.t) - (trace.u - trace.u[0]))
+    K, u = float(job.p[model.index("K")]), trace.u
+    if (shown := model.namespace.get("reading" if observable == job.observable else "stiffness")) is not None:
         W0 = dict.fromkeys(["W0"], job.load.rest(float(job.t[0])))
         p = model.vector(dict(zip(model.names, job.p.tolist(), strict=True)) | W0)
-        u = np.asarray(reading(trace.x, trace.V, trace.W, np.zeros_like(trace.W), p))
-    if job.observable == "elongation":
+        found = np.asarray(shown(trace.x, trace.V, trace.W, np.zeros_like(trace.W), p))
+        u, K = (found, K) if observable == job.observable else (u, found)
+    if observable == "elongation":
         return u
-    return K * u if job.observable == "force" else K * u / trace.W
+    return K * u if observable == "force" else K * u / trace.W
 
 
 @dataclass(frozen=True)
@@ -100,20 +113,24 @@ class Gauge:
     seed: int = 0
 
 
-def measure(gauge: Gauge, job: Job, observed: Array) -> Array | None:
-    """Return the observable through the gauge, None where it reads exactly; each run has its own noise."""
+def measure(gauge: Gauge, job: Job, observed: Array, observable: str = "") -> Array | None:
+    """Return the observable through its gauge, None where it reads exactly; each run, and what it has besides, has its own noise."""
     from srfcli.data.noise import measured
 
     if not (gauge.noise or gauge.quantum):
         return None
     return measured(
-        observed, noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed, stream=job.name
+        observed, noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed,
+        stream=" ".join(filter(None, (job.name, observable))),
     )
 
 
 @dataclass(frozen=True)
 class Work:
-    """What is to be simulated, and what is needed to tell and to write it: `experiment` makes one of the records."""
+    """What is to be simulated, and what is needed to tell and to write it: `experiment` makes one of the records.
+
+    `others` are the gauges of what is observed besides.
+    """
 
     model: GeneratedModel
     jobs: tuple[Job, ...]
@@ -123,6 +140,7 @@ class Work:
     inputs: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
     meta: Mapping[str, Any] = field(default_factory=dict)
+    others: Mapping[str, Gauge] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -185,7 +203,7 @@ class Rows(Sequence[tuple[Any, ...]]):
 
 def record_table(work: Work, records: Sequence[Record], *, status: Status) -> Table:
     """Return the records one below the other: t, V, W, u, v, the ages, mu, tau, and what was recorded or measured."""
-    from srfcli.data.values import OBSERVABLES
+    from srfcli.data.values import BESIDE, OBSERVABLES
 
     model, named = work.model, any(job.run is not None for job in work.jobs)
     gauge = any(r.measured is not None for r in records)
@@ -205,7 +223,11 @@ def record_table(work: Work, records: Sequence[Record], *, status: Status) -> Ta
     unit = units.pop() if len(units) == 1 else "um, N or 1"
     columns += [Column("recorded", unit, "what the run's file holds")] if named else []
     columns += [Column("measured", unit, "the simulated observable through the gauge")] if gauge else []
-    blocks = [_block(r, ages, named=named, gauge=gauge) for r in records]
+    told = {"slip": "slip of the slider since the first sample", "contact_area": "contact area over that of contacts of 1 s"}
+    beside = list(dict.fromkeys(name for job in work.jobs for name in job.beside))
+    every = OBSERVABLES | BESIDE
+    columns += [Column(name, every[name], told.get(name, "what another gauge shows")) for name in beside]
+    blocks = [_block(r, ages, beside, named=named, gauge=gauge) for r in records]
     notes = (*work.notes, *(note for r in records for note in summary(r, named=named)))
     meta = {"samples": {r.job.name: r.done for r in records}, **work.meta}
     return Table(
@@ -213,7 +235,7 @@ def record_table(work: Work, records: Sequence[Record], *, status: Status) -> Ta
     )
 
 
-def _block(r: Record, ages: list[str], *, named: bool, gauge: bool) -> tuple[tuple[Any, ...], Sequence[Array]]:
+def _block(r: Record, ages: list[str], beside: list[str], *, named: bool, gauge: bool) -> tuple[tuple[Any, ...], Sequence[Array]]:
     import numpy as np
 
     n, trace = r.done, r.trace
@@ -225,6 +247,8 @@ def _block(r: Record, ages: list[str], *, named: bool, gauge: bool) -> tuple[tup
         columns.append(np.where(r.job.run.used, r.job.run.observed, np.nan))
     if gauge:
         columns.append(r.observed if r.measured is None else r.measured)
+    others = dict(zip(r.job.beside, r.others, strict=True))
+    columns += [others.get(name, np.full(trace.t.size, np.nan)) for name in beside]
     return ((r.job.name,) if named else ()), [c[:n] for c in columns]
 
 
@@ -304,23 +328,25 @@ def curves(records: Sequence[Record]) -> list[dict[str, Any]]:
     return drawn
 
 
-def simulated_run(model: GeneratedModel, r: Record, *, quantum: float) -> Run:
+def simulated_run(model: GeneratedModel, r: Record, gauge: Gauge, others: Mapping[str, Gauge]) -> Run:
     """Return the run as a recording of the simulation; what the repeated run says beside the observable is kept."""
     import dataclasses
 
     import numpy as np
 
-    from srfcli.data.values import Run
+    from srfcli.data.values import Run, Signal
 
     observed = r.observed if r.measured is None else r.measured
     job, used = r.job, np.ones(observed.size, bool)
+    beside = tuple(Signal(name, y, used, others[name].quantum) for name, y in zip(job.beside, r.others, strict=True))
     initial = "steady" if job.start is None else "free"  # the form has no other word for a state of one's own
     K = float(job.p[model.index("K")])
     if job.run is not None:
         return dataclasses.replace(
-            job.run, observed=observed, used=used, quantum=quantum, notices=(), stiffness=K, initial=initial
-        )
+            job.run, observed=observed, used=used, quantum=gauge.quantum, notices=(), stiffness=K, initial=initial,
+            others=beside,
+        )  # fmt: skip
     return Run(
         job.name, Path(f"{job.name}.csv"), False, 0.0, initial, job.t, observed, job.observable, used, job.drive,
-        job.load, K, job.modulation, quantum, (),
+        job.load, K, job.modulation, gauge.quantum, (), others=beside,
     )  # fmt: skip

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from srfcli.core.errors import SrfError, Status, worst
-from srfcli.data.values import OBSERVABLES
+from srfcli.core.errors import SrfError, Status, did_you_mean, worst
+from srfcli.data.description import MOST_OBSERVABLES
+from srfcli.data.values import BESIDE, OBSERVABLES
 from srfcli.motion import simulate as integrate
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, ModulatedLoad, Modulation
 from srfcli.results.simulation import RISE, Gauge, Job, Record, SimulationResult, Work, measure, observe
@@ -29,7 +30,7 @@ def simulate(
     load: Load | Sequence[tuple[float, float]] | None = None,
     onset: float | None = None,
     start: ArrayLike | None = None,
-    observable: str = "elongation",
+    observable: str | Sequence[str] = "elongation",
     rtol: float = 1e-8,
 ) -> SimulationResult:
     """Return what a slider does under a program of driving velocity and load.
@@ -48,8 +49,8 @@ def simulate(
         When the modulation begins to rise, in s; at the first sample if left out.
     start : array (n_states,), optional
         State at the first sample, as the model orders it; steady sliding at the first velocity if left out.
-    observable : {'elongation', 'force', 'friction'}
-        What the apparatus records, in um, N or 1.
+    observable : {'elongation', 'force', 'friction'} or sequence of str
+        What the apparatus records, in um, N or 1; of several, others or 'slip' (um) and 'contact_area' (1) after the first.
     rtol : float
         Local relative error of integration, from 1e-13 to 1e-2.
 
@@ -78,8 +79,7 @@ def simulate(
     times = np.asarray(t, float)
     if times.ndim != 1 or times.size < 2 or not (np.diff(times) > 0).all():
         raise SrfError("t is no rising list of times", "Like numpy.linspace(0, 4, 4001), in s.")
-    if observable not in OBSERVABLES:
-        raise SrfError(f"unknown observable {observable!r}", f"Known: {', '.join(OBSERVABLES)}.")
+    first, *beside = check_observables([observable] if isinstance(observable, str) else list(observable))
     if not 1e-13 <= rtol <= 1e-2:
         raise SrfError(f"rtol = {rtol:g} is out of range", "Choose it between 1e-13 and 1e-2, as 1e-8.")
     system.model.check_changing_load(system.vector())
@@ -106,10 +106,24 @@ def simulate(
     model = system.model
     job = Job(
         "simulated", model.vector(values), moved, pressed, times, None if start is None else np.asarray(start, float),
-        observable, f, None if f is None else (f, eps, since),
+        first, f, None if f is None else (f, eps, since), beside=tuple(beside),
     )  # fmt: skip
     replaced = [*(["V"] if drive is not None else []), *(["W0"] if load is not None else [])]
     return simulate_work(Work(model, (job,), Gauge(), system.described(without=replaced), _none), rtol=rtol)
+
+
+def check_observables(names: Sequence[str]) -> list[str]:
+    """Return the names of observables, which must be known; the first is one of the spring."""
+    for number, name in enumerate(names):
+        if name not in OBSERVABLES | BESIDE:
+            raise SrfError(f"unknown observable {name!r}", did_you_mean(name, OBSERVABLES | BESIDE))
+        if number == 0 and name in BESIDE:
+            raise SrfError(f"{name} needs an elongation, a force or a friction before it", f"As force,{name}.")
+        if name in names[:number]:
+            raise SrfError(f"the observable {name!r} is named twice", "Name each once.")
+    if not 1 <= len(names) <= MOST_OBSERVABLES:
+        raise SrfError(f"{len(names)} observables", f"Name one to {MOST_OBSERVABLES}.")
+    return list(names)
 
 
 def _none(records: Sequence[Record]) -> Experiment:
@@ -136,8 +150,13 @@ def simulate_work(
                 tables=job.tables,
                 rtol=rtol,
             )
-            observed = observe(work.model, job, trace)
-            records.append(Record(job, trace, observed, measure(work.gauge, job, observed)))
+            observed = observe(work.model, job, trace, job.observable)
+            others = []
+            for name in job.beside:
+                shown = observe(work.model, job, trace, name)
+                read = measure(work.others[name], job, shown, name) if name in work.others else None
+                others.append(shown if read is None else read)
+            records.append(Record(job, trace, observed, measure(work.gauge, job, observed), tuple(others)))
             progress(job.name, True)
     except KeyboardInterrupt:
         return SimulationResult(work, tuple(records), Status.INTERRUPTED)
