@@ -26,8 +26,9 @@ from srfcli.laws.registry import load_registry
 
 compiled = pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
 ROCK = (
-    "--law", "dieterich-ruina", "--interface", "rigid", "--no-inertia", "--set", "mu0=0.6", "--set", "A=0.008", "--set", "B=0.011",
-    "--set", "D0=10", "--K", "30 MPa/mm", "--W0", "10", "--drive", "20:1, 15:10, 30:1", "--rate", "10", "--seed", "1",
+    "--law", "dieterich-ruina", "--interface", "rigid", "--no-inertia", "--set", "mu0=0.6", "--set", "A=0.008",
+    "--set", "B=0.011", "--set", "D0=10", "--K", "30 MPa/mm",
+    "--W0", "10", "--drive", "20:1, 15:10, 30:1", "--rate", "10", "--seed", "1",
 )  # fmt: skip
 
 

@@ -214,7 +214,8 @@ def test_a_linear_model_agrees_with_statsmodels(make_model, beside):
     used = np.ones(n, bool)
     used[60:75] = False
     seen = [used, *(np.roll(used, 20 * k) for k in range(1, 1 + len(beside)))]
-    run = replace(run, used=used, others=tuple(Signal(what, np.zeros(n), u, 0.0) for what, u in zip(beside, seen[1:], strict=True)))
+    others = [Signal(what, np.zeros(n), u, 0.0) for what, u in zip(beside, seen[1:], strict=True)]
+    run = replace(run, used=used, others=tuple(others))
     noises = [(sd * f, s * f, tau * g) for f, g in ((1.0, 1.0), (2.0, 0.5), (0.3, 3.0))][: 1 + len(beside)]
     gauges = [{m: f"{m}[{k}]" for m in ("gauge_white", "gauge_colour1", "gauge_time1")} for k in range(len(noises))]
     noise = {name: v for own, row in zip(gauges, noises, strict=True) for name, v in zip(own.values(), row, strict=True)}

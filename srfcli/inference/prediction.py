@@ -1,8 +1,8 @@
 """What a model predicts for a run, with exact derivatives, and what belongs to one run alone.
 
-Names are RUN.mu (friction at the first sample), RUN.ln_PHI (logarithm of an age there, s), RUN.trend (per um or per s), and of what
-is observed besides RUN.slip (um, where its gauge stands at the first sample), RUN.area and RUN.area_growth: a contact area is
-W/W(t0) area (1 + area_growth ln(phi/1 s)), the growth by the logarithm of age of Dieterich and Kilgore, Pageoph 143 (1994).
+Names are RUN.mu (friction at the first sample), RUN.ln_PHI (logarithm of an age there, s), RUN.trend (per um or per s), and of
+what is observed besides RUN.slip (um, where its gauge stands at the first sample), RUN.area and RUN.area_growth: a contact area
+is W/W(t0) area (1 + area_growth ln(phi/1 s)), the growth by the logarithm of age of Dieterich and Kilgore, Pageoph 143 (1994).
 """
 
 from __future__ import annotations

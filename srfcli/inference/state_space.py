@@ -516,9 +516,10 @@ class Likelihood:
         return replace(found.point.runs[0], run=run)
 
     def pieces(self, point: Point) -> Iterator[tuple[Array, Array, tuple[str, float]]]:
-        """Yield standardised innovations, their log densities, and the kind of gauge noise, of each signal at each of its rates."""
+        """Yield standardised innovations, their log densities, kinds of gauge noise, of each signal at each of its rates."""
         for f in point.runs:
-            kind = np.concatenate([i * len(f.run.sampling.spacings) + f.run.sampling.at[s.used] for i, s in enumerate(f.run.signals)])
+            rates, at = len(f.run.sampling.spacings), f.run.sampling.at
+            kind = np.concatenate([i * rates + at[s.used] for i, s in enumerate(f.run.signals)])
             white, density = f.white, f.log_density
             for k, own in enumerate(_kinds(f.run)):
                 yield white[kind == k], density[kind == k], own

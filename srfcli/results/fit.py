@@ -273,8 +273,9 @@ def run_table(fit: Fit, experiment: Experiment) -> Table:
         observable = f.observable or runs[f.name].observable
         size = sum(b - a for a, b in f.parts)
         ratio = f.rms / f.white if f.white else None
+        unit = runs[f.name].unit_of(observable)
         rows.append(
-            (f.name, observable, "held out" if f.holdout else "fit", size, f.rms, f.white, runs[f.name].unit_of(observable), ratio,
+            (f.name, observable, "held out" if f.holdout else "fit", size, f.rms, f.white, unit, ratio,
              lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
         )  # fmt: skip
     return Table("srf.fit.runs/1", RUNS, rows, "runs")

@@ -28,6 +28,13 @@ if TYPE_CHECKING:
 RISE = 0.02  # s over which steps of the load are rounded: five times the slider's bounce on its interface
 MANY_BREAKS = 50  # a recorded load has knots, not changes
 FEW_SAMPLES = 20  # show no oscillation
+OTHERS = (  # what a record has beside the first observable, where it is asked for
+    Column("elongation", "um", "what another gauge shows"),
+    Column("force", "N", "what another gauge shows"),
+    Column("friction", "1", "what another gauge shows"),
+    Column("slip", "um", "slip of the slider since the first sample"),
+    Column("contact_area", "1", "contact area over that of contacts of 1 s"),
+)
 STICK = 0.1  # of the driving velocity: a cycle whose slowest slip is below it sticks
 
 
@@ -89,7 +96,7 @@ def observe(model: GeneratedModel, job: Job, trace: Trace, observable: str) -> A
         return np.asarray(trace.W / trace.W[0] * (1 + AREA_GROWTH * trace.state("ln_phi")))
     if observable == "slip":
         return np.asarray(job.drive.displacement(trace.t) - (trace.u - trace.u[0]))
-    K, u = float(job.p[model.index("K")]), trace.u
+    K, u = np.asarray(job.p[model.index("K")]), trace.u
     if (shown := model.namespace.get("reading" if observable == job.observable else "stiffness")) is not None:
         W0 = dict.fromkeys(["W0"], job.load.rest(float(job.t[0])))
         p = model.vector(dict(zip(model.names, job.p.tolist(), strict=True)) | W0)
@@ -114,7 +121,7 @@ class Gauge:
 
 
 def measure(gauge: Gauge, job: Job, observed: Array, observable: str = "") -> Array | None:
-    """Return the observable through its gauge, None where it reads exactly; each run, and what it has besides, has its own noise."""
+    """Return an observable through its gauge, None where it reads exactly; each run and `observable` besides has its noise."""
     from srfcli.data.noise import measured
 
     if not (gauge.noise or gauge.quantum):
@@ -203,7 +210,7 @@ class Rows(Sequence[tuple[Any, ...]]):
 
 def record_table(work: Work, records: Sequence[Record], *, status: Status) -> Table:
     """Return the records one below the other: t, V, W, u, v, the ages, mu, tau, and what was recorded or measured."""
-    from srfcli.data.values import BESIDE, OBSERVABLES
+    from srfcli.data.values import OBSERVABLES
 
     model, named = work.model, any(job.run is not None for job in work.jobs)
     gauge = any(r.measured is not None for r in records)
@@ -223,10 +230,9 @@ def record_table(work: Work, records: Sequence[Record], *, status: Status) -> Ta
     unit = units.pop() if len(units) == 1 else "um, N or 1"
     columns += [Column("recorded", unit, "what the run's file holds")] if named else []
     columns += [Column("measured", unit, "the simulated observable through the gauge")] if gauge else []
-    told = {"slip": "slip of the slider since the first sample", "contact_area": "contact area over that of contacts of 1 s"}
     beside = list(dict.fromkeys(name for job in work.jobs for name in job.beside))
-    every = OBSERVABLES | BESIDE
-    columns += [Column(name, every[name], told.get(name, "what another gauge shows")) for name in beside]
+    columns += [column for column in OTHERS if column.name in beside]
+    beside = [column.name for column in columns[-len(beside) :]] if beside else []
     blocks = [_block(r, ages, beside, named=named, gauge=gauge) for r in records]
     notes = (*work.notes, *(note for r in records for note in summary(r, named=named)))
     meta = {"samples": {r.job.name: r.done for r in records}, **work.meta}
