@@ -120,10 +120,10 @@ def kalman_filter(
     """Return the innovations of the readings `observed` (n,) at times `t` (s) that do not fall; those `used` are taken up.
 
     A reading is `factor` (n,) times the elongation, or what else `signals` say it shows, plus `offset` (n,) plus gauge noise:
-    white of variance `R` (n,), and processes of as many states as `order` (g,) says, 3 a signal at most. `gauge` (rates, g, 3) has
-    their parameters: of one state, e' = -e/tau + s sqrt(2/tau) w, (tau, s, -); of two, an oscillator of frequency f (Hz), quality q
-    and standard deviation s, (f, s, q). `rate` (n,) says which row holds at a sample, the first if left out; where it changes, a new
-    noise begins.
+    white of variance `R` (n,), and processes of as many states as `order` (g,) says, 3 a signal at most. `gauge` (rates, g, 3)
+    has their parameters: of one state, e' = -e/tau + s sqrt(2/tau) w, (tau, s, -); of two, an oscillator of frequency f (Hz),
+    quality q and standard deviation s, (f, s, q). `rate` (n,) says which row holds at a sample, the first if left out; where it
+    changes, a new noise begins.
     `p` are the model's parameters, `start` (n_states,) and `covariance` (n_states, n_states) the belief at t[0]. All are dual
     numbers in the same k directions. After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a
     compiler, or for a model without a random friction field.

@@ -44,7 +44,7 @@ def own_start(
         steepest = 10 * float(np.ptp(run.observed)) / max(float(np.ptp(basis(run, trend or "slip"))), 1e-9)
         return 0.0, -max(steepest, 1e-9), max(steepest, 1e-9)
     if kind == "mu":
-        mu = first_elongation(run) * run.stiffness / run.load.rest(float(run.t[0]))
+        mu = first_friction(run)
         wide = max(0.5 * abs(mu), UNLOADED)
         return mu, mu - wide, mu + wide
     if kind in {n for names in GAUGES.values() for n in names}:
@@ -53,11 +53,15 @@ def own_start(
     return steady, steady - 15.0, steady + 15.0
 
 
+def first_friction(run: Run) -> float:
+    """Return the friction coefficient in the first readings of a run, by the stated stiffness."""
+    first, W = float(np.median(run.observed[run.used][:5])), run.load.rest(float(run.t[0]))
+    return {"elongation": first * run.stiffness / W, "force": first / W, "friction": first}[run.observable]
+
+
 def first_elongation(run: Run) -> float:
     """Return the spring's elongation (um) in the first readings of a run, by the stated stiffness."""
-    W = run.load.rest(float(run.t[0]))
-    over = {"elongation": 1.0, "force": run.stiffness, "friction": run.stiffness / W}[run.observable]
-    return float(np.median(run.observed[run.used][:5])) / over
+    return first_friction(run) * run.load.rest(float(run.t[0])) / run.stiffness
 
 
 def _gauge_start(run: Run, kind: str) -> tuple[float, float, float]:

@@ -52,6 +52,7 @@ WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
 SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
 FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
+FAINT_FIELDS = (0.03, 0.1, 0.3, 1.0)  # amplitudes over FAINT, that are tried beside a fit without a field
 FIELD_STEPS = 6  # of the trial of a small field beside a fit without one: parameters that are off may hide it
 BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
 SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
@@ -919,7 +920,53 @@ def _fitted(
         likelier = best.maximum if walked else _along_ridges(best.likelihood, best.maximum, close, progress)
         likelier = _likelier(best.likelihood, likelier, close, progress)
         best = replace(best, maximum=likelier, evaluations=best.evaluations + best.likelihood.evaluations - before)
+    if fresh and smooth is None and best.smooth:
+        best = _with_faint_fields(best, likelihood(False, best.likelihood.processes))
     return best
+
+
+def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFit:
+    """Return a fit without a field, with what fields that are too faint to be told add to its covariance.
+
+    Averaged over amplitudes, the prior even in their logarithm from SMALL on, and over lengths, each with the posterior of the
+    other parameters by Laplace's method, one step of scoring from the fit (Rue, Martino and Chopin, J. R. Stat. Soc. B 71, 2009).
+    """
+    plain, maximum, before = fitted.likelihood, fitted.maximum, rough.evaluations
+    inner = np.nonzero(np.diag(maximum.covariance) > 0)[0]
+    at = [rough.names.index(plain.names[i]) for i in inner]
+    bare, logs = rough.coordinates(fitted.values), np.log(np.array(FAINT_FIELDS) * FAINT / SMALL)
+    prior = np.array([logs[0], *np.repeat(np.gradient(logs), len(SHORT)) / len(SHORT)])  # below the first it is as none
+    evidence, moves, covariances = [_laplace(maximum.point, inner)[0]], [np.zeros(inner.size)], []
+    covariances.append(maximum.covariance[np.ix_(inner, inner)])
+    for share, short in product(FAINT_FIELDS, SHORT):
+        x = _under_field(rough, bare, share * FAINT, short)
+        likely = rough.at(x, slopes=False).log_likelihood > fitted.log_likelihood - DOWN
+        point = rough.at(x, slopes=likely)
+        if not likely:
+            point = replace(point, log_likelihood=-np.inf)
+        height, move, covariance = _laplace(point, np.array(at))
+        evidence.append(height)
+        moves.append(move)
+        covariances.append(covariance)
+    weight = np.log(prior) + np.array(evidence)
+    weight = np.exp(weight - weight.max())
+    weight /= weight.sum()
+    whole = sum(w * (C + np.outer(d, d)) for w, C, d in zip(weight, covariances, moves, strict=True))
+    spread = np.zeros_like(maximum.covariance) + maximum.spread
+    spread[np.ix_(inner, inner)] += whole - covariances[0]
+    count = fitted.evaluations + rough.evaluations - before
+    return replace(fitted, maximum=replace(maximum, spread=spread), evaluations=count)
+
+
+def _laplace(point: Point, at: Array) -> tuple[float, Array, Array]:
+    """Return the log marginal likelihood over coordinates `at` (m,), less a constant, the step to its maximum, the covariance."""
+    if not np.isfinite(point.log_likelihood):
+        return -np.inf, np.zeros(at.size), np.zeros((at.size, at.size))
+    covariance = inverse(point.information[np.ix_(at, at)])
+    move = covariance @ point.score[at]
+    d = np.sqrt(np.diag(covariance))
+    height = point.log_likelihood + 0.5 * float(point.score[at] @ move)
+    return height + 0.5 * float(np.linalg.slogdet(covariance / np.outer(d, d))[1]) + float(np.sum(np.log(d))), move, covariance
 
 
 def _short_field(fitted: StateSpaceFit) -> bool:
@@ -1149,7 +1196,7 @@ def _with_or_without(
 def _small_field(rough: Likelihood, bare: Point) -> Point | None:
     """Return where a few steps lead from the likeliest of a few small fields beside a fit, None where that gains too little."""
     best: tuple[float, Array] = (-np.inf, bare.x)
-    for share in (0.03, 0.1, 0.3, 1.0):
+    for share in FAINT_FIELDS:
         for short in SHORT:
             x = _under_field(rough, rough.coordinates(bare.values), share * FAINT, short)
             found = rough.at(x, slopes=False).log_likelihood
