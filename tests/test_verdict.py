@@ -12,7 +12,7 @@ from srfcli.core.settings import Parameter
 from srfcli.diagnosis import verdict as module
 from srfcli.diagnosis.hypotheses import Hypothesis, neutral_values
 from srfcli.diagnosis.scores import Score
-from srfcli.diagnosis.verdict import HELD, UNEXPLAINED, conclude, interesting
+from srfcli.diagnosis.verdict import HELD, MISSED, UNEXPLAINED, conclude, interesting
 from srfcli.laws.registry import bundled_registry
 
 SHIPPED = bundled_registry()
@@ -119,7 +119,8 @@ def test_a_baseline_that_passes_is_refused_by_held_out_runs_too(concluded):
 
 def test_a_model_far_off_has_no_share_of_the_confidence(concluded):
     found = concluded(fitted("viscous-drag", evidence=100.0, fine=False), LOST)
-    assert found.verdict == "unknown" and found.confidence["unknown"] > 0.99
+    assert found.verdict == "unknown" and found.confidence["viscous-drag"] == 0.0
+    assert found.confidence["unknown"] == pytest.approx(1 - MISSED) and found.confidence["missed"] == pytest.approx(MISSED)
     sure = concluded(fitted("viscous-drag", evidence=100.0), LOST)
     assert sure.confidence["unknown"] == pytest.approx(UNEXPLAINED, rel=0.05)
 
