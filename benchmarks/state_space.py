@@ -1,12 +1,13 @@
 """The state-space fit on recordings of another code: coverage of its intervals, and whether it is found from values 30 % off.
 
-usage: state_space.py [--repeats N] [--workers N] [--without ridges|weights]      N of each kind of track, 50 if left out
+usage: state_space.py [--repeats N] [--workers N] [--without ridges|weights|faint]      N of each kind of track, 50 if left out
 
 The recordings are those of the sealed trials' generator, which shares no equation and no integrator with the fit: four runs
 (steps of velocity, stick-slip, a load step, slides and holds), gauge noise of 0.02 um quantised at 0.005 um. Parameters are drawn
 anew in each repeat, start values are the truth times 0.7 or 1.3, each, within the bounds of the file (mu0: 0.9 or 1.1). A fit
 has found its maximum where one from the true parameters is not likelier by more than 1. `--without` leaves a part of the search
-out: that along ridges, or the weights with which a fit begins, so that all readings count alike from the start.
+out: that along ridges, the weights with which a fit begins, so that all readings count alike from the start, or what fields
+too faint to be told add to the errors.
 """
 
 from __future__ import annotations
@@ -74,6 +75,8 @@ def one(task: tuple[float, bool, int, str]) -> dict[str, object]:
         state_space.REACH = 0.0
     if without == "weights":
         state_space.WIDTHS = ()
+    if without == "faint":
+        state_space._with_faint_fields = lambda fitted, rough: fitted
     begun = time.process_time()
     found = fit_state_space(replace(problem, start=start(far)))
     used = time.process_time() - begun
@@ -90,7 +93,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--without", choices=("ridges", "weights"), default="")
+    parser.add_argument("--without", choices=("ridges", "weights", "faint"), default="")
     asked = parser.parse_args()
     report = common.Report("state_space", __doc__ or "")
     kinds = [(a, shared) for a in AMPLITUDES for shared in ((False, True) if a else (False,))]
