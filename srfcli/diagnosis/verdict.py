@@ -208,7 +208,7 @@ def _equivalent(scores: Sequence[Score], close: Sequence[Fitted]) -> tuple[tuple
 
 
 def _confidence(ranked: Sequence[Fitted], verdict: str) -> dict[str, float]:
-    """Return the stated confidence in each model, by evidence, in `unknown`, and in what the search `missed` where none passes."""
+    """Return the stated confidence in each model, by evidence, in `unknown`, in what the search `missed` where none passes."""
     weights = {f.name: f.evidence - (0.0 if f.fine else LACKING) for f in ranked}
     top = max(weights.values())
     share = {name: float(np.exp(max((w - top) / TEMPER, -60.0))) for name, w in weights.items()}
