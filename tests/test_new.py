@@ -261,7 +261,7 @@ def test_holds_and_oscillations_are_told_from_steps() -> None:
         (
             ["run1.csv", "--stiffness", "1 1/um", "--column", "tau=mu"],
             "--column tau: no such role",
-            "Known: elongation",
+            "Known: contact_area, elongation",
         ),
         (["run1.csv", "--stiffness", "1 1/um", "--column", "friction=nu"], "no column 'nu'", "Did you mean 'mu'?"),
         (["run1.csv", "--stiffness", "1 1/um", "--column", "friction"], "is no ROLE=HEADING", "As in"),
