@@ -385,7 +385,7 @@ def friction(p: Physics) -> tuple[Solve, Solve]:
         """Return x without drag: a closed form."""
         if cut:
             R = (m - mu) / a  # ln(1 + Va/v); 0 and below at no velocity
-            return min(end - math.log(math.expm1(R)), FASTEST) if R > 0 else FASTEST
+            return min(end - R - math.log(-math.expm1(-R)), FASTEST) if R > 0 else FASTEST
         y = max(mu / a, 1e-12)
         return min(y + math.log(-math.expm1(-2 * y)) - m / a, FASTEST)
 
@@ -596,7 +596,16 @@ class Slider:
         return self.contact.slide(y, m, a, felt.W, -p.cross * felt.excess, K), felt
 
     def rates(self, t: float, states: Array, V: float) -> list[float]:
-        """Return the rates of the states at time t in s, where the stage's nominal velocity is V um/s."""
+        """Return the rates of the states at time t in s, where the stage's nominal velocity is V um/s.
+
+        NaN of states that ran away: the solver's compiled code would lose an exception, and go on.
+        """
+        try:
+            return self._rates(t, states, V)
+        except (ArithmeticError, ValueError):
+            return [math.nan] * len(self.names)
+
+    def _rates(self, t: float, states: Array, V: float) -> list[float]:
         y, p, nominal = states.tolist(), self.p, V
         sliding, felt = self.sliding(t, y)
         v, u, _ = sliding
@@ -689,10 +698,10 @@ def _through(slider: Slider, solver: ode, trace: Trace, end: float) -> Array | N
         for k in np.flatnonzero((t >= solver.t - 1e-9) & (t < end - 1e-9)).tolist():
             if t[k] > solver.t:
                 solver.integrate(t[k])
-            if not solver.successful():
+            if not (solver.successful() and np.isfinite(solver.y).all()):
                 return None
             trace.u[k] = slider.shown(float(t[k]), solver.y.tolist())
         y: Array = solver.integrate(end)
     except OverflowError:  # a state ran away
         return None
-    return y if solver.successful() else None
+    return y if solver.successful() and np.isfinite(y).all() else None
