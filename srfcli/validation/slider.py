@@ -696,7 +696,7 @@ def _through(slider: Slider, solver: ode, trace: Trace, end: float) -> Array | N
     t = trace.t
     try:
         for k in np.flatnonzero((t >= solver.t - 1e-9) & (t < end - 1e-9)).tolist():
-            if t[k] > solver.t:
+            if t[k] > solver.t + 1e-9:  # a solver fails that is asked for a step of the last digits
                 solver.integrate(t[k])
             if not (solver.successful() and np.isfinite(solver.y).all()):
                 return None
