@@ -389,7 +389,7 @@ def test_marks_are_counted_by_what_the_case_was_set_in():
     wrong = replace(marked(truth_of(ALPHA), "identified", DRAG), set_in={"apparatus": "paper", "noise": "white"})
     found = {(r["circumstance"], r["value"]): r for r in report.rows_of(report.by_setting([alarm, right, wrong]))}
     assert list(found) == [("apparatus", "paper"), ("apparatus", "rock-stress"), ("noise", "1/f"), ("noise", "white")]
-    counts = [[r[n] for n in ("hits", "cases", "false_alarms", "nothing", "wrong_names")] for r in found.values()]
+    counts = [[r[n] for n in ("hits", "cases", "false_alarms", "nothing", "named_wrongly")] for r in found.values()]
     assert counts == [[1, 2, 0, 0, 1], [0, 1, 1, 1, 0], [1, 2, 1, 1, 0], [0, 1, 0, 0, 1]]
 
 

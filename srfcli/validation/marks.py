@@ -516,7 +516,7 @@ def by_setting(marks: Sequence[Mark]) -> Table:
     """Return how often the answer was right by each circumstance in which something, or nothing, was concealed."""
     columns = (
         Column("circumstance"), Column("value"), *COUNTED, Column("false_alarms", about="where nothing is concealed"),
-        Column("nothing", about="cases that conceal nothing"), Column("wrong_names", about="cases named wrongly"),
+        Column("nothing", about="cases that conceal nothing"), Column("named_wrongly", about="cases named wrongly"),
     )  # fmt: skip
     rows = []
     for name, value in dict.fromkeys(pair for m in marks for pair in m.set_in.items()):
