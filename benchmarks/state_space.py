@@ -46,7 +46,8 @@ def one(task: tuple[float, bool, int, str]) -> dict[str, object]:
     from srfcli.inference.fit import fit_problem
     from srfcli.inference.state_space import fit_state_space
     from srfcli.laws.registry import load_registry
-    from srfcli.validation.cases import SPREAD, Gauge, case_files, read_gauge
+    from srfcli.validation.cases import SPREAD, case_files
+    from srfcli.validation.gauge import Gauge, read_gauge
     from srfcli.validation.slider import SMOOTH, Physics, Track, move
 
     amplitude, shared, seed, without = task

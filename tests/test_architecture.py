@@ -43,7 +43,8 @@ WITHOUT = {
     "laws/registry.py": HEAVY,
 }
 # the generator of concealed cases, and the one folder that it may share with the rest
-GENERATOR, BEHIND_THE_WALL = {"srfcli.validation.slider", "srfcli.validation.cases"}, "core"
+GENERATOR = {f"srfcli.validation.{name}" for name in ("slider", "gauge", "apparatus", "cases")}
+BEHIND_THE_WALL = "core"
 
 
 def is_typing(node: ast.AST) -> bool:

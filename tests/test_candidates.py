@@ -13,7 +13,8 @@ from srfcli.diagnosis.hypotheses import Hypothesis, applicable
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.diagnosis.verdict import held_out
 from srfcli.laws.registry import bundled_registry, load_registry
-from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.cases import case_files
+from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, move
 
 SHIPPED = bundled_registry()

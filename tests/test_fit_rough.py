@@ -13,7 +13,8 @@ import srfcli as srf
 from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiler
 from srfcli.inference.fit import between_groups
-from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.cases import case_files
+from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, Track, move
 
 PLANS = (

@@ -17,7 +17,8 @@ from srfcli.diagnosis.verdict import conclude
 from srfcli.inference import state_space
 from srfcli.inference.state_space import COLOUR, Likelihood, correlated, fit_state_space
 from srfcli.laws.registry import bundled_registry
-from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.cases import case_files
+from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, Track, move
 
 SHIPPED = bundled_registry()

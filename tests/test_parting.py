@@ -40,7 +40,8 @@ from srfcli.inference.state_space import Likelihood, fit_state_space
 from srfcli.laws.registry import bundled_registry
 from srfcli.motion.imposed import ConstantLoad, Drive
 from srfcli.motion.integrators import integrate
-from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.cases import case_files
+from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, move
 
 SHIPPED = bundled_registry()

@@ -13,16 +13,33 @@ import pytest
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
 from srfcli.laws.registry import load_registry
+from srfcli.validation.apparatus import (
+    AGEING_SHARES,
+    APPARATUS,
+    LAW_SHARES,
+    NOISE_SHARES,
+    PROTOCOLS,
+    WRONG_AGEING,
+    Setting,
+    critical_spring,
+    draw_setup,
+    settings,
+)
 from srfcli.validation.cases import (
     KINDS,
     NAMES,
     OUTSIDE_NAMES,
     SEAL,
     STARTS,
+    WIDE_KINDS,
+    acting,
     check_cases,
     draw_recipe,
+    draw_wide,
+    known_gauge,
     known_physics,
     known_plans,
+    known_rig,
     known_traces,
     make_bank,
     make_case,
@@ -159,6 +176,124 @@ def test_a_plan_covers_every_effect():
     assert (sum(not names for names in plan), sum(len(names) == 2 for names in plan)) == (50, 30)
     assert plan == plan_bank(200, 5) != plan_bank(200, 6)
     assert any(a != b for a, b in pairwise(map(len, plan[:40])))  # shuffled
+
+
+# ---- the wide bank
+
+
+SETTINGS = (
+    Setting("rock", "steps", "dieterich-ruina", "ruina", "ruina"),
+    Setting("rock", "holds", "dieterich-cutoff", "kato-tullis", "kato-tullis"),
+    Setting("rock", "load-steps", "two-state", "nagata", "nagata"),
+    Setting("rock", "oscillation", "log-log", "dieterich", "dieterich"),
+    Setting("micro", "stick-slip", "bowden-tabor", "dieterich", "dieterich"),
+    Setting("micro", "load-steps", "rice-regularized", "perrin-rice-zheng", "perrin-rice-zheng"),
+    Setting("paper", "steps", "srf-vsat", "ruina", "dieterich"),
+)
+
+
+@pytest.fixture
+def set_in(monkeypatch):
+    """Let the wide bank have one setting, and one kind of noise."""
+
+    def chosen(setting, noise="white"):
+        monkeypatch.setattr("srfcli.validation.cases.settings", lambda **kind: [setting])
+        monkeypatch.setattr("srfcli.validation.cases.NOISE_SHARES", {noise: 1.0})
+
+    return chosen
+
+
+@pytest.mark.parametrize(
+    ("setting", "noise"), list(zip(SETTINGS, ("ar1", "spikes", "white", "1/f", "white", "gaps", "uneven"), strict=True))
+)
+def test_a_case_of_the_wide_bank_reads_back(set_in, tmp_path, setting, noise):
+    """The reader finds the stated laws, and what it reads is what the truth predicts, to the gauge's noise."""
+    set_in(setting, noise)
+    kind = "none" if setting.ageing == setting.stated else "ageing"
+    truth = make_case(tmp_path / "c", 12, kind=kind, rough=False, strengths=False, bank="wide")
+    experiment = read_experiment(tmp_path / "c", registry=load_registry())
+    choice, rig, gauge = experiment.choice, known_rig(truth), known_gauge(truth)
+    assert (choice.law, choice.ageing, truth["protocol"], truth["noise"]) == (
+        setting.law, setting.stated, setting.protocol, noise,
+    )  # fmt: skip
+    assert truth["effects"] == ([] if kind == "none" else ["ruina"]) and truth["kind"] == kind
+    assert truth["accept"] == ([] if kind == "none" else ["slip-evolution"])
+    traces = known_traces(truth)
+    for run, plan in zip(experiment.runs, known_plans(truth), strict=True):
+        made = traces[plan.name].u * (rig.factor if rig.observes == "force" else 1.0)
+        unit = gauge.sigma * (rig.factor if rig.observes == "force" else 1.0)
+        assert run.observable == rig.observes and np.allclose(run.t, plan.times(), atol=1e-6)
+        assert 0.6 < rms((run.observed - made)[run.used]) / unit < 1.5  # 1/f noise of a short run wanders
+        assert rms(run.load(run.t)[0] - [plan.load()(t)[0] for t in run.t.tolist()]) < 2e-3 * plan.W0
+    text = b" ".join(contents(tmp_path / "c").values()).decode()
+    assert not [n for n in (*NAMES, *OUTSIDE_NAMES, "effect", "rough", "seed", "truth") if n != "inertia" and n in text]
+
+
+def test_every_setting_has_a_slider_that_slides_as_its_protocol_asks():
+    every = settings()
+    assert {s.apparatus for s in every} == set(APPARATUS) and {s.protocol for s in every} == set(PROTOCOLS)
+    assert {s.law for s in every} == set(LAW_SHARES) and {s.ageing for s in every} == set(AGEING_SHARES)
+    assert {(s.ageing, s.stated) for s in settings(wrong_ageing=True)} == set(WRONG_AGEING)
+    for k, setting in enumerate(every[::5]):
+        p, plans = draw_setup(np.random.default_rng(k), setting)
+        assert (p.law_name, p.ageing_name) == (setting.law, setting.ageing)
+        assert all(plan.interval * plan.f <= 1 / 8 and 200 < plan.times().size < 12000 for plan in plans)
+        springs = [critical_spring(p, plan) for plan in plans]
+        if setting.protocol == "stick-slip":
+            assert max(springs) > p.K
+        elif plans:
+            assert max(springs) < p.K and sum(plan.holdout for plan in plans) == (len(plans) > 1)
+        if setting.apparatus == "rock":
+            assert p.massless and p.rigid and 10 <= p.D0 <= 50 and 5 <= p.Wref <= 100
+            assert all(0.1 <= v <= 300 or v == 0 for plan in plans for _, v in plan.drive)
+        if setting.apparatus == "micro":
+            assert all(0.02 <= plan.W0 <= 1 for plan in plans)
+
+
+def test_the_wide_bank_draws_what_it_says():
+    recipes = [draw_wide(np.random.default_rng(seed)) for seed in range(150)]
+    kinds = [r.kind for r in recipes]
+    assert set(kinds) == set(WIDE_KINDS)
+    assert {r.noise for r in recipes} == set(NOISE_SHARES) and {r.protocol for r in recipes} == set(PROTOCOLS)
+    assert len({r.rig for r in recipes}) == 5 and len({r.baseline.law_name for r in recipes}) == len(LAW_SHARES)
+    for recipe in recipes:
+        names = [e.name for e in recipe.effects]
+        wanted = {"none": 0, "pair": 2}.get(recipe.kind, 1)
+        assert len(names) == wanted and all(e.listed for e in recipe.effects) is (recipe.kind != "outside")
+        stated, true = recipe.baseline.ageing_name, recipe.physics.ageing_name
+        assert ((true, stated) in WRONG_AGEING) is (recipe.kind == "ageing") and (stated == true or names == [true])
+        assert bool(recipe.only) is (recipe.kind == "one-run")
+        assert (recipe.physics == recipe.baseline) is (recipe.kind == "none")
+    alphas = [r.physics.alpha for r in recipes if r.rig.startswith("rock") and r.physics.alpha]
+    assert all(0.1 <= a <= 0.5 for a in alphas)
+
+
+def test_an_effect_in_one_run_leaves_the_others_alone(set_in, tmp_path):
+    set_in(Setting("rock", "load-steps", "dieterich-ruina", "dieterich", "dieterich"))
+    truth = make_case(
+        tmp_path / "c", 4, kind="one-run", effects=["tangential-crosstalk"], size=1.0, rough=False, bank="wide"
+    )
+    assert truth["verdict"] == "identified" and truth["accept"] == ["unknown"]
+    moved = truth["strength"]["tangential-crosstalk"]["rms_over_noise"]
+    assert truth["only"] in ("first", "second") and moved[truth["only"]] > 1
+    assert {name for name, rms in moved.items() if rms} == {truth["only"]}
+    acts = {plan.name: acting(truth, plan) != known_physics(truth, baseline=True) for plan in known_plans(truth)}
+    assert [name for name, acting_there in acts.items() if acting_there] == [truth["only"]]
+
+
+def test_the_same_seed_makes_the_same_case_of_the_wide_bank(set_in, tmp_path):
+    set_in(Setting("rock", "oscillation", "two-state", "ruina", "ruina"), "1/f")
+    made = [make_case(tmp_path / n, s, kind="single", effects=["drive-ripple"], bank="wide") for n, s in (("a", 3), ("b", 3))]
+    assert contents(tmp_path / "a") == contents(tmp_path / "b") and json.dumps(made[0]) == json.dumps(made[1])
+    again = json.loads(json.dumps(made[0], allow_nan=False))
+    assert known_plans(again) == known_plans(made[0]) and known_physics(again) == known_physics(made[0])
+
+
+def test_effects_that_go_together_nowhere_are_told(tmp_path):
+    with pytest.raises(SrfError, match="no apparatus, protocol and law go with age-saturation and log-log-coupling"):
+        make_case(tmp_path / "c", 1, effects=["age-saturation", "log-log-coupling"], bank="wide")
+    with pytest.raises(SrfError, match="unknown bank 'wid'"):
+        make_case(tmp_path / "c", 1, bank="wid")
 
 
 @pytest.fixture

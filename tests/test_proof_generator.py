@@ -16,18 +16,12 @@ from scipy.integrate import solve_ivp
 from srfcli.data.experiment import read_experiment
 from srfcli.inference.prediction import predict
 from srfcli.laws.registry import load_registry
-from srfcli.validation.cases import (
-    EFFECTS,
-    NAMES,
-    OUTSIDE,
-    OUTSIDE_NAMES,
-    Gauge,
-    case_files,
-    draw_protocol,
-    play,
-    read_gauge,
-)
+from srfcli.validation.apparatus import OF_LAW, PARAMETERS, RIGS, Setting, recorded, with_laws
+from srfcli.validation.cases import EFFECTS, NAMES, OUTSIDE, OUTSIDE_NAMES, case_files, draw_protocol
+from srfcli.validation.gauge import Gauge, autocovariance, play, read_gauge, white
 from srfcli.validation.slider import (
+    AGEING_LAWS,
+    LAWS,
     SMOOTH,
     Physics,
     Plan,
@@ -35,11 +29,14 @@ from srfcli.validation.slider import (
     ageing,
     at_unit_velocity,
     example_protocol,
+    friction,
     log_velocity,
     move,
     steady_age,
+    steady_friction,
 )
 
+GENERATOR = ("slider", "gauge", "apparatus", "cases")
 NOISE = float(np.hypot(0.02, 0.005 / np.sqrt(12)))  # um, of a gauge and its quanta
 OPEN = [f"open-{n:02d}" for n in range(1, 9)]
 EXAMPLES = {plan.name: plan for plan in example_protocol()}
@@ -99,6 +96,106 @@ def test_without_effects_it_agrees_with_the_fitter(make_model, tmp_path, change)
         made = predict(model, experiment, run, values, rtol=1e-8)
         assert made.status.ok
         assert np.abs(made.y - trace.u).max() < 1e-3, run.name
+
+
+# rock between rigid blocks: steps of velocity, a hold, steps of the load
+ROCK = Physics(K=0.05, M=0.0, A=0.009, B=0.010, D0=20.0, Vsat=800.0, rigid=True, massless=True)
+ROCK_RUN = Plan(
+    "steps", ((60.0, 3.0), (20.0, 20.0), (20.0, 0.0), (20.0, 3.0)), 20.0, 0.1, steps=((30.0, 3.0), (90.0, -3.0)), rise=0.5
+)
+QUICK = {(law, "dieterich") for law in LAWS} | {("dieterich-ruina", ageing) for ageing in AGEING_LAWS} | {("two-state", "nagata")}
+
+
+def slow_unless_quick(law, ageing):
+    return pytest.param(law, ageing, marks=() if (law, ageing) in QUICK else pytest.mark.slow)
+
+
+def predicted(make_model, folder, p, plan, rig, u):
+    """Return what the fitter predicts for a case whose parameters are those of the generator's slider."""
+    for name, text in case_files("neutral", p, {plan: u}, rig=rig).items():
+        (folder / name).write_text(text)
+    experiment = read_experiment(folder, registry=load_registry())
+    model = make_model(**asdict(experiment.choice))
+    values = {PARAMETERS.get(n, n): getattr(p, n) for n in (*OF_LAW[p.law_name], "lam", "nagata", "V0")}
+    values = {n: v for n, v in {**values, "Vb": p.Vsat}.items() if n in model.names}
+    made = predict(model, experiment, experiment.runs[0], values, rtol=1e-9)
+    assert made.status.ok
+    return made.y
+
+
+@pytest.mark.parametrize(("law", "ageing"), [slow_unless_quick(law, ageing) for law in LAWS for ageing in AGEING_LAWS])
+def test_every_law_and_ageing_law_agrees_with_the_fitter_on_rock(make_model, tmp_path, law, ageing):
+    """The friction coefficient of a press, quasi-static and rigid, through steps of velocity and load, and a hold at rest."""
+    p = with_laws(ROCK, 0.65, np.random.default_rng(1), Setting("rock", "steps", law, ageing, ageing))
+    assert (p.law_name, p.ageing_name) == (law, ageing)
+    u = recorded(RIGS["rock-friction"], p, ROCK_RUN, move(p, ROCK_RUN).u)
+    assert np.ptp(u) > 0.05
+    made = predicted(make_model, tmp_path, p, ROCK_RUN, RIGS["rock-friction"], u)
+    assert np.abs(made - u).max() < 5e-7  # of friction; good recordings have noise of 1e-4
+
+
+@pytest.mark.parametrize(("law", "ageing"), [slow_unless_quick(law, ageing) for law in LAWS for ageing in AGEING_LAWS])
+def test_every_law_and_ageing_law_agrees_with_the_fitter_on_the_papers_slider(make_model, tmp_path, law, ageing):
+    """With an elastic interface and a mass, where the rate of the friction force and the inverse of each law are others."""
+    p = with_laws(Physics(), 0.464, np.random.default_rng(1), Setting("paper", "steps", law, ageing, ageing))
+    u = move(p, SHORT[1]).u
+    assert np.abs(predicted(make_model, tmp_path, p, SHORT[1], RIGS["paper"], u) - u).max() < 2e-3 * NOISE
+
+
+@pytest.mark.parametrize("rig", ["micro-force", "micro-elongation"])
+def test_a_micro_tribometer_agrees_with_the_fitter(make_model, tmp_path, rig):
+    """A rigid slider with a small mass under 0.2 N on a soft spring: forces in mN, or elongations, of stick-slip."""
+    slider = Physics(K=3e-3, M=1e-9, A=0.01, B=0.017, D0=0.06, rigid=True)
+    setting = Setting("micro", "stick-slip", "dieterich-ruina", "dieterich", "dieterich")
+    p = with_laws(slider, 0.4, np.random.default_rng(1), setting)
+    plan = Plan("first", ((1.0, 5.0), (2.0, 4.0)), 0.2, 0.004)
+    u = recorded(RIGS[rig], p, plan, move(p, plan).u)
+    unit = RIGS[rig].factor if rig == "micro-force" else 1.0  # the fitter has N
+    made = predicted(make_model, tmp_path, p, plan, RIGS[rig], u) / unit
+    assert np.ptp(u) > 50 * (level := 0.02 * (1.0 if unit == 1.0 else 1e3 * p.K))
+    assert rms(made - u) < 0.05 * level  # of stick-slip: a shift of 1e-6 in phase
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("V", [0.1, 300.0])
+def test_steady_friction_is_the_closed_form(law, V):
+    """mu(V) with the age D0/V, and the a - b of its slope."""
+    p = with_laws(ROCK, 0.65, np.random.default_rng(1), Setting("rock", "steps", law, "dieterich", "dieterich"))
+    g, l = np.log1p(p.Vsat / V), np.log(V)
+    closed = {
+        "srf-vsat": p.mu0 + p.A * l + p.B * g,
+        "dieterich-ruina": p.mu0 + (p.A - p.B) * l,
+        "dieterich-cutoff": p.mu0 - p.A * np.log1p(p.Va / V) + p.B * g,
+        "rice-regularized": p.A * np.arcsinh(V / 2 * np.exp((p.mu0 - p.B * l) / p.A)),
+        "log-log": p.mu0 + p.A * l + p.B * g + p.C * l * g,
+        "bowden-tabor": (p.mu0 + p.A * l) * (1 + p.B / p.mu0 * g),
+        "two-state": p.mu0 + (p.A - p.B - p.B2) * l,
+    }[law]
+    assert steady_friction(p, V, 20.0) == pytest.approx(closed, rel=1e-10)
+    plan = Plan("rest", ((5.0, V),), 20.0, 0.1)
+    assert np.allclose(recorded(RIGS["rock-stress"], p, plan, move(p, plan).u), 20.0 * closed, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("ageing", "q"), [("ruina", 1.0), ("perrin-rice-zheng", 2.0), ("kato-tullis", 1.0)])
+def test_steady_ages_are_the_closed_form(ageing, q):
+    p = Physics(ageing=ageing)
+    assert np.exp(steady_age(p, 3.0)) == pytest.approx(q * p.D0 / 3.0, rel=1e-12)
+    slow = Physics(ageing="kato-tullis", Vc=1e3)  # heals at 3 um/s as at rest: q ln q = 1
+    assert 3.0 / slow.D0 * np.exp(steady_age(slow, 3.0)) == pytest.approx(1.763, rel=2e-3)
+
+
+@pytest.mark.parametrize("law", ["dieterich-cutoff", "rice-regularized", "srf-vsat"])
+@pytest.mark.parametrize("drag", [0.0, 1e-5])
+@pytest.mark.parametrize("x", [-25.0, -3.0, 0.0, 4.0])
+def test_friction_and_its_inverse(law, drag, x):
+    resistance, velocity = friction(Physics(law="" if law == "srf-vsat" else law, Va=3000.0))
+    assert velocity(resistance(x, 0.5, 0.0126, drag), 0.5, 0.0126, drag) == pytest.approx(x, abs=1e-9)
+
+
+def test_a_second_age_follows_the_ageing_law_under_two_states():
+    p = with_laws(ROCK, 0.65, np.random.default_rng(1), Setting("rock", "steps", "two-state", "ruina", "ruina"))
+    other = replace(p, ageing="dieterich")
+    assert rms(move(p, ROCK_RUN).u - move(other, ROCK_RUN).u) > 0.05
 
 
 def test_strain_form_is_the_slip_relation():
@@ -322,11 +419,57 @@ def test_gauge_noise_is_what_it_says(lag1):
     assert np.allclose(coarse / 0.005, np.round(coarse / 0.005), atol=1e-9)
 
 
+def test_noise_of_1_over_f_has_its_slope_and_its_variance():
+    gauge = Gauge(sigma=0.02, pink=0.9, quantum=1e-4)
+    made = np.array([read_gauge(np.zeros(4096), gauge, np.random.default_rng(seed)) for seed in range(30)])
+    assert np.sqrt(np.mean(made**2)) == pytest.approx(0.02, rel=0.1)
+    window = np.hanning(4096)
+    power = np.mean(np.abs(np.fft.rfft(made * window)) ** 2, axis=0)
+    f, low = np.arange(power.size), slice(8, 100)  # below that the window leaks, above it the white tenth shows
+    assert np.polyfit(np.log(f[low]), np.log(power[low]), 1)[0] == pytest.approx(-1.0, abs=0.12)
+    covariance = autocovariance(gauge, 4096)
+    assert covariance[0] == pytest.approx(0.02**2, rel=1e-4)
+    for lag in (1, 100):
+        assert np.mean(made[:, lag:] * made[:, :-lag]) == pytest.approx(covariance[lag], abs=0.07 * covariance[0])
+
+
+@pytest.mark.parametrize("gauge", [Gauge(pink=0.8), Gauge(pink=0.4, sigma=0.1)])
+def test_whitening_is_the_cholesky_factors(gauge):
+    n = 200
+    signal = np.random.default_rng(3).standard_normal((n, 2))
+    found = white(signal, gauge)
+    covariance = autocovariance(gauge, n)
+    C = covariance[np.abs(np.subtract.outer(np.arange(n), np.arange(n)))]
+    assert np.allclose(found, np.linalg.solve(np.linalg.cholesky(C), signal), rtol=1e-8, atol=1e-8)
+
+
+def test_spikes_are_few_and_large():
+    u = np.full(1000, 10.0)
+    off = np.abs(read_gauge(u, Gauge(spikes=3), np.random.default_rng(2)) - u)
+    assert sum(off > 1.0) == 3 and np.sort(off)[-4] < 0.1
+
+
+def test_gaps_and_uneven_sampling():
+    plan = Plan("a", ((4.0, 5.0), (4.0, 10.0)), 5.0, 0.01)
+    every = plan.times()
+    gap = replace(plan, gaps=((1.0, 1.5),)).times()
+    assert every.size - gap.size == 51 and set(gap) <= set(every) and not ((gap >= 1.0) & (gap <= 1.5)).any()
+    dense = replace(plan, dense=1.0).times()
+    assert set(dense) <= set(every) and (np.diff(dense[(dense > 4.0) & (dense < 5.0)]) < 0.011).all()
+    assert np.allclose(np.diff(dense[(dense > 5.1) & (dense < 7.9)]), 0.05)
+    wander = replace(plan, wander=0.2).times()
+    assert wander.size == every.size and np.diff(wander).min() > 0
+    assert np.std((wander - every)[1:]) == pytest.approx(0.002, rel=0.1)
+    trace = move(Physics(), replace(plan, wander=0.2, gaps=((1.0, 1.5),)))
+    assert trace.complete and trace.u.size == trace.t.size
+    assert np.allclose(trace.u, np.interp(trace.t, every, move(Physics(), plan).u), atol=5e-3)
+
+
 def test_it_shares_nothing_with_what_it_proves():
     folder = Path(__file__).resolve().parents[1] / "srfcli" / "validation"
-    for path in (folder / "slider.py", folder / "cases.py"):
+    for path in (folder / f"{name}.py" for name in GENERATOR):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         names = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
         names |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
-        own = {n for n in names if n.startswith("srfcli") and not n.startswith("srfcli.validation.slider")}
+        own = {n for n in names if n.startswith("srfcli")} - {f"srfcli.validation.{name}" for name in GENERATOR}
         assert own <= {"srfcli.core.errors", "srfcli.core.files", "srfcli.core.parallel"}, path

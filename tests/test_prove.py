@@ -26,6 +26,7 @@ from srfcli.core.errors import SrfError
 from srfcli.core.parallel import run_processes
 from srfcli.laws.registry import load_registry
 from srfcli.validation import marks as report
+from srfcli.validation.apparatus import RIGS
 from srfcli.validation.blind import (
     Answer,
     Task,
@@ -37,7 +38,18 @@ from srfcli.validation.blind import (
     to_line,
     write_answers,
 )
-from srfcli.validation.cases import KINDS, NAMES, make_case, plan_bank, variants
+from srfcli.validation.cases import (
+    BANKS,
+    KINDS,
+    NAMES,
+    WIDE_KINDS,
+    make_case,
+    plan_bank,
+    plan_wide,
+    possible_pairs,
+    variants,
+)
+from srfcli.validation.gauge import Gauge
 from srfcli.validation.marks import (
     INVISIBLE,
     SIZES,
@@ -51,7 +63,7 @@ from srfcli.validation.marks import (
     see,
     stands_out,
 )
-from srfcli.validation.slider import Physics, Plan
+from srfcli.validation.slider import Physics, Plan, move
 from srfcli.validation.trials import Trial, answer_all, begin, open_truths
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -158,6 +170,12 @@ ALPHA, DRAG, LAG = "linker-dieterich", "viscous-drag", "sensor-lag"
         (truth_of(ALPHA, accept=["unknown"]), "unknown", (), True),
         (truth_of(ALPHA, accept=["sensor-lag+viscous-drag"]), "identified", (DRAG, LAG), True),
         (truth_of(ALPHA), "failed", (), False),
+        (truth_of("ruina", kind="ageing", accept=["slip-evolution"]), "identified", ("ruina",), True),
+        (truth_of("ruina", kind="ageing", accept=["slip-evolution"]), "identified", ("slip-evolution",), True),
+        (truth_of("dieterich", kind="ageing"), "unknown", (), False),
+        (truth_of("dieterich", kind="ageing"), "identified", ("dieterich",), True),
+        (truth_of(LAG, kind="one-run", accept=["unknown"], only="strong"), "unknown", (), True),
+        (truth_of(LAG, kind="one-run", accept=["unknown"], only="strong"), "none", (), False),
     ],
 )
 def test_right_is_the_verdict_and_the_set(truth, verdict, names, right):
@@ -348,6 +366,33 @@ def test_tables_count_what_was_marked():
     assert rows(report.calibrated(marks))
 
 
+def test_an_effect_in_one_run_is_marked_by_its_name_and_by_its_run():
+    truth = truth_of(LAG, kind="one-run", accept=["unknown"], only="strong")
+    answers = [
+        Answer("c", "identified", (LAG,), run="strong"), Answer("c", "identified", (LAG,), run="steps"),
+        Answer("c", "unknown", run="strong"), Answer("c", "identified", (DRAG,), run="strong"),
+    ]  # fmt: skip
+    marks = [mark(truth, answer, Sight("c", sigmas={LAG: 90.0})) for answer in answers]
+    assert [(m.kind, m.right, m.located) for m in marks] == [
+        ("one-run", True, True), ("one-run", True, False), ("one-run", True, False), ("one-run", False, False),
+    ]  # fmt: skip
+    found = rows(report.rates([*marks, marked(truth_of("ruina", kind="ageing"), "identified", "ruina")]))
+    assert [found[f"effect in one run: named, {how}"]["hits"] for how in ("or unknown", "and the run")] == [3, 1]
+    assert (found["ageing law named, where another is stated"]["hits"], len(marks)) == (1, 4)
+    everywhere = mark(truth_of(LAG), Answer("c", "identified", (LAG,)), Sight("c", sigmas={LAG: 90.0}))
+    assert everywhere.right and not everywhere.located
+
+
+def test_marks_are_counted_by_what_the_case_was_set_in():
+    alarm = replace(marked(truth_of(), "unknown"), set_in={"apparatus": "rock-stress", "noise": "1/f"})
+    right = replace(marked(truth_of(ALPHA), "identified", ALPHA), set_in={"apparatus": "paper", "noise": "1/f"})
+    wrong = replace(marked(truth_of(ALPHA), "identified", DRAG), set_in={"apparatus": "paper", "noise": "white"})
+    found = {(r["circumstance"], r["value"]): r for r in report.rows_of(report.by_setting([alarm, right, wrong]))}
+    assert list(found) == [("apparatus", "paper"), ("apparatus", "rock-stress"), ("noise", "1/f"), ("noise", "white")]
+    counts = [[r[n] for n in ("hits", "cases", "false_alarms", "nothing", "named_wrongly")] for r in found.values()]
+    assert counts == [[1, 2, 0, 0, 1], [0, 1, 1, 1, 0], [1, 2, 1, 1, 0], [0, 1, 0, 0, 1]]
+
+
 def test_a_report_holds_everything_and_survives_json():
     from srfcli.results.tables import envelope, to_json, to_text
 
@@ -374,6 +419,9 @@ def test_answers_survive_their_file(tmp_path):
     ]
     write_answers(tmp_path / "a", reversed(answers))
     assert read_answers(tmp_path / "a") == {a.case: a for a in answers}
+    older = json.loads(to_line(answers[0]))
+    del older["run"]  # which answers of former states of the program lack
+    assert from_line(json.dumps(older), where="a") == answers[0]
     assert len((tmp_path / "a").read_text().splitlines()) == 3
     assert read_answers(tmp_path / "nothing") == {}
 
@@ -394,16 +442,15 @@ def test_a_damaged_line_is_named(tmp_path, line):
 def test_an_effect_stands_out_by_what_the_baseline_cannot_do():
     """The size's standard error in a linear fit, by the normal equations, of a drag beside the baseline."""
     plan, p = SHORT[1], replace(Physics(), drag=3e-5)
-    gauge = replace(report.Gauge(), lag1=0.6)
-    shown = {plan: report.move(p, plan).u}
+    gauge = Gauge(lag1=0.6)
     drag = variants("viscous-drag")[0]
-    left, raw = stands_out(drag, [], p, gauge=gauge, shown=shown)
+    left, raw = stands_out(drag, [], {plan: p}, gauge=gauge)
 
-    base = report.move(replace(p, drag=0.0), plan).u
-    columns = [(shown[plan] - base) / p.drag]
+    base = move(replace(p, drag=0.0), plan).u
+    columns = [(move(p, plan).u - base) / p.drag]
     for name in ("mu0", "A", "B", "D0", "Vsat", "lam"):
         h = 1e-4 * getattr(p, name)
-        up, down = (report.move(replace(p, drag=0.0, **{name: getattr(p, name) + s * h}), plan).u for s in (1, -1))
+        up, down = (move(replace(p, drag=0.0, **{name: getattr(p, name) + s * h}), plan).u for s in (1, -1))
         columns.append((up - down) / (2 * h))
     J = np.column_stack(columns)
     n, level2 = len(base), 0.02**2 + 0.005**2 / 12
@@ -420,7 +467,7 @@ def test_a_shift_of_a_free_parameter_does_not_stand_out():
     p = replace(Physics(), Wa=0.05)
     adhesion = variants("adhesion-offset")[0]
     for plan, most in ((steady, 0.2), (SHORT[1], np.inf)):
-        left, raw = stands_out(adhesion, [], p, gauge=report.Gauge(), shown={plan: report.move(p, plan).u})
+        left, raw = stands_out(adhesion, [], {plan: p}, gauge=Gauge())
         assert left < most
         assert raw > 20
     assert left > 5  # a step of the load shows it
@@ -431,14 +478,15 @@ def test_a_wrong_stiffness_does_not_stand_out_where_no_mass_is_known():
     r, p = 1.2, replace(Physics(), massless=True)
     stiffer, scaled = replace(p, ratio=r), replace(p, mu0=p.mu0 / r, A=p.A / r, B=p.B / r, lam=p.lam * r)
     plan, wrong = SHORT[1], variants("stiffness-error")[0]
-    u = report.move(stiffer, plan).u
-    np.testing.assert_allclose(u, report.move(scaled, plan).u, rtol=1e-6)
-    left, raw = stands_out(wrong, [], stiffer, gauge=report.Gauge(), shown={plan: u})
+    np.testing.assert_allclose(move(stiffer, plan).u, move(scaled, plan).u, rtol=1e-6)
+    left, raw = stands_out(wrong, [], {plan: stiffer}, gauge=Gauge())
     assert left == 0 < 20 < raw
-    heavy = replace(stiffer, massless=False, M=4e-6)
-    shown = {plan: report.move(heavy, plan).u}
-    assert stands_out(wrong, [], heavy, gauge=report.Gauge(), shown=shown)[0] > 0
-    assert stands_out(wrong, list(variants("inertia")), heavy, gauge=report.Gauge(), shown=shown)[0] == 0
+    heavy = {plan: replace(stiffer, massless=False, M=4e-6)}
+    assert stands_out(wrong, [], heavy, gauge=Gauge())[0] > 0
+    assert stands_out(wrong, list(variants("inertia")), heavy, gauge=Gauge())[0] == 0
+    stress = Gauge(sigma=1e-3, quantum=1e-4)
+    force = stands_out(wrong, [], {plan: stiffer}, gauge=stress, rig=RIGS["rock-stress"])[0]
+    assert force > INVISIBLE  # a force is known, and a softer spring loads more slowly
 
 
 def test_the_true_model_leaves_the_noise(quick, tmp_path):
@@ -599,7 +647,22 @@ def test_kinds_of_a_bank():
     assert plan_bank(200, 5, kinds=KINDS) == plan_bank(200, 5)
     with pytest.raises(SrfError, match="unknown kind of case 'sngle'"):
         plan_bank(5, 1, kinds=["sngle"])
-    assert command.KINDS == KINDS
+    with pytest.raises(SrfError, match="no cases of the kind 'ageing'") as caught:
+        plan_bank(5, 1, kinds=["ageing"])
+    assert "--bank wide" in caught.value.hint
+    assert (command.KINDS, command.BANKS) == (WIDE_KINDS, BANKS)
+
+
+def test_kinds_of_a_wide_bank():
+    plan = plan_wide(200, 3)
+    counts = {kind: sum(k == kind for k, _ in plan) for kind in WIDE_KINDS}
+    assert counts == {"none": 50, "single": 60, "pair": 20, "outside": 26, "ageing": 28, "one-run": 16}
+    assert {names for kind, names in plan if kind in ("none", "ageing")} == {()}
+    singles = [names[0] for kind, names in plan if kind == "single"]
+    assert set(singles) == set(NAMES) and len({singles.count(n) for n in NAMES} | {3}) <= 2
+    assert {names for kind, names in plan if kind == "pair"} <= set(possible_pairs())
+    assert {kind for kind, _ in plan_wide(30, 1, kinds=["ageing", "one-run"])} == {"ageing", "one-run"}
+    assert plan_wide(40, 3) == plan_wide(40, 3) != plan_wide(40, 4)
 
 
 def deadly(task):
@@ -652,9 +715,29 @@ def test_the_command_from_bank_to_report(stub, tmp_path, capsys):
     assert "is a trial of cases 4, not 5" in capsys.readouterr().err
 
 
+def test_the_command_on_the_wide_bank(stub, tmp_path, monkeypatch, capsys):
+    """Rock in a press, steps of the load alone: from the bank to the tables by apparatus, protocol, law, noise and field."""
+    monkeypatch.setattr("srfcli.validation.apparatus.APPARATUS", {"rock": 1.0})
+    monkeypatch.setattr("srfcli.validation.apparatus.PROTOCOLS", {"load-steps": 1.0})
+    folder = tmp_path / "t"
+    kinds = ("--kind", "none", "--kind", "ageing")
+    assert srf("prove", "--bank", "wide", "--cases", 3, "--seed", 5, *kinds, "--out", folder) == 0
+    assert "By apparatus, protocol, law, noise and field: right" in capsys.readouterr().out
+    data = json.loads((folder / "report.json").read_bytes())
+    assert {m["kind"] for m in data["meta"]["marks"]} == {"none", "ageing"}
+    assert all(m["sigmas"] > INVISIBLE for m in data["meta"]["marks"] if m["kind"] == "ageing")
+    found = {(r["circumstance"], r["value"]): r["cases"] for r in data["meta"]["settings"]}
+    assert found["protocol", "load-steps"] == 3
+    assert {name for name, _ in found} == {"apparatus", "protocol", "friction law", "ageing law", "noise", "field"}
+    assert srf("prove", "--out", folder, "--resume", "--bank", "paper") == 2
+    assert "is a trial of bank wide, not paper" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["--out", "a", "--kind", "ageing"], "the bank of the paper has no cases of the kind 'ageing'"),
+        (["--report-only", "full", "--bank", "wide"], "--bank has no meaning"),
         ([], "neither --out nor --report-only"),
         (["--out", "a", "--report-only", "b"], "exclude each other"),
         (["--out", "a", "--json", "--csv"], "--json and --csv exclude"),

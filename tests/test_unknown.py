@@ -27,7 +27,8 @@ from srfcli.diagnosis.verdict import Diagnosis, conclude
 from srfcli.laws.effect_file import formula_text
 from srfcli.laws.registry import bundled_registry, read_law
 from srfcli.tasks.law_check import check_law
-from srfcli.validation.cases import Gauge, case_files, read_gauge
+from srfcli.validation.cases import case_files
+from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, move
 
 TERMS = sorted(FOLDER.glob("*.toml"))

@@ -23,9 +23,11 @@ srf prove --cases 200 --seed 4 --workers 0 --out proof     two hundred cases on 
 srf prove --out proof --resume                             go on with what was interrupted
 srf prove --cases 40 --kind none --out nulls               false alarms alone
 srf prove --cases 40 --track own --out rough               every run on a rough track of its own
+srf prove --bank wide --cases 60 --workers 0 --out wide    rock, micro-tribometers, other laws, protocols and noise, too
 srf prove --report-only proof --json | jq .meta.rates      the tables again
 """
-KINDS = ("none", "single", "pair", "outside")
+KINDS = ("none", "single", "pair", "outside", "ageing", "one-run")
+BANKS = ("paper", "wide")
 TRACKS = ("smooth", "shared", "own")
 
 
@@ -37,7 +39,12 @@ TRACKS = ("smooth", "shared", "own")
     "kinds",
     multiple=True,
     type=click.Choice(KINDS),
-    help="Make cases of this kind only; may be given several times.",
+    help="Make cases of this kind only; may be given several times. ageing and one-run are in the wide bank.",
+)
+@click.option(
+    "--bank",
+    type=click.Choice(BANKS),
+    help="What cases are like: the paper's apparatus, protocol and law, or a wide choice of each.  [default: paper]",
 )
 @click.option(
     "--track",
@@ -72,6 +79,7 @@ def command(
     cases: int | None,
     seed: int | None,
     kinds: tuple[str, ...],
+    bank: str | None,
     track: str | None,
     workers: int,
     out: Path | None,
@@ -104,12 +112,13 @@ def command(
     count = workers or os.cpu_count() or 1
     if report is None:
         assert out is not None
-        trial = _answered(out, cases, seed, kinds, track, resume, unfinished, count, limit, plugins)
+        trial = _answered(out, cases, seed, kinds, bank, track, resume, unfinished, count, limit, plugins)
     else:
         given = {
             "--cases": cases is not None,
             "--seed": seed is not None,
             "--kind": bool(kinds),
+            "--bank": bank is not None,
             "--track": track is not None,
             "--resume": resume,
         }
@@ -125,6 +134,7 @@ def _answered(
     cases: int | None,
     seed: int | None,
     kinds: tuple[str, ...],
+    bank: str | None,
     track: str | None,
     resume: bool,
     unfinished: bool,
@@ -151,6 +161,7 @@ def _answered(
                 seed=seed,
                 kinds=kinds,
                 track=track,
+                bank=bank,
                 resume=resume,
                 workers=workers,
                 told=lambda k, n: progress.advance(),

@@ -42,7 +42,8 @@ class Answer:
 
     `fit` holds the fitted runs' rms over noise, `held` each held-out run's rms in um and over noise, by `baseline` and
     `augmented`; `parameters` are those that the effects brought, in declared units; `tried` has what was fitted, `ungated` the
-    verdict without a say of held-out runs; `cpu` and `wall` are in s; `code` tells programs apart.
+    verdict without a say of held-out runs; `run` is where most of the baseline's excess misfit is, if one run has more than half;
+    `cpu` and `wall` are in s; `code` tells programs apart.
     """
 
     case: str
@@ -60,6 +61,7 @@ class Answer:
     wall: float = 0.0
     code: str = ""
     failure: str = ""
+    run: str = ""
 
     @property
     def said(self) -> str:
@@ -78,7 +80,7 @@ def from_line(line: str, *, where: str) -> Answer:
     """Return the answer of a line; SrfError, naming `where`, for one that is no answer."""
     try:
         found = parse_json(line, "the line")
-        if not isinstance(found, dict) or set(found) != {f.name for f in fields(Answer)}:
+        if not isinstance(found, dict) or {"run", *found} != {f.name for f in fields(Answer)}:  # older ones have no run
             raise ValueError("not the keys of an answer")
         if found["verdict"] not in VERDICTS:
             raise ValueError(f"verdict {found['verdict']!r}")
@@ -173,6 +175,7 @@ def told(diagnosis: Diagnosis, *, case: str) -> Answer:
     from srfcli.diagnosis.answer import run_views
     from srfcli.diagnosis.verdict import brought
 
+    views = run_views(diagnosis)
     return Answer(
         case,
         diagnosis.verdict,
@@ -185,10 +188,18 @@ def told(diagnosis: Diagnosis, *, case: str) -> Answer:
             "baseline": _finite(diagnosis.shown.fit.maximum.point.rms),
             "augmented": _finite(diagnosis.final.fit.maximum.point.rms),
         },
-        {view.run.name: _errors(view) for view in run_views(diagnosis) if view.holdout},
+        {view.run.name: _errors(view) for view in views if view.holdout},
         {f.name: _evidence(f) for f in reversed(diagnosis.ranked)},
         diagnosis.ungated,
+        run=_worst([view for view in views if not view.holdout]),
     )
+
+
+def _worst(views: Sequence[RunView]) -> str:
+    """Return the fitted run that has more than half of what the baseline leaves beyond its noise; "" of none, or of one run."""
+    excess = {v.run.name: float(v.run.used.sum()) * max(v.rms[0] ** 2 - 1, 0.0) for v in views}
+    largest = max(excess, key=lambda name: excess[name], default="")
+    return largest if len(excess) > 1 and excess[largest] > 0.5 * sum(excess.values()) > 0 else ""
 
 
 def _evidence(fitted: Fitted) -> Mapping[str, float]:

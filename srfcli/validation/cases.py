@@ -8,16 +8,31 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from itertools import accumulate, cycle, islice
+from itertools import accumulate, combinations, cycle, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import parse_json, read_plain, write_atomic
 from srfcli.core.parallel import run_here, run_processes
+from srfcli.validation.apparatus import (
+    NOISE_SHARES,
+    ONE_RUN,
+    PAPER,
+    RIGS,
+    SIZES,
+    Rig,
+    Setting,
+    disturbed,
+    draw_gauge,
+    draw_setup,
+    possible,
+    recorded,
+    settings,
+)
+from srfcli.validation.gauge import REDDEST, Array, Gauge, play, read_gauge
 from srfcli.validation.slider import SMOOTH, Physics, Plan, Trace, Track, move
 
 # What can be concealed: each effect, how strong it is drawn, and what the baseline is that lacks it.
@@ -40,7 +55,7 @@ class Effect:
     signs: tuple[int, ...] = (1,)
     neutral: float = 0.0
     beside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    absent: Mapping[str, bool] = field(default_factory=dict)
+    absent: Mapping[str, bool | str | float] = field(default_factory=dict)
     scale: float = 1.0  # the field is neutral + scale * sign * size
     listed: bool = True
     resembles: tuple[str, ...] = ()
@@ -54,6 +69,13 @@ class Effect:
         if self.varies == "Vsat":
             changes["Vsat"] = 1 / strength  # the cut-off is absent at 1/Vsat = 0
         return replace(p, **changes)
+
+    def present(self, p: Physics, before: Physics) -> Physics:
+        """Return `p` where the baseline `before` it was drawn around lacks the effect already: with what it lacks."""
+        lacked: dict[str, Any] = {name: False for name in self.absent if getattr(before, name)}
+        if "bare" in lacked:
+            lacked["mu0"] = p.mu0 - p.B * math.log(p.Vsat / p.V0)
+        return replace(p, **lacked)
 
     def removed(self, p: Physics) -> Physics:
         """Return `p` without this effect: the baseline's own physics."""
@@ -115,6 +137,7 @@ OUTSIDE: tuple[Effect, ...] = (
 )  # fmt: skip
 NAMES = tuple(dict.fromkeys(e.name for e in EFFECTS))
 OUTSIDE_NAMES = tuple(e.name for e in OUTSIDE)
+ONE_RUN_NAMES = tuple(dict.fromkeys(e.name for e in EFFECTS if e.varies in ONE_RUN))
 
 
 def variants(name: str) -> tuple[Effect, ...]:
@@ -128,8 +151,11 @@ def variants(name: str) -> tuple[Effect, ...]:
 # What a case is made of, drawn from its seed: laws around those of the examples, effects, protocol, track and gauge.
 
 KINDS = ("none", "single", "pair", "outside")
+WIDE_KINDS = (*KINDS, "ageing", "one-run")  # another ageing law is stated; an effect acts in one run
+BANKS = ("paper", "wide")
 TRACKS = {"smooth": (False, False), "shared": (True, False), "own": (True, True)}  # whether rough, and each run's own
 SHARES = (0.25, 0.4, 0.15, 0.2)  # of the kinds, where none is asked for
+WIDE_SHARES = (0.25, 0.3, 0.1, 0.13, 0.14, 0.08)
 SPREAD = {"A": 0.05, "B": 0.05, "D0": 0.05, "lam": 0.05, "Vsat": 0.13, "mu0": 0.01}  # relative standard deviations
 ODD = ("rigid", "massless", "bare")  # baselines other than the usual one
 ODD_SHARE = 0.15  # of the cases where no effect decides it: else an odd baseline would give the answer away
@@ -144,21 +170,15 @@ USUAL_ONLY = {
 ROUGH_SHARE, WHITE_SHARE = 0.4, 0.6
 OWN_SHARE = 0.5  # of rough tracks: each run has its own
 ROUGHNESS, CORRELATION = (5e-5, 4e-4), (3.0, 30.0)  # of mu0; um
-SIGMA, QUANTUM, REDDEST = 0.02, 0.005, 0.85
-
-
-@dataclass(frozen=True)
-class Gauge:
-    """The noise of a gauge: standard deviation and quantum in um, correlation of neighbouring samples."""
-
-    sigma: float = SIGMA
-    lag1: float = 0.0
-    quantum: float = QUANTUM
+ROCK_CORRELATION = 10.0  # times as long, as are slip lengths and distances
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A case before anything moves: the truth `physics`, the `baseline` that is stated, the plans of its runs, its gauge."""
+    """A case before anything moves: the truth `physics`, the `baseline` that is stated, the plans of its runs, its gauge.
+
+    `rig` is of RIGS, `noise` of NOISE_SHARES; `only` is the one run in which the effects act, empty for all.
+    """
 
     effects: tuple[Effect, ...]
     sizes: tuple[float, ...]
@@ -166,6 +186,22 @@ class Recipe:
     baseline: Physics
     plans: tuple[Plan, ...]
     gauge: Gauge
+    kind: str = ""
+    rig: str = "paper"
+    protocol: str = "mixed"
+    noise: str = "white"
+    only: str = ""
+
+    def acting(self, plan: Plan) -> Physics:
+        """Return what is true in one run."""
+        return self.physics if self.only in ("", plan.name) else without(self.physics, self.effects)
+
+
+def without(p: Physics, effects: Sequence[Effect]) -> Physics:
+    """Return `p` without these effects."""
+    for effect in effects:
+        p = effect.removed(p)
+    return p
 
 
 def draw_recipe(
@@ -190,16 +226,124 @@ def draw_recipe(
     for effect, strength in zip(chosen, sizes, strict=True):
         physics = effect.added(physics, rng, strength)
     physics = replace(physics, track=track)
-    baseline = physics
-    for effect in chosen:
-        baseline = effect.removed(baseline)
+    baseline = without(physics, chosen)
     plans = draw_protocol(rng)
     lag1 = float(rng.uniform(0.3, REDDEST))
     gauge = Gauge(lag1=0.0 if rng.uniform() < WHITE_SHARE else lag1)
     drawn_own = rng.uniform() < OWN_SHARE
     if track.size and (drawn_own if own is None else own):
         physics, baseline = (replace(p, track=replace(track, own=True)) for p in (physics, baseline))
-    return Recipe(chosen, sizes, physics, baseline, plans, gauge)
+    noise = "ar1" if gauge.lag1 else "white"
+    return Recipe(chosen, sizes, physics, baseline, plans, gauge, kind_of(chosen), noise=noise)
+
+
+def kind_of(effects: Sequence[Effect]) -> str:
+    """Return the kind of a case that conceals these effects in all of its runs."""
+    return ("none", "single", "pair")[len(effects)] if all(e.listed for e in effects) else "outside"
+
+
+def draw_wide(
+    rng: np.random.Generator,
+    *,
+    kind: str | None = None,
+    effects: Sequence[str] | None = None,
+    size: float | None = None,
+    rough: bool | float | None = None,
+    own: bool | None = None,
+) -> Recipe:
+    """Return the case of the wide bank that `rng` gives; what is asked for is not drawn.
+
+    Apparatus, protocol, laws and noise are among those in which the effects make sense, `effects` those that `kind` wants.
+    """
+    if kind is None and effects is not None:
+        kind = kind_of([e for name in effects for e in variants(name)[:1]])
+    kind = str(rng.choice(WIDE_KINDS, p=WIDE_SHARES)) if kind is None else kind
+    if kind not in WIDE_KINDS:
+        raise SrfError(f"unknown kind of case '{kind}'", did_you_mean(kind, WIDE_KINDS))
+    names = wide_names(rng, kind) if effects is None else tuple(effects)
+    forms, setting = _set(rng, kind, names)
+    physics, plans = draw_setup(rng, setting)
+    plans = plans or draw_protocol(rng)
+    if setting.apparatus == "paper" and rng.uniform() < ODD_SHARE and _may_be_odd(forms, setting):
+        which = str(rng.choice(("rigid", "massless")))
+        physics = replace(physics, rigid=which == "rigid", massless=which == "massless")
+    drawn = rng.uniform(0, 1, size=len(forms)).tolist()
+    sizes = tuple(drawn if size is None else [_within(size)] * len(forms))
+    for effect, strength in zip(forms, sizes, strict=True):
+        physics = effect.present(effect.added(physics, rng, strength), physics)
+    track = _track(rng, rough)
+    if track.size and setting.apparatus == "rock":
+        track = replace(track, length=ROCK_CORRELATION * track.length)
+    drawn_own = rng.uniform() < OWN_SHARE
+    physics = replace(physics, track=replace(track, own=bool(track.size) and (drawn_own if own is None else own)))
+    if kind == "ageing":
+        forms, sizes = (other_ageing(setting.ageing, setting.stated),), (1.0,)
+    noise = str(rng.choice(list(NOISE_SHARES), p=list(NOISE_SHARES.values())))
+    plans = disturbed(rng, plans, noise)
+    rig = str(rng.choice([name for name in RIGS if name.partition("-")[0] == setting.apparatus]))
+    gauge = draw_gauge(rng, rig, physics, noise)
+    only = str(rng.choice(_runs_of(forms[0], plans))) if kind == "one-run" else ""
+    return Recipe(forms, sizes, physics, without(physics, forms), plans, gauge, kind, rig, setting.protocol, noise, only)
+
+
+def wide_names(rng: np.random.Generator, kind: str) -> tuple[str, ...]:
+    """Return the effects of a case of the wide bank, by its kind."""
+    if kind == "pair":
+        pairs = possible_pairs()
+        return pairs[int(rng.integers(len(pairs)))]
+    known = {"single": NAMES, "outside": OUTSIDE_NAMES, "one-run": ONE_RUN_NAMES}.get(kind)
+    return (str(rng.choice(known)),) if known else ()
+
+
+def _set(rng: np.random.Generator, kind: str, names: Sequence[str]) -> tuple[tuple[Effect, ...], Setting]:
+    """Return the effects in forms and sizes of a setting in which they make sense, and the setting."""
+    if len(set(names)) < len(names):
+        raise SrfError(f"an effect is named twice: {', '.join(names)}", "name each once")
+    forms = tuple(some[int(rng.integers(len(some)))] for some in map(variants, names))
+    found = [s for s in settings(wrong_ageing=kind == "ageing") if all(possible(e.varies, s) for e in forms)]
+    if kind == "one-run":
+        found = [s for s in found if s.protocol != "steps"]  # which is one run
+    if not found:
+        raise SrfError(f"no apparatus, protocol and law go with {' and '.join(names)}", "name other effects")
+    shares = np.array([s.share for s in found])
+    setting = found[int(rng.choice(len(found), p=shares / shares.sum()))]
+    sizes = SIZES.get(setting.apparatus, {})
+    return tuple(_sized(e, sizes.get(e.varies)) for e in forms), setting
+
+
+def _sized(effect: Effect, sizes: tuple[float, float, Mapping[str, tuple[float, float]]] | None) -> Effect:
+    if sizes is None:
+        return effect
+    weak, strong, beside = sizes
+    return replace(effect, weak=weak, strong=strong, beside=beside)
+
+
+def _may_be_odd(forms: Sequence[Effect], setting: Setting) -> bool:
+    """Return whether a rigid or quasi-static baseline can be followed, and gives nothing away."""
+    decided = any(e.name in USUAL_ONLY for e in forms)
+    return not decided and setting.protocol not in ("mixed", "stick-slip") and "nagata" not in (setting.ageing, setting.stated)
+
+
+def _runs_of(effect: Effect, plans: Sequence[Plan]) -> list[str]:
+    """Return the fitted runs in which an effect can act."""
+    fitted = [p for p in plans if not p.holdout]
+    if effect.varies in ("rho", "distortion"):
+        fitted = [p for p in fitted if p.eps]
+    elif effect.varies == "cross":
+        fitted = [p for p in fitted if p.eps or p.steps]
+    return [p.name for p in fitted]
+
+
+def possible_pairs() -> list[tuple[str, str]]:
+    """Return the pairs of effects that make sense together in some setting."""
+    every = settings()
+    fits = {name: {s for s in every if possible(variants(name)[0].varies, s)} for name in NAMES}
+    return [(a, b) for a, b in combinations(NAMES, 2) if fits[a] & fits[b]]
+
+
+def other_ageing(true: str, stated: str) -> Effect:
+    """Return the true ageing law as an effect that a baseline with the stated one lacks."""
+    return Effect(true, "ageing", 1.0, 1.0, absent={"ageing": stated, "nagata": 0.0})
 
 
 def _within(size: float) -> float:
@@ -282,90 +426,61 @@ def draw_protocol(rng: np.random.Generator) -> tuple[Plan, ...]:
     )  # fmt: skip
 
 
-# What a gauge makes of the true elongation: play, coloured noise, quanta.
-
-Array = np.ndarray
-
-
-def read_gauge(u: Array, gauge: Gauge, rng: np.random.Generator, *, backlash: float = 0.0) -> Array:
-    """Return the readings (n,) in um of the elongations u (n,): those of a first-order autoregressive noise, then rounded."""
-    shown = play(u, backlash) if backlash else u
-    draws = rng.standard_normal(u.size)
-    draws[1:] *= np.sqrt(1 - gauge.lag1**2)  # the first is as wide as all that follow
-    noise = gauge.sigma * lfilter([1.0], [1.0, -gauge.lag1], draws)
-    return np.asarray(np.round((shown + noise) / gauge.quantum) * gauge.quantum)
-
-
-def play(u: Array, half: float) -> Array:
-    """Return what a pointer with play shows: it stays until u is more than `half` um away, and then is dragged along."""
-    shown, at = np.empty_like(u), float(u[0])
-    for k, value in enumerate(u.tolist()):
-        at = min(max(at, value - half), value + half)
-        shown[k] = at
-    return shown
-
-
 # A case as a folder in the format srf-experiment/1: what the one who is to diagnose it gets to see.
 
 DESCRIPTION = "experiment.toml"
-HEADER = "time [s],load_point_velocity [um/s],normal_load [N],elongation [um]"
-STARTS = {  # name -> value, lower, upper: the same for every case, as in the examples
-    "mu0": (0.33, 0.2, 0.5),
-    "A": (0.012, 0.006, 0.03),
-    "B": (0.023, 0.01, 0.06),
-    "D0": (0.4, 0.1, 1.5),
-    "Vsat": (280.0, 50.0, 2000.0),
-    "lambda": (0.62, 0.2, 1.5),
-}
-BARE_START = (0.46, 0.3, 0.7)  # of mu0, where it is the steady friction at V0
+STARTS = PAPER.start(Physics())  # name -> value, lower, upper: the same for every case, as in the examples
 
 
-def description(title: str, baseline: Physics, plans: tuple[Plan, ...]) -> str:
+def description(baseline: Physics, plans: tuple[Plan, ...], *, title: str, rig: Rig = PAPER, spikes: bool = False) -> str:
     """Return the text of experiment.toml: apparatus and model as the baseline has them, nothing of what is concealed."""
-    starts = dict(STARTS)
-    if baseline.bare:
-        starts["mu0"] = BARE_START
-        del starts["Vsat"]
-    if baseline.rigid:
-        del starts["lambda"]
     mass = "" if baseline.massless else f'mass = "{baseline.M * 1e6:.3g} kg"\n'
+    reference = [] if baseline.law == "dieterich-cutoff" else ["V0 = { value = 1.0, fixed = true }"]
+    unit = "MPa/um" if rig.unit == "MPa" else "N/um"
     lines = [
         f'format = "srf-experiment/1"\ntitle = "{title}"\n',
-        f'[apparatus]\nstiffness = "{baseline.K:.6g} N/um"\n{mass}',
-        f'[model]\nlaw = "{"dieterich-ruina" if baseline.bare else "srf-vsat"}"\nageing = "dieterich"',
+        f'[apparatus]\nstiffness = "{baseline.K:.6g} {unit}"\n{mass}',
+        f'[model]\nlaw = "{baseline.law_name}"\nageing = "{baseline.ageing_name}"',
         f'interface = "{"rigid" if baseline.rigid else "elastic"}"\ninertia = {_toml_truth(not baseline.massless)}\n',
         "[parameters]   # start values and bounds of what is to be fitted; um, s, N",
-        *(f"{n} = {{ value = {v!r}, lower = {a!r}, upper = {b!r} }}" for n, (v, a, b) in starts.items()),
-        "V0 = { value = 1.0, fixed = true }",
+        *(f"{n} = {{ value = {v!r}, lower = {a!r}, upper = {b!r} }}" for n, (v, a, b) in rig.start(baseline).items()),
+        *reference,
     ]
-    return "\n".join([*lines, *map(_run, plans)]) + "\n"
+    return "\n".join([*lines, *(_run(plan, spikes=spikes) for plan in plans)]) + "\n"
 
 
-def _run(plan: Plan) -> str:
+def _run(plan: Plan, *, spikes: bool) -> str:
     drive = ", ".join(f"{{ duration = {d!r}, velocity = {v!r} }}" for d, v in plan.drive)
     text = f'\n[[runs]]\nname = "{plan.name}"\nfile = "{plan.name}.csv"\nholdout = {_toml_truth(plan.holdout)}'
     text += f"\ndrive = [{drive}]   # s, um/s"
-    if plan.eps:
+    if spikes:
+        text += '\ncorrections = ["spike"]'
+    if plan.eps and not plan.rise:  # a slow oscillation is in the column, and nowhere else
         text += f"\nmodulation = {{ frequency = {plan.f!r}, amplitude = {plan.eps!r}, onset = {plan.onset!r} }}"
         text += "   # Hz, of the mean load, s; the load itself is the column"
     return text
 
 
-def table(plan: Plan, observed: np.ndarray) -> str:
+def table(plan: Plan, observed: Array, rig: Rig = PAPER) -> str:
     """Return the text of a run's CSV: time, nominal velocity of the load point, imposed load, readings `observed` (n,)."""
     t, load = plan.times(), plan.load()
     ends = np.array(list(accumulate(d for d, _ in plan.drive)))
     velocities = np.array([v for _, v in plan.drive])
     V = velocities[np.minimum(np.searchsorted(ends, t + 1e-9, side="right"), velocities.size - 1)]
-    W = [load(s)[0] for s in t.tolist()]
-    rows = (f"{s:.4f},{v:g},{w:.6f},{u:.3f}" for s, v, w, u in zip(t, V, W, observed, strict=True))
-    return "\n".join([HEADER, *rows]) + "\n"
+    W = [load(s)[0] / rig.factor for s in t.tolist()]
+    rows = (
+        f"{s:.4f},{v:g},{w:.{rig.load_digits}f},{u:.{rig.digits}f}" for s, v, w, u in zip(t, V, W, observed, strict=True)
+    )
+    header = f"time [s],load_point_velocity [um/s],{rig.load},{rig.heading}"
+    return "\n".join([header, *rows]) + "\n"
 
 
-def case_files(title: str, baseline: Physics, readings: Mapping[Plan, np.ndarray]) -> dict[str, str]:
-    """Return the files of a case, name -> text."""
-    runs = {f"{plan.name}.csv": table(plan, observed) for plan, observed in readings.items()}
-    return {**runs, DESCRIPTION: description(title, baseline, tuple(readings))}
+def case_files(
+    title: str, baseline: Physics, readings: Mapping[Plan, Array], *, rig: Rig = PAPER, spikes: bool = False
+) -> dict[str, str]:
+    """Return the files of a case, name -> text; `spikes` asks for their correction."""
+    runs = {f"{plan.name}.csv": table(plan, observed, rig) for plan, observed in readings.items()}
+    return {**runs, DESCRIPTION: description(baseline, tuple(readings), title=title, rig=rig, spikes=spikes)}
 
 
 def _toml_truth(value: bool) -> str:
@@ -388,23 +503,31 @@ def make_case(
     rough: bool | float | None = None,
     own: bool | None = None,
     strengths: bool = True,
+    bank: str = "paper",
 ) -> Truth:
     """Write a concealed experiment to the new folder `folder` and return the truth about it, ready for JSON.
 
-    `kind` is none, single, pair or outside; `effects` names them instead. With `strengths` every run is moved again without each
-    effect, to know how far it moves the record. The same seed and choices give the same bytes.
+    `kind` is none, single, pair or outside, in the wide `bank` also ageing or one-run; `effects` names them. With `strengths`
+    every run is moved again without each effect, to know how far it moves the record. The same seed and choices give the same
+    bytes.
     Raises SrfError for unknown names, and where the folder exists.
     """
     if folder.exists():
         raise SrfError(f"{folder} exists already", "A case is never overwritten; name another folder.")
-    recipe, motions, attempt = _moving(seed, {"kind": kind, "effects": effects, "size": size, "rough": rough, "own": own})
-    rng = np.random.default_rng([*_whole(seed), attempt, 1])
-    readings = {plan: read_gauge(u, recipe.gauge, rng, backlash=recipe.physics.backlash) for plan, u in motions.items()}
+    if bank not in BANKS:
+        raise SrfError(f"unknown bank '{bank}'", did_you_mean(bank, BANKS))
+    asked = {"kind": kind, "effects": effects, "size": size, "rough": rough, "own": own}
+    recipe, motions, attempt = _moving(seed, draw_wide if bank == "wide" else draw_recipe, asked)
+    rng, rig = np.random.default_rng([*_whole(seed), attempt, 1]), RIGS[recipe.rig]
+    readings = {
+        plan: read_gauge(recorded(rig, recipe.acting(plan), plan, u), recipe.gauge, rng) for plan, u in motions.items()
+    }
     truth = _truth(recipe, attempt, seed)
     if strengths:
         truth["strength"] = {e.name: strength_of(e, recipe, motions) for e in recipe.effects}
     folder.mkdir(parents=True)
-    for name, text in case_files("PMMA on PMMA, concealed case", recipe.baseline, readings).items():
+    files = case_files(rig.title, recipe.baseline, readings, rig=rig, spikes=recipe.gauge.spikes > 0)
+    for name, text in files.items():
         write_atomic(folder / name, text)  # the description last: without it a folder is no experiment
     return truth
 
@@ -413,16 +536,18 @@ def _whole(seed: int | Sequence[int]) -> list[int]:
     return [seed] if isinstance(seed, int) else list(seed)
 
 
-def _moving(seed: int | Sequence[int], asked: Mapping[str, Any]) -> tuple[Recipe, dict[Plan, Array], int]:
-    """Return the first recipe of the seed whose runs all reach their ends, its motions, and how many came before it."""
+def _moving(
+    seed: int | Sequence[int], draw: Callable[..., Recipe], asked: Mapping[str, Any]
+) -> tuple[Recipe, dict[Plan, Array], int]:
+    """Return the first recipe of the seed whose runs all reach their ends, what their gauges show, and how many came before."""
     for attempt in range(ATTEMPTS):
-        recipe = draw_recipe(np.random.default_rng([*_whole(seed), attempt, 0]), **asked)
+        recipe = draw(np.random.default_rng([*_whole(seed), attempt, 0]), **asked)
         motions: dict[Plan, Array] = {}
         for plan in recipe.plans:
-            trace = move(recipe.physics, plan)
-            if not trace.complete:
+            u = shown(recipe.acting(plan), plan)
+            if not np.isfinite(u).all():
                 break
-            motions[plan] = trace.u
+            motions[plan] = u
         else:
             return recipe, motions, attempt
     raise SrfError(
@@ -431,31 +556,47 @@ def _moving(seed: int | Sequence[int], asked: Mapping[str, Any]) -> tuple[Recipe
     )
 
 
+def shown(p: Physics, plan: Plan) -> Array:
+    """Return the elongations that a slider's gauge would show (n,) in um without noise; NaN from where it cannot be followed."""
+    u = move(p, plan).u
+    return play(u, p.backlash) if p.backlash else u
+
+
 def strength_of(effect: Effect, recipe: Recipe, motions: Mapping[Plan, Array]) -> Truth:
     """Return how far one effect moves the record: rms over noise by run, and over all samples of the fitted runs.
 
     `noncentrality` is the sum of squares over the noise's variance, before a fit of the baseline has absorbed its share; null
     where the slider without the effect cannot be followed.
     """
-    less, backlash = effect.removed(recipe.physics), recipe.physics.backlash
+    rig = RIGS[recipe.rig]
     rms: dict[str, float | None] = {}
     total: float | None = 0.0
     for plan, u in motions.items():
-        trace = move(less, plan)
-        moved = play(trace.u, less.backlash) if less.backlash else trace.u
-        change = ((play(u, backlash) if backlash else u) - moved) / recipe.gauge.sigma
-        rms[plan.name] = round(float(np.sqrt(np.mean(change**2))), 6) if trace.complete else None
+        p = recipe.acting(plan)
+        less = effect.removed(p)
+        change = (recorded(rig, p, plan, u) - recorded(rig, less, plan, shown(less, plan))) / recipe.gauge.sigma
+        followed = bool(np.isfinite(change).all())
+        rms[plan.name] = round(float(np.sqrt(np.mean(change**2))), 6) if followed else None
         if not plan.holdout:
-            total = total + float(change @ change) if trace.complete and total is not None else None
+            total = total + float(change @ change) if followed and total is not None else None
     return {"rms_over_noise": rms, "noncentrality": None if total is None else round(total, 4)}
 
 
 def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
     names = [e.name for e in recipe.effects]
     listed = all(e.listed for e in recipe.effects)
+    accept = ["unknown"] if recipe.only else []
+    if recipe.kind == "ageing" and names == ["ruina"] and recipe.baseline.ageing == "dieterich":
+        accept = ["slip-evolution"]  # its share of 1 is this law
     return {
         "effects": names,
         "verdict": "none" if not names else "identified" if listed else "unknown",
+        "kind": recipe.kind,
+        "accept": accept,
+        "only": recipe.only,
+        "rig": recipe.rig,
+        "protocol": recipe.protocol,
+        "noise": recipe.noise,
         "resembles": sorted({r for e in recipe.effects for r in e.resembles}),
         "sizes": dict(zip(names, recipe.sizes, strict=True)),
         "truth": {n: v for n, v in _changed(recipe.physics, recipe.baseline).items()},
@@ -485,18 +626,40 @@ def known_physics(truth: Mapping[str, Any], *, baseline: bool = False) -> Physic
 def known_plans(truth: Mapping[str, Any]) -> tuple[Plan, ...]:
     """Return the runs of a case from the truth about it."""
     return tuple(
-        Plan(**{**r, "drive": tuple(map(tuple, r["drive"])), "steps": tuple(map(tuple, r["steps"]))})
+        Plan(**{**r, **{n: tuple(map(tuple, r.get(n, ()))) for n in ("drive", "steps", "gaps")}})
         for r in truth["runs"]
     )
 
 
+def concealed(truth: Mapping[str, Any]) -> list[Effect]:
+    """Return the effects of a truth; of several forms of one, the form that the truth has."""
+    if truth.get("kind") == "ageing":
+        return [other_ageing(truth["effects"][0], known_physics(truth, baseline=True).ageing_name)]
+    found = []
+    for name in truth["effects"]:
+        forms = variants(name)
+        found.append(next((e for e in forms if len(forms) == 1 or e.varies in truth["truth"]), forms[0]))
+    return found
+
+
+def known_rig(truth: Mapping[str, Any]) -> Rig:
+    """Return the rig of a case from the truth about it."""
+    return RIGS[truth.get("rig", "paper")]
+
+
+def acting(truth: Mapping[str, Any], plan: Plan) -> Physics:
+    """Return what is true in one run of a case."""
+    p, only = known_physics(truth), truth.get("only", "")
+    return p if only in ("", plan.name) else without(p, concealed(truth))
+
+
 def known_traces(truth: Mapping[str, Any]) -> dict[str, Trace]:
-    """Return what a model that knows the truth, the track included, predicts for every run, by the run's name."""
-    p = known_physics(truth)
-    traces = {plan.name: move(p, plan) for plan in known_plans(truth)}
-    return {
-        name: replace(trace, u=play(trace.u, p.backlash)) if p.backlash else trace for name, trace in traces.items()
-    }
+    """Return what a model that knows the truth, the track included, predicts to be recorded in every run, by the run's name."""
+    found, rig = {}, known_rig(truth)
+    for plan in known_plans(truth):
+        p = acting(truth, plan)
+        found[plan.name] = Trace(plan.times(), recorded(rig, p, plan, shown(p, plan)))
+    return found
 
 
 def known_gauge(truth: Mapping[str, Any]) -> Gauge:
@@ -616,12 +779,14 @@ def make_bank(
     strengths: bool = True,
     kinds: Sequence[str] | None = None,
     track: str | None = None,
+    bank: str = "paper",
     told: Callable[[int, int], None] | None = None,
 ) -> Bank:
     """Write `n` cases to the new folder `folder`, their truths to `apart` (default: beside it), and the seal between them.
 
-    Does not depend on the number of workers. `kinds` are the kinds of cases, default all of KINDS, `track` one of TRACKS, default
-    all; `told` is called with how many are done, of how many. Raises SrfError for a folder that exists and for an unknown kind.
+    Does not depend on the number of workers. `kinds` are the kinds of cases, default all of the bank's, `track` one of TRACKS,
+    default all, `bank` one of BANKS; `told` is called with how many are done, of how many. Raises SrfError for a folder that
+    exists and for an unknown kind.
     """
     if n < 1:
         raise SrfError(f"{n} cases", "make one or more")
@@ -630,10 +795,11 @@ def make_bank(
     apart = folder.with_name(f"{folder.name}.truths.json") if apart is None else apart
     if apart.exists():
         raise SrfError(f"{apart} exists already", "Truths are never overwritten; name another file.")
+    plan = plan_wide(n, seed, kinds=kinds) if bank == "wide" else [(None, p) for p in plan_bank(n, seed, kinds=kinds)]
     folder.mkdir(parents=True)
     tasks = [
-        (folder / f"case-{i:03d}", (seed, i), names, track, strengths)
-        for i, names in enumerate(plan_bank(n, seed, kinds=kinds))
+        (folder / f"case-{i:03d}", (seed, i), kind, names, track, strengths, bank)
+        for i, (kind, names) in enumerate(plan)
     ]
     truths: dict[str, Truth] = {}
     for _, (name, truth) in run_here(_make, tasks) if workers <= 1 else run_processes(_make, tasks, workers=workers):
@@ -647,7 +813,8 @@ def make_bank(
 def plan_bank(n: int, seed: int, *, kinds: Sequence[str] | None = None) -> list[tuple[str, ...]]:
     """Return what each case of a bank conceals: the kinds in their usual shares, every effect as often as any other, shuffled."""
     rng = np.random.default_rng([seed, 2])
-    counts = _counts(n, KINDS if kinds is None else kinds)
+    check_kinds(kinds or (), "paper")
+    counts = _counts(n, KINDS if kinds is None else kinds, KINDS, SHARES)
     none, single, pair, outside = counts
     one = cycle(rng.permutation(NAMES).tolist())
     other = cycle(rng.permutation(OUTSIDE_NAMES).tolist())
@@ -659,21 +826,47 @@ def plan_bank(n: int, seed: int, *, kinds: Sequence[str] | None = None) -> list[
     return [plans[i] for i in rng.permutation(n).tolist()]
 
 
-def _counts(n: int, kinds: Sequence[str]) -> list[int]:
-    """Return how many cases of each of KINDS a bank of `n` has; what rounding leaves over is of the most frequent kind."""
-    strange = [k for k in kinds if k not in KINDS]
+def plan_wide(n: int, seed: int, *, kinds: Sequence[str] | None = None) -> list[tuple[str | None, tuple[str, ...]]]:
+    """Return kind and effects of each case of a wide bank, every effect of a kind as often as any other, shuffled."""
+    rng = np.random.default_rng([seed, 2])
+    check_kinds(kinds or (), "wide")
+    counts = _counts(n, WIDE_KINDS if kinds is None else kinds, WIDE_KINDS, WIDE_SHARES)
+    pairs = possible_pairs()
+    names: dict[str, list[tuple[str, ...]]] = {
+        "single": [(name,) for name in rng.permutation(NAMES).tolist()],
+        "pair": [pairs[k] for k in rng.permutation(len(pairs)).tolist()],
+        "outside": [(name,) for name in rng.permutation(OUTSIDE_NAMES).tolist()],
+        "one-run": [(name,) for name in rng.permutation(ONE_RUN_NAMES).tolist()],
+    }
+    plans: list[tuple[str | None, tuple[str, ...]]] = []
+    for kind, count in zip(WIDE_KINDS, counts, strict=True):
+        plans += [(kind, some) for some in islice(cycle(names.get(kind, [()])), count)]
+    return [plans[i] for i in rng.permutation(n).tolist()]
+
+
+def check_kinds(kinds: Sequence[str], bank: str) -> None:
+    """Raise SrfError for a kind of case that a bank does not have."""
+    every = WIDE_KINDS if bank == "wide" else KINDS
+    strange = [k for k in kinds if k not in every]
+    if strange and strange[0] in WIDE_KINDS:
+        raise SrfError(f"the bank of the paper has no cases of the kind '{strange[0]}'", "srf prove --bank wide has them.")
     if strange:
-        raise SrfError(f"unknown kind of case '{strange[0]}'", did_you_mean(strange[0], KINDS))
-    shares = np.array([s if k in kinds else 0.0 for k, s in zip(KINDS, SHARES, strict=True)])
-    counts = [int(c) for c in np.floor(shares / (shares.sum() if len(set(kinds)) < len(KINDS) else 1.0) * n + 1e-9)]
+        raise SrfError(f"unknown kind of case '{strange[0]}'", did_you_mean(strange[0], every))
+
+
+def _counts(n: int, kinds: Sequence[str], every: Sequence[str], usual: Sequence[float]) -> list[int]:
+    """Return how many cases of each kind a bank of `n` has; what rounding leaves over is of the most frequent kind."""
+    shares = np.array([s if k in kinds else 0.0 for k, s in zip(every, usual, strict=True)])
+    counts = [int(c) for c in np.floor(shares / (shares.sum() if len(set(kinds)) < len(every) else 1.0) * n + 1e-9)]
     counts[int(np.argmax(shares))] += n - sum(counts)
     return counts
 
 
-Task = tuple[Path, tuple[int, int], tuple[str, ...], str | None, bool]
+Task = tuple[Path, tuple[int, int], str | None, tuple[str, ...], str | None, bool, str]
 
 
 def _make(task: Task) -> tuple[str, Truth]:
-    folder, seed, names, track, strengths = task
+    folder, seed, kind, names, track, strengths, bank = task
     rough, own = TRACKS[track] if track else (None, None)
-    return folder.name, make_case(folder, seed, effects=names, rough=rough, own=own, strengths=strengths)
+    made = make_case(folder, seed, kind=kind, effects=names, rough=rough, own=own, strengths=strengths, bank=bank)
+    return folder.name, made

@@ -23,9 +23,21 @@ from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis.search import CLOSE
 from srfcli.laws.registry import load_registry
 from srfcli.results.tables import Column, Table
+from srfcli.validation.apparatus import OF_LAW, PAPER, Rig, recorded
 from srfcli.validation.blind import FAILED, VERDICTS, Answer
-from srfcli.validation.cases import KINDS, Effect, Gauge, known_gauge, known_physics, known_plans, play, variants
-from srfcli.validation.slider import Physics, Plan, move
+from srfcli.validation.cases import (
+    WIDE_KINDS,
+    Effect,
+    acting,
+    concealed,
+    known_gauge,
+    known_physics,
+    known_plans,
+    known_rig,
+    shown,
+)
+from srfcli.validation.gauge import Array, Gauge, white
+from srfcli.validation.slider import Physics, Plan
 
 # One answer held against the truth: what would have been right, and whether it was said.
 
@@ -43,7 +55,8 @@ class Mark:
     missing. `top` is the hypothesis with most confidence, `stated` that confidence, `hit` whether it is the truth; `error` the
     held-out rms of the final model over that of the true one, `baseline_error` that of the baseline; `deviation` is the
     distance of an effect's size from the true one, where it was named rightly and alone: in standard errors, and relative.
-    `own_track`: each run has a rough track of its own.
+    `own_track`: each run has a rough track of its own. `set_in` says in which apparatus, protocol, law, noise and field it was
+    concealed. `located`: of an effect in one run, whether it is named and most of the misfit is placed in that run.
     """
 
     case: str
@@ -64,6 +77,8 @@ class Mark:
     deviation: tuple[float, float] | None = None
     accepted: Accepted = frozenset()
     own_track: bool = False
+    set_in: Mapping[str, str] = field(default_factory=dict)
+    located: bool = False
 
     @property
     def visible(self) -> bool:
@@ -115,11 +130,30 @@ def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
         deviation(truth, answer),
         allowed,
         truth.get("own_track", False),
+        setting_of(truth),
+        answer.verdict == "identified" and answer.effects == hidden and answer.run == truth.get("only", "") != "",
     )
 
 
+def setting_of(truth: Mapping[str, Any]) -> Mapping[str, str]:
+    """Return what a case was set in, by kind of circumstance; nothing for a truth that does not say."""
+    if "rig" not in truth:
+        return {}
+    p, baseline = known_physics(truth), known_physics(truth, baseline=True)
+    return {
+        "apparatus": truth["rig"],
+        "protocol": truth["protocol"],
+        "friction law": baseline.law_name,
+        "ageing law": p.ageing_name,
+        "noise": truth["noise"],
+        "field": "none" if not truth["rough"] else "one per run" if truth.get("own_track") else "one for all runs",
+    }
+
+
 def kind_of(truth: Mapping[str, Any]) -> str:
-    """Return the kind of a case: none, single, pair or outside."""
+    """Return the kind of a case, of WIDE_KINDS."""
+    if truth.get("kind"):
+        return str(truth["kind"])
     if truth["verdict"] == "unknown":
         return "outside"
     return ("none", "single", "pair")[len(truth["effects"])]
@@ -168,8 +202,6 @@ def _ratio(answer: Answer, sight: Sight, model: str) -> float | None:
 # What there was to be seen in a case, from its truth: the error of a model that knows it, and how far each effect stands out.
 
 STEP = 2e-4  # relative, of a parameter's difference: in stick-slip a larger one shifts the phase by more than is linear
-FITTED = ("mu0", "A", "B", "D0", "Vsat", "lam")  # of the baseline, where it has them
-Array = np.ndarray
 
 
 @dataclass(frozen=True)
@@ -192,69 +224,66 @@ Task = tuple[Path, Mapping[str, Any]]
 def see(task: Task) -> Sight:
     """Return what there was to be seen in one case: its folder, and the truth about it."""
     folder, truth = task
-    plans, p, gauge = known_plans(truth), known_physics(truth), known_gauge(truth)
+    gauge, rig = known_gauge(truth), known_rig(truth)
     experiment = read_experiment(folder, registry=load_registry())
     held = {run.name: run for run in experiment.runs if run.holdout}
-    shown = {plan: _shown(p, plan) for plan in plans}
+    sliders = {plan: acting(truth, plan) for plan in known_plans(truth)}
     known = {}
-    for plan in plans:
+    for plan, p in sliders.items():
         if plan.name in held:
             run = held[plan.name]
-            known[plan.name] = float(np.sqrt(np.mean((run.observed - shown[plan])[run.used] ** 2)))
-    fitted = {plan: u for plan, u in shown.items() if not plan.holdout}
+            made = _record(rig, p, plan) * (rig.factor if rig.observes == "force" else 1.0)
+            known[plan.name] = float(np.sqrt(np.mean((run.observed - made)[run.used] ** 2)))
+    fitted = {plan: p for plan, p in sliders.items() if not plan.holdout}
     effects = concealed(truth)
-    stands = {e.name: stands_out(e, [o for o in effects if o is not e], p, gauge=gauge, shown=fitted) for e in effects}
+    stands = {
+        e.name: stands_out(e, [o for o in effects if o is not e], fitted, gauge=gauge, rig=rig) for e in effects
+    }
     return Sight(folder.name, known, {n: s for n, (s, _) in stands.items()}, {n: r for n, (_, r) in stands.items()})
 
 
-def concealed(truth: Mapping[str, Any]) -> list[Effect]:
-    """Return the effects of a truth; of several forms of one, the form that the truth has."""
-    found = []
-    for name in truth["effects"]:
-        forms = variants(name)
-        found.append(next((e for e in forms if len(forms) == 1 or e.varies in truth["truth"]), forms[0]))
-    return found
+def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, Physics], *, gauge: Gauge,
+               rig: Rig = PAPER) -> tuple[float | None, float | None]:  # fmt: skip
+    """Return how many standard errors an effect stands out of runs, with the baseline free and with it known.
 
-
-def stands_out(effect: Effect, others: Sequence[Effect], p: Physics, *, gauge: Gauge,
-               shown: Mapping[Plan, Array]) -> tuple[float | None, float | None]:  # fmt: skip
-    """Return how many standard errors an effect stands out of the runs `shown` (n,) um, with the baseline free and with it known.
-
-    The baseline's parameters and the sizes of the `others` are free to first order, from the slider without the effect. A rough
-    track is taken as known: where it is not, less is seen. Where no mass is known, a wrong stiffness does not stand out at all:
-    elongations are those of mu0, A, B and M over the ratio and lambda times it.
+    `sliders` are the runs and what is true in each. The baseline's parameters and the sizes of the `others` are free to first
+    order, from the slider without the effect. A rough track is taken as known: where it is not, less is seen. Where no mass is
+    known, a wrong stiffness does not stand out of elongations at all: they are those of mu0, A, B and M over the ratio and lambda
+    times it.
     """
-    less = effect.removed(p)
-    free = [n for n in FITTED if not (n == "Vsat" and less.bare) and not (n == "lam" and less.rigid)]
-    free += [o.varies for o in others if o.varies not in free and getattr(less, o.varies)]
     signals, tangents = [], []
-    for plan, u in shown.items():
-        base = _shown(less, plan)
-        moved = [_shown(replace(less, **{n: getattr(less, n) * (1 + STEP)}), plan) for n in free]
-        if not all(np.isfinite(x).all() for x in (base, *moved)):
+    bare = {plan: effect.removed(p) for plan, p in sliders.items()}
+    free = _free(next(iter(bare.values())))
+    free += [o.varies for o in others if o.varies not in free and any(getattr(p, o.varies) for p in bare.values())]
+    for plan, p in sliders.items():
+        less = bare[plan]
+        base = _record(rig, less, plan)
+        moved = [_record(rig, replace(less, **{n: getattr(less, n) * (1 + STEP)}), plan) for n in free]
+        signal = _record(rig, p, plan) - base
+        tangent = np.column_stack([(x - base) / STEP for x in moved])
+        if not (np.isfinite(signal).all() and np.isfinite(tangent).all()):
             return None, None
-        signals.append(_white(u - base, gauge))
-        tangents.append(np.column_stack([_white((x - base) / STEP, gauge) for x in moved]))
+        whitened = white(np.column_stack([signal, tangent]), gauge)
+        signals.append(whitened[:, 0])
+        tangents.append(whitened[:, 1:])
     signal, tangent = np.concatenate(signals), np.concatenate(tangents)
-    if effect.varies == "ratio" and (less.massless or any(o.varies == "M" for o in others)):
+    massless = any(p.massless for p in bare.values()) or any(o.varies == "M" for o in others)
+    if effect.varies == "ratio" and rig.observes == "elongation" and massless:
         return 0.0, float(np.linalg.norm(signal))
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=0), 1e-12)
     left = signal - tangent @ np.linalg.lstsq(tangent, signal, rcond=1e-10)[0]
     return float(np.linalg.norm(left)), float(np.linalg.norm(signal))
 
 
-def _shown(p: Physics, plan: Plan) -> Array:
-    """Return what the gauge of a slider would show (n,) um without noise; NaN from where it cannot be followed."""
-    u = move(p, plan).u
-    return play(u, p.backlash) if p.backlash else u
+def _free(baseline: Physics) -> list[str]:
+    """Return the fields of a baseline that its fit has free."""
+    more = [] if baseline.rigid else ["lam"]
+    return [*OF_LAW[baseline.law_name], *more, *(["nagata"] if baseline.nagata else [])]
 
 
-def _white(x: Array, gauge: Gauge) -> Array:
-    """Return a signal (n,) um in units of white noise of size 1, the gauge's correlation taken out."""
-    level = float(np.hypot(gauge.sigma, gauge.quantum / np.sqrt(12)))
-    out = x / level
-    out[1:] = (x[1:] - gauge.lag1 * x[:-1]) / (level * np.sqrt(1 - gauge.lag1**2))
-    return np.asarray(out)
+def _record(rig: Rig, p: Physics, plan: Plan) -> Array:
+    """Return what a rig would record (n,) without noise; NaN from where the slider cannot be followed."""
+    return recorded(rig, p, plan, shown(p, plan))
 
 
 def see_all(bank: Path, truths: Mapping[str, Mapping[str, Any]], *, workers: int, kept: Path) -> Iterator[Sight]:
@@ -363,6 +392,7 @@ def tables(marks: Sequence[Mark], *, digest: str, seed: int, of: int) -> tuple[T
         rates(marks),
         by_effect(marks),
         by_outside(marks),
+        by_setting(marks),
         by_strength(marks),
         calibrated(marks),
         held(marks),
@@ -406,7 +436,7 @@ def confusion(marks: Sequence[Mark]) -> Table:
     """Return true kinds against verdicts; `right` counts the effects too, where they are named."""
     columns = (Column("concealed"), Column("cases"), *map(Column, VERDICTS), Column("right"), Column("class_right"))
     rows = []
-    for kind, (rough, own, told) in product(KINDS, TRACKS):
+    for kind, (rough, own, told) in product(WIDE_KINDS, TRACKS):
         chosen = [m for m in marks if m.kind == kind and m.rough == rough and m.own_track == own]
         if chosen:
             counts = [sum(m.answer.verdict == v for m in chosen) for v in VERDICTS]
@@ -437,6 +467,11 @@ def rates(marks: Sequence[Mark]) -> Table:
     add("false alarm, rough tracks", [m for m in none if m.rough], lambda m: m.alarm, "< 0.05")
     add(f"wrong name, stated above {CONFIDENT}", marks, lambda m: m.confident_wrong)
     add("wrong name, of all names", named, lambda m: m.wrong_name)
+    ageing = [m for m in marks if m.kind == "ageing"]
+    alone = [m for m in marks if m.kind == "one-run"]
+    add("ageing law named, where another is stated", ageing, lambda m: m.right)
+    add("effect in one run: named, or unknown", alone, lambda m: m.right)
+    add("effect in one run: named, and the run", alone, lambda m: m.located)
     add("unknown recognised", outside, lambda m: m.answer.verdict == "unknown", ">= 0.8")
     add("unknown recognised, where visible", [m for m in outside if m.visible], lambda m: m.answer.verdict == "unknown")
     add("something concealed is invisible", some, lambda m: not m.visible)
@@ -475,6 +510,23 @@ def by_outside(marks: Sequence[Mark]) -> Table:
         found = rate(m.answer.verdict == "unknown" for m in chosen)
         rows.append((name, *_cells(found), sum(not m.visible for m in chosen), ", ".join(called) or None))
     return Table("srf.prove.outside/1", columns, rows, "Outside the library: unknown")
+
+
+def by_setting(marks: Sequence[Mark]) -> Table:
+    """Return how often the answer was right by each circumstance in which something, or nothing, was concealed."""
+    columns = (
+        Column("circumstance"), Column("value"), *COUNTED, Column("false_alarms", about="where nothing is concealed"),
+        Column("nothing", about="cases that conceal nothing"), Column("named_wrongly", about="cases named wrongly"),
+    )  # fmt: skip
+    rows = []
+    for name, value in dict.fromkeys(pair for m in marks for pair in m.set_in.items()):
+        chosen = [m for m in marks if m.set_in.get(name) == value]
+        nothing = [m for m in chosen if m.kind == "none"]
+        counts = (sum(m.alarm for m in nothing), len(nothing), sum(m.wrong_name for m in chosen))
+        rows.append((name, value, *_cells(rate(m.right for m in chosen)), *counts))
+    order = list(dict.fromkeys(name for m in marks for name in m.set_in))
+    rows.sort(key=lambda row: (order.index(row[0]), row[1]))
+    return Table("srf.prove.settings/1", columns, rows, "By apparatus, protocol, law, noise and field: right")
 
 
 def by_strength(marks: Sequence[Mark]) -> Table:

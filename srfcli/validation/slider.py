@@ -80,12 +80,17 @@ SMOOTH = Track()
 
 # What moves the slider of a concealed case: every number of its laws, with the values at which each effect is absent.
 
+LAWS = ("srf-vsat", "dieterich-ruina", "dieterich-cutoff", "rice-regularized", "log-log", "bowden-tabor", "two-state")
+BARE = ("dieterich-ruina", "rice-regularized", "two-state")  # without a cut-off of age
+AGEING_LAWS = ("dieterich", "ruina", "perrin-rice-zheng", "kato-tullis", "nagata")
+
 
 @dataclass(frozen=True)
 class Physics:
     """The truth of a case in um, s, N (mass in N s^2/um). Every field after `rigid` and `massless` is neutral by default.
 
-    mu = mu0 + A ln(v/V0) + B ln(1 + Vsat phi/D0), phi' = 1 - v phi/D0, kappa = W/lam, unless an effect says otherwise.
+    mu = mu0 + A ln(v/V0) + B ln(1 + Vsat phi/D0), phi' = 1 - v phi/D0, kappa = W/lam, unless `law`, `ageing` or an effect says
+    otherwise. `law` is empty for this one, and for the one without cut-off of age that `bare` stands for.
     """
 
     K: float = 0.21
@@ -100,6 +105,10 @@ class Physics:
     rigid: bool = False  # no interfacial compliance
     massless: bool = False  # quasi-static
     bare: bool = False  # B ln(V0 phi/D0): no cut-off at short ages
+    law: str = ""  # of LAWS, where it is neither srf-vsat nor dieterich-ruina
+    ageing: str = "dieterich"  # of AGEING_LAWS; that of nagata is the ageing law with `nagata` above 0
+    Va: float = 1e4  # dieterich-cutoff: -A ln(1 + Va/v) in place of A ln(v/V0)
+    Vc: float = 0.01  # kato-tullis: exp(-v/Vc) - q ln q
     # what diagnosis may name
     alpha: float = 0.0  # phi' gains -(alpha/B) phi W'/W
     n_kappa: float = 1.0  # kappa = (Wref/lam) (W/Wref)^n
@@ -153,6 +162,16 @@ class Physics:
     track: Track = SMOOTH
 
     @property
+    def law_name(self) -> str:
+        """Return the name of the friction law."""
+        return self.law or ("dieterich-ruina" if self.bare else "srf-vsat")
+
+    @property
+    def ageing_name(self) -> str:
+        """Return the name of the ageing law."""
+        return "nagata" if self.nagata and self.ageing == "dieterich" else self.ageing
+
+    @property
     def spring(self) -> float:
         """Return the stiffness in N/um that the spring really has, under the load Wref where it depends on that."""
         return self.K * self.ratio
@@ -166,11 +185,18 @@ class Physics:
 
 MODULATION_RISE = 0.02  # s, of the tanh that switches a modulation on
 STEP_RISE = 0.03  # s, of the tanh of a load step
+SPARSE = 5  # one sample in so many is kept where a recorder is slowed down
+WIDEST = 0.4  # of the interval: how far from its place an uneven sample may be
 
 
 @dataclass(frozen=True)
 class Plan:
-    """One run: drive as (s, um/s), mean load W0 (N), sampling interval (s), modulation from `onset` (s), load steps as (s, N)."""
+    """One run: drive as (s, um/s), mean load W0 (N), sampling interval (s), modulation from `onset` (s), load steps as (s, N).
+
+    `rise` is the time in s of a switched modulation's tanh, or a load step's; 0 for the usual ones. Samples within `gaps` (s, s)
+    are missing. After a step of the drive all are kept for `dense` s, then one in SPARSE; 0 keeps all. Of samples that come
+    unevenly, `wander` is the standard deviation of their times over the interval.
+    """
 
     name: str
     drive: tuple[tuple[float, float], ...]
@@ -181,6 +207,10 @@ class Plan:
     f: float = 0.0
     onset: float = 0.0
     steps: tuple[tuple[float, float], ...] = field(default=())
+    rise: float = 0.0
+    gaps: tuple[tuple[float, float], ...] = field(default=())
+    dense: float = 0.0
+    wander: float = 0.0
 
     @property
     def duration(self) -> float:
@@ -193,11 +223,23 @@ class Plan:
 
     def times(self) -> np.ndarray:
         """Return the sample times in s, without the very end of the drive."""
-        return np.arange(round(self.duration / self.interval)) * self.interval
+        t = np.arange(round(self.duration / self.interval)) * self.interval
+        if self.wander:  # never as far as the next sample; the times are known as they are written
+            late = np.random.default_rng(crc32(self.name.encode())).standard_normal(t.size)
+            t[1:] += self.interval * np.clip(self.wander * late[1:], -WIDEST, WIDEST)
+            t = np.round(t, 4)
+        keep = np.ones(t.size, dtype=bool)
+        for begin, end in self.gaps:
+            keep &= (t < begin) | (t > end)
+        if self.dense:
+            edges = np.array([0.0, *accumulate(d for d, _ in self.drive)])
+            since = t - edges[np.searchsorted(edges, t + 1e-9, side="right") - 1]
+            keep &= (since <= self.dense) | (np.arange(t.size) % SPARSE == 0)
+        return t[keep]
 
     def load(self) -> Callable[[float], tuple[float, float]]:
         """Return the imposed load and its rate, N and N/s, as a function of time."""
-        W0, jumps = self.W0, self.steps
+        W0, jumps, step_rise = self.W0, self.steps, self.rise or STEP_RISE
         share, omega, height = self.switched(), 2 * math.pi * self.f, self.eps * self.W0
 
         def load(t: float) -> tuple[float, float]:
@@ -208,20 +250,20 @@ class Plan:
                 W += height * s * c
                 rate += height * (s_dot * c - s * omega * math.sin(omega * t))
             for at, jump in jumps:
-                h = math.tanh((t - at) / STEP_RISE)
+                h = math.tanh((t - at) / step_rise)
                 W += 0.5 * jump * (1 + h)
-                rate += 0.5 * jump * (1 - h * h) / STEP_RISE
+                rate += 0.5 * jump * (1 - h * h) / step_rise
             return W, rate
 
         return load
 
     def switched(self) -> Callable[[float], tuple[float, float]]:
         """Return how much of the modulation is on, 0 to 1, and the rate of that."""
-        onset = self.onset
+        onset, rise = self.onset, self.rise or MODULATION_RISE
 
         def share(t: float) -> tuple[float, float]:
-            h = math.tanh((t - onset) / MODULATION_RISE)
-            return 0.5 * (1 + h), 0.5 * (1 - h * h) / MODULATION_RISE
+            h = math.tanh((t - onset) / rise)
+            return 0.5 * (1 + h), 0.5 * (1 - h * h) / rise
 
         return share
 
@@ -274,7 +316,7 @@ def felt_load(p: Physics, plan: Plan) -> Callable[[float], Felt]:
 
 
 def at_unit_velocity(p: Physics, longest: float) -> Callable[[float, float, float, float, float], tuple[float, float]]:
-    """Return f(t, slip, ln phi, ln phi2, W) -> (m, a): mu = m + a x + drag e^x, x = ln(v/V0)."""
+    """Return f(t, slip, ln phi, ln phi2, W) -> (m, a): mu = m + a h(x) + drag e^x, x = ln(v/V0); h is x in most laws."""
     profile = p.track.profile(longest)
     local = p.topo != 0 or p.bump != 0 or p.track.size != 0
     drifting = p.drift_t != 0 or p.drift_x != 0
@@ -293,7 +335,7 @@ def at_unit_velocity(p: Physics, longest: float) -> Callable[[float, float, floa
             m += p.bump * math.exp(-0.5 * ((s - p.bump_x) / p.bump_w) ** 2)
         if drifting:
             m += p.drift_t * max(t - p.drift_t0, 0.0) + p.drift_x * max(s - p.drift_x0, 0.0)
-        return m, p.A + p.C * grown
+        return m, p.A * (1 + p.B / p.mu0 * grown) if p.law == "bowden-tabor" else p.A + p.C * grown
 
     return terms
 
@@ -315,16 +357,83 @@ def log_velocity(R: float, a: float, c: float) -> float:
     return x
 
 
+Solve = Callable[[float, float, float, float], float]
+"""Of mu or x, m, a and the drag: x or mu."""
+
+
+def friction(p: Physics) -> tuple[Solve, Solve]:
+    """Return mu(x, m, a, c) = m + a h(x) + c e^x, x = ln(v/V0), of the law of `p`, and its inverse x(mu, m, a, c).
+
+    h(x) is x, -ln(1 + Va/v) under dieterich-cutoff, and asinh(exp(x + m/a)/2) - m/a under rice-regularized.
+    """
+    if p.law not in ("dieterich-cutoff", "rice-regularized"):
+
+        def straight(x: float, m: float, a: float, c: float) -> float:
+            return m + a * x + c * math.exp(x)
+
+        return straight, lambda mu, m, a, c: log_velocity(mu - m, a, c)
+    end = math.log(p.Va / p.V0)
+    cut = p.law == "dieterich-cutoff"
+
+    def bent(x: float, m: float, a: float, c: float) -> float:
+        flow = c * math.exp(min(x, FASTEST)) if c else 0.0
+        if cut:
+            return m - a * math.log1p(math.exp(min(end - x, 700.0))) + flow
+        return a * math.asinh(0.5 * math.exp(min(x + m / a, 700.0))) + flow
+
+    def plain(mu: float, m: float, a: float) -> float:
+        """Return x without drag: a closed form."""
+        if cut:
+            R = (m - mu) / a  # ln(1 + Va/v); 0 and below at no velocity
+            return min(end - R - math.log(-math.expm1(-R)), FASTEST) if R > 0 else FASTEST
+        y = max(mu / a, 1e-12)
+        return min(y + math.log(-math.expm1(-2 * y)) - m / a, FASTEST)
+
+    def solve(mu: float, m: float, a: float, c: float) -> float:
+        high = plain(mu, m, a)
+        if c <= 0.0:
+            return high
+        low = high - 1.0
+        while bent(low, m, a, c) > mu:
+            low = high - 2 * (high - low)
+        for _ in range(100):  # bisection, from a bracket that regula falsi would close from one side
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if bent(middle, m, a, c) > mu else (middle, high)
+            if high - low < 1e-14 * (1 + abs(high)):
+                break
+        return 0.5 * (low + high)
+
+    return bent, solve
+
+
 def ageing(p: Physics) -> Callable[..., float]:
     """Return f(v, ln phi, W, W', F' = 0) -> d(ln phi)/dt, F the friction force."""
+    law = p.ageing
 
     def rate(v: float, ln_phi: float, W: float, W_dot: float, F_dot: float = 0.0) -> float:
         phi = math.exp(ln_phi)
         D = p.D0 * (v / p.V_D) ** p.D_power if p.D_power else p.D0
         q = max(v * phi / D, 1e-300)
         worn = q if p.p_age == 1.0 else q**p.p_age
-        grown = (1 - p.slip_share) * (1 - worn) - (p.slip_share * q * math.log(q) if p.slip_share else 0.0)
+        if law == "dieterich":
+            base = 1 - worn
+        elif law == "perrin-rice-zheng":
+            base = 1 - 0.25 * worn * worn
+        else:
+            base = (math.exp(-v / p.Vc) if law == "kato-tullis" else 0.0) - q * math.log(q)
+        grown = (1 - p.slip_share) * base - (p.slip_share * q * math.log(q) if p.slip_share else 0.0)
         return grown / phi - p.alpha / p.B * W_dot / W - p.nagata / p.B * F_dot / W - p.age_rate
+
+    return rate
+
+
+def second_ageing(p: Physics) -> Callable[..., float]:
+    """Return the same for the second age: by the first one's law under two-state, else an age that slip of D2 renews."""
+    if p.law == "two-state":
+        return ageing(replace(p, D0=p.D2, B=p.B2))
+
+    def rate(v: float, ln_phi: float, W: float, W_dot: float, F_dot: float = 0.0) -> float:
+        return math.exp(-ln_phi) - v / p.D2
 
     return rate
 
@@ -336,6 +445,18 @@ def steady_age(p: Physics, V: float) -> float:
     rate = ageing(p)
     middle = math.log(p.D0 / V)
     return float(brentq(lambda x: rate(V, x, 1.0, 0.0) * math.exp(x), middle - 20, middle + 20, xtol=1e-14))
+
+
+def steady_ages(p: Physics, V: float) -> tuple[float, float]:
+    """Return ln phi and ln phi2 in steady sliding at V um/s."""
+    second = steady_age(replace(p, D0=p.D2, B=p.B2), V) if p.law == "two-state" else math.log(p.D2 / V)
+    return steady_age(p, V), second
+
+
+def steady_friction(p: Physics, V: float, W: float) -> float:
+    """Return the friction coefficient in steady sliding at V um/s under a load of W N."""
+    m, a = at_unit_velocity(p, 0.0)(0.0, 0.0, *steady_ages(p, V), W)
+    return friction(p)[0](math.log(V / p.V0), m, a, p.drag)
 
 
 def stiffness(p: Physics) -> Callable[[float], float]:
@@ -350,6 +471,7 @@ def stiffness(p: Physics) -> Callable[[float], float]:
 Sliding = tuple[float, float, float]  # slip velocity um/s, elongation of the spring um, friction force N
 Slide = Callable[[list[float], float, float, float, float, float], Sliding]  # of states, m, a, load, force along, spring's K
 Push = Callable[[list[float], Sliding, float, float, float], list[float]]  # of states, the above, stage velocity, force, K
+Pull = Callable[[list[float], list[float], float, float], float]  # of states, their rates, load and its rate: F'
 
 
 @dataclass(frozen=True)
@@ -360,6 +482,7 @@ class Contact:
     slide: Slide
     push: Push
     steady: Callable[[float, float, float, float], list[float]]  # of velocity, friction force, load, spring's K
+    pull: Pull | None = None  # the rate of the friction force, where it follows from the states
 
 
 def build_contact(p: Physics) -> Contact:
@@ -369,28 +492,33 @@ def build_contact(p: Physics) -> Contact:
 
 def _elastic(p: Physics) -> Contact:
     """The stretch e of the interface is a state: kappa e + eta (z - v) = F = (W + Wa) mu(v, phi) gives v."""
-    kappa = stiffness(p)
+    kappa, (_, velocity) = stiffness(p), friction(p)
 
     def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
         weight = W + p.Wa
         pull = kappa(W) * y[2] + p.eta * y[1]
-        v = p.V0 * math.exp(log_velocity(pull / weight - m, a, p.drag + p.eta * p.V0 / weight))
+        v = p.V0 * math.exp(velocity(pull / weight, m, a, p.drag + p.eta * p.V0 / weight))
         return v, y[0], pull - p.eta * v
 
     def push(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
         v, u, F = sliding
         return [V - y[1], (K * u + aside - F) / p.M, y[1] - v]
 
-    return Contact(("u", "z", "e"), slide, push, lambda V, F, W, K: [F / K, V, F / kappa(W)])
+    def rate(y: list[float], rates: list[float], W: float, W_dot: float) -> float:
+        return (W * rates[2] + W_dot * y[2]) / p.lam
+
+    known = None if p.eta or p.n_kappa != 1.0 else rate
+    return Contact(("u", "z", "e"), slide, push, lambda V, F, W, K: [F / K, V, F / kappa(W)], known)
 
 
 def _rigid(p: Physics) -> Contact:
     """There is nothing to stretch: ln v is a state, which inertia moves."""
+    resistance, _ = friction(p)
 
     def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
         x = min(y[1], FASTEST)
         v = p.V0 * math.exp(x)
-        return v, y[0], (W + p.Wa) * (m + a * x + p.drag * v / p.V0)
+        return v, y[0], (W + p.Wa) * resistance(x, m, a, p.drag)
 
     def push(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
         v, u, F = sliding
@@ -401,17 +529,25 @@ def _rigid(p: Physics) -> Contact:
 
 def _massless(p: Physics) -> Contact:
     """Spring and interface in series carry the friction force; their joint stretch D is the state."""
-    kappa = stiffness(p)
+    kappa, (_, velocity) = stiffness(p), friction(p)
 
     def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
         yielding = 1 / K + (0.0 if p.rigid else 1 / kappa(W))
         F = (y[0] + aside / K) / yielding
-        return p.V0 * math.exp(log_velocity(F / (W + p.Wa) - m, a, p.drag)), (F - aside) / K, F
+        return p.V0 * math.exp(velocity(F / (W + p.Wa), m, a, p.drag)), (F - aside) / K, F
 
     def push(y: list[float], sliding: Sliding, V: float, aside: float, K: float) -> list[float]:
         return [V - sliding[0]]
 
-    return Contact(("D",), slide, push, lambda V, F, W, K: [F / K + (0.0 if p.rigid else F / kappa(W))])
+    def rate(y: list[float], rates: list[float], W: float, W_dot: float) -> float:
+        """Return F' of F (1/K + lam/W) = D."""
+        if p.rigid:
+            return p.spring * rates[0]
+        yielding = 1 / p.spring + p.lam / W
+        return (rates[0] + y[0] / yielding * p.lam * W_dot / W**2) / yielding
+
+    known = None if p.cross or p.K_power or p.n_kappa != 1.0 else rate
+    return Contact(("D",), slide, push, lambda V, F, W, K: [F / K + (0.0 if p.rigid else F / kappa(W))], known)
 
 
 # The run of a slider from steady sliding: states joined, integrated by backward differentiation formulas, read by a gauge.
@@ -428,13 +564,13 @@ class Slider:
     """The first-order system of one run. States: the contact's, ln phi, slip, then only what the effects at work need."""
 
     def __init__(self, p: Physics, plan: Plan) -> None:
-        if p.nagata and not (p.rigid and p.massless and not p.cross and not p.K_power):
-            raise ValueError("nagata: the rate of the friction force is that of a plain spring's, rigid and massless")
         self.p, self.plan = p, plan
         self.contact: Contact = build_contact(p)
+        if p.nagata and (self.contact.pull is None or p.Wa):
+            raise ValueError("nagata: the rate of the friction force does not follow from the states")
         self._felt = felt_load(p, plan)
         self._terms = at_unit_velocity(replace(p, track=p.track.under(plan.name)), plan.distance + OVERSHOOT)
-        self._aged = ageing(p)
+        self._aged, self._aged2, (self._resistance, _) = ageing(p), second_ageing(p), friction(p)
         extra = {
             "ln_phi2": p.B2, "Wm": p.memory, "gauge": p.lag, "stage": p.drive_tau, "X": p.ripple, "Ws": p.servo,
             "Ws_dot": p.servo, "late": p.creep,
@@ -460,7 +596,16 @@ class Slider:
         return self.contact.slide(y, m, a, felt.W, -p.cross * felt.excess, K), felt
 
     def rates(self, t: float, states: Array, V: float) -> list[float]:
-        """Return the rates of the states at time t in s, where the stage's nominal velocity is V um/s."""
+        """Return the rates of the states at time t in s, where the stage's nominal velocity is V um/s.
+
+        NaN of states that ran away: the solver's compiled code would lose an exception, and go on.
+        """
+        try:
+            return self._rates(t, states, V)
+        except (ArithmeticError, ValueError):
+            return [math.nan] * len(self.names)
+
+    def _rates(self, t: float, states: Array, V: float) -> list[float]:
         y, p, nominal = states.tolist(), self.p, V
         sliding, felt = self.sliding(t, y)
         v, u, _ = sliding
@@ -470,10 +615,10 @@ class Slider:
             V *= 1 + p.ripple * math.cos(2 * math.pi * y[self._X] / p.ripple_p + p.ripple_phase)
         V += p.poisson * felt.imposed_rate
         out = self.contact.push(y, sliding, V, -p.cross * felt.excess, p.spring_under(felt.imposed))
-        F_dot = p.spring * out[0] if p.nagata else 0.0
+        F_dot = self.contact.pull(y, out, felt.W, felt.rate) if p.nagata and self.contact.pull else 0.0
         out += (self._aged(v, y[self._age], felt.W, felt.rate, F_dot), v)
         if self._age2:
-            out.append(math.exp(-y[self._age2]) - v / p.D2)
+            out.append(self._aged2(v, y[self._age2], felt.W, felt.rate, F_dot))
         if self._delay:
             out.append((self._felt(t).W - y[self._delay]) / p.memory_tau)
         if self._gauge:
@@ -499,9 +644,9 @@ class Slider:
         """Return the states of steady sliding at the run's first velocity and load."""
         p, V, felt = self.p, self.plan.drive[0][1], self._felt(0.0)
         W, K = felt.W, self.p.spring_under(felt.imposed)
-        ln_phi, ln_phi2 = steady_age(p, V), math.log(p.D2 / V)
+        ln_phi, ln_phi2 = steady_ages(p, V)
         m, a = self._terms(0.0, 0.0, ln_phi, ln_phi2, W)
-        F = (W + p.Wa) * (m + a * math.log(V / p.V0) + p.drag * V / p.V0)
+        F = (W + p.Wa) * self._resistance(math.log(V / p.V0), m, a, p.drag)
         extra = {"ln_phi2": ln_phi2, "Wm": W, "gauge": F / K, "stage": V, "X": 0.0, "Ws": W, "Ws_dot": 0.0, "late": F / K}
         mechanical = self.contact.steady(V, F, W, K)
         return [*mechanical, ln_phi, 0.0, *(extra[name] for name in self.names[len(mechanical) + 2 :])]
@@ -538,7 +683,9 @@ def move(p: Physics, plan: Plan, *, rtol: float = RTOL) -> Trace:
 
 def _solver(slider: Slider, rtol: float) -> ode:
     tolerance = [SMALLEST.get(name, 1e-8) * rtol / RTOL for name in slider.names]
-    longest = min(LONGEST_STEP, 0.25 / slider.plan.f) if slider.plan.eps else LONGEST_STEP
+    longest = slider.plan.rise / 3 if slider.plan.rise else LONGEST_STEP
+    if slider.plan.eps:
+        longest = min(longest, 0.25 / slider.plan.f)
     options = {"rtol": rtol, "atol": tolerance, "nsteps": MOST_STEPS, "max_step": longest}
     # with_jacobian: Newton's method with differences; without it VODE iterates the stiff equations as they stand
     return ode(slider.rates).set_integrator("vode", method="bdf", with_jacobian=True, **options)
@@ -549,12 +696,12 @@ def _through(slider: Slider, solver: ode, trace: Trace, end: float) -> Array | N
     t = trace.t
     try:
         for k in np.flatnonzero((t >= solver.t - 1e-9) & (t < end - 1e-9)).tolist():
-            if t[k] > solver.t:
+            if t[k] > solver.t + 1e-9:  # a solver fails that is asked for a step of the last digits
                 solver.integrate(t[k])
-            if not solver.successful():
+            if not (solver.successful() and np.isfinite(solver.y).all()):
                 return None
             trace.u[k] = slider.shown(float(t[k]), solver.y.tolist())
         y: Array = solver.integrate(end)
     except OverflowError:  # a state ran away
         return None
-    return y if solver.successful() else None
+    return y if solver.successful() and np.isfinite(y).all() else None

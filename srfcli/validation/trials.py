@@ -25,7 +25,7 @@ from srfcli.validation.blind import (
     read_answers,
     write_answers,
 )
-from srfcli.validation.cases import SEAL, Truths, check_cases, make_bank, unseal
+from srfcli.validation.cases import SEAL, Truths, check_cases, check_kinds, make_bank, unseal
 
 SCHEMA = "srf.trial/1"
 LIMIT = 1800.0  # s of CPU a case may take: six times what it should
@@ -63,7 +63,7 @@ class Trial:
         return self.folder / "unsealed.json"
 
     def asked(self) -> dict[str, Any]:
-        """Return what was asked for: cases, seed, kinds and track; SrfError where the folder is none of a trial."""
+        """Return what was asked for: cases, seed, kinds, track and bank; SrfError where the folder is none of a trial."""
         try:
             found = parse_json(read_plain(self.note), self.note)
         except (OSError, SrfError) as error:
@@ -71,7 +71,8 @@ class Trial:
                            "Name the folder that --out of srf prove has made.") from None  # fmt: skip
         if not isinstance(found, dict) or found.get("schema") != SCHEMA:
             raise SrfError(f"{self.note}: expected schema {SCHEMA!r}", "Name the folder that srf prove has made.")
-        return {name: found.get(name) for name in ("cases", "seed", "kinds", "track")}
+        asked = {name: found.get(name) for name in ("cases", "seed", "kinds", "track")}
+        return {**asked, "bank": found.get("bank", "paper")}
 
     def digest(self) -> str:
         """Return the digest of the truths, as it was published with the cases."""
@@ -84,8 +85,9 @@ class Trial:
                 if name not in answered]  # fmt: skip
 
 
-def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[str], track: str | None = None, resume: bool,
-          workers: int, told: Callable[[int, int], None] | None = None) -> Trial:  # fmt: skip
+def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[str], track: str | None = None,
+          bank: str | None = None, resume: bool, workers: int,
+          told: Callable[[int, int], None] | None = None) -> Trial:  # fmt: skip
     """Return the trial in `folder`, its bank made and sealed; with `resume` one that is there goes on.
 
     Raises SrfError for a folder that exists where nothing is resumed, and for a trial of other cases.
@@ -95,7 +97,7 @@ def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[
         clear(folder)
     if trial.note.exists() and resume:
         asked = trial.asked()
-        given = {"cases": cases, "seed": seed, "kinds": sorted(kinds) or None, "track": track}
+        given = {"cases": cases, "seed": seed, "kinds": sorted(kinds) or None, "track": track, "bank": bank}
         other = [n for n, v in given.items() if v is not None and v != asked[n]]
         if other:
             raise SrfError(f"{folder} is a trial of {other[0]} {asked[other[0]]}, not {given[other[0]]}",
@@ -108,7 +110,9 @@ def begin(folder: Path, *, cases: int | None, seed: int | None, kinds: Sequence[
             "seed": 1 if seed is None else seed,
             "kinds": sorted(kinds),
             "track": track,
+            "bank": "paper" if bank is None else bank,
         }
+        check_kinds(kinds, asked["bank"])
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(trial.note, json.dumps({"schema": SCHEMA, **asked}, indent=1) + "\n")
     if not trial.bank.exists():
@@ -132,6 +136,7 @@ def _make(trial: Trial, asked: dict[str, Any], *, workers: int, told: Callable[[
             told=told,
             kinds=asked["kinds"] or None,
             track=asked["track"],
+            bank=asked["bank"],
             strengths=False,
         )
     made.folder.rename(trial.bank)
