@@ -15,9 +15,10 @@ from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.settings import Parameter
 from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
-from srfcli.data.clock import Mask, Rate, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
+from srfcli.data.clock import Mask, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
 from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, ColumnSpec, Node, RunDescription, read_description
+from srfcli.data.gauge import GaugeNoise, find_noise
 from srfcli.data.imposed import (
     ACCIDENTS,
     DIFFERS,
@@ -33,8 +34,6 @@ from srfcli.data.imposed import (
     strokes,
 )
 from srfcli.data.noise import (
-    Noise,
-    describe_noise,
     observable_jumps,
     quantisation,
     rejoined,
@@ -510,15 +509,15 @@ class LoadHistory:
 
 @dataclass(frozen=True)
 class RunCheck:
-    """What was found in one run; `noise` is that of the longest evenly sampled stretch, `noises` those of all long ones.
+    """What was found in one run; `noises` are those of the gauge at each of its spacings, `noise` that of most samples.
 
     `friction_noise` is the noise of a sample in units of the friction coefficient. `drive` holds (from s, um/s, um/s^2).
     """
 
     run: Run
     sampling: Sampling
-    noise: Noise
-    noises: tuple[tuple[Rate, Noise], ...]
+    noise: GaugeNoise
+    noises: tuple[GaugeNoise, ...]
     friction_noise: float
     drive: tuple[tuple[float, float, float], ...]
     slowest: float
@@ -541,21 +540,16 @@ def check_run(run: Run) -> RunCheck:
     sampling = find_sampling(run.t)
     load = load_history(run.load, run.t)
     x = np.interp(run.t, run.t[run.used], run.observed[run.used])
-    noises = []
-    for rate in sampling.rates:
-        if rate.last - rate.first >= 128:
-            cycles = load.modulation.frequency * rate.interval if load.modulation else None
-            noises.append((rate, describe_noise(x[rate.first : rate.last], cycles)))
-    longest = _longest(sampling)
-    noise = next((n for r, n in noises if r is longest), None) or describe_noise(x[longest.first : longest.last + 1])
-    size = noise.total if math.isfinite(noise.total) else noise.white
-    pieces, slowest, fastest = _drive_pieces(run.drive, run.t)
+    cut = 1 + np.union1d(np.flatnonzero(np.diff(sampling.at)), sampling.gaps)
+    pieces, noises = np.split(x, cut), []
+    for k, dt in enumerate(sampling.spacings):
+        parts = [piece for piece, begin in zip(pieces, (0, *cut), strict=True) if sampling.at[begin] == k]
+        cycles = load.modulation.frequency * dt if load.modulation else None
+        noises.append(find_noise(parts, dt, quantum=run.quantum, cycles=cycles))
+    noise = noises[int(np.argmax(np.bincount(sampling.at)))]
+    driven, slowest, fastest = _drive_pieces(run.drive, run.t)
     factor = {"elongation": run.stiffness / load.mean, "force": 1 / load.mean, "friction": 1.0}[run.observable]
-    return RunCheck(run, sampling, noise, tuple(noises), size * factor, pieces, slowest, fastest, load)
-
-
-def _longest(sampling: Sampling) -> Rate:
-    return max(sampling.rates, key=lambda r: r.last - r.first)
+    return RunCheck(run, sampling, noise, tuple(noises), noise.total * factor, driven, slowest, fastest, load)
 
 
 def _drive_pieces(drive: Drive, t: Array) -> tuple[tuple[tuple[float, float, float], ...], float, float]:

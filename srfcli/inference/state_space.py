@@ -25,6 +25,7 @@ from scipy.signal import lfilter, welch
 from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
+from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, QUALITY
 from srfcli.data.values import Experiment, Run
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
 from srfcli.inference.kalman import Dual, Innovations, Smoothed, kalman_filter, smooth
@@ -44,7 +45,6 @@ T = TypeVar("T")
 RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
-PROCESSES = ("relaxation", "oscillation")  # of coloured gauge noise: e' = -e / tau + w, or e'' + (omega / q) e' + omega^2 e = w
 # A fit begins with the likeliest of nine fields: amplitudes over the friction of the recordings, lengths over that of PIECES
 WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
@@ -74,12 +74,8 @@ CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
-CORRELATION_TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
-QUALITIES = (0.5, 3.0, 30.0)  # of an oscillation, where it begins: smooth noise, a broad line and a narrow one
-QUALITY = (0.2, 1000.0)  # of an oscillation: one of a smaller quality is a relaxation
 PERIODOGRAM = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
-FASTEST = 1.0  # frequency of an oscillation times the spacing: smooth noise may end beyond half of the sampling rate
 DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import Status
 from srfcli.core.units import from_base
+from srfcli.data.gauge import colour_text
 from srfcli.results.tables import Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
@@ -327,10 +328,8 @@ def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float
     if len(starts) > 1:
         notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
     for colour in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):
-        told = f"{colour[1]:.3g} correlated over {colour[0]:.3g} s"
-        if len(colour) == 3:  # an oscillation of a quality of a half is noise that is smooth, of a large one a line
-            told = f"{colour[1]:.3g} about {colour[0]:.3g} Hz, of quality {colour[2]:.2g},"
-        notes.append(f"gauge noise: {told} besides white noise, or physics that is missing")
+        comma = "," if len(colour) == 3 else ""
+        notes.append(f"gauge noise: {colour_text(colour)}{comma} besides white noise, or physics that is missing")
     coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
     if coloured:
         notes.append(
