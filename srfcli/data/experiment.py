@@ -19,6 +19,7 @@ from srfcli.data.clock import Mask, Sampling, find_sampling, kept_samples, sampl
 from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, ColumnSpec, Node, RunDescription, read_description
 from srfcli.data.gauge import GaugeNoise, find_noise
+from srfcli.data.groups import BY, grouped
 from srfcli.data.imposed import (
     ACCIDENTS,
     DIFFERS,
@@ -80,7 +81,8 @@ def read_experiment(
         own = [registry.get("effect", name) for name in choice.effects]
         stated = described.parameters.value if described.parameters is not None else {}
         parameters = own_bounds(parameters, apart([e for e in own if isinstance(e, Effect)]), runs, stated)
-    return Experiment(
+    vary, by = read_groups(described.model)
+    found = Experiment(
         described.path,
         described.title,
         choice,
@@ -91,6 +93,7 @@ def read_experiment(
         notices,
         described.apparatus.stated,
     )
+    return grouped(found, vary, by)
 
 
 # The model of an experiment and its parameters, judged by the laws themselves.
@@ -105,9 +108,20 @@ _IMPOSED = {
 }
 
 
+def read_groups(node: Node) -> tuple[tuple[str, ...], str]:
+    """Return which parameters have a value of their own in each group, and what makes a group."""
+    vary, by = node.get("vary"), node.get("by")
+    if vary is not None and not isinstance(vary.value, list):
+        vary.expected("a list of parameters", 'Write vary = ["mu0"].')
+    if by is not None and by.text() not in BY:
+        by.expected(" or ".join(f'"{word}"' for word in BY), did_you_mean(by.text(), BY))
+    names = tuple(vary.child(i).text() for i in range(len(vary.value))) if vary is not None else ()
+    return names, by.text() if by is not None else "run"
+
+
 def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[ModelChoice, tuple[Parameter, ...]]:
     """Return the chosen model and all parameters that its laws and the apparatus have, in declared units."""
-    node.keys(("law", "ageing", "interface", "inertia", "effects"))
+    node.keys(("law", "ageing", "interface", "inertia", "effects", "vary", "by"))
     law = node.require("law", 'Name a friction law: law = "srf-vsat"; `srf laws` lists them.')
     ageing = node.require("ageing", 'Name an ageing law: ageing = "dieterich"; `srf laws` lists them.')
     interface, inertia = node.get("interface"), node.get("inertia")
@@ -323,6 +337,8 @@ def read_run(
         notices=(*notices, *told, *weighed, *flaws),
         stress=any(units.values()),
         proposed=proposed,
+        backward=run.backward,
+        segments=run.segments,
     )
 
 

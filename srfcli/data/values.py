@@ -54,6 +54,7 @@ class Run:
     on all of [t[0], t[-1]]. `start` is the place on the track in um, `initial` "steady" or "free", `stiffness` K in N/um,
     `modulation` the declared frequency (Hz), relative amplitude and onset (s), `quantum` the quantisation step, or 0.
     `proposed` is the observable as the corrections that are proposed would make it, None where there are none.
+    `backward` where drive and observable count with the opposite sign, `segments` are the times (s) at which it may be cut.
     `stress` where stresses were recorded: a stress counts as the force on 1 mm^2, so that what is in N is in MPa.
     """
 
@@ -74,6 +75,8 @@ class Run:
     notices: tuple[Notice, ...]
     stress: bool = False
     proposed: Array | None = field(default=None, repr=False)
+    backward: bool = False
+    segments: tuple[float, ...] = ()
 
     @property
     def unit(self) -> str:
@@ -104,7 +107,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Runs under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider."""
+    """Runs under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider.
+
+    Parameters in `vary` have a value for each run, load, segment or direction, as `by` says.
+    """
 
     path: Path
     title: str
@@ -115,6 +121,8 @@ class Experiment:
     runs: tuple[Run, ...]
     notices: tuple[Notice, ...]
     stiffness_unit: str = ""
+    vary: tuple[str, ...] = ()
+    by: str = "run"
 
     @property
     def stress(self) -> bool:

@@ -303,7 +303,7 @@ class Likelihood:
         self, problem: Problem, *, smooth: bool = False, processes: Sequence[str] = (), rtol: float = RTOL
     ) -> None:
         self.problem, self.smooth, self.processes = problem, smooth, tuple(processes)
-        self.rtol = FREE_RUNNING * rtol if smooth else rtol
+        self.base_rtol, self.rtol = rtol, FREE_RUNNING * rtol if smooth else rtol
         self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs)
@@ -409,9 +409,10 @@ class Likelihood:
         of_group = set(problem.varying.get(run.name, {}).values()) - set(own)
         held = {n: values[n] for n in (*problem.held, *problem.names) if "." not in n or n in of_group}
         alone = replace(
-            problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held
-        )
-        likelihood = Likelihood(alone, smooth=self.smooth, processes=self.processes, rtol=self.rtol)
+            problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held,
+            priors=(),
+        )  # fmt: skip
+        likelihood = Likelihood(alone, smooth=self.smooth, processes=self.processes, rtol=self.base_rtol)
         known = {n: values[n] for n in FIELD}
         for alone_names, names in zip(likelihood.gauges(alone.runs[0]), self.gauges(run), strict=True):
             known |= {name: values[names[local]] for local, name in alone_names.items()}
@@ -457,8 +458,16 @@ class Likelihood:
         runs = tuple(self.over_runs(one))
         total = float(sum(f.log_likelihood for f in runs))
         score, information = np.zeros(k), np.zeros((k, k))
+        unit = self.unit(x)
+        for names, scatter in self.problem.priors:  # of values about a mean that is unknown
+            places = [self.names.index(n) for n in names]
+            off = np.array([values[n] for n in names])
+            off = (off - off.mean()) / scatter**2
+            total -= 0.5 * scatter**2 * float(off @ off)
+            score[places] -= off * unit[places]
+            centred = np.eye(off.size) - 1 / off.size
+            information[np.ix_(places, places)] += centred / scatter**2 * np.outer(unit[places], unit[places])
         if slopes and np.isfinite(total):
-            unit = self.unit(x)
             for f in runs:
                 at = [self.names.index(n) for n in f.names]
                 score[at] += f.score * unit[at]
@@ -719,6 +728,15 @@ def fit_state_space(
     except KeyboardInterrupt as error:
         last = next((own.best for own in reversed(tried) if own.best is not None), None)
         raise Interrupted(last.values if last else problem.named(problem.start)) from error
+
+
+def with_priors(found: StateSpaceFit, priors: Sequence[tuple[tuple[str, ...], float]]) -> StateSpaceFit:
+    """Return the fit with the values of groups, each with the scatter of its prior, drawn towards their means."""
+    own = found.likelihood
+    problem = replace(own.problem, priors=tuple(priors))
+    likelihood = Likelihood(problem, smooth=own.smooth, processes=own.processes, rtol=own.base_rtol)
+    maximum = maximise(likelihood, likelihood.coordinates(found.values), widths=())
+    return StateSpaceFit(likelihood, maximum, found.evaluations + likelihood.evaluations)
 
 
 def stopped(problem: Problem, values: Mapping[str, float]) -> StateSpaceFit:

@@ -119,7 +119,7 @@ class FitResult(Result):
     @cached_property
     def varied(self) -> Table | None:
         """Return a row for each parameter that varies between runs or loads, None where none does."""
-        return varied_table(self.found.problem, self.found.fit)
+        return varied_table(self.found)
 
     @cached_property
     def draws(self) -> Table | None:
@@ -269,28 +269,17 @@ def run_table(fit: Fit, experiment: Experiment) -> Table:
     return Table("srf.fit.runs/1", RUNS, rows, "runs")
 
 
-def varied_table(problem: Problem, fit: Fit) -> Table | None:
-    """Return mean and scatter of what varies between runs or loads, and how likely that scatter is by chance."""
-    import numpy as np
-
-    from srfcli.inference.fit import between_groups
-
-    parts: dict[str, list[int]] = {}
-    for names in problem.varying.values():
-        for n, name in names.items():
-            if name in fit.names and fit.names.index(name) not in parts.setdefault(n, []):
-                parts[n].append(fit.names.index(name))
+def varied_table(found: RecordingFit) -> Table | None:
+    """Return mean and scatter of what varies between groups of runs, and how likely that scatter is by chance."""
     rows: list[tuple[Any, ...]] = []
-    for name, places in parts.items():
-        declared = unit_of(problem, name)
-        unit, factor = problem.experiment.shown(declared)
-        covariance = np.asarray(fit.covariance)[np.ix_(places, places)]
-        if not (np.diag(covariance) > 0).all():
+    for name, scatter in found.scatter.items():
+        declared = unit_of(found.problem, name)
+        unit, factor = found.problem.experiment.shown(declared)
+        if scatter is None:
             rows.append((name, None, None, None, unit, None))  # one is at its bound: its error is not known
             continue
-        found = between_groups(np.array([fit.values[fit.names[k]] for k in places]), covariance)
-        shown = [from_base(x, declared) * factor for x in (found.mean, found.stderr, found.scatter)]
-        rows.append((name, *shown, unit, found.p_value))
+        shown = [from_base(x, declared) * factor for x in (scatter.mean, scatter.stderr, scatter.scatter)]
+        rows.append((name, *shown, unit, scatter.p_value))
     return Table("srf.fit.varied/1", VARIED, rows, "what varies") if rows else None
 
 
