@@ -42,7 +42,7 @@ from sparse_signals import Array, Baseline, Inverse, Signals, columns, guided, s
 
 from srfcli.codegen.model import open_model
 from srfcli.data.experiment import read_experiment
-from srfcli.data.noise import describe_noise
+from srfcli.data.gauge import find_noise
 from srfcli.data.values import Run
 from srfcli.diagnosis.search import ModelSearch
 from srfcli.laws.registry import Registry, load_registry
@@ -73,10 +73,10 @@ def fitted_baseline(registry: Registry, folder: Path, kept: Path | None) -> tupl
 
 def noise_of(run: Run) -> tuple[float, float]:
     """Return level in um and lag-1 correlation of a run's noise."""
-    cycles = run.modulation[0] * float(np.median(np.diff(run.t))) if run.modulation else None
-    about = describe_noise(run.observed, cycles)
-    level = about.total if np.isfinite(about.total) else about.white
-    return max(level, LEAST_NOISE), min(max(about.lag1, 0.0), 0.95) if np.isfinite(about.lag1) else 0.0
+    spacing = float(np.median(np.diff(run.t)))
+    about = find_noise([run.observed], spacing, cycles=run.modulation[0] * spacing if run.modulation else None)
+    own, next_ = about.covariance(np.array([0.0, spacing]))
+    return max(about.total, LEAST_NOISE), min(max(next_ / own, 0.0), 0.95)
 
 
 def read(registry: Registry, folder: Path, start: dict[str, float]) -> tuple[Reading, Reading]:

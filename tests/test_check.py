@@ -21,7 +21,7 @@ from srfcli.codegen.model import open_model
 from srfcli.data.experiment import check_run, read_experiment
 from srfcli.data.values import Experiment, FitParameter
 from srfcli.inference import cramer_rao as reach
-from srfcli.inference.cramer_rao import Forecast, Reach, forecast, noise_of
+from srfcli.inference.cramer_rao import Forecast, Reach, forecast
 from srfcli.inference.fit import fit, fit_problem
 from srfcli.inference.prediction import predict
 from srfcli.laws.registry import load_registry
@@ -57,7 +57,7 @@ def test_the_tables_fit_a_page(small: Path) -> None:
     tables = [line for line in text.splitlines() if not line.startswith("Note: ")]
     assert max(map(len, tables)) <= 100
     assert tables[:2] == ["three steps", "srf-vsat, dieterich, elastic, inertia on; stiffness 0.21 N/um, mass 2.37 kg"]
-    for title in ("Samples", "Readings", "Imposed", "What the load can tell at best: errors, and"):
+    for title in ("Samples", "Readings", "Noise", "Imposed", "What the load can tell at best: errors, and"):
         assert any(line.startswith(title) for line in tables)
     assert next(line.split() for line in tables if line.startswith("one "))[:5] == ["one", "fit", "120", "120", "1.19"]
 
@@ -76,7 +76,7 @@ def test_csv_has_a_row_for_each_run_in_full_precision(small: Path) -> None:
 
 def test_json_has_everything(small: Path) -> None:
     done = json.loads(srf("check", str(small), "--json").stdout)
-    assert done["schema"] == "srf.check/2" and len(done["rows"]) == 2
+    assert done["schema"] == "srf.check/3" and len(done["rows"]) == 2
     run = done["meta"]["runs"][0]
     assert run["drive"] == [
         {"from": 0.0, "velocity": 8.0, "acceleration": 0.0},
@@ -217,12 +217,13 @@ def test_errors_from_differences(name: str, case: str, shared: Path) -> None:
     choice = replace(experiment.choice, ageing="dieterich+linker-dieterich")
     model = open_model(REGISTRY, **asdict(choice))
     lam = next(p.value for p in experiment.parameters if p.name == "lambda")
-    sigma, rho = noise_of(check)
+    used = np.flatnonzero(run.used)
+    lag = np.abs(np.subtract.outer(run.t[used], run.t[used]))
+    covariance = check.noise.covariance(lag)
     for asked, low, high, unit in (("alpha", 0.0, 2e-5, 1.0), ("lambda", lam * (1 - 1e-5), lam * (1 + 1e-5), lam)):
         y = [predict(model, experiment, run, {"alpha": 0.0, asked: x}, rtol=1e-9).y for x in (low, high)]
-        slope = (y[1] - y[0]) / (high - low) * unit / sigma
-        seen = np.r_[slope[0], (slope[1:] - rho[1:] * slope[:-1]) / np.sqrt(1 - rho[1:] ** 2)]
-        assert found.errors[asked] == pytest.approx(1 / np.linalg.norm(seen[run.used]), rel=0.1)
+        slope = ((y[1] - y[0]) / (high - low) * unit)[used]
+        assert found.errors[asked] == pytest.approx(float(slope @ np.linalg.solve(covariance, slope)) ** -0.5, rel=0.1)
 
 
 def test_a_constant_load_cannot_tell_alpha(shared: Path) -> None:
@@ -260,8 +261,8 @@ def test_a_long_run_is_thinned_without_another_answer(made: Path, monkeypatch: p
     whole = told(experiment).runs[1].errors
     monkeypatch.setattr(reach, "LONGEST", 900)
     thin = told(experiment).runs[1].errors
-    for name in whole:
-        assert thin[name] == pytest.approx(whole[name], rel=0.2)
+    for name in whole:  # what a step of the load makes takes a few samples, of which blocks have more or fewer
+        assert thin[name] == pytest.approx(whole[name], rel=0.3)
 
 
 def test_a_simulation_unlike_the_recording_is_not_believed(small: Path) -> None:

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 import srfcli as srf
 from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiler
+from srfcli.data.groups import grouped, labels
 from srfcli.inference.fit import between_groups
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
@@ -102,6 +103,109 @@ def test_what_varies_with_the_load_is_one_value_a_load(offset):
     assert [row["parameter"] for row in found["rows"][:2]] == ["mu0[3 N]", "mu0[4 N]"]
     assert vary(offset, "--vary", "B")[0].exit_code == 2  # not free
     assert vary(offset, "--vary", "mu0", "--track", "shared")[0].exit_code == 2
+
+
+LADDER = "6:10, 4:30, 6:10, 4:30, 6:10, 4:30, 6:10"
+
+
+@pytest.fixture(scope="module")
+def ladder(tmp_path_factory):
+    """One run of six steps of the velocity, up and down in turn, in steady sliding between them."""
+    folder = tmp_path_factory.mktemp("ladder") / "made"
+    system = ["--law", "dieterich-ruina", "--interface", "rigid", "--no-inertia", "--set", "mu0=0.6", "--set", "A=0.008"]
+    system += ["--set", "B=0.011", "--set", "D0=10", "--K", "30 MPa/mm", "--W0", "10", "--observe", "force"]
+    words = ["simulate", *system, "--drive", LADDER, "--rate", "20", "--noise", "0.002", "--seed", "1"]
+    done = CliRunner().invoke(cli, [*words, "--out-dir", str(folder)])
+    assert done.exit_code == 0, done.stderr
+    return folder
+
+
+def with_model(folder, place, *lines, run=""):
+    """Return a copy of an experiment with more keys in [model], and in its run."""
+    text = (folder / "experiment.toml").read_text(encoding="utf-8").replace("[model]", "\n".join(("[model]", *lines)))
+    place.mkdir()
+    (place / "experiment.toml").write_text(text + run, encoding="utf-8")
+    (place / "simulated.csv").write_bytes((folder / "simulated.csv").read_bytes())
+    return place
+
+
+def test_a_run_is_cut_between_its_steps(ladder, tmp_path):
+    """Halfway between the steps, or where it says so; no reading is lost or used twice, and every command sees the pieces."""
+    whole = srf.read_experiment(ladder).runs[0]
+    pieces = grouped(srf.read_experiment(ladder), by="segment").runs
+    assert [run.name for run in pieces] == [f"simulated-{k}" for k in range(1, 7)]
+    assert np.array_equal(np.concatenate([run.t for run in pieces]), whole.t)
+    assert [run.t[0] for run in pieces] == pytest.approx([0, 8, 13, 18, 23, 28], abs=0.06)
+    driven = [10 * 6 + 30 * 2, 10 * 3 + 30 * 2, 10 * 3 + 30 * 2]  # um between the cuts
+    assert np.diff([run.start for run in pieces])[:3] == pytest.approx(driven, abs=2)
+    own = with_model(ladder, tmp_path / "own", 'by = "segment"', 'vary = ["mu0"]', run="segments = [8.0, 23.0]\n")
+    read = srf.read_experiment(own)
+    assert read.vary == ("mu0",) and [run.t[0] for run in read.runs] == pytest.approx([0, 8, 23])
+    done = CliRunner().invoke(cli, ["check", str(own), "--no-simulate", "--csv"])
+    assert [line.split(",")[0] for line in done.stdout.splitlines()[1:]] == [f"simulated-{k}" for k in (1, 2, 3)]
+    done = CliRunner().invoke(cli, ["fit", str(own), "--track", "smooth", "--csv"])
+    assert "mu0[simulated-3]" in done.stdout
+
+
+def test_steps_up_and_down_and_strokes_are_groups(ladder, tmp_path):
+    """By direction a run's steps up have one value, its steps down another; of a reciprocating drive it is the stroke's."""
+    done = CliRunner().invoke(cli, ["fit", str(ladder), "--vary", "D0", "--by", "direction", "--track", "smooth", "--json"])
+    rows = {row["parameter"]: row for row in json.loads(done.stdout)["rows"]}
+    for name in ("D0[up]", "D0[down]"):
+        assert abs(rows[name]["value"] - 10) < 3.5 * rows[name]["stderr"] < 0.5
+    text = with_model(ladder, tmp_path / "strokes").joinpath("experiment.toml").read_text(encoding="utf-8")
+    head, run = text.split("[[runs]]")
+    halves = [run.replace('"simulated"', f'"{n}"') + f"window = {w}\n{more}" for n, w, more in (
+        ("out", "[0.0, 17.9]", ""), ("back", "[0.0, 17.9]", 'direction = "backward"\n'))]  # fmt: skip
+    rows = (tmp_path / "strokes" / "simulated.csv").read_text(encoding="utf-8")
+    backward = tmp_path / "strokes" / "back.csv"
+    lines = [line.split(",") for line in rows.splitlines()]
+    at = next(k for k, name in enumerate(lines[0]) if name.startswith("force"))
+    negative = [lines[0], *([*c[:at], str(-float(c[at])), *c[at + 1 :]] for c in lines[1:])]
+    backward.write_text("\n".join(",".join(c) for c in negative), encoding="utf-8")
+    halves[1] = halves[1].replace("simulated.csv", "back.csv")
+    (tmp_path / "strokes" / "experiment.toml").write_text("[[runs]]".join((head, *halves)), encoding="utf-8")
+    both = grouped(srf.read_experiment(tmp_path / "strokes"), ["mu0"], "direction")
+    assert labels(both) == {"out": "forward", "back": "backward"}
+
+
+@pytest.mark.parametrize(
+    ("line", "what"),
+    [('by = "sement"', "segment"), ('vary = "mu0"', 'vary = ["mu0"]'), ('vary = ["E"]', "is to vary, and is not free")],
+)
+def test_what_varies_is_checked_where_it_is_written(line, what, ladder, tmp_path):
+    done = CliRunner().invoke(cli, ["fit", str(with_model(ladder, tmp_path / "bad", line))])
+    assert done.exit_code == 2 and what in done.stderr
+
+
+def test_segments_that_do_not_rise_are_refused(ladder, tmp_path):
+    place = with_model(ladder, tmp_path / "bad", run="segments = [8.0, 2.0]\n")
+    done = CliRunner().invoke(cli, ["check", str(place)])
+    assert done.exit_code == 2 and "segments: the times do not rise" in done.stderr
+
+
+def test_values_of_many_groups_are_drawn_to_their_mean(ladder):
+    """Where D0 scatters by chance, its six values come together; the maximum is that of likelihood times prior."""
+    pieces = grouped(srf.read_experiment(ladder), ["mu0", "D0"], "segment")
+    off = np.array([3, -2, 1, 0, -1, 2]) * 1e-3  # of mu0, times the load of 10 N
+    runs = tuple(replace(run, observed=run.observed + 10 * o) for run, o in zip(pieces.runs, off, strict=True))
+    choice = {"free": ["mu0", "A", "D0"], "track": "smooth"}
+    apart, drawn = (srf.fit(replace(pieces, runs=runs), prior=prior, **choice).found for prior in (False, True))
+    D0 = apart.problem.groups["D0"]
+    raw, shrunk = (np.array([found.fit.values[n] for n in D0]) for found in (apart, drawn))
+    assert apart.scatter == drawn.scatter and np.std(shrunk) < 0.5 * np.std(raw)
+    assert np.mean([drawn.fit.stderr[n] for n in D0]) < 0.8 * np.mean([apart.fit.stderr[n] for n in D0])
+    mu0 = np.array([drawn.fit.values[n] for n in drawn.problem.groups["mu0"]])
+    assert mu0 - mu0.mean() == pytest.approx(off - off.mean(), abs=4e-4)  # what truly varies stays
+    # near its maximum the likelihood is a Gaussian: its product with the prior is another
+    x, C = np.array([apart.fit.values[n] for n in apart.fit.names]), apart.fit.covariance
+    P = np.zeros_like(C)
+    for names, scatter in drawn.problem.priors:
+        at = [apart.fit.names.index(n) for n in names]
+        P[np.ix_(at, at)] = (np.eye(6) - 1 / 6) / scatter**2
+    expected = np.linalg.solve(np.linalg.inv(C) + P, np.linalg.solve(C, x))
+    errors = np.sqrt(np.diag(C))
+    assert (np.abs(np.array([drawn.fit.values[n] for n in apart.fit.names]) - expected) < 0.3 * errors).all()
 
 
 def test_values_of_groups_are_summed_up_as_random_effects():

@@ -9,6 +9,7 @@ import pytest
 
 from srfcli.codegen.c_source import compiler
 from srfcli.data.experiment import read_experiment
+from srfcli.data.groups import grouped
 from srfcli.diagnosis.goodness_of_fit import log_evidence
 from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.scores import Remainder, Scores
@@ -66,10 +67,10 @@ def test_a_friction_of_each_runs_own_is_no_missing_physics(tmp_path):
     for name, text in case_files("small", Physics(), readings).items():
         (tmp_path / name).write_text(text)
     search = ModelSearch(
-        SHIPPED, read_experiment(tmp_path, registry=SHIPPED, holdout=False), effects=FEW, vary=("mu0",)
+        SHIPPED, grouped(read_experiment(tmp_path, registry=SHIPPED, holdout=False), ["mu0"]), effects=FEW
     )
     search.run()
-    found = conclude(search, read_experiment(tmp_path, registry=SHIPPED))
+    found = conclude(search, grouped(read_experiment(tmp_path, registry=SHIPPED), ["mu0"]))
     assert found.verdict in ("none", "inconclusive") and found.best is found.baseline
     values = found.best.fit.values
     apart = [values[f"mu0[{plan.name}]"] - values["mu0[steps]"] for plan in PLANS[1:3]]

@@ -117,9 +117,9 @@ def test_a_laboratory_s_table_becomes_an_experiment(form: str, step: dict[str, n
 @pytest.mark.parametrize(
     ("headings", "options", "said", "hint"),
     [
-        (["t [s]", "v [um/s]", "Torque [N m]", "Fn [N]"], (), "'N m' measures um*N, not N", 'radius = "25 mm"'),
-        (["t [s]", "Angle [deg]", "Fs [N]", "Fn [N]"], (), "'deg' measures rad, not um", 'radius = "25 mm"'),
-        (["t [s]", "Shear strain", "Fs [N]", "Fn [N]"], (), "measures 1, not um", 'thickness = "4 mm"'),
+        (["t [s]", "v [um/s]", "Torque [N m]", "Fn [N]"], (), "'Torque [N m]' is in N m: a rotary rig", "--radius '25 mm'"),
+        (["t [s]", "Angle [deg]", "Fs [N]", "Fn [N]"], (), "'Angle [deg]' is in deg: a rotary rig", "--radius '25 mm'"),
+        (["t [s]", "Shear strain", "Fs [N]", "Fn [N]"], (), "strains need the thickness", "--thickness"),
         (["t [s]", "v [um/s]", "Fs [N]", "Fn [N]"], ("--area", "0 mm^2"), "expected an area above 0", ""),
         (["t [s]", "v [um/s]", "Fs [N]", "Fn [N]"], ("--area", "3 mm^2", "--mass", "1 kg"), "a mass beside an area", ""),
         (["t [s]", "v [um/s]", "Upper stress [MPa]", "Lower stress [MPa]"], (), "which column is", "shear_stress=HEADING"),
@@ -274,6 +274,9 @@ def test_holds_and_oscillations_are_told_from_steps() -> None:
         ),
         (["run1.csv", "--stiffness", "1 1/um", "--holdout", "run7"], "no such run", "Did you mean 'run1'?"),
         (["still.csv", "--stiffness", "1 1/um"], "no column has the load point's velocity", "--drive VELOCITY"),
+        (["still.csv", "--stiffness", "1 1/um"], "no column has", "--column load_point_displacement=HEADING"),
+        (["dated.csv", "--stiffness", "1 1/um", "--drive", "1"], "'2024-01-01 00:00:01'", "the seconds since the start"),
+        (["twice.csv", "--stiffness", "1 1/um", "--drive", "1", "--load", "5 N"], "2 columns are called", "rename one"),
         (["lift.csv", "--stiffness", "1 1/um"], "the load is -1 N", "--window FROM,TO"),
     ],
 )
@@ -284,6 +287,9 @@ def test_what_is_missing_or_wrong_is_said_in_a_line_and_nothing_is_written(
     table(["t", "v", "mu", "sigma_MPa"], [t, 1 + t, 0.6 + 0 * t, 5 + 0 * t])
     table(["t", "mu"], [t, t], "still.csv")
     table(["a", "b"], [t, t], "bare.csv")
+    table(["t", "force [N]", "force [N]"], [t, t, t], "twice.csv")
+    dated = [f"2024-01-01 00:00:{i:02d},0.6" for i in range(1, 50)]
+    Path("dated.csv").write_text("\n".join(["timestamp,mu", *dated]), encoding="utf-8")
     table(["t", "v", "mu", "sigma_MPa"], [t, 1 + t, t, t - 1], "lift.csv")
     done = srf("new", *arguments, code=2)
     error, way_out = done.stderr.strip().splitlines()

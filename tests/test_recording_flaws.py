@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from recording_cases import HEADING, TOML, write
+from scipy.linalg import expm
 
 import srfcli
 from srfcli.cli.main import cli
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import KINDS, check_run, read_experiment
+from srfcli.data.gauge import GaugeNoise, find_noise, whiten
 from srfcli.data.imposed import Place, find_modulation, load_from_column
-from srfcli.data.noise import describe_noise, measured
+from srfcli.data.noise import measured
 from srfcli.data.values import Run
 from srfcli.laws.registry import load_registry
 from srfcli.motion.imposed import ConstantLoad
@@ -308,17 +310,97 @@ def test_a_wobbling_servo_is_no_modulation(amplitude: float) -> None:
     assert find_modulation(t, 5 * (1 + amplitude * np.cos(2 * np.pi * 0.7 * t))) is None
 
 
+def oscillating(n: int, cycles: float, quality: float, random: np.random.Generator) -> np.ndarray:
+    """Return a noise-driven oscillator of unit variance, exact at each sample: e'' + (w/q) e' + w^2 e = noise."""
+    w = 2 * np.pi * cycles
+    F = expm(np.array([[0.0, w], [-w, -w / quality]]))  # of e and e'/w, which have one variance
+    noise = random.standard_normal((n, 2)) @ np.linalg.cholesky(np.eye(2) - F @ F.T).T
+    x, out = random.standard_normal(2), np.empty(n)
+    for i in range(n):
+        x = F @ x + noise[i]
+        out[i] = x[0]
+    return out
+
+
+def slow(n: int) -> np.ndarray:
+    return np.asarray(10 + 0.5 * np.sin(np.arange(n) / 3000))
+
+
 @pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
 def test_level_and_colour_of_the_noise(rho: float) -> None:
-    """AR(1) noise of standard deviation 0.02 about a slow curve comes out with its level and its correlation."""
-    random, n = np.random.default_rng(3), 20_000
-    steps = random.normal(0, 0.02 * np.sqrt(1 - rho**2), n)
-    noise = np.zeros(n)
-    for i in range(1, n):
-        noise[i] = rho * noise[i - 1] + steps[i]
-    found = describe_noise(10 + 0.5 * np.sin(np.arange(n) / 3000) + noise)
-    assert found.lag1 == pytest.approx(rho, abs=0.06)
-    assert found.total == pytest.approx(0.02, rel=0.2 if rho < 0.8 else 0.35)
+    """AR(1) noise about a slow curve comes out with its level and the correlation of neighbours."""
+    n = 20_000
+    found = find_noise([slow(n) + measured(np.zeros(n), noise=0.02, lag1=rho, seed=3)], 1e-3)
+    own, neighbour = found.covariance(np.array([0.0, 1e-3]))
+    assert neighbour / own == pytest.approx(rho, abs=0.03)
+    assert found.total == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_parts_of_the_noise_are_told_apart(seed: int) -> None:
+    """White noise, and with it a relaxation, or a line of half of the variance at 5 Hz, or noise behind a filter."""
+    random, n, dt = np.random.default_rng(seed), 10_000, 0.01
+    white = 0.03 * random.standard_normal(n)
+    found = find_noise([slow(n) + white], dt)
+    assert found.colours == () and found.white == pytest.approx(0.03, rel=0.03)
+    relaxing = measured(np.zeros(n), noise=0.03, lag1=float(np.exp(-dt / 0.08)), seed=seed + 50)
+    found = find_noise([slow(n) + white + relaxing], dt)
+    time, level = found.colours[0]
+    assert len(found.colours) == 1 and (time, level) == pytest.approx((0.08, 0.03), rel=0.3)
+    assert found.white == pytest.approx(0.03, rel=0.05)
+    found = find_noise([slow(n) + white + 0.03 * oscillating(n, 5 * dt, 20.0, random)], dt)
+    frequency, level, quality = found.colours[0]
+    assert (frequency, level, quality) == (pytest.approx(5, rel=0.01), pytest.approx(0.03, rel=0.15), pytest.approx(20, rel=0.4))
+    assert found.white == pytest.approx(0.03, rel=0.05) and len(found.colours) == 1
+    found = find_noise([slow(n) + 0.03 * oscillating(n, 0.05, 0.5, random)], dt)
+    assert found.white < 0.003 and found.colours[0] == pytest.approx((5, 0.03, 0.5), rel=0.2)
+
+
+def test_each_rate_has_a_noise_of_its_own_and_rounding_its_part(tmp_path: Path) -> None:
+    """10 Hz with a slow part, then 100 Hz with a line, steps of the gauge in both; the parts add up to what there is."""
+    random, n = np.random.default_rng(1), 4000
+    c = Columns(2 * n)
+    c.t = np.r_[0.1 * np.arange(n), 0.1 * n + 0.01 * np.arange(n)]
+    first = measured(np.zeros(n), noise=0.03, lag1=float(np.exp(-0.1 / 0.5)), seed=2) + 0.02 * random.standard_normal(n)
+    second = 0.03 * oscillating(n, 0.05, 10.0, random) + 0.01 * random.standard_normal(n)
+    c.u = np.round((12 + np.r_[first, second]) / 0.02) * 0.02
+    c.V[:], c.toml = 8.0, c.toml.replace("velocity = 12.0", "velocity = 8.0").replace("99.0", "999.0")
+    check = check_run(c.read(tmp_path))
+    assert check.sampling.spacings == pytest.approx((0.01, 0.1))
+    fast, slow_ = check.noises
+    assert fast.colours[0] == (pytest.approx(5, rel=0.02), pytest.approx(0.03, rel=0.15), pytest.approx(10, rel=0.4))
+    assert slow_.colours[0] == pytest.approx((0.5, 0.03), rel=0.35)
+    assert (fast.quantum, slow_.quantum) == pytest.approx((0.02, 0.02))
+    assert fast.total == pytest.approx(np.std(c.u[n:]), rel=0.07) and slow_.total == pytest.approx(np.std(c.u[:n]), rel=0.07)
+    assert fast.white == pytest.approx(0.01, rel=0.15) and slow_.white == pytest.approx(0.02, rel=0.2)
+
+
+def test_ringing_after_steps_is_no_line() -> None:
+    """What rings at 30 Hz for a while after each step is signal: a gauge's line is there all along."""
+    random, dt = np.random.default_rng(4), 1e-3
+    t = dt * np.arange(12_000)
+    since = t % 4.0
+    ringing = 0.3 * np.exp(-since / 0.15) * np.cos(2 * np.pi * 30 * since)
+    found = find_noise([ringing + measured(np.zeros(t.size), noise=0.02, lag1=0.5, seed=4)], dt)
+    assert found.total == pytest.approx(0.02, rel=0.1)
+    line = 0.02 * oscillating(t.size, 0.03, 50.0, random)
+    found = find_noise([line + measured(np.zeros(t.size), noise=0.02, lag1=0.5, seed=4)], dt)
+    assert any(len(colour) == 3 and abs(colour[0] - 30) < 1 for colour in found.colours)
+
+
+def test_whitening_is_that_of_the_covariance_matrix() -> None:
+    """The filter's innovations have the products of columns over the dense covariance, at two rates, with readings left out."""
+    random = np.random.default_rng(5)
+    noises = (GaugeNoise(0.5, 0.4, ((0.3, 1.0), (2.0, 0.7, 5.0))), GaugeNoise(0.2, 0.0, ((3.0, 0.5, 0.4),)))
+    t = np.sort(random.uniform(0, 10, 120))
+    t[60:] = 12 + 0.05 * np.arange(60)
+    rate, begins = np.repeat([0, 1], 60).astype(np.intc), np.arange(120) == 60
+    columns = random.standard_normal((120, 3))
+    C = np.zeros((120, 120))
+    for k, part in enumerate((slice(0, 60), slice(60, 120))):
+        C[part, part] = noises[k].covariance(np.abs(np.subtract.outer(t[part], t[part])))
+    white = whiten(noises, rate, begins, t, columns)
+    assert white.T @ white == pytest.approx(columns.T @ np.linalg.solve(C, columns), rel=1e-8, abs=1e-8)
 
 
 def test_noise_under_a_modulation(tmp_path: Path) -> None:

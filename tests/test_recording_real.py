@@ -11,6 +11,7 @@ from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
 from srfcli.data.experiment import read_experiment
+from srfcli.data.gauge import GaugeNoise
 from srfcli.laws.registry import load_registry
 
 REGISTRY = load_registry(user=False, entry_points=False)
@@ -75,7 +76,10 @@ def test_a_velocity_step_of_p655(name: str, columns: str, shared: Path, tmp_path
     row = done["rows"][0]
     assert (row["V_min"], row["V_max"]) == pytest.approx((2.286, 22.86), rel=2e-3)
     assert (row["rate_min"], row["rate_max"]) == pytest.approx((10, 1000), rel=1e-3)
-    assert row["W_mean"] == pytest.approx(99.91, abs=0.01) and 0.5 < row["lag1"] < 0.95
+    assert row["W_mean"] == pytest.approx(99.91, abs=0.01)
+    noises = done["meta"]["runs"][0]["noise"]  # smooth at 1 and 10 ms, as the fit of this step has it
+    assert [n["interval"] for n in noises] == pytest.approx([1e-3, 1e-2, 1e-1], rel=1e-2)
+    assert all(n["white"] < 0.3 * n["level"] and 10 < n["colours"][0]["frequency"] < 40 for n in noises[:2])
     assert done["meta"]["runs"][0]["drive"][1]["from"] == pytest.approx(3852.36, abs=0.1)
     text = srf("check", str(place)).stdout
     assert "alpha (Linker-Dieterich: a change of load changes the age) can hardly be identified" in text
@@ -101,7 +105,10 @@ def test_the_basalt_step(shared: Path, tmp_path: Path) -> None:
     row, run = done["rows"][0], done["meta"]["runs"][0]
     assert row["samples"] == 5849 and row["resets"] == 1
     assert [run["drive"][k]["velocity"] for k in (0, -1)] == pytest.approx([3.0, 10.0], rel=5e-3)
-    assert row["lag1"] == pytest.approx(0.75, abs=0.05)  # as its README says of a fit's residuals
+    noise = run["noise"][0]
+    found = GaugeNoise(noise["white"], noise["quantum"], tuple(tuple(c.values()) for c in noise["colours"]))
+    own, neighbour = found.covariance(np.array([0.0, noise["interval"]]))
+    assert neighbour / own == pytest.approx(0.75, abs=0.05)  # as its README says of a fit's residuals
     assert row["noise"] == pytest.approx(8.9e-4, rel=0.25)
     assert run["drive"][1]["from"] == pytest.approx(11676.4, abs=0.5)
     assert [1 / s["interval"] for s in run["sampling"]] == pytest.approx([10, 100], rel=1e-6)

@@ -17,6 +17,7 @@ LONGEST = 2**20  # bytes of a line
 SAMPLE = 2**16  # bytes by which the number of lines is estimated
 SNIFFED = 4096  # bytes from which a reader is chosen
 NOTHING = {"", "nan", "na", "n/a", "null", "none", "-nan", "#n/a"}
+CLOCK = re.compile(r"\d:\d\d|\d{4}[-/.]\d{1,2}[-/.]\d")
 NUMBER = re.compile(
     r"[+-]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eEdD][+-]?\d++)?"
 )  # possessive: in the time that the cell is long
@@ -379,4 +380,7 @@ class _Table:
                 f"Write a point: {cell.replace(',', '.', 1)}, in the whole file.",
             )
         short = cell if len(cell) <= 40 else cell[:37] + "..."
-        raise SrfError(f"{where}: found {short!r}, expected a number", "Leave a missing value empty, or write nan.")
+        hint = "Leave a missing value empty, or write nan."
+        if CLOCK.search(cell):
+            hint = "Dates and times of day are not read: write the seconds since the start."
+        raise SrfError(f"{where}: found {short!r}, expected a number", hint)

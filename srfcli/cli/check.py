@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from srfcli.data.experiment import RunCheck
-    from srfcli.data.noise import Noise
+    from srfcli.data.gauge import GaugeNoise
     from srfcli.data.values import Experiment, Run
     from srfcli.inference.cramer_rao import Forecast, Reach
     from srfcli.laws.registry import Registry
@@ -92,7 +92,7 @@ def command(
     forecast = _forecast(found, checks, registry) if simulate else None
     table, more = _table(found, checks, forecast), []
     if output.format == "text":
-        more = report(table.rows, forecast, load_unit="MPa" if found.stress else "N")
+        more = report(table.rows, checks, forecast, load_unit="MPa" if found.stress else "N")
         more[-1] = dataclasses.replace(more[-1], notes=table.notes)
         title = f"{table.title}\n{_model_line(found)}"
         table = dataclasses.replace(table, columns=(), rows=(), notes=(), title=title)
@@ -179,7 +179,7 @@ def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecas
     title = experiment.title or experiment.path.parent.name
     rows = [row(check, one) for check, one in zip(checks, told, strict=True)]
     columns = tuple(dataclasses.replace(c, unit=shown_unit(c.unit, stress=experiment.stress)) for c in COLUMNS)
-    return Table("srf.check/2", columns, rows, title, tuple(notes), parameters, meta)
+    return Table("srf.check/3", columns, rows, title, tuple(notes), parameters, meta)
 
 
 def _figure(experiment: Experiment, checks: Sequence[RunCheck]) -> Figure:
@@ -224,9 +224,9 @@ COLUMNS = (
     Column("unit", about="of the readings: um, N, MPa or 1"),
     Column("reading_min", about="smallest reading that is compared, in the observable's unit"),
     Column("reading_max", about="largest one"),
-    Column("noise", about="standard deviation about the trend, in the observable's unit"),
-    Column("lag1", about="correlation from sample to sample"),
-    Column("white_noise", about="white level, in the observable's unit"),
+    Column("noise", about="standard deviation of the gauge's noise, in the observable's unit"),
+    Column("white_noise", about="that of its white part"),
+    Column("colour", about="processes of coloured noise: standard deviation, time or frequency, quality"),
     Column("quantum", about="quantisation step, 0 for none"),
     Column("V_min", "um/s", "lowest driving velocity"),
     Column("V_max", "um/s", "highest driving velocity"),
@@ -252,6 +252,8 @@ def row(check: RunCheck, told: Reach | None) -> tuple[Any, ...]:
     """Return the cells of one run under COLUMNS."""
     import numpy as np
 
+    from srfcli.data.gauge import colour_text
+
     run, load, rates = check.run, check.load, [1 / r.interval for r in check.sampling.rates]
     read, found = run.observed[run.used], load.modulation
     found_out = {} if told is None else {"error": told.errors, "peak": told.peaks}
@@ -260,7 +262,8 @@ def row(check: RunCheck, told: Reach | None) -> tuple[Any, ...]:
         "duration": float(np.ptp(run.t)), "rate_min": min(rates), "rate_max": max(rates),
         "gaps": int(check.sampling.gaps.size), "spikes": check.spikes, "resets": check.count("reset"),
         "observable": run.quantity, "unit": run.unit, "reading_min": float(read.min()), "reading_max": float(read.max()),
-        "noise": check.noise.total, "lag1": check.noise.lag1, "white_noise": check.noise.white, "quantum": run.quantum,
+        "noise": check.noise.total, "white_noise": check.noise.white,
+        "colour": "; ".join(map(colour_text, check.noise.colours)), "quantum": run.quantum,
         "V_min": check.slowest, "V_max": check.fastest,
         "W_mean": load.mean, "W_min": load.lowest, "W_max": load.highest, "W_rate": load.rate,
         "f": found.frequency if found else None, "eps": found.amplitude if found else None,
@@ -270,14 +273,17 @@ def row(check: RunCheck, told: Reach | None) -> tuple[Any, ...]:
     return tuple(cells[column.name] for column in COLUMNS)
 
 
-def report(rows: Sequence[Sequence[Any]], forecast: Forecast | None, *, load_unit: str = "N") -> list[Table]:
-    """Return the rows as tables no wider than a page, rounded: samples, readings, what was imposed, what the load can tell."""
+def report(
+    rows: Sequence[Sequence[Any]], checks: Sequence[RunCheck], forecast: Forecast | None, *, load_unit: str = "N"
+) -> list[Table]:
+    """Return tables no wider than a page, rounded: samples, readings, noise, what was imposed, what the load can tell."""
     cells = [{c.name: cell for c, cell in zip(COLUMNS, r, strict=True)} for r in rows]
     shown = {
         title: {heading.replace("[N]", f"[{load_unit}]"): of for heading, of in columns.items()}
         for title, columns in SHOWN.items()
     }
     tables = [_shown(title, columns, cells) for title, columns in shown.items()]
+    tables.insert(2, _noise_table(checks))
     return tables if forecast is None else [*tables, _told(forecast)]
 
 
@@ -285,6 +291,22 @@ def _shown(title: str, columns: Mapping[str, Callable[[Cells], Any]], rows: Sequ
     return Table(
         "srf.check.text/1", tuple(map(Column, columns)), [[of(r) for of in columns.values()] for r in rows], title
     )
+
+
+def _noise_table(checks: Sequence[RunCheck]) -> Table:
+    """Return what each run's noise consists of, at each of its sampling rates."""
+    rows: list[list[Any]] = []
+    for check in checks:
+        for dt, noise in zip(check.sampling.spacings, check.noises, strict=True):
+            parts = [p for p in noise.parts if p[0] != "rounding" or (p[1] / noise.total) ** 2 >= 0.005]
+            for k, (part, sd, colour) in enumerate(parts):
+                own = [check.run.name, rounded(1 / dt, 4)] if k == 0 else ["", None]
+                time, frequency = (None, None) if not colour else (colour[0], None) if len(colour) == 2 else (None, colour[0])
+                quality = colour[2] if len(colour) == 3 else None
+                share = f"{100 * (sd / noise.total) ** 2:.0f} %"
+                rows.append([*own, part, rounded(sd, 3), share, *(rounded(x, 3) for x in (time, frequency, quality))])
+    headings = ["run", "rate [Hz]", "noise", "sd", "share", "over [s]", "about [Hz]", "quality"]
+    return Table("srf.check.text/1", tuple(map(Column, headings)), rows, "Noise")
 
 
 def _digits(name: str, digits: int) -> Callable[[Cells], Any]:
@@ -322,8 +344,6 @@ SHOWN: dict[str, dict[str, Callable[[Cells], Any]]] = {
         "lowest": _digits("reading_min", 5),
         "highest": _digits("reading_max", 5),
         "noise": _digits("noise", 3),
-        "lag1": lambda r: None if r["lag1"] is None else round(r["lag1"], 2) + 0.0,
-        "white": _digits("white_noise", 3),
         "quantum": _digits("quantum", 3),
     },
     "Imposed": {
@@ -373,8 +393,9 @@ def described(check: RunCheck, told: Reach | None) -> dict[str, Any]:
             for r in check.sampling.rates
         ],
         "gaps": [[float(run.t[g]), float(run.t[g + 1])] for g in check.sampling.gaps.tolist()],
-        "noise": [{"interval": r.interval, "first": float(run.t[r.first]), **_noise(n)} for r, n in check.noises]
-        or [_noise(check.noise)],
+        "noise": [
+            {"interval": dt, **_noise(noise)} for dt, noise in zip(check.sampling.spacings, check.noises, strict=True)
+        ],
         "friction_noise": check.friction_noise,
         "drive": [{"from": a, "velocity": v, "acceleration": s} for a, v, s in check.drive],
         "load": {"mean": load.mean, "low": load.lowest, "high": load.highest, "rate": load.rate},
@@ -402,8 +423,13 @@ def tells(told: Reach) -> dict[str, Any]:
     }
 
 
-def _noise(noise: Noise) -> dict[str, Any]:
-    return {"level": noise.total, "lag1": noise.lag1, "white": noise.white, "samples": noise.samples}
+def _noise(noise: GaugeNoise) -> dict[str, Any]:
+    names = ("time", "level"), ("frequency", "level", "quality")
+    colours = [dict(zip(names[len(c) - 2], c, strict=True)) for c in noise.colours]
+    return {
+        "level": noise.total, "white": noise.white, "quantum": noise.quantum, "colours": colours,
+        "samples": noise.samples, "stretch": noise.stretch,
+    }  # fmt: skip
 
 
 # What `srf check` says in words: what the loads of these recordings can and cannot identify, and how the noise was found.
@@ -423,8 +449,8 @@ SUBJECTS = {
     "n": "n (the exponent with which the interface stiffens under load)",
 }
 NOISE = (
-    "noise: about parabolas over 64 samples (and a modulation's harmonics), in the calmest quarter of them; lag1 is its "
-    "correlation from sample to sample; white is the floor of the spectrum's upper half"
+    "noise: about parabolas over 64 to 256 samples (and a modulation's harmonics), where these are calm; shares are those of its "
+    "variance; a fit estimates the same parts with its parameters"
 )
 
 

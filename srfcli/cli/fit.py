@@ -68,6 +68,12 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
 @click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
 @vary_options
 @click.option(
+    "--prior/--no-prior",
+    default=True,
+    show_default=True,
+    help="Draw what varies between five groups or more towards its mean, as far as it scatters by chance.",
+)
+@click.option(
     "--track",
     type=click.Choice(["smooth", "rough", "shared"]),
     help="Random friction field along slip: none, one for each run, one for all; else the recording decides.",
@@ -114,7 +120,8 @@ def command(
                 f"{source}: a recording, and no experiment yet",
                 f"`srf new {source}` writes the experiment.toml to fit.",
             )
-        _refuse(options, ("starts", "profile", "trend", "vary", "by", "track", "sample", "draws", "reader"), "recordings")
+        meant = ("starts", "profile", "trend", "vary", "by", "prior", "track", "sample", "draws", "reader")
+        _refuse(options, meant, "recordings")
         fit_thresholds(
             source, system=system, output=output, free=options["free"], bounds=options["bounds"],
             methods=options["method"], tol=options["tol"], max_evaluations=options["max_evaluations"],
@@ -165,7 +172,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
             progress.advance(note=text, share=done.after(text) if stage == "fit" else share)
 
         found = fit(
-            experiment, free=free, trend=options["trend"], vary=listed(options["vary"]), by=options["by"],
+            experiment, free=free, trend=options["trend"], vary=listed(options["vary"]), by=options["by"], prior=options["prior"],
             track=options["track"], starts=options["starts"],
             profile=options["profile"], sample=options["sample"], seed=options["seed"], registry=registry, progress=report,
         )  # fmt: skip
@@ -199,7 +206,7 @@ def _fit_campaign(
     from srfcli.core.files import check_target, write_atomic
     from srfcli.tasks.campaign import fit_campaign
 
-    _refuse(options, ("profile", "sample", "draws", "vary", "by"), "one experiment")
+    _refuse(options, ("profile", "sample", "draws", "vary", "by", "prior"), "one experiment")
     target = None if place is None else Path(place).expanduser()
     if target is not None:
         if target.suffix.lower() != ".csv":

@@ -573,7 +573,7 @@ def listed(texts: Sequence[str]) -> list[str]:
 def vary_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add --vary and --by, which fits of recordings have in common."""
     by = click.option(
-        "--by", type=click.Choice(["run", "load"]), default="run", show_default=True, help="What --vary goes by."
+        "--by", type=click.Choice(["run", "load", "segment", "direction"]), help="What --vary goes by; run if nothing says."
     )
     vary = click.option(
         "--vary", multiple=True, metavar="NAMES", help="Parameters with a value of their own in each run, or for each --by."

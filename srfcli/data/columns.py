@@ -251,10 +251,11 @@ class _Finder:
         else:
             found = self._named(spec)
         if len(found) > 1:
-            raise SrfError(
-                f"{self.path}: {len(found)} columns are called '{self.parts[found[0]][0]}'",
-                f'Name the one for {role} in full: [columns] {role} = {{ name = "{self.headings[found[0]]}" }}.',
-            )
+            full = self.headings[found[0]]
+            hint = f'Name the one for {role} in full: [columns] {role} = {{ name = "{full}" }}.'
+            if len({self.headings[i] for i in found}) == 1:
+                hint = f"Their headings are the same, '{full}': rename one of them in the file."
+            raise SrfError(f"{self.path}: {len(found)} columns are called '{self.parts[found[0]][0]}'", hint)
         return self._channel(role, spec, found[0])
 
     def _named(self, spec: ColumnSpec) -> list[int]:

@@ -8,6 +8,7 @@ import re
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -60,6 +61,7 @@ _RUN = (
     "direction",
     "corrections",
     "observables",
+    "segments",
 )
 _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
 
@@ -110,6 +112,7 @@ class RunDescription:
     backward: bool = False
     corrections: frozenset[str] = frozenset()
     observables: tuple[str, ...] = ()
+    segments: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -305,7 +308,20 @@ def _run(node: Node, geometry: Geometry) -> RunDescription:
         backward=direction is not None and direction.text() == "backward",
         corrections=_corrections(node.get("corrections")),
         observables=_observables(node.get("observables")),
+        segments=_segments(node.get("segments")),
     )
+
+
+def _segments(node: Node | None) -> tuple[float, ...]:
+    """Return the times at which a run may be cut, rising."""
+    if node is None:
+        return ()
+    if not isinstance(node.value, list):
+        node.expected("a list of times in s of the file's own clock", "Write segments = [120.0, 240.0].")
+    times = [node.child(i).quantity("s") for i in range(len(node.value))]
+    if any(b <= a for a, b in pairwise(times)):
+        node.fail("the times do not rise", "Give the earlier time first.")
+    return tuple(times)
 
 
 def _corrections(node: Node | None) -> frozenset[str]:

@@ -292,10 +292,23 @@ def missing(columns: Sequence[Named], wish: Wish, path: Path, headings: Sequence
         what = "friction, shear stress, force or elongation of the spring"
         lacks.append(("--column shear_stress=HEADING", f"{path}: which column is {what}? It has {listed}"))
     if wish.drive is None and not roles & {"load_point_velocity", "load_point_displacement"}:
-        lacks.append(("--drive VELOCITY", f"{path}: no column has the load point's velocity or displacement"))
+        option = "--drive VELOCITY, or --column load_point_displacement=HEADING"
+        lacks.append((option, f"{path}: no column has the load point's velocity or displacement"))
     if wish.load is None and not roles & {"normal_load", "normal_stress", "friction"}:
-        lacks.append(("--load '5 N'", f"{path}: no column has the normal load or stress"))
+        lacks.append(("--load '5 N', or --column normal_stress=HEADING", f"{path}: no column has the normal load or stress"))
     return lacks
+
+
+def _check_rig(columns: Sequence[Named], wish: Wish, path: Path) -> None:
+    """Raise SrfError for angles, torques and strains of a rig whose radius or thickness is not said."""
+    needed = {"rad": "radius", "rad/s": "radius", "N*um": "radius"}
+    for column in columns:
+        kind = _kind_of_unit(column.unit)
+        strain = column.role in ("load_point_displacement", "load_point_velocity") and kind in ("1", "1/s")
+        key = "thickness" if strain else needed.get(kind)
+        if key is not None and key not in wish.rig:
+            what = "strains need the thickness of the layer" if strain else "a rotary rig needs its radius"
+            raise SrfError(f"{path}: '{column.heading}' is in {column.unit}: {what}", f"Say it with --{key} '25 mm'.")
 
 
 def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry) -> Draft:
@@ -313,6 +326,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         lacks = missing(own, wish, path, headings)
         if lacks:
             raise SrfError(lacks[0][1], " ".join(f"Say it with {option}." for option, _ in lacks))
+        _check_rig(own, wish, path)
         if named and [(n.role, n.heading, n.unit) for n in own] != [(n.role, n.heading, n.unit) for n in named]:
             raise SrfError(
                 f"{path}: its columns are not those of {files[0]}", "Files of one experiment have the same headings."

@@ -15,9 +15,11 @@ from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.settings import Parameter
 from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
-from srfcli.data.clock import Mask, Rate, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
+from srfcli.data.clock import Mask, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
 from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, ColumnSpec, Node, RunDescription, read_description
+from srfcli.data.gauge import GaugeNoise, find_noise
+from srfcli.data.groups import BY, grouped
 from srfcli.data.imposed import (
     ACCIDENTS,
     DIFFERS,
@@ -33,8 +35,6 @@ from srfcli.data.imposed import (
     strokes,
 )
 from srfcli.data.noise import (
-    Noise,
-    describe_noise,
     observable_jumps,
     quantisation,
     rejoined,
@@ -81,7 +81,8 @@ def read_experiment(
         own = [registry.get("effect", name) for name in choice.effects]
         stated = described.parameters.value if described.parameters is not None else {}
         parameters = own_bounds(parameters, apart([e for e in own if isinstance(e, Effect)]), runs, stated)
-    return Experiment(
+    vary, by = read_groups(described.model)
+    found = Experiment(
         described.path,
         described.title,
         choice,
@@ -92,6 +93,7 @@ def read_experiment(
         notices,
         described.apparatus.stated,
     )
+    return grouped(found, vary, by)
 
 
 # The model of an experiment and its parameters, judged by the laws themselves.
@@ -106,9 +108,20 @@ _IMPOSED = {
 }
 
 
+def read_groups(node: Node) -> tuple[tuple[str, ...], str]:
+    """Return which parameters have a value of their own in each group, and what makes a group."""
+    vary, by = node.get("vary"), node.get("by")
+    if vary is not None and not isinstance(vary.value, list):
+        vary.expected("a list of parameters", 'Write vary = ["mu0"].')
+    if by is not None and by.text() not in BY:
+        by.expected(" or ".join(f'"{word}"' for word in BY), did_you_mean(by.text(), BY))
+    names = tuple(vary.child(i).text() for i in range(len(vary.value))) if vary is not None else ()
+    return names, by.text() if by is not None else "run"
+
+
 def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[ModelChoice, tuple[Parameter, ...]]:
     """Return the chosen model and all parameters that its laws and the apparatus have, in declared units."""
-    node.keys(("law", "ageing", "interface", "inertia", "effects"))
+    node.keys(("law", "ageing", "interface", "inertia", "effects", "vary", "by"))
     law = node.require("law", 'Name a friction law: law = "srf-vsat"; `srf laws` lists them.')
     ageing = node.require("ageing", 'Name an ageing law: ageing = "dieterich"; `srf laws` lists them.')
     interface, inertia = node.get("interface"), node.get("inertia")
@@ -326,6 +339,8 @@ def read_run(
         stress=any(units.values()),
         proposed=proposed,
         others=tuple(signal for signal, _ in others),
+        backward=run.backward,
+        segments=run.segments,
     )
 
 
@@ -527,15 +542,15 @@ class LoadHistory:
 
 @dataclass(frozen=True)
 class RunCheck:
-    """What was found in one run; `noise` is that of the longest evenly sampled stretch, `noises` those of all long ones.
+    """What was found in one run; `noises` are those of the gauge at each of its spacings, `noise` that of most samples.
 
     `friction_noise` is the noise of a sample in units of the friction coefficient. `drive` holds (from s, um/s, um/s^2).
     """
 
     run: Run
     sampling: Sampling
-    noise: Noise
-    noises: tuple[tuple[Rate, Noise], ...]
+    noise: GaugeNoise
+    noises: tuple[GaugeNoise, ...]
     friction_noise: float
     drive: tuple[tuple[float, float, float], ...]
     slowest: float
@@ -558,21 +573,16 @@ def check_run(run: Run) -> RunCheck:
     sampling = find_sampling(run.t)
     load = load_history(run.load, run.t)
     x = np.interp(run.t, run.t[run.used], run.observed[run.used])
-    noises = []
-    for rate in sampling.rates:
-        if rate.last - rate.first >= 128:
-            cycles = load.modulation.frequency * rate.interval if load.modulation else None
-            noises.append((rate, describe_noise(x[rate.first : rate.last], cycles)))
-    longest = _longest(sampling)
-    noise = next((n for r, n in noises if r is longest), None) or describe_noise(x[longest.first : longest.last + 1])
-    size = noise.total if math.isfinite(noise.total) else noise.white
-    pieces, slowest, fastest = _drive_pieces(run.drive, run.t)
+    cut = 1 + np.union1d(np.flatnonzero(np.diff(sampling.at)), sampling.gaps)
+    pieces, noises = np.split(x, cut), []
+    for k, dt in enumerate(sampling.spacings):
+        parts = [piece for piece, begin in zip(pieces, (0, *cut), strict=True) if sampling.at[begin] == k]
+        cycles = load.modulation.frequency * dt if load.modulation else None
+        noises.append(find_noise(parts, dt, quantum=run.quantum, cycles=cycles))
+    noise = noises[int(np.argmax(np.bincount(sampling.at)))]
+    driven, slowest, fastest = _drive_pieces(run.drive, run.t)
     factor = {"elongation": run.stiffness / load.mean, "force": 1 / load.mean, "friction": 1.0}[run.observable]
-    return RunCheck(run, sampling, noise, tuple(noises), size * factor, pieces, slowest, fastest, load)
-
-
-def _longest(sampling: Sampling) -> Rate:
-    return max(sampling.rates, key=lambda r: r.last - r.first)
+    return RunCheck(run, sampling, noise, tuple(noises), noise.total * factor, driven, slowest, fastest, load)
 
 
 def _drive_pieces(drive: Drive, t: Array) -> tuple[tuple[tuple[float, float, float], ...], float, float]:

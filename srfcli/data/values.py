@@ -67,6 +67,7 @@ class Run:
     `modulation` the declared frequency (Hz), relative amplitude and onset (s), `quantum` the quantisation step, or 0.
     `others` are what was observed at the same times besides.
     `proposed` is the observable as the corrections that are proposed would make it, None where there are none.
+    `backward` where drive and observable count with the opposite sign, `segments` are the times (s) at which it may be cut.
     `stress` where stresses were recorded: a stress counts as the force on 1 mm^2, so that what is in N is in MPa.
     """
 
@@ -88,6 +89,8 @@ class Run:
     stress: bool = False
     proposed: Array | None = field(default=None, repr=False)
     others: tuple[Signal, ...] = ()
+    backward: bool = False
+    segments: tuple[float, ...] = ()
 
     @property
     def signals(self) -> tuple[Signal, ...]:
@@ -109,10 +112,14 @@ class Run:
         return find_sampling(self.t)
 
     def thinned(self, every: int) -> Run:
-        """Return every so-many-th reading of the run; drive and load are as they were."""
-        own = {n: getattr(self, n)[::every] for n in ("t", "observed", "used")}
-        others = tuple(replace(s, observed=s.observed[::every], used=s.used[::every]) for s in self.others)
-        return replace(self, **own, others=others, proposed=None if self.proposed is None else self.proposed[::every])
+        """Return every so-many-th reading of the run."""
+        return self.part(slice(None, None, every))
+
+    def part(self, which: slice) -> Run:
+        """Return the run with these of its readings alone; drive and load are as they were."""
+        own = {n: getattr(self, n)[which] for n in ("t", "observed", "used")}
+        others = tuple(replace(s, observed=s.observed[which], used=s.used[which]) for s in self.others)
+        return replace(self, **own, others=others, proposed=None if self.proposed is None else self.proposed[which])
 
     @property
     def load_unit(self) -> str:
@@ -132,7 +139,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Runs under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider."""
+    """Runs under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider.
+
+    Parameters in `vary` have a value for each run, load, segment or direction, as `by` says.
+    """
 
     path: Path
     title: str
@@ -143,6 +153,8 @@ class Experiment:
     runs: tuple[Run, ...]
     notices: tuple[Notice, ...]
     stiffness_unit: str = ""
+    vary: tuple[str, ...] = ()
+    by: str = "run"
 
     @property
     def stress(self) -> bool:

@@ -98,6 +98,7 @@ def augment(
     lines += [f"stiffness = {_value(text)}"] + ([f'mass = "{shortest(mass, KILOGRAM)!r} kg"'] if mass else [])
     lines += ["", "[model]", *(f'{"law" if kind == "friction" else kind} = "{kind}.toml"' for kind in LAWS)]
     lines += [f"inertia = {_value(inertia)}"] + ([f"effects = {_value(list(effects))}"] if effects else [])
+    lines += [f"vary = {_value(list(experiment.vary))}", f"by = {_value(experiment.by)}"] if experiment.vary else []
     lines += ["", "[parameters]", *(_free_parameter(q, base) for q in listed)]
     if "columns" in description:
         lines += ["", "[columns]", *(f"{_key(k)} = {_value(v)}" for k, v in description["columns"].items())]

@@ -152,9 +152,7 @@ def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
     """Return the closed form that explains most for its length; None where no term helps, or held-out runs refuse all."""
     registry = with_terms(search.registry)
     names = {e.name for e in registry.entries("effect") if e.origin == ORIGIN}
-    own = ModelSearch(
-        registry, search.experiment, search.progress, sorted(names), **search.choice
-    )
+    own = ModelSearch(registry, search.experiment, search.progress, sorted(names), search.trend)
     start = [diagnosis.baseline]
     if diagnosis.best is not diagnosis.baseline and not diagnosis.best.fine:
         start.append(diagnosis.best)

@@ -131,8 +131,6 @@ class Hypothesis:
         *,
         at: Mapping[str, float] | None = None,
         trend: str | None = None,
-        vary: Sequence[str] = (),
-        by: str = "run",
         random_field: bool = True,
     ) -> Problem:
         """Return the fit of baseline and effects together, from the values in `at` where there are some."""
@@ -145,7 +143,7 @@ class Hypothesis:
         listed = tuple(
             replace(q, value=float(np.clip(at.get(q.name, q.value), q.lower, q.upper))) for q in (*kept, *added)
         )
-        problem = fit_problem(model, replace(experiment, parameters=listed), trend=trend, vary=vary, by=by)
+        problem = fit_problem(model, replace(experiment, parameters=listed), trend=trend)
         start = [at.get(n, s) for n, s in zip(problem.names, problem.start, strict=True)]
         return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper))
 

@@ -119,12 +119,10 @@ class ModelSearch:
         effects: Sequence[str] | None = None,
         trend: str | None = None,
         *,
-        vary: Sequence[str] = (),
-        by: str = "run",
         budget: float = BUDGET,
     ) -> None:
         self.registry, self.whole, self.progress = registry, experiment, progress
-        self.choice: dict[str, Any] = {"trend": trend, "vary": tuple(vary), "by": by}  # of every fit
+        self.trend = trend  # of every fit
         self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs))
         self.candidates, self.excluded = applicable(registry, experiment, effects)
         self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]
@@ -148,7 +146,7 @@ class ModelSearch:
         return self._judged(hypothesis, found)
 
     def _problem(self, hypothesis: Hypothesis, at: Mapping[str, float]) -> Problem:
-        return hypothesis.problem(self.registry, self.experiment, at=at, **self.choice)
+        return hypothesis.problem(self.registry, self.experiment, at=at, trend=self.trend)
 
     def _started(self, move: _Move) -> dict[str, float]:
         """Return where a model is fitted from: the sizes that its scores expect, or a part of them where that is likelier.

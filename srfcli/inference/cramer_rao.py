@@ -23,6 +23,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import to_base
 from srfcli.data.clock import Mask
 from srfcli.data.experiment import RunCheck
+from srfcli.data.gauge import whiten
 from srfcli.data.values import Experiment, ModelChoice
 from srfcli.inference.prediction import own_names, own_start, predict, run_parameters, stiffness_share
 from srfcli.laws.registry import Registry
@@ -36,7 +37,8 @@ SIZES = {
 }  # that one would want to see: of rock's alpha, of lambda's own value, of n
 FAR = 3.0  # root mean square of simulation minus recording over the recording's own spread, from which it is another motion
 STIFFER = 1.5  # from half to twice the stated stiffness
-LONGEST = 20_000  # samples of a run that are simulated; of more, evenly chosen pairs stand for the others
+LONGEST = 20_000  # samples of a run that are simulated; of more, evenly chosen blocks stand for the others
+BLOCK = 16  # samples of one: the first half tells what the noise is like there, the second half counts
 UNKNOWN = 100.0  # an error beyond this tells nothing: alpha and n are of order 1, lambda counts relative to itself
 
 
@@ -199,11 +201,11 @@ def _simulated(question: _Question, check: RunCheck) -> _Told:
         values[name], low, high = own_start(model, short, p, name)
         ranges.append(_width(low, high, values[name]))
     found = predict(model, question.experiment, short, values, by=(*question.names, *own), trend=question.trend)
-    sigma, rho = (x[chosen] for x in noise_of(check))
+    rate = run.sampling.at[chosen]
     seen = short.used & (short.t <= found.reached) & np.isfinite(found.J).all(axis=1)
-    Z = np.where(seen[:, None], found.J, 0.0) / sigma[:, None]
-    J = innovations(Z, chosen, seen, rho, weight=weight)
-    Z, F, k = Z[seen], J.T @ J, len(question.names)
+    sigma = np.array([noise.total for noise in check.noises])[rate]
+    Z, J = found.J[seen] / sigma[seen, None], innovations(check, chosen, found.J, seen, weight=weight)
+    F, k = J.T @ J, len(question.names)
     if own:
         inner = F[k:, k:] + np.diag([12 / w**2 for w in ranges])
         taken = np.linalg.solve(inner, F[k:, :k])
@@ -214,35 +216,28 @@ def _simulated(question: _Question, check: RunCheck) -> _Told:
     return _Told(F, Z, misfit, found.status, float(found.reached))
 
 
-def noise_of(check: RunCheck) -> tuple[Array, Array]:
-    """Return standard deviation and lag-1 correlation of the noise at each sample (n,) of a run, by its sampling rates."""
-    run = check.run
-    least = max(run.quantum / math.sqrt(12), 1e-9 * float(np.ptp(run.observed)), 1e-300)
-    sigma, rho = np.empty(run.t.size), np.empty(run.t.size)
-    for begin, noise in [(0, check.noise), *((r.first, n) for r, n in check.noises)]:
-        sigma[begin:] = max(noise.total if math.isfinite(noise.total) else noise.white, least)
-        rho[begin:] = min(max(noise.lag1, 0.0), 0.98) if math.isfinite(noise.lag1) else 0.0
-    return sigma, rho
-
-
 def _chosen(size: int) -> tuple[NDArray[np.int64], float]:
-    """Return which samples of a run are simulated, and how many each stands for: all, or pairs of neighbours of a long one."""
+    """Return which samples of a run are simulated, and how many each that counts stands for: all, or blocks of a long one."""
     if size <= LONGEST:
         return np.arange(size), 1.0
-    step = -(-2 * size // LONGEST)
-    first = np.arange(0, size - 1, step)
-    return np.column_stack([first, first + 1]).ravel(), float(step)
+    first = np.linspace(0, size - BLOCK, LONGEST // BLOCK).astype(int)
+    return (first[:, None] + np.arange(BLOCK)).ravel(), size / (first.size * BLOCK / 2)
 
 
-def innovations(Z: Array, chosen: NDArray[np.int64], used: Mask, rho: Array, *, weight: float) -> Array:
-    """Return what each sample adds to those before it: derivatives Z (n, k) over AR(1) noise, whitened.
+def innovations(check: RunCheck, chosen: NDArray[np.int64], J: Array, used: Mask, *, weight: float = 1.0) -> Array:
+    """Return what each sample used adds to those before it: derivatives J (n, k), whitened by the noise that was found.
 
-    `chosen` are the samples' places in the run. Where they are pairs, only a pair's second sample counts, `weight` times.
+    `chosen` (n,) are the samples' places in the run. Where each stands for `weight` > 1 they are blocks, of which the second half
+    counts, so many times.
     """
-    linked = np.r_[False, (np.diff(chosen) == 1) & used[1:] & used[:-1]]
-    share = np.where(linked, rho, 0.0)[:, None]
-    out = (Z - share * np.roll(Z, 1, axis=0)) / np.sqrt(1 - share**2)
-    return np.asarray(math.sqrt(weight) * out[linked if weight > 1 else used])
+    at, t = check.run.sampling.at[chosen], check.run.t[chosen]
+    begins, counts = np.diff(at, prepend=at[0]) != 0, used
+    if weight > 1:
+        place = np.arange(chosen.size) % BLOCK
+        begins, counts = begins | (place == 0), used & (place >= BLOCK // 2)
+    begins = np.diff(np.cumsum(begins)[used], prepend=-1) > 0  # a beginning that is not used passes to the next sample that is
+    white = whiten(check.noises, at[used], begins, t[used], J[used])
+    return np.asarray(math.sqrt(weight) * white[counts[used]])
 
 
 def _errors(question: _Question, told: Sequence[_Told]) -> tuple[dict[str, float], dict[str, float]]:

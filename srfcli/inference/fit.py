@@ -14,6 +14,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
+from srfcli.data.groups import labels
 from srfcli.data.values import Experiment, Run, Signal
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
 from srfcli.inference.prediction import RTOL, Prediction, own_names, own_start, predict, run_parameters
@@ -134,6 +135,17 @@ class Problem:
     held: Mapping[str, float] = field(default_factory=dict)
     rtol: float = RTOL
     varying: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # run -> parameter -> its name for that run's group
+    priors: tuple[tuple[tuple[str, ...], float], ...] = ()  # names, and the scatter of their values about an unknown mean
+
+    @property
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Return the names of the values of each parameter that varies, of the runs fitted."""
+        found: dict[str, dict[str, None]] = {}
+        for names in self.varying.values():
+            for n, name in names.items():
+                if name in self.names:
+                    found.setdefault(n, {})[name] = None
+        return {n: tuple(names) for n, names in found.items()}
 
     def named(self, theta: Array) -> dict[str, float]:
         """Return parameters by name, those that are held among them."""
@@ -165,12 +177,10 @@ def fit_problem(
     *,
     free: Sequence[str] | None = None,
     trend: str | None = None,
-    vary: Sequence[str] = (),
-    by: str = "run",
 ) -> Problem:
     """Return the problem that an experiment states; `free` replaces its own choice of parameters, `trend` is slip or time.
 
-    Parameters in `vary` have a value for each run, or, `by` load, for each load; B of a run up is then called B[up].
+    Parameters that vary have a value for each group of runs; B of a run up is then called B[up].
     """
     listed = {q.name: q for q in experiment.parameters}
     names = list(free) if free is not None else [q.name for q in experiment.parameters if not q.fixed]
@@ -182,8 +192,8 @@ def fit_problem(
         raise SrfError("every run is held out", "set holdout = false for those that are to be fitted")
     if not names:
         raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
-    varying = _varying(experiment, runs, names, vary, by)
-    groups = {n: list(dict.fromkeys(varying[run.name][n] for run in runs)) for n in vary}
+    varying = _varying(experiment, runs, names)
+    groups = {n: list(dict.fromkeys(varying[run.name][n] for run in runs)) for n in experiment.vary}
     rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names for _ in groups.get(n, [n])]
     names = [own for n in names for own in groups.get(n, [n])]
     for run in runs:
@@ -198,17 +208,15 @@ def fit_problem(
     return Problem(model, experiment, runs, tuple(names), start, lower, upper, trend, varying=varying)
 
 
-def _varying(
-    experiment: Experiment, runs: Sequence[Run], names: Sequence[str], vary: Sequence[str], by: str
-) -> dict[str, dict[str, str]]:
+def _varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[str]) -> dict[str, dict[str, str]]:
     """Return what the parameters that vary are called in each run of an experiment."""
+    vary, by = experiment.vary, experiment.by
     if not vary:
         return {}
     for name in vary:
         if name not in names:
             raise SrfError(f"'{name}' is to vary, and is not free", did_you_mean(name, names))
-    loads = {run.name: f"{run.load.rest(float(run.t[0])):.3g} {run.load_unit}" for run in experiment.runs}
-    label = loads if by == "load" else {run.name: run.name for run in experiment.runs}
+    label = labels(experiment)
     if len({label[run.name] for run in runs}) < 2:
         raise SrfError(f"{', '.join(vary)} cannot vary by {by}: the runs fitted have only one", "Leave `vary` out.")
     return {run.name: {n: f"{n}[{label[run.name]}]" for n in vary} for run in experiment.runs}
@@ -248,6 +256,13 @@ def between_groups(values: Array, covariance: Array) -> BetweenGroups:
     scatter = float(found.x) if found.fun < about(0.0)[3] else 0.0
     mean, variance = about(scatter)[:2]
     return BetweenGroups(mean, float(np.sqrt(variance)), scatter, float(chi2.sf(about(0.0)[2], k - 1)))
+
+
+def scatter_of(fit: Fit, names: Sequence[str]) -> BetweenGroups | None:
+    """Return how the values of one parameter in several groups scatter; None where one is at its bound, its error not known."""
+    places = [fit.names.index(n) for n in names]
+    covariance = np.asarray(fit.covariance)[np.ix_(places, places)]
+    return between_groups(np.array([fit.values[n] for n in names]), covariance) if (np.diag(covariance) > 0).all() else None
 
 
 def fit(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from typing import Any
 
@@ -12,11 +12,22 @@ import numpy as np
 from srfcli.codegen.c_source import compiler
 from srfcli.codegen.model import Array, open_model
 from srfcli.core.errors import SrfError, Status
+from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment, Run
-from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, fit, fit_problem, held_fit
+from srfcli.inference.fit import (
+    BetweenGroups,
+    Fit,
+    Interrupted,
+    Problem,
+    RunFit,
+    fit,
+    fit_problem,
+    held_fit,
+    scatter_of,
+)
 from srfcli.inference.noise import Noise, estimate_noise, stretches, white_level
 from srfcli.inference.random_field import Latent, LatentFit, Roughness, fit_latent, tracks_for
-from srfcli.inference.state_space import StateSpaceFit, as_fit, fit_state_space, stopped
+from srfcli.inference.state_space import StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
 from srfcli.laws.registry import Registry
 
 # The fit of an experiment's recordings as `srf fit` makes it: which likelihood, which starts, whose random friction field.
@@ -51,6 +62,31 @@ class RecordingFit:
     track: Track | None
     starts: tuple[tuple[float, bool], ...]
     status: Status
+    scatter: Mapping[str, BetweenGroups | None] = field(default_factory=dict)
+
+
+MANY = 5  # groups from which their scatter is known well enough to be a prior: to a third of itself
+NONE = 0.01  # of the errors: a scatter that stands for none at all
+
+
+def _with_scatter(found: RecordingFit, *, prior: bool) -> RecordingFit:
+    """Return the fit with how the values of groups scatter, and, with `prior`, with values drawn towards their means.
+
+    The prior is Gaussian, of unknown mean; its standard deviation is how values scatter beyond their errors: empirical Bayes.
+    """
+    groups, fit = found.problem.groups, found.fit
+    scatter = {n: scatter_of(fit, names) for n, names in groups.items()}
+    priors = []
+    for n, own in scatter.items():
+        if own is not None and len(groups[n]) >= MANY:
+            error = float(np.mean([fit.stderr[name] for name in groups[n]]))
+            priors.append((groups[n], max(own.scatter, NONE * error)))
+    found = replace(found, scatter=scatter)
+    if not (prior and priors and found.state_space):
+        return found
+    shrunk = with_priors(found.state_space, priors)
+    fit = as_fit(shrunk)
+    return replace(found, problem=shrunk.likelihood.problem, fit=fit, state_space=shrunk, status=fit.status)
 
 
 def fit_recordings(
@@ -60,30 +96,33 @@ def fit_recordings(
     free: Sequence[str] | None = None,
     trend: str | None = None,
     vary: Sequence[str] = (),
-    by: str = "run",
+    by: str | None = None,
+    prior: bool = True,
     track: str | None = None,
     ask_shared: bool = True,
     starts: int = 1,
     seed: int = 0,
     progress: Callable[[str], None] = lambda text: None,
 ) -> RecordingFit:
-    """Return the maximum-likelihood fit of all runs together; parameters that `vary` have a value for each run or load.
+    """Return the maximum-likelihood fit of all runs together; parameters that `vary` have a value for each group of runs.
 
     `track` is "smooth" for no random friction field, "rough" for one in each run, "shared" for one that all runs share; left out,
-    the recordings decide, whether it is shared only with `ask_shared`. Without a C compiler there is no field, and noise is
-    autoregressive. A fit stopped by Ctrl-C is a status; SrfError is raised for what cannot be fitted.
+    the recordings decide, whether it is shared only with `ask_shared`. With `prior` the values of five groups or more are drawn
+    towards their mean. Without a C compiler there is no field, and noise is autoregressive. A fit stopped by Ctrl-C is a status;
+    SrfError is raised for what cannot be fitted.
     """
     beside = next((run.name for run in experiment.runs if run.others), "")
     if beside and (track == "shared" or compiler() is None):
         why = "needs a C compiler" if compiler() is None else "does not go with `track` shared"
         raise SrfError(f"to fit several observables, as run '{beside}' has, {why}", "Leave `observables` out.")
-    if vary and (track == "shared" or compiler() is None):
+    experiment = grouped(experiment, vary, by)
+    if experiment.vary and (track == "shared" or compiler() is None):
         why = "needs a C compiler" if compiler() is None else "does not go with `track` shared"
         raise SrfError(f"`vary` {why}", "Leave it out.")
     if compiler() is None:
         return _without_compiler(registry, experiment, free, trend, track, starts, seed, progress)
     model = open_model(registry, **asdict(experiment.choice), random_field=True)
-    problem = fit_problem(model, experiment, free=free, trend=trend, vary=vary, by=by)
+    problem = fit_problem(model, experiment, free=free, trend=trend)
     smooth = None if track is None else track == "smooth"
 
     def one(start: Array, report: Callable[[str], None]) -> tuple[Fit, Any]:
@@ -98,10 +137,11 @@ def fit_recordings(
         return RecordingFit(problem, as_fit(found), found, _track(found), (), Status.INTERRUPTED)
     found, status = several.beside, Status.INTERRUPTED if several.interrupted else several.best.status
     result = RecordingFit(problem, several.best, found, _track(found), tuple(several.rows), status)
+    result = _with_scatter(result, prior=prior and not several.interrupted)
     if several.interrupted or len(problem.runs) < 2:
         return result
     try:
-        asked = ask_shared and track is None and not (vary or any(run.others for run in problem.runs))
+        asked = ask_shared and track is None and not (experiment.vary or any(run.others for run in problem.runs))
         if not (track == "shared" or (asked and shared_field(found) > ALIKE)):
             return result
         tabled = open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),))

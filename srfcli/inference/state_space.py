@@ -26,6 +26,7 @@ from scipy.signal import lfilter, welch
 from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
+from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, QUALITY
 from srfcli.data.values import Experiment, Run
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
@@ -46,7 +47,6 @@ T = TypeVar("T")
 RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
-PROCESSES = ("relaxation", "oscillation")  # of coloured gauge noise: e' = -e / tau + w, or e'' + (omega / q) e' + omega^2 e = w
 # A fit begins with the likeliest of nine fields: amplitudes over the friction of the recordings, lengths over that of PIECES
 WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
@@ -77,12 +77,8 @@ CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
-CORRELATION_TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
-QUALITIES = (0.5, 3.0, 30.0)  # of an oscillation, where it begins: smooth noise, a broad line and a narrow one
-QUALITY = (0.2, 1000.0)  # of an oscillation: one of a smaller quality is a relaxation
 PERIODOGRAM = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
-FASTEST = 1.0  # frequency of an oscillation times the spacing: smooth noise may end beyond half of the sampling rate
 DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
 
@@ -399,7 +395,7 @@ class Likelihood:
         self, problem: Problem, *, smooth: bool = False, processes: Sequence[str] = (), rtol: float = RTOL
     ) -> None:
         self.problem, self.smooth, self.processes = problem, smooth, tuple(processes)
-        self.rtol = FREE_RUNNING * rtol if smooth else rtol
+        self.base_rtol, self.rtol = rtol, FREE_RUNNING * rtol if smooth else rtol
         self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs)
@@ -506,9 +502,10 @@ class Likelihood:
         of_group = set(problem.varying.get(run.name, {}).values()) - set(own)
         held = {n: values[n] for n in (*problem.held, *problem.names) if "." not in n or n in of_group}
         alone = replace(
-            problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held
-        )
-        likelihood = Likelihood(alone, smooth=self.smooth, processes=self.processes, rtol=self.rtol)
+            problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held,
+            priors=(),
+        )  # fmt: skip
+        likelihood = Likelihood(alone, smooth=self.smooth, processes=self.processes, rtol=self.base_rtol)
         known = {n: values[n] for n in FIELD}
         for alone_names, names in zip(likelihood.gauges(alone.runs[0]), self.gauges(run), strict=True):
             known |= {name: values[names[local]] for local, name in alone_names.items()}
@@ -556,8 +553,16 @@ class Likelihood:
         runs = tuple(self.over_runs(one))
         total = float(sum(f.log_likelihood for f in runs))
         score, information = np.zeros(k), np.zeros((k, k))
+        unit = self.unit(x)
+        for names, scatter in self.problem.priors:  # of values about a mean that is unknown
+            places = [self.names.index(n) for n in names]
+            off = np.array([values[n] for n in names])
+            off = (off - off.mean()) / scatter**2
+            total -= 0.5 * scatter**2 * float(off @ off)
+            score[places] -= off * unit[places]
+            centred = np.eye(off.size) - 1 / off.size
+            information[np.ix_(places, places)] += centred / scatter**2 * np.outer(unit[places], unit[places])
         if slopes and np.isfinite(total):
-            unit = self.unit(x)
             for f in runs:
                 at = [self.names.index(n) for n in f.names]
                 score[at] += f.score * unit[at]
@@ -827,6 +832,15 @@ def fit_state_space(
     except KeyboardInterrupt as error:
         last = next((own.best for own in reversed(tried) if own.best is not None), None)
         raise Interrupted(last.values if last else problem.named(problem.start)) from error
+
+
+def with_priors(found: StateSpaceFit, priors: Sequence[tuple[tuple[str, ...], float]]) -> StateSpaceFit:
+    """Return the fit with the values of groups, each with the scatter of its prior, drawn towards their means."""
+    own = found.likelihood
+    problem = replace(own.problem, priors=tuple(priors))
+    likelihood = Likelihood(problem, smooth=own.smooth, processes=own.processes, rtol=own.base_rtol)
+    maximum = maximise(likelihood, likelihood.coordinates(found.values), widths=())
+    return StateSpaceFit(likelihood, maximum, found.evaluations + likelihood.evaluations)
 
 
 def stopped(problem: Problem, values: Mapping[str, float]) -> StateSpaceFit:

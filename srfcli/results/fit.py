@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import Status
 from srfcli.core.units import from_base
+from srfcli.data.gauge import colour_text
 from srfcli.data.values import OBSERVABLES
 from srfcli.results.tables import Column, Result, Table, own_figure
 
@@ -120,7 +121,7 @@ class FitResult(Result):
     @cached_property
     def varied(self) -> Table | None:
         """Return a row for each parameter that varies between runs or loads, None where none does."""
-        return varied_table(self.found.problem, self.found.fit)
+        return varied_table(self.found)
 
     @cached_property
     def draws(self) -> Table | None:
@@ -281,28 +282,17 @@ def run_table(fit: Fit, experiment: Experiment) -> Table:
     return Table("srf.fit.runs/1", RUNS, rows, "runs")
 
 
-def varied_table(problem: Problem, fit: Fit) -> Table | None:
-    """Return mean and scatter of what varies between runs or loads, and how likely that scatter is by chance."""
-    import numpy as np
-
-    from srfcli.inference.fit import between_groups
-
-    parts: dict[str, list[int]] = {}
-    for names in problem.varying.values():
-        for n, name in names.items():
-            if name in fit.names and fit.names.index(name) not in parts.setdefault(n, []):
-                parts[n].append(fit.names.index(name))
+def varied_table(found: RecordingFit) -> Table | None:
+    """Return mean and scatter of what varies between groups of runs, and how likely that scatter is by chance."""
     rows: list[tuple[Any, ...]] = []
-    for name, places in parts.items():
-        declared = unit_of(problem, name)
-        unit, factor = problem.experiment.shown(declared)
-        covariance = np.asarray(fit.covariance)[np.ix_(places, places)]
-        if not (np.diag(covariance) > 0).all():
+    for name, scatter in found.scatter.items():
+        declared = unit_of(found.problem, name)
+        unit, factor = found.problem.experiment.shown(declared)
+        if scatter is None:
             rows.append((name, None, None, None, unit, None))  # one is at its bound: its error is not known
             continue
-        found = between_groups(np.array([fit.values[fit.names[k]] for k in places]), covariance)
-        shown = [from_base(x, declared) * factor for x in (found.mean, found.stderr, found.scatter)]
-        rows.append((name, *shown, unit, found.p_value))
+        shown = [from_base(x, declared) * factor for x in (scatter.mean, scatter.stderr, scatter.scatter)]
+        rows.append((name, *shown, unit, scatter.p_value))
     return Table("srf.fit.varied/1", VARIED, rows, "what varies") if rows else None
 
 
@@ -345,10 +335,8 @@ def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float
     if len(starts) > 1:
         notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
     for colour in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):
-        told = f"{colour[1]:.3g} correlated over {colour[0]:.3g} s"
-        if len(colour) == 3:  # an oscillation of a quality of a half is noise that is smooth, of a large one a line
-            told = f"{colour[1]:.3g} about {colour[0]:.3g} Hz, of quality {colour[2]:.2g},"
-        notes.append(f"gauge noise: {told} besides white noise, or physics that is missing")
+        comma = "," if len(colour) == 3 else ""
+        notes.append(f"gauge noise: {colour_text(colour)}{comma} besides white noise, or physics that is missing")
     coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
     if coloured:
         notes.append(

@@ -10,6 +10,7 @@ from pathlib import Path
 from srfcli.codegen.c_source import GET_COMPILER, compiler
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.data.experiment import read_experiment
+from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.design import parting_experiment
 from srfcli.diagnosis.discrepancy import explain_unknown
@@ -28,7 +29,7 @@ def diagnose(
     effects: Sequence[str] = (),
     trend: str | None = None,
     vary: Sequence[str] = (),
-    by: str = "run",
+    by: str | None = None,
     reader: str | None = None,
     seed: int = 0,
     registry: Registry | None = None,
@@ -48,9 +49,9 @@ def diagnose(
     trend : {'slip', 'time'}, optional
         Let each run's observable drift.
     vary : sequence of str
-        Free parameters that have a value of their own in each run or under each load.
-    by : {'run', 'load'}
-        What they vary with.
+        Free parameters that have a value of their own in each group of runs; as the experiment says if left out.
+    by : {'run', 'load', 'segment', 'direction'}, optional
+        What makes a group.
     reader : str, optional
         How every data file is read.
     seed : int
@@ -93,8 +94,9 @@ def diagnose(
 
     def read(*, holdout: bool) -> Experiment:
         if isinstance(experiment, Experiment):
-            return experiment
-        return read_experiment(Path(experiment), registry=registry, format=reader, holdout=holdout)
+            return grouped(experiment, vary, by)
+        found = read_experiment(Path(experiment), registry=registry, format=reader, holdout=holdout)
+        return grouped(found, vary, by)
 
     fitted = read(holdout=False)
     fitted = replace(fitted, runs=tuple(r for r in fitted.runs if not r.holdout))
@@ -105,7 +107,7 @@ def diagnose(
     def told(text: str) -> None:
         progress(text, search.share if searching else None)
 
-    search = ModelSearch(registry, fitted, told, effects or None, trend, vary=vary, by=by)
+    search = ModelSearch(registry, fitted, told, effects or None, trend)
     searching = True
     try:
         search.run()

@@ -79,7 +79,8 @@ def fit(
     free: Sequence[str] | None = None,
     trend: str | None = None,
     vary: Sequence[str] = (),
-    by: str = "run",
+    by: str | None = None,
+    prior: bool = True,
     track: str | None = None,
     starts: int = 1,
     profile: bool = False,
@@ -102,9 +103,12 @@ def fit(
     trend : {'slip', 'time'}, optional
         Let each run's observable drift.
     vary : sequence of str
-        Free parameters that have a value of their own in each run or under each load: B in a run up is B[up].
-    by : {'run', 'load'}
-        What they vary with.
+        Free parameters that have a value of their own in each group of runs, B in a run up is B[up]; as the experiment says if
+        left out.
+    by : {'run', 'load', 'segment', 'direction'}, optional
+        What makes a group.
+    prior : bool
+        Draw the values of five or more groups towards their mean, as far as they scatter by chance.
     track : {'smooth', 'rough', 'shared'}, optional
         Random friction field along slip: none, one for each run, one for all; the recordings decide if left out.
     starts : int
@@ -170,7 +174,7 @@ def fit(
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment, registry=registry)
     found = fit_recordings(
-        registry, experiment, free=free, trend=trend, vary=vary, by=by, track=track,
+        registry, experiment, free=free, trend=trend, vary=vary, by=by, prior=prior, track=track,
         ask_shared=not (profile or sample), starts=starts, seed=seed, progress=lambda text: progress("fit", text, None),
     )  # fmt: skip
     status = found.status

@@ -1,0 +1,92 @@
+"""What parameters may vary with: runs, loads, segments of runs about each step of the velocity, the direction of these steps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from srfcli.core.errors import SrfError
+from srfcli.data.values import Experiment, Run
+
+BY = ("run", "load", "segment", "direction")
+CUT = ("segment", "direction")  # for which runs are cut
+STEP = 1.5  # factor of a step of the velocity: what is fitted through noisy displacements wavers by less
+STILL = 1e-6  # um/s, below which the drive is held: no piece of a run can begin there in steady sliding
+FEWEST = 8  # samples of a run
+
+
+def grouped(experiment: Experiment, vary: Sequence[str] = (), by: str | None = None) -> Experiment:
+    """Return the experiment with what varies, and by what; left out, as it says itself.
+
+    By segment or direction, its runs are cut between the steps of their velocities; a stroke of a reciprocating drive is not.
+    """
+    chosen = replace(experiment, vary=tuple(vary) or experiment.vary, by=by or experiment.by)
+    strokes = chosen.by == "direction" and any(run.backward for run in experiment.runs)
+    if chosen.by not in CUT or experiment.by in CUT or strokes:  # what is cut already stays as it is
+        return chosen
+    runs = tuple(piece for run in experiment.runs for piece in segments(run))
+    name, count = Counter(run.name for run in runs).most_common(1)[0]
+    if count > 1:
+        raise SrfError(f"{name} would be the name of a run and of a segment", "Rename the run.")
+    return replace(chosen, runs=runs)
+
+
+def labels(experiment: Experiment) -> dict[str, str]:
+    """Return the group of each run, by its name."""
+    if experiment.by == "load":
+        return {run.name: f"{run.load.rest(float(run.t[0])):.3g} {run.load_unit}" for run in experiment.runs}
+    if experiment.by == "direction":
+        strokes = any(run.backward for run in experiment.runs)
+        return {run.name: stroke(run) if strokes else step(run) for run in experiment.runs}
+    return {run.name: run.name for run in experiment.runs}
+
+
+def stroke(run: Run) -> str:
+    """Return which way a run of a reciprocating drive goes."""
+    return "backward" if run.backward else "forward"
+
+
+def step(run: Run) -> str:
+    """Return whether the first step of a run's velocity is up or down; steady where it has none."""
+    found = levels(run)
+    return "steady" if len(found) < 2 else "up" if found[1][1] > found[0][1] else "down"
+
+
+def levels(run: Run) -> list[tuple[float, float]]:
+    """Return when each velocity of a run begins (s), and what it is (um/s); ramps lie between them."""
+    starts = [float(run.t[0]), *(b for b in run.drive.breaks if run.t[0] < b < run.t[-1])]
+    found: list[tuple[float, float]] = []
+    for begin, end in zip(starts, [*starts[1:], float(run.t[-1])], strict=True):
+        V, rate, since = run.drive.piece(begin)
+        ends = np.maximum([V + rate * (begin - since), V + rate * (end - since)], STILL)
+        if np.ptp(np.log(ends)) > np.log(STEP):
+            continue
+        own = float(np.sqrt(ends.prod()))
+        if not found or abs(np.log(own / found[-1][1])) > np.log(STEP):
+            found.append((begin, own))
+    return found
+
+
+def segments(run: Run) -> list[Run]:
+    """Return a run cut where it says so, or halfway between the steps of its velocity: runs of their own, named in order.
+
+    Each piece begins as the run does, in steady sliding or free, and no reading is in two of them.
+    """
+    found = levels(run)
+    halfway = [0.5 * (a[0] + b[0]) for a, b in pairwise(found[1:]) if a[1] > STILL]
+    edges = [0]
+    for cut in run.segments or halfway:
+        at = int(np.searchsorted(run.t, cut))
+        if min(run.used[edges[-1] : at].sum(), run.used[at:].sum()) >= FEWEST:
+            edges.append(at)
+    if len(edges) == 1:
+        return [run]
+    slid, pieces = run.drive.displacement(run.t), []
+    for k, (a, b) in enumerate(pairwise([*edges, run.t.size])):
+        own = {"name": f"{run.name}-{k + 1}", "start": run.start + float(slid[a]), "notices": run.notices if a == 0 else ()}
+        pieces.append(replace(run.part(slice(a, b)), segments=(), **own))
+    return pieces
