@@ -17,7 +17,7 @@ from srfcli.cli.options import (
     listed,
     output_options,
     parse_over,
-    system_options,
+    stability_options,
     vary_options,
     worker_options,
 )
@@ -87,7 +87,7 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
     "--max-evaluations", type=click.IntRange(1), help="Of the cost over the critical loads, for each minimiser."
 )
 @worker_options
-@system_options
+@stability_options
 @output_options
 def command(
     sources: tuple[Path, ...],
@@ -124,6 +124,8 @@ def command(
     for name in ("law", "ageing", "interface", "loading", "inertia"):
         if getattr(system, name).origin == "flag":
             raise SrfError(f"--{name} is given, and an experiment names its own", "Change [model] in experiment.toml.")
+    if system.effects:
+        raise SrfError("--effect is given, and an experiment names its own", "Change [model] in experiment.toml.")
     if system.flags:
         name = next(iter(system.flags))
         raise SrfError(f"{name} is set, and an experiment has its own values", "Change it in experiment.toml.")
