@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from srfcli.core.settings import Parameter
-    from srfcli.inference.threshold_table import Scale
+    from srfcli.inference.free_parameters import Scale
     from srfcli.inference.thresholds import MethodFit, ThresholdFit, Trace
     from srfcli.results.campaign import CampaignResult
     from srfcli.results.tables import Table
@@ -295,8 +295,9 @@ def fit_thresholds(
     the system's values. Exit codes: 3 where the limit of evaluations cut a method, 130 where it was interrupted.
     """
     from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.data.thresholds import read_thresholds
     from srfcli.inference import thresholds as inference
-    from srfcli.inference.threshold_table import GIVEN, free_parameters, read_thresholds, with_transmission
+    from srfcli.inference.free_parameters import GIVEN, free_parameters, with_transmission
 
     table = read_thresholds(path)
     model = system.model()
