@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,19 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy.integrate import solve_ivp
+from threshold_tables import generated, with_noise
 
 import srfcli as srf
 from srfcli.cli.main import cli
+from srfcli.codegen.model import open_model
 from srfcli.core.errors import SrfError
-from srfcli.inference.thresholds import forced_slopes, hopf_slopes
+from srfcli.data.thresholds import Thresholds, thresholds_csv
+from srfcli.data.writing import write_experiment
+from srfcli.inference.fit import fit_problem
+from srfcli.inference.free_parameters import free_parameters, with_transmission
+from srfcli.inference.state_space import Likelihood
+from srfcli.inference.thresholds import fit_thresholds, forced_slopes, hopf_slopes
+from srfcli.laws.registry import load_registry
 from srfcli.numerics.boundary import along, polish
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point, hopf_points
@@ -228,3 +238,213 @@ def test_effects_without_a_part_in_critical_loads_are_refused(empty_folder: Path
     assert reason in result.output
     with pytest.raises(SrfError, match=reason):
         srf.system(effects=[effect])
+
+
+# experiments that hold tables
+
+
+V = np.array([1.0, 10.0, 50.0, 1.0, 10.0, 50.0, 5.0, 20.0])
+FELT_EPS = np.array([0.0, 0.0, 0.0, 0.09, 0.09, 0.045, 0.13, 0.09])
+RHO = 0.48
+HEAD = """
+format = "srf-experiment/1"
+title = "critical loads"
+[apparatus]
+stiffness = "0.21 N/um"
+mass = "2.37 kg"
+[model]
+law = "srf-vsat"
+ageing = "dieterich"
+{model}
+[parameters]
+A = {{ value = 0.012, lower = 0.004, upper = 0.04 }}
+D0 = {{ value = 0.38, lower = 0.1, upper = 1.5 }}
+lambda = {{ value = 0.62, lower = 0.1, upper = 3.0 }}
+{parameters}
+"""
+TABLE = '[[thresholds]]\nfile = "loads.csv"\nfrequency = 120.0\n'
+RUN = '[[runs]]\nname = "run"\nfile = "run.csv"\n'
+
+
+@pytest.fixture(scope="module")
+def measured(model: Any) -> Thresholds:
+    """Eight critical loads of the default parameters, with 3 % noise."""
+    return with_noise(generated(model, V, FELT_EPS, values=model.defaults()), 3)
+
+
+def folder_of(place: Path, text: str, **tables: Thresholds) -> Path:
+    """An experiment's folder, with tables by the names of their files."""
+    place.mkdir(exist_ok=True)
+    (place / "experiment.toml").write_text(text)
+    for name, table in tables.items():
+        (place / f"{name}.csv").write_text(thresholds_csv(table))
+    return place
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory, measured: Thresholds) -> Path:
+    """An experiment with one table and no run."""
+    return folder_of(tmp_path_factory.mktemp("alone"), HEAD.format(model="", parameters="") + TABLE, loads=measured)
+
+
+def test_a_table_alone_is_fitted_as_least_squares_fits_it(alone: Path, model: Any, measured: Thresholds) -> None:
+    """The same loads by another minimiser, which shares the matching of crossings alone."""
+    found = srf.fit(alone)
+    assert found.status.ok and found.runs is None
+    start = {**model.defaults(), "A": 0.012, "D0": 0.38, "lambda": 0.62}
+    scale = free_parameters(with_transmission(model.parameters), ("A", "D0", "lambda"), start=start)
+    other = fit_thresholds(model, measured, scale=scale, values=start, methods=["least-squares"]).best
+    for name, value, error in zip(scale.names, other.values, other.uncertainty.errors, strict=True):
+        assert found.values[name] == pytest.approx(value, abs=0.1 * error)
+        assert found.stderr[name] == pytest.approx(error, rel=0.03)
+    assert found.found.fit.tables[0].match.cost == pytest.approx(other.cost, abs=0.02)
+
+
+def test_the_score_of_critical_loads_is_the_slope_of_their_log_density(alone: Path) -> None:
+    experiment = srf.read_experiment(alone)
+    stable = open_model(load_registry(), **asdict(experiment.choice), stability=True)
+    likelihood = Likelihood(fit_problem(stable, experiment, stability=stable))
+    point, h = likelihood.at(likelihood.start), 1e-4
+    for j, slope in enumerate(point.score):
+        sides = [likelihood.at(likelihood.start + s * np.eye(3)[j], slopes=False).log_likelihood for s in (h, -h)]
+        assert slope == pytest.approx((sides[0] - sides[1]) / (2 * h), rel=1e-3)
+    r = point.tables[0].match.residuals
+    expected = -0.5 * np.sum(r**2 + np.log(2 * np.pi * point.tables[0].loads.table.sigma ** 2))
+    assert point.log_likelihood == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_share_of_a_modulation_is_found_from_the_loads(tmp_path: Path, measured: Thresholds) -> None:
+    text = HEAD.format(
+        model='effects = ["load-transmission"]', parameters="rho = { value = 0.6, lower = 0.2, upper = 1.5 }"
+    )
+    folder = folder_of(tmp_path, text + TABLE, loads=replace(measured, eps=measured.eps / RHO))
+    found = srf.fit(folder)
+    assert found.status.ok
+    for name, truth in (("rho", RHO), ("A", 0.0126), ("D0", 0.402), ("lambda", 0.56)):
+        assert abs(found.values[name] - truth) < 3 * found.stderr[name]
+    assert found.stderr["rho"] < 0.05
+
+
+def recording(seed: int) -> str:
+    """A velocity step as CSV, of the default parameters, with noise."""
+    t = np.arange(0, 1.2, 0.005)
+    slider = srf.system(W0=5, V=5)
+    record = srf.simulate(slider, t=t, drive=[(0, 5), (0.6, 20)], observable="force").records[0]
+    force = record.observed + np.random.default_rng(seed).normal(0, 2e-3, t.size)
+    rows = zip(t, np.where(t < 0.6, 5, 20), force, strict=True)
+    lines = [f"{a:.3f},{b:g},5,{c:.6f}" for a, b, c in rows]
+    return "\n".join(["time [s],load_point_velocity [um/s],normal_load [N],force [N]", *lines])
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory, measured: Thresholds) -> Path:
+    """An experiment with a run, a table, and a table that is held out."""
+    held = '[[thresholds]]\nname = "held"\nfile = "held.csv"\nholdout = true\n'
+    text = HEAD.format(model="", parameters="mu0 = { value = 0.34, lower = 0.2, upper = 0.5 }")
+    still = Thresholds("held.csv", *(x[:3] for x in (measured.V, measured.eps, measured.W0c, measured.sigma)), lines=(2, 3, 4))
+    place = folder_of(tmp_path_factory.mktemp("both"), text + RUN + TABLE + held, loads=measured, held=still)
+    (place / "run.csv").write_text(recording(5))
+    return place
+
+
+def test_runs_and_tables_are_fitted_together(both: Path, alone: Path) -> None:
+    """Their log likelihoods and their information add."""
+    found = srf.fit(both, track="smooth")
+    assert found.status.ok
+    assert [t.loads.name for t in found.found.fit.tables] == ["loads", "held"]
+    fitted, held = found.found.fit.tables
+    state = found.found.state_space
+    assert state is not None
+    (run,), (table,) = state.maximum.point.runs, state.maximum.point.tables
+    assert state.log_likelihood == pytest.approx(run.log_likelihood + table.log_likelihood, rel=1e-12)
+    assert held.loads.holdout and held.match.cost == pytest.approx(fitted.match.cost - np.sum(fitted.white[3:] ** 2), rel=1e-6)
+    assert np.allclose(state.maximum.point.information, informed(run, state) + informed(table, state), rtol=1e-9)
+    by_tables = srf.fit(alone).found.state_space
+    assert by_tables is not None
+    for name, truth in (("A", 0.0126), ("D0", 0.402), ("lambda", 0.56)):
+        places = [s.likelihood.names.index(name) for s in (state, by_tables)]
+        one, other = (s.maximum.covariance[k, k] for s, k in zip((state, by_tables), places, strict=True))
+        assert one < other
+        assert abs(found.values[name] - truth) < 4 * found.stderr[name]
+
+
+def informed(part: Any, state: Any) -> np.ndarray:
+    """A run's or a table's information in the coordinates of a likelihood."""
+    names, unit = state.likelihood.names, state.likelihood.unit(state.maximum.point.x)
+    out, at = np.zeros((len(names), len(names))), [names.index(n) for n in part.names]
+    out[np.ix_(at, at)] = part.information * np.outer(unit[at], unit[at])
+    return out
+
+
+def test_the_command_shows_tables_and_loads(alone: Path, empty_folder: Path) -> None:
+    shown = run("fit", str(alone), "--json", "--plot", "loads.svg")
+    assert shown.exit_code == 0 and Path("loads.svg").stat().st_size > 1000
+    found = json.loads(shown.stdout)
+    (table,) = found["meta"]["tables"]
+    assert (table["table"], table["role"], table["loads"], table["missing"]) == ("loads", "fit", 8, 0)
+    assert len(found["meta"]["loads"]) == 8 and {r["type"] for r in found["meta"]["loads"]} == {"hopf", "ns"}
+    assert table["chi2"] == pytest.approx(sum(r["residual"] ** 2 for r in found["meta"]["loads"]), rel=1e-9)
+    assert "track" not in found["meta"] and not any("field" in note for note in found["notes"])
+    for words, told in (
+        (("check", str(alone)), "no recordings to check"),
+        (("simulate", str(alone)), "no recordings to simulate"),
+        (("fit", str(alone), "--track", "rough"), "--track is for recordings"),
+        (("fit", str(alone), "--sample", "100"), "no recordings of which a posterior is drawn"),
+        (("fit", str(alone), "--effect", "load-lag"), "--effect is given"),
+    ):
+        result = run(*words)
+        assert result.exit_code == 2 and told in result.output
+
+
+BREACHES = [
+    ("", "runs: missing"),
+    ("thresholds = 3", "thresholds: found 3, expected tables, at least one"),
+    ('[[thresholds]]\nname = "a"', "thresholds[0].file: missing"),
+    ('[[thresholds]]\nfile = "none.csv"', "no file"),
+    ('[[thresholds]]\nfile = ""', "expected the name of a table"),
+    ('[[thresholds]]\nfile = "loads.csv"', "line 5 of loads.csv has a modulated load, and its frequency is not said"),
+    (TABLE.replace("120.0", "-1"), "found -1, expected a frequency above 0"),
+    (TABLE + "load = 3", "thresholds[0].load: unknown key"),
+    (TABLE + TABLE, "'loads' is the name of another run or table"),
+    (TABLE + 'name = " "', "expected a name"),
+    (TABLE + "holdout = 1", "expected true or false"),
+]
+
+
+@pytest.mark.parametrize(("text", "told"), BREACHES, ids=range(len(BREACHES)))
+def test_a_breach_names_file_line_and_key(tmp_path: Path, measured: Thresholds, text: str, told: str) -> None:
+    head = HEAD.format(model="", parameters="")
+    if text.startswith("thresholds"):
+        head, text = text + head, ""
+    folder = folder_of(tmp_path, head + text, loads=measured)
+    with pytest.raises(SrfError, match=re.escape(told)) as caught:
+        srf.read_experiment(folder)
+    assert "experiment.toml" in caught.value.message
+
+
+@pytest.mark.parametrize("stiffness", ["1e-3 1/um", "3 MPa/mm"])
+def test_loads_in_newton_need_a_stiffness_that_goes_with_them(
+    tmp_path: Path, measured: Thresholds, stiffness: str
+) -> None:
+    head = HEAD.format(model="", parameters="").replace("0.21 N/um", stiffness).replace('mass = "2.37 kg"\n', "")
+    with pytest.raises(SrfError, match="critical loads are in N"):
+        srf.read_experiment(folder_of(tmp_path, head + TABLE, loads=measured))
+
+
+def test_what_is_held_out_is_not_opened_and_something_must_be_left(tmp_path: Path, measured: Thresholds) -> None:
+    folder = folder_of(tmp_path, HEAD.format(model="", parameters="") + TABLE + "holdout = true\n", loads=measured)
+    with pytest.raises(SrfError, match="every table of critical loads is held out"):
+        srf.fit(folder)
+    (folder / "loads.csv").unlink()
+    assert srf.read_experiment(folder, holdout=False).thresholds == ()
+
+
+def test_an_experiment_with_tables_is_written_and_read_back(both: Path, tmp_path: Path) -> None:
+    experiment = srf.read_experiment(both)
+    write_experiment(experiment, tmp_path / "again")
+    again = srf.read_experiment(tmp_path / "again")
+    assert [run.name for run in again.runs] == ["run"]
+    for one, other in zip(experiment.thresholds, again.thresholds, strict=True):
+        assert (one.name, one.holdout, one.frequency) == (other.name, other.holdout, other.frequency)
+        for column in ("V", "eps", "W0c", "sigma"):
+            assert np.array_equal(getattr(one.table, column), getattr(other.table, column))

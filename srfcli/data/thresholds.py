@@ -21,7 +21,6 @@ REQUIRED = ("V", "eps", "W0c")
 RELATIVE_ERROR = 0.03  # of the critical load, where the table gives none: the paper's "typically 3 %"
 PERCENT = ("eps", "sigma")  # columns that may be given in %
 LARGEST = 64 * 2**20  # bytes of a table
-LONGEST, LINES = 2**16, 10_000  # characters of the line of names, and lines that are searched for it
 CELL = 500  # characters of a heading that are looked through for its unit
 _HEADER = re.compile(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*")
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
-from srfcli.data.values import Experiment, Run
+from srfcli.data.values import CriticalLoads, Experiment, Run
+from srfcli.inference.critical_loads import Matched
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
 from srfcli.inference.prediction import RTOL, Prediction, own_names, own_start, predict, run_parameters
 
@@ -86,6 +87,7 @@ class Fit:
     status: Status
     evaluations: int
     trail: tuple[tuple[float, str], ...] = ()
+    tables: tuple[Matched, ...] = ()
 
     @property
     def stderr(self) -> dict[str, float]:
@@ -99,11 +101,15 @@ class Fit:
         return np.asarray(self.covariance / np.outer(sd, sd))
 
     def rms_over_noise(self, *, holdout: bool = False) -> float:
-        """Return the residuals' root mean square over the white noise level, all runs fitted (or held out) together."""
+        """Return the residuals' root mean square over the white noise level, all runs fitted (or held out) together.
+
+        Critical loads count like readings, over their errors.
+        """
         chosen = [r for r in self.runs if r.holdout == holdout]
-        sizes = np.array([sum(b - a for a, b in r.parts) for r in chosen], dtype=float)
-        ratios = np.array([(r.rms / r.white) ** 2 if r.white else np.nan for r in chosen])
-        return float(np.sqrt(np.sum(sizes * ratios) / np.sum(sizes))) if chosen else float("nan")
+        tables = [t for t in self.tables if t.loads.holdout == holdout]
+        sizes = np.array([sum(b - a for a, b in r.parts) for r in chosen] + [t.white.size for t in tables], dtype=float)
+        ratios = [(r.rms / r.white) ** 2 if r.white else np.nan for r in chosen] + [float(np.mean(t.white**2)) for t in tables]
+        return float(np.sqrt(np.sum(sizes * np.array(ratios)) / np.sum(sizes))) if sizes.size else float("nan")
 
 
 class Interrupted(Exception):
@@ -116,7 +122,10 @@ class Interrupted(Exception):
 
 @dataclass(frozen=True)
 class Problem:
-    """What is fitted to what: the free parameters with their bounds, and the runs that judge them."""
+    """What is fitted to what: the free parameters with their bounds, and the runs and tables of critical loads that judge them.
+
+    `stability` is the model of critical loads. Without runs it is the `model`, too.
+    """
 
     model: GeneratedModel
     experiment: Experiment
@@ -129,6 +138,8 @@ class Problem:
     held: Mapping[str, float] = field(default_factory=dict)
     rtol: float = RTOL
     varying: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # run -> parameter -> its name for that run's group
+    tables: tuple[CriticalLoads, ...] = ()
+    stability: GeneratedModel | None = None
 
     def named(self, theta: Array) -> dict[str, float]:
         """Return parameters by name, those that are held among them."""
@@ -162,9 +173,11 @@ def fit_problem(
     trend: str | None = None,
     vary: Sequence[str] = (),
     by: str = "run",
+    stability: GeneratedModel | None = None,
 ) -> Problem:
     """Return the problem that an experiment states; `free` replaces its own choice of parameters, `trend` is slip or time.
 
+    Tables of critical loads take part where their model, `stability`, is given.
     Parameters in `vary` have a value for each run, or, `by` load, for each load; B of a run up is then called B[up].
     """
     listed = {q.name: q for q in experiment.parameters}
@@ -173,8 +186,10 @@ def fit_problem(
         if name not in listed:
             raise SrfError(f"'{name}' has no start value in [parameters]", did_you_mean(name, listed))
     runs = tuple(r for r in experiment.runs if not r.holdout)
-    if not runs:
-        raise SrfError("every run is held out", "set holdout = false for those that are to be fitted")
+    tables = tuple(t for t in experiment.thresholds if not t.holdout) if stability is not None else ()
+    if not runs and (experiment.runs or not tables):
+        what = "run" if experiment.runs else "table of critical loads"
+        raise SrfError(f"every {what} is held out", "set holdout = false for those that are to be fitted")
     if not names:
         raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
     varying = _varying(experiment, runs, names, vary, by)
@@ -190,7 +205,9 @@ def fit_problem(
     for name, low, high in zip(names, lower, upper, strict=True):
         if not (np.isfinite(low) and np.isfinite(high)):
             raise SrfError(f"'{name}' has no bounds", "give lower and upper in [parameters]")
-    return Problem(model, experiment, runs, tuple(names), start, lower, upper, trend, varying=varying)
+    return Problem(
+        model, experiment, runs, tuple(names), start, lower, upper, trend, varying=varying, tables=tables, stability=stability
+    )
 
 
 def _varying(
