@@ -29,7 +29,7 @@ from srfcli.core.units import dimension, parse_quantity
 from srfcli.data.columns import open_source
 from srfcli.data.description import read_description
 from srfcli.data.experiment import read_experiment
-from srfcli.inference.threshold_table import read_thresholds
+from srfcli.data.thresholds import read_thresholds
 from srfcli.laws.expression import parse_expression
 from srfcli.laws.law_file import read_header, template
 from srfcli.laws.registry import bundled_registry, read_law, scan_python

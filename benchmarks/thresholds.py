@@ -25,7 +25,8 @@ from common import Report, interleaved
 from threshold_tables import generated, with_noise
 
 from srfcli.codegen.model import GeneratedModel, open_model
-from srfcli.inference.threshold_table import Scale, Thresholds, free_parameters, with_transmission
+from srfcli.data.thresholds import Thresholds
+from srfcli.inference.free_parameters import Scale, free_parameters, with_transmission
 from srfcli.inference.thresholds import Matcher, MethodFit, fit_thresholds
 from srfcli.laws.registry import load_registry
 

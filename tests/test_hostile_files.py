@@ -26,7 +26,7 @@ from srfcli.core.settings import load_toml, resolve
 from srfcli.core.units import dimension, parse_quantity
 from srfcli.data.columns import open_source
 from srfcli.data.experiment import read_experiment
-from srfcli.inference.threshold_table import read_thresholds
+from srfcli.data.thresholds import read_thresholds
 from srfcli.laws.expression import parse_expression
 from srfcli.laws.law_file import read_header, template
 from srfcli.laws.registry import bundled_registry, read_law, scan_python

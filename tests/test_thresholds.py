@@ -14,18 +14,12 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from threshold_tables import generated, thresholds_csv, with_noise
+from threshold_tables import generated, with_noise
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.settings import Parameter
-from srfcli.inference.threshold_table import (
-    FreeParameter,
-    Scale,
-    free_parameters,
-    read_thresholds,
-    thresholds,
-    with_transmission,
-)
+from srfcli.data.thresholds import read_thresholds, thresholds, thresholds_csv
+from srfcli.inference.free_parameters import FreeParameter, Scale, free_parameters, with_transmission
 from srfcli.inference.thresholds import (
     FAR,
     Matcher,

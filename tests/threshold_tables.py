@@ -9,16 +9,9 @@ import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError
-from srfcli.inference.threshold_table import Thresholds, thresholds
+from srfcli.data.thresholds import Thresholds, thresholds
 from srfcli.numerics.critical import critical_line, load_window
 from srfcli.numerics.hopf import critical_point
-
-
-def thresholds_csv(table: Thresholds) -> str:
-    """Return the table as CSV that `read_thresholds` reads back to the same numbers."""
-    rows = zip(table.V, table.eps, table.W0c, table.sigma, strict=True)
-    body = "".join(",".join(repr(float(v)) for v in row) + "\n" for row in rows)
-    return f"V [um/s],eps,W0c [N],sigma [N]\n{body}"
 
 
 def with_noise(table: Thresholds, seed: int, *, relative: float = 0.03) -> Thresholds:

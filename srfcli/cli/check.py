@@ -88,6 +88,7 @@ def command(
     _check_kinds(fail_on)
     begun, registry = time.perf_counter(), open_registry(plugins)
     found = read_experiment(experiment, registry=registry, format=format, limit=int(limit * 2**20))
+    found.check_recorded("to check")
     checks = [check_run(run) for run in _chosen(found, names)]
     forecast = _forecast(found, checks, registry) if simulate else None
     table, more = _table(found, checks, forecast), []

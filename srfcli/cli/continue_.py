@@ -15,7 +15,7 @@ from srfcli.cli.options import (
     output_options,
     over_option,
     parse_over,
-    system_options,
+    stability_options,
     values_option,
 )
 from srfcli.core.settings import Parameter
@@ -33,7 +33,7 @@ AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation ampli
 
 
 @click.command("continue", cls=SrfCommand, epilog=EXAMPLES)
-@system_options
+@stability_options
 @values_option(AMPLITUDE)
 @click.option("--V", "V", metavar="VALUE", help="Driving velocity in um/s, where it is not an axis.")
 @click.option("--W0", "W0", metavar="VALUE", help="Mean normal load in N, where it is not an axis.")

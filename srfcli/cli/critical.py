@@ -13,7 +13,7 @@ from srfcli.cli.options import (
     SystemOptions,
     output_options,
     parse_over,
-    system_options,
+    stability_options,
     values_option,
 )
 from srfcli.core.settings import Parameter
@@ -28,7 +28,7 @@ AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation ampli
 
 
 @click.command("critical", cls=SrfCommand, epilog=EXAMPLES)
-@system_options
+@stability_options
 @values_option(VELOCITY)
 @values_option(AMPLITUDE)
 @click.option(

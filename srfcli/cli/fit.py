@@ -17,7 +17,7 @@ from srfcli.cli.options import (
     listed,
     output_options,
     parse_over,
-    system_options,
+    stability_options,
     vary_options,
     worker_options,
 )
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from srfcli.core.settings import Parameter
-    from srfcli.inference.threshold_table import Scale
+    from srfcli.inference.free_parameters import Scale
     from srfcli.inference.thresholds import MethodFit, ThresholdFit, Trace
     from srfcli.results.campaign import CampaignResult
     from srfcli.results.tables import Table
@@ -93,7 +93,7 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
     "--max-evaluations", type=click.IntRange(1), help="Of the cost over the critical loads, for each minimiser."
 )
 @worker_options
-@system_options
+@stability_options
 @output_options
 def command(
     sources: tuple[Path, ...],
@@ -103,7 +103,7 @@ def command(
     output: OutputOptions,
     **options: Any,
 ) -> None:
-    """Fit the model of an experiment to its recordings, all runs together, by maximum likelihood.
+    """Fit the model of an experiment to its recordings and critical loads, all together, by maximum likelihood.
 
     The gauge's noise, its level and colour, and a random friction field along slip are estimated with the parameters and count
     in their errors. Several experiments, or --table, are a campaign: each is fitted by itself and has a row. A CSV file is taken
@@ -131,6 +131,8 @@ def command(
     for name in ("law", "ageing", "interface", "loading", "inertia"):
         if getattr(system, name).origin == "flag":
             raise SrfError(f"--{name} is given, and an experiment names its own", "Change [model] in experiment.toml.")
+    if system.effects:
+        raise SrfError("--effect is given, and an experiment names its own", "Change [model] in experiment.toml.")
     if system.flags:
         name = next(iter(system.flags))
         raise SrfError(f"{name} is set, and an experiment has its own values", "Change it in experiment.toml.")
@@ -163,7 +165,8 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     experiment = read_experiment(source, format=options["reader"], registry=registry)
     free = listed(options["free"]) or None
     kept = _draws_file(options["draws"], options["sample"], output)
-    warn_uncompiled("the fit has no random friction field, and takes up to 34 times as long")
+    if experiment.runs:
+        warn_uncompiled("the fit has no random friction field, and takes up to 34 times as long")
     begun, done = time.perf_counter(), FitShare(options["starts"])
     with Progress("fit") as progress:
 
@@ -179,10 +182,10 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     for run in experiment.runs:
         for notice in run.notices:
             Session.current().detail(f"{run.name}: {notice}")
-    more = [t for t in (found.varied, found.runs, found.draws) if t is not None]
+    more = [t for t in (found.varied, found.runs, found.tables, found.loads, found.draws) if t is not None]
     emit(
         found.table, output, more=more, laws=found.found.problem.model.laws,
-        inputs=[experiment.path, *(r.file for r in experiment.runs)], seed=options["seed"],
+        inputs=[experiment.path, *experiment.files], seed=options["seed"],
         timings={"fit": time.perf_counter() - begun}, figure=found.plot,
     )  # fmt: skip
     if found.posterior is not None and kept is not None:
@@ -300,8 +303,9 @@ def fit_thresholds(
     the system's values. Exit codes: 3 where the limit of evaluations cut a method, 130 where it was interrupted.
     """
     from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.data.thresholds import read_thresholds
     from srfcli.inference import thresholds as inference
-    from srfcli.inference.threshold_table import GIVEN, free_parameters, read_thresholds, with_transmission
+    from srfcli.inference.free_parameters import GIVEN, free_parameters, with_transmission
 
     table = read_thresholds(path)
     model = system.model()
@@ -470,29 +474,11 @@ def _trace(fit: ThresholdFit) -> Table:
 
 
 def _loads(fit: ThresholdFit) -> Table:
+    from srfcli.results.fit import LOADS, load_rows
     from srfcli.results.tables import Column, Table
 
-    columns = (
-        Column("method", "", METHOD),
-        Column("line", "1", "of the table"),
-        Column("V", "um/s", "driving velocity"),
-        Column("eps", "1", "as the table has it, before rho"),
-        Column("measured", "N", "critical load of the table"),
-        Column("sigma", "N", "its standard error"),
-        Column(
-            "W0c", "N", "nearest odd crossing of the model; where it is missing, the end that it lies beyond", ".7g"
-        ),
-        Column("residual", "1", "(W0c - measured)/sigma", ".3g"),
-        Column("next_odd", "N", "second nearest odd crossing among those looked at"),
-        Column("type", "", "hopf, ns, pd or fold; missing where the model has no such crossing"),
-    )
-    rows = []
-    for m in fit.methods:
-        kinds = [getattr(c.point, "kind", "hopf") if c is not None else "missing" for c in m.match.crossings]
-        t = fit.table
-        cells = (t.lines, t.V, t.eps, t.W0c, t.sigma, m.match.loads, m.match.residuals, m.match.rivals, kinds)
-        rows += [(m.method, *(v.item() if hasattr(v, "item") else v for v in row)) for row in zip(*cells, strict=True)]
-    return Table("srf.fit-thresholds.loads/1", columns, rows, "Critical loads")
+    rows = [(m.method, *row) for m in fit.methods for row in load_rows(fit.table, m.match)]
+    return Table("srf.fit-thresholds.loads/1", (Column("method", "", METHOD), *LOADS), rows, "Critical loads")
 
 
 def _threshold_figure(fit: ThresholdFit, title: str) -> Figure:
@@ -500,22 +486,14 @@ def _threshold_figure(fit: ThresholdFit, title: str) -> Figure:
     import numpy as np
 
     from srfcli.results import plots
+    from srfcli.results.figures import draw_loads
 
     table, best = fit.table, min(fit.methods, key=lambda m: m.cost)
-    there = [crossing is not None for crossing in best.match.crossings]
-    loads = np.where(there, best.match.loads, np.nan)
-    mark: dict[str, Any] = {"fmt": "o", "markersize": 5, "markerfacecolor": "none"}
+    loads = np.where(best.match.missing, np.nan, best.match.loads)
     with plots.house_style():
         figure = plots.bare_figure((6.0, 7.2))
         above, below = figure.subplots(2, 1, height_ratios=(3, 2))
-        for index, eps in enumerate(np.unique(table.eps)):
-            colour, dash = plots.COLOURS[index % len(plots.COLOURS)], plots.DASHES[index % len(plots.DASHES)]
-            here = np.flatnonzero(table.eps == eps)
-            here = here[np.argsort(table.V[here], kind="stable")]
-            above.errorbar(table.V[here], table.W0c[here], yerr=table.sigma[here], color=colour, **mark)
-            above.plot(table.V[here], loads[here], color=colour, linestyle=dash, label=f"fit, ε = {eps:g}")
-        above.errorbar([], [], yerr=[], color="#555555", label="measured, ± σ", **mark)
-        above.set(xscale="log", yscale="log", xlabel="V  [µm/s]", ylabel="critical W$_0$  [N]")
+        draw_loads(above, table, {"fit": loads})
         for index, m in enumerate(fit.methods):
             look = {"color": ("#000000", "#777777")[index], "linestyle": plots.DASHES[index]}
             count = range(1, len(m.trace) + 1)
@@ -529,8 +507,7 @@ def _threshold_figure(fit: ThresholdFit, title: str) -> Figure:
             plots.valued(q.name, q.declared(float(best.values[i])), q.parameter.unit) for i, q in enumerate(fit.scale)
         )
         plots.heading(figure, f"{plots.name_text(str(table.source))}: {title}\nfit: {found}")
-        for ax in (above, below):
-            plots.decade_ticks(ax)
-            ax.legend(loc="best", fontsize=plots.NAME, handlelength=2.8)
+        plots.decade_ticks(below)
+        below.legend(loc="best", fontsize=plots.NAME, handlelength=2.8)
         figure.align_ylabels([above, below])
         return figure

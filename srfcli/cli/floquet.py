@@ -7,7 +7,7 @@ import time
 import click
 
 from srfcli.cli.base import SrfCommand
-from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options
+from srfcli.cli.options import OutputOptions, SystemOptions, output_options, stability_options
 
 EXAMPLES = """
 srf floquet --V 8 --W0 9 --eps 0.09
@@ -17,7 +17,7 @@ srf floquet --V 8 --W0 9 --eps 0.09 --json --tol 1e-9
 
 
 @click.command("floquet", cls=SrfCommand, epilog=EXAMPLES)
-@system_options
+@stability_options
 @click.option("--V", "V", metavar="VALUE", help="Driving velocity, in um/s.")
 @click.option("--W0", "W0", metavar="VALUE", help="Mean normal load, in N.")
 @click.option("--eps", "eps", metavar="VALUE", help="Relative amplitude of the load modulation.")

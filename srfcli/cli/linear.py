@@ -12,7 +12,7 @@ from srfcli.cli.options import (
     output_options,
     over_option,
     parse_over,
-    system_options,
+    stability_options,
 )
 
 EXAMPLES = """
@@ -25,7 +25,7 @@ srf linear --loading inclined --ageing dieterich+linker-dieterich --over angle=-
 
 
 @click.command("linear", cls=SrfCommand, epilog=EXAMPLES)
-@system_options
+@stability_options
 @over_option(help="Values to run over, V=1:100:60 unless given; repeat for a grid of two parameters.")
 @click.option(
     "--all-roots", is_flag=True, help="List every Hopf point, also where stability returns or other roots are unstable."

@@ -53,7 +53,7 @@ COMMANDS = {
     "check": ("srfcli.cli.check:command", "Read and validate an experiment and report what its recordings are like."),
     "fit": (
         "srfcli.cli.fit:command",
-        "Fit the model of an experiment to its recordings, all runs together, by maximum likelihood.",
+        "Fit the model of an experiment to its recordings and critical loads, all together, by maximum likelihood.",
     ),
     "diagnose": (
         "srfcli.cli.diagnose:command",

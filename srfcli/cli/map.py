@@ -19,7 +19,7 @@ from srfcli.cli.options import (
     over_option,
     parse_over,
     read_output,
-    system_options,
+    stability_options,
     worker_options,
 )
 from srfcli.core.errors import SrfError
@@ -41,7 +41,7 @@ srf map --eps 0.4 --workers 8 --resume parts --out map.csv
 
 
 @click.command("map", cls=SrfCommand, epilog=EXAMPLES)
-@system_options
+@stability_options
 @click.option("--eps", "eps", metavar="VALUE", help="Relative modulation amplitude, where it is not an axis.")
 @click.option("--V", "V", metavar="VALUE", help="Driving velocity in um/s, where it is not an axis.")
 @click.option("--W0", "W0", metavar="VALUE", help="Mean normal load in N, where it is not an axis.")

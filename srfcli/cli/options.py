@@ -239,6 +239,7 @@ __all__ = [
     "parse_overs",
     "parse_values",
     "record_options",
+    "stability_options",
     "system_options",
     "values_option",
 ]
@@ -268,10 +269,12 @@ class SystemOptions:
     flags: Mapping[str, str]
     plugins: tuple[Path, ...] = ()
     toml: TomlSettings = field(default_factory=TomlSettings)
+    effects: tuple[str, ...] = ()
 
     def registry(self) -> Registry:
         """Return the registry of shipped and installed laws and those in --plugins."""
-        return open_registry(self.plugins, (self.law, self.ageing, self.interface))
+        named = (Setting(name, "flag") for name in self.effects)
+        return open_registry(self.plugins, (self.law, self.ageing, self.interface, *named))
 
     def _chosen(self) -> dict[str, Any]:
         check_origins(self.toml, {"law": self.law, "ageing": self.ageing, "interface": self.interface})
@@ -286,8 +289,11 @@ class SystemOptions:
     def model(self, *, tables: Sequence[tuple[str, str]] = ()) -> GeneratedModel:
         """Return the numerical model of that system, with tables if asked for; sympy runs only where the cache has none."""
         from srfcli.codegen.model import open_model
+        from srfcli.codegen.slider import check_part
 
-        return open_model(self.registry(), **self._chosen(), tables=tables)
+        registry = self.registry()
+        check_part(registry, self.effects)
+        return open_model(registry, **self._chosen(), tables=tables, effects=self.effects, stability=True)
 
     def resolve(self, parameters: Sequence[Parameter], **given: str | float | None) -> Resolved:
         """Return every parameter's value and origin.
@@ -362,14 +368,26 @@ def check_origins(toml: TomlSettings, settings: Mapping[str, Setting]) -> None:
 
 def system_options(function: F) -> F:
     """Add the options that choose a system; the command gets them as `system`, a SystemOptions."""
+    return _add_system(function, _system_click_options())
+
+
+def stability_options(function: F) -> F:
+    """Add what `system_options` adds, and --effect, for a command whose results are those of sliding at one velocity for ever."""
+    text = "Have this effect besides the laws, as `srf laws --kind effect` lists them; repeatable."
+    complete = names_of("effect")
+    effect = click.option("--effect", "effects", multiple=True, metavar="NAME", help=text, shell_complete=complete)
+    return _add_system(function, [*_system_click_options(), effect])
+
+
+def _add_system(function: F, options: Sequence[Callable[[Any], Any]]) -> F:
     names = ("law", "ageing", "interface", "loading", "inertia", "plugins", "assignments", *_apparatus_keys().values())
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
-        taken = {name: kwargs.pop(name) for name in names}
+        taken = {name: kwargs.pop(name) for name in names} | {"effects": kwargs.pop("effects", ())}
         return function(*args, system=_read_system(taken), **kwargs)
 
-    for option in reversed(_system_click_options()):
+    for option in reversed(options):
         wrapper = option(wrapper)
     return wrapper  # type: ignore[return-value]
 
@@ -421,7 +439,7 @@ def _read_system(taken: Mapping[str, Any]) -> SystemOptions:
             raise SrfError(f"{name} is set twice: {flags[name]} and {value}", "Give each parameter one value.")
         flags[name] = value
     folders = [Path(p) for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
-    return SystemOptions(**chosen, flags=flags, plugins=(*taken["plugins"], *folders), toml=toml)
+    return SystemOptions(**chosen, flags=flags, plugins=(*taken["plugins"], *folders), toml=toml, effects=taken["effects"])
 
 
 @dataclass(frozen=True)

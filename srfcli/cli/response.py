@@ -14,7 +14,7 @@ from srfcli.cli.options import (
     SystemOptions,
     output_options,
     over_option,
-    system_options,
+    stability_options,
     values_option,
 )
 from srfcli.core.errors import Status, worst
@@ -39,7 +39,7 @@ QUANTITIES = ("friction", "force", "position", "velocity")
 
 
 @click.command("response", cls=SrfCommand, epilog=EXAMPLES)
-@system_options
+@stability_options
 @click.option("--V", "V", metavar="VALUE", help="Driving velocity in um/s.")
 @click.option("--W0", "W0", metavar="VALUE", help="Mean normal load in N.")
 @values_option(AMPLITUDE)

@@ -553,6 +553,7 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
 
     registry = system.registry()
     experiment = read_experiment(path, registry=registry, format=given["reader"])
+    experiment.check_recorded("to simulate")
     choice = _choice(system, experiment.choice)
     model = _open(registry, choice)
     flags = _flags(system, model)

@@ -127,17 +127,22 @@ def open_model(
     effects: Sequence[str] = (),
     tables: Sequence[tuple[str, str]] = (),
     random_field: bool = False,
+    stability: bool = False,
     anew: bool = False,
 ) -> GeneratedModel:
     """Return the model of the system that these names describe: a shipped one, or from the cache where it was built before.
 
-    With effects, tables or a random friction field it holds what motion in time needs, and nothing of stability.
+    With effects, tables or a random friction field it holds what motion in time needs, and nothing of stability; with effects
+    and `stability` it holds that of sliding under a constant load, or one that is modulated for ever, and leaves out the effects
+    that critical loads do not depend on.
     With `anew` the text is derived whatever is there.
     """
     base, *modifiers = ageing.split("+")
     wanted = [("friction", law), ("ageing", base), *(("modifier", m) for m in modifiers), ("interface", interface)]
     wanted += [("effect", name) for name in effects]
     parts, laws = [_writers(), loading, str(inertia), repr(tuple(tables)), str(random_field)], []
+    stability = (stability or not effects) and not (tables or random_field)
+    parts += ["stability"] if effects and stability else []
     for kind, name in wanted:
         found, fingerprint = _source(registry, kind, name.strip())
         parts += [kind, name, fingerprint]
@@ -150,9 +155,9 @@ def open_model(
 
         system = build_system(
             registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia, effects=effects,
-            tables=tables, random_field=random_field,
+            tables=tables, random_field=random_field, stability=stability,
         )  # fmt: skip
-        return generate_motion(system) if effects or tables or random_field else generate(system)
+        return generate(system) if stability else generate_motion(system)
 
     if anew:
         return load_source(build(), key=key, laws=tuple(laws))

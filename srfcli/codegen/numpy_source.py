@@ -10,15 +10,16 @@ import itertools
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import sympy as sp
 
+from srfcli.core.settings import Parameter
 from srfcli.laws.expression import NUMPY_FUNCTIONS, NumPyText, python_name, renamed, symbol
 from srfcli.symbolic.derive import Linearisation, closed_limits, in_law_parameters, linearise
 from srfcli.symbolic.equations import Equations, equations_of, lut, lut1, tidy
-from srfcli.symbolic.system import RANDOM_FIELD, System
+from srfcli.symbolic.system import RANDOM_FIELD, RUN, System
 
 # Formulas in steps: named intermediate values, then outputs in them; derivatives are taken step by step.
 
@@ -95,9 +96,14 @@ class Writer:
 
     def __init__(self, system: System, equations: Equations) -> None:
         self.system, self.equations = system, equations
-        self.parameters = [p.name for p in system.parameters]
+        self.declared = system.parameters
         self.printer = NumPyText()
         self.parts: list[str] = []
+
+    @property
+    def parameters(self) -> list[str]:
+        """Return the parameters' names, in the order of p."""
+        return [p.name for p in self.declared]
 
     def function(
         self,
@@ -170,28 +176,36 @@ class Writer:
 
 
 def generate(system: System) -> str:
-    """Return the source of the module that computes everything numerical about `system`."""
-    eq = equations_of(system)
-    linear = linearise(system)
-    writer = Writer(system, eq)
-    _write_statics(writer, eq, linear)
-    _write_closed(writer, system)
-    _write_rates(writer, eq)
+    """Return the source of the module that computes everything numerical about `system`; its effects all have a part there."""
+    eq = equations_of(system, cyclic=bool(system.effects))
+    still = _at_constant_load(eq) if system.effects else eq
+    writer = Writer(system, still)
+    if system.effects:
+        writer.declared = tuple(p for p in system.parameters if p not in RUN)
+        _write_statics_by_rates(writer, still)
+        polynomial, forms = -1, {}
+    else:
+        linear = linearise(system)
+        _write_statics(writer, eq, linear)
+        _write_closed(writer, system)
+        polynomial, forms = linear.polynomial_degree, linear.names
+    _write_rates(writer, still)
     _write_cycle(writer, eq)
     body = "\n\n\n".join(writer.parts)
+    helpers = "".join(h for name, h in HELPERS.items() if f"{name}(" in body)
     names = [f for f in NUMPY_FUNCTIONS if re.search(rf"\b{f}\b", body)]
     return (
         _HEAD.format(
             title=system.title,
             names=", ".join(names),
-            helpers="".join(h for name, h in HELPERS.items() if f"{name}(" in body),
+            helpers=helpers,
             states=tuple_text(eq.names),
             logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
-            parameters=parameter_rows(system),
+            parameters=parameter_rows(writer.declared),
             elastic=system.elastic,
             inertia=system.inertia,
-            polynomial=linear.polynomial_degree,
-            forms=textwrap.indent("\n".join(f'"{k}": {v!r},' for k, v in linear.names.items()), "    "),
+            polynomial=polynomial,
+            forms=textwrap.indent("\n".join(f'"{k}": {v!r},' for k, v in forms.items()), "    "),
         )
         + body
         + "\n\n\n"
@@ -199,12 +213,19 @@ def generate(system: System) -> str:
     )
 
 
-def parameter_rows(system: System) -> str:
+def _at_constant_load(eq: Equations) -> Equations:
+    """Return the equations of effects without what they say of a modulation."""
+    none = {symbol(n): sp.S.Zero for n in ("time", "begin", "envelope", "modulated", "eps", "weighed")}
+    rates, steady = (tuple(e.subs(none) for e in formulas) for formulas in (eq.rates, eq.steady))
+    return replace(eq, rates=rates, steady=steady, **{n: getattr(eq, n).subs(none) for n in ("spring", "load", "mu")})
+
+
+def parameter_rows(parameters: Sequence[Parameter]) -> str:
     """Return the rows of PARAMETERS."""
-    return "\n".join(f"    {_parameter(p)}," for p in system.parameters)
+    return "\n".join(f"    {_parameter(p)}," for p in parameters)
 
 
-def _parameter(p: Any) -> str:
+def _parameter(p: Parameter) -> str:
     bounds = [repr(float(b)).replace("inf", 'float("inf")') for b in (p.lower, p.upper)]
     return f"({p.name!r}, {float(p.default)!r}, {p.unit!r}, {bounds[0]}, {bounds[1]}, {p.about!r})"
 
@@ -254,6 +275,23 @@ def _write_statics(writer: Writer, eq: Equations, linear: Linearisation) -> None
             shape=f"({len(linear.hurwitz)},)",
             state=False,
         )
+
+
+def _write_statics_by_rates(writer: Writer, eq: Equations) -> None:
+    """Write steady sliding and its linear stability with effects: the polynomial is that of the rates' Jacobian."""
+    steady = [(str(i), sp.log(e) if log else e) for i, (e, log) in enumerate(zip(eq.steady, eq.logarithmic, strict=True))]
+    writer.function("steady", "Steady sliding at V under W0.", steady, shape=f"({len(steady)},)", state=False)
+    at_rest = dict(zip(eq.unknowns, eq.steady, strict=True)) | {symbol("W"): symbol("W0"), symbol("W_dot"): sp.S.Zero}
+    mu = eq.mu.subs(symbol("W"), eq.load)
+    doc = "Friction coefficient in steady sliding at V."
+    writer.function("steady_friction", doc, [("", mu.subs(at_rest))], state=False)
+    v, V, rest = symbol("v"), symbol("V"), eq.names.index("ln_v") + 1
+    slopes = [(v * sp.diff(mu, v)).subs(at_rest)]
+    for s, value in zip(eq.unknowns[rest:], eq.steady[rest:], strict=True):
+        slopes.append(-sp.diff(mu, s).subs(at_rest) * V * sp.diff(value, V))
+    doc = "d mu/d ln v, then what each other state takes from d mu/d ln V, in steady sliding."
+    writer.function("slopes", doc, [(str(i), e) for i, e in enumerate(slopes)], shape=f"({len(slopes)},)", state=False)
+    writer.parts.append(_CHARACTERISTIC.format(V=writer.parameters.index("V"), W0=writer.parameters.index("W0")))
 
 
 def _write_closed(writer: Writer, system: System) -> None:
@@ -352,6 +390,10 @@ def _write_cycle(writer: Writer, eq: Equations) -> None:
     phase, f, eps, W0 = sp.Symbol("tau"), symbol("f"), symbol("eps"), symbol("W0")
     angle = 2 * sp.pi * phase
     load = {symbol("W"): W0 * (1 + eps * sp.cos(angle)), symbol("W_dot"): -2 * sp.pi * f * W0 * eps * sp.sin(angle)}
+    mu = eq.mu
+    if writer.system.effects:
+        load |= {symbol("time"): phase / f, symbol("envelope"): sp.S.One, symbol("modulated"): sp.S.One}
+        mu = mu.subs(symbol("W"), eq.load)
     field = staged(eq.rates).substituted(load)
     field = field.with_outputs([e / f for e in field.outputs])
     shape = f"({len(n)},)"
@@ -361,7 +403,7 @@ def _write_cycle(writer: Writer, eq: Equations) -> None:
         "cycle", "dx/dtau over one forcing period, W = W0 (1 + eps cos 2 pi tau).", field, head=head, shape=shape
     )
     writer.square("cycle_jacobian", "d(cycle)/dx.", jacobian, head=head)
-    writer.function("cycle_friction", "Friction coefficient.", [("", eq.mu.subs(load))], head=head)
+    writer.function("cycle_friction", "Friction coefficient.", [("", mu.subs(load))], head=head)
     writer.function("cycle_load", "Normal load W.", [("", eq.load.subs(load))], head=head)
     writer.function("cycle_elongation", "Spring elongation u.", [("", eq.spring.subs(load))], head=head)
     w, a = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "wa")
@@ -391,6 +433,27 @@ def _write_cycle(writer: Writer, eq: Equations) -> None:
         )
 
 
+_CHARACTERISTIC = '''def characteristic(p):
+    """Real coefficients a_0..a_n of the characteristic polynomial in s."""
+    return principal_minors(rates_jacobian(steady(p), p[{V}], p[{W0}], 0.0, p))'''
+
+_MINORS = '''
+
+def principal_minors(matrix):
+    """Coefficients, lowest first, of det(s - matrix): sums of principal minors, in which nothing large cancels."""
+    from itertools import combinations
+
+    from numpy.linalg import det
+
+    n = matrix.shape[-1]
+    out = zeros((*matrix.shape[:-2], n + 1), dtype=matrix.dtype)
+    out[..., n] = 1.0
+    for k in range(1, n + 1):
+        for rows in combinations(range(n), k):
+            out[..., n - k] += (-1) ** k * det(matrix[..., rows, :][..., rows])
+    return out
+'''
+
 _LAMBERTW = '''
 
 def lambertw(x):
@@ -411,7 +474,7 @@ def positive_ratio(above, below):
     return where(ratio > 0, ratio, nan)
 '''
 
-HELPERS = {"lambertw": _LAMBERTW, "positive_ratio": _RATIO}
+HELPERS = {"lambertw": _LAMBERTW, "positive_ratio": _RATIO, "principal_minors": _MINORS}
 
 _HEAD = '''"""Generated by srf from {title}.
 
@@ -502,7 +565,7 @@ def generate_motion(system: System) -> str:
             logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
             arguments=repr(system.tables),
             observed=unknown.get(eq.reading, ""),
-            parameters=parameter_rows(system),
+            parameters=parameter_rows(system.parameters),
             helpers="".join(h for name, h in HELPERS.items() if f"{name}(" in body)
             + ("\nlut, lut1, lut2 = tables_after(len(PARAMETERS))\n" if system.tables else ""),
         )

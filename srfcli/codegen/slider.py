@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from srfcli.codegen.model import GeneratedModel, open_model
+from srfcli.core.errors import SrfError
 from srfcli.core.settings import DEFAULTS, Resolved, resolve
 from srfcli.laws.registry import Registry, load_registry
 
@@ -73,6 +74,7 @@ def system(
     interface: str = str(DEFAULTS["interface"].value),
     loading: str = str(DEFAULTS["loading"].value),
     inertia: bool = True,
+    effects: Sequence[str] = (),
     plugins: Sequence[str | Path] = (),
     parameters: Mapping[str, float | str] | None = None,
     **more: float | str,
@@ -89,6 +91,8 @@ def system(
         How the normal load is applied.
     inertia : bool
         Whether the slider's mass counts.
+    effects : sequence of str
+        Effects that the system has besides its laws, names or paths of files, which critical loads depend on.
     plugins : sequence of path
         Folders in which laws are looked for, too.
     parameters, **more : number or str
@@ -117,11 +121,28 @@ def system(
     >>> pmma.parameters["K"], pmma.at(K=0.3).parameters["K"]
     (0.21, 0.3)
     """
-    words = [w.strip() for text in (law, ageing, interface) for w in text.split("+")]
+    words = [w.strip() for text in (law, ageing, interface, *effects) for w in text.split("+")]
     registry = load_registry([Path(p) for p in plugins], named=[Path(w) for w in words if w.endswith(".py")])
-    model = open_model(registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia)
+    check_part(registry, effects)
+    model = open_model(
+        registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia, effects=effects,
+        stability=True,
+    )  # fmt: skip
     given = {**(parameters or {}), **more}
     return SlidingSystem(model, resolve(model.parameters, given, env={}, where=model.title))
+
+
+def check_part(registry: Registry, effects: Sequence[str]) -> None:
+    """Raise SrfError for an effect that critical loads do not depend on."""
+    if not effects:
+        return
+    from srfcli.laws.values import Effect
+    from srfcli.symbolic.system import without_part
+
+    for name in effects:
+        effect = registry.get("effect", name)
+        if isinstance(effect, Effect) and (reason := without_part(effect)):
+            raise SrfError(f"critical loads do not depend on '{effect.name}': it {reason}", "Leave it out.")
 
 
 def load_law(name: str | Path, *, kind: str = "friction", plugins: Sequence[str | Path] = ()) -> Law:

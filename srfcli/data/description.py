@@ -45,7 +45,7 @@ READABLE = ("elongation", "force", "shear_stress", "friction", "slip", "contact_
 MOST_OBSERVABLES = 3  # of a run
 CORRECTIONS = ("reset", "spike")  # of a run: what is proposed, and made only where it is asked for
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
-_TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs")
+_TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs", "thresholds")
 _COLUMN = ("name", "unit", "scale", "offset", "integrate")
 _RUN = (
     "name",
@@ -63,7 +63,9 @@ _RUN = (
     "observables",
     "segments",
 )
+_THRESHOLDS = ("name", "file", "holdout", "frequency")
 _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
+_TABLES = '[[thresholds]] with file = "....csv" for each table of critical loads.'
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,17 @@ class RunDescription:
 
 
 @dataclass(frozen=True)
+class ThresholdsDescription:
+    """What the description says of one table of critical loads; `frequency` (Hz) of their modulation, None if left out."""
+
+    name: str
+    file: Path
+    holdout: bool
+    frequency: float | None
+    node: Node = field(repr=False, compare=False)
+
+
+@dataclass(frozen=True)
 class Description:
     """A whole `experiment.toml`; `model` and `parameters` are still nodes, as only the laws can judge them."""
 
@@ -126,6 +139,7 @@ class Description:
     parameters: Node | None
     columns: Mapping[str, ColumnSpec]
     runs: tuple[RunDescription, ...]
+    thresholds: tuple[ThresholdsDescription, ...] = ()
 
 
 def read_description(path: Path) -> Description:
@@ -141,8 +155,12 @@ def read_description(path: Path) -> Description:
     root.keys(_TOP)
     title = root.get("title")
     apparatus = root.require("apparatus", '[apparatus] with stiffness = "0.21 N/um".').table("[apparatus].")
-    parameters, columns = root.get("parameters"), root.get("columns")
+    parameters, columns, tables = root.get("parameters"), root.get("columns"), root.get("thresholds")
     machine = _apparatus(apparatus)
+    if tables is None:
+        root.require("runs", _RUNS)
+    recorded = root.get("runs")
+    runs = _runs(recorded, machine.geometry) if recorded else ()
     return Description(
         path=file,
         title=title.text() if title else "",
@@ -150,7 +168,8 @@ def read_description(path: Path) -> Description:
         model=root.require("model", '[model] with law = "srf-vsat" and ageing = "dieterich".').table("[model]."),
         parameters=parameters.table("[parameters].") if parameters else None,
         columns=_columns(columns.table("[columns]."), machine.geometry) if columns else {},
-        runs=_runs(root.require("runs", _RUNS), machine.geometry),
+        runs=runs,
+        thresholds=_thresholds(tables, machine, runs) if tables else (),
     )
 
 
@@ -322,6 +341,37 @@ def _segments(node: Node | None) -> tuple[float, ...]:
     if any(b <= a for a, b in pairwise(times)):
         node.fail("the times do not rise", "Give the earlier time first.")
     return tuple(times)
+
+
+def _thresholds(node: Node, machine: Apparatus, runs: tuple[RunDescription, ...]) -> tuple[ThresholdsDescription, ...]:
+    stress = "counts stresses" if machine.geometry.area or is_stress(machine.stated) else ""
+    if machine.per_load or stress:
+        which = stress or "has a stiffness in friction per micron, which leaves no load to be critical"
+        node.child(0).fail(f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.')
+    found: list[ThresholdsDescription] = []
+    for entry in node.tables(_TABLES):
+        entry.keys(_THRESHOLDS)
+        file = entry.require("file", 'Write file = "critical-loads.csv", relative to the experiment\'s folder.')
+        if not file.text().strip() or "\0" in file.text():
+            file.expected("the name of a table of critical loads")
+        name, holdout, frequency = (entry.get(key) for key in ("name", "holdout", "frequency"))
+        if name and not name.text().strip():
+            name.expected("a name")
+        if frequency and not frequency.quantity("Hz") > 0:
+            frequency.expected("a frequency above 0")
+        called = name.text() if name else Path(file.text()).stem
+        if called in {*(run.name for run in runs), *(other.name for other in found)}:
+            (name or file).fail(f"'{called}' is the name of another run or table", 'Give it one of its own: name = "...".')
+        found.append(
+            ThresholdsDescription(
+                called,
+                entry.file.parent / file.text(),
+                holdout.boolean() if holdout else False,
+                frequency.quantity("Hz") if frequency else None,
+                entry,
+            )
+        )
+    return tuple(found)
 
 
 def _corrections(node: Node | None) -> frozenset[str]:

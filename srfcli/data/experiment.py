@@ -17,7 +17,14 @@ from srfcli.core.settings import Parameter
 from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
 from srfcli.data.clock import Mask, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
 from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
-from srfcli.data.description import Apparatus, ColumnSpec, Node, RunDescription, read_description
+from srfcli.data.description import (
+    Apparatus,
+    ColumnSpec,
+    Node,
+    RunDescription,
+    ThresholdsDescription,
+    read_description,
+)
 from srfcli.data.gauge import GaugeNoise, find_noise
 from srfcli.data.groups import BY, grouped
 from srfcli.data.imposed import (
@@ -43,7 +50,17 @@ from srfcli.data.noise import (
     white_level,
 )
 from srfcli.data.scales import own_bounds
-from srfcli.data.values import BESIDE, OBSERVABLES, Experiment, FitParameter, ModelChoice, Run, Signal
+from srfcli.data.thresholds import read_thresholds
+from srfcli.data.values import (
+    BESIDE,
+    OBSERVABLES,
+    CriticalLoads,
+    Experiment,
+    FitParameter,
+    ModelChoice,
+    Run,
+    Signal,
+)
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation
@@ -75,12 +92,14 @@ def read_experiment(
         return read_run(run, described.apparatus, described.columns, registry=registry, format=format, limit=limit)
 
     runs = tuple(read(run) for run in described.runs if holdout or not run.holdout)
-    if choice.effects and runs:
+    tables = tuple(_read_table(one) for one in described.thresholds if holdout or not one.holdout)
+    notices += tuple(Notice("sigma", t.name, text) for t in tables for text in t.table.notes)
+    if choice.effects and (runs or tables):
         from srfcli.symbolic.system import apart  # only for a description that has effects
 
         own = [registry.get("effect", name) for name in choice.effects]
         stated = described.parameters.value if described.parameters is not None else {}
-        parameters = own_bounds(parameters, apart([e for e in own if isinstance(e, Effect)]), runs, stated)
+        parameters = own_bounds(parameters, apart([e for e in own if isinstance(e, Effect)]), runs, stated, tables)
     vary, by = read_groups(described.model)
     found = Experiment(
         described.path,
@@ -92,8 +111,23 @@ def read_experiment(
         runs,
         notices,
         described.apparatus.stated,
+        thresholds=tables,
     )
     return grouped(found, vary, by)
+
+
+def _read_table(described: ThresholdsDescription) -> CriticalLoads:
+    """Return the table of critical loads in a description's file."""
+    if not described.file.exists():
+        described.node.child("file").fail(f"no file {described.file}", "Its path is relative to the experiment's folder.")
+    table = read_thresholds(described.file)
+    if described.frequency is None and table.eps.max() > 0:
+        line = table.lines[int(np.argmax(table.eps > 0))]
+        described.node.fail(
+            f"line {line} of {described.file.name} has a modulated load, and its frequency is not said",
+            "Write frequency = 120.0, in Hz.",
+        )
+    return CriticalLoads(described.name, described.file, described.holdout, described.frequency or 1.0, table)
 
 
 # The model of an experiment and its parameters, judged by the laws themselves.
@@ -526,6 +560,7 @@ KINDS = {  # of notices, as --fail-on takes them
     "observable": "more than one observable in the file",
     "load": "more than one load in the file",
     "start-value": "a start value that is not the apparatus'",
+    "sigma": "critical loads without an error of their own",
 }
 
 

@@ -87,6 +87,7 @@ def segments(run: Run) -> list[Run]:
         return [run]
     slid, pieces = run.drive.displacement(run.t), []
     for k, (a, b) in enumerate(pairwise([*edges, run.t.size])):
-        own = {"name": f"{run.name}-{k + 1}", "start": run.start + float(slid[a]), "notices": run.notices if a == 0 else ()}
-        pieces.append(replace(run.part(slice(a, b)), segments=(), **own))
+        piece, notices = run.part(slice(a, b)), run.notices if a == 0 else ()
+        start = run.start + float(slid[a])
+        pieces.append(replace(piece, name=f"{run.name}-{k + 1}", start=start, notices=notices, segments=()))
     return pieces

@@ -10,18 +10,34 @@ import numpy as np
 
 from srfcli.core.settings import Parameter
 from srfcli.core.units import find_unit, to_base
-from srfcli.data.values import FitParameter, Run
+from srfcli.data.values import CriticalLoads, FitParameter, Run
 from srfcli.laws.values import Effect
 
 
-def scales_of(runs: Sequence[Run], parameters: Sequence[FitParameter]) -> dict[str, float]:
+def scales_of(
+    runs: Sequence[Run], parameters: Sequence[FitParameter], tables: Sequence[CriticalLoads] = ()
+) -> dict[str, float]:
     """Return the scales that effect files may name, in um, s, N, of the runs that are fitted (of all, where none is).
 
     `segment` is the longest slip at one velocity and `track` in one run, `duration` that of the longest run, `interval` the
     shortest between samples, `V_low` and `V_high` the range of the drive while it moves, `load` the mean of the normal load. D0
-    and V0 are the model's start values, and are missing where the model has none.
+    and V0 are the model's start values, and are missing where the model has none. Without runs, V_low, V_high and load are those
+    of the tables of critical loads, which have no other scale.
     """
-    fitted = [run for run in runs if not run.holdout] or list(runs)
+    found = _of_runs([run for run in runs if not run.holdout] or list(runs)) if runs else _of_tables(tables)
+    found |= {q.name: q.value for q in parameters if q.name in ("D0", "V0")}
+    return {name: value for name, value in found.items() if 0 < value < math.inf}
+
+
+def _of_tables(tables: Sequence[CriticalLoads]) -> dict[str, float]:
+    fitted = [t.table for t in tables if not t.holdout] or [t.table for t in tables]
+    if not fitted:
+        return {}
+    V, loads = (np.concatenate([getattr(t, name) for t in fitted]) for name in ("V", "W0c"))
+    return {"V_low": float(V.min()), "V_high": float(V.max()), "load": float(loads.mean())}
+
+
+def _of_runs(fitted: Sequence[Run]) -> dict[str, float]:
     slips, moving = [], []
     for run in fitted:
         edges = [float(run.t[0]), *(b for b in run.drive.breaks if run.t[0] < b < run.t[-1]), float(run.t[-1])]
@@ -30,15 +46,13 @@ def scales_of(runs: Sequence[Run], parameters: Sequence[FitParameter]) -> dict[s
         slips.append((V * np.diff(edges)).tolist())
         moving.append(V[1e-3 * V.max() < V] if V.any() else V)
     V = np.concatenate(moving)
-    found = {
+    return {
         "segment": max(max(s) for s in slips), "track": max(sum(s) for s in slips),
         "duration": max(float(np.ptp(run.t)) for run in fitted),
         "interval": min(float(np.median(np.diff(run.t))) for run in fitted),
         "V_low": float(V.min(initial=math.inf)), "V_high": float(V.max(initial=0.0)),
         "load": float(np.mean([run.load(run.t)[0].mean() for run in fitted])),
     }  # fmt: skip
-    found |= {q.name: q.value for q in parameters if q.name in ("D0", "V0")}
-    return {name: value for name, value in found.items() if 0 < value < math.inf}
 
 
 def at_scale(effect: Effect, scales: Mapping[str, float]) -> Effect:
@@ -58,13 +72,14 @@ def own_bounds(
     effects: Sequence[Effect],
     runs: Sequence[Run],
     stated: Mapping[str, Collection[str]],
+    tables: Sequence[CriticalLoads] = (),
 ) -> tuple[FitParameter, ...]:
     """Return the parameters of an experiment with the bounds that the recording gives those of its effects.
 
     `stated` has by name which of lower, upper and fixed the experiment says itself: these stay. Bounds make room for the start
     value. What an effect never fits is added where the experiment does not list it, and held where it does not say otherwise.
     """
-    scales, found, out = scales_of(runs, parameters), dict[str, Parameter](), []
+    scales, found, out = scales_of(runs, parameters, tables), dict[str, Parameter](), []
     held = {name for effect in effects for name in effect.fixed}
     listed = {q.name for q in parameters}
     for effect in effects:

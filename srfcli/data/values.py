@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import Notice
+from srfcli.core.errors import Notice, SrfError
 from srfcli.core.units import factor_between, find_unit, split_quantity
 from srfcli.data.clock import Sampling, find_sampling
+from srfcli.data.thresholds import Thresholds
 from srfcli.motion.imposed import Drive, Load
 
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
@@ -138,8 +139,19 @@ class Run:
 
 
 @dataclass(frozen=True)
+class CriticalLoads:
+    """A table of critical loads that were measured with the apparatus; `frequency` is that of their modulation in Hz."""
+
+    name: str
+    file: Path
+    holdout: bool
+    frequency: float
+    table: Thresholds = field(repr=False)
+
+
+@dataclass(frozen=True)
 class Experiment:
-    """Runs under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider.
+    """Runs and critical loads under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider.
 
     Parameters in `vary` have a value for each run, load, segment or direction, as `by` says.
     """
@@ -155,6 +167,28 @@ class Experiment:
     stiffness_unit: str = ""
     vary: tuple[str, ...] = ()
     by: str = "run"
+    thresholds: tuple[CriticalLoads, ...] = ()
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Return the files of recordings and tables, each once."""
+        return tuple(dict.fromkeys([*(run.file for run in self.runs), *(table.file for table in self.thresholds)]))
+
+    def check_recorded(self, purpose: str) -> None:
+        """Raise SrfError where there is no recording, only critical loads."""
+        if not self.runs:
+            raise SrfError(f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`.")
+
+    def fitted(self) -> Experiment:
+        """Return the experiment without what is held out."""
+        runs = tuple(run for run in self.runs if not run.holdout)
+        return replace(self, runs=runs, thresholds=tuple(table for table in self.thresholds if not table.holdout))
+
+    @property
+    def stiffness(self) -> float:
+        """Return the stated stiffness in N/um, or in 1/um where it is friction per micron."""
+        number, unit = split_quantity(self.stiffness_text, name="stiffness")
+        return number * find_unit(unit).factor
 
     @property
     def stress(self) -> bool:

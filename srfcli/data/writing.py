@@ -16,6 +16,7 @@ from srfcli.core.errors import SrfError
 from srfcli.core.files import SIDECAR, clear, parse_toml, read_text, recover, whole_folder
 from srfcli.core.units import find_unit
 from srfcli.data.description import LARGEST
+from srfcli.data.thresholds import thresholds_csv
 from srfcli.data.values import BESIDE, OBSERVABLES, Experiment, FitParameter, Run
 from srfcli.motion.imposed import Drive
 
@@ -41,13 +42,11 @@ def write_experiment(
 
 def experiment_files(experiment: Experiment) -> dict[str, str]:
     """Return the files of an experiment folder, name -> text."""
-    if not experiment.runs:
+    if not (experiment.runs or experiment.thresholds):
         raise SrfError("an experiment without runs cannot be written", "give it one run or more")
-    names = _file_names([run.name for run in experiment.runs])
-    return {
-        DESCRIPTION: _description(experiment, names),
-        **{name: run_csv(run) for name, run in zip(names, experiment.runs, strict=True)},
-    }
+    texts = [*map(run_csv, experiment.runs), *(thresholds_csv(t.table) for t in experiment.thresholds)]
+    names = _file_names([*(run.name for run in experiment.runs), *(table.name for table in experiment.thresholds)])
+    return {DESCRIPTION: _description(experiment, names), **dict(zip(names, texts, strict=True))}
 
 
 def check_folder(folder: Path, *, force: bool) -> None:
@@ -80,8 +79,8 @@ def _own_files(folder: Path) -> set[str]:
         return set()
     if not str(data.get("format", "")).startswith("srf-experiment/"):
         return set()
-    runs = data.get("runs")
-    listed = [run.get("file") for run in runs if isinstance(run, dict)] if isinstance(runs, list) else []
+    parts = [part for key in ("runs", "thresholds") if isinstance(listed := data.get(key), list) for part in listed]
+    listed = [part.get("file") for part in parts if isinstance(part, dict)]
     names = {DESCRIPTION, *(name for name in listed if isinstance(name, str))}
     return names | {name + SIDECAR for name in names}
 
@@ -142,8 +141,11 @@ def _description(experiment: Experiment, files: list[str]) -> str:
         lines.append(f"effects = [{', '.join(map(_text, choice.effects))}]")
     if experiment.parameters:
         lines += ["", "[parameters]", *map(_parameter_line, experiment.parameters)]
-    for run, file in zip(experiment.runs, files, strict=True):
+    for run, file in zip(experiment.runs, files, strict=False):
         lines += ["", "[[runs]]", *_run_lines(run, file)]
+    for table, file in zip(experiment.thresholds, files[len(experiment.runs) :], strict=True):
+        lines += ["", "[[thresholds]]", f"name = {_text(table.name)}", f"file = {_text(file)}"]
+        lines += [f"holdout = {_truth(table.holdout)}", f"frequency = {float(table.frequency)!r}"]
     return "\n".join(lines) + "\n"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,13 @@ from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.errors import SrfError
 from srfcli.data.values import Experiment
 from srfcli.inference.prediction import stiffness_share
-from srfcli.laws.expression import symbol
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.numerics.continuation import AtlasSettings, find_components
 from srfcli.numerics.critical import load_window
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.plane import Axis, Plane
+from srfcli.symbolic.system import without_part
 
 VELOCITIES = 61
 CORNERS = 5  # velocities at which the loads without modulation say where boundaries are looked for
@@ -32,8 +32,8 @@ def stability(
     """Return V (um/s), the critical loads (N) of both models under constant load and under the strongest modulation, and a note.
 
     `at` are the baseline's fitted parameters; the augmented experiment has its own. Loads are NaN where sliding is steady at any;
-    boundaries under modulation have velocities of their own, NaN between components. Effects of the apparatus change diagrams by
-    the parameters that they had bent, and by how much of the modulation they let through.
+    boundaries under modulation have velocities of their own, NaN between components. Effects that critical loads do not depend on
+    change diagrams by the parameters that they had bent.
     """
     driven = np.concatenate([np.abs(r.drive.velocities) for r in baseline.runs])
     driven = driven[driven > 0]
@@ -49,8 +49,7 @@ def stability(
             model, base = _model(registry, experiment, values)
             found[f"W0_hopf_{side}"] = _loads(model, base, V)
             if strongest:
-                share = _let_through(registry, experiment, values)
-                found |= _boundary(model, base, V, strongest[0], share * strongest[1], side, notes)
+                found |= _boundary(model, base, V, *strongest[:2], side, notes)
     except SrfError as error:
         return {"note": f"no stability diagram: {error.message}"}
     if not any(np.isfinite(loads).any() for key, loads in found.items() if key.startswith("W0")):
@@ -62,14 +61,18 @@ def stability(
             drawn = f"under a load modulated by {strongest[1]:.3g} at {strongest[0]:g} Hz, the strongest here."
             notes.insert(1, f"Drawn through: {drawn}")
         notes.append("srf continue --eps and srf map follow the boundary at any other.")
-    if left := augmented.choice.effects:
-        notes.append(f"{', '.join(left)}: of the apparatus, not in the laws.")
+    effects = [registry.get("effect", n) for n in augmented.choice.effects]
+    apart = [e.name for e in effects if isinstance(e, Effect) and without_part(e)]
+    if joined := [e.name for e in effects if e.name not in apart]:
+        notes.append(f"{', '.join(joined)}: beside the laws; these commands have that with --effect.")
+    if apart:
+        notes.append(f"{', '.join(apart)}: critical loads do not depend on that.")
     return found | {"note": " ".join(notes)}
 
 
 def _model(registry: Registry, experiment: Experiment, values: Mapping[str, float]) -> tuple[GeneratedModel, Array]:
-    """Return the laws' model without effects of the apparatus, and its parameters."""
-    model = open_model(registry, **asdict(replace(experiment.choice, effects=())))
+    """Return the model of sliding at one velocity for ever, and its parameters."""
+    model = open_model(registry, **asdict(experiment.choice), stability=True)
     own = {n: v for n, v in values.items() if n in model.names and n not in ("V", "W0", "K")}
     run = experiment.runs[0]
     own["K"] = values["K"] * stiffness_share(experiment, run) if "K" in values else run.stiffness
@@ -89,21 +92,6 @@ def _at(model: GeneratedModel, base: Array, **values: float) -> Array:
     for name, value in values.items():
         p[model.index(name)] = value
     return p
-
-
-def _let_through(registry: Registry, experiment: Experiment, values: Mapping[str, float]) -> float:
-    """Return the share of a modulation that effects of the apparatus let through, of first order."""
-    share = 1.0
-    for name in experiment.choice.effects:
-        effect = registry.get("effect", name)
-        assert isinstance(effect, Effect)
-        for slot, formula in effect.changes:
-            if slot == "W":
-                slope = formula.diff(symbol("W")).subs(symbol("modulated"), 1)
-                numbers = {symbol(q.name): values.get(q.name, q.default) for q in effect.parameters}
-                passed = slope.subs(numbers)
-                share *= float(passed) if passed.is_number else 1.0
-    return share
 
 
 def _boundary(

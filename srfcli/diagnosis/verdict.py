@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.core.errors import Status
-from srfcli.core.units import find_unit, from_base, split_quantity, to_base
+from srfcli.core.units import from_base, to_base
 from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.hypotheses import Excluded, neutral_values
 from srfcli.diagnosis.scores import Score
@@ -229,8 +229,7 @@ def parameters_of(fitted: Fitted) -> dict[str, dict[str, Any]]:
         unit = units.get(name, units.get(name.partition("[")[0], "1"))
         found[name] = {"value": from_base(values[name], unit), "stderr": from_base(error, unit), "unit": unit}
     if "K" in found:
-        number, unit = split_quantity(problem.experiment.stiffness_text, name="stiffness")
-        stated = from_base(number * find_unit(unit).factor, found["K"]["unit"])
+        stated = from_base(problem.experiment.stiffness, found["K"]["unit"])
         found["ratio"] = {k: found["K"][k] / stated for k in ("value", "stderr")} | {"unit": "1"}
     return found
 

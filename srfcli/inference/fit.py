@@ -15,7 +15,8 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.groups import labels
-from srfcli.data.values import Experiment, Run, Signal
+from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
+from srfcli.inference.critical_loads import Matched
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
 from srfcli.inference.prediction import RTOL, Prediction, own_names, own_start, predict, run_parameters
 
@@ -92,6 +93,7 @@ class Fit:
     evaluations: int
     trail: tuple[tuple[float, str], ...] = ()
     others: tuple[RunFit, ...] = ()
+    tables: tuple[Matched, ...] = ()
 
     @property
     def stderr(self) -> dict[str, float]:
@@ -105,11 +107,15 @@ class Fit:
         return np.asarray(self.covariance / np.outer(sd, sd))
 
     def rms_over_noise(self, *, holdout: bool = False) -> float:
-        """Return the residuals' root mean square over the white noise level, all runs fitted (or held out) together."""
+        """Return the residuals' root mean square over the white noise level, all runs fitted (or held out) together.
+
+        Critical loads count like readings, over their errors.
+        """
         chosen = [r for r in self.runs if r.holdout == holdout]
-        sizes = np.array([sum(b - a for a, b in r.parts) for r in chosen], dtype=float)
-        ratios = np.array([(r.rms / r.white) ** 2 if r.white else np.nan for r in chosen])
-        return float(np.sqrt(np.sum(sizes * ratios) / np.sum(sizes))) if chosen else float("nan")
+        tables = [t for t in self.tables if t.loads.holdout == holdout]
+        sizes = np.array([sum(b - a for a, b in r.parts) for r in chosen] + [t.white.size for t in tables], dtype=float)
+        ratios = [(r.rms / r.white) ** 2 if r.white else np.nan for r in chosen] + [float(np.mean(t.white**2)) for t in tables]
+        return float(np.sqrt(np.sum(sizes * np.array(ratios)) / np.sum(sizes))) if sizes.size else float("nan")
 
 
 class Interrupted(Exception):
@@ -122,7 +128,10 @@ class Interrupted(Exception):
 
 @dataclass(frozen=True)
 class Problem:
-    """What is fitted to what: the free parameters with their bounds, and the runs that judge them."""
+    """What is fitted to what: the free parameters with their bounds, and the runs and tables of critical loads that judge them.
+
+    `stability` is the model of critical loads. Without runs it is the `model`, too.
+    """
 
     model: GeneratedModel
     experiment: Experiment
@@ -136,6 +145,8 @@ class Problem:
     rtol: float = RTOL
     varying: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # run -> parameter -> its name for that run's group
     priors: tuple[tuple[tuple[str, ...], float], ...] = ()  # names, and the scatter of their values about an unknown mean
+    tables: tuple[CriticalLoads, ...] = ()
+    stability: GeneratedModel | None = None
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:
@@ -177,10 +188,12 @@ def fit_problem(
     *,
     free: Sequence[str] | None = None,
     trend: str | None = None,
+    stability: GeneratedModel | None = None,
 ) -> Problem:
     """Return the problem that an experiment states; `free` replaces its own choice of parameters, `trend` is slip or time.
 
-    Parameters that vary have a value for each group of runs; B of a run up is then called B[up].
+    Tables of critical loads take part where their model, `stability`, is given. Parameters that vary have a value for each group
+    of runs; B of a run up is then called B[up].
     """
     listed = {q.name: q for q in experiment.parameters}
     names = list(free) if free is not None else [q.name for q in experiment.parameters if not q.fixed]
@@ -188,8 +201,10 @@ def fit_problem(
         if name not in listed:
             raise SrfError(f"'{name}' has no start value in [parameters]", did_you_mean(name, listed))
     runs = tuple(r for r in experiment.runs if not r.holdout)
-    if not runs:
-        raise SrfError("every run is held out", "set holdout = false for those that are to be fitted")
+    tables = tuple(t for t in experiment.thresholds if not t.holdout) if stability is not None else ()
+    if not runs and (experiment.runs or not tables):
+        what = "run" if experiment.runs else "table of critical loads"
+        raise SrfError(f"every {what} is held out", "set holdout = false for those that are to be fitted")
     if not names:
         raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
     varying = _varying(experiment, runs, names)
@@ -205,7 +220,9 @@ def fit_problem(
     for name, low, high in zip(names, lower, upper, strict=True):
         if not (np.isfinite(low) and np.isfinite(high)):
             raise SrfError(f"'{name}' has no bounds", "give lower and upper in [parameters]")
-    return Problem(model, experiment, runs, tuple(names), start, lower, upper, trend, varying=varying)
+    return Problem(
+        model, experiment, runs, tuple(names), start, lower, upper, trend, varying=varying, tables=tables, stability=stability
+    )
 
 
 def _varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[str]) -> dict[str, dict[str, str]]:

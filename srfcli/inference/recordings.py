@@ -1,4 +1,4 @@
-"""The fit of an experiment's recordings as `srf fit` makes it: likelihood, starts, random friction field."""
+"""The fit of an experiment as `srf fit` makes it: likelihood, starts, random friction field."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from srfcli.codegen.c_source import compiler
+from srfcli.codegen.c_source import GET_COMPILER, compiler
 from srfcli.codegen.model import Array, open_model
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.groups import grouped
@@ -104,12 +104,13 @@ def fit_recordings(
     seed: int = 0,
     progress: Callable[[str], None] = lambda text: None,
 ) -> RecordingFit:
-    """Return the maximum-likelihood fit of all runs together; parameters that `vary` have a value for each group of runs.
+    """Return the maximum-likelihood fit of all runs and tables of critical loads together.
 
-    `track` is "smooth" for no random friction field, "rough" for one in each run, "shared" for one that all runs share; left out,
-    the recordings decide, whether it is shared only with `ask_shared`. With `prior` the values of five groups or more are drawn
-    towards their mean. Without a C compiler there is no field, and noise is autoregressive. A fit stopped by Ctrl-C is a status;
-    SrfError is raised for what cannot be fitted.
+    Parameters that `vary` have a value for each group of runs. `track` is "smooth" for no random friction field, "rough" for one
+    in each run, "shared" for one that all runs share; left out, the recordings decide, whether it is shared only with `ask_shared`
+    and without critical loads. With `prior` the values of five groups or more are drawn towards their mean. Without a C compiler
+    there is no field, and noise is autoregressive. A fit stopped by Ctrl-C is a status; SrfError is raised for what cannot be
+    fitted.
     """
     beside = next((run.name for run in experiment.runs if run.others), "")
     if beside and (track == "shared" or compiler() is None):
@@ -119,10 +120,22 @@ def fit_recordings(
     if experiment.vary and (track == "shared" or compiler() is None):
         why = "needs a C compiler" if compiler() is None else "does not go with `track` shared"
         raise SrfError(f"`vary` {why}", "Leave it out.")
-    if compiler() is None:
+    stability = open_model(registry, **asdict(experiment.choice), stability=True) if experiment.thresholds else None
+    if not experiment.runs:
+        if vary or trend or track:
+            named = "vary" if vary else "trend" if trend else "track"
+            raise SrfError(f"`{named}` is for recordings, and {experiment.path} has none", "Leave it out.")
+        assert stability is not None
+        model = stability
+    elif compiler() is None:
+        if stability is not None:
+            raise SrfError("critical loads beside recordings need a C compiler", GET_COMPILER)
         return _without_compiler(registry, experiment, free, trend, track, starts, seed, progress)
-    model = open_model(registry, **asdict(experiment.choice), random_field=True)
-    problem = fit_problem(model, experiment, free=free, trend=trend)
+    else:
+        model = open_model(registry, **asdict(experiment.choice), random_field=True)
+    if stability is not None and track == "shared":
+        raise SrfError("`track` shared does not go with critical loads", "Leave it out, or name rough.")
+    problem = fit_problem(model, experiment, free=free, trend=trend, stability=stability)
     smooth = None if track is None else track == "smooth"
 
     def one(start: Array, report: Callable[[str], None]) -> tuple[Fit, Any]:
@@ -138,7 +151,7 @@ def fit_recordings(
     found, status = several.beside, Status.INTERRUPTED if several.interrupted else several.best.status
     result = RecordingFit(problem, several.best, found, _track(found), tuple(several.rows), status)
     result = _with_scatter(result, prior=prior and not several.interrupted)
-    if several.interrupted or len(problem.runs) < 2:
+    if several.interrupted or len(problem.runs) < 2 or problem.tables:
         return result
     try:
         asked = ask_shared and track is None and not (experiment.vary or any(run.others for run in problem.runs))
@@ -153,8 +166,10 @@ def fit_recordings(
     return replace(result, fit=shared.fit, state_space=None, track=_shared(shared), status=shared.fit.status)
 
 
-def _track(found: StateSpaceFit) -> Track:
+def _track(found: StateSpaceFit) -> Track | None:
     values = found.values
+    if not found.likelihood.problem.runs:
+        return None
     return Track() if found.smooth else Track(values["field_amplitude"], values["field_length"])
 
 

@@ -27,7 +27,8 @@ from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, QUALITY
-from srfcli.data.values import Experiment, Run
+from srfcli.data.values import CriticalLoads, Experiment, Run
+from srfcli.inference.critical_loads import Matched, TableLikelihood, joined_slopes
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, stretches
@@ -79,6 +80,7 @@ LAGS = 5  # of that statistic
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
 PERIODOGRAM = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
+SURVEYS = 3  # of all lines of the tables of critical loads at a maximum, and fits from where that finds nearer crossings
 DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
 
@@ -366,7 +368,10 @@ def _field_columns(model: GeneratedModel, run: Run, p: Array, x0: Array) -> Arra
 
 @dataclass(frozen=True)
 class Point:
-    """Where a likelihood was evaluated: `x` (k,) in its own coordinates, values by name, derivatives by x, runs filtered."""
+    """Where a likelihood was evaluated: `x` (k,) in its own coordinates, values by name, derivatives by x, runs filtered.
+
+    `tables` are those of critical loads, matched.
+    """
 
     x: Array
     values: dict[str, float] = field(repr=False)
@@ -374,34 +379,35 @@ class Point:
     score: Array = field(repr=False)
     information: Array = field(repr=False)
     runs: tuple[Filtered, ...] = field(repr=False)
+    tables: tuple[Matched, ...] = field(default=(), repr=False)
 
     @property
     def rms(self) -> float:
-        """Return the root mean square of all standardised innovations: 1 under the right model."""
-        white = np.concatenate([f.white for f in self.runs])
+        """Return the root mean square of all standardised innovations and residuals: 1 under the right model."""
+        white = np.concatenate([f.white for f in self.runs] + [t.white for t in self.tables])
         return float(np.sqrt(np.mean(white**2)))
 
 
 class Likelihood:
-    """The log likelihood of a problem's runs; its model has a random friction field.
+    """The log likelihood of a problem's runs, whose model has a random friction field, and of its tables of critical loads.
 
     Coordinates x are the problem's parameters, then field_amplitude and field_length unless the track is `smooth`, gauge_white,
     and the parameters of the gauge's coloured `processes`, each a word of PROCESSES; those with a positive lower bound by
     their logarithms, in which friction laws are nearly linear. Another observable or sampling rate has a gauge noise of its own,
-    within a run too; names then end in `[kind]`.
+    within a run too; names then end in `[kind]`. Without runs there is neither field nor gauge.
     """
 
     def __init__(
         self, problem: Problem, *, smooth: bool = False, processes: Sequence[str] = (), rtol: float = RTOL
     ) -> None:
-        self.problem, self.smooth, self.processes = problem, smooth, tuple(processes)
+        self.problem, self.smooth, self.processes = problem, smooth or not problem.runs, tuple(processes)
         self.base_rtol, self.rtol = rtol, FREE_RUNNING * rtol if smooth else rtol
         self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
-        scales = _scales(problem.runs)
+        scales = _scales(problem.runs) if problem.runs else {}
         self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
         self.kinds = list(dict.fromkeys(kind for run in problem.runs for kind in _kinds(run)))
-        own = [(n, *scales[n]) for n in (() if smooth else FIELD)]
+        own = [(n, *scales[n]) for n in (() if self.smooth else FIELD)]
         for kind in self.kinds:
             own += [(name, *scales[n.rstrip("123"), kind[0]]) for n, name in self.gauge_names(kind).items()]
         self.names = (*problem.names, *(row[0] for row in own))
@@ -411,11 +417,37 @@ class Likelihood:
             np.array([np.log(v) if log else v for v, log in zip(column, self.logarithmic, strict=True)])
             for column in zip(*rows, strict=True)
         )
+        self._tables = [self._table(loads) for loads in problem.tables]
 
     @property
     def samples(self) -> int:
-        """Return the number of readings used."""
-        return sum(int(run.used.sum()) for run in self.problem.runs)
+        """Return the number of readings used, and of critical loads."""
+        return sum(int(run.used.sum()) for run in self.problem.runs) + sum(len(t.table) for t in self.problem.tables)
+
+    @property
+    def _varying(self) -> dict[str, list[str]]:
+        """Return the names of what varies between runs, by the parameter that it is."""
+        found: dict[str, list[str]] = {}
+        for n, name in (item for own in self.problem.varying.values() for item in own.items()):
+            if name in self.names and name not in found.setdefault(n, []):
+                found[n].append(name)
+        return found
+
+    def _table(self, loads: CriticalLoads) -> TableLikelihood:
+        problem, varying = self.problem, self._varying
+        assert problem.stability is not None
+        place = {name: n for n, names in varying.items() for name in names}
+        rows = zip(problem.names, problem.start, problem.lower, problem.upper, strict=True)
+        bounds = {place.get(name, name): (float(a), float(b), float(c)) for name, a, b, c in rows}
+        return TableLikelihood(problem.stability, problem.experiment, loads, bounds)
+
+    def held_out_table(self, loads: CriticalLoads, values: Mapping[str, float]) -> Matched:
+        """Return a table that was not fitted, matched with what was found, with derivatives by the names here."""
+        return self._matched(self._table(loads), values)
+
+    def _matched(self, table: TableLikelihood, values: Mapping[str, float], **how: bool) -> Matched:
+        found = table.at(values, **how)
+        return replace(found, names=self.names, slopes=joined_slopes(found, self.names, self._varying))
 
     def values(self, x: Array) -> dict[str, float]:
         """Return parameters by name in um, s, N."""
@@ -503,7 +535,7 @@ class Likelihood:
         held = {n: values[n] for n in (*problem.held, *problem.names) if "." not in n or n in of_group}
         alone = replace(
             problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held,
-            priors=(),
+            priors=(), tables=(),
         )  # fmt: skip
         likelihood = Likelihood(alone, smooth=self.smooth, processes=self.processes, rtol=self.base_rtol)
         known = {n: values[n] for n in FIELD}
@@ -539,9 +571,14 @@ class Likelihood:
         with ThreadPoolExecutor(count) as pool:
             return list(pool.map(work, self.problem.runs))
 
-    def at(self, x: Array, *, slopes: bool = True, keep: bool = False, like: Point | None = None) -> Point:
-        """Return log likelihood, score and information at x (k,); -inf where a run takes PATIENCE times the steps of `like`."""
-        if slopes and not keep and self.best is not None and np.array_equal(x, self.best.x):
+    def at(
+        self, x: Array, *, slopes: bool = True, keep: bool = False, like: Point | None = None, anew: bool = False
+    ) -> Point:
+        """Return log likelihood, score and information at x (k,); -inf where a run takes PATIENCE times the steps of `like`.
+
+        With `anew` every line of the tables is searched in full.
+        """
+        if slopes and not keep and not anew and self.best is not None and np.array_equal(x, self.best.x):
             return self.best
         values, k = self.values(x), len(self.names)
         self.evaluations += 1
@@ -552,6 +589,10 @@ class Likelihood:
 
         runs = tuple(self.over_runs(one))
         total = float(sum(f.log_likelihood for f in runs))
+        tables: tuple[Matched, ...] = ()
+        if np.isfinite(total):
+            tables = tuple(self._matched(t, values, slopes=slopes, anew=anew) for t in self._tables)
+            total += sum(t.log_likelihood for t in tables)
         score, information = np.zeros(k), np.zeros((k, k))
         unit = self.unit(x)
         for names, scatter in self.problem.priors:  # of values about a mean that is unknown
@@ -563,14 +604,17 @@ class Likelihood:
             centred = np.eye(off.size) - 1 / off.size
             information[np.ix_(places, places)] += centred / scatter**2 * np.outer(unit[places], unit[places])
         if slopes and np.isfinite(total):
+            for t in tables:
+                score += t.score * unit
+                information += t.information * np.outer(unit, unit)
             for f in runs:
                 at = [self.names.index(n) for n in f.names]
                 score[at] += f.score * unit[at]
                 information[np.ix_(at, at)] += f.information * np.outer(unit[at], unit[at])
             if not (np.isfinite(score).all() and np.isfinite(information).all()):
                 total = -np.inf  # a motion that cannot be differentiated is none to go on from
-        point = Point(x, values, total, score, information, runs)
-        if slopes and (self.best is None or total > self.best.log_likelihood):
+        point = Point(x, values, total, score, information, runs, tables)
+        if slopes and (anew or self.best is None or total > self.best.log_likelihood):
             self.best = point
         return point
 
@@ -641,7 +685,8 @@ def maximise(
 ) -> Maximum:
     """Return the maximum from x (k,), by Fisher scoring with Levenberg's damping; parameters `held` stay where they are.
 
-    Readings are weighted first, by how far each tells something, `widths` one after the other (WIDTHS), and then all count alike.
+    Readings and critical loads are weighted first, by how far each tells something, `widths` one after the other (WIDTHS), and
+    then all count alike.
     It ends within `close` standard errors of the maximum, by the score, or where two steps running each gain less than a quarter
     of what that distance is worth. Parameters that a step would push out stay at their
     bounds. A likelihood that cannot be evaluated at x is a status.
@@ -709,7 +754,8 @@ def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -
     standard errors if that is less, and the variance of a reading to be larger by what that makes of it. So a reading has no say
     on what it tells only next to the parameters where it was differentiated: each in the fall of a stick-slip cycle would give
     the likelihood a narrow maximum for each way in which falls meet samples. A weight rests on earlier readings alone, so that
-    the weighted score is zero on average at the true parameters. Orear, Am. J. Phys. 50 (1982).
+    the weighted score is zero on average at the true parameters. Where two crossings merge and vanish a critical load has slopes
+    without end, and no say, so that its jump is no barrier. Orear, Am. J. Phys. 50 (1982).
     """
     k, own = len(likelihood.names), free & np.isin(likelihood.names, likelihood.problem.names)
     unit = likelihood.unit(point.x)
@@ -718,6 +764,9 @@ def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -
         at = [likelihood.names.index(n) for n in f.names]
         a, b = (slope * unit[at] for slope in f.slopes)
         runs.append((at, a, b, 0.5 * (f.white**2 - 1)[:, None] * b - f.white[:, None] * a))
+    for t in point.tables:
+        a = t.slopes * unit
+        runs.append(([*range(k)], a, np.zeros_like(a), -t.white[:, None] * a))
     widest = np.where(own, width * np.where(likelihood.logarithmic, 1.0, np.abs(point.x)), 0.0)
     uncertain = widest
     for _ in range(ROUNDS):
@@ -738,8 +787,8 @@ def _gain(trial: Point, point: Point, weights: Sequence[Array]) -> float:
     """Return what a trial gains in log likelihood, that of weighted readings if there are weights."""
     if not weights or not np.isfinite(trial.log_likelihood):
         return trial.log_likelihood - point.log_likelihood
-    pairs = zip(weights, trial.runs, point.runs, strict=True)
-    return float(sum(w @ (new.log_density - old.log_density) for w, new, old in pairs))
+    after, before = ([f.log_density for f in x.runs] + [t.log_density for t in x.tables] for x in (trial, point))
+    return float(sum(w @ (new - old) for w, new, old in zip(weights, after, before, strict=True)))
 
 
 def _curvature_beyond(last: Point, point: Point) -> Array:
@@ -824,11 +873,15 @@ def fit_state_space(
         "smooth": smooth, "processes": processes, "cautious": cautious, "close": close, "progress": progress,
     }  # fmt: skip
     try:
+        if not problem.runs:
+            return _surveyed(_of_tables(likelihood, start or {}, close, progress), close, progress)
         if part is None and start is None and (runs := thinned(problem.runs)) is not problem.runs:
             part = fit_state_space(replace(problem, runs=runs), thorough=thorough, rtol=rtol, **choice)
         if part is not None and part.maximum.status is not Status.INTEGRATION:
-            return _on_all(part, likelihood, **choice)
-        return _fitted(likelihood, start or {}, thorough=thorough, **choice)
+            found = _on_all(part, likelihood, **choice)
+        else:
+            found = _fitted(likelihood, start or {}, thorough=thorough, **choice)
+        return _surveyed(found, close, progress) if problem.tables else found
     except KeyboardInterrupt as error:
         last = next((own.best for own in reversed(tried) if own.best is not None), None)
         raise Interrupted(last.values if last else problem.named(problem.start)) from error
@@ -841,6 +894,32 @@ def with_priors(found: StateSpaceFit, priors: Sequence[tuple[tuple[str, ...], fl
     likelihood = Likelihood(problem, smooth=own.smooth, processes=own.processes, rtol=own.base_rtol)
     maximum = maximise(likelihood, likelihood.coordinates(found.values), widths=())
     return StateSpaceFit(likelihood, maximum, found.evaluations + likelihood.evaluations)
+
+
+def _of_tables(
+    likelihood: Callable[[bool, Sequence[str]], Likelihood],
+    start: Mapping[str, float],
+    close: float,
+    progress: Callable[[str], None],
+) -> StateSpaceFit:
+    """Return the fit of a problem without runs: there is neither field nor gauge."""
+    own = likelihood(True, ())
+    return StateSpaceFit(own, maximise(own, own.coordinates(start), close=close, progress=progress), own.evaluations)
+
+
+def _surveyed(found: StateSpaceFit, close: float, progress: Callable[[str], None]) -> StateSpaceFit:
+    """Return a fit whose critical loads are the nearest of all: where a search of every line finds nearer ones, it goes on."""
+    own, maximum, before = found.likelihood, found.maximum, found.likelihood.evaluations
+    if maximum.status is Status.INTEGRATION:
+        return found
+    for _ in range(SURVEYS):
+        point = own.at(maximum.point.x, anew=True)
+        if abs(point.log_likelihood - maximum.point.log_likelihood) < close**2 / 2:
+            maximum = replace(maximum, point=point)
+            break
+        progress(f"nearer critical loads: log likelihood {point.log_likelihood:.1f}")
+        maximum = maximise(own, point.x, close=close, widths=(), progress=progress)
+    return StateSpaceFit(own, maximum, found.evaluations + own.evaluations - before)
 
 
 def stopped(problem: Problem, values: Mapping[str, float]) -> StateSpaceFit:
@@ -1345,6 +1424,7 @@ def as_fit(found: StateSpaceFit) -> Fit:
     likelihood, maximum = found.likelihood, found.maximum
     problem, values, k = likelihood.problem, found.values, len(likelihood.problem.names)
     held = [likelihood.held_out(run, values) for run in problem.experiment.runs if run.holdout]
+    tables = [likelihood.held_out_table(t, values) for t in problem.experiment.thresholds if t.holdout and problem.stability]
     runs, others = [], []
     for f in (*maximum.point.runs, *held):
         first, *beside = [_run_fit(likelihood, f, number, values) for number in range(len(f.run.signals))]
@@ -1354,6 +1434,7 @@ def as_fit(found: StateSpaceFit) -> Fit:
         problem.names, {**problem.held, **{n: values[n] for n in problem.names}}, found.covariance[:k, :k], problem.lower,
         problem.upper,
         tuple(runs), found.log_likelihood, maximum.status, found.evaluations, others=tuple(others),
+        tables=(*maximum.point.tables, *tables),
     )  # fmt: skip
 
 

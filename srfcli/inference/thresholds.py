@@ -15,7 +15,8 @@ import numpy as np
 
 from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
-from srfcli.inference.threshold_table import RHO, Scale, Thresholds
+from srfcli.data.thresholds import Thresholds
+from srfcli.inference.free_parameters import RHO, Scale
 from srfcli.numerics.boundary import CHUNK, BoundaryPoint, along, linearise_boundary, polish
 from srfcli.numerics.collocation import join
 from srfcli.numerics.critical import critical_line

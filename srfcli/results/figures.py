@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 from srfcli.results.plots import (
     COLOURS,
     DASHES,
+    NAME,
     QUANTITY,
     Values,
     bare_figure,
@@ -24,6 +25,8 @@ from srfcli.results.plots import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from srfcli.data.thresholds import Thresholds
 
 # Figures of stability maps: growth as colour, boundaries as lines, special points as marks.
 
@@ -486,16 +489,42 @@ def envelope(t: Any, y: Any, *, bins: int = BINS) -> tuple[Any, Any]:
 FitRow = tuple[str, bool, str, Any, Any, Any, float]
 
 
-def fit_figure(rows: Sequence[FitRow], *, title: str = "", found: str = "") -> Figure:
+def draw_loads(ax: Axes, table: Thresholds, computed: Mapping[str, Values]) -> None:
+    """Draw measured critical loads, with their errors, and computed ones (n,) over V, by name; all but the first are thin."""
+    import numpy as np
+
+    mark: dict[str, Any] = {"fmt": "o", "markersize": 5, "markerfacecolor": "none"}
+    for index, eps in enumerate(np.unique(table.eps)):
+        colour, dash = COLOURS[index % len(COLOURS)], DASHES[index % len(DASHES)]
+        here = np.flatnonzero(table.eps == eps)
+        here = here[np.argsort(table.V[here], kind="stable")]
+        ax.errorbar(table.V[here], table.W0c[here], yerr=table.sigma[here], color=colour, **mark)
+        for number, (name, loads) in enumerate(computed.items()):
+            style: dict[str, Any] = {"color": colour, "linestyle": dash} | ({"linewidth": 0.6} if number else {})
+            ax.plot(table.V[here], np.asarray(loads)[here], label=f"{name}, ε = {eps:g}", **style)
+    ax.errorbar([], [], yerr=[], color="#555555", label="measured, ± σ", **mark)
+    ax.set(xscale="log", yscale="log", xlabel="V  [µm/s]", ylabel="critical W$_0$  [N]")
+    decade_ticks(ax)
+    ax.legend(loc="best", fontsize=NAME, handlelength=2.8)
+
+
+def fit_figure(
+    rows: Sequence[FitRow],
+    *,
+    title: str = "",
+    found: str = "",
+    tables: Sequence[tuple[str, bool, Thresholds, Values]] = (),
+) -> Figure:
     """Return a figure of two panels for each observable of a run.
 
     A row is (name, held out, quantity with its unit, t in s, recorded, predicted, noise level).
 
-    `title` names the laws, `found` the parameters with their errors.
+    `title` names the laws, `found` the parameters with their errors. Each of the `tables` of critical loads has a panel: name,
+    held out, measured, and computed loads (n,).
     """
     with house_style():
-        columns = 2 if len(rows) > 1 else 1
-        lines = -(-len(rows) // columns)
+        columns = 2 if len(rows) + len(tables) > 1 else 1
+        lines = -(-(len(rows) + len(tables)) // columns)
         figure = bare_figure((6.0 * columns if columns == 1 else 5.2 * columns, 2.9 * lines + 0.9))
         grid = figure.add_gridspec(lines, columns)
         handles: list[Any] = []
@@ -518,6 +547,10 @@ def fit_figure(rows: Sequence[FitRow], *, title: str = "", found: str = "") -> F
             below.set_xlabel("time  [s]")
             above.margins(x=0.01)
             figure.align_ylabels([above, below])
+        for place, (name, holdout, table, loads) in enumerate(tables, len(rows)):
+            ax = figure.add_subplot(grid[place // columns, place % columns])
+            draw_loads(ax, table, {"fit": loads})
+            ax.set_title(name_text(name) + (" (held out)" if holdout else ""))
         names_below(figure, handles, [h.get_label() for h in handles], markerscale=3)
         heading(figure, "\n".join(t for t in (title, found) if t))
         return figure

@@ -1,4 +1,4 @@
-"""A fit of recordings: parameters with their errors and flags, how each run is fitted, the posterior where it was drawn."""
+"""A fit of an experiment: parameters with errors and flags, how each run and table is fitted, the posterior if it was drawn."""
 
 from __future__ import annotations
 
@@ -18,10 +18,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from srfcli.data.thresholds import Thresholds
     from srfcli.data.values import Experiment
     from srfcli.inference.fit import Fit, Problem, RunFit
     from srfcli.inference.posterior import Interval, Posterior
     from srfcli.inference.recordings import RecordingFit
+    from srfcli.inference.thresholds import Match
 
 PARAMETERS = (
     Column("parameter", "", "name"),
@@ -44,6 +46,25 @@ RUNS = (
     Column("rms_over_noise", "", "1 where the model explains all but the noise", ".4g"),
     Column("lag1", "", "correlation of neighbouring residuals", ".3g"),
     Column("order", "", "how many times of correlation the gauge's noise has"),
+)
+TABLES = (
+    Column("table", "", "name"),
+    Column("role", "", "fit, or held out"),
+    Column("loads", "1", "critical loads in it"),
+    Column("chi2", "1", "sum of squared residuals in sigma", ".4g"),
+    Column("largest", "1", "residual, in sigma", ".3g"),
+    Column("missing", "1", "lines on which the model has no such crossing"),
+)
+LOADS = (
+    Column("line", "1", "of the table"),
+    Column("V", "um/s", "driving velocity"),
+    Column("eps", "1", "as the table has it"),
+    Column("measured", "N", "critical load of the table"),
+    Column("sigma", "N", "its standard error"),
+    Column("W0c", "N", "nearest odd crossing of the model; where it is missing, the end that it lies beyond", ".7g"),
+    Column("residual", "1", "(W0c - measured)/sigma", ".3g"),
+    Column("next_odd", "N", "second nearest odd crossing among those looked at"),
+    Column("type", "", "hopf, ns, pd or fold; missing where the model has no such crossing"),
 )
 POSTERIOR = (
     Column("parameter", "", "name"),
@@ -76,7 +97,7 @@ BROAD = 3e-3  # of the friction: a random friction field ten times that of a pol
 
 @dataclass(frozen=True, repr=False, eq=False)
 class FitResult(Result):
-    """The maximum-likelihood fit of a model to all recordings of an experiment.
+    """The maximum-likelihood fit of a model to all recordings and critical loads of an experiment.
 
     Attributes
     ----------
@@ -114,9 +135,26 @@ class FitResult(Result):
         return dict(self.found.fit.stderr)
 
     @cached_property
-    def runs(self) -> Table:
-        """Return a row for each run, fitted or held out: residual, noise, and what is left of them."""
-        return run_table(self.found.fit, self.experiment)
+    def runs(self) -> Table | None:
+        """Return a row for each run, fitted or held out: residual, noise, and what is left of them; None without runs."""
+        return run_table(self.found.fit, self.experiment) if self.experiment.runs else None
+
+    @cached_property
+    def tables(self) -> Table | None:
+        """Return a row for each table of critical loads, fitted or held out; None where there is none."""
+        rows = [
+            (t.loads.name, "held out" if t.loads.holdout else "fit", t.white.size, t.match.cost,
+             float(abs(t.white).max()), int(t.match.missing.sum()))
+            for t in self.found.fit.tables
+        ]  # fmt: skip
+        return Table("srf.fit.tables/1", TABLES, rows, "tables of critical loads") if rows else None
+
+    @cached_property
+    def loads(self) -> Table | None:
+        """Return a row for each critical load, measured and computed; None where there is none."""
+        rows = [(t.loads.name, *row) for t in self.found.fit.tables for row in load_rows(t.loads.table, t.match)]
+        columns = (Column("table", "", "name"), *LOADS)
+        return Table("srf.fit.loads/1", columns, rows, "critical loads") if rows else None
 
     @cached_property
     def varied(self) -> Table | None:
@@ -135,6 +173,9 @@ class FitResult(Result):
         made = parameter_table(
             found.problem, found.fit, self.intervals, found.starts, self.posterior, self.runs, self.worst
         )
+        if self.tables is not None and self.loads is not None:
+            parts = {"tables": as_records(self.tables), "loads": as_records(self.loads)}
+            made = replace(made, notes=(*made.notes, *load_notes(found.fit)), meta={**made.meta, **parts})
         if found.track is not None:
             from srfcli.inference.state_space import typical_friction
 
@@ -152,7 +193,9 @@ class FitResult(Result):
         return made
 
     def plot(self, ax: Axes | None = None) -> Figure:
-        """Return each run's recording and prediction above its residual."""
+        """Return each run's recording and prediction above its residual, and each table's measured and computed loads."""
+        import numpy as np
+
         from srfcli.results.figures import fit_figure
         from srfcli.results.plots import symbol_text
         from srfcli.results.report_text import NO_BREAK, bracketed, unit_text
@@ -160,6 +203,9 @@ class FitResult(Result):
         own_figure(ax, "a fit")
         problem, fit, experiment = self.found.problem, self.found.fit, self.experiment
         runs = {r.name: r for r in experiment.runs}
+        tables = [
+            (t.loads.name, t.loads.holdout, t.loads.table, np.where(t.match.missing, np.nan, t.match.loads)) for t in fit.tables
+        ]
         rows, told = [], []
         for f in every_observable(fit):
             run, what = runs[f.name], f.observable or runs[f.name].observable
@@ -174,7 +220,7 @@ class FitResult(Result):
             told.append(f"{symbol_text(name)} = {bracketed(value, error)}{shown}")
         choice = experiment.choice
         title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
-        return fit_figure(rows, title=title, found=", ".join(told))
+        return fit_figure(rows, title=title, found=", ".join(told), tables=tables)
 
 
 def parameter_table(
@@ -183,7 +229,7 @@ def parameter_table(
     intervals: Sequence[Interval],
     starts: Sequence[tuple[float, bool]],
     posterior: Posterior | None,
-    runs: Table,
+    runs: Table | None,
     status: Status,
 ) -> Table:
     """Return the estimates as a table whose `meta` has the runs, the correlations and all that has no column."""
@@ -204,7 +250,7 @@ def parameter_table(
     notes += filter(None, [problem.experiment.rescaled()])
     notes += [] if posterior is None else _posterior_notes(posterior)
     meta = {
-        "runs": [dict(zip((c.name for c in RUNS), row, strict=True)) for row in runs.rows],
+        "runs": [] if runs is None else as_records(runs),
         "correlation": fit.correlation,
         "log_likelihood": fit.log_likelihood,
         "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
@@ -217,6 +263,38 @@ def parameter_table(
         "posterior": None if posterior is None else _described(posterior),
     }
     return Table("srf.fit/2", PARAMETERS, rows, problem.experiment.title, tuple(notes), {}, meta, status=status.value)
+
+
+def as_records(table: Table) -> list[dict[str, Any]]:
+    """Return the rows of a table by the names of its columns."""
+    return [dict(zip((c.name for c in table.columns), row, strict=True)) for row in table.rows]
+
+
+def load_rows(table: Thresholds, match: Match) -> list[tuple[Any, ...]]:
+    """Return a row under LOADS for each critical load."""
+    kinds = ["missing" if c is None else getattr(c.point, "kind", "hopf") for c in match.crossings]
+    cells = (table.lines, table.V, table.eps, table.W0c, table.sigma, match.loads, match.residuals, match.rivals, kinds)
+    return [tuple(v.item() if hasattr(v, "item") else v for v in row) for row in zip(*cells, strict=True)]
+
+
+def load_notes(fit: Fit) -> list[str]:
+    """Return what a reader of a fit has to know of its critical loads: whether they are described, and how they were matched."""
+    from srfcli.inference.critical_loads import chance_of
+    from srfcli.inference.thresholds import match_notes
+
+    notes, fitted = [], [t for t in fit.tables if not t.loads.holdout]
+    alone = not any(not r.holdout for r in fit.runs)
+    size, cost = sum(t.white.size for t in fitted), sum(t.match.cost for t in fitted)
+    freedom = size - len(fit.names) if alone else size  # beside recordings they have little say in the parameters
+    chance = chance_of(cost, freedom)
+    if fit.status.ok and chance < 1e-3:
+        notes.append(
+            f"critical loads: chi2 {cost:.4g} on {freedom} degrees of freedom, chance {chance:.1g}; the model does not describe"
+            " them within sigma, and the errors do not allow for that"
+        )
+    for t in fit.tables:
+        notes += [f"{t.loads.name}: {text}" for text in (*t.loads.table.notes, *match_notes(t.loads.table, t.match))]
+    return notes
 
 
 def posterior_table(problem: Problem, posterior: Posterior) -> Table:
@@ -324,8 +402,9 @@ def flag(fit: Fit, k: int) -> str:
 
 
 def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float, bool]]) -> list[str]:
-    notes = [f"rms over noise {fit.rms_over_noise():.3f} in the runs fitted"]
-    if any(f.holdout for f in fit.runs):
+    of = "runs" if fit.runs else "critical loads"
+    notes = [f"rms over noise {fit.rms_over_noise():.3f} in the {of} fitted"]
+    if any(f.holdout for f in fit.runs) or any(t.loads.holdout for t in fit.tables):
         notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
     done = [i.name for i in intervals]
     whose = "profile likelihood" + (

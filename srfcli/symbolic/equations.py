@@ -129,11 +129,11 @@ class Parts:
         return tuple(f for f in found if f is not None)
 
 
-def parts_of(system: System) -> Parts:
+def parts_of(system: System, *, cyclic: bool = False) -> Parts:
     """Return friction coefficient, contact stiffness, load on the asperities, extra force, stage velocity and so on of `system`.
 
     Each effect's formula takes the place of what was there before; the tables come last. A gauge that weighs shows the spring's
-    force over the stated K.
+    force over the stated K. `cyclic` is as `equations_of` has it.
     """
     found = {"mu": system.friction.mu, "W": symbol("W"), "force": sp.S.Zero, "V": symbol("V"), "K": symbol("K")}
     stiffness, shown = symbol("K"), list[sp.Expr]()
@@ -156,8 +156,8 @@ def parts_of(system: System) -> Parts:
     for number, (slot, argument) in enumerate(system.tables):
         value = lut(sp.Integer(number), symbol(argument))
         found[slot] = found[slot] * (1 + value) if slot == "V" else found[slot] + value
-    parts = {slot: _modulated(f) for slot, f in found.items()}
-    return Parts(**{"kappa": None, **parts}, shown=tuple(map(_modulated, shown)))
+    parts = {slot: _modulated(f, cyclic=cyclic) for slot, f in found.items()}
+    return Parts(**{"kappa": None, **parts}, shown=tuple(_modulated(f, cyclic=cyclic) for f in shown))
 
 
 def check_slots(system: System, parts: Parts) -> None:
@@ -180,42 +180,48 @@ def check_slots(system: System, parts: Parts) -> None:
             )
 
 
-def _modulated(formula: sp.Expr) -> sp.Expr:
-    """Return a formula with the modulation's angle and envelope written in the clock and in the run's own parameters."""
+def _modulated(formula: sp.Expr, *, cyclic: bool) -> sp.Expr:
+    """Return a formula with the modulation's angle and envelope written in the clock and in the run's own parameters.
+
+    Where it is `cyclic` the angle is 0 at time 0 and the envelope is left, as it does not change.
+    """
     s, t = symbol, symbol("time")
+    if cyclic:
+        return formula.subs(s("theta"), 2 * sp.pi * s("f") * t)
     envelope = (1 + sp.tanh((t - s("onset0")) / s("rise0"))) / 2  # of its switch-on
     return formula.subs({s("theta"): 2 * sp.pi * s("f") * t + s("psi"), s("envelope"): envelope})
 
 
-def auxiliary(system: System, parts: Parts) -> tuple[str, ...]:
-    """Return which of slip, stage and time the equations need as unknowns."""
+def auxiliary(system: System, parts: Parts, *, cyclic: bool = False) -> tuple[str, ...]:
+    """Return which of slip, stage and time the equations need besides the unknowns of motion."""
     formulas = [*parts.formulas(), *(e.rate for e in system.extra_states)]
     formulas += [f for e in system.effects for slot, f in e.changes if slot == "rate"]
-    used = {str(x) for f in formulas for x in _modulated(f).free_symbols}
+    used = {str(x) for f in formulas for x in _modulated(f, cyclic=cyclic).free_symbols}
     return tuple(a for a in AUXILIARY if a in used)
 
 
 @lru_cache(maxsize=32)
-def equations_of(system: System) -> Equations:
+def equations_of(system: System, *, cyclic: bool = False) -> Equations:
     """Return x' = f(x, t) of `system`, solved for the derivatives.
 
     The slip relation d(W mu/kappa)/dt = z - v, the force balance and the ageing laws are linear in the unknown derivatives
-    as long as each law is linear in mu_dot, W_dot and F_dot_over_W; otherwise SrfError.
+    as long as each law is linear in mu_dot, W_dot and F_dot_over_W; otherwise SrfError. Where they are `cyclic` the load is
+    constant or modulated for ever, time is no unknown, and the formulas hold `time`, `envelope` and `modulated` as they are.
     """
-    return _Builder(system).equations()
+    return _Builder(system, cyclic=cyclic).equations()
 
 
 class _Builder:
     """The balance of one system with stand-ins for what is long, and their meanings."""
 
-    def __init__(self, system: System) -> None:
-        self.system, self.parts = system, parts_of(system)
+    def __init__(self, system: System, *, cyclic: bool = False) -> None:
+        self.system, self.parts, self.cyclic = system, parts_of(system, cyclic=cyclic), cyclic
         check_slots(system, self.parts)
         self.extras = tuple(
             replace(e, rate=e.rate.subs(symbol("gauge"), shown), steady=e.steady.subs(symbol("gauge"), shown))
             for e, shown in zip(system.extra_states, self.parts.shown, strict=True)
         )
-        self.aux = auxiliary(system, self.parts)
+        self.aux = auxiliary(system, self.parts, cyclic=cyclic)
         self.phis = [symbol(state.name) for state in system.friction.states]
         self.steady = steady_states(system)
         self.mu, self.load, self.V = sp.Symbol("mu_"), sp.Symbol("load_"), sp.Symbol("V_")
@@ -254,15 +260,16 @@ class _Builder:
             rate = self.extra_rate(extra)
             rates.append(rate / s(extra.name) if extra.logarithmic else rate)
             steady.append(self.settled(extra.steady, u_rest, mu_ss))
-        for name in aux:
+        for name in () if self.cyclic else aux:
             names.append(name)
             unknowns.append(s(name))
             rates.append(self.aux_rate(name))
             steady.append(self.settled(s(name), u_rest, mu_ss))
         meaning = [*([] if system.inertia else [(s("u"), spring)]), *meaning]  # it is made of what follows
-        filled = [_modulated(r.subs(meaning)) for r in rates]
-        self.check_known(filled, {*map(str, unknowns), "V", "W", "W_dot"})
-        self.check_known(steady, set())
+        filled = [_modulated(r.subs(meaning), cyclic=self.cyclic) for r in rates]
+        clock = {"time", "envelope"} if self.cyclic else set()
+        self.check_known(filled, {*map(str, unknowns), "V", "W", "W_dot", *clock})
+        self.check_known(steady, clock)
         reading, shown = self.parts.gauge, self.parts.plain
         if not system.inertia:
             spring, reading, shown = (e.subs(meaning) for e in (spring, reading, shown))

@@ -65,6 +65,7 @@ RANDOM_FIELD = Effect(  # correlation (1 + r) exp(-r), r = sqrt(3) d/length (Mat
     neutral=(("field_amplitude", 0.0),),
 )  # fmt: skip
 EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "gauge", "kappa", "force", "rate", "V")
+PASSING = {"slip": "slip", "stage": "the stage's position", "time": "time"}  # what an effect may name that never comes back
 LOADINGS = ("vertical", "inclined")
 
 
@@ -143,12 +144,15 @@ def build_system(
     effects: Sequence[str] = (),
     tables: Sequence[tuple[str, str]] = (),
     random_field: bool = False,
+    stability: bool = False,
 ) -> System:
     """Return the system that these registered names describe; `ageing` may carry modifiers, `dieterich+linker-dieterich`.
 
-    With `random_field` a random friction field along slip adds to mu, as RANDOM_FIELD says.
+    With `random_field` a random friction field along slip adds to mu, as RANDOM_FIELD says. With `stability` effects that
+    critical loads do not depend on are left out.
     """
-    added = apart([_of(Effect, registry.get("effect", name)) for name in effects])
+    every = [_of(Effect, registry.get("effect", name)) for name in effects]
+    added = tuple(e for e in apart(every) if not (stability and without_part(e)))
     if random_field:
         added = (*added, RANDOM_FIELD)
     for effect in added:
@@ -169,6 +173,16 @@ def build_system(
     )
     _check_symbols(system)
     return system
+
+
+def without_part(effect: Effect) -> str:
+    """Return why critical loads do not depend on an effect: as a clause that follows its name, or nothing where they do."""
+    if effect.observed or (effect.changes and all(slot == "gauge" for slot, _ in effect.changes)):
+        return "changes what the gauge shows, not how the slider moves"
+    formulas = [*(f for _, f in effect.changes), *(e for x in effect.states for e in (x.rate, x.steady))]
+    used = {str(s) for f in formulas for s in f.free_symbols}
+    along = next((name for name in PASSING if name in used), "")
+    return f"changes with {PASSING[along]}, so that no sliding is steady" if along else ""
 
 
 def with_effects(system: System, effects: Sequence[Effect]) -> System:

@@ -112,6 +112,7 @@ def fit_one(task: Task) -> dict[str, Any]:
     try:
         registry = load_registry([Path(p) for p in task.plugins])
         experiment = read_experiment(task.path, format=task.reader, registry=registry)
+        experiment.check_recorded("for a row")
         found = fit(experiment, registry=registry, **dict(task.options))
         if found.worst is Status.INTERRUPTED:
             raise KeyboardInterrupt

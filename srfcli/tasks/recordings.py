@@ -89,7 +89,7 @@ def fit(
     registry: Registry | None = None,
     progress: Callable[[str, str, float | None], None] = lambda stage, text, share: None,
 ) -> FitResult:
-    """Return the maximum-likelihood fit of an experiment's model to its recordings, all runs together.
+    """Return the maximum-likelihood fit of an experiment's model to its recordings and critical loads, all together.
 
     The gauge's noise, its level and colour, and a random friction field along slip are estimated with the parameters and count
     in their errors.
@@ -173,6 +173,8 @@ def fit(
     registry = registry or load_registry()
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment, registry=registry)
+    if sample:
+        experiment.check_recorded("of which a posterior is drawn")
     found = fit_recordings(
         registry, experiment, free=free, trend=trend, vary=vary, by=by, prior=prior, track=track,
         ask_shared=not (profile or sample), starts=starts, seed=seed, progress=lambda text: progress("fit", text, None),
