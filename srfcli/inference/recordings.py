@@ -107,10 +107,10 @@ def fit_recordings(
     """Return the maximum-likelihood fit of all runs and tables of critical loads together.
 
     Parameters that `vary` have a value for each group of runs. `track` is "smooth" for no random friction field, "rough" for one
-    in each run, "shared" for one that all runs share; left out, the recordings decide, whether it is shared only with `ask_shared`
-    and without critical loads. With `prior` the values of five groups or more are drawn towards their mean. Without a C compiler
-    there is no field, and noise is autoregressive. A fit stopped by Ctrl-C is a status; SrfError is raised for what cannot be
-    fitted.
+    in each run, "shared" for one that all runs share; left out, the recordings decide, whether it is shared only with
+    `ask_shared` and without critical loads. With `prior` the values of five groups or more are drawn towards their mean. Without
+    a C compiler there is no field, and noise is autoregressive. A fit stopped by Ctrl-C is a status; SrfError is raised for what
+    cannot be fitted.
     """
     beside = next((run.name for run in experiment.runs if run.others), "")
     if beside and (track == "shared" or compiler() is None):
