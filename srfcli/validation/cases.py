@@ -123,7 +123,10 @@ OUTSIDE: tuple[Effect, ...] = (
         resembles=("load-transmission", "linker-dieterich"),
     ),
     Effect("speed-dependent-length", "D_power", 0.04, 0.4, BOTH, listed=False, resembles=("slip-evolution",)),
-    Effect("load-dependent-friction", "W_power", 0.004, 0.08, BOTH, listed=False, resembles=("adhesion-offset",)),
+    Effect(
+        "load-dependent-friction", "W_power", 0.004, 0.08, BOTH, listed=False,
+        resembles=("adhesion-offset", "tangential-crosstalk"),
+    ),
     Effect("age-limit", "age_rate", 0.05, 2.0, listed=False, resembles=("age-saturation",)),
     Effect("interface-damping", "eta", 5e-4, 0.02, listed=False),
     Effect("drive-lag", "drive_tau", 0.005, 0.15, listed=False, resembles=("sensor-lag",)),
