@@ -614,7 +614,7 @@ def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
 def _smooth(place: Place, W: Array) -> tuple[Load, list[Notice]]:
     if np.ptp(W) == 0 or W.size < 4:
         return ConstantLoad(float(W[0])), []
-    noise = white_level(W)
+    noise = white_level(W, place.t)
     mean = float(W.mean())
     if noise and is_constant(W, noise):
         what = f"constant to its noise of {noise / mean:.2g} of {mean:.6g} N: taken as constant"

@@ -16,13 +16,18 @@ from srfcli.core.errors import SrfError
 from srfcli.data.clock import Mask, runs_of
 
 SEGMENT = 256  # samples of a periodogram
+NEIGHBOURS = 9  # samples whose mean time is an even one
+JITTER = 1e-3  # spacings by which a sample may be off an even time, and be taken as even
 
 
-def white_level(x: Array) -> float:
+def white_level(x: Array, t: Array | None = None) -> float:
     """Return the standard deviation of white noise whose floor the spectrum of x (n,) shows above half the Nyquist frequency.
 
-    The median over frequencies and stretches: lines, events and a slow signal do not raise it. Coloured noise counts as signal.
+    The median over frequencies and stretches: lines, events and a slow signal do not raise it. Coloured noise counts as signal, and
+    so would a signal that is read at uneven times: where those are given, t (n,), it is what even ones nearby would have read.
     """
+    if t is not None:
+        x = _at_even_times(t, x)
     length = min(SEGMENT, 2 ** int(np.log2(max(x.size, 1))))
     if length < 16:
         third = np.diff(x, 3) if x.size > 3 else np.zeros(1)
@@ -39,11 +44,27 @@ def white_level(x: Array) -> float:
     return float(np.sqrt(np.median(np.median(upper, axis=1)) / np.log(2)))
 
 
+def _at_even_times(t: Array, x: Array) -> Array:
+    """Return x (n,), by a spline through it, at the means of neighbouring times t (n,); x itself where these are even."""
+    from scipy.interpolate import make_interp_spline
+    from scipy.ndimage import uniform_filter1d
+
+    if x.size < 4 * NEIGHBOURS:
+        return x
+    moved = t.copy()
+    inner = slice(NEIGHBOURS // 2, -(NEIGHBOURS // 2))
+    moved[inner] = t[0] + uniform_filter1d(t - t[0], NEIGHBOURS)[inner]
+    if np.median(np.abs(moved - t)) < JITTER * np.median(np.diff(t)):
+        return x
+    return np.asarray(make_interp_spline(t, x, k=5)(moved))
+
+
 # Flaws of a channel: spikes, level jumps of a transducer, saturation, and the step of its quantisation.
 
 WIDEST_SPIKE = 3  # samples of a spike
 BESIDE = 5  # samples before and after that tell the level
 FACTOR = 8.0  # robust standard deviations
+CREST = 0.5  # share of a spike's size by which it is off a cubic through its neighbours, at least
 FEW = 0.02  # share of samples that move: below it they are the accidents of a constant, and not its noise
 SATURATED = 10  # samples in a row at the extreme value
 LARGE = 0.05  # share of the level from which a jump is a transducer's for certain
@@ -116,9 +137,24 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
         if rise is not None:  # from the median before, three samples back, to the median after
             threshold = np.maximum(threshold, 3 * (width + 5) * rise[first])
         hit = (size > threshold) & (np.abs(after - before) < 0.5 * size)
+        hit &= _off_neighbours(x, first, width) > CREST * size
         for k in range(width):
             found[first[hit] + k] = True
     return found
+
+
+def _off_neighbours(x: Array, first: NDArray[np.intp], width: int) -> Array:
+    """Return by how much groups of samples that begin at `first` are off the cubics through two samples on each side, at least.
+
+    The crest of a wave of eight samples and more is foretold by its neighbours, a spike is not.
+    """
+    at = np.array([-2.0, -1.0, width, width + 1.0])
+    sides = np.stack([x[first - 2], x[first - 1], x[first + width], x[first + width + 1]])
+    off = []
+    for k in range(width):
+        weights = [np.prod((k - np.delete(at, j)) / (at[j] - np.delete(at, j))) for j in range(4)]
+        off.append(np.abs(x[first + k] - np.array(weights) @ sides))
+    return np.asarray(np.min(off, axis=0))
 
 
 def saturation(x: Array, *, fewest: int = 1) -> Mask:

@@ -437,7 +437,7 @@ class ModelSearch:
                 self._push(node.evidence + pair.gain + 2 * one, Hypothesis(pair.effects), node, pair.values)
 
     def _swap(self, node: Fitted) -> None:
-        """Push the other registered ageing laws, each after a few steps from where the model stands."""
+        """Push the other registered ageing laws, each after a few steps from where the model stands, with what its score promises."""
         stated, *modifiers = self.experiment.choice.ageing.split("+")
         for name in self.laws:
             if name == stated:
@@ -447,11 +447,11 @@ class ModelSearch:
             if likelihood is None:
                 continue
             x = likelihood.coordinates(_followable(node.fit.values, likelihood.problem))
-            found = maximise(likelihood, x, steps=3, close=1.0, progress=self.progress)
-            if found.status is Status.INTEGRATION:
+            found = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
+            if not np.isfinite(found.away):
                 continue
             self.count += 1
-            expected = found.point.log_likelihood - node.fit.log_likelihood + node.evidence
+            expected = found.point.log_likelihood + 0.5 * found.away**2 - node.fit.log_likelihood + node.evidence
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
 
     def _eliminate(self) -> None:

@@ -224,6 +224,7 @@ def _check_positive(name: str, value: float) -> None:
 # A measured load as piecewise polynomials; um, s, N.
 
 UNEVEN = 1.6  # ratio of an interval to its neighbours' median at which a stretch ends
+WANDER = 6.0  # times the median of the logarithms of these ratios, if that is more: of times that are all uneven
 SHORTEST = 16  # samples of a stretch that carries the spline
 REACH = 4  # samples on each side from which a sample is foretold
 ROUGH = 0.02  # share of the local range by which a sample may differ from what its neighbours foretell
@@ -343,13 +344,13 @@ def _build(t: Array, W: Array, noise: float) -> tuple[Array, Array, tuple[float,
 
 
 def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
-    """Return first and last sample of the stretches that carry a spline: evenly sampled, without jump or corner inside."""
+    """Return first and last sample of the stretches that carry a spline: as evenly sampled as all is, without jump or corner."""
     steps = np.diff(t)
     usual = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(steps, 2, mode="edge"), 5), axis=1)
-    even = np.abs(np.log(steps / usual)) < np.log(UNEVEN)
-    change = np.abs(np.diff(np.log(steps))) > np.log(
-        UNEVEN
-    )  # between two rates a sample ends one stretch, begins the next
+    off = np.abs(np.log(steps / usual))
+    allowed = max(np.log(UNEVEN), WANDER * float(np.median(off)))  # of times that wander, a spline goes through what they are
+    even = off < allowed
+    change = np.abs(np.diff(np.log(steps))) > (allowed if allowed == np.log(UNEVEN) else 2 * allowed)  # between two rates
     found = []
     for a, b in _runs(even):
         cuts = [a, *(a + 1 + np.flatnonzero(change[a:b])).tolist(), b + 1]

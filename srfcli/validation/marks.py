@@ -181,7 +181,9 @@ def _key(name: str) -> tuple[str, frozenset[str]]:
 
 
 def _listed(truth: Mapping[str, Any], answer: Answer) -> bool:
-    """Return whether an ambiguous answer lists the truth, or what it calls its equivalents."""
+    """Return whether an ambiguous answer lists the truth or its equivalents, or an inconclusive one is about nothing."""
+    if truth["verdict"] == "none":
+        return answer.verdict == "inconclusive"
     if answer.verdict != "ambiguous" or truth["verdict"] != "identified":
         return False
     listed = set(answer.effects)
