@@ -157,6 +157,12 @@ def test_the_recordings_are_the_same(experiment: Experiment, tmp_path: Path) -> 
     assert again.choice.effects == () and again.choice.inertia
 
 
+def test_what_varies_goes_along(experiment: Experiment, tmp_path: Path) -> None:
+    fit = fitted(replace(experiment, vary=("A",), by="load"), A=(0.0133, 0.006, 0.03, "1"))
+    again, _ = written(replace(experiment, vary=("A",), by="load"), (), fit, tmp_path / "new")
+    assert (again.vary, again.by) == (("A",), "load")
+
+
 def test_stiffness_and_mass_go_into_the_apparatus(experiment: Experiment, tmp_path: Path) -> None:
     fit = fitted(experiment, K=(0.25, 0.04, 1.0, "N/um"), M=(3e-6, 1e-9, 1e-4, "kg"))
     again, found = written(experiment, ("stiffness-error",), fit, tmp_path / "new")

@@ -17,6 +17,8 @@ from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import load_registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, SampledLoad
 from srfcli.motion.integrators import Motion, integrate
+from srfcli.tasks.diagnose import diagnose
+from srfcli.validation.cases import make_case
 from srfcli.validation.slider import Physics, Plan, move
 
 REGISTRY = load_registry(user=False, entry_points=False)
@@ -326,3 +328,17 @@ V0 = { value = 10.0, fixed = true }
 m = { value = 0.0 }
 Wref = { value = 7.0 }
 """
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here")
+def test_a_concealed_servo_is_found_where_it_is_asked_for(tmp_path: Path) -> None:
+    """Of another code: near its modulations a servo is almost a smaller load-transmission, and its frequency has false maxima."""
+    truth = make_case(
+        tmp_path / "servo", 7, effects=["load-servo"], size=0.6, rough=0.0, strengths=False
+    )["physics"]
+    found = diagnose(tmp_path / "servo", effects=["load-servo", "load-transmission"], registry=REGISTRY)
+    assert (found.verdict, found.effects) == ("identified", ("load-servo",))
+    fitted = found.diagnosis.final.fit.values
+    for name, own in (("share", "servo"), ("natural", "servo_f"), ("damping", "servo_damping")):
+        assert fitted[name] == pytest.approx(truth[own], rel=0.05)

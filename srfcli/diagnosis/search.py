@@ -383,8 +383,12 @@ class ModelSearch:
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
 
     def _again(self, node: Fitted) -> _Move | None:
-        """Return a model that fails a test from another size of what is built in, where that is likelier: a false maximum."""
+        """Return a model that fails a test from another size of what is built in, where that is likelier: a false maximum.
+
+        So with the first of several inner parameters of an effect with states, as a frequency beside a damping.
+        """
         built = [p.name for e in node.hypothesis.effects if e.settings for p in e.parameters]
+        built += [e.scans[0][0] for e in node.hypothesis.effects if e.states and len(e.scans) > 1]
         likelihood = node.fit.likelihood
         name = next((n for n in likelihood.problem.names if n in built), None)
         if name is None:
