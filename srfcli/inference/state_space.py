@@ -26,7 +26,7 @@ from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.data.values import CriticalLoads, Experiment, Run
-from srfcli.inference.critical_loads import Matched, TableLikelihood, joined_slopes
+from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
 from srfcli.inference.kalman import Dual, Innovations, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, stretches
@@ -350,7 +350,7 @@ class Likelihood:
         place = {name: n for n, names in varying.items() for name in names}
         rows = zip(problem.names, problem.start, problem.lower, problem.upper, strict=True)
         bounds = {place.get(name, name): (float(a), float(b), float(c)) for name, a, b, c in rows}
-        return TableLikelihood(problem.stability, problem.experiment, loads, bounds)
+        return TableLikelihood(problem.stability, loads, apparatus(problem.experiment, loads.frequency), bounds)
 
     def held_out_table(self, loads: CriticalLoads, values: Mapping[str, float]) -> Matched:
         """Return a table that was not fitted, matched with what was found, with derivatives by the names here."""
@@ -1030,7 +1030,7 @@ def correlated(point: Point) -> float:
 
     That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of a run.
     """
-    worst, longest = 0.0, max(f.white.size for f in point.runs)
+    worst, longest = 0.0, max((f.white.size for f in point.runs), default=0)
     for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
         product, square = 0.0, 0.0
         for f in point.runs:
