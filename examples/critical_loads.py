@@ -8,8 +8,8 @@ Two experiments are written to DIR, each a folder with one table of critical loa
     cushion    the same loads against the amplitude that is applied, of which the air cushion lets rho = 0.48 through, the paper's
                trial value; the baseline takes the modulation for what it is said to be
 
-The paper prints its figures and no table, so the loads are made: from its optimised set (Table I) at 31 velocities and amplitudes of
-these figures, with the 3 % of noise that it states (seed 2003). Start values are its trial set.
+The paper prints its figures and no table, so the loads are made: from its optimised set (Table I) at 31 velocities and amplitudes
+of these figures, with the 3 % of noise that it states (seed 2003). Start values are its trial set.
 """
 
 from __future__ import annotations

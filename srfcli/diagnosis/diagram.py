@@ -77,8 +77,10 @@ def _model(registry: Registry, experiment: Experiment, values: Mapping[str, floa
     """Return the model of sliding at one velocity for ever, and its parameters."""
     model = open_model(registry, **asdict(experiment.choice), stability=True)
     own = {n: v for n, v in values.items() if n in model.names and n not in ("V", "W0", "K")}
-    share = stiffness_share(experiment, experiment.runs[0]) if experiment.runs else 1.0
-    own["K"] = values.get("K", experiment.stiffness) * share
+    share, stated = 1.0, experiment.stiffness
+    if experiment.runs:
+        share, stated = stiffness_share(experiment, experiment.runs[0]), experiment.runs[0].stiffness
+    own["K"] = values["K"] * share if "K" in values else stated
     if "M" in model.names and experiment.mass is not None:
         own.setdefault("M", experiment.mass)
     return model, model.vector({**own, "W0": 1.0, "eps": 0.0})

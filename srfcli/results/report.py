@@ -151,7 +151,7 @@ def numbers(matter: Matter) -> Markup:
 
 def places(matter: Matter) -> Markup:
     """Return where simulation and recording part, and computed and measured critical loads."""
-    if not matter.traces:
+    if matter.loads and not matter.traces:
         return section("where", "Critical loads, measured and computed", critical_loads(matter))
     parts: list[Any] = [tag("p", " ".join(_location_sentences(matter)))]
     parts.append(
