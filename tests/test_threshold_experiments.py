@@ -21,10 +21,12 @@ from srfcli.codegen.model import open_model
 from srfcli.core.errors import SrfError
 from srfcli.data.thresholds import Thresholds, thresholds_csv
 from srfcli.data.writing import write_experiment
+from srfcli.diagnosis.hypotheses import applicable
+from srfcli.diagnosis.verdict import held_out_loads, refusal
 from srfcli.inference.fit import fit_problem
 from srfcli.inference.free_parameters import free_parameters, with_transmission
 from srfcli.inference.state_space import Likelihood
-from srfcli.inference.thresholds import fit_thresholds, forced_slopes, hopf_slopes
+from srfcli.inference.thresholds import Matcher, fit_thresholds, forced_slopes, hopf_slopes
 from srfcli.laws.registry import load_registry
 from srfcli.numerics.boundary import along, polish
 from srfcli.numerics.critical import critical_line
@@ -448,3 +450,82 @@ def test_an_experiment_with_tables_is_written_and_read_back(both: Path, tmp_path
         assert (one.name, one.holdout, one.frequency) == (other.name, other.holdout, other.frequency)
         for column in ("V", "eps", "W0c", "sigma"):
             assert np.array_equal(getattr(one.table, column), getattr(other.table, column))
+
+
+# a diagnosis of critical loads
+
+
+@pytest.fixture(scope="module")
+def diagnosed(tmp_path_factory: pytest.TempPathFactory, model: Any) -> tuple[Any, Path]:
+    """The diagnosis of a baseline with a rigid interface, a table of loads held out, and the folder that it is written to."""
+    exact = generated(model, V, FELT_EPS, values=model.defaults())
+    loads, held = (with_noise(exact, seed, relative=0.015) for seed in (3, 4))
+    text = HEAD.format(model='interface = "rigid"', parameters="").replace("lambda =", "# lambda =")
+    text += TABLE + TABLE.replace("loads.csv", "held.csv") + "holdout = true\n"
+    place = folder_of(tmp_path_factory.mktemp("diagnosed"), text, loads=loads, held=held)
+    found = srf.diagnose(place)
+    found.write(place / "found")
+    return found, place / "found"
+
+
+def test_a_diagnosis_of_loads_alone_names_what_the_baseline_lacks(diagnosed: tuple[Any, Path]) -> None:
+    found, _ = diagnosed
+    assert (found.verdict, found.effects) == ("identified", ("interface-compliance",))
+    size = found.answer["augmented"]["parameters"]["lambda"]
+    assert abs(size["value"] - 0.56) < 3 * size["stderr"] < 0.1
+    tables = {t["name"]: t for t in found.answer["thresholds"]}
+    assert not tables["loads"]["holdout"] and tables["held"]["holdout"]
+    for name in tables:  # the held-out loads were not fitted, and are predicted better all the same
+        assert tables[name]["chi2"]["augmented"] < 20 < 40 < tables[name]["chi2"]["baseline"]
+    assert "critical loads have chi2" in found.diagnosis.baseline.against[0]
+    reasons = {x["effect"]: x["reason"] for x in found.answer["not_identifiable"]}
+    for effect in ("sensor-lag", "track-topography", "drive-ripple"):
+        assert reasons[effect].startswith("critical loads do not depend on it")
+    assert not found.run_table.rows and len(found.load_table.rows) == 2
+    assert len(found.plot().axes) == 1
+
+
+def test_scores_are_the_slopes_of_critical_loads(diagnosed: tuple[Any, Path], make_model: Any) -> None:
+    """What an effect promises is by the derivatives of the loads at its neutral size: differences give the same columns."""
+    base = diagnosed[0].diagnosis.baseline
+    (column,) = [c for c in base.scores.columns if c.effect.name == "linker-dieterich"]
+    stable = with_effects(make_model, "linker-dieterich", interface="rigid")
+    table = base.fit.maximum.point.tables[0].loads.table
+    values = {n: v for n, v in base.fit.values.items() if n in stable.names}
+    sides = []
+    for alpha in (1e-4, -1e-4):
+        given = {**values, "alpha": alpha, "M": 2.37e-6}
+        scale = free_parameters(with_transmission(stable.parameters), ("A",), start={**stable.defaults(), **given})
+        sides.append(Matcher(stable, table, values=given, scale=scale, tol=1e-9).match(np.zeros(1)).loads)
+    raw = (sides[0] - sides[1]) / 2e-4 / table.sigma
+    assert column.columns[:, 0] == pytest.approx(base.remainder.free(raw), abs=1e-3 * float(np.abs(raw).max()))
+
+
+def test_what_is_written_of_loads_alone_is_whole(diagnosed: tuple[Any, Path], empty_folder: Path) -> None:
+    found, folder = diagnosed
+    assert json.loads((folder / "answer.json").read_text())["verdict"] == "identified"
+    page = (folder / "report.html").read_text()
+    assert "Critical loads, measured and computed" in page and "held (held out)" in page
+    assert (folder / "figures" / "loads-loads.svg").stat().st_size > 1000
+    again = srf.fit(folder / "augmented")
+    assert again.values["lambda"] == pytest.approx(found.answer["augmented"]["parameters"]["lambda"]["value"], rel=2e-3)
+    assert [t.loads.name for t in again.found.fit.tables] == ["loads", "held"]
+
+
+def test_held_out_loads_refuse_a_model_that_does_not_predict_them(diagnosed: tuple[Any, Path]) -> None:
+    diagnosis = diagnosed[0].diagnosis
+    best, baseline, whole = diagnosis.best, diagnosis.baseline, diagnosis.experiment
+    assert refusal(best, baseline, (), held_out_loads(baseline, best, whole)) == ""
+    loads = next(t for t in whole.thresholds if t.holdout)
+    moved = replace(loads, table=replace(loads.table, W0c=1.15 * loads.table.W0c))
+    wrong = held_out_loads(baseline, best, replace(whole, thresholds=(moved,)))
+    assert "held-out critical loads are not predicted: held has chi2" in refusal(best, baseline, (), wrong)
+
+
+def test_where_no_load_is_modulated_effects_on_modulation_cannot_be_seen(tmp_path: Path, measured: Thresholds) -> None:
+    still = replace(measured, eps=np.zeros(8))
+    experiment = srf.read_experiment(folder_of(tmp_path, HEAD.format(model="", parameters="") + TABLE, loads=still))
+    candidates, excluded = applicable(load_registry(), experiment)
+    reasons = {x.effect: x.reason for x in excluded}
+    assert reasons["load-transmission"] == reasons["linker-dieterich"] == "the load is constant"
+    assert "viscous-drag" in {e.name for e in candidates}

@@ -49,7 +49,7 @@ def concluded(monkeypatch):
         search = SimpleNamespace(
             ranked=lambda: ranked, baseline=baseline, excluded=[], cut_short=cut_short, budget=150.0
         )
-        return conclude(search, SimpleNamespace(runs=()))
+        return conclude(search, SimpleNamespace(runs=(), thresholds=()))
 
     return verdict
 

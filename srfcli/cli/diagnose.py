@@ -39,7 +39,7 @@ srf fit found/augmented                              the augmented model is an e
 @click.option("--out", metavar="DIR", help="Write answer, report, predictions and augmented experiment to DIR.")
 @click.option("--force", is_flag=True, help="Replace a diagnosis that is in DIR already.")
 def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], **options: Any) -> None:
-    """Say where recordings and their model part, and which physics the model lacks.
+    """Say where recordings, or critical loads, and their model part, and which physics the model lacks.
 
     The baseline of the experiment is fitted with a random friction field and coloured gauge noise. Every registered effect is
     scored for what it could explain beyond these, and those that promise most are fitted. Held-out runs are opened when the
@@ -82,7 +82,7 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
         click.echo(json_text(found.answer, indent=2))
     else:
         click.echo(f"{found.sentence}\n")
-        for table in (found.table, found.parameter_table, found.run_table):
+        for table in (found.table, found.parameter_table, *(t for t in (found.run_table, found.load_table) if t.rows)):
             if sys.stdout.isatty():
                 print_terminal(table, sys.stdout)
             else:

@@ -319,9 +319,11 @@ static int eigenpair(const double *M, const double *target, double *rho, double 
         v[0][NX + i] = 0.3 / (2 + i);
     }
     for (int round = 0; round < 6; round++) {
-        while (!shifted(M, 0, sigma, a, pivot)) {
-            if (!isfinite(sigma[0] + sigma[1]) || fabs(sigma[0]) > 1e100) return 0;
-            sigma[0] += 1e-15 + 1e-15 * fabs(sigma[0]); /* an exact eigenvalue */
+        double nudge = 1e-15;
+        while (!shifted(M, 0, sigma, a, pivot)) { /* an exact eigenvalue, or a matrix without finite factors */
+            if (!isfinite(sigma[0] + sigma[1]) || nudge > 1e-12) return 0;
+            sigma[0] += nudge + nudge * fabs(sigma[0]);
+            nudge *= 10.0;
         }
         memcpy(rho, sigma, sizeof last);
         for (int step = 0; step < (round ? 2 : 40); step++) {

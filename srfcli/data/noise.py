@@ -23,8 +23,8 @@ JITTER = 1e-3  # spacings by which a sample may be off an even time, and be take
 def white_level(x: Array, t: Array | None = None) -> float:
     """Return the standard deviation of white noise whose floor the spectrum of x (n,) shows above half the Nyquist frequency.
 
-    The median over frequencies and stretches: lines, events and a slow signal do not raise it. Coloured noise counts as signal, and
-    so would a signal that is read at uneven times: where those are given, t (n,), it is what even ones nearby would have read.
+    The median over frequencies and stretches: lines, events and a slow signal do not raise it. Coloured noise counts as signal.
+    A signal that is read at uneven times looks like noise: where those are given, t (n,), it is taken as even ones would read it.
     """
     if t is not None:
         x = _at_even_times(t, x)

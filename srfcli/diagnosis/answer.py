@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.data.values import Run
+from srfcli.data.values import CriticalLoads, Run
 from srfcli.diagnosis.design import Parting, described
 from srfcli.diagnosis.discrepancy import RunForce, unexplained_friction
 from srfcli.diagnosis.residual_scan import Location, Row
@@ -37,6 +37,11 @@ class RunView:
     slip: Array
     white: tuple[Array, Array] = field(repr=False)
     others: tuple[tuple[Array, Array], ...] = field(repr=False, default=())
+
+    @property
+    def used(self) -> Array:
+        """Return which readings count (n,)."""
+        return self.run.used
 
 
 def run_views(diagnosis: Diagnosis) -> tuple[RunView, ...]:
@@ -84,7 +89,7 @@ def answer(
 
     `parting` is the run that would part what is ambiguous.
     """
-    views, last = run_views(diagnosis), diagnosis.final
+    views, loads, last = run_views(diagnosis), load_views(diagnosis), diagnosis.final
     sides = {}
     for place, (name, fitted, own) in enumerate(
         (("baseline", diagnosis.shown, diagnosis.baseline), ("augmented", last, last))
@@ -93,7 +98,7 @@ def answer(
         sides[name] = {
             "parameters": parameters_of(fitted),
             "fit": {"rms_over_noise": fitted.fit.maximum.point.rms},
-            "holdout": {"rms_over_noise": together([v for v in views if v.holdout], place)},
+            "holdout": {"rms_over_noise": together([*(v for v in views if v.holdout), *(v for v in loads if v.holdout)], place)},
             "field": None
             if own.fit.smooth
             else {"amplitude": values["field_amplitude"], "length_um": values["field_length"]},
@@ -110,6 +115,11 @@ def answer(
         "model": model,
         "reasons": list(diagnosis.reasons),
     }
+    if loads:
+        chi2 = [dict(zip(sides, v.chi2, strict=True)) for v in loads]
+        found["thresholds"] = [
+            {"name": v.name, "holdout": v.holdout, "loads": v.used.size, "chi2": c} for v, c in zip(loads, chi2, strict=True)
+        ]
     if diagnosis.verdict == "inconclusive":
         found["detectable"] = dict(diagnosis.detectable)
     if diagnosis.verdict == "ambiguous" and parting is not None:
@@ -117,11 +127,52 @@ def answer(
     return found
 
 
-def together(views: Sequence[RunView], place: int) -> float | None:
-    """Return the root mean square over the noise of several runs together; None of none."""
+@dataclass(frozen=True)
+class LoadView:
+    """One table of critical loads under both models: arrays (n,) of computed loads, NaN where there is none; rms of residuals."""
+
+    loads: CriticalLoads
+    baseline: Array
+    augmented: Array
+    chi2: tuple[float, float]
+    rms: tuple[float, float]
+
+    @property
+    def name(self) -> str:
+        """Return the table's name."""
+        return self.loads.name
+
+    @property
+    def holdout(self) -> bool:
+        """Return whether it was held out."""
+        return self.loads.holdout
+
+    @property
+    def used(self) -> Array:
+        """Return that every load counts (n,)."""
+        return np.ones(len(self.loads.table), dtype=bool)
+
+
+def load_views(diagnosis: Diagnosis) -> tuple[LoadView, ...]:
+    """Return every table of critical loads under baseline and final model, fitted ones first."""
+    fitted = zip(*(f.fit.maximum.point.tables for f in (diagnosis.shown, diagnosis.final)), strict=True)
+    same = diagnosis.final is diagnosis.baseline
+    held = ((h.baseline, h.baseline if same else h.augmented) for h in diagnosis.held_loads)
+    views = []
+    for sides in (*fitted, *held):
+        before, after = (np.where(t.match.missing, np.nan, t.match.loads) for t in sides)
+        chi2 = (sides[0].match.cost, sides[1].match.cost)
+        size = sides[0].white.size
+        rms = (float(np.sqrt(chi2[0] / size)), float(np.sqrt(chi2[1] / size)))
+        views.append(LoadView(sides[0].loads, before, after, chi2, rms))
+    return tuple(views)
+
+
+def together(views: Sequence[RunView | LoadView], place: int) -> float | None:
+    """Return the root mean square over the noise of several runs and tables together; None of none."""
     if not views:
         return None
-    sizes = np.array([int(v.run.used.sum()) for v in views], dtype=float)
+    sizes = np.array([int(v.used.sum()) for v in views], dtype=float)
     squares = np.array([v.rms[place] ** 2 for v in views])
     return float(np.sqrt(sizes @ squares / sizes.sum()))
 
@@ -139,11 +190,17 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
             "observable": v.run.observable, "rms": list(v.rms), "modulation": of_run(v.run), "white": list(v.white),
             "friction": [_force_of(found.get(v.run.name), v.run) for found in friction],
         })  # fmt: skip
+    tables = [
+        {"name": v.name, "holdout": v.holdout, "table": v.loads.table, "baseline": v.baseline, "augmented": v.augmented,
+         "chi2": list(v.chi2)}
+        for v in load_views(diagnosis)
+    ]  # fmt: skip
     about = {e.reported: e.about for f in diagnosis.ranked for e in f.hypothesis.effects}
     return {
         "title": diagnosis.experiment.title,
         "about": about,
         "runs": runs,
+        "thresholds": tables,
         "atlas": [atlas_row(row) for row in location.atlas],
         "ranked": ranked_rows(diagnosis),
         "parameters": parameter_rows(diagnosis),

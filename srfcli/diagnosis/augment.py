@@ -86,7 +86,9 @@ def augment(
     mass = values.get("M", experiment.mass) if inertia else experiment.mass
     effects, sources = _beside(laws.left)
     description = open_node(experiment.path).value
-    runs, copies = _runs(description["runs"], experiment.path.parent, folder, reader)
+    recorded, loads = description.get("runs", []), description.get("thresholds", [])
+    parts, copies = _parts([*recorded, *loads], experiment.path.parent, folder)
+    runs = [{**run, **({"format": reader} if reader else {})} for run in parts[: len(recorded)]]
     title = experiment.title + (
         f" (augmented with {', '.join(hypothesis.reported)})" if hypothesis.reported else " (fitted)"
     )
@@ -104,6 +106,8 @@ def augment(
         lines += ["", "[columns]", *(f"{_key(k)} = {_value(v)}" for k, v in description["columns"].items())]
     for run in runs:
         lines += ["", "[[runs]]", *(f"{_key(k)} = {_value(v)}" for k, v in run.items())]
+    for table in parts[len(recorded) :]:
+        lines += ["", "[[thresholds]]", *(f"{_key(k)} = {_value(v)}" for k, v in table.items())]
     files = {DESCRIPTION: "\n".join(lines) + "\n", **law_files(laws, values)}
     files |= {name: path.read_text(encoding="utf-8") for name, path in sources.items()}
     return Augmented(files, copies, tuple(e.name for e in laws.left), (K, mass / KILOGRAM if mass else None))
@@ -135,10 +139,10 @@ def _beside(left: Sequence[Effect]) -> tuple[tuple[str, ...], dict[str, Path]]:
     return tuple(names), sources
 
 
-def _runs(
-    described: Sequence[Mapping[str, Any]], home: Path, folder: Path, reader: str | None
+def _parts(
+    described: Sequence[Mapping[str, Any]], home: Path, folder: Path
 ) -> tuple[list[dict[str, Any]], dict[str, Path]]:
-    """Return the runs' tables with their files named as seen from `folder`, and what is to be copied there."""
+    """Return what is described of runs and critical loads, files named as seen from `folder`, and what is to be copied there."""
     paths = {str(run["file"]): (home / str(run["file"])).resolve() for run in described}
     small = sum(p.stat().st_size for p in set(paths.values())) <= LARGEST
     copies: dict[str, Path] = {}
@@ -157,7 +161,7 @@ def _runs(
                 name = f"{stem}-{number}{suffix}"
             taken.add(name.lower())
             names[path], copies[name] = name, path
-        runs.append({**run, "file": names[path], **({"format": reader} if reader else {})})
+        runs.append({**run, "file": names[path]})
     return runs, copies
 
 

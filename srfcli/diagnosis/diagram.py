@@ -35,13 +35,16 @@ def stability(
     boundaries under modulation have velocities of their own, NaN between components. Effects that critical loads do not depend on
     change diagrams by the parameters that they had bent.
     """
-    driven = np.concatenate([np.abs(r.drive.velocities) for r in baseline.runs])
+    tables = [t.table for t in baseline.thresholds]
+    driven = np.concatenate([*(np.abs(r.drive.velocities) for r in baseline.runs), *(t.V for t in tables)])
     driven = driven[driven > 0]
     if not driven.size:
         return {}
     V = np.geomspace(driven.min() / BEYOND, driven.max() * BEYOND, VELOCITIES)
     before, after = ({q.name: q.value for q in e.parameters} for e in (baseline, augmented))
-    strongest = max((r.modulation for r in baseline.runs if r.modulation), key=lambda m: m[1], default=None)
+    modulations = [r.modulation[:2] for r in baseline.runs if r.modulation]
+    modulations += [(t.frequency, eps) for t in baseline.thresholds if (eps := float(t.table.eps.max())) > 0]
+    strongest = max(modulations, key=lambda m: m[1], default=None)
     notes = ["Dotted: under constant load."] if strongest else ["Under constant load."]
     found: dict[str, Any] = {"V": V}
     try:
@@ -49,7 +52,7 @@ def stability(
             model, base = _model(registry, experiment, values)
             found[f"W0_hopf_{side}"] = _loads(model, base, V)
             if strongest:
-                found |= _boundary(model, base, V, *strongest[:2], side, notes)
+                found |= _boundary(model, base, V, *strongest, side, notes)
     except SrfError as error:
         return {"note": f"no stability diagram: {error.message}"}
     if not any(np.isfinite(loads).any() for key, loads in found.items() if key.startswith("W0")):
@@ -74,8 +77,10 @@ def _model(registry: Registry, experiment: Experiment, values: Mapping[str, floa
     """Return the model of sliding at one velocity for ever, and its parameters."""
     model = open_model(registry, **asdict(experiment.choice), stability=True)
     own = {n: v for n, v in values.items() if n in model.names and n not in ("V", "W0", "K")}
-    run = experiment.runs[0]
-    own["K"] = values["K"] * stiffness_share(experiment, run) if "K" in values else run.stiffness
+    share, stated = 1.0, experiment.stiffness
+    if experiment.runs:
+        share, stated = stiffness_share(experiment, experiment.runs[0]), experiment.runs[0].stiffness
+    own["K"] = values["K"] * share if "K" in values else stated
     if "M" in model.names and experiment.mass is not None:
         own.setdefault("M", experiment.mass)
     return model, model.vector({**own, "W0": 1.0, "eps": 0.0})

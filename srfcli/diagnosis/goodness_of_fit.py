@@ -12,6 +12,7 @@ from itertools import product
 import numpy as np
 
 from srfcli.codegen.model import Array
+from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import stretches, white_level
 from srfcli.inference.state_space import LAGS, Filtered, StateSpaceFit, correlated, cut, typical_friction
 
@@ -51,6 +52,7 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
             if information > 0:
                 off = abs(float(f.score[k])) / np.sqrt(information)
                 tests.append((off / DEVIATION, f"the field is of another amplitude in {f.run.name}"))
+    tests += _of_loads(found)
     tests.append((correlated(point) / DEVIATION, "innovations are correlated"))
     if not found.smooth:
         friction = max(float(np.median([typical_friction(f.run) for f in point.runs])), 1e-6)
@@ -88,6 +90,31 @@ def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[
             loud *= _smooth_share(piece)
         tests.append((max(loud, shifted) / (DEVIATION + 1.0), f"a stretch of {name} is off"))
     return tests
+
+
+def _of_loads(found: StateSpaceFit) -> list[tuple[float, str]]:
+    """Return tests of the critical loads: chi2 of all, less what was fitted to them, and each table's largest residual."""
+    tables = found.maximum.point.tables
+    if not tables:
+        return []
+    size, fitted = sum(t.white.size for t in tables), 0.0
+    for t in tables:  # the share of each parameter that the loads determine is a degree of freedom less
+        unit = found.likelihood.unit(found.maximum.point.x)
+        fitted += float(np.trace(t.information * np.outer(unit, unit) @ found.maximum.covariance))
+    cost = sum(t.match.cost for t in tables)
+    freedom = max(size - fitted, 1.0)
+    tests = [(improbability(cost, freedom), f"critical loads have chi2 {cost:.1f} on {freedom:.0f} degrees of freedom")]
+    for t in tables:
+        worst = int(np.argmax(np.abs(t.white)))
+        line, residual = t.loads.table.lines[worst], float(abs(t.white[worst]))
+        tests.append((residual / DEVIATION, f"the critical load of line {line} of {t.loads.name} is {residual:.1f} sigma off"))
+    return tests
+
+
+def improbability(cost: float, freedom: float) -> float:
+    """Return the logarithm of the chance of a chi2 of critical loads over that of IMPROBABLE: above 1 it is none."""
+    chance = chance_of(cost, freedom)
+    return float(np.log(max(chance, 1e-300)) / np.log(IMPROBABLE))
 
 
 def _smooth_share(white: Array) -> float:

@@ -19,6 +19,7 @@ from srfcli.inference.prediction import of_run
 from srfcli.laws.expression import symbol
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
+from srfcli.symbolic.system import without_part
 
 UNMODULATED = {symbol(name): 0 for name in ("modulated", "eps", "envelope")}
 
@@ -38,7 +39,8 @@ def applicable(
 
     Among the former are those that could join it only beside another one that brings what they need.
     """
-    base, scales = open_model(registry, **asdict(experiment.choice)), scales_of(experiment.runs, experiment.parameters)
+    base = open_model(registry, **asdict(experiment.choice))
+    scales = scales_of(experiment.runs, experiment.parameters, experiment.thresholds)
     found, excluded, waiting = [], [], []
     free = {p.name for p in experiment.parameters if not p.fixed}
     present = [registry.get("effect", name) for name in experiment.choice.effects]
@@ -74,12 +76,34 @@ def applicable(
 
 
 def _unseen(effect: Effect, experiment: Experiment) -> str:
-    """Return why these recordings cannot show an effect at all, or nothing."""
+    """Return why recordings and critical loads cannot show an effect at all, or nothing."""
+    reasons = []
+    if experiment.runs:
+        loads = [run.load(run.t)[0] for run in experiment.runs]
+        spread = max(float(np.ptp(np.log(W))) for W in loads)
+        between = float(np.ptp([np.log(W.mean()) for W in loads])) if len(loads) > 1 else 0.0
+        modulated = any(of_run(run)["modulated"] for run in experiment.runs)
+        if "V" in dict(effect.changes) and any(s.observable == "slip" for run in experiment.runs for s in run.others):
+            reasons.append("the slip that is observed is compared with the drive as it is stated")
+        else:
+            reasons.append(_unseen_under(effect, spread, between, "" if modulated else "no run has a modulated load"))
+    if experiment.thresholds:
+        if reason := without_part(effect):
+            reasons.append(f"critical loads do not depend on it: it {reason}")
+        else:
+            W, eps = (np.concatenate([getattr(t.table, name) for t in experiment.thresholds]) for name in ("W0c", "eps"))
+            calm = "" if eps.max() > 0 else "the load is constant"
+            reasons.append(_unseen_under(effect, float(eps.max()), float(np.ptp(np.log(W))), calm))
+    return reasons[0] if all(reasons) else ""
+
+
+def _unseen_under(effect: Effect, spread: float, between: float, unmodulated: str) -> str:
+    """Return why an effect cannot be seen where ln W varies by `spread` while sliding, and by `between` from one time to another.
+
+    `unmodulated` is the reason where no load is modulated.
+    """
     formulas = {slot: f for slot, f in effect.changes}
     used = {str(s) for f in formulas.values() for s in f.free_symbols}
-    loads = [run.load(run.t)[0] for run in experiment.runs]
-    spread = max(float(np.ptp(np.log(W))) for W in loads)
-    between = float(np.ptp([np.log(W.mean()) for W in loads])) if len(loads) > 1 else 0.0
     calm = {symbol("W"): symbol("W0")} | {symbol(s.name): s.steady for s in effect.states} | UNMODULATED
     still = {symbol("W"): symbol("W0"), symbol("force"): symbol("force")}
     pressed = [f.subs(calm) != still[symbol(slot)] for slot, f in formulas.items() if slot in ("W", "force")]
@@ -88,11 +112,8 @@ def _unseen(effect: Effect, experiment: Experiment) -> str:
     if "W" in used and not effect.states and max(spread, between) < 1e-3:
         wide = 100 * max(spread, between)
         return f"the loads of all runs lie within {wide:.2g} %" if wide else "the load is constant, the same in all runs"
-    if "V" in formulas and any(s.observable == "slip" for run in experiment.runs for s in run.others):
-        return "the slip that is observed is compared with the drive as it is stated"
-    unmodulated = not any(of_run(run)["modulated"] for run in experiment.runs)
     if unmodulated and formulas and all(f.subs(UNMODULATED) == symbol(slot) for slot, f in formulas.items()):
-        return "no run has a modulated load"
+        return unmodulated
     return ""
 
 
@@ -120,9 +141,16 @@ class Hypothesis:
         return replace(experiment, choice=replace(experiment.choice, ageing=self.ageing))
 
     def model(self, registry: Registry, experiment: Experiment, *, random_field: bool = True) -> GeneratedModel:
-        """Return the model, with a random friction field along slip unless that is left out."""
+        """Return the model, with a random friction field along slip unless that is left out; of critical loads without runs."""
+        if not experiment.runs:
+            return self.stability(registry, experiment)
         choice = self.experiment(experiment).choice.plus(e.name for e in self.effects)
         return open_model(registry, **asdict(choice), random_field=random_field)
+
+    def stability(self, registry: Registry, experiment: Experiment) -> GeneratedModel:
+        """Return the model of critical loads."""
+        choice = self.experiment(experiment).choice.plus(e.name for e in self.effects)
+        return open_model(registry, **asdict(choice), stability=True)
 
     def problem(
         self,
@@ -143,7 +171,9 @@ class Hypothesis:
         listed = tuple(
             replace(q, value=float(np.clip(at.get(q.name, q.value), q.lower, q.upper))) for q in (*kept, *added)
         )
-        problem = fit_problem(model, replace(experiment, parameters=listed), trend=trend)
+        stability = self.stability(registry, experiment) if experiment.thresholds else None
+        listed_in = replace(experiment, parameters=listed)
+        problem = fit_problem(model, listed_in, trend=trend, stability=stability)
         start = [at.get(n, s) for n, s in zip(problem.names, problem.start, strict=True)]
         return replace(problem, start=np.clip(np.array(start, dtype=float), problem.lower, problem.upper))
 

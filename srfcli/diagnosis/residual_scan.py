@@ -84,8 +84,11 @@ def locate(fitted: Fitted, *, last: Fitted | None = None, draws: int = DRAWS, se
     `draws` recordings with nothing but noise are simulated through the same projection. Of a model that is known to be better,
     `last`, the parameters, the field and the noise are taken, and what is uncertain of them counts as noise. Phases, lines and
     quantities are looked for as long as each run is followed: once cycles are lost, a residual says nothing of them.
+    Critical loads have no place.
     """
     likelihood, values = fitted.fit.likelihood, fitted.fit.values
+    if not likelihood.problem.runs:
+        return Location((), None, (), None, 1.0)
     forcing = {r.name: of_run(r)["f"] for r in likelihood.problem.runs if of_run(r)["modulated"]}
     if last is None:
         pieces = pieces_of(fitted, values)

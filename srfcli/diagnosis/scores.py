@@ -18,7 +18,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.errors import SrfError
-from srfcli.core.units import split_quantity, to_base
+from srfcli.core.units import to_base
 from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.hypotheses import (
     Excluded,
@@ -28,6 +28,7 @@ from srfcli.diagnosis.hypotheses import (
     neutral_values,
     own_parameters,
 )
+from srfcli.inference.critical_loads import TableLikelihood, apparatus
 from srfcli.inference.recordings import slip_along
 from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns, filter_run
 from srfcli.laws.registry import Registry
@@ -100,20 +101,25 @@ class SharedField:
 
 
 class Remainder:
-    """What a fit leaves, `left` (2 m,): standardised innovations and their squares, projected off what was fitted.
+    """What a fit leaves, `left` (n,): standardised innovations and their squares, projected off what was fitted.
 
-    `rest` (2 m,) is the same before that, `base` (2 m, p) are orthonormal directions of what was fitted.
+    `rest` (n,) is the same before that, `base` (n, p) are orthonormal directions of what was fitted. Residuals of critical loads,
+    over their errors, stand at the end.
     """
 
     def __init__(self, fitted: StateSpaceFit) -> None:
         self.fitted, point = fitted, fitted.maximum.point
-        self.rest = np.concatenate([_stacked(f.white, (f.white**2 - 1) / np.sqrt(2)) for f in point.runs])
+        recorded = [_stacked(f.white, (f.white**2 - 1) / np.sqrt(2)) for f in point.runs]
+        self.rest = np.concatenate([*recorded, *(t.white for t in point.tables)])
         base = np.zeros((self.rest.size, len(fitted.likelihood.names)))
         at = 0
         for f in point.runs:
             block = _stacked(*_whitened(f))
             base[at : at + len(block), [fitted.likelihood.names.index(n) for n in f.names]] = block
             at += len(block)
+        for t in point.tables:
+            base[at : at + len(t.white)] = -t.slopes
+            at += len(t.white)
         size = np.linalg.norm(base, axis=0)
         u, s, v = np.linalg.svd(base[:, size > 0] / size[size > 0], full_matrices=False)
         known = s > 1e-7 * s[0]
@@ -121,6 +127,11 @@ class Remainder:
         self._back = np.zeros((size.size, int(known.sum())))
         self._back[size > 0] = v[known].T / s[known] / size[size > 0][:, None]
         self.left = self.free(self.rest)
+
+    def padded(self, blocks: Sequence[Array]) -> Array:
+        """Return columns (n, k) of the runs' blocks, zero for critical loads."""
+        columns = np.concatenate(blocks)
+        return np.concatenate([columns, np.zeros((self.rest.size - len(columns), columns.shape[1]))])
 
     def free(self, columns: Array) -> Array:
         """Return columns (2 m, k) projected off what was fitted."""
@@ -148,7 +159,7 @@ class Remainder:
         r = np.sqrt(3) * np.abs(nodes[:, None] - nodes) / values["field_length"]
         root = np.linalg.cholesky((1 + r) * np.exp(-r) + 1e-9 * np.eye(count))
         hat = Shape("slip", lambda s, k: np.interp(s, nodes, np.arange(count) == k), ("node",))
-        columns = np.concatenate([_carried(f, self.fitted, [(hat, [k]) for k in range(count)]) for f in self.runs])
+        columns = self.padded([_carried(f, self.fitted, [(hat, [k]) for k in range(count)]) for f in self.runs])
         u, size, _ = np.linalg.svd(self.free(columns @ root), full_matrices=False)
         left = u.T @ self.left
         best = SharedField(u, np.zeros(count), left, 0.0)
@@ -195,8 +206,11 @@ class Scores:
         return found
 
     def _model(self, added: Sequence[Effect]) -> GeneratedModel:
-        names = (e.name for e in (*self.present, *added))
-        return open_model(self.registry, **asdict(self.experiment.choice.plus(names)), random_field=True)
+        return self._opened(added, stability=not self.experiment.runs)
+
+    def _opened(self, added: Sequence[Effect], *, stability: bool) -> GeneratedModel:
+        choice = self.experiment.choice.plus(e.name for e in (*self.present, *added))
+        return open_model(self.registry, **asdict(choice), random_field=not stability, stability=stability)
 
     def _neutral(self, model: GeneratedModel, added: Sequence[Effect]) -> dict[str, float]:
         values = dict(self.fitted.values)
@@ -210,8 +224,10 @@ class Scores:
                 values[long] = neutral.get(p.name, to_base(p.default, p.unit))
         return values
 
-    def _run_columns(self, model: GeneratedModel, values: Mapping[str, float], by: Sequence[str]) -> Array:
-        """Return the columns (2 m, k) by parameters of a larger model, at values where it is the fitted one."""
+    def _columns(
+        self, model: GeneratedModel, added: Sequence[Effect], values: Mapping[str, float], by: Sequence[str]
+    ) -> Array:
+        """Return the columns (n, k) by parameters of a model with `added` effects, at values where it is the fitted one."""
         likelihood = self.fitted.likelihood
 
         def block(run: Run) -> Array:
@@ -227,7 +243,23 @@ class Scores:
             )
             return _stacked(*_whitened(found))
 
-        return np.concatenate(likelihood.over_runs(block))
+        return np.concatenate([*likelihood.over_runs(block), *self._load_columns(added, values, by)])
+
+    def _load_columns(self, added: Sequence[Effect], values: Mapping[str, float], by: Sequence[str]) -> list[Array]:
+        """Return the same of each table of critical loads; zero for what they do not depend on."""
+        problem, found = self.fitted.likelihood.problem, []
+        if not problem.tables:
+            return []
+        model = self._opened(added, stability=True)
+        known = [n for n in by if n in model.names]
+        for loads in problem.tables:
+            given = apparatus(self.experiment, loads.frequency) | dict(values)
+            bounds = {n: (values[n], values[n] - 1.0, values[n] + 1.0) for n in known}
+            slopes = TableLikelihood(model, loads, given, bounds).at(values).slopes
+            columns = np.zeros((len(loads.table), len(by)))
+            columns[:, [by.index(n) for n in known]] = -slopes
+            found.append(columns)
+        return found
 
     def _derived(self, effects: Sequence[Effect]) -> list[_Column]:
         """Return the columns of effects from one model that has them all, in parts where they do not go together.
@@ -251,7 +283,7 @@ class Scores:
             some = [e for e in effects if j < len(grids[e.name])]
             inner = {longs[e.name][n]: v for e in some for n, v in grids[e.name][j].items()}
             sizes = [longs[e.name][e.sizes[0]] for e in some]
-            found = self._run_columns(model, self._neutral(model, effects) | inner, sizes)
+            found = self._columns(model, effects, self._neutral(model, effects) | inner, sizes)
             for k, e in enumerate(some):
                 columns[e.name].append(found[:, k])
         made = []
@@ -264,13 +296,14 @@ class Scores:
         return made
 
     def _freed(self, effect: Effect) -> list[_Column]:
-        columns = self._run_columns(self.fitted.likelihood.problem.model, self.fitted.values, ["K"])
+        values = {"K": self.experiment.stiffness, **self.fitted.values}
+        columns = self._columns(self.fitted.likelihood.problem.model, (), values, ["K"])
         return [_Column(effect, "K", {}, columns)]
 
     def _lagging(self) -> Array:
         """Return the column of a gauge that follows late: of first order in the delay, it shows less by what u gained in it."""
         blocks = [_carried(f, self.fitted, (), late=True) for f in self.remainder.runs]
-        return np.concatenate(blocks)
+        return self.remainder.padded(blocks)
 
     def _along(self, effects: Sequence[Effect], shapes: Mapping[str, Shape]) -> list[_Column]:
         """Return the columns of effects that are functions of slip, time or stage position, for all inner values."""
@@ -283,7 +316,7 @@ class Scores:
                 for inner in group
             ]
             blocks.append(_carried(f, self.fitted, functions))
-        every = np.concatenate(blocks)
+        every = self.remainder.padded(blocks)
         found, at = [], 0
         for effect, group in wanted:
             found.append(_Column(effect, effect.sizes[0], group[0], every[:, at : at + len(group)]))
@@ -368,9 +401,7 @@ class Scores:
         """Return what is expected of an effect's parameters, within their bounds; two phases are one amplitude and its phase."""
         effect, inner = column.effect, dict(column.inner)
         if "K" in effect.frees:
-            stated = self.fitted.likelihood.problem.experiment
-            value, unit = split_quantity(stated.stiffness_text, name="stiffness")
-            K = to_base(value, unit)
+            K = self.fitted.likelihood.problem.experiment.stiffness
             return {"K": float(np.clip(K + size[0], 0.3 * K, 3 * K))}
         p = next(p for p in effect.parameters if p.name == column.name)
         value, low, high = float(size[0]), to_base(p.lower, p.unit), to_base(p.upper, p.unit)

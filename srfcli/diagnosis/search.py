@@ -137,11 +137,19 @@ class ModelSearch:
     def fit(self, move: _Move | None) -> Fitted:
         """Return a model fitted from where its parent stands, and judged; the baseline from the file's own start values."""
         hypothesis = move.hypothesis if move else Hypothesis()
-        values = self._started(move) if move else None
         options = {"processes": self.processes if move else None, "cautious": True, **self.options}
-        found = fit_state_space(
-            self._problem(hypothesis, values or {}), start=values, close=NEAR, rtol=COARSE, progress=self.progress, **options,
-        )  # fmt: skip
+
+        def fitted(values: dict[str, float] | None) -> StateSpaceFit:
+            problem = self._problem(hypothesis, values or {})
+            return fit_state_space(problem, start=values, close=NEAR, rtol=COARSE, progress=self.progress, **options)
+
+        if move and not self.experiment.runs:  # without a field a parent that is far off leads to the crossings next to its own
+            stated = {q.name: q.value for q in self.experiment.parameters}
+            found = fitted(self._started(replace(move, values=stated, shifts={})))
+            if shortcomings(found):
+                found = max(found, fitted(self._started(move)), key=lambda f: f.log_likelihood)
+        else:
+            found = fitted(self._started(move) if move else None)
         self.processes = found.likelihood.processes
         return self._judged(hypothesis, found)
 
@@ -263,7 +271,8 @@ class ModelSearch:
         """Fit what comes close to the best model, or would mend it; expand the best once nothing does."""
         while not self.spent:
             best = self.best()
-            least = best.evidence + (-CLOSE if best.fine else CLOSE)
+            near = best.fine or not self.experiment.runs  # of critical loads a model that is far off promises too little
+            least = best.evidence + (-CLOSE if near else CLOSE)
             if not self.queue or -self.queue[0].expected < least:
                 if best.scores is not None or len(best.hypothesis.effects) >= LARGEST:
                     break
@@ -441,7 +450,7 @@ class ModelSearch:
                 self._push(node.evidence + pair.gain + 2 * one, Hypothesis(pair.effects), node, pair.values)
 
     def _swap(self, node: Fitted) -> None:
-        """Push the other registered ageing laws, each after a few steps from where the model stands, with what its score promises."""
+        """Push the other ageing laws, each after a few steps from where the model stands, with what its score promises."""
         stated, *modifiers = self.experiment.choice.ageing.split("+")
         for name in self.laws:
             if name == stated:

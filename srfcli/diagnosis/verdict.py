@@ -11,9 +11,11 @@ import numpy as np
 from srfcli.core.errors import Status
 from srfcli.core.units import from_base, to_base
 from srfcli.data.values import Experiment, Run
+from srfcli.diagnosis.goodness_of_fit import improbability
 from srfcli.diagnosis.hypotheses import Excluded, neutral_values
 from srfcli.diagnosis.scores import Score
 from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, Fitted, ModelSearch
+from srfcli.inference.critical_loads import Matched
 from srfcli.inference.state_space import Filtered, Likelihood, StateSpaceFit, maximise
 
 NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
@@ -50,6 +52,23 @@ class Held:
 
 
 @dataclass(frozen=True)
+class HeldLoads:
+    """One held-out table of critical loads beside the baseline's and the best model's, as they were fitted to the rest.
+
+    `excess` says how improbable its chi2 is under the best model, the model's own errors allowed for: above 1 it is no chance.
+    """
+
+    baseline: Matched
+    augmented: Matched
+    excess: float
+
+    @property
+    def gain(self) -> float:
+        """Return what the best model gains in log likelihood."""
+        return self.augmented.log_likelihood - self.baseline.log_likelihood
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Everything that is said and what it rests on; `close` are the models that may be it, best first.
 
@@ -73,6 +92,7 @@ class Diagnosis:
     held: tuple[Held, ...] = field(repr=False)
     reasons: tuple[str, ...]
     ungated: str
+    held_loads: tuple[HeldLoads, ...] = field(default=(), repr=False)
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -98,10 +118,10 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     close = tuple(f for f in close if not any(n < set(f.hypothesis.reported) for n in names))
     best = close[0] if close else best
     shown = on_the_track_of(best, baseline) if best.fine else baseline
-    held = held_out(baseline, best, whole, shown)
+    held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
     scores = tuple(baseline.promised)
     ungated, reasons = _said(best, close, scores)
-    refused = refusal(best, baseline, held) if ungated != "unknown" else ""
+    refused = refusal(best, baseline, held, held_loads) if ungated != "unknown" else ""
     verdict = "unknown" if refused else ungated
     reasons += [refused] if refused else []
     reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]
@@ -116,7 +136,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
         whole, verdict, best, baseline, baseline if verdict in NOTHING else shown, ranked, close,
         _confidence(ranked, verdict), scores,
         (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores}, _equivalent(scores, close), held,
-        tuple(reasons), ungated,
+        tuple(reasons), ungated, held_loads,
     )  # fmt: skip
 
 
@@ -125,7 +145,7 @@ def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
 
     By itself it widens the field until that takes up what is missing, and nothing is left to be seen.
     """
-    if best is baseline:
+    if best is baseline or not baseline.fit.likelihood.problem.runs:
         return baseline
     old = baseline.fit.likelihood
     likelihood = Likelihood(old.problem, smooth=best.fit.smooth, processes=best.fit.likelihood.processes, rtol=COARSE)
@@ -142,6 +162,17 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
     return tuple(
         Held(*(f.fit.likelihood.held_out(run, f.fit.values) for f in models)) for run in whole.runs if run.holdout
     )
+
+
+def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[HeldLoads, ...]:
+    """Return every held-out table of critical loads under two fitted models."""
+    found = []
+    for loads in (t for t in whole.thresholds if t.holdout):
+        before, after = (f.fit.likelihood.held_out_table(loads, f.fit.values) for f in (baseline, best))
+        spread = np.eye(after.white.size) + after.slopes @ best.fit.covariance @ after.slopes.T
+        cost = float(after.white @ np.linalg.solve(spread, after.white))
+        found.append(HeldLoads(before, after, improbability(cost, after.white.size)))
+    return tuple(found)
 
 
 def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score]) -> tuple[str, list[str]]:
@@ -161,8 +192,15 @@ def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score]) -> tup
     return "identified", reasons
 
 
-def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held]) -> str:
-    """Return why held-out runs refuse the best model; nothing where they do not."""
+def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequence[HeldLoads] = ()) -> str:
+    """Return why held-out runs and critical loads refuse the best model; nothing where they do not."""
+    for table in loads:
+        if table.excess > 1.0:
+            name, chi2 = table.augmented.loads.name, table.augmented.match.cost
+            return f"held-out critical loads are not predicted: {name} has chi2 {chi2:.1f}"
+    more = sum(h.gain for h in held) + sum(h.gain for h in loads)
+    if loads and best is not baseline and more < 0:
+        return f"what is held out is predicted worse than by the baseline: log likelihood {more:+.1f}"
     if not held:
         return ""
     if not all(h.augmented.whole for h in held):

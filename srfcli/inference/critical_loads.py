@@ -16,6 +16,8 @@ from srfcli.data.values import CriticalLoads, Experiment
 from srfcli.inference.free_parameters import FreeParameter, Scale
 from srfcli.inference.thresholds import Match, Matcher
 
+IMPROBABLE = 1e-3  # chance of a chi2 of critical loads below which the model is said not to describe them
+
 
 @dataclass(frozen=True)
 class Matched:
@@ -58,21 +60,21 @@ class Matched:
 class TableLikelihood:
     """One table under one model at one set of parameters after another; derivatives are by the parameters in `bounds`.
 
-    `bounds` holds name -> (start, lower, upper) in um, s, N, of those that the model has.
+    `bounds` holds name -> (start, lower, upper) in um, s, N, of those that the model has; the others stay as they are `given`.
     """
 
     def __init__(
         self,
         model: GeneratedModel,
-        experiment: Experiment,
         loads: CriticalLoads,
+        given: Mapping[str, float],
         bounds: Mapping[str, tuple[float, float, float]],
     ) -> None:
         self.loads = loads
         self.scale = Scale(
             tuple(FreeParameter(Parameter(n, row[0]), *row) for n, row in bounds.items() if n in model.names)
         )
-        self.matcher = Matcher(model, loads.table, values=apparatus(experiment, loads.frequency), scale=self.scale)
+        self.matcher = Matcher(model, loads.table, values=given, scale=self.scale)
 
     def at(self, values: Mapping[str, float], *, slopes: bool = True, anew: bool = False) -> Matched:
         """Return the table matched at parameters by name; `anew` searches every line in full."""
@@ -102,7 +104,7 @@ def joined_slopes(matched: Matched, names: Sequence[str], varying: Mapping[str, 
     return out
 
 
-def chance_of(cost: float, freedom: int) -> float:
+def chance_of(cost: float, freedom: float) -> float:
     """Return how likely a chi2 is to be as large by chance, 1 without degrees of freedom."""
     from scipy.stats import chi2
 

@@ -28,7 +28,7 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, QUALITY
 from srfcli.data.values import CriticalLoads, Experiment, Run
-from srfcli.inference.critical_loads import Matched, TableLikelihood, joined_slopes
+from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, stretches
@@ -439,7 +439,7 @@ class Likelihood:
         place = {name: n for n, names in varying.items() for name in names}
         rows = zip(problem.names, problem.start, problem.lower, problem.upper, strict=True)
         bounds = {place.get(name, name): (float(a), float(b), float(c)) for name, a, b, c in rows}
-        return TableLikelihood(problem.stability, problem.experiment, loads, bounds)
+        return TableLikelihood(problem.stability, loads, apparatus(problem.experiment, loads.frequency), bounds)
 
     def held_out_table(self, loads: CriticalLoads, values: Mapping[str, float]) -> Matched:
         """Return a table that was not fitted, matched with what was found, with derivatives by the names here."""
@@ -1193,7 +1193,7 @@ def correlated(point: Point) -> float:
 
     That is the score test of gauge noise with one more correlation time, over times from one sample to a tenth of a run.
     """
-    worst, longest = 0.0, max(white.size for f in point.runs for white in f.parts)
+    worst, longest = 0.0, max((white.size for f in point.runs for white in f.parts), default=0)
     for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
         product, square = 0.0, 0.0
         for white in (np.clip(w, -5.0, 5.0) for f in point.runs for w in f.parts):

@@ -62,6 +62,13 @@ RUNS = (
     Column("p_value", "", "adjusted for all that was looked at", ".1g"),
     Column("where", "", "times (s) that hold most of it"),
 )
+LOADS = (
+    Column("table", "", "of critical loads: its name"),
+    Column("role", "", "fit, or held out"),
+    Column("loads", "1", "critical loads in it"),
+    Column("baseline", "", "chi2: sum of squared residuals in sigma", ".4g"),
+    Column("augmented", "", "chi2: sum of squared residuals in sigma", ".4g"),
+)
 SENTENCES = {
     "none": "none: the baseline explains the recordings down to the noise",
     "identified": "identified: {}",
@@ -135,7 +142,7 @@ class DiagnosisResult(Result):
             (r["name"], r["evidence"] - zero, r["rms_over_noise"], r["field"], r["confidence"], r["against"])
             for r in ranked[:MOST]
         ]
-        notes = tuple(_notes(self.answer))
+        notes = tuple(_notes(self.answer, recorded=bool(self.diagnosis.experiment.runs)))
         return Table("srf.diagnose.hypotheses/1", HYPOTHESES, rows, "hypotheses", notes, status=self.status.value)
 
     @property
@@ -160,8 +167,18 @@ class DiagnosisResult(Result):
             rows.append((v.run.name, "held out" if v.holdout else "fit", *v.rms, *told))
         return Table("srf.diagnose.runs/1", RUNS, rows, "runs", tuple(_places(self.location)))
 
+    @property
+    def load_table(self) -> Table:
+        """Return what is left of each table of critical loads."""
+        from srfcli.diagnosis.answer import load_views
+
+        rows = [(v.name, "held out" if v.holdout else "fit", v.used.size, *v.chi2) for v in load_views(self.diagnosis)]
+        return Table("srf.diagnose.loads/1", LOADS, rows, "critical loads")
+
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the run that the verdict rests on most: recording, both models, residuals, random friction, what was imposed.
+
+        Without runs it is the first table of critical loads, under both models.
 
         Raises
         ------
@@ -170,10 +187,13 @@ class DiagnosisResult(Result):
         """
         own_figure(ax, "a diagnosis")
         from srfcli.diagnosis.answer import material
-        from srfcli.results.report_figures import run_figure, trace
+        from srfcli.results.report_figures import loads_figure, run_figure, trace
 
+        made = material(self.diagnosis, self.location)
+        if not made["runs"]:
+            return loads_figure(made["thresholds"][0])
         shares = {r.name: r.share for r in self.location.runs}
-        runs = [r for r in material(self.diagnosis, self.location)["runs"] if not r["holdout"]]
+        runs = [r for r in made["runs"] if not r["holdout"]]
         return run_figure(trace(max(runs, key=lambda r: shares.get(r["name"], 0.0))))
 
     def write(
@@ -213,10 +233,9 @@ class DiagnosisResult(Result):
         with whole_folder(folder, lambda: check_answer(folder, force=force)) as fresh:  # an hour may have passed
             text = (json_text(found, indent=2) + "\n").encode("utf-8")
             write_atomic(fresh / ANSWER, text)
-            runs = diagnosis.experiment.runs
             made = Provenance(
                 arguments=tuple(arguments), laws=last.fit.likelihood.problem.model.laws,
-                inputs=(diagnosis.experiment.path, *dict.fromkeys(r.file for r in runs)), seed=self.seed,
+                inputs=(diagnosis.experiment.path, *diagnosis.experiment.files), seed=self.seed,
                 timings={"diagnose": self.seconds},
             )  # fmt: skip
             write_sidecar(fresh / ANSWER, text, made)
@@ -249,7 +268,7 @@ class DiagnosisResult(Result):
             _report(fresh, found, made_of, told, debug)
 
 
-def _notes(found: dict[str, Any]) -> list[str]:
+def _notes(found: dict[str, Any], *, recorded: bool = True) -> list[str]:
     notes = list(found["reasons"])
     for name, side in (("baseline", found["baseline"]), ("final model", found["augmented"])):
         held = side["holdout"]["rms_over_noise"]
@@ -257,7 +276,11 @@ def _notes(found: dict[str, Any]) -> list[str]:
         field = side["field"]
         track = "needs no random friction" if field is None else f"needs random friction of {field['amplitude']:.2g}"
         like = " with the final model's" if name == "baseline" and found["baseline"] != found["augmented"] else ""
-        notes.append(f"{name}: {track};{like} rms over noise {side['fit']['rms_over_noise']:.4g} in the runs fitted{rest}")
+        told = f"rms over noise {side['fit']['rms_over_noise']:.4g} in"
+        if recorded:
+            notes.append(f"{name}: {track};{like} {told} the runs fitted{rest}")
+        else:
+            notes.append(f"{name}: {told} the critical loads fitted{rest}")
     notes += [f"{a} and {b} cannot be told apart by these recordings" for a, b in found["equivalent"]]
     notes += [f"{x['effect']} is not identifiable: {x['reason']}" for x in found["not_identifiable"]]
     notes += _missing(found.get("missing") or {})

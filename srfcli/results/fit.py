@@ -279,7 +279,7 @@ def load_rows(table: Thresholds, match: Match) -> list[tuple[Any, ...]]:
 
 def load_notes(fit: Fit) -> list[str]:
     """Return what a reader of a fit has to know of its critical loads: whether they are described, and how they were matched."""
-    from srfcli.inference.critical_loads import chance_of
+    from srfcli.inference.critical_loads import IMPROBABLE, chance_of
     from srfcli.inference.thresholds import match_notes
 
     notes, fitted = [], [t for t in fit.tables if not t.loads.holdout]
@@ -287,7 +287,7 @@ def load_notes(fit: Fit) -> list[str]:
     size, cost = sum(t.white.size for t in fitted), sum(t.match.cost for t in fitted)
     freedom = size - len(fit.names) if alone else size  # beside recordings they have little say in the parameters
     chance = chance_of(cost, freedom)
-    if fit.status.ok and chance < 1e-3:
+    if fit.status.ok and chance < IMPROBABLE:
         notes.append(
             f"critical loads: chi2 {cost:.4g} on {freedom} degrees of freedom, chance {chance:.1g}; the model does not describe"
             " them within sigma, and the errors do not allow for that"

@@ -29,6 +29,7 @@ from srfcli.results.report_figures import (
     force_by_state,
     force_figure,
     foremost,
+    loads_figure,
     overview,
     parameters_figure,
     rms_over_noise,
@@ -101,7 +102,12 @@ class Matter:
     @property
     def same(self) -> bool:
         """True where nothing was added: one model, drawn once."""
-        return all(t.same for t in self.traces)
+        return all(t.same for t in self.traces) and all(t["chi2"][0] == t["chi2"][1] for t in self.loads)
+
+    @property
+    def loads(self) -> list[Mapping[str, Any]]:
+        """Return the tables of critical loads: name, held out or not, and chi2 under both models."""
+        return list(self.tables.get("thresholds") or ())
 
     def rms(self, one: Trace) -> tuple[float, float]:
         """Return a run's residual over noise, whitened where the material has it so, before and after."""
@@ -144,7 +150,9 @@ def numbers(matter: Matter) -> Markup:
 
 
 def places(matter: Matter) -> Markup:
-    """Return where simulation and recording part."""
+    """Return where simulation and recording part, and computed and measured critical loads."""
+    if matter.loads and not matter.traces:
+        return section("where", "Critical loads, measured and computed", critical_loads(matter))
     parts: list[Any] = [tag("p", " ".join(_location_sentences(matter)))]
     parts.append(
         matter.figure(
@@ -168,7 +176,25 @@ def places(matter: Matter) -> Markup:
     parts += [_run(matter, one) for one in matter.fitted[1:SHOWN]]
     if len(matter.fitted) > SHOWN:
         parts.append(tag("p", f"The other {len(matter.fitted) - SHOWN} runs are drawn in the folder figures."))
-    return section("where", "Where simulation and recording part", parts, atlas(matter))
+    return section("where", "Where simulation and recording part", parts, critical_loads(matter), atlas(matter))
+
+
+def critical_loads(matter: Matter) -> list[Any]:
+    """Return each table's chi2 under both models, and its figure."""
+    if not matter.loads:
+        return []
+    rows = []
+    for one in matter.loads:
+        both = [number(one["chi2"][0], 3)] + ([] if matter.same else [number(one["chi2"][1], 3)])
+        rows.append([one["name"] + (" (held out)" if one["holdout"] else ""), str(one["size"]), *both])
+    heads = ["critical loads", "number", "baseline"] + ([] if matter.same else ["augmented model"])
+    caption = "chi2: the sum of squared residuals over their errors; about the number of loads where a model has them."
+    figures = [
+        matter.figure(f"loads {one['name']}", "Measured and computed critical loads over velocity.",
+                      "Circles: measured, with their errors. Lines: those of the model, thin: of the baseline.")
+        for one in matter.loads
+    ]  # fmt: skip
+    return [table(heads, rows, caption=caption, numeric=tuple(range(1, len(heads)))), *figures]
 
 
 def _run_table(matter: Matter) -> Markup:
@@ -369,6 +395,8 @@ def parameters(matter: Matter) -> Markup:
 
 def held_out(matter: Matter) -> Markup:
     """Return how runs are predicted that no fit has seen."""
+    if not matter.held and any(one["holdout"] for one in matter.loads):
+        return Markup("")  # tables of critical loads that were held out stand with the others
     if not matter.held:
         text = "No run was held out, so nothing shows that the model predicts what it has not seen; mark one with holdout = true."
         return section("held-out", "Runs that the fit never saw", tag("p", text))
@@ -632,6 +660,7 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     atlas: {axis, run, statistic, p_value, log_p, and low, high or bin};
     ranked: {name, evidence, rms_over_noise, p_value}; scores: {effect, gain, size, stderr, surviving, detectable, unit};
     parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma}.
+    thresholds: {name, holdout, table, chi2 (before, after)}, with baseline and augmented, critical loads (n,) in N, if any.
     Optional: title; about {effect: a phrase}; parting, paragraphs on a run that parts what is ambiguous; commands, lines to go
     on with; force {run: {t, force, band, v, phi, W}, "form": text, "unit": text}; diagram {V, W0_baseline, W0_augmented, note}.
     Without matplotlib the page has all but the figures, and says so.
@@ -651,7 +680,11 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
 
 def _tables(material: Mapping[str, Any]) -> dict[str, Any]:
     """Return the material as plain data, without the long arrays."""
-    found = {k: plain_value(v) for k, v in material.items() if k not in ("runs", *ARRAYS)}
+    found = {k: plain_value(v) for k, v in material.items() if k not in ("runs", "thresholds", *ARRAYS)}
+    found["thresholds"] = [
+        {"name": str(t["name"]), "holdout": bool(t["holdout"]), "chi2": plain_value(t["chi2"]), "size": len(t["table"])}
+        for t in material.get("thresholds", ())
+    ]
     found["runs"] = [
         {"name": str(r["name"]), "rms": plain_value(r.get("rms")), "holdout": bool(r.get("holdout"))}
         for r in material.get("runs", ())
@@ -699,8 +732,11 @@ def _drawings(traces: tuple[Trace, ...], material: Mapping[str, Any]) -> Iterato
         yield "overview", partial(overview, traces)
     for one in traces:
         yield f"run {one.name}", partial(run_figure, one)
+    for loads in material.get("thresholds", ()):
+        yield f"loads {loads['name']}", partial(loads_figure, loads)
     yield "atlas", partial(atlas_figure, plain_value(material.get("atlas") or ()))
-    if not all(one.same for one in traces):
+    changed = any(t["chi2"][0] != t["chi2"][1] for t in material.get("thresholds", ()))
+    if changed or not all(one.same for one in traces):
         yield "parameters", partial(parameters_figure, plain_value(material.get("parameters") or ()))
     force = material.get("force") or {}
     unit, runs = (

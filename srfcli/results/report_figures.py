@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.results.figures import _imposed, _settle, _thinned
+from srfcli.results.figures import _imposed, _settle, _thinned, draw_loads
 from srfcli.results.plots import (
     COLOURS,
     DASHES,
@@ -719,6 +719,17 @@ def _by_state(axis: Axes, x: Any, y: Any, log: bool, label: str, index: int) -> 
     middle = 0.5 * (edges[1:] + edges[:-1])[kept]
     mean = np.bincount(place, weights=y, minlength=PIECES)[kept] / count[kept]
     axis.plot(np.exp(middle) if log else middle, mean, color=colour, linestyle=DASHES[index % len(DASHES)], label=label)
+
+
+def loads_figure(one: Mapping[str, Any], *, narrow: bool = False) -> Figure:
+    """Return measured critical loads and those of both models over velocity; keys table, baseline, augmented, name."""
+    same = np.array_equal(one["baseline"], one["augmented"], equal_nan=True)
+    curves = {"model": one["baseline"]} if same else {"augmented model": one["augmented"], "baseline": one["baseline"]}
+    with house_style():
+        figure, (axis,) = new_figure(size=(NARROW_FIGURE, 5.0) if narrow else (7.4, 5.0))
+        draw_loads(axis, one["table"], curves)
+        axis.set_title(name_text(str(one["name"])) + (" (held out)" if one["holdout"] else ""))
+        return figure
 
 
 def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figure | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from srfcli.codegen.c_source import GET_COMPILER, compiler
@@ -35,7 +34,7 @@ def diagnose(
     registry: Registry | None = None,
     progress: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> DiagnosisResult:
-    """Return which physics an experiment's model lacks, as far as its recordings tell.
+    """Return which physics an experiment's model lacks, as far as its recordings and critical loads tell.
 
     The baseline is fitted with a random friction field and the gauge's noise; every registered effect is scored against it, those
     that promise most are fitted, and held-out runs judge the best.
@@ -98,9 +97,10 @@ def diagnose(
         found = read_experiment(Path(experiment), registry=registry, format=reader, holdout=holdout)
         return grouped(found, vary, by)
 
-    fitted = read(holdout=False)
-    fitted = replace(fitted, runs=tuple(r for r in fitted.runs if not r.holdout))
-    if compiler() is None:
+    fitted = read(holdout=False).fitted()
+    if not fitted.runs and (trend or vary):
+        raise SrfError(f"`{'trend' if trend else 'vary'}` is for recordings, and there are none", "Leave it out.")
+    if compiler() is None and fitted.runs:
         raise SrfError("srf diagnose needs a C compiler: it fits dozens of models", GET_COMPILER)
     stopped = searching = False
 
@@ -122,7 +122,7 @@ def diagnose(
     last = diagnosis.final if diagnosis.final is not diagnosis.baseline and diagnosis.final.fine else None
     location = locate(diagnosis.baseline, last=last, seed=seed)
     missing, parting = {}, None
-    if not stopped and diagnosis.verdict == "unknown":
+    if not stopped and fitted.runs and diagnosis.verdict == "unknown":
 
         def interrupted() -> None:
             nonlocal stopped
@@ -130,7 +130,7 @@ def diagnose(
 
         told("unknown: what is missing")
         missing = explain_unknown(search, diagnosis, stopped=interrupted)
-    if not stopped and diagnosis.verdict == "ambiguous":
+    if not stopped and fitted.runs and diagnosis.verdict == "ambiguous":
         told("ambiguous: the run that would tell them apart")
         parting = parting_experiment(registry, diagnosis, seed=seed)
     return DiagnosisResult(
