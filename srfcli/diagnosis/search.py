@@ -271,9 +271,11 @@ class ModelSearch:
         """Fit what comes close to the best model, or would mend it; expand the best once nothing does."""
         while not self.spent:
             best = self.best()
-            near = best.fine or not self.experiment.runs  # of critical loads a model that is far off promises too little
-            least = best.evidence + (-CLOSE if near else CLOSE)
-            if not self.queue or -self.queue[0].expected < least:
+            least = best.evidence + (-CLOSE if best.fine else CLOSE)
+            promised = bool(self.queue) and -self.queue[0].expected >= least
+            if self.queue and self.experiment.thresholds and not best.fine:  # at first order a model far off promises too little
+                promised = promised or self.queue[0].direction is not None or -self.queue[0].expected >= best.evidence - CLOSE
+            if not promised:
                 if best.scores is not None or len(best.hypothesis.effects) >= LARGEST:
                     break
                 self._expand(best)

@@ -20,7 +20,7 @@ from srfcli.inference.free_parameters import RHO, Scale
 from srfcli.numerics.boundary import CHUNK, BoundaryPoint, along, linearise_boundary, polish
 from srfcli.numerics.collocation import join
 from srfcli.numerics.critical import critical_line
-from srfcli.numerics.hopf import HopfPoint, hopf_points
+from srfcli.numerics.hopf import HopfPoint, hopf_points, steady_is_stable
 
 # Measured critical loads against computed ones: each is compared with the nearest odd crossing of its own line.
 #
@@ -190,10 +190,7 @@ class Matcher:
         points = [q for q in hopf_points(self.model, p) if q.leading and q.crossing_rate > 0]
         line.odd = [Crossing(q.W0, q, y) for q in points if datum / FAR <= q.W0 <= datum * FAR]
         if not line.odd:
-            low = p.copy()
-            low[self.model.index("W0")] = datum / FAR
-            roots = np.roots(np.asarray(self.model.characteristic(list(low)))[::-1])
-            line.end = datum * FAR if np.all(roots.real < 0) else datum / FAR
+            line.end = datum * FAR if steady_is_stable(self.model, p, datum / FAR) else datum / FAR
 
     def _survey(self, i: int, y: Array, p: Array, first: float | None) -> None:
         """Set the odd crossings of a line by a search of its own: near the datum, and further where that decides nothing."""

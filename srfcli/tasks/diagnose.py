@@ -122,7 +122,7 @@ def diagnose(
     last = diagnosis.final if diagnosis.final is not diagnosis.baseline and diagnosis.final.fine else None
     location = locate(diagnosis.baseline, last=last, seed=seed)
     missing, parting = {}, None
-    if not stopped and fitted.runs and diagnosis.verdict == "unknown":
+    if not stopped and not fitted.thresholds and diagnosis.verdict == "unknown":
 
         def interrupted() -> None:
             nonlocal stopped
@@ -130,7 +130,7 @@ def diagnose(
 
         told("unknown: what is missing")
         missing = explain_unknown(search, diagnosis, stopped=interrupted)
-    if not stopped and fitted.runs and diagnosis.verdict == "ambiguous":
+    if not stopped and not fitted.thresholds and diagnosis.verdict == "ambiguous":
         told("ambiguous: the run that would tell them apart")
         parting = parting_experiment(registry, diagnosis, seed=seed)
     return DiagnosisResult(
