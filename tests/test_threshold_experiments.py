@@ -399,6 +399,7 @@ def test_the_command_shows_tables_and_loads(alone: Path, empty_folder: Path) -> 
 
 
 BREACHES = [
+    ("thresholds = []", "thresholds: found [], expected tables, at least one"),
     ("", "runs: missing"),
     ("thresholds = 3", "thresholds: found 3, expected tables, at least one"),
     ('[[thresholds]]\nname = "a"', "thresholds[0].file: missing"),

@@ -344,12 +344,13 @@ def _segments(node: Node | None) -> tuple[float, ...]:
 
 
 def _thresholds(node: Node, machine: Apparatus, runs: tuple[RunDescription, ...]) -> tuple[ThresholdsDescription, ...]:
+    entries = list(node.tables(_TABLES))
     stress = "counts stresses" if machine.geometry.area or is_stress(machine.stated) else ""
     if machine.per_load or stress:
         which = stress or "has a stiffness in friction per micron, which leaves no load to be critical"
-        node.child(0).fail(f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.')
+        entries[0].fail(f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.')
     found: list[ThresholdsDescription] = []
-    for entry in node.tables(_TABLES):
+    for entry in entries:
         entry.keys(_THRESHOLDS)
         file = entry.require("file", 'Write file = "critical-loads.csv", relative to the experiment\'s folder.')
         if not file.text().strip() or "\0" in file.text():

@@ -124,6 +124,8 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     refused = refusal(best, baseline, held, held_loads) if ungated != "unknown" else ""
     verdict = "unknown" if refused else ungated
     reasons += [refused] if refused else []
+    if whole.runs and not baseline.fit.likelihood.problem.runs:
+        reasons.append("held-out runs are not judged, as no run was fitted that would tell the gauge's noise")
     reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]
     if search.cut_short:
         reasons.append(f"the search ended at its budget of {search.budget:g} s of CPU, with models left to fit")
@@ -158,6 +160,8 @@ def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
 
 def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | None = None) -> tuple[Held, ...]:
     """Return every held-out run under two fitted models, and under the baseline as it is shown, if that is another."""
+    if not baseline.fit.likelihood.problem.runs:
+        return ()  # of a gauge that nothing was fitted to
     models = (baseline, best, shown or baseline)
     return tuple(
         Held(*(f.fit.likelihood.held_out(run, f.fit.values) for f in models)) for run in whole.runs if run.holdout
