@@ -442,6 +442,15 @@ def test_what_is_held_out_is_not_opened_and_something_must_be_left(tmp_path: Pat
     assert srf.read_experiment(folder, holdout=False).thresholds == ()
 
 
+def test_loads_without_an_error_are_told_to_have_the_usual_one(tmp_path: Path, measured: Thresholds) -> None:
+    folder = folder_of(tmp_path, HEAD.format(model="", parameters="") + TABLE, loads=measured)
+    rows = (f"{v},{e},{w}" for v, e, w in zip(measured.V, measured.eps, measured.W0c, strict=True))
+    (folder / "loads.csv").write_text("\n".join(["V [um/s],eps,W0c [N]", *rows]))
+    experiment = srf.read_experiment(folder)
+    assert [n.kind for n in experiment.notices] == ["sigma"] and "3%" in experiment.notices[0].what
+    assert experiment.thresholds[0].table.sigma == pytest.approx(0.03 * measured.W0c)
+
+
 def test_an_experiment_with_tables_is_written_and_read_back(both: Path, tmp_path: Path) -> None:
     experiment = srf.read_experiment(both)
     write_experiment(experiment, tmp_path / "again")

@@ -21,6 +21,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, lru_cache, singledispatch
 from importlib.resources import files
@@ -308,6 +309,7 @@ ORBIT_FUNCTIONS = {"cycle": "srf_cycle", "cycle_jacobian": "srf_cycle_jacobian",
 LANES = 16  # derivatives that the filter carries along at a time: a run has 11 to 14
 GAUGE_PROCESSES = 3  # of coloured gauge noise, at most, of one state or two
 SIGNALS = 3  # of a run, each with its own gauge noise, at most
+_ONE = threading.Lock()  # one thread writes and compiles at a time; Python 3.11 takes parsing in two for an error
 TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
 
 
@@ -408,7 +410,8 @@ def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
     """Return the compiled integrator of this model, or None where there is no compiler; SrfError where it fails on the text."""
     if compiler() is None:
         return None
-    library = library_of(lambda: c_source(model), ["motion", model.source])
+    with _ONE:
+        library = library_of(lambda: c_source(model), ["motion", model.source])
     library.srf_integrate.restype = ctypes.c_int
     if hasattr(library, "srf_filter"):
         library.srf_filter.restype = ctypes.c_int
