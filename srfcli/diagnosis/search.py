@@ -222,7 +222,9 @@ class ModelSearch:
         base = self._expand(base)
         self._search()
         for further in (self._recolour, self._together, self._swap):  # dearer, or less likely
-            if not self.best().fine and not self.spent:
+            best = self.best()
+            imitated = further == self._swap and not self.baseline.fine  # an effect may pass for another ageing law
+            if (imitated or not best.fine) and not self.spent:
                 further(self.baseline)
                 self._search()
         self.cut_short = self.spent and bool(self.queue)
