@@ -318,15 +318,12 @@ def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
             f"{run.file}: none of the columns {', '.join(roles)}; found: {', '.join(finder.headings)}",
             f"One of them is needed; [columns] can name it. {_near(roles, names)}".strip(),
         )
-    listed = [c for c in observables if c.role in finder.specs] or observables
-    if run.observables:
-        listed = observables
-    elif len(observables) > 1:
-        others = ", ".join(c.role for c in observables if c is not listed[0])
+    seen = observables if run.observables else ([c for c in observables if c.role in finder.specs] or observables)[:1]
+    if len(observables) > len(seen):
+        others = ", ".join(c.role for c in observables if c is not seen[0])
         every = ", ".join(f'"{c.role}"' for c in observables)
-        what = f"{listed[0].role} is what is compared; the file also has {others}, left aside (observables = [{every}] takes all)"
+        what = f"{seen[0].role} is what is compared; the file also has {others}, left aside (observables = [{every}] takes all)"
         finder.notices.append(Notice("observable", str(run.file), what))
-    seen = listed if run.observables else listed[:1]
     channels = [time, *(replace(c, role="force") if c.role == "shear_stress" else c for c in seen)]
     moves = finder.find("load_point_velocity")
     if moves is None and run.drive is None:

@@ -383,20 +383,21 @@ def _signal(
 ) -> tuple[Signal, list[Notice]]:
     """Return what was observed besides, as it is: spikes, resets and saturation are looked for in the first observable alone."""
     place = Place(run.file, columns.channels[role].heading, rows, t)
-    known, filled = _numbers(place, x)
-    told = f"without a number in '{place.heading}', not compared"
-    return Signal(role, filled, known, quantisation(filled[known])), spots("nan", ~known, run.file, rows, t, told)
+    known, filled, notices = _numbers(place, x)
+    return Signal(role, filled, known, quantisation(filled[known])), notices
 
 
-def _numbers(place: Place, x: Array) -> tuple[Mask, Array]:
-    """Return which readings (n,) are numbers, and the readings with others in the place of what is none."""
+def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
+    """Return which readings (n,) are numbers, the readings with others in the place of what is none, and notices of these."""
     known = np.isfinite(x)
     if known.sum() < 8:
         raise SrfError(
             f"{place.path.name}: column '{place.heading}' has {int(known.sum())} numbers in {x.size} samples",
             "A recording needs 8 or more.",
         )
-    return known, np.interp(place.t, place.t[known], x[known])
+    told = f"without a number in '{place.heading}', not compared"
+    notices = spots("nan", ~known, place.path, place.rows, place.t, told)
+    return known, np.interp(place.t, place.t[known], x[known]), notices
 
 
 def moved(t: Array, arrays: Mapping[str, Array]) -> Array:
@@ -483,8 +484,7 @@ def clean_observable(
     Raises SrfError where nothing is left.
     """
     t, path, rows = place.t, place.path, place.rows
-    known, filled = _numbers(place, x)
-    notices = spots("nan", ~known, path, rows, t, f"without a number in '{place.heading}', not compared")
+    known, filled, notices = _numbers(place, x)
     quantum = quantisation(filled[known])
     clipped = saturation(filled)
     if clipped.any():

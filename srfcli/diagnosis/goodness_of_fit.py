@@ -73,12 +73,12 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
 
 def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[float, str]]:
     """Return the tests of one signal of a run: how far each is from what noise would give, over what is allowed, in words."""
-    signal, white, rates = f.run.signals[number], f.parts[number], len(f.run.sampling.spacings)
+    signal, white = f.run.signals[number], f.parts[number]
     name = f"{signal.observable} of {f.run.name}" if number else f.run.name
     n = white.size
     off = abs(float(np.sum(white**2)) - n) / np.sqrt(2 * n)
     tests = [(off / DEVIATION, f"innovations of {name} have an rms of {np.sqrt(np.mean(white**2)):.3f}")]
-    owns = found.likelihood.gauges(f.run)[number * rates : (number + 1) * rates]
+    owns = found.likelihood.gauges(f.run, number)
     gauges = [[found.values[n] for local, n in own.items() if local.startswith(LEVELS)] for own in owns]
     level = np.linalg.norm(np.array(gauges), axis=1)[f.run.sampling.at][signal.used]
     expected = (signal.observed - f.of(number).nu)[signal.used]

@@ -483,8 +483,7 @@ def _carried(
             if by_V is None:
                 by_V = _rates_by_V(model, fitted, run, kept.mean[:, : len(states)])
             inputs[1:, : len(states), j] = 0.5 * (by_V[1:] + by_V[:-1]) * total[:, None]
-    signals, used = len(run.signals), np.zeros(every.nu.size, dtype=bool)
-    used[f.used] = True
+    signals = len(run.signals)
     c, out = np.zeros((a, inputs.shape[2])), np.zeros((every.nu.size, inputs.shape[2]))
     for k in range(every.nu.size):
         if k % signals == 0:
@@ -494,7 +493,7 @@ def _carried(
         if late and k % signals == 0:  # a delay is that of the first signal's gauge
             seen[-1] += shown[at_sample]
         out[k] = seen
-        if used[k]:
+        if f.taken[k]:
             c -= np.outer(every.kept.covariance[k] @ every.kept.gradient[k] / every.S[k], seen)
     white = out[f.used] / np.sqrt(every.S[f.used])[:, None]
     return _stacked(white, np.zeros_like(white))

@@ -113,6 +113,11 @@ class Filtered:
         k = len(self.run.signals)
         return np.concatenate([np.nonzero(s.used)[0] * k + i for i, s in enumerate(self.run.signals)])
 
+    @cached_property
+    def taken(self) -> Array:
+        """Return whether each of all readings is used."""
+        return np.stack([s.used for s in self.run.signals], axis=1).ravel()
+
     @property
     def whole(self) -> bool:
         """Return whether the motion was followed to the last sample, and every variance is one."""
@@ -162,9 +167,7 @@ class Filtered:
 
     def smoothed(self) -> Smoothed:
         """Return states and field (n, ...) given all readings of the run; it was filtered with `keep`."""
-        used = np.zeros(self.every.nu.size, dtype=bool)
-        used[self.used] = True
-        found, k = smooth(self.every, used), len(self.run.signals)
+        found, k = smooth(self.every, self.taken), len(self.run.signals)
         return Smoothed(found.mean[::k], found.covariance[::k], found.r[::k], found.N[::k])
 
 
@@ -475,12 +478,13 @@ class Likelihood:
         """Return the names of the gauge noise of a kind, an observable and a spacing, by those that `filter_run` has."""
         return {n: n if len(self.kinds) == 1 else f"{n}[{kind[0]}, {kind[1]:g} s]" for n in self._gauge}
 
-    def gauges(self, run: Run) -> list[dict[str, str]]:
+    def gauges(self, run: Run, signal: int | None = None) -> list[dict[str, str]]:
         """Return the names of a run's gauge noise, by those that `filter_run` has for them, of each signal at each sampling rate.
 
-        A run that was held out has those of what was sampled most alike.
+        Of one `signal` alone, where its number is given. A run that was held out has those of what was sampled most alike.
         """
-        return [self.gauge_like(kind) for kind in _kinds(run)]
+        found, rates = [self.gauge_like(kind) for kind in _kinds(run)], len(run.sampling.spacings)
+        return found if signal is None else found[signal * rates : (signal + 1) * rates]
 
     def gauge_like(self, kind: tuple[str, float]) -> dict[str, str]:
         """Return the names of the gauge noise of the kind that is most like this one."""
@@ -1440,8 +1444,8 @@ def as_fit(found: StateSpaceFit) -> Fit:
 
 def _run_fit(likelihood: Likelihood, f: Filtered, number: int, values: Mapping[str, float]) -> RunFit:
     """Return how one signal of a run is fitted."""
-    run, signal, found, rates = f.run, f.run.signals[number], f.of(number), len(f.run.sampling.spacings)
-    gauges, rate = likelihood.gauges(run)[number * rates : (number + 1) * rates], run.sampling.at
+    run, signal, found = f.run, f.run.signals[number], f.of(number)
+    gauges, rate = likelihood.gauges(run, number), run.sampling.at
     levels = np.array([np.hypot(values[own["gauge_white"]], signal.quantum / np.sqrt(12)) for own in gauges])
     level = float(np.sqrt(np.mean(levels[rate] ** 2)))
     every = (tuple(values[own[n]] for n in row) for own in gauges for row in gauge_rows(likelihood.processes))
