@@ -47,7 +47,7 @@ NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 i
 COARSE = 1e-3  # tolerance of the integration: 0.02 in log likelihood
 BUDGET = 150.0  # s of CPU
 SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
-ASTRAY = 1000.0  # in log likelihood below its parent, from where a model is not fitted
+ASTRAY = 1000.0  # in log likelihood below its parent, from where a model is not fitted: its score knows nothing of the maximum
 BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
 FAR = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
 AGAIN = 6  # of them, about the best, whose other parameters are fitted too where the model fails a test
@@ -465,7 +465,7 @@ class ModelSearch:
                 continue
             x = likelihood.coordinates(_followable(node.fit.values, likelihood.problem))
             found = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
-            if not np.isfinite(found.away):
+            if not (np.isfinite(found.away) and found.point.log_likelihood > node.fit.log_likelihood - ASTRAY):
                 continue
             self.count += 1
             expected = found.point.log_likelihood + 0.5 * found.away**2 - node.fit.log_likelihood + node.evidence

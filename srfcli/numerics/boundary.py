@@ -195,7 +195,8 @@ def slope_in_last(linear: BoundaryLinear) -> Array:
     try:
         response = np.linalg.solve(inner, last)[..., 0]
     except np.linalg.LinAlgError:  # one singular point spoils the batch
-        usable = np.abs(np.linalg.det(np.nan_to_num(inner))) > 1e-300
+        with np.errstate(over="ignore"):  # a huge determinant is not a singular one
+            usable = np.abs(np.linalg.det(np.nan_to_num(inner))) > 1e-300
         response = np.linalg.solve(np.where(usable[..., None, None], inner, np.eye(n)), last)[..., 0]
         response = np.where(usable[..., None], response, np.nan)
     return linear.growth[..., -1] - np.einsum("...n,...n->...", linear.growth[..., :n], response)
@@ -428,7 +429,7 @@ def _step(model: GeneratedModel, r: _Polished, index: Array, direction: Directio
     r.p[np.asarray(rows)[:, None], index] = direction.moved(q[rows], dq)
     r.orbit.x[index] += limit[:, None, None] * dx
     r.orbit.stages[index] += limit[:, None, None, None] * dstages
-    left = size * size  # what the step just made leaves behind
+    left = np.minimum(size, 1.0) ** 2  # what the step just made leaves behind; a nearly singular one has no bound
     enough = np.maximum(0.1 * tol, 0.1 * mesh_error(model, part))  # a tenth of the mesh's own error
     done = usable & (left < enough) & (size < 1e-3)
     r.residual[index] = np.where(done, left, np.abs(linear.g))
