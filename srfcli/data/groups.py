@@ -13,6 +13,7 @@ from srfcli.core.errors import SrfError
 from srfcli.data.values import Experiment, Run
 
 BY = ("run", "load", "segment", "direction")
+NOISE = "noise"  # what may vary besides parameters: the gauge noise of a group of runs
 CUT = ("segment", "direction")  # for which runs are cut
 STEP = 1.5  # factor of a step of the velocity: what is fitted through noisy displacements wavers by less
 STILL = 1e-6  # um/s, below which the drive is held: no piece of a run can begin there in steady sliding

@@ -14,20 +14,21 @@ from srfcli.codegen.model import Array
 from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError
 from srfcli.data.clock import Mask, runs_of
+from srfcli.motion.imposed import from_neighbours
 
 SEGMENT = 256  # samples of a periodogram
-NEIGHBOURS = 9  # samples whose mean time is an even one
-JITTER = 1e-3  # spacings by which a sample may be off an even time, and be taken as even
+NEIGHBOURS = 16  # samples that foretell one between them: sines of five samples a period or more, to 1e-4 of them
+JITTER = 1e-3  # spacings by which times that are taken as even may be off
 
 
 def white_level(x: Array, t: Array | None = None) -> float:
     """Return the standard deviation of white noise whose floor the spectrum of x (n,) shows above half the Nyquist frequency.
 
     The median over frequencies and stretches: lines, events and a slow signal do not raise it. Coloured noise counts as signal.
-    A signal that is read at uneven times looks like noise: where those are given, t (n,), it is taken as even ones would read it.
+    A signal that is read at uneven times looks like noise: where those are given, t (n,), it is what neighbours do not foretell.
     """
-    if t is not None:
-        x = _at_even_times(t, x)
+    if t is not None and x.size > 4 * NEIGHBOURS and np.median(np.abs(np.diff(t, 2))) > JITTER * np.median(np.diff(t)):
+        return _foretold(t, x)
     length = min(SEGMENT, 2 ** int(np.log2(max(x.size, 1))))
     if length < 16:
         third = np.diff(x, 3) if x.size > 3 else np.zeros(1)
@@ -44,19 +45,12 @@ def white_level(x: Array, t: Array | None = None) -> float:
     return float(np.sqrt(np.median(np.median(upper, axis=1)) / np.log(2)))
 
 
-def _at_even_times(t: Array, x: Array) -> Array:
-    """Return x (n,), by a spline through it, at the means of neighbouring times t (n,); x itself where these are even."""
-    from scipy.interpolate import make_interp_spline
-    from scipy.ndimage import uniform_filter1d
-
-    if x.size < 4 * NEIGHBOURS:
-        return x
-    moved = t.copy()
-    inner = slice(NEIGHBOURS // 2, -(NEIGHBOURS // 2))
-    moved[inner] = t[0] + uniform_filter1d(t - t[0], NEIGHBOURS)[inner]
-    if np.median(np.abs(moved - t)) < JITTER * np.median(np.diff(t)):
-        return x
-    return np.asarray(make_interp_spline(t, x, k=5)(moved))
+def _foretold(t: Array, x: Array) -> float:
+    """Return the level of noise in x (n,) by how far polynomials through the neighbours of each sample at times t miss it."""
+    reach = NEIGHBOURS // 2
+    weights, windows = from_neighbours(t, reach), np.lib.stride_tricks.sliding_window_view(x, 2 * reach + 1)
+    missed = windows[:, reach] - np.sum(np.delete(windows, reach, axis=1) * weights, axis=1)
+    return float(np.median(np.abs(missed) / np.sqrt(1 + np.sum(weights**2, axis=1))) / 0.6745)
 
 
 # Flaws of a channel: spikes, level jumps of a transducer, saturation, and the step of its quantisation.

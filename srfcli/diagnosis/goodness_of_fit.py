@@ -14,11 +14,10 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import stretches, white_level
-from srfcli.inference.state_space import LAGS, Filtered, StateSpaceFit, correlated, cut, typical_friction
+from srfcli.inference.state_space import LAGS, LOST, Filtered, StateSpaceFit, correlated, cut, typical_friction
 
 DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
 PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
-LOST = 3.0  # standard errors from its maximum at which a fit is none
 STEADY = 2.0  # gauge's noise: a stretch whose readings are expected to vary by less is one of steady sliding
 LEVELS = ("gauge_white", "gauge_colour")
 LOUD = 1.15  # gauge noise over that which differences of the recording show, beyond which it holds something else
@@ -75,14 +74,14 @@ def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[
     """Return the tests of one signal of a run: how far each is from what noise would give, over what is allowed, in words."""
     signal, white = f.run.signals[number], f.parts[number]
     name = f"{signal.observable} of {f.run.name}" if number else f.run.name
-    n = white.size
-    off = abs(float(np.sum(white**2)) - n) / np.sqrt(2 * n)
+    n, own = white.size, _own_level(white)
+    off = abs(float(np.sum(white**2)) / own**2 - n) / np.sqrt(2 * n)
     tests = [(off / DEVIATION, f"innovations of {name} have an rms of {np.sqrt(np.mean(white**2)):.3f}")]
     owns = found.likelihood.gauges(f.run, number)
     gauges = [[found.values[n] for local, n in own.items() if local.startswith(LEVELS)] for own in owns]
     level = np.linalg.norm(np.array(gauges), axis=1)[f.run.sampling.at][signal.used]
     expected = (signal.observed - f.of(number).nu)[signal.used]
-    for piece, y, noise in zip(cut(white), cut(expected), cut(level), strict=True):
+    for piece, y, noise in zip(cut(white / own), cut(expected), cut(level), strict=True):
         m = piece.size
         loud = (float(np.sum(np.clip(piece, -6, 6) ** 2)) - m) / np.sqrt(2 * m)
         shifted = abs(float(np.sum(piece))) / np.sqrt(m)
@@ -90,6 +89,18 @@ def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[
             loud *= _smooth_share(piece)
         tests.append((max(loud, shifted) / (DEVIATION + 1.0), f"a stretch of {name} is off"))
     return tests
+
+
+def _own_level(white: Array) -> float:
+    """Return the level of a run's noise, in that which runs share: what its calm innovations say, the rms at most.
+
+    It is the median size of third differences. What a model lacks is smooth, or lies in a part of the run; noise lies in all.
+    """
+    if white.size < 32:
+        return 1.0
+    third = float(np.median(np.abs(np.diff(white, 3)))) / (0.6745 * np.sqrt(20.0))
+    low, high = sorted((1.0, float(np.sqrt(np.mean(white**2)))))
+    return float(np.clip(np.clip(third, low, high), 1 / LOUD, LOUD))
 
 
 def _of_loads(found: StateSpaceFit) -> list[tuple[float, str]]:

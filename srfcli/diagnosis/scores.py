@@ -149,7 +149,7 @@ class Remainder:
     @cached_property
     def shared(self) -> SharedField:
         """Return the field that all runs share, of the correlation length that each run's own has."""
-        if self.fitted.smooth or len(self.fitted.likelihood.problem.runs) < 2:
+        if self.fitted.smooth or len(self.runs) < 2 or not all(f.whole for f in self.runs):
             return SharedField(np.zeros((self.left.size, 0)), np.zeros(0), np.zeros(0), 0.0)
         values, states = self.fitted.values, self.fitted.likelihood.problem.model.states
         slips = [slip_along(f.run, f.found.kept.mean, states) for f in self.runs if f.found.kept]

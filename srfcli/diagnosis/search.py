@@ -48,6 +48,7 @@ COARSE = 1e-3  # tolerance of the integration: 0.02 in log likelihood
 BUDGET = 150.0  # s of CPU
 SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 ASTRAY = 1000.0  # in log likelihood below its parent, from where a model is not fitted: its score knows nothing of the maximum
+FARTHEST = 10.0  # in the logarithm of a parameter, that a score can move it: beyond any bounds
 BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
 FAR = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
 AGAIN = 6  # of them, about the best, whose other parameters are fitted too where the model fails a test
@@ -184,7 +185,7 @@ class ModelSearch:
         model, values = move.hypothesis.model(self.registry, self.experiment), dict(move.values)
         for name, shift in shifts.items():  # relative ones as powers: what is positive stays so
             value = values[name]
-            values[name] = value * float(np.exp(share * shift / value)) if value > 0 else value + share * shift
+            values[name] = value * float(np.exp(np.clip(share * shift / value, -FARTHEST, FARTHEST))) if value > 0 else value + share * shift
         for number, (effect, sizes) in enumerate(zip(move.hypothesis.effects, move.sizes, strict=True)):
             part = share if number >= len(move.sizes) - move.fresh else 1.0
             longs = {p.name: long for long, p in own_parameters(effect, model).items()}
@@ -223,7 +224,7 @@ class ModelSearch:
         self._search()
         for further in (self._recolour, self._together, self._swap):  # dearer, or less likely
             best = self.best()
-            imitated = further == self._swap and not self.baseline.fine  # an effect may pass for another ageing law
+            imitated = further == self._swap and (not self.baseline.fine or best is not self.baseline)  # an effect may pass for one
             if (imitated or not best.fine) and not self.spent:
                 further(self.baseline)
                 self._search()

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
-from srfcli.data.groups import labels
+from srfcli.data.groups import NOISE, labels
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
@@ -162,10 +163,26 @@ class Problem:
         """Return parameters by name, those that are held among them."""
         return {**self.held, **dict(zip(self.names, np.asarray(theta).tolist(), strict=True))}
 
+    def varied(self, run: Run) -> dict[str, str]:
+        """Return what the parameters that vary are called in a run, fitted or not."""
+        return {n: f"{n}[{self.group(run)}]" for n in self.experiment.vary if n != NOISE}
+
+    def group(self, run: Run) -> str:
+        """Return the group of a run for what varies."""
+        known = self._labels.get(run.name)
+        return known or labels(replace(self.experiment, runs=(*self.experiment.runs, run)))[run.name]
+
+    @cached_property
+    def _labels(self) -> dict[str, str]:
+        return labels(self.experiment)
+
+    def noise_group(self, run: Run) -> str:
+        """Return the group of runs whose gauge noise a run has; nothing where all share one."""
+        return self.group(run) if NOISE in self.experiment.vary else ""
+
     def local(self, run: Run, values: Mapping[str, float]) -> dict[str, float]:
         """Return parameters by name with those that vary under their own names, at what they are in this run."""
-        own = self.varying.get(run.name, {})
-        return {**values, **{n: values[name] for n, name in own.items() if name in values}}
+        return {**values, **{n: values[name] for n, name in self.varied(run).items() if name in values}}
 
     def predicted(self, run: Run, theta: Array, *, until: float = np.inf, slopes: bool = True) -> Prediction:
         """Return the prediction of a run, with derivatives by the free parameters."""
@@ -208,7 +225,7 @@ def fit_problem(
     if not names:
         raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
     varying = _varying(experiment, runs, names)
-    groups = {n: list(dict.fromkeys(varying[run.name][n] for run in runs)) for n in experiment.vary}
+    groups = {n: list(dict.fromkeys(varying[run.name][n] for run in runs)) for n in experiment.vary if n != NOISE}
     rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names for _ in groups.get(n, [n])]
     names = [own for n in names for own in groups.get(n, [n])]
     for run in runs:
@@ -231,12 +248,12 @@ def _varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[str]) 
     if not vary:
         return {}
     for name in vary:
-        if name not in names:
-            raise SrfError(f"'{name}' is to vary, and is not free", did_you_mean(name, names))
+        if name not in (*names, NOISE):
+            raise SrfError(f"'{name}' is to vary, and is not free", did_you_mean(name, [*names, NOISE]))
     label = labels(experiment)
     if len({label[run.name] for run in runs}) < 2:
         raise SrfError(f"{', '.join(vary)} cannot vary by {by}: the runs fitted have only one", "Leave `vary` out.")
-    return {run.name: {n: f"{n}[{label[run.name]}]" for n in vary} for run in experiment.runs}
+    return {run.name: {n: f"{n}[{label[run.name]}]" for n in vary if n != NOISE} for run in experiment.runs}
 
 
 @dataclass(frozen=True)

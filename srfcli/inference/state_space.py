@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from scipy.signal import lfilter, welch
@@ -45,11 +45,14 @@ from srfcli.inference.prediction import (
 )
 
 T = TypeVar("T")
+Kind: TypeAlias = tuple[str, float, str]  # of gauge noise: an observable, the spacing of its samples, the group of runs if it varies
 RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
 # A fit begins with the likeliest of nine fields: amplitudes over the friction of the recordings, lengths over that of PIECES
 WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
+TRIES = 3  # of these fields, from which a fit begins anew where half of its steps ended far from a maximum
+LOST = 3.0  # standard errors from its maximum at which a fit is none
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
 SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
 FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
@@ -409,7 +412,7 @@ class Likelihood:
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs) if problem.runs else {}
         self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
-        self.kinds = list(dict.fromkeys(kind for run in problem.runs for kind in _kinds(run)))
+        self.kinds = list(dict.fromkeys(kind for run in problem.runs for kind in self.kinds_of(run)))
         own = [(n, *scales[n]) for n in (() if self.smooth else FIELD)]
         for kind in self.kinds:
             own += [(name, *scales[n.rstrip("123"), kind[0]]) for n, name in self.gauge_names(kind).items()]
@@ -459,7 +462,7 @@ class Likelihood:
             zip(self.names, plain.tolist(), strict=True)
         )
         for n in {n for own in self.problem.varying.values() for n in own}:  # where no run is asked for, it is the mean
-            found[n] = float(np.mean([found[name] for name in self.names if name.startswith(f"{n}[")]))
+            found[n] = float(np.mean([value for name, value in found.items() if name.startswith(f"{n}[")]))
         return found | ({"field_amplitude": 0.0, "field_length": 1.0} if self.smooth else {})
 
     def unit(self, x: Array) -> Array:
@@ -474,21 +477,28 @@ class Likelihood:
                 x[i] = np.log(max(values[name], 1e-300)) if self.logarithmic[i] else values[name]
         return np.clip(x, self.lower, self.upper)
 
-    def gauge_names(self, kind: tuple[str, float]) -> dict[str, str]:
-        """Return the names of the gauge noise of a kind, an observable and a spacing, by those that `filter_run` has."""
-        return {n: n if len(self.kinds) == 1 else f"{n}[{kind[0]}, {kind[1]:g} s]" for n in self._gauge}
+    def kinds_of(self, run: Run) -> list[Kind]:
+        """Return the kinds of gauge noise of a run: each signal at each of its sampling rates, in its group if noise varies."""
+        group = self.problem.noise_group(run)
+        return [(s.observable, dt, group) for s in run.signals for dt in _spacings(run)]
+
+    def gauge_names(self, kind: Kind) -> dict[str, str]:
+        """Return the names of the gauge noise of a kind by those that `filter_run` has."""
+        told = f"{kind[0]}, {kind[1]:g} s" + (f", {kind[2]}" if kind[2] else "")
+        return {n: n if len(self.kinds) == 1 else f"{n}[{told}]" for n in self._gauge}
 
     def gauges(self, run: Run, signal: int | None = None) -> list[dict[str, str]]:
         """Return the names of a run's gauge noise, by those that `filter_run` has for them, of each signal at each sampling rate.
 
         Of one `signal` alone, where its number is given. A run that was held out has those of what was sampled most alike.
         """
-        found, rates = [self.gauge_like(kind) for kind in _kinds(run)], len(run.sampling.spacings)
+        found, rates = [self.gauge_like(kind) for kind in self.kinds_of(run)], len(run.sampling.spacings)
         return found if signal is None else found[signal * rates : (signal + 1) * rates]
 
-    def gauge_like(self, kind: tuple[str, float]) -> dict[str, str]:
+    def gauge_like(self, kind: Kind) -> dict[str, str]:
         """Return the names of the gauge noise of the kind that is most like this one."""
         near = [known for known in self.kinds if known[0] == kind[0]] or self.kinds
+        near = [known for known in near if known[2] == kind[2]] or near
         return self.gauge_names(min(near, key=lambda known: abs(np.log(known[1] / kind[1]))))
 
     def filtered(
@@ -502,7 +512,7 @@ class Likelihood:
     ) -> Filtered:
         """Return one run filtered under values by name, with derivatives by the names that it depends on."""
         gauges, problem = self.gauges(run), self.problem
-        varying = problem.varying.get(run.name, {})
+        varying = problem.varied(run)
         own = {name: n for n, name in varying.items()} | {n: n for gauge in gauges for n in gauge.values()}
         others = {name for names in problem.varying.values() for name in names.values()}
         by = {
@@ -524,8 +534,9 @@ class Likelihood:
         """
         problem = self.problem
         own = own_names(problem.model, run, problem.trend)
-        varying = {name: n for n, name in problem.varying.get(run.name, {}).items() if name not in values}
-        if not (own or varying):
+        varying = {name: n for n, name in problem.varied(run).items() if name not in values}
+        noisy = problem.noise_group(run) not in {group for _, _, group in self.kinds}
+        if not (own or varying or noisy):
             return self.filtered(run, values)
         p = run_parameters(problem.model, problem.experiment, run, values)
         rows = [own_start(problem.model, run, p, n, problem.trend) for n in own]
@@ -534,8 +545,8 @@ class Likelihood:
             others = [values[other] for other in {names[n] for names in problem.varying.values()} if other in values]
             rows.append((float(np.mean(others)), listed[n].lower, listed[n].upper))
             own.append(name)
-        start, lower, upper = np.array(rows).T
-        of_group = set(problem.varying.get(run.name, {}).values()) - set(own)
+        start, lower, upper = np.array(rows).reshape(-1, 3).T
+        of_group = set(problem.varied(run).values()) - set(own)
         held = {n: values[n] for n in (*problem.held, *problem.names) if "." not in n or n in of_group}
         alone = replace(
             problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held,
@@ -546,16 +557,17 @@ class Likelihood:
         for alone_names, names in zip(likelihood.gauges(alone.runs[0]), self.gauges(run), strict=True):
             known |= {name: values[names[local]] for local, name in alone_names.items()}
         x = likelihood.coordinates(known)
-        found = maximise(likelihood, x, held=[n for n in likelihood.names if n not in own])
+        gauge = [n for n in likelihood.names if n not in (*own, *FIELD)] if noisy else []
+        found = maximise(likelihood, x, held=[n for n in likelihood.names if n not in (*own, *gauge)])
         return replace(found.point.runs[0], run=run)
 
-    def pieces(self, point: Point) -> Iterator[tuple[Array, Array, tuple[str, float]]]:
+    def pieces(self, point: Point) -> Iterator[tuple[Array, Array, Kind]]:
         """Yield standardised innovations, their log densities, kinds of gauge noise, of each signal at each of its rates."""
         for f in point.runs:
             rates, at = len(f.run.sampling.spacings), f.run.sampling.at
             kind = np.concatenate([i * rates + at[s.used] for i, s in enumerate(f.run.signals)])
             white, density = f.white, f.log_density
-            for k, own in enumerate(_kinds(f.run)):
+            for k, own in enumerate(self.kinds_of(f.run)):
                 yield white[kind == k], density[kind == k], own
 
     def by_kind(self, point: Point) -> list[float]:
@@ -613,8 +625,9 @@ class Likelihood:
                 information += t.information * np.outer(unit, unit)
             for f in runs:
                 at = [self.names.index(n) for n in f.names]
-                score[at] += f.score * unit[at]
-                information[np.ix_(at, at)] += f.information * np.outer(unit[at], unit[at])
+                with np.errstate(over="ignore", invalid="ignore"):  # of a motion that cannot be differentiated
+                    score[at] += f.score * unit[at]
+                    information[np.ix_(at, at)] += f.information * np.outer(unit[at], unit[at])
             if not (np.isfinite(score).all() and np.isfinite(information).all()):
                 total = -np.inf  # a motion that cannot be differentiated is none to go on from
         point = Point(x, values, total, score, information, runs, tables)
@@ -644,11 +657,6 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
             ("gauge_quality", what): (0.5, *QUALITY),
         }
     return found
-
-
-def _kinds(run: Run) -> list[tuple[str, float]]:
-    """Return the kinds of gauge noise of a run: each signal at each of its sampling rates."""
-    return [(s.observable, dt) for s in run.signals for dt in _spacings(run)]
 
 
 def _spacings(run: Run) -> list[float]:
@@ -988,8 +996,16 @@ def _fitted(
 ) -> StateSpaceFit:
     wide = likelihood(False, processes or ())
     fresh = "field_amplitude" not in start
-    steps = STEPS if fresh else 12
-    found = maximise(wide, _widest(wide, start, progress), steps=steps, close=1.0, progress=progress)
+    found: Maximum | None = None
+    for x in _widest(wide, start, progress)[:TRIES]:
+        other = maximise(wide, x, steps=STEPS // 2 if fresh else 12, close=1.0, progress=progress)
+        if found is None or other.point.log_likelihood > found.point.log_likelihood:
+            found = other
+        if other.away < LOST:
+            break
+    assert found is not None
+    if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
+        found = maximise(wide, found.point.x, steps=STEPS // 2, close=1.0, progress=progress)
     best = StateSpaceFit(wide, found, wide.evaluations)
     if found.status is Status.INTEGRATION:
         return best
@@ -1352,7 +1368,7 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
     return StateSpaceFit(wider, maximum, wider.evaluations)
 
 
-def _peaks(fitted: StateSpaceFit, kinds: Sequence[tuple[str, float]]) -> list[list[float]]:
+def _peaks(fitted: StateSpaceFit, kinds: Sequence[Kind]) -> list[list[float]]:
     """Return, for each kind, frequencies (Hz) at which an oscillation may be: where innovations are strongest, and two others."""
     found = []
     for of in kinds:
@@ -1380,13 +1396,13 @@ def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Arra
     return found
 
 
-def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> Array:
-    """Return x at `start` under the likeliest of a few wide fields: there the filter stays with the recording."""
+def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> list[Array]:
+    """Return x at `start` under a few wide fields, the likeliest first: there the filter stays with the recording."""
     x = rough.coordinates(start)
     if "field_amplitude" in start:
-        return x
+        return [x]
     amplitude, length = (rough.names.index(n) for n in FIELD)
-    best = (-np.inf, x)
+    trials: list[tuple[float, Array]] = []
     for wide in WIDE:
         for short in SHORT:
             trial = _under_field(rough, x, wide, short)
@@ -1394,9 +1410,9 @@ def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[s
             progress(
                 f"field of {np.exp(trial[amplitude]):.2g} over {np.exp(trial[length]):.2g} um: log likelihood {found:.1f}"
             )
-            if found > best[0]:
-                best = found, trial
-    return best[1] if np.isfinite(best[0]) else _elsewhere(rough, x, progress)
+            if np.isfinite(found):
+                trials.append((found, trial))
+    return [trial for _, trial in sorted(trials, key=lambda t: -t[0])] or [_elsewhere(rough, x, progress)]
 
 
 def _elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> Array:

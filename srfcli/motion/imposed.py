@@ -224,7 +224,7 @@ def _check_positive(name: str, value: float) -> None:
 # A measured load as piecewise polynomials; um, s, N.
 
 UNEVEN = 1.6  # ratio of an interval to its neighbours' median at which a stretch ends
-WANDER = 6.0  # times the median of the logarithms of these ratios, if that is more: of times that are all uneven
+WANDER = 10.0  # times the median of the logarithms of these ratios, if that is more: of times that are all uneven
 SHORTEST = 16  # samples of a stretch that carries the spline
 REACH = 4  # samples on each side from which a sample is foretold
 ROUGH = 0.02  # share of the local range by which a sample may differ from what its neighbours foretell
@@ -347,10 +347,12 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
     """Return first and last sample of the stretches that carry a spline: as evenly sampled as all is, without jump or corner."""
     steps = np.diff(t)
     usual = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(steps, 2, mode="edge"), 5), axis=1)
-    off = np.abs(np.log(steps / usual))
-    allowed = max(np.log(UNEVEN), WANDER * float(np.median(off)))  # of times that wander, a spline goes through what they are
-    even = off < allowed
-    change = np.abs(np.diff(np.log(steps))) > (allowed if allowed == np.log(UNEVEN) else 2 * allowed)  # between two rates
+    longer, allowed = np.log(steps / usual), float(np.log(UNEVEN))
+    wander = WANDER * float(np.median(np.abs(longer)))
+    if wander > allowed:  # of times that wander, a spline goes through what they are: a short interval is none to bridge
+        even, change = longer < wander, np.abs(np.diff(np.log(usual))) > wander
+    else:
+        even, change = np.abs(longer) < allowed, np.abs(np.diff(np.log(steps))) > allowed  # between two rates
     found = []
     for a, b in _runs(even):
         cuts = [a, *(a + 1 + np.flatnonzero(change[a:b])).tolist(), b + 1]
@@ -358,7 +360,7 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
     total = float(np.ptp(W))
     smooth = []
     for a, b in found:
-        rough = _rough(W[a : b + 1], total, noise)
+        rough = _rough(t[a : b + 1], W[a : b + 1], total, noise)
         if rough.mean() > MOSTLY:
             rough[:] = False
         calm = ~(rough[1:] | rough[:-1])  # intervals between two samples that their neighbours foretell
@@ -366,15 +368,26 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
     return smooth
 
 
-def _rough(W: Array, total: float, noise: float) -> NDArray[np.bool_]:
-    """Return which samples of an even stretch the polynomial through their eight neighbours does not foretell."""
+def from_neighbours(t: Array, reach: int) -> Array:
+    """Return Lagrange's weights (n - 2 reach, 2 reach) by which samples at times t (n,) on both sides of one foretell it."""
+    times = np.lib.stride_tricks.sliding_window_view(t, 2 * reach + 1)
+    near = np.delete(times, reach, axis=1)
+    weights = np.ones(near.shape)
+    for j in range(2 * reach):
+        others = np.delete(near, j, axis=1)
+        weights[:, j] = np.prod((times[:, reach, None] - others) / (near[:, j, None] - others), axis=1)
+    return weights
+
+
+def _rough(t: Array, W: Array, total: float, noise: float) -> NDArray[np.bool_]:
+    """Return which samples of a stretch the polynomial through their eight neighbours does not foretell."""
     from numpy.lib.stride_tricks import sliding_window_view
 
-    weights = np.array([-1, 8, -28, 56, -70, 56, -28, 8, -1]) / 70.0  # the eighth difference, 1 at the sample itself
-    windows = sliding_window_view(W, 2 * REACH + 1)
-    error = np.abs(windows @ weights)
+    windows, weights = sliding_window_view(W, 2 * REACH + 1), from_neighbours(t, REACH)
+    error = np.abs(windows[:, REACH] - np.sum(np.delete(windows, REACH, axis=1) * weights, axis=1))
+    of_noise = 5 * noise * np.sqrt(1 + np.sum(weights**2, axis=1))
     rough = np.zeros(W.size, bool)
-    rough[REACH:-REACH] = error > np.maximum(ROUGH * np.ptp(windows, axis=1), max(FAINT * total, 8 * noise))
+    rough[REACH:-REACH] = error > np.maximum(ROUGH * np.ptp(windows, axis=1), np.maximum(FAINT * total, of_noise))
     return rough
 
 
@@ -661,7 +674,7 @@ def _shifted(coefficients: Array, by: Array | float) -> Array:
 
 # What the experimenter imposes: the driving velocity V(t) and the normal load W(t), piece by smooth piece; um, s, N.
 
-__all__ = ["ConstantLoad", "Drive", "Load", "LoadPiece", "Modulation", "SampledLoad"]
+__all__ = ["ConstantLoad", "Drive", "Load", "LoadPiece", "Modulation", "SampledLoad", "from_neighbours"]
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,9 @@ class Matter:
     def rms(self, one: Trace) -> tuple[float, float]:
         """Return a run's residual over noise, whitened where the material has it so, before and after."""
         given = next((r.get("rms") for r in self.tables["runs"] if r["name"] == one.name), None)
-        return (given[0], given[1]) if given else (rms_over_noise(one.before), rms_over_noise(one.after))
+        found = (given[0], given[1]) if given else (rms_over_noise(one.before), rms_over_noise(one.after))
+        before, after = (float("inf") if value is None else value for value in found)  # of a run that a model cannot follow
+        return before, after
 
     def figure(self, name: str, alt: str, caption: Any = "", *, small: bool = False) -> Markup:
         """Return a figure, or nothing where it was not drawn."""
@@ -404,6 +406,7 @@ def held_out(matter: Matter) -> Markup:
     for one in matter.held:
         before, after = matter.rms(one)
         word = "better" if after < 0.99 * before else "worse" if after > 1.01 * before else "alike"
+        word = word if min(before, after) < float("inf") else "not at all"
         rows.append([one.name, rms(before)] + ([] if matter.same else [rms(after), word]))
     heads = ["run", "baseline"] + ([] if matter.same else ["augmented model", "predicted"])
     text = "These were opened only after the model was final."
