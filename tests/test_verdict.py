@@ -33,7 +33,8 @@ def fitted(*names, evidence, fine=True, scores=()):
 
 def held(rms, gain=1.0, whole=True):
     white = rms * np.where(np.arange(400) % 2, 1.0, -1.0)
-    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain)
+    told = SimpleNamespace(rms=rms)
+    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain, foretold=(told, told))
 
 
 @pytest.fixture

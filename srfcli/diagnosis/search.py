@@ -185,7 +185,8 @@ class ModelSearch:
         model, values = move.hypothesis.model(self.registry, self.experiment), dict(move.values)
         for name, shift in shifts.items():  # relative ones as powers: what is positive stays so
             value = values[name]
-            values[name] = value * float(np.exp(np.clip(share * shift / value, -FARTHEST, FARTHEST))) if value > 0 else value + share * shift
+            power = np.clip(share * shift / value, -FARTHEST, FARTHEST) if value > 0 else 0.0
+            values[name] = value * float(np.exp(power)) if value > 0 else value + share * shift
         for number, (effect, sizes) in enumerate(zip(move.hypothesis.effects, move.sizes, strict=True)):
             part = share if number >= len(move.sizes) - move.fresh else 1.0
             longs = {p.name: long for long, p in own_parameters(effect, model).items()}
@@ -224,7 +225,8 @@ class ModelSearch:
         self._search()
         for further in (self._recolour, self._together, self._swap):  # dearer, or less likely
             best = self.best()
-            imitated = further == self._swap and (not self.baseline.fine or best is not self.baseline)  # an effect may pass for one
+            wanting = best is not self.baseline or not self.baseline.fine
+            imitated = further == self._swap and wanting  # an effect may pass for another ageing law
             if (imitated or not best.fine) and not self.spent:
                 further(self.baseline)
                 self._search()

@@ -16,7 +16,7 @@ from srfcli.diagnosis.hypotheses import Excluded, neutral_values
 from srfcli.diagnosis.scores import Score
 from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.state_space import Filtered, Likelihood, StateSpaceFit, maximise
+from srfcli.inference.state_space import Filtered, Foretold, Likelihood, StateSpaceFit, maximise
 
 NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
 HELD = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
@@ -33,12 +33,14 @@ UNEXPLAINED, MISSED = 0.09, 0.25
 class Held:
     """One held-out run filtered under the baseline and under the best model, both as they were fitted to the other runs.
 
-    `shown` is that of the baseline with the best model's field and gauge noise.
+    `shown` is that of the baseline with the best model's field and gauge noise. `foretold` says how well each of the first two
+    predicts it, with parameters as uncertain as their fits leave them.
     """
 
     baseline: Filtered
     augmented: Filtered
     shown: Filtered
+    foretold: tuple[Foretold, Foretold]
 
     @property
     def run(self) -> Run:
@@ -47,8 +49,8 @@ class Held:
 
     @property
     def gain(self) -> float:
-        """Return what the best model gains in log likelihood."""
-        return self.augmented.log_likelihood - self.baseline.log_likelihood
+        """Return what the best model gains in log marginal likelihood."""
+        return self.foretold[1].log_likelihood - self.foretold[0].log_likelihood
 
 
 @dataclass(frozen=True)
@@ -163,9 +165,12 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
     if not baseline.fit.likelihood.problem.runs:
         return ()  # of a gauge that nothing was fitted to
     models = (baseline, best, shown or baseline)
-    return tuple(
-        Held(*(f.fit.likelihood.held_out(run, f.fit.values) for f in models)) for run in whole.runs if run.holdout
-    )
+    found = []
+    for run in (run for run in whole.runs if run.holdout):
+        first, last, seen = (f.fit.likelihood.held_out(run, f.fit.values) for f in models)
+        before = baseline.fit.foretold(run)
+        found.append(Held(first, last, seen, (before, before if best is baseline else best.fit.foretold(run))))
+    return tuple(found)
 
 
 def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[HeldLoads, ...]:
@@ -209,10 +214,10 @@ def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequenc
         return ""
     if not all(h.augmented.whole for h in held):
         return "held-out runs cannot be followed"
-    white = np.concatenate([h.augmented.white for h in held])
-    rms = float(np.sqrt(np.mean(white**2)))
+    sizes, levels = [h.augmented.white.size for h in held], [h.foretold[1].rms for h in held]
+    rms = float(np.sqrt(np.average(np.square(levels), weights=sizes)))
     if not rms < HELD:
-        return f"held-out runs are not predicted: innovations have an rms of {rms:.3f}"
+        return f"held-out runs are not predicted: innovations have an rms of {rms:.3f} with the parameters moved as they may"
     gain = sum(h.gain for h in held)
     if best is not baseline and gain < 0:
         return f"held-out runs are predicted worse than by the baseline: log likelihood {gain:+.1f}"

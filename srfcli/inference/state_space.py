@@ -29,7 +29,7 @@ from srfcli.core.errors import Status
 from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, QUALITY
 from srfcli.data.values import CriticalLoads, Experiment, Run
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
-from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse
+from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse, root
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, stretches
 from srfcli.inference.prediction import (
@@ -45,7 +45,7 @@ from srfcli.inference.prediction import (
 )
 
 T = TypeVar("T")
-Kind: TypeAlias = tuple[str, float, str]  # of gauge noise: an observable, the spacing of its samples, the group of runs if it varies
+Kind: TypeAlias = tuple[str, float, str]  # of gauge noise: an observable, the spacing of its samples, a group of runs or ""
 RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
@@ -538,6 +538,14 @@ class Likelihood:
         noisy = problem.noise_group(run) not in {group for _, _, group in self.kinds}
         if not (own or varying or noisy):
             return self.filtered(run, values)
+        return replace(self._alone(run, values)[1].runs[0], run=run)
+
+    def _alone(self, run: Run, values: Mapping[str, float]) -> tuple[Likelihood, Point]:
+        """Return the likelihood of a run that was not fitted, by what belongs to it alone, and its maximum."""
+        problem = self.problem
+        own = own_names(problem.model, run, problem.trend)
+        varying = {name: n for n, name in problem.varied(run).items() if name not in values}
+        noisy = problem.noise_group(run) not in {group for _, _, group in self.kinds}
         p = run_parameters(problem.model, problem.experiment, run, values)
         rows = [own_start(problem.model, run, p, n, problem.trend) for n in own]
         listed = {q.name: q for q in problem.experiment.parameters}
@@ -558,8 +566,7 @@ class Likelihood:
             known |= {name: values[names[local]] for local, name in alone_names.items()}
         x = likelihood.coordinates(known)
         gauge = [n for n in likelihood.names if n not in (*own, *FIELD)] if noisy else []
-        found = maximise(likelihood, x, held=[n for n in likelihood.names if n not in (*own, *gauge)])
-        return replace(found.point.runs[0], run=run)
+        return likelihood, maximise(likelihood, x, held=[n for n in likelihood.names if n not in (*own, *gauge)]).point
 
     def pieces(self, point: Point) -> Iterator[tuple[Array, Array, Kind]]:
         """Yield standardised innovations, their log densities, kinds of gauge noise, of each signal at each of its rates."""
@@ -818,6 +825,14 @@ def _curvature_beyond(last: Point, point: Point) -> Array:
 
 
 @dataclass(frozen=True)
+class Foretold:
+    """Log marginal likelihood of a run under a fit to others, and the rms of its innovations with what parameters may move."""
+
+    log_likelihood: float
+    rms: float
+
+
+@dataclass(frozen=True)
 class StateSpaceFit:
     """A fit of all runs together: its likelihood, the maximum there, and how many times all runs were filtered."""
 
@@ -845,6 +860,50 @@ class StateSpaceFit:
     def log_likelihood(self) -> float:
         """Return the log likelihood at the maximum."""
         return self.maximum.point.log_likelihood
+
+    def foretold(self, run: Run) -> Foretold:
+        """Return how well a run that was not fitted is predicted, with the parameters as uncertain as they are.
+
+        Laplace's method: the fit is the prior of the parameters that the run shares with others.
+        """
+        own, (alone, point) = self.likelihood, self.likelihood._alone(run, self.values)
+        problem, like = alone.problem, dict(zip(own.names, range(len(own.names)), strict=True))
+        if own.problem.noise_group(run) in {group for _, _, group in own.kinds}:
+            for mine, theirs in zip(alone.gauges(problem.runs[0]), own.gauges(run), strict=True):
+                like |= {name: like[theirs[n]] for n, name in mine.items()}
+        else:
+            like = {n: place for n, place in like.items() if n not in alone.names or n in FIELD}
+        groups = {name for names in problem.varying.values() for name in names.values()} - set(problem.varied(run).values())
+        shared = [i for i, n in enumerate(own.problem.names) if "." not in n and n not in groups and n not in problem.names]
+        both = replace(
+            problem,
+            names=(*problem.names, *(own.problem.names[i] for i in shared)),
+            start=np.append(problem.start, own.problem.start[shared]),
+            lower=np.append(problem.lower, own.problem.lower[shared]),
+            upper=np.append(problem.upper, own.problem.upper[shared]),
+        )
+        wide = Likelihood(both, smooth=own.smooth, processes=own.processes, rtol=own.base_rtol)
+        point = wide.at(wide.coordinates(point.values))
+        if not np.isfinite(point.log_likelihood):
+            return Foretold(-np.inf, np.inf)
+        covariance = np.diag((wide.upper - wide.lower) ** 2)  # of what belongs to the run alone
+        known = [i for i, n in enumerate(wide.names) if n in like]
+        there = [like[wide.names[i]] for i in known]
+        covariance[np.ix_(known, known)] = (self.maximum.covariance + self.maximum.spread)[np.ix_(there, there)]
+        free = np.nonzero(np.diag(covariance) > 0)[0]
+        away = root(covariance[np.ix_(free, free)])
+        bent = np.eye(free.size) + away.T @ point.information[np.ix_(free, free)] @ away
+        step = np.linalg.solve(bent, away.T @ point.score[free])
+        best, chi2 = point.log_likelihood, float(point.runs[0].white @ point.runs[0].white)
+        for share in (1.0, 0.5, 0.25):
+            x = point.x.copy()
+            x[free] += share * away @ step
+            moved, cost = wide.at(np.clip(x, wide.lower, wide.upper), slopes=False, like=point), share**2 * float(step @ step)
+            if moved.log_likelihood - cost / 2 > best:
+                best, chi2 = moved.log_likelihood - cost / 2, float(moved.runs[0].white @ moved.runs[0].white) + cost
+                break
+        size = moved.runs[0].white.size
+        return Foretold(best - 0.5 * float(np.linalg.slogdet(bent)[1]), float(np.sqrt(chi2 / size)))
 
     @property
     def criterion(self) -> float:
@@ -996,13 +1055,21 @@ def _fitted(
 ) -> StateSpaceFit:
     wide = likelihood(False, processes or ())
     fresh = "field_amplitude" not in start
-    found: Maximum | None = None
-    for x in _widest(wide, start, progress)[:TRIES]:
-        other = maximise(wide, x, steps=STEPS // 2 if fresh else 12, close=1.0, progress=progress)
-        if found is None or other.point.log_likelihood > found.point.log_likelihood:
-            found = other
-        if other.away < LOST:
-            break
+
+    def from_any(starts: Sequence[Array]) -> Maximum | None:
+        """Return the maximum from the first start that leads near one, or the likeliest that was reached from a few."""
+        found: Maximum | None = None
+        for x in starts[:TRIES]:
+            other = maximise(wide, x, steps=STEPS // 2 if fresh else 12, close=1.0, progress=progress)
+            if found is None or other.point.log_likelihood > found.point.log_likelihood:
+                found = other
+            if other.away < LOST:
+                break
+        return found
+
+    found = from_any(_widest(wide, start, progress))
+    if found is None or (fresh and found.status is Status.INTEGRATION):
+        found = from_any(_elsewhere(wide, wide.coordinates(start), progress))
     assert found is not None
     if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
         found = maximise(wide, found.point.x, steps=STEPS // 2, close=1.0, progress=progress)
@@ -1412,27 +1479,31 @@ def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[s
             )
             if np.isfinite(found):
                 trials.append((found, trial))
-    return [trial for _, trial in sorted(trials, key=lambda t: -t[0])] or [_elsewhere(rough, x, progress)]
+    return [trial for _, trial in sorted(trials, key=lambda t: -t[0])]
 
 
-def _elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> Array:
-    """Return the likeliest of SOBOL_STARTS starts over the bounds under a wide field, x where none can be followed.
+def _elsewhere(rough: Likelihood, x: Array, progress: Callable[[str], None]) -> list[Array]:
+    """Return SOBOL_STARTS starts over the bounds, mu0 that of the recordings, under wide fields in turn, the likeliest first.
 
     A model that slips without end at the file's start values, as one without inertia may, is followed from others.
     """
     from scipy.stats import qmc
 
     k = len(rough.problem.names)
-    best = (-np.inf, x)
-    for share in qmc.Sobol(k, seed=0).random(SOBOL_STARTS):
+    levels = [i for i, n in enumerate(rough.problem.names) if n.partition("[")[0] == "mu0"]
+    seen = float(np.median([typical_friction(run) for run in rough.problem.runs]))
+    trials: list[tuple[float, Array]] = []
+    for number, share in enumerate(qmc.Sobol(k, seed=0).random(SOBOL_STARTS)):
         trial = x.copy()
         trial[:k] = rough.lower[:k] + share * (rough.upper - rough.lower)[:k]
-        trial = _under_field(rough, trial, WIDE[-1], SHORT[1])
+        trial[levels] = np.where(rough.logarithmic[levels], np.log(seen), seen)
+        trial = np.clip(trial, rough.lower, rough.upper)
+        trial = _under_field(rough, trial, WIDE[number % len(WIDE)], SHORT[number % 2])
         found = rough.at(trial, slopes=False).log_likelihood
         progress(f"from elsewhere: log likelihood {found:.1f}")
-        if found > best[0]:
-            best = found, trial
-    return best[1]
+        if np.isfinite(found):
+            trials.append((found, trial))
+    return [trial for _, trial in sorted(trials, key=lambda t: -t[0])] or [x]
 
 
 def as_fit(found: StateSpaceFit) -> Fit:
