@@ -21,6 +21,7 @@ PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it
 STEADY = 2.0  # gauge's noise: a stretch whose readings are expected to vary by less is one of steady sliding
 LEVELS = ("gauge_white", "gauge_colour")
 LOUD = 1.15  # gauge noise over that which differences of the recording show, beyond which it holds something else
+THIRD = 1.16  # relative variance, times n, of a level that third differences of n samples tell: (1 + 2 sum rho^2) / 2
 
 
 def log_evidence(found: StateSpaceFit) -> float:
@@ -57,16 +58,19 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
         friction = max(float(np.median([typical_friction(f.run) for f in point.runs])), 1e-6)
         share = values["field_amplitude"] / friction / PLAUSIBLE
         tests.append((share, f"the field's amplitude is {values['field_amplitude']:.2g}"))
-    levels: dict[str, list[tuple[float, float]]] = {}
+    levels: dict[str, list[tuple[float, float, int]]] = {}
     for f in point.runs:
         rate, gauges = f.run.sampling.at, iter(found.likelihood.gauges(f.run))
         for signal, k in product(f.run.signals, range(len(f.run.sampling.spacings))):
-            seen = white_level(signal.observed, stretches(f.run.t, signal.used & (rate == k)))
-            levels.setdefault(next(gauges)["gauge_white"], []).append((seen, signal.quantum))
+            here = signal.used & (rate == k)
+            seen = white_level(signal.observed, stretches(f.run.t, here))
+            levels.setdefault(next(gauges)["gauge_white"], []).append((max(seen, 1e-300), signal.quantum, int(here.sum())))
     for name, shown in levels.items():
-        quantum = max(q for _, q in shown) / np.sqrt(12)
-        ratio = float(np.hypot(values[name], quantum)) / max(min(seen for seen, _ in shown), 1e-300)
-        tests.append((ratio / LOUD, f"the gauge's noise is {ratio:.2f} times what the recording shows"))
+        quantum = max(q for _, q, _ in shown) / np.sqrt(12)
+        for seen, _, n in shown:
+            ratio = float(np.hypot(values[name], quantum)) / seen
+            size = ratio / max(LOUD, 1 + DEVIATION * float(np.sqrt(THIRD / max(n, 1))))
+            tests.append((size, f"the gauge's noise is {ratio:.2f} times what the recording shows"))
     return [text for size, text in sorted(tests, reverse=True) if size > 1.0]
 
 

@@ -21,12 +21,11 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment
-from srfcli.diagnosis.goodness_of_fit import log_evidence, shortcomings
+from srfcli.diagnosis.goodness_of_fit import DEVIATION, log_evidence, shortcomings
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
 from srfcli.diagnosis.scores import Remainder, Score, Scores
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
-    COLOUR,
     NEEDED,
     Likelihood,
     StateSpaceFit,
@@ -276,10 +275,9 @@ class ModelSearch:
         """Fit what comes close to the best model, or would mend it; expand the best once nothing does."""
         while not self.spent:
             best = self.best()
-            least = best.evidence + (-CLOSE if best.fine else CLOSE)
-            promised = bool(self.queue) and -self.queue[0].expected >= least
+            promised = bool(self.queue) and -self.queue[0].expected >= best.evidence - CLOSE
             if self.queue and self.experiment.thresholds and not best.fine:  # at first order a model far off promises too little
-                promised = promised or self.queue[0].direction is not None or -self.queue[0].expected >= best.evidence - CLOSE
+                promised = promised or self.queue[0].direction is not None
             if not promised:
                 if best.scores is not None or len(best.hypothesis.effects) >= LARGEST:
                     break
@@ -427,7 +425,7 @@ class ModelSearch:
     def _recolour(self, base: Fitted) -> None:
         """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""
         best = self.best()
-        if "processes" in self.options or correlated(best.fit.maximum.point) < COLOUR:
+        if "processes" in self.options or correlated(best.fit.maximum.point) < DEVIATION:
             return
         self.processes = self._refitted(best, None).fit.likelihood.processes
         if self.processes != best.fit.likelihood.processes:
