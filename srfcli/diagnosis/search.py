@@ -28,6 +28,7 @@ from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
     NEEDED,
     Likelihood,
+    Maximum,
     StateSpaceFit,
     correlated,
     fit_state_space,
@@ -455,8 +456,12 @@ class ModelSearch:
                 self._push(node.evidence + pair.gain + 2 * one, Hypothesis(pair.effects), node, pair.values)
 
     def _swap(self, node: Fitted) -> None:
-        """Push the other ageing laws, each after a few steps from where the model stands, with what its score promises."""
+        """Push the other ageing laws, each after a few steps from where the model stands, with what its score promises.
+
+        The one that promises most goes on from there: a law that is right lies further from the stated one than a step tells.
+        """
         stated, *modifiers = self.experiment.choice.ageing.split("+")
+        reached: list[tuple[float, Hypothesis, Likelihood, Maximum]] = []
         for name in self.laws:
             if name == stated:
                 continue
@@ -468,8 +473,14 @@ class ModelSearch:
             found = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
             if not (np.isfinite(found.away) and found.point.log_likelihood > node.fit.log_likelihood - ASTRAY):
                 continue
+            reached.append((found.point.log_likelihood + 0.5 * found.away**2, hypothesis, likelihood, found))
+        reached.sort(key=lambda r: -r[0])
+        for number, (promise, hypothesis, likelihood, found) in enumerate(reached):
+            if number == 0 and found.away > NEAR:
+                found = maximise(likelihood, found.point.x, steps=9, close=1.0, widths=(), progress=self.progress)
+                promise = found.point.log_likelihood + 0.5 * found.away**2
             self.count += 1
-            expected = found.point.log_likelihood + 0.5 * found.away**2 - node.fit.log_likelihood + node.evidence
+            expected = promise - node.fit.log_likelihood + node.evidence
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
 
     def _eliminate(self) -> None:
