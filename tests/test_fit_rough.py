@@ -242,3 +242,56 @@ def test_the_likeliest_of_many_maxima_is_found(tmp_path):
     true = {"mu0": base.mu0, "A": base.A, "B": base.B, "D0": base.D0, "Vsat": base.Vsat, "lambda": base.lam}
     for name, value in true.items():
         assert abs(found.values[name] - value) < 4 * found.stderr[name] < 0.04 * value, name
+
+
+@pytest.fixture(scope="module")
+def loud(tmp_path_factory):
+    """Three runs whose gauges have noise of 0.02, 0.06 and, held out, 0.12 um; slider and track are alike."""
+    folder, rng = tmp_path_factory.mktemp("loud"), np.random.default_rng(8)
+    plans = [Plan(f"up{k}", ((0.6, 20), (0.6, 60), (0.6, 35)), 3.0, 0.004, holdout=k == 2) for k in range(3)]
+    noise = zip(plans, (0.02, 0.06, 0.12), strict=True)
+    readings = {q: read_gauge(move(Physics(), q).u, Gauge(sigma=level), rng) for q, level in noise}
+    for name, text in case_files("small", Physics(), readings).items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_gauge_noise_may_be_a_run_s_own(loud):
+    """Each run then has its own level, a held-out one too; where one is for all, innovations are too loud or too quiet."""
+    free, experiment = ["mu0", "A", "D0"], srf.read_experiment(loud)
+    one, own = (srf.fit(experiment, free=free, vary=vary, track="smooth").found for vary in ([], ["noise"]))
+    for level, run in ((0.02, "up0"), (0.06, "up1")):
+        (name,) = [n for n in own.state_space.values if n.startswith("gauge_white[") and n.endswith(f"{run}]")]
+        assert own.state_space.values[name] == pytest.approx(level, rel=0.1)
+    rms = {f.run.name: np.sqrt(np.mean(f.white**2)) for f in own.state_space.maximum.point.runs}
+    assert rms == pytest.approx({"up0": 1.0, "up1": 1.0}, abs=0.05)
+    (held,) = [run for run in experiment.runs if run.holdout]
+    seen = [found.state_space.likelihood.held_out(held, found.state_space.values).white for found in (own, one)]
+    assert np.std(seen[0]) == pytest.approx(1.0, abs=0.06) and np.std(seen[1]) > 2
+    shared = {f.run.name: np.std(f.white) for f in one.state_space.maximum.point.runs}
+    assert shared["up0"] < 0.6 and shared["up1"] > 1.2
+
+
+def test_noise_alone_may_be_asked_for(loud):
+    done = CliRunner().invoke(cli, ["fit", str(loud), "--free", "mu0,A", "--vary", "noise", "--track", "smooth", "--json"])
+    assert done.exit_code == 0 and {row["parameter"] for row in json.loads(done.stdout)["rows"]} == {"mu0", "A"}
+    wrong = CliRunner().invoke(cli, ["fit", str(loud), "--free", "mu0,A", "--vary", "nois"])
+    assert wrong.exit_code == 2 and "noise" in wrong.stderr
+
+
+def test_what_a_held_out_run_adds_to_the_evidence_is_what_is_foretold_of_it(loud):
+    """By Laplace's method p(second | first) = p(both) / p(first), where the priors are flat."""
+    whole = srf.read_experiment(loud)
+    first, second, _ = whole.runs
+
+    def evidence(runs):
+        found = srf.fit(replace(whole, runs=runs), free=["mu0", "A", "D0"], vary=[], track="smooth").found.state_space
+        return found, found.log_likelihood + 0.5 * np.linalg.slogdet(found.maximum.covariance)[1]
+
+    quiet = replace(second, observed=0.7 * first.observed + 0.3 * second.observed)  # of noise near the first's
+    fit, alone = evidence((first,))
+    both = evidence((first, quiet))[1]
+    told = fit.foretold(quiet)
+    assert told.log_likelihood == pytest.approx(both - alone, abs=0.3)
+    plain = fit.likelihood.held_out(quiet, fit.values)
+    assert told.rms <= np.sqrt(np.mean(plain.white**2)) + 1e-9

@@ -10,6 +10,7 @@ from brute import Slider, rates, steady
 from scipy.integrate import solve_ivp
 
 from srfcli.core.errors import SrfError, Status
+from srfcli.data.noise import white_level
 from srfcli.motion import integrators as motion
 from srfcli.motion.imposed import ConstantLoad, Drive, Modulation, SampledLoad
 from srfcli.motion.integrators import scalar_function, scalar_source
@@ -126,6 +127,19 @@ def test_a_sampled_load_is_the_load_it_was_sampled_from(model):
     p, drive, start = model.vector(), Drive.constant(8.0), model.steady(model.vector({"V": 8.0, "W0": 6.0}))
     a, b = (simulate(model, p, drive=drive, load=load, t=t, start=start, rtol=1e-10) for load in (whole, sampled))
     assert a.x == pytest.approx(b.x, rel=1e-5, abs=1e-5)
+
+
+def test_a_load_read_at_uneven_times_is_the_load_it_was_sampled_from():
+    """Nine samples a period, each up to 0.4 of an interval off its place: no short interval is bridged, and nothing is noise."""
+    rng, whole = np.random.default_rng(4), Modulation(6.0, 0.19, 110.0)
+    times = np.sort(np.arange(3000) * 1e-3 + np.clip(rng.normal(0, 0.16e-3, 3000), -0.4e-3, 0.4e-3))
+    read = np.round(whole(times)[0], 6)
+    assert white_level(read, times) < 1e-6
+    t = np.linspace(times[20], times[-20], 20001)
+    W, W_dot = SampledLoad(times, read)(t)
+    assert np.abs(W - whole(t)[0]).max() < 1e-3 and np.std(W_dot - whole(t)[1]) < 1e-3 * np.std(whole(t)[1])
+    noisy = read + rng.normal(0, 0.02, read.size)
+    assert white_level(noisy, times) == pytest.approx(0.02, rel=0.1)
 
 
 def test_switch_on_is_smooth():

@@ -594,6 +594,6 @@ def vary_options(command: Callable[..., Any]) -> Callable[..., Any]:
         "--by", type=click.Choice(["run", "load", "segment", "direction"]), help="What --vary goes by; run if nothing says."
     )
     vary = click.option(
-        "--vary", multiple=True, metavar="NAMES", help="Parameters with a value of their own in each run, or for each --by."
+        "--vary", multiple=True, metavar="NAMES", help="Parameters, or noise, with a value of their own in each run, or --by."
     )
     return vary(by(command))
