@@ -48,7 +48,8 @@ def diagnose(
     trend : {'slip', 'time'}, optional
         Let each run's observable drift.
     vary : sequence of str
-        Free parameters, or "noise" of the gauge, that have a value of their own in each group of runs; as the experiment says if left out.
+        Free parameters, or "noise" of the gauge, with a value of their own in each group of runs; as the experiment says if
+        left out.
     by : {'run', 'load', 'segment', 'direction'}, optional
         What makes a group.
     reader : str, optional

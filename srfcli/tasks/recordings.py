@@ -103,8 +103,8 @@ def fit(
     trend : {'slip', 'time'}, optional
         Let each run's observable drift.
     vary : sequence of str
-        Free parameters, or "noise" of the gauge, with a value of their own in each group, B in a run up is B[up]; as the experiment says if
-        left out.
+        Free parameters, or "noise" of the gauge, with a value of their own in each group of runs, B in a run up is B[up]; as
+        the experiment says if left out.
     by : {'run', 'load', 'segment', 'direction'}, optional
         What makes a group.
     prior : bool
