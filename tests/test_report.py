@@ -351,6 +351,21 @@ def test_a_long_record_is_drawn_by_extremes() -> None:
     assert long < 1_000_000 and long < 4 * short
 
 
+def test_a_slower_sampling_rate_is_no_gap() -> None:
+    """The first second has a tenth of the samples: it is drawn all the same, and half a second without any is not."""
+    run = made_run("two rates", n=3001)
+    t = run["t"]
+    kept = (np.arange(t.size) % 10 == 0) | (t > 1.0)
+    kept &= (t < 2.0) | (t > 2.5)
+    thin = {k: v[kept] if isinstance(v, np.ndarray) and v.size == t.size else v for k, v in run.items()}
+    (line,) = [q for q in run_figure(trace(thin)).axes[0].lines if q.get_label() == "recorded"][:1]
+    x, y = (np.asarray(a, float) for a in (line.get_xdata(), line.get_ydata()))
+    drawn = x[np.isfinite(y)]
+    assert (drawn < 0.9).sum() > 50 and not ((drawn > 2.01) & (drawn < 2.49)).any()
+    borders = np.flatnonzero(~np.isfinite(y))
+    assert ((x[borders[:-1]] if borders.size > 1 else x[borders]) > 1.5).all()
+
+
 def test_a_trace_has_only_what_is_compared() -> None:
     one = trace(made_run("a"))
     assert one.t.size == 890 and float(np.abs(one.observed).max()) < 12

@@ -46,6 +46,7 @@ VARIES = 1e-3  # relative variation of a load from which it is worth a panel
 LABELS = {"elongation": "elongation  [µm]", "force": "force  [N]", "friction": "friction coefficient"}
 NARROW_FIGURE = 4.3  # inches: a figure for a small screen, whose text keeps its size there
 GAP = 5.0  # usual steps in time after which a record has a gap
+BESIDE = 5  # steps before it, and after, that tell the usual one: a record may change its sampling rate
 SAME = 1e-9  # of the noise: predictions that differ by less are one
 
 
@@ -415,7 +416,9 @@ def _pieces(t: Array) -> list[tuple[int, int]]:
     if t.size < 2:
         return [(0, t.size)]
     steps = np.diff(t)
-    borders = [0, *(np.flatnonzero(steps > GAP * float(np.median(steps))) + 1).tolist(), t.size]
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(steps, BESIDE, mode="edge"), BESIDE), axis=1)
+    longer = np.maximum(usual[: steps.size], usual[BESIDE + 1 : BESIDE + 1 + steps.size])  # of those before, and after
+    borders = [0, *(np.flatnonzero(steps > GAP * longer) + 1).tolist(), t.size]
     return [(a, b) for a, b in itertools.pairwise(borders) if b > a]
 
 
