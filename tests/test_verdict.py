@@ -149,3 +149,18 @@ def test_an_interesting_size_is_in_base_units():
     in_ms = replace(own, parameters=(Parameter(name, 3.0, "ms", 0.0, 100.0),), neutral=((name, 1.0),))
     assert interesting(replace(score("sensor-lag", 1.0), effect=in_ms)) == pytest.approx(0.002)
     assert neutral_values(in_ms) == {name: pytest.approx(0.001)}
+
+
+@pytest.mark.parametrize(
+    ("apart", "said"), [(1e-3, ("identified", ("ruina",))), (0.5, ("ambiguous", ("ruina", "slip-evolution")))]
+)
+def test_an_effect_that_became_another_ageing_law_gives_way_to_it(concluded, apart, said):
+    """Where both leave the same innovations; where they do not, either may be it."""
+    law, effect = fitted(evidence=100.0), fitted("slip-evolution", evidence=97.0)
+    law.hypothesis = Hypothesis((), "ruina")
+    law.name = law.hypothesis.name
+    white = np.where(np.arange(400) % 2, 1.0, -1.0)
+    for fit, off in ((law, 0.0), (effect, apart)):
+        fit.fit = SimpleNamespace(maximum=SimpleNamespace(point=SimpleNamespace(runs=[SimpleNamespace(white=white + off)])))
+    found = concluded(law, effect, LOST)
+    assert (found.verdict, found.effects) == said

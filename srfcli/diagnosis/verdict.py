@@ -118,6 +118,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     close = tuple(f for f in ranked if f.fine and best.evidence - f.evidence < CLOSE)
     names = [set(f.hypothesis.reported) for f in close]
     close = tuple(f for f in close if not any(n < set(f.hypothesis.reported) for n in names))
+    close = tuple(f for f in close if not any(_is_that_law(f, other) for other in close))
     best = close[0] if close else best
     shown = on_the_track_of(best, baseline) if best.fine else baseline
     held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
@@ -142,6 +143,15 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
         (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores}, _equivalent(scores, close), held,
         tuple(reasons), ungated, held_loads,
     )  # fmt: skip
+
+
+def _is_that_law(fitted: Fitted, other: Fitted) -> bool:
+    """Return whether a model with effects became what another ageing law is, which has better evidence as it needs no size."""
+    alone = other.hypothesis.ageing and not other.hypothesis.effects and fitted.hypothesis.effects
+    if not alone or fitted.evidence > other.evidence:
+        return False
+    whites = zip(fitted.fit.maximum.point.runs, other.fit.maximum.point.runs, strict=True)
+    return float(sum(np.sum((a.white - b.white) ** 2) for a, b in whites)) < 2 * CLOSE
 
 
 def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
