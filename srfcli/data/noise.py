@@ -14,7 +14,7 @@ from srfcli.codegen.model import Array
 from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError
 from srfcli.data.clock import Mask, runs_of
-from srfcli.motion.imposed import from_neighbours
+from srfcli.motion.imposed import unforetold
 
 SEGMENT = 256  # samples of a periodogram
 NEIGHBOURS = 16  # samples that foretell one between them: sines of five samples a period or more, to 1e-4 of them
@@ -28,7 +28,8 @@ def white_level(x: Array, t: Array | None = None) -> float:
     A signal that is read at uneven times looks like noise: where those are given, t (n,), it is what neighbours do not foretell.
     """
     if t is not None and x.size > 4 * NEIGHBOURS and np.median(np.abs(np.diff(t, 2))) > JITTER * np.median(np.diff(t)):
-        return _foretold(t, x)
+        missed, unit = unforetold(t, x, NEIGHBOURS // 2)
+        return float(np.median(missed / unit) / 0.6745)
     length = min(SEGMENT, 2 ** int(np.log2(max(x.size, 1))))
     if length < 16:
         third = np.diff(x, 3) if x.size > 3 else np.zeros(1)
@@ -43,14 +44,6 @@ def white_level(x: Array, t: Array | None = None) -> float:
     power = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2 / (window @ window)
     upper = power[:, length // 4 : length // 2]
     return float(np.sqrt(np.median(np.median(upper, axis=1)) / np.log(2)))
-
-
-def _foretold(t: Array, x: Array) -> float:
-    """Return the level of noise in x (n,) by how far polynomials through the neighbours of each sample at times t miss it."""
-    reach = NEIGHBOURS // 2
-    weights, windows = from_neighbours(t, reach), np.lib.stride_tricks.sliding_window_view(x, 2 * reach + 1)
-    missed = windows[:, reach] - np.sum(np.delete(windows, reach, axis=1) * weights, axis=1)
-    return float(np.median(np.abs(missed) / np.sqrt(1 + np.sum(weights**2, axis=1))) / 0.6745)
 
 
 # Flaws of a channel: spikes, level jumps of a transducer, saturation, and the step of its quantisation.

@@ -78,14 +78,14 @@ def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[
     """Return the tests of one signal of a run: how far each is from what noise would give, over what is allowed, in words."""
     signal, white = f.run.signals[number], f.parts[number]
     name = f"{signal.observable} of {f.run.name}" if number else f.run.name
-    n, own = white.size, _own_level(white)
-    off = abs(float(np.sum(white**2)) / own**2 - n) / np.sqrt(2 * n)
+    n = white.size
+    off = abs(float(np.sum(white**2)) - n) / np.sqrt(2 * n)
     tests = [(off / DEVIATION, f"innovations of {name} have an rms of {np.sqrt(np.mean(white**2)):.3f}")]
     owns = found.likelihood.gauges(f.run, number)
     gauges = [[found.values[n] for local, n in own.items() if local.startswith(LEVELS)] for own in owns]
     level = np.linalg.norm(np.array(gauges), axis=1)[f.run.sampling.at][signal.used]
     expected = (signal.observed - f.of(number).nu)[signal.used]
-    for piece, y, noise in zip(cut(white / own), cut(expected), cut(level), strict=True):
+    for piece, y, noise in zip(cut(white), cut(expected), cut(level), strict=True):
         m = piece.size
         loud = (float(np.sum(np.clip(piece, -6, 6) ** 2)) - m) / np.sqrt(2 * m)
         shifted = abs(float(np.sum(piece))) / np.sqrt(m)
@@ -93,18 +93,6 @@ def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[
             loud *= _smooth_share(piece)
         tests.append((max(loud, shifted) / (DEVIATION + 1.0), f"a stretch of {name} is off"))
     return tests
-
-
-def _own_level(white: Array) -> float:
-    """Return the level of a run's noise, in that which runs share: what its calm innovations say, the rms at most.
-
-    It is the median size of third differences. What a model lacks is smooth, or lies in a part of the run; noise lies in all.
-    """
-    if white.size < 32:
-        return 1.0
-    third = float(np.median(np.abs(np.diff(white, 3)))) / (0.6745 * np.sqrt(20.0))
-    low, high = sorted((1.0, float(np.sqrt(np.mean(white**2)))))
-    return float(np.clip(np.clip(third, low, high), 1 / LOUD, LOUD))
 
 
 def _of_loads(found: StateSpaceFit) -> list[tuple[float, str]]:

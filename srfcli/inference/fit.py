@@ -144,7 +144,6 @@ class Problem:
     trend: str | None = None
     held: Mapping[str, float] = field(default_factory=dict)
     rtol: float = RTOL
-    varying: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # run -> parameter -> its name for that run's group
     priors: tuple[tuple[tuple[str, ...], float], ...] = ()  # names, and the scatter of their values about an unknown mean
     tables: tuple[CriticalLoads, ...] = ()
     stability: GeneratedModel | None = None
@@ -162,6 +161,11 @@ class Problem:
     def named(self, theta: Array) -> dict[str, float]:
         """Return parameters by name, those that are held among them."""
         return {**self.held, **dict(zip(self.names, np.asarray(theta).tolist(), strict=True))}
+
+    @cached_property
+    def varying(self) -> dict[str, dict[str, str]]:
+        """Return what the parameters that vary are called in each run of the experiment."""
+        return {run.name: self.varied(run) for run in self.experiment.runs}
 
     def varied(self, run: Run) -> dict[str, str]:
         """Return what the parameters that vary are called in a run, fitted or not."""
@@ -224,8 +228,9 @@ def fit_problem(
         raise SrfError(f"every {what} is held out", "set holdout = false for those that are to be fitted")
     if not names:
         raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
-    varying = _varying(experiment, runs, names)
-    groups = {n: list(dict.fromkeys(varying[run.name][n] for run in runs)) for n in experiment.vary if n != NOISE}
+    _check_varying(experiment, runs, names)
+    label = labels(experiment)
+    groups = {n: list(dict.fromkeys(f"{n}[{label[run.name]}]" for run in runs)) for n in experiment.vary if n != NOISE}
     rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names for _ in groups.get(n, [n])]
     names = [own for n in names for own in groups.get(n, [n])]
     for run in runs:
@@ -238,22 +243,19 @@ def fit_problem(
         if not (np.isfinite(low) and np.isfinite(high)):
             raise SrfError(f"'{name}' has no bounds", "give lower and upper in [parameters]")
     return Problem(
-        model, experiment, runs, tuple(names), start, lower, upper, trend, varying=varying, tables=tables, stability=stability
+        model, experiment, runs, tuple(names), start, lower, upper, trend, tables=tables, stability=stability
     )
 
 
-def _varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return what the parameters that vary are called in each run of an experiment."""
+def _check_varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[str]) -> None:
+    """Raise SrfError where what is to vary is not free, or the runs fitted are of one group."""
     vary, by = experiment.vary, experiment.by
-    if not vary:
-        return {}
     for name in vary:
         if name not in (*names, NOISE):
             raise SrfError(f"'{name}' is to vary, and is not free", did_you_mean(name, [*names, NOISE]))
     label = labels(experiment)
-    if len({label[run.name] for run in runs}) < 2:
+    if vary and len({label[run.name] for run in runs}) < 2:
         raise SrfError(f"{', '.join(vary)} cannot vary by {by}: the runs fitted have only one", "Leave `vary` out.")
-    return {run.name: {n: f"{n}[{label[run.name]}]" for n in vary if n != NOISE} for run in experiment.runs}
 
 
 @dataclass(frozen=True)

@@ -532,20 +532,20 @@ class Likelihood:
 
         So is what varies, if no run that was fitted is of its group.
         """
-        problem = self.problem
-        own = own_names(problem.model, run, problem.trend)
-        varying = {name: n for n, name in problem.varied(run).items() if name not in values}
-        noisy = problem.noise_group(run) not in {group for _, _, group in self.kinds}
-        if not (own or varying or noisy):
+        own = own_names(self.problem.model, run, self.problem.trend)
+        if not own and not self._noisy_alone(run) and values.keys() >= {*self.problem.varied(run).values()}:
             return self.filtered(run, values)
         return replace(self._alone(run, values)[1].runs[0], run=run)
+
+    def _noisy_alone(self, run: Run) -> bool:
+        """Return whether no run that was fitted has the gauge noise of this one."""
+        return self.problem.noise_group(run) not in {group for _, _, group in self.kinds}
 
     def _alone(self, run: Run, values: Mapping[str, float]) -> tuple[Likelihood, Point]:
         """Return the likelihood of a run that was not fitted, by what belongs to it alone, and its maximum."""
         problem = self.problem
         own = own_names(problem.model, run, problem.trend)
         varying = {name: n for n, name in problem.varied(run).items() if name not in values}
-        noisy = problem.noise_group(run) not in {group for _, _, group in self.kinds}
         p = run_parameters(problem.model, problem.experiment, run, values)
         rows = [own_start(problem.model, run, p, n, problem.trend) for n in own]
         listed = {q.name: q for q in problem.experiment.parameters}
@@ -565,7 +565,7 @@ class Likelihood:
         for alone_names, names in zip(likelihood.gauges(alone.runs[0]), self.gauges(run), strict=True):
             known |= {name: values[names[local]] for local, name in alone_names.items()}
         x = likelihood.coordinates(known)
-        gauge = [n for n in likelihood.names if n not in (*own, *FIELD)] if noisy else []
+        gauge = [n for n in likelihood.names if n not in (*own, *FIELD)] if self._noisy_alone(run) else []
         return likelihood, maximise(likelihood, x, held=[n for n in likelihood.names if n not in (*own, *gauge)]).point
 
     def pieces(self, point: Point) -> Iterator[tuple[Array, Array, Kind]]:
@@ -868,11 +868,11 @@ class StateSpaceFit:
         """
         own, (alone, point) = self.likelihood, self.likelihood._alone(run, self.values)
         problem, like = alone.problem, dict(zip(own.names, range(len(own.names)), strict=True))
-        if own.problem.noise_group(run) in {group for _, _, group in own.kinds}:
+        if own._noisy_alone(run):
+            like = {n: place for n, place in like.items() if n not in alone.names or n in FIELD}
+        else:
             for mine, theirs in zip(alone.gauges(problem.runs[0]), own.gauges(run), strict=True):
                 like |= {name: like[theirs[n]] for n, name in mine.items()}
-        else:
-            like = {n: place for n, place in like.items() if n not in alone.names or n in FIELD}
         groups = {name for names in problem.varying.values() for name in names.values()} - set(problem.varied(run).values())
         shared = [i for i, n in enumerate(own.problem.names) if "." not in n and n not in groups and n not in problem.names]
         both = replace(

@@ -368,26 +368,28 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
     return smooth
 
 
-def from_neighbours(t: Array, reach: int) -> Array:
-    """Return Lagrange's weights (n - 2 reach, 2 reach) by which samples at times t (n,) on both sides of one foretell it."""
-    times = np.lib.stride_tricks.sliding_window_view(t, 2 * reach + 1)
-    near = np.delete(times, reach, axis=1)
-    weights = np.ones(near.shape)
+def unforetold(t: Array, x: Array, reach: int) -> tuple[Array, Array]:
+    """Return by how much the polynomial through `reach` samples on both sides misses each of x (n,) at times t, but for the ends.
+
+    And what it is (n - 2 reach,) for white noise of standard deviation 1.
+    """
+    times, values = (np.lib.stride_tricks.sliding_window_view(a, 2 * reach + 1) for a in (t, x))
+    near, beside = (np.delete(a, reach, axis=1) for a in (times, values))
+    weights = np.ones(near.shape)  # Lagrange's
     for j in range(2 * reach):
         others = np.delete(near, j, axis=1)
         weights[:, j] = np.prod((times[:, reach, None] - others) / (near[:, j, None] - others), axis=1)
-    return weights
+    return np.abs(values[:, reach] - np.sum(beside * weights, axis=1)), np.sqrt(1 + np.sum(weights**2, axis=1))
 
 
 def _rough(t: Array, W: Array, total: float, noise: float) -> NDArray[np.bool_]:
     """Return which samples of a stretch the polynomial through their eight neighbours does not foretell."""
     from numpy.lib.stride_tricks import sliding_window_view
 
-    windows, weights = sliding_window_view(W, 2 * REACH + 1), from_neighbours(t, REACH)
-    error = np.abs(windows[:, REACH] - np.sum(np.delete(windows, REACH, axis=1) * weights, axis=1))
-    of_noise = 5 * noise * np.sqrt(1 + np.sum(weights**2, axis=1))
+    error, unit = unforetold(t, W, REACH)
+    ranges = np.ptp(sliding_window_view(W, 2 * REACH + 1), axis=1)
     rough = np.zeros(W.size, bool)
-    rough[REACH:-REACH] = error > np.maximum(ROUGH * np.ptp(windows, axis=1), np.maximum(FAINT * total, of_noise))
+    rough[REACH:-REACH] = error > np.maximum(ROUGH * ranges, np.maximum(FAINT * total, 5 * noise * unit))
     return rough
 
 
@@ -674,7 +676,7 @@ def _shifted(coefficients: Array, by: Array | float) -> Array:
 
 # What the experimenter imposes: the driving velocity V(t) and the normal load W(t), piece by smooth piece; um, s, N.
 
-__all__ = ["ConstantLoad", "Drive", "Load", "LoadPiece", "Modulation", "SampledLoad", "from_neighbours"]
+__all__ = ["ConstantLoad", "Drive", "Load", "LoadPiece", "Modulation", "SampledLoad", "unforetold"]
 
 
 @dataclass(frozen=True)
