@@ -634,7 +634,7 @@ def _job(model: GeneratedModel, experiment: Experiment, run: Run, flags: Mapping
     begin = float(run.t[0])
     mass = {"M": experiment.mass} if experiment.mass and "M" in model.names else {}
     values = _values(model, experiment) | {"K": run.stiffness} | mass | _asked_by_effects(model, run) | dict(flags)
-    p = model.vector(values)
+    p = model.vector(values | {n: v for n, v in experiment.elsewhere(run).items() if n in model.names})
     model.check_changing_load(p)
     try:
         state = start_state(model, p, start, drive=run.drive, load=run.load.rest(begin), begin=begin)

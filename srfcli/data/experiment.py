@@ -20,6 +20,7 @@ from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
 from srfcli.data.description import (
     Apparatus,
     ColumnSpec,
+    Description,
     Node,
     RunDescription,
     ThresholdsDescription,
@@ -113,7 +114,19 @@ def read_experiment(
         described.apparatus.stated,
         thresholds=tables,
     )
-    return grouped(found, vary, by)
+    found = grouped(found, vary, by)
+    _check_acting(found, described)
+    return found
+
+
+def _check_acting(experiment: Experiment, described: Description) -> None:
+    """Raise SrfError where a parameter acts in a run that there is not."""
+    known = dict.fromkeys([*(run.name for run in described.runs), *(run.name for run in experiment.runs)])
+    for q in experiment.parameters:
+        for i, name in enumerate(q.runs):
+            if name not in known and described.parameters is not None:
+                at = described.parameters.child(q.name).child("runs").child(i)
+                at.fail(f"there is no run '{name}'", did_you_mean(name, known))
 
 
 def _read_table(described: ThresholdsDescription) -> CriticalLoads:
@@ -132,7 +145,7 @@ def _read_table(described: ThresholdsDescription) -> CriticalLoads:
 
 # The model of an experiment and its parameters, judged by the laws themselves.
 
-_ENTRY = ("value", "lower", "upper", "fixed")
+_ENTRY = ("value", "lower", "upper", "fixed", "runs", "elsewhere")
 _IMPOSED = {
     "V": "The drive of each run says it.",
     "W0": "The load of each run says it.",
@@ -288,7 +301,26 @@ def _parameter(entry: Node, parameter: Parameter, geometry: Geometry) -> FitPara
             f"value = {value:g}{unit} is outside its bounds [{lower:g}, {upper:g}]{unit}", "Change it or the bounds."
         )
     factor = to_base(1.0, parameter.unit)
-    return FitParameter(parameter.name, value * factor, lower * factor, upper * factor, held, parameter.unit)
+    runs, elsewhere = _acting(entry, parameter, geometry)
+    return FitParameter(
+        parameter.name, value * factor, lower * factor, upper * factor, held, parameter.unit, runs, elsewhere * factor
+    )
+
+
+def _acting(entry: Node, parameter: Parameter, geometry: Geometry) -> tuple[tuple[str, ...], float]:
+    """Return the runs in which a parameter acts, none for all of them, and what it is in the others, in its declared unit."""
+    listed, other = entry.get("runs"), entry.get("elsewhere")
+    if listed is None:
+        if other is not None:
+            other.fail("it acts in all runs", 'Name those where it does: runs = ["slow"], or leave elsewhere out.')
+        return (), 0.0
+    if not isinstance(listed.value, list) or not listed.value:
+        listed.expected("a list of runs", 'Write runs = ["slow"].')
+    if parameter.name in ("K", "M"):
+        listed.fail(f"{parameter.name} is the apparatus', and no run's own", "Leave runs out.")
+    if other is None:
+        entry.fail(f"nothing says what {parameter.name} is in the other runs", "Write elsewhere = 0, or what it is there.")
+    return tuple(listed.child(i).text() for i in range(len(listed.value))), _stated(other, parameter, geometry)
 
 
 def _stated(node: Node, parameter: Parameter, geometry: Geometry) -> float:

@@ -39,7 +39,10 @@ class ModelChoice:
 
 @dataclass(frozen=True)
 class FitParameter:
-    """A parameter's start value and bounds in um, s, N; `unit` is the one it is declared in."""
+    """A parameter's start value and bounds in um, s, N; `unit` is the one it is declared in.
+
+    Where `runs` are named it acts in these alone, and is `elsewhere` in the others.
+    """
 
     name: str
     value: float
@@ -47,6 +50,8 @@ class FitParameter:
     upper: float
     fixed: bool
     unit: str
+    runs: tuple[str, ...] = ()
+    elsewhere: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -178,6 +183,10 @@ class Experiment:
         """Raise SrfError where there is no recording, only critical loads."""
         if not self.runs:
             raise SrfError(f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`.")
+
+    def elsewhere(self, run: Run) -> dict[str, float]:
+        """Return the parameters that act in other runs alone, at what they are in this one."""
+        return {q.name: q.elsewhere for q in self.parameters if q.runs and run.name not in q.runs}
 
     def fitted(self) -> Experiment:
         """Return the experiment without what is held out."""

@@ -140,7 +140,7 @@ def _description(experiment: Experiment, files: list[str]) -> str:
     if choice.effects:
         lines.append(f"effects = [{', '.join(map(_text, choice.effects))}]")
     if experiment.parameters:
-        lines += ["", "[parameters]", *map(_parameter_line, experiment.parameters)]
+        lines += ["", "[parameters]", *map(parameter_line, experiment.parameters)]
     for run, file in zip(experiment.runs, files, strict=False):
         lines += ["", "[[runs]]", *_run_lines(run, file)]
     for table, file in zip(experiment.thresholds, files[len(experiment.runs) :], strict=True):
@@ -149,11 +149,15 @@ def _description(experiment: Experiment, files: list[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _parameter_line(p: FitParameter) -> str:
-    factor = find_unit(p.unit).factor
+def parameter_line(p: FitParameter, unit: str = "") -> str:
+    """Return a parameter as [parameters] has it, in `unit` if that is not the one it is declared in."""
+    factor = find_unit(unit or p.unit).factor
     cells = {"value": p.value, "lower": p.lower, "upper": p.upper}
     parts = [f"{name} = {shortest(value, factor)!r}" for name, value in cells.items() if np.isfinite(value)]
-    return f"{_key(p.name)} = {{ {', '.join([*parts, *(['fixed = true'] if p.fixed else [])])} }}"
+    parts += ["fixed = true"] if p.fixed else []
+    if p.runs:
+        parts += [f"runs = [{', '.join(map(_text, p.runs))}]", f"elsewhere = {shortest(p.elsewhere, factor)!r}"]
+    return f"{_key(p.name)} = {{ {', '.join(parts)} }}"
 
 
 def _run_lines(run: Run, file: str) -> list[str]:

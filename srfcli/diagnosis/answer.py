@@ -115,6 +115,8 @@ def answer(
         "model": model,
         "reasons": list(diagnosis.reasons),
     }
+    if diagnosis.acts_in:
+        found["acts_in"] = diagnosis.acts_in
     if loads:
         chi2 = [dict(zip(sides, v.chi2, strict=True)) for v in loads]
         found["thresholds"] = [

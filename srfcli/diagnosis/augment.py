@@ -22,8 +22,8 @@ from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
 from srfcli.core.units import find_unit, from_base, split_quantity
 from srfcli.data.description import GEOMETRY, open_node
-from srfcli.data.values import Experiment, FitParameter, ModelChoice
-from srfcli.data.writing import DESCRIPTION, KILOGRAM, shortest
+from srfcli.data.values import Experiment, ModelChoice
+from srfcli.data.writing import DESCRIPTION, KILOGRAM, parameter_line, shortest
 from srfcli.diagnosis.hypotheses import Hypothesis
 from srfcli.inference.state_space import StateSpaceFit
 from srfcli.laws.effect_file import formula_text
@@ -101,7 +101,7 @@ def augment(
     lines += ["", "[model]", *(f'{"law" if kind == "friction" else kind} = "{kind}.toml"' for kind in LAWS)]
     lines += [f"inertia = {_value(inertia)}"] + ([f"effects = {_value(list(effects))}"] if effects else [])
     lines += [f"vary = {_value(list(experiment.vary))}", f"by = {_value(experiment.by)}"] if experiment.vary else []
-    lines += ["", "[parameters]", *(_free_parameter(q, base) for q in listed)]
+    lines += ["", "[parameters]", *(parameter_line(q, base if q.name == "K" else "") for q in listed)]
     if "columns" in description:
         lines += ["", "[columns]", *(f"{_key(k)} = {_value(v)}" for k, v in description["columns"].items())]
     for run in runs:
@@ -163,13 +163,6 @@ def _parts(
             names[path], copies[name] = name, path
         runs.append({**run, "file": names[path]})
     return runs, copies
-
-
-def _free_parameter(q: FitParameter, stiffness_unit: str) -> str:
-    factor = find_unit(stiffness_unit if q.name == "K" else q.unit).factor
-    cells = {"value": q.value, "lower": q.lower, "upper": q.upper}
-    parts = [f"{name} = {shortest(value, factor)!r}" for name, value in cells.items() if np.isfinite(value)]
-    return f"{_key(q.name)} = {{ {', '.join([*parts, *(['fixed = true'] if q.fixed else [])])} }}"
 
 
 def _value(value: Any) -> str:

@@ -131,8 +131,8 @@ class Hypothesis:
 
     @property
     def name(self) -> str:
-        """Return these names joined, or none."""
-        return "+".join(sorted(self.reported)) or "none"
+        """Return these names joined, each with the run in which alone it acts, if it does; or none."""
+        return "+".join(sorted([*self.reported[: bool(self.ageing)], *(e.label for e in self.effects)])) or "none"
 
     def experiment(self, experiment: Experiment) -> Experiment:
         """Return the experiment under the hypothesis' ageing law."""
@@ -194,12 +194,16 @@ def neutral_values(effect: Effect) -> dict[str, float]:
 
 
 def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment) -> list[FitParameter]:
-    """Return start values and bounds of an effect's parameters in um, s, N: sizes at their neutral values, or just inside."""
+    """Return start values and bounds of an effect's parameters in um, s, N: sizes at their neutral values, or just inside.
+
+    So they are elsewhere where the effect acts in one run alone.
+    """
     neutral, found = neutral_values(effect), []
     for name, p in own_parameters(effect, model).items():
         low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
         value = float(np.clip(neutral.get(p.name, to_base(p.default, p.unit)), low, high))
-        found.append(FitParameter(name, value, low, high, p.name in effect.fixed, p.unit))
+        runs = (effect.run,) if effect.run and p.name in neutral else ()
+        found.append(FitParameter(name, value, low, high, p.name in effect.fixed, p.unit, runs, value if runs else 0.0))
     for name in effect.frees:
         if name == "K":
             size, unit = split_quantity(experiment.stiffness_text, name="stiffness")

@@ -186,8 +186,9 @@ class Scores:
         self.remainder, self.fitted = remainder, remainder.fitted
         self.excluded: list[Excluded] = []
         self.shared = self.remainder.shared
-        self.columns = self._projected(self._all(candidates))
-        self.singles = self._singles()
+        self.raw = self._all(candidates)
+        self.columns = self._projected(self.raw)
+        self.singles = self._best_of(self.columns)
 
     def _all(self, candidates: Sequence[Effect]) -> list[_Column]:
         shapes = {e.name: shape for e in candidates if (shape := along_table(e)) is not None}
@@ -323,6 +324,27 @@ class Scores:
             at += len(group)
         return found
 
+    def alone(self) -> list[Score]:
+        """Return the scores of effects that act in one run alone, where that gains more than to act in all; largest first.
+
+        Laws are the same in all runs; what belongs to the apparatus may befall one.
+        """
+        every, best, end = {s.effect.reported: s.gain for s in self.singles}, dict[str, Score](), 0
+        apparatus = [c for c in self.raw if not (c.effect.constitutive or c.effect.frees or c.effect.settings)]
+        for f in self.remainder.runs:
+            rows = slice(end, end := end + 2 * f.white.size)
+            for first in range(0, len(apparatus), TOGETHER):
+                parts = []
+                for c in apparatus[first : first + TOGETHER]:
+                    columns = np.zeros_like(c.columns)
+                    columns[rows] = c.columns[rows]
+                    parts.append(replace(c, effect=replace(c.effect, run=f.run.name), columns=columns))
+                for score in self._best_of(self._projected(parts)):
+                    label = score.effect.label
+                    if score.gain > max(every.get(score.effect.reported, 0.0), best[label].gain if label in best else 0.0):
+                        best[label] = score
+        return sorted(best.values(), key=lambda s: -s.gain) if len(self.remainder.runs) > 1 else []
+
     def _projected(self, columns: Sequence[_Column]) -> list[_Column]:
         """Return the columns that do something here, projected off what was fitted, many at a time."""
         found: list[_Column] = []
@@ -366,9 +388,10 @@ class Scores:
         size = inverse @ g
         return 0.5 * float(g @ size), size, inverse
 
-    def _singles(self) -> list[Score]:
+    def _best_of(self, columns: Sequence[_Column]) -> list[Score]:
+        """Return the best score of each effect, largest gain first."""
         best: dict[str, Score] = {}
-        for column in self.columns:
+        for column in columns:
             gain, size, covariance = self._judge(column)
             effect = column.effect
             if not self._possible(column, size):

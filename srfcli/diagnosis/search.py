@@ -26,6 +26,7 @@ from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, appli
 from srfcli.diagnosis.scores import Remainder, Score, Scores
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
+    LOST,
     NEEDED,
     Likelihood,
     Maximum,
@@ -51,7 +52,7 @@ ASTRAY = 1000.0  # in log likelihood below its parent, from where a model is not
 FARTHEST = 10.0  # in the logarithm of a parameter, that a score can move it: beyond any bounds
 BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
 FAR = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
-AGAIN = 6  # of them, about the best, whose other parameters are fitted too where the model fails a test
+AGAIN = 9  # of them, about the best, whose other parameters are fitted too where the model fails a test: 26 % apart
 HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
 FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
@@ -207,13 +208,23 @@ class ModelSearch:
             )
         remainder = self.remainder(found)
         evidence = log_evidence(found) + self._prior(hypothesis)
-        if not any((shape := along_table(e)) and shape.argument == "slip" for e in hypothesis.effects):
-            evidence += max(remainder.shared.gain - CLOSE, 0.0)  # a track is a function of slip or a random one
+        by_slip = any((shape := along_table(e)) and shape.argument == "slip" for e in hypothesis.effects)
+        if not by_slip and found.maximum.away < LOST:  # a track is a function of slip or a random one
+            evidence += max(remainder.shared.gain - CLOSE, 0.0)  # at first order, about a maximum
         return Fitted(hypothesis, found, evidence, tuple(shortcomings(found)), remainder)
 
     def _prior(self, hypothesis: Hypothesis) -> float:
-        """Return the log prior of a model: each effect is one of those that there are, and halves its share."""
-        return -len(hypothesis.reported) * float(np.log(2 * max(len(self.candidates), 1)))
+        """Return the log prior of a model: each effect is one of those that there are, and halves its share.
+
+        One that acts in one run alone is in any of them.
+        """
+        each = float(np.log(2 * max(len(self.candidates), 1)))
+        return -len(hypothesis.reported) * each - sum(self._rarer for e in hypothesis.effects if e.run)
+
+    @property
+    def _rarer(self) -> float:
+        """Return by how much less likely an effect is in one run alone than in all, in the logarithm."""
+        return float(np.log(max(len(self.experiment.runs), 1)))
 
     # ------------------------------------------------------------------ the search
 
@@ -223,13 +234,15 @@ class ModelSearch:
         base = self._record(self.fit(None))
         base = self._expand(base)
         self._search()
-        for further in (self._recolour, self._together, self._swap):  # dearer, or less likely
+        for further in (self._recolour, self._together, self._swap, self._swap):  # dearer, or less likely
             best = self.best()
             wanting = best is not self.baseline or not self.baseline.fine
             imitated = further == self._swap and wanting  # an effect may pass for another ageing law
             if (imitated or not best.fine) and not self.spent:
                 further(self.baseline)
                 self._search()
+            if further == self._swap and not self.best().hypothesis.ageing:
+                break
         self.cut_short = self.spent and bool(self.queue)
         self._eliminate()
         if self.experiment.runs is not self.whole.runs:
@@ -318,7 +331,7 @@ class ModelSearch:
         there = {p.name for p in node.fit.likelihood.problem.model.parameters}
         joining = [e for e in self.candidates if e.reported not in names and there.issuperset(e.needs)]
         self.progress(f"{node.name}: scores")
-        scores = Scores(self.registry, node.hypothesis.experiment(self.experiment), node.remainder, present, joining)
+        scores = Scores(self.registry, node.fit.likelihood.problem.experiment, node.remainder, present, joining)
         self.excluded += scores.excluded
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
@@ -326,11 +339,15 @@ class ModelSearch:
         least = WORTH if node.fine else WORTH / 2
         if node.fine and not node.hypothesis.reported and (not node.fit.smooth or node.fit.likelihood.processes):
             least = HINT
-        for score in [s for s in scores.singles if s.gain > least][:SINGLES]:
+        alone = scores.alone() if not node.fine or any(s.gain > least for s in scores.singles) else []
+        scores.raw = []  # of much memory
+        promised = [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in alone]
+        promised = sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])
+        for gain, score in promised[:SINGLES]:
             hypothesis = Hypothesis((*present, score.effect), node.hypothesis.ageing)
             sizes = (*self._sizes(node), score.values)
             own = {n: score.shifts[n] for n in node.fit.likelihood.problem.names if score.shifts.get(n)}
-            self._push(node.evidence + score.gain + one, hypothesis, node, sizes, direction=score.direction, shifts=own)
+            self._push(node.evidence + gain + one, hypothesis, node, sizes, direction=score.direction, shifts=own)
         if not node.fine:
             for effect in (e for e in joining if e.settings or e.observed):
                 self._build(node, effect, one)
@@ -412,9 +429,9 @@ class ModelSearch:
         for ratio in np.geomspace(1 / FAR, FAR, AGAIN):
             values = _followable(node.fit.values, likelihood.problem)
             y = likelihood.coordinates({**values, name: values[name] * ratio})
-            trials.append(maximise(likelihood, y, held=[name], steps=3, close=1.0, progress=self.progress))
+            trials.append(maximise(likelihood, y, held=[name], steps=12, close=1.0, widths=(), progress=self.progress))
         likeliest = max(trials, key=lambda f: f.point.log_likelihood)
-        found = maximise(likelihood, likeliest.point.x, steps=4, close=1.0, progress=self.progress)
+        found = maximise(likelihood, likeliest.point.x, steps=12, close=1.0, widths=(), progress=self.progress)
         gain = found.point.log_likelihood - node.fit.log_likelihood
         if gain < NEEDED:
             return None
@@ -456,20 +473,21 @@ class ModelSearch:
                 self._push(node.evidence + pair.gain + 2 * one, Hypothesis(pair.effects), node, pair.values)
 
     def _swap(self, node: Fitted) -> None:
-        """Push the other ageing laws, each after a few steps from where the model stands, with what its score promises.
+        """Push the other ageing laws, each after a few steps from where the model or the best one stands, with what it promises.
 
         The one that promises most goes on from there: a law that is right lies further from the stated one than a step tells.
         """
         stated, *modifiers = self.experiment.choice.ageing.split("+")
         reached: list[tuple[float, Hypothesis, Likelihood, Maximum]] = []
         for name in self.laws:
-            if name == stated:
-                continue
             hypothesis = Hypothesis((), "+".join([name, *modifiers]))
+            if name == stated or hypothesis == self.best().hypothesis:
+                continue
             likelihood = self._likelihood(hypothesis, node, name)
             if likelihood is None:
                 continue
-            x = likelihood.coordinates(_followable(node.fit.values, likelihood.problem))
+            starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in (node, self.best())]
+            x = max(starts, key=lambda y: likelihood.at(y, slopes=False).log_likelihood)
             found = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
             if not (np.isfinite(found.away) and found.point.log_likelihood > node.fit.log_likelihood - ASTRAY):
                 continue

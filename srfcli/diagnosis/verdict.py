@@ -14,7 +14,7 @@ from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import improbability
 from srfcli.diagnosis.hypotheses import Excluded, neutral_values
 from srfcli.diagnosis.scores import Score
-from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, Fitted, ModelSearch
+from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, SINGLES, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
 from srfcli.inference.state_space import Filtered, Foretold, Likelihood, StateSpaceFit, maximise
 
@@ -106,6 +106,12 @@ class Diagnosis:
         return ()
 
     @property
+    def acts_in(self) -> dict[str, str]:
+        """Return the run in which alone an effect acts, by the effect's name, of those identified."""
+        named = self.best.hypothesis.effects if self.verdict == "identified" else ()
+        return {e.reported: e.run for e in named if e.run}
+
+    @property
     def final(self) -> Fitted:
         """Return the model that the answer calls augmented: the baseline itself where nothing is to be added."""
         return self.baseline if self.verdict in NOTHING else self.best
@@ -115,10 +121,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     """Return the verdict on a finished search; `whole` is the experiment with its held-out runs, opened only now."""
     ranked = tuple(search.ranked())
     baseline, best = search.baseline, ranked[0]
-    close = tuple(f for f in ranked if f.fine and best.evidence - f.evidence < CLOSE)
-    names = [set(f.hypothesis.reported) for f in close]
-    close = tuple(f for f in close if not any(n < set(f.hypothesis.reported) for n in names))
-    close = tuple(f for f in close if not any(_is_that_law(f, other) for other in close))
+    close, joint = may_be_it(ranked, whole)
     best = close[0] if close else best
     shown = on_the_track_of(best, baseline) if best.fine else baseline
     held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
@@ -139,16 +142,46 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     ]
     return Diagnosis(
         whole, verdict, best, baseline, baseline if verdict in NOTHING else shown, ranked, close,
-        _confidence(ranked, verdict), scores,
+        _confidence(ranked, joint, verdict), scores,
         (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores}, _equivalent(scores, close), held,
         tuple(reasons), ungated, held_loads,
     )  # fmt: skip
 
 
-def _is_that_law(fitted: Fitted, other: Fitted) -> bool:
-    """Return whether a model with effects became what another ageing law is, which has better evidence as it needs no size."""
-    alone = other.hypothesis.ageing and not other.hypothesis.effects and fitted.hypothesis.effects
-    if not alone or fitted.evidence > other.evidence:
+def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted, ...], dict[str, float]]:
+    """Return the models that pass and may be it, best first, and the log evidence of each model on all runs together.
+
+    That is its evidence on the runs fitted and its likelihood of the runs held out, for the few best that pass; the others are
+    given the same likelihood as the best of those. Of two that come close one that holds the other gives way, and one that
+    became the other.
+    """
+    least = -np.inf if ranked[0].fine else ranked[0].evidence - CLOSE
+    passed = [f for f in ranked if f.fine and f.evidence > least][:SINGLES]
+    told = {f.name: foretold(f, whole) for f in passed}
+    if not any(np.isfinite(t) for t in told.values()):  # no model follows what is held out
+        told = {}
+    passed.sort(key=lambda f: -f.evidence - told.get(f.name, 0.0))
+    rest = told.get(passed[0].name, 0.0) if passed else 0.0
+    joint = {f.name: f.evidence + told.get(f.name, rest) for f in ranked}
+    close = [f for f in passed if joint[passed[0].name] - joint[f.name] < CLOSE]
+    names = [set(f.hypothesis.reported) for f in close]
+    close = [f for f in close if not any(n < set(f.hypothesis.reported) for n in names)]
+    return tuple(f for f in close if not any(_is_that_law(f, other, joint) for other in close)), joint
+
+
+def foretold(fitted: Fitted, whole: Experiment) -> float:
+    """Return the log likelihood of all that is held out, with the model's parameters as uncertain as its fit leaves them."""
+    own = fitted.fit.likelihood
+    runs = sum(fitted.fit.foretold(run).log_likelihood for run in whole.runs if run.holdout and own.problem.runs)
+    return runs + sum(own.held_out_table(t, fitted.fit.values).log_likelihood for t in whole.thresholds if t.holdout)
+
+
+def _is_that_law(fitted: Fitted, other: Fitted, evidence: Mapping[str, float]) -> bool:
+    """Return whether a model became what another ageing law is that has fewer parameters: the innovations are the same."""
+    sizes = [len(f.fit.likelihood.problem.model.parameters) for f in (fitted, other)]
+    if not other.hypothesis.ageing or other.hypothesis.effects or sizes[1] >= sizes[0]:
+        return False
+    if evidence[fitted.name] - evidence[other.name] > (sizes[0] - sizes[1]) * np.log(2):  # each halves a model's prior share
         return False
     whites = zip(fitted.fit.maximum.point.runs, other.fit.maximum.point.runs, strict=True)
     return float(sum(np.sum((a.white - b.white) ** 2) for a, b in whites)) < 2 * CLOSE
@@ -264,9 +297,9 @@ def _equivalent(scores: Sequence[Score], close: Sequence[Fitted]) -> tuple[tuple
     return tuple(found)
 
 
-def _confidence(ranked: Sequence[Fitted], verdict: str) -> dict[str, float]:
+def _confidence(ranked: Sequence[Fitted], joint: Mapping[str, float], verdict: str) -> dict[str, float]:
     """Return the stated confidence in each model, by evidence, in `unknown`, in what the search `missed` where none passes."""
-    weights = {f.name: f.evidence - (0.0 if f.fine else LACKING) for f in ranked}
+    weights = {f.name: joint[f.name] - (0.0 if f.fine else LACKING) for f in ranked}
     top = max(weights.values())
     share = {name: float(np.exp(max((w - top) / TEMPER, -60.0))) for name, w in weights.items()}
     total, unknown = sum(share.values()), 1 - MISSED if verdict == "unknown" else UNEXPLAINED

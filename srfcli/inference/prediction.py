@@ -189,11 +189,15 @@ class Prediction:
 
 
 def run_parameters(model: GeneratedModel, experiment: Experiment, run: Run, values: Mapping[str, float]) -> Array:
-    """Return p for this run: the experiment's values, overridden by `values`, with the run's own stiffness, V and W0."""
+    """Return p for this run: the experiment's values, overridden by `values`, with the run's own stiffness, V and W0.
+
+    What acts in other runs alone is as it is elsewhere.
+    """
     base = {"K": run.stiffness}
     if experiment.mass is not None and "M" in model.names:
         base["M"] = experiment.mass
     listed = {q.name: q.value for q in experiment.parameters} | dict(values)
+    listed |= experiment.elsewhere(run)
     base |= {name: value for name, value in listed.items() if name in model.names}
     if "K" in listed:
         base["K"] = listed["K"] * stiffness_share(experiment, run)
@@ -282,7 +286,8 @@ def predict(
     if tables:
         p = appended(p, tables)
     t = run.t[: max(int(np.sum(run.t <= until)), 2)]
-    own = [k for k, name in enumerate(by) if name in model.names or name.startswith(f"{run.name}.")]
+    still = experiment.elsewhere(run)
+    own = [k for k, n in enumerate(by) if n not in still and (n in model.names or n.startswith(f"{run.name}."))]
     moving = [k for k in own if not by[k].endswith(".trend")]
     names = [by[k] for k in moving]
     places = [model.index(n) if n in model.names else -1 for n in names]

@@ -514,7 +514,7 @@ class Likelihood:
         gauges, problem = self.gauges(run), self.problem
         varying = problem.varied(run)
         own = {name: n for n, name in varying.items()} | {n: n for gauge in gauges for n in gauge.values()}
-        others = {name for names in problem.varying.values() for name in names.values()}
+        others = {name for names in problem.varying.values() for name in names.values()} | {*problem.experiment.elsewhere(run)}
         by = {
             n: own.get(n, n)
             for n in self.names

@@ -101,6 +101,7 @@ class Effect(Law):
     Those in `fixed` are never fitted: a reference load, say.
     One `on_request` is searched for only where it is named.
     `constants` are numbers with units that formulas in `written` name; in `changes` and `states` their values stand, um, s, N.
+    A hypothesis may have it act in one `run` alone.
     """
 
     changes: tuple[tuple[str, sympy.Expr], ...] = ()
@@ -119,6 +120,12 @@ class Effect(Law):
     scaled: tuple[tuple[str, str, sympy.Expr], ...] = ()
     on_request: bool = False
     fixed: tuple[str, ...] = ()
+    run: str = ""
+
+    @property
+    def label(self) -> str:
+        """Return the name of a hypothesis that has it: with the run, where it acts in one alone."""
+        return f"{self.reported}[{self.run}]" if self.run else self.reported
 
     @property
     def reported(self) -> str:

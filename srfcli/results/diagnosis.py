@@ -111,7 +111,9 @@ class DiagnosisResult(Result):
     @property
     def sentence(self) -> str:
         """Return the verdict in a sentence."""
-        return SENTENCES[self.verdict].format(" and ".join(self.effects))
+        alone = self.diagnosis.acts_in
+        named = [f"{name} in {alone[name]} alone" if name in alone else name for name in self.effects]
+        return SENTENCES[self.verdict].format(" and ".join(named))
 
     @property
     def status(self) -> Status:

@@ -201,7 +201,9 @@ def verdict_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> 
     if verdict == "none":
         return "Nothing is missing: the model explains the recordings down to the noise."
     if verdict == "identified":
-        return " ".join(_capital(_wrong(e, answer, material)) + "." for e in effects)
+        alone = answer.get("acts_in") or {}
+        told = [_wrong(e, answer, material) + (f", in the run {alone[e]} alone" if e in alone else "") for e in effects]
+        return " ".join(_capital(text) + "." for text in told)
     if verdict == "ambiguous":
         return f"Something is missing, and these recordings cannot tell which of {joined(effects, 'or')} it is."
     if verdict == "unknown":

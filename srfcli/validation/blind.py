@@ -6,6 +6,7 @@ import functools
 import hashlib
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -175,12 +176,14 @@ def told(diagnosis: Diagnosis, *, case: str) -> Answer:
     from srfcli.diagnosis.answer import run_views
     from srfcli.diagnosis.verdict import brought
 
-    views = run_views(diagnosis)
+    views, confidence = run_views(diagnosis), dict[str, float]()
+    for name, share in diagnosis.confidence.items():
+        confidence[_plain(name)] = confidence.get(_plain(name), 0.0) + float(share)
     return Answer(
         case,
         diagnosis.verdict,
         tuple(diagnosis.effects),
-        {name: float(share) for name, share in diagnosis.confidence.items()},
+        confidence,
         tuple(tuple(names) for names in diagnosis.equivalent),
         tuple(dict.fromkeys(x.effect for x in diagnosis.not_identifiable)),
         {name: {k: _finite(v) for k, v in value.items()} for name, value in brought(diagnosis).items()},
@@ -189,17 +192,15 @@ def told(diagnosis: Diagnosis, *, case: str) -> Answer:
             "augmented": _finite(diagnosis.final.fit.maximum.point.rms),
         },
         {view.run.name: _errors(view) for view in views if view.holdout},
-        {f.name: _evidence(f) for f in reversed(diagnosis.ranked)},
+        {_plain(f.name): _evidence(f) for f in reversed(diagnosis.ranked)},
         diagnosis.ungated,
-        run=_worst([view for view in views if not view.holdout]),
+        run=next(iter(diagnosis.acts_in.values()), ""),
     )
 
 
-def _worst(views: Sequence[RunView]) -> str:
-    """Return the fitted run that has more than half of what the baseline leaves beyond its noise; "" of none, or of one run."""
-    excess = {v.run.name: float(v.run.used.sum()) * max(v.rms[0] ** 2 - 1, 0.0) for v in views}
-    largest = max(excess, key=lambda name: excess[name], default="")
-    return largest if len(excess) > 1 and excess[largest] > 0.5 * sum(excess.values()) > 0 else ""
+def _plain(name: str) -> str:
+    """Return a hypothesis' name without the runs in which its effects act."""
+    return re.sub(r"\[[^]]*\]", "", name)
 
 
 def _evidence(fitted: Fitted) -> Mapping[str, float]:

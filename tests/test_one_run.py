@@ -1,0 +1,111 @@
+"""A parameter that acts in some runs alone: in experiments, in simulations, in fits, and as what a diagnosis names."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from srfcli.cli.main import cli
+from srfcli.codegen.c_source import compiler
+from srfcli.core.errors import SrfError
+from srfcli.data.experiment import read_experiment
+from srfcli.laws.registry import bundled_registry
+from srfcli.validation.cases import case_files
+from srfcli.validation.gauge import Gauge, read_gauge
+from srfcli.validation.slider import Physics, Plan, move
+
+SHIPPED = bundled_registry()
+PLANS = (
+    Plan("up", ((0.5, 10), (0.7, 40)), 3.0, 0.002, steps=((0.3, 1.0), (0.7, -0.5))),
+    Plan("down", ((0.7, 40), (0.6, 15)), 3.0, 0.002, steps=((0.3, 1.0), (0.9, -0.5))),
+    Plan("again", ((0.4, 15), (0.4, 30)), 3.0, 0.002, steps=((0.2, 1.0),), holdout=True),
+)
+SHARE, NAME = 0.05, "tangential-crosstalk"
+needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here")
+
+
+def srf(*arguments) -> Result:
+    return CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="srf")
+
+
+def written(folder, only):
+    """Write the recordings of the independent generator: the load pushes along the track in the runs `only`."""
+    rng, calm = np.random.default_rng(5), Physics()
+    pushed = replace(calm, cross=SHARE)
+    readings = {p: read_gauge(move(pushed if p.name in only else calm, p).u, Gauge(), rng) for p in PLANS}
+    for name, text in case_files("one run", calm, readings).items():
+        (folder / name).write_text(text)
+    return folder
+
+
+@needs_compiler
+@pytest.mark.parametrize("only", [("down",), ("up", "down", "again")], ids=["one", "all"])
+def test_a_diagnosis_names_the_run_in_which_alone_an_effect_acts(only, tmp_path):
+    folder = written(tmp_path, only)
+    done = srf("diagnose", str(folder), "--effect", NAME, "--json", "--out", str(tmp_path / "found"))
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert (told["verdict"], told["effects"]) == ("identified", [NAME])
+    share = told["augmented"]["parameters"]["share"]
+    assert abs(share["value"] - SHARE) < 4 * share["stderr"] < 0.2 * SHARE
+    if len(only) > 1:
+        assert "acts_in" not in told
+        return
+    assert told["acts_in"] == {NAME: "down"}
+    augmented = read_experiment(tmp_path / "found" / "augmented", registry=SHIPPED)
+    (q,) = (q for q in augmented.parameters if q.name == "share")
+    assert (q.runs, q.elsewhere) == (("down",), 0.0)
+    assert [q.name in augmented.elsewhere(run) for run in augmented.runs] == [True, False, True]
+
+
+STATED = """
+effects = ["tangential-crosstalk"]
+[parameters]
+share = { value = 0.05, runs = ["down"], elsewhere = 0.0 }
+"""
+
+
+def stated(folder, text=STATED):
+    """Write the experiment with the effect in its description."""
+    written(folder, ())
+    path = folder / "experiment.toml"
+    before, after = path.read_text().split("\n[parameters]", 1)
+    path.write_text(before + text + after.split("\n", 1)[1])
+    return path
+
+
+@needs_compiler
+def test_a_simulation_and_a_fit_have_it_in_that_run_alone(tmp_path):
+    """Against the same simulation without the effect: in the other runs nothing differs, in that one the load pushes."""
+    stated(tmp_path)
+    for name, share in (("with", SHARE), ("without", 0)):
+        done = srf("simulate", str(tmp_path), "--set", f"share={share}", "--out-dir", str(tmp_path / name))
+        assert done.exit_code == 0, done.output
+    one, other = (read_experiment(tmp_path / name, registry=SHIPPED) for name in ("with", "without"))
+    apart = {a.name: float(np.max(np.abs(a.observed - b.observed))) for a, b in zip(one.runs, other.runs, strict=True)}
+    assert apart["up"] == apart["again"] == 0.0
+    assert apart["down"] == pytest.approx(SHARE * 1.0 / 0.21, rel=0.2)  # share (W - W0)/K, in um
+    done = srf("fit", str(tmp_path / "with"), "--track", "smooth", "--json")
+    assert done.exit_code == 0, done.output
+    rows = {row["parameter"]: row for row in json.loads(done.stdout)["tables"][0]["rows"]}
+    assert rows["share"]["value"] == pytest.approx(SHARE, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ('runs = ["dwon"], elsewhere = 0.0', "no run 'dwon'"),
+        ('runs = ["down"]', "nothing says what share is in the other runs"),
+        ("runs = [], elsewhere = 0.0", "expected a list of runs"),
+        ("elsewhere = 0.0", "it acts in all runs"),
+    ],
+)
+def test_what_is_wrong_with_it_is_said(entry, said, tmp_path):
+    path = stated(tmp_path, STATED.replace('runs = ["down"], elsewhere = 0.0', entry))
+    with pytest.raises(SrfError, match=said) as found:
+        read_experiment(path, registry=SHIPPED)
+    assert "experiment.toml" in str(found.value)
