@@ -39,11 +39,11 @@ srf fit found/augmented                              the augmented model is an e
 @click.option("--out", metavar="DIR", help="Write answer, report, predictions and augmented experiment to DIR.")
 @click.option("--force", is_flag=True, help="Replace a diagnosis that is in DIR already.")
 def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], **options: Any) -> None:
-    """Say where recordings, or critical loads, and their model part, and which physics the model lacks.
+    """Find where recordings, or critical loads, differ from their model, and which physics the model lacks.
 
     The baseline of the experiment is fitted with a random friction field and coloured gauge noise. Every registered effect is
-    scored for what it could explain beyond these, and those that promise most are fitted. Held-out runs are opened when the
-    models are final, and judge them. Verdicts are none, identified, ambiguous, unknown and inconclusive.
+    scored for what it could explain beyond these, and those with the highest scores are fitted. Held-out runs are read when the
+    models are final, and must be predicted. Verdicts are none, identified, ambiguous, unknown and inconclusive.
     """
     from srfcli.cli.emit import Progress, finish
     from srfcli.cli.options import open_registry

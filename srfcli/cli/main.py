@@ -57,7 +57,7 @@ COMMANDS = {
     ),
     "diagnose": (
         "srfcli.cli.diagnose:command",
-        "Say where recordings, or critical loads, and their model part, and which physics the model lacks.",
+        "Find where recordings, or critical loads, differ from their model, and which physics the model lacks.",
     ),
     "report": (
         "srfcli.cli.report:command",

@@ -49,7 +49,7 @@ TRACKS = ("smooth", "shared", "own")
 @click.option(
     "--track",
     type=click.Choice(TRACKS),
-    help="Make cases on such tracks only: smooth, a rough one that all runs share, or one of each run's own.",
+    help="Random friction field of the cases: none, one that all runs share, or one of each run's own.",
 )
 @click.option(
     "--workers", type=click.IntRange(0, 4096), default=1, show_default=True, help="Processes, 0 for all cores."

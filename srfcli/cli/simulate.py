@@ -112,10 +112,10 @@ def _options(function: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--lag1", type=float, default=0.0, help="Correlation of the noise from sample to sample, as 0.8."),
         click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded."),
         click.option(
-            "--roughness", metavar="SIZE", help="Standard deviation by which mu0 wanders along the track, as 3e-4."
+            "--roughness", metavar="SIZE", help="Standard deviation of a random friction field along slip, as 3e-4."
         ),
         click.option(
-            "--roughness-length", metavar="UM", help="Correlation length of the track, in um.  [default: 10 um]"
+            "--roughness-length", metavar="UM", help="Correlation length of that field, in um.  [default: 10 um]"
         ),
         click.option(
             "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is random."
