@@ -33,6 +33,7 @@ from srfcli.inference.state_space import (
     StateSpaceFit,
     correlated,
     fit_state_space,
+    likeliest_beside,
     maximise,
     thinned,
 )
@@ -143,7 +144,9 @@ class ModelSearch:
 
         def fitted(values: dict[str, float] | None) -> StateSpaceFit:
             problem = self._problem(hypothesis, values or {})
-            return fit_state_space(problem, start=values, close=NEAR, rtol=COARSE, progress=self.progress, **options)
+            return fit_state_space(
+                problem, start=values, beside=False, close=NEAR, rtol=COARSE, progress=self.progress, **options
+            )
 
         if move and not self.experiment.runs:  # without a field a parent that is far off leads to the crossings next to its own
             stated = {q.name: q.value for q in self.experiment.parameters}
@@ -153,7 +156,10 @@ class ModelSearch:
         else:
             found = fitted(self._started(move) if move else None)
         self.processes = found.likelihood.processes
-        return self._judged(hypothesis, found)
+        judged = self._judged(hypothesis, found)
+        if move is None and judged.fine:  # else it is not what is reported
+            judged = self._judged(hypothesis, likeliest_beside(found, NEAR, self.progress))
+        return judged
 
     def _problem(self, hypothesis: Hypothesis, at: Mapping[str, float]) -> Problem:
         return hypothesis.problem(self.registry, self.experiment, at=at, trend=self.trend)
@@ -419,7 +425,7 @@ class ModelSearch:
 
         So with the first of several inner parameters of an effect with states, as a frequency beside a damping.
         """
-        built = [p.name for e in node.hypothesis.effects if e.settings for p in e.parameters]
+        built = [n for e in node.hypothesis.effects if e.settings for n in (*(p.name for p in e.parameters), *e.frees)]
         built += [e.scans[0][0] for e in node.hypothesis.effects if e.states and len(e.scans) > 1]
         likelihood = node.fit.likelihood
         name = next((n for n in likelihood.problem.names if n in built), None)

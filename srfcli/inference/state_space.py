@@ -920,6 +920,7 @@ def fit_state_space(
     processes: Sequence[str] | None = None,
     cautious: bool = False,
     thorough: bool = True,
+    beside: bool = True,
     close: float = CONVERGED,
     rtol: float = RTOL,
     progress: Callable[[str], None] = lambda text: None,
@@ -932,7 +933,8 @@ def fit_state_space(
     `smooth` says whether there is no field; left out, there is one where it gains 2 in log likelihood. `processes` says which
     of coloured noise the gauge has, words of PROCESSES; left out, Schwarz's criterion decides, early and, if the fit is to be
     `thorough`, again at the maximum; where it is `cautious`, more than one only if innovations are correlated all along, as those
-    of a model that lacks something are not. The status is that of the last maximisation.
+    of a model that lacks something are not. `beside` says whether maxima next to that found are looked for
+    (`likeliest_beside`). The status is that of the last maximisation.
     """
     tried: list[Likelihood] = []
 
@@ -947,11 +949,11 @@ def fit_state_space(
         if not problem.runs:
             return _surveyed(_of_tables(likelihood, start or {}, close, progress), close, progress)
         if part is None and start is None and (runs := thinned(problem.runs)) is not problem.runs:
-            part = fit_state_space(replace(problem, runs=runs), thorough=thorough, rtol=rtol, **choice)
+            part = fit_state_space(replace(problem, runs=runs), thorough=thorough, beside=beside, rtol=rtol, **choice)
         if part is not None and part.maximum.status is not Status.INTEGRATION:
             found = _on_all(part, likelihood, **choice)
         else:
-            found = _fitted(likelihood, start or {}, thorough=thorough, **choice)
+            found = _fitted(likelihood, start or {}, thorough=thorough, beside=beside, **choice)
         return _surveyed(found, close, progress) if problem.tables else found
     except KeyboardInterrupt as error:
         last = next((own.best for own in reversed(tried) if own.best is not None), None)
@@ -1050,6 +1052,7 @@ def _fitted(
     processes: Sequence[str] | None,
     cautious: bool,
     thorough: bool,
+    beside: bool,
     close: float,
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
@@ -1098,8 +1101,8 @@ def _fitted(
     if fresh:
         before = best.likelihood.evaluations
         likelier = best.maximum if walked else _along_ridges(best.likelihood, best.maximum, close, progress)
-        likelier = _likelier(best.likelihood, likelier, close, progress)
         best = replace(best, maximum=likelier, evaluations=best.evaluations + best.likelihood.evaluations - before)
+        best = likeliest_beside(best, close, progress) if beside else best
     if fresh and smooth is None and best.smooth:
         best = _with_faint_fields(best, likelihood(False, best.likelihood.processes))
     return best
@@ -1155,15 +1158,14 @@ def _short_field(fitted: StateSpaceFit) -> bool:
     return bool(fitted.maximum.point.x[at] < fitted.likelihood.lower[at] + 0.1)
 
 
-def _likelier(
-    likelihood: Likelihood, maximum: Maximum, close: float, progress: Callable[[str], None]
-) -> Maximum:
-    """Return the likeliest of the maxima next to one along its ridges, with what these add to the covariance.
+def likeliest_beside(found: StateSpaceFit, close: float, progress: Callable[[str], None]) -> StateSpaceFit:
+    """Return the fit at the likeliest of the maxima next to its own along its ridges, with what these add to the covariance.
 
     A ridge is how the others follow one parameter, by the covariance. Where the likelihood falls off along it by less than its
     curvature wants, it has maximum beside maximum: readings of an oscillation of the contact that is faster than the sampling
     are alike for many compliances. Where none of these stands out, the parameter is as uncertain as all of them are together.
     """
+    likelihood, maximum, before = found.likelihood, found.maximum, found.likelihood.evaluations
     for _ in range(HOPS):
         spread, best = np.zeros_like(maximum.covariance), maximum.point
         for j in _ridges(likelihood, maximum):
@@ -1172,10 +1174,11 @@ def _likelier(
             best = max(best, beside, key=lambda p: p.log_likelihood)
         if best.log_likelihood < maximum.point.log_likelihood + NEEDED:
             break
-        found = maximise(likelihood, best.x, close=close, widths=(), progress=progress)
-        progress(f"log likelihood {found.point.log_likelihood:.1f} beside {maximum.point.log_likelihood:.1f}")
-        maximum = found
-    return replace(maximum, spread=spread)
+        other = maximise(likelihood, best.x, close=close, widths=(), progress=progress)
+        progress(f"log likelihood {other.point.log_likelihood:.1f} beside {maximum.point.log_likelihood:.1f}")
+        maximum = other
+    count = found.evaluations + likelihood.evaluations - before
+    return replace(found, maximum=replace(maximum, spread=spread), evaluations=count)
 
 
 def _ridges(likelihood: Likelihood, maximum: Maximum) -> list[int]:
