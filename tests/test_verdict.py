@@ -23,18 +23,18 @@ def score(name, detectable, direction=(1.0, 0.0)):
     return Score(SHIPPED.get("effect", name), 1.0, {}, 0.0, 1.0, detectable, 0.5, np.array(direction))
 
 
-def fitted(*names, evidence, fine=True, scores=()):
+def fitted(*names, evidence, fine=True, scores=(), told=0.0):
     hypothesis = Hypothesis(tuple(SHIPPED.get("effect", n) for n in names))
     return SimpleNamespace(
         hypothesis=hypothesis, name=hypothesis.name, evidence=evidence, fine=fine,
-        against=() if fine else ("a stretch of steps is off",), promised=scores,
+        against=() if fine else ("a stretch of steps is off",), promised=scores, told=told,
     )  # fmt: skip
 
 
 def held(rms, gain=1.0, whole=True):
     white = rms * np.where(np.arange(400) % 2, 1.0, -1.0)
     told = SimpleNamespace(rms=rms)
-    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain, foretold=(told, told))
+    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain, foretold=(told, told), loud="")
 
 
 @pytest.fixture
@@ -43,6 +43,7 @@ def concluded(monkeypatch):
 
     def verdict(*fits, held=(), cut_short=False):
         monkeypatch.setattr(module, "held_out", lambda *_: tuple(held))
+        monkeypatch.setattr(module, "foretold", lambda fit, whole: fit.told)
         monkeypatch.setattr(module, "on_the_track_of", lambda best, baseline: baseline)
         monkeypatch.setattr(module, "at_bounds", lambda best: [])
         ranked = sorted(fits, key=lambda f: -f.evidence)
@@ -161,6 +162,29 @@ def test_an_effect_that_became_another_ageing_law_gives_way_to_it(concluded, apa
     law.name = law.hypothesis.name
     white = np.where(np.arange(400) % 2, 1.0, -1.0)
     for fit, off in ((law, 0.0), (effect, apart)):
-        fit.fit = SimpleNamespace(maximum=SimpleNamespace(point=SimpleNamespace(runs=[SimpleNamespace(white=white + off)])))
+        problem = SimpleNamespace(model=SimpleNamespace(parameters=[0] * (5 if fit is law else 6)))
+        fit.fit = SimpleNamespace(
+            maximum=SimpleNamespace(point=SimpleNamespace(runs=[SimpleNamespace(white=white + off)])),
+            likelihood=SimpleNamespace(problem=problem),
+        )
     found = concluded(law, effect, LOST)
     assert (found.verdict, found.effects) == said
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [(0.0, ("ambiguous", ("slip-evolution", "viscous-drag"))), (20.0, ("identified", ("viscous-drag",)))],
+)
+def test_held_out_runs_choose_between_models_that_fit_equally_well(concluded, told, said):
+    found = concluded(
+        fitted("slip-evolution", evidence=100.0, told=-30.0), fitted("viscous-drag", evidence=98.0, told=told - 30.0), LOST
+    )
+    assert (found.verdict, found.effects) == said
+    assert found.confidence["viscous-drag"] > 0.85 if told else found.confidence["slip-evolution"] > 0.5
+
+
+def test_models_that_held_out_runs_do_not_tell_apart_where_none_is_followed_are_told_apart_by_the_rest(concluded):
+    found = concluded(
+        fitted("slip-evolution", evidence=100.0, told=-np.inf), fitted("viscous-drag", evidence=90.0, told=-np.inf), LOST
+    )
+    assert (found.verdict, found.effects) == ("identified", ("slip-evolution",))

@@ -14,7 +14,17 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import stretches, white_level
-from srfcli.inference.state_space import LAGS, LOST, Filtered, StateSpaceFit, correlated, cut, typical_friction
+from srfcli.inference.state_space import (
+    LAGS,
+    LOST,
+    Filtered,
+    Likelihood,
+    Point,
+    StateSpaceFit,
+    correlated,
+    cut,
+    typical_friction,
+)
 
 DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
 PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
@@ -58,9 +68,16 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
         friction = max(float(np.median([typical_friction(f.run) for f in point.runs])), 1e-6)
         share = values["field_amplitude"] / friction / PLAUSIBLE
         tests.append((share, f"the field's amplitude is {values['field_amplitude']:.2g}"))
+    tests += loudness(found.likelihood, point)
+    return [text for size, text in sorted(tests, reverse=True) if size > 1.0]
+
+
+def loudness(likelihood: Likelihood, point: Point) -> list[tuple[float, str]]:
+    """Return how loud each kind of gauge noise is, over what third differences of the recordings allow, in words."""
     levels: dict[str, list[tuple[float, float, int]]] = {}
+    tests = []
     for f in point.runs:
-        rate, gauges = f.run.sampling.at, iter(found.likelihood.gauges(f.run))
+        rate, gauges = f.run.sampling.at, iter(likelihood.gauges(f.run))
         for signal, k in product(f.run.signals, range(len(f.run.sampling.spacings))):
             here = signal.used & (rate == k)
             seen = white_level(signal.observed, stretches(f.run.t, here))
@@ -68,10 +85,10 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
     for name, shown in levels.items():
         quantum = max(q for _, q, _ in shown) / np.sqrt(12)
         for seen, _, n in shown:
-            ratio = float(np.hypot(values[name], quantum)) / seen
+            ratio = float(np.hypot(point.values[name], quantum)) / seen
             size = ratio / max(LOUD, 1 + DEVIATION * float(np.sqrt(THIRD / max(n, 1))))
             tests.append((size, f"the gauge's noise is {ratio:.2f} times what the recording shows"))
-    return [text for size, text in sorted(tests, reverse=True) if size > 1.0]
+    return tests
 
 
 def _signal_tests(found: StateSpaceFit, f: Filtered, number: int) -> list[tuple[float, str]]:

@@ -493,7 +493,8 @@ class ModelSearch:
             if likelihood is None:
                 continue
             starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in (node, self.best())]
-            x = max(starts, key=lambda y: likelihood.at(y, slopes=False).log_likelihood)
+            heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts]
+            x = starts[int(np.argmax(heights))]
             found = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
             if not (np.isfinite(found.away) and found.point.log_likelihood > node.fit.log_likelihood - ASTRAY):
                 continue

@@ -11,10 +11,10 @@ import numpy as np
 from srfcli.core.errors import Status
 from srfcli.core.units import from_base, to_base
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.goodness_of_fit import improbability
+from srfcli.diagnosis.goodness_of_fit import improbability, loudness
 from srfcli.diagnosis.hypotheses import Excluded, neutral_values
 from srfcli.diagnosis.scores import Score
-from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, SINGLES, Fitted, ModelSearch
+from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
 from srfcli.inference.state_space import Filtered, Foretold, Likelihood, StateSpaceFit, maximise
 
@@ -34,13 +34,15 @@ class Held:
     """One held-out run filtered under the baseline and under the best model, both as they were fitted to the other runs.
 
     `shown` is that of the baseline with the best model's field and gauge noise. `foretold` says how well each of the first two
-    predicts it, with parameters as uncertain as their fits leave them.
+    predicts it, with parameters as uncertain as their fits leave them. `loud` says whether the best model needs more gauge noise
+    than the run shows, where no run that was fitted has its noise.
     """
 
     baseline: Filtered
     augmented: Filtered
     shown: Filtered
     foretold: tuple[Foretold, Foretold]
+    loud: str = ""
 
     @property
     def run(self) -> Run:
@@ -151,12 +153,12 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
 def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted, ...], dict[str, float]]:
     """Return the models that pass and may be it, best first, and the log evidence of each model on all runs together.
 
-    That is its evidence on the runs fitted and its likelihood of the runs held out, for the few best that pass; the others are
-    given the same likelihood as the best of those. Of two that come close one that holds the other gives way, and one that
+    That is its evidence on the runs fitted and its likelihood of the runs held out, for those that pass; the others are given
+    the same likelihood as the best of these. Of two that come close one that holds the other gives way, and one that
     became the other.
     """
     least = -np.inf if ranked[0].fine else ranked[0].evidence - CLOSE
-    passed = [f for f in ranked if f.fine and f.evidence > least][:SINGLES]
+    passed = [f for f in ranked if f.fine and f.evidence > least]
     told = {f.name: foretold(f, whole) for f in passed}
     if not any(np.isfinite(t) for t in told.values()):  # no model follows what is held out
         told = {}
@@ -178,10 +180,10 @@ def foretold(fitted: Fitted, whole: Experiment) -> float:
 
 def _is_that_law(fitted: Fitted, other: Fitted, evidence: Mapping[str, float]) -> bool:
     """Return whether a model became what another ageing law is that has fewer parameters: the innovations are the same."""
-    sizes = [len(f.fit.likelihood.problem.model.parameters) for f in (fitted, other)]
-    if not other.hypothesis.ageing or other.hypothesis.effects or sizes[1] >= sizes[0]:
+    if not other.hypothesis.ageing or other.hypothesis.effects or other is fitted:
         return False
-    if evidence[fitted.name] - evidence[other.name] > (sizes[0] - sizes[1]) * np.log(2):  # each halves a model's prior share
+    more, less = (len(f.fit.likelihood.problem.model.parameters) for f in (fitted, other))
+    if more <= less or evidence[fitted.name] - evidence[other.name] > (more - less) * np.log(2):  # each halves the prior
         return False
     whites = zip(fitted.fit.maximum.point.runs, other.fit.maximum.point.runs, strict=True)
     return float(sum(np.sum((a.white - b.white) ** 2) for a, b in whites)) < 2 * CLOSE
@@ -211,8 +213,10 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
     found = []
     for run in (run for run in whole.runs if run.holdout):
         first, last, seen = (f.fit.likelihood.held_out(run, f.fit.values) for f in models)
-        before = baseline.fit.foretold(run)
-        found.append(Held(first, last, seen, (before, before if best is baseline else best.fit.foretold(run))))
+        before, loud, own = baseline.fit.foretold(run), "", best.fit.likelihood
+        if own.noisy_alone(run):
+            loud = next((text for size, text in loudness(*own.alone(run, best.fit.values)) if size > 1.0), "")
+        found.append(Held(first, last, seen, (before, before if best is baseline else best.fit.foretold(run)), loud))
     return tuple(found)
 
 
@@ -257,6 +261,8 @@ def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequenc
         return ""
     if not all(h.augmented.whole for h in held):
         return "held-out runs cannot be followed"
+    if loud := next((f"{h.run.name}: {h.loud}" for h in held if h.loud), ""):
+        return f"held-out runs are not predicted: in {loud}"
     sizes, levels = [h.augmented.white.size for h in held], [h.foretold[1].rms for h in held]
     rms = float(np.sqrt(np.average(np.square(levels), weights=sizes)))
     if not rms < HELD:

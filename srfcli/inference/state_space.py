@@ -80,6 +80,7 @@ FLAT = 1e-8  # of the scaled information: a direction that is flatter has a scor
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
+ALIKE = 0.25  # in the logarithm of the sampling interval, within which a gauge's noise is the same
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
 PERIODOGRAM = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
@@ -533,15 +534,18 @@ class Likelihood:
         So is what varies, if no run that was fitted is of its group.
         """
         own = own_names(self.problem.model, run, self.problem.trend)
-        if not own and not self._noisy_alone(run) and values.keys() >= {*self.problem.varied(run).values()}:
+        if not own and not self.noisy_alone(run) and values.keys() >= {*self.problem.varied(run).values()}:
             return self.filtered(run, values)
-        return replace(self._alone(run, values)[1].runs[0], run=run)
+        return replace(self.alone(run, values)[1].runs[0], run=run)
 
-    def _noisy_alone(self, run: Run) -> bool:
-        """Return whether no run that was fitted has the gauge noise of this one."""
-        return self.problem.noise_group(run) not in {group for _, _, group in self.kinds}
+    def noisy_alone(self, run: Run) -> bool:
+        """Return whether no run that was fitted has this one's gauge noise: none of its group, or none sampled about as often."""
+        return not all(
+            any(known[::2] == kind[::2] and abs(np.log(known[1] / kind[1])) < ALIKE for known in self.kinds)
+            for kind in self.kinds_of(run)
+        )
 
-    def _alone(self, run: Run, values: Mapping[str, float]) -> tuple[Likelihood, Point]:
+    def alone(self, run: Run, values: Mapping[str, float]) -> tuple[Likelihood, Point]:
         """Return the likelihood of a run that was not fitted, by what belongs to it alone, and its maximum."""
         problem = self.problem
         own = own_names(problem.model, run, problem.trend)
@@ -565,7 +569,7 @@ class Likelihood:
         for alone_names, names in zip(likelihood.gauges(alone.runs[0]), self.gauges(run), strict=True):
             known |= {name: values[names[local]] for local, name in alone_names.items()}
         x = likelihood.coordinates(known)
-        gauge = [n for n in likelihood.names if n not in (*own, *FIELD)] if self._noisy_alone(run) else []
+        gauge = [n for n in likelihood.names if n not in (*own, *FIELD)] if self.noisy_alone(run) else []
         return likelihood, maximise(likelihood, x, held=[n for n in likelihood.names if n not in (*own, *gauge)]).point
 
     def pieces(self, point: Point) -> Iterator[tuple[Array, Array, Kind]]:
@@ -866,9 +870,9 @@ class StateSpaceFit:
 
         Laplace's method: the fit is the prior of the parameters that the run shares with others.
         """
-        own, (alone, point) = self.likelihood, self.likelihood._alone(run, self.values)
+        own, (alone, point) = self.likelihood, self.likelihood.alone(run, self.values)
         problem, like = alone.problem, dict(zip(own.names, range(len(own.names)), strict=True))
-        if own._noisy_alone(run):
+        if own.noisy_alone(run):
             like = {n: place for n, place in like.items() if n not in alone.names or n in FIELD}
         else:
             for mine, theirs in zip(alone.gauges(problem.runs[0]), own.gauges(run), strict=True):
