@@ -21,12 +21,12 @@ from srfcli.numerics.collocation import (
     Discretisation,
     condense,
     gauss,
-    join,
     kernel,
     linearised,
     mesh_error,
     respond,
     running_products,
+    solved,
     stage_parameters,
     wanted_mesh,
 )
@@ -161,7 +161,7 @@ def weights_backwards(c: Condensed, l: Array) -> ComplexArray:
     # l carried backwards: l_{i+1} = (l G_{N-1} ... G_{i+1}); G_i is the n x n corner of the interval's map
     backwards = running_products(np.swapaxes(c.maps[..., ::-1, :n, :n], -1, -2))  # transposes, from the end
     l_mesh = (backwards[..., -2::-1, :, :] @ l[..., None, :, None])[..., 0]
-    seed = (gauss(m).step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
+    seed = (gauss().step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
     w = np.linalg.solve(np.swapaxes(c.block, -1, -2), np.stack([seed.real, seed.imag], axis=-1))
     return np.asarray((w[..., 0] + 1j * w[..., 1]).reshape(*l_mesh.shape[:-1], m, n))
 
@@ -191,19 +191,13 @@ def _growth_row(
 def slope_in_last(linear: BoundaryLinear) -> Array:
     """Return d ln|rho| / d(last parameter) along the branch of orbits, the other parameters fixed, (...,); NaN at its fold."""
     n = linear.periodic.shape[-2]
-    inner, last = linear.periodic[..., :n], linear.periodic[..., -1:]
-    try:
-        response = np.linalg.solve(inner, last)[..., 0]
-    except np.linalg.LinAlgError:  # one singular point spoils the batch
-        with np.errstate(over="ignore"):  # a huge determinant is not a singular one
-            usable = np.abs(np.linalg.det(np.nan_to_num(inner))) > 1e-300
-        response = np.linalg.solve(np.where(usable[..., None, None], inner, np.eye(n)), last)[..., 0]
-        response = np.where(usable[..., None], response, np.nan)
+    response = solved(linear.periodic[..., :n], linear.periodic[..., -1:])[..., 0]
     return linear.growth[..., -1] - np.einsum("...n,...n->...", linear.growth[..., :n], response)
 
 
 # Boundary points to full precision: Newton's method in one parameter, then meshes doubled until the error is met.
 
+MOST_ITERATIONS = 14
 LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
 FINE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
 SHALLOW = 0.02  # slopes in ln|rho| per ln(parameter) below this are computed anew
@@ -238,11 +232,8 @@ class Direction:
     def moved(self, values: Array, distances: Array) -> Array:
         """Return `values` (k, B) moved by `distances` (B, d)."""
         shift = np.einsum("bkd,bd->kb", self.vectors, distances)
-        return np.where(
-            np.array(self.log)[:, None],
-            values * np.exp(np.where(np.array(self.log)[:, None], shift, 0)),
-            values + shift,
-        )
+        log = np.array(self.log)[:, None]
+        return np.where(log, values * np.exp(np.where(log, shift, 0)), values + shift)
 
 
 def along(name: str, count: int) -> Direction:
@@ -295,6 +286,8 @@ def bifurcation_kind(rho: complex) -> str:
 
 @dataclass
 class _Polished:
+    """Points (B,) on one mesh on their way to the boundary, with what is known of each after its last Newton step."""
+
     p: Array
     orbit: Discretisation
     rho: ComplexArray
@@ -302,9 +295,6 @@ class _Polished:
     others: Array
     slope: Array
     converged: Array
-
-
-_POINTWISE = ("rho", "residual", "others", "slope", "converged")
 
 
 def polish(
@@ -322,20 +312,17 @@ def polish(
     `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess. A point that does not converge, or whose estimated
     error stays above `tol` on `max_mesh` intervals, says so in its status.
     """
-    count = p.shape[1]
-    points: list[BoundaryPoint | None] = [None] * count
-    blank = (*(np.full(count, np.nan),) * 3, np.ones(count, bool))
-    waiting = [(np.arange(count), _Polished(p, orbit, target, *blank))]
+    points: list[BoundaryPoint | None] = [None] * p.shape[1]
+    waiting = [(np.arange(p.shape[1]), p, orbit, target)]
     while waiting:
-        index, coarse = waiting.pop()
-        N = coarse.orbit.x.shape[-2]
-        wanted = wanted_mesh(mesh_error(model, coarse.orbit), N, tol, max_mesh)
+        index, p, orbit, target = waiting.pop()
+        N = orbit.x.shape[-2]
+        wanted = wanted_mesh(mesh_error(model, orbit), N, tol, max_mesh)
         for mesh in sorted(set(wanted.tolist())):  # np.unique imports numpy.ma
             here = np.nonzero(wanted == mesh)[0]
-            part = _select(coarse, here)
-            start = part.orbit if mesh == N else interpolate(part.orbit, uniform_mesh(int(mesh)))
+            start = orbit.part(here) if mesh == N else interpolate(orbit.part(here), uniform_mesh(int(mesh)))
             lines = direction.part(index[here])
-            fine = _newton(model, part.p, start, part.rho, lines, tol)
+            fine = _newton(model, p[:, here], start, target[here], lines, tol)
             error = mesh_error(model, fine.orbit) + np.where(fine.converged, fine.residual, 0.0)
             _renew(model, fine, lines, tol)
             done = (error <= tol) | ~fine.converged | (mesh >= max_mesh)
@@ -344,7 +331,7 @@ def polish(
                 points[end] = _point(model, fine, int(j), direction.names[-1], float(error[j]), tol)
             again = np.nonzero(~done)[0]
             if again.size:
-                waiting.append((index[here[again]], _select(fine, again)))
+                waiting.append((index[here[again]], fine.p[:, again], fine.orbit.part(again), fine.rho[again]))
     return [q for q in points if q is not None]
 
 
@@ -366,51 +353,21 @@ def _point(model: GeneratedModel, r: _Polished, j: int, name: str, error: float,
     )
 
 
-def _select(r: _Polished, keep: Array) -> _Polished:
-    fields = (getattr(r, k)[keep] for k in _POINTWISE)
-    return _Polished(r.p[:, keep], r.orbit.part(keep), *fields)
-
-
 def _newton(
     model: GeneratedModel, p: Array, orbit: Discretisation, target: ComplexArray, direction: Direction, tol: float
 ) -> _Polished:
-    parts = []
-    for a in range(0, p.shape[1], CHUNK):
-        cut = slice(a, a + CHUNK)
-        parts.append(_newton_chunk(model, p[:, cut], orbit.part(cut), target[cut], direction.part(cut), tol))
-    if len(parts) == 1:
-        return parts[0]
-    fields = (np.concatenate([getattr(q, k) for q in parts]) for k in _POINTWISE)
-    return _Polished(np.concatenate([q.p for q in parts], axis=1), join([q.orbit for q in parts]), *fields)
-
-
-def _newton_chunk(
-    model: GeneratedModel,
-    p: Array,
-    orbit: Discretisation,
-    target: ComplexArray,
-    direction: Direction,
-    tol: float,
-    *,
-    max_iterations: int = 14,
-) -> _Polished:
-    """Solve {periodicity, ln |rho| = 0} in (orbit, distance along `direction`) for a batch on one mesh."""
-    B = p.shape[1]
-    r = _Polished(
-        p.copy(),
-        Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges),
-        target.astype(complex).copy(),
-        np.full(B, np.nan),
-        np.full(B, np.nan),
-        np.full(B, np.nan),
-        np.zeros(B, bool),
-    )
-    active = np.arange(B)
-    for _ in range(max_iterations):
-        active = _step(model, r, active, direction.part(active), tol)
-        if not active.size:
-            break
-    return r
+    """Return the solutions of {periodicity, ln |rho| = 0} in (orbit, distance along `direction`) on one mesh."""
+    count = p.shape[1]
+    start = Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges)
+    residual, others, slope = np.full((3, count), np.nan)
+    found = _Polished(p.copy(), start, target.astype(complex), residual, others, slope, np.zeros(count, bool))
+    for a in range(0, count, CHUNK):
+        active = np.arange(a, min(a + CHUNK, count))
+        for _ in range(MOST_ITERATIONS):
+            active = _step(model, found, active, direction.part(active), tol)
+            if not active.size:
+                break
+    return found
 
 
 def _step(model: GeneratedModel, r: _Polished, index: Array, direction: Direction, tol: float) -> Array:

@@ -9,6 +9,7 @@ Leading axes are a batch of parameter points throughout.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +17,11 @@ from functools import cache, lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from srfcli.codegen.c_source import NoForm, compiler, library_of, orbit_source
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 
-# The Gauss-Legendre scheme of collocation, and the bound on a Newton step: what NumPy and compiled code must share.
+# The Gauss-Legendre scheme of collocation, and the bound on a Newton step: NumPy and compiled code share them.
 
 STAGES = 4
 LOG_STEP = 3.0  # a Newton step changes no velocity or age by more than a factor e^3
@@ -37,12 +37,12 @@ class Scheme:
     weights: Array
 
 
-@lru_cache
-def gauss(m: int = STAGES) -> Scheme:
-    """Return the Gauss-Legendre scheme of `m` stages (order 2m at the mesh points)."""
-    points, weights = np.polynomial.legendre.leggauss(m)
+@cache
+def gauss() -> Scheme:
+    """Return the Gauss-Legendre scheme of STAGES points (order 2 STAGES at the mesh points)."""
+    points, weights = np.polynomial.legendre.leggauss(STAGES)
     nodes = (points + 1) / 2
-    powers = np.arange(1, m + 1)
+    powers = np.arange(1, STAGES + 1)
     vandermonde = nodes[:, None] ** (powers - 1)
     integral = (nodes[:, None] ** powers / powers) @ np.linalg.inv(vandermonde)
     inverse = np.linalg.inv(integral)
@@ -179,11 +179,16 @@ COVERING_RIGID = 30.0  # without the interface's compliance the slip velocity fo
 
 @dataclass
 class Discretisation:
-    """An orbit on a mesh: `x` (..., N, n) at the mesh points, `stages` (..., N, m, n) between, `edges` (N+1,) in [0, 1]."""
+    """An orbit on a mesh: `x` (..., N, n) at the mesh points, `stages` (..., N, m, n) between, `edges` (N+1,) in [0, 1].
+
+    Orbits on one mesh are added, subtracted, and multiplied by a number, or by one for each orbit of a batch (B,).
+    """
 
     x: Array
     stages: Array
     edges: Array
+
+    __array_ufunc__ = None  # an array on the left leaves the product to __rmul__
 
     @property
     def steps(self) -> Array:
@@ -193,11 +198,30 @@ class Discretisation:
     @property
     def phases(self) -> Array:
         """Return tau at the Gauss points, (N, m)."""
-        return _frame(self.edges.tobytes(), *self.stages.shape[-2:]).phases
+        return _frame(self.edges.tobytes(), self.x.shape[-1]).phases
 
-    def part(self, index: slice | Array | NDArray[np.intp]) -> Discretisation:
-        """Return the orbits of a batch that `index` selects."""
+    @property
+    def weights(self) -> Array:
+        """Return the weights of Gauss quadrature over the period, (N, m)."""
+        return self.steps[:, None] * gauss().weights
+
+    def part(self, index: Any) -> Discretisation:
+        """Return the orbits of a batch that `index` selects; a whole number selects one orbit without the batch's axis."""
         return Discretisation(self.x[index], self.stages[index], self.edges)
+
+    def __add__(self, other: Discretisation) -> Discretisation:
+        return Discretisation(self.x + other.x, self.stages + other.stages, self.edges)
+
+    def __sub__(self, other: Discretisation) -> Discretisation:
+        return Discretisation(self.x - other.x, self.stages - other.stages, self.edges)
+
+    def __rmul__(self, factor: Array | float) -> Discretisation:
+        each = np.asarray(factor)[..., None, None]
+        return Discretisation(each * self.x, each[..., None] * self.stages, self.edges)
+
+    def __truediv__(self, divisor: Array | float) -> Discretisation:
+        each = np.asarray(divisor)[..., None, None]
+        return Discretisation(self.x / each, self.stages / each[..., None], self.edges)
 
 
 def join(parts: Sequence[Discretisation]) -> Discretisation:
@@ -243,13 +267,13 @@ class _Frame:
 
 
 @lru_cache(maxsize=64)
-def _frame(edges: bytes, m: int, n: int) -> _Frame:
+def _frame(edges: bytes, n: int) -> _Frame:
     mesh = np.frombuffer(edges)
     h = np.diff(mesh)
-    scheme = gauss(m)
+    scheme = gauss()
     inverse = scheme.inverse / h[:, None, None]
     block = inverse[:, :, None, :, None] * np.eye(n)[:, None, :]
-    first = (inverse.sum(axis=-1)[..., None, None] * np.eye(n)).reshape(len(h), m * n, n)
+    first = (inverse.sum(axis=-1)[..., None, None] * np.eye(n)).reshape(len(h), -1, n)
     return _Frame(mesh[:-1, None] + h[:, None] * scheme.nodes, inverse, block, first)
 
 
@@ -261,8 +285,8 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     x, X = orbit.x, orbit.stages
     m, n = X.shape[-2:]
     k, size, batch = len(names), m * n, X.shape[:-2]  # batch includes the intervals
-    step = gauss(m).step
-    frame = _frame(orbit.edges.tobytes(), m, n)
+    step = gauss().step
+    frame = _frame(orbit.edges.tobytes(), n)
     tau, ps = frame.phases, stage_parameters(p)
     block = np.empty((*batch, m, n, m, n))
     block[...] = frame.block
@@ -275,7 +299,7 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     right[..., n] = (model.cycle(tau, X, ps) - frame.inverse @ away).reshape(*batch, size)
     for column, name in enumerate(names):
         right[..., n + 1 + column] = model.cycle_parameter(name)(tau, X, ps).reshape(*batch, size)
-    local = np.linalg.solve(block, right)
+    local = solved(block, right)
     maps = np.zeros((*batch, n + 1 + k, n + 1 + k))
     maps[..., :n, :] = (step @ local.reshape(*batch, m, n * (n + 1 + k))).reshape(*batch, n, n + 1 + k)
     diagonal = np.einsum("...aa->...a", maps)
@@ -286,15 +310,26 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     return Condensed(block, local.reshape(*batch, m, n, n + 1 + k), maps, running_products(maps))
 
 
+def solved(matrix: Array, right: Array) -> Array:
+    """Return the solutions of the linear systems `matrix` (..., n, n), `right` (..., n, c), NaN for a singular matrix."""
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:  # one singular matrix spoils the batch: they are taken one by one
+        solution = np.full(right.shape, np.nan)
+        for index in np.ndindex(matrix.shape[:-2]):
+            with contextlib.suppress(np.linalg.LinAlgError):
+                solution[index] = np.linalg.solve(matrix[index], right[index])
+        return solution
+
+
 def log_determinant(condensed: Condensed, orbit: Discretisation) -> float:
     """Return ln |det M| of one orbit's monodromy matrix, also where its entries are far below rounding.
 
     An interval's map r I + D L^-1 B has the determinant r^n det(L + B D/r) / det L, two well-conditioned determinants.
     """
-    m, n = orbit.stages.shape[-2:]
-    step = gauss(m).step
+    n, step = orbit.x.shape[-1], gauss().step
     r = 1 - step.sum()
-    outer = _frame(orbit.edges.tobytes(), m, n).first @ np.kron(step, np.eye(n)) / r
+    outer = _frame(orbit.edges.tobytes(), n).first @ np.kron(step, np.eye(n)) / r
     above = np.linalg.slogdet(condensed.block + outer)[1]
     return float((above - np.linalg.slogdet(condensed.block)[1] + n * np.log(abs(r))).sum())
 
@@ -317,43 +352,29 @@ def running_products(maps: Array) -> Array:
     return out
 
 
-def expand(condensed: Condensed, start: Array, parameters: Array | None = None) -> tuple[Array, Array]:
-    """Return the Newton corrections of mesh values and stages for a correction `start` (..., n) at tau = 0."""
-    n = start.shape[-1]
-    k = condensed.local.shape[-1] - n - 1
-    head = np.zeros((*start.shape[:-1], n + 1 + k, 1))
-    head[..., :n, 0] = start
-    head[..., n, 0] = 1
-    if parameters is not None:
-        head[..., n + 1 :, 0] = parameters
-    dx, dstages = respond(condensed, head)
-    return dx[..., 0], dstages[..., 0]
-
-
 def respond(condensed: Condensed, head: Array) -> tuple[Array, Array]:
     """Return mesh values (..., N, n, c) and stages (..., N, m, n, c) for columns `head` (..., n+1+k, c).
 
     A column holds the change at tau = 0, the share of the residual to be removed, and the changes of the parameters.
     """
     n, width = condensed.local.shape[-2:]
-    full = (
-        condensed.prefix[..., :-1, :, :] @ head[..., None, :, :]
-    )  # the last 1 + k rows of each map are those of identity
+    # the last 1 + k rows of each map are those of identity
+    full = condensed.prefix[..., :-1, :, :] @ head[..., None, :, :]
     local = condensed.local.reshape(*condensed.local.shape[:-3], -1, width)
     stages = local @ full
     return full[..., :n, :], stages.reshape(*condensed.local.shape[:-1], head.shape[-1])
 
 
-@lru_cache
-def _top_coefficient(m: int) -> Array:
-    """Return the weights that give the Legendre coefficient of degree m from the values at 0 and at the m Gauss points."""
-    nodes = 2 * np.concatenate([[0.0], gauss(m).nodes]) - 1
-    return np.linalg.inv(np.polynomial.legendre.legvander(nodes, m))[m]
+@cache
+def _top_coefficient() -> Array:
+    """Return the weights that give the Legendre coefficient of degree STAGES from the values at 0 and at the Gauss points."""
+    nodes = 2 * np.concatenate([[0.0], gauss().nodes]) - 1
+    return np.linalg.inv(np.polynomial.legendre.legvander(nodes, STAGES))[STAGES]
 
 
 def last_coefficient(model: GeneratedModel, orbit: Discretisation) -> Array:
     """Return what the polynomials still carry in their last Legendre coefficient, over the logarithmic unknowns, (..., N)."""
-    weights = _top_coefficient(orbit.stages.shape[-2])
+    weights = _top_coefficient()
     top = weights[0] * orbit.x + np.einsum("j,...jn->...n", weights[1:], orbit.stages)
     return np.linalg.norm(top[..., list(model.logarithmic)], axis=-1)
 

@@ -9,6 +9,7 @@ import numpy as np
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.collocation import (
+    STAGES,
     Discretisation,
     condense,
     gauss,
@@ -24,9 +25,8 @@ FIRST_MESH = 16
 PATIENT = 256  # intervals up to which a state that was not found is looked for on a finer mesh
 STIFF = 3.0
 NEWTON = 1e-10  # last step of Newton's method
-ROUNDED = (
-    1e-7  # the same where a multiplier next to 1 lets rounding grow beyond that; the error of the multipliers tells
-)
+# the same where a multiplier next to 1 lets rounding grow beyond that; the error of the multipliers tells
+ROUNDED = 1e-7
 CLIMBED_ON = 64  # intervals of the first mesh that is laid where the state needs it
 CALM = 0.2  # share of the intervals that are spread evenly
 SMALLEST_CLIMB, MOST_CLIMBS = 1e-4, 200  # shares of eps
@@ -102,7 +102,7 @@ def solve_floquet(
         if smaller < error:
             batch, error = laid, smaller
     status = Status.NO_CONVERGENCE if not batch.converged[0] else Status.OK if error <= tol else Status.TOLERANCE
-    orbit = Discretisation(batch.orbit.x[0], batch.orbit.stages[0], batch.orbit.edges)
+    orbit = batch.orbit.part(0)
     rest = float(model.steady_friction(p))
     finer = interpolate(orbit, _split(orbit.edges, 8 * (harmonics + 8)))
     at = finer.phases, finer.stages, stage_parameters(p)
@@ -155,7 +155,7 @@ def _laid(model: GeneratedModel, orbit: Discretisation, intervals: int) -> Array
     An interval of width h carries h^STAGES, so that its share of the intervals goes with the root of that; a share for all keeps
     the mesh from leaving the calm part of the period to a few.
     """
-    density = last_coefficient(model, orbit)[0] ** (1 / orbit.stages.shape[-2]) / orbit.steps
+    density = last_coefficient(model, orbit)[0] ** (1 / STAGES) / orbit.steps
     density = np.maximum(density, np.maximum(np.roll(density, 1), np.roll(density, -1)))
     density += CALM * float((density * orbit.steps).sum())
     reached = np.concatenate([[0.0], np.cumsum(density * orbit.steps)])
@@ -175,14 +175,13 @@ def climbed(model: GeneratedModel, p: Array, finest: int) -> tuple[OrbitBatch, f
     calm[eps] = 0.0
     batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=ROUNDED)
     reached, step, tries = 0.0, FIRST_CLIMB, 0
-    slope = Discretisation(np.zeros_like(batch.orbit.x), np.zeros_like(batch.orbit.stages), edges)
+    slope = 0.0 * batch.orbit
     while batch.converged[0] and reached < 1 and step > SMALLEST_CLIMB and tries < MOST_CLIMBS:
         tries += 1
         target = 1.0 if reached + step > 1 - SMALLEST_CLIMB else reached + step
         q, before, ahead = p.copy(), batch.orbit, target - reached
         q[eps] *= target
-        guess = Discretisation(before.x + ahead * slope.x, before.stages + ahead * slope.stages, before.edges)
-        found = solve_orbits(model, q, guess, tol=ROUNDED, max_iterations=CLIMBING)
+        found = solve_orbits(model, q, before + ahead * slope, tol=ROUNDED, max_iterations=CLIMBING)
         if not found.converged[0]:
             step /= 2
             continue
@@ -191,9 +190,7 @@ def climbed(model: GeneratedModel, p: Array, finest: int) -> tuple[OrbitBatch, f
         again = solve_orbits(model, q, moved, tol=ROUNDED, max_iterations=CLIMBING)
         if again.converged[0]:
             found, before = again, interpolate(before, again.orbit.edges)
-        slope = Discretisation(
-            (found.orbit.x - before.x) / ahead, (found.orbit.stages - before.stages) / ahead, found.orbit.edges
-        )
+        slope = (found.orbit - before) / ahead
         batch, reached, step = found, target, 1.5 * step
     batch.converged &= reached >= 1
     batch.p[:] = p
@@ -215,7 +212,7 @@ def waveforms(model: GeneratedModel, p: Array, orbit: Discretisation, samples: i
 
 def _harmonics(orbit: Discretisation, values: Array, count: int) -> ComplexArray:
     """Return c_0..c_count of values (N, m) at the Gauss points, by their quadrature: the mean, then amplitudes with phases."""
-    weighted = values * orbit.steps[:, None] * gauss(orbit.stages.shape[-2]).weights
+    weighted = values * orbit.steps[:, None] * gauss().weights
     waves = np.exp(-2j * np.pi * np.arange(count + 1)[:, None, None] * orbit.phases)
     amplitudes = (waves * weighted).sum(axis=(-1, -2))
     amplitudes[1:] *= 2
@@ -229,7 +226,7 @@ def _liouville(model: GeneratedModel, p: Array, orbit: Discretisation) -> float:
     is far below rounding against 1, but not by its right factor.
     """
     trace = np.trace(model.cycle_jacobian(orbit.phases, orbit.stages, stage_parameters(p)), axis1=-2, axis2=-1)
-    exponents = (trace @ gauss(orbit.stages.shape[-2]).weights) * orbit.steps
+    exponents = (trace @ gauss().weights) * orbit.steps
     if np.abs(exponents).max() > STIFF:
         return float("nan")
     return float(abs(np.expm1(log_determinant(condense(model, p, orbit), orbit) - exponents.sum())))

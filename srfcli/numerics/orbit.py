@@ -15,11 +15,12 @@ from srfcli.numerics.collocation import (
     Condensed,
     Discretisation,
     condense,
-    expand,
     gauss,
     join,
     kernel,
     newton_orbits,
+    respond,
+    solved,
 )
 
 CHUNK = 48  # parameter points solved together: their blocks fit the cache
@@ -79,21 +80,21 @@ def uniform_mesh(intervals: int) -> Array:
     return np.linspace(0.0, 1.0, intervals + 1)
 
 
-def steady_guess(model: GeneratedModel, p: Array, edges: Array, m: int = STAGES) -> Discretisation:
+def steady_guess(model: GeneratedModel, p: Array, edges: Array) -> Discretisation:
     """Return steady sliding under the mean load as a first guess of the orbit."""
     rest = model.steady(p)
     N, n = len(edges) - 1, rest.shape[-1]
     x = np.broadcast_to(rest[..., None, :], (*rest.shape[:-1], N, n)).copy()
-    stages = np.broadcast_to(rest[..., None, None, :], (*rest.shape[:-1], N, m, n)).copy()
+    stages = np.broadcast_to(rest[..., None, None, :], (*rest.shape[:-1], N, STAGES, n)).copy()
     return Discretisation(x, stages, edges)
 
 
-def forced_guess(model: GeneratedModel, p: Array, edges: Array, m: int = STAGES) -> Discretisation:
+def forced_guess(model: GeneratedModel, p: Array, edges: Array) -> Discretisation:
     """Return steady sliding with its linear response to the modulation as a first guess of the orbits at `p` (n_parameters, B).
 
     The response is scaled down where a logarithm would swing by more than LARGEST_SWING either way.
     """
-    guess = steady_guess(model, p, edges, m)
+    guess = steady_guess(model, p, edges)
     rest, n = model.steady(p), len(model.states)
     calm = p.copy()
     calm[model.index("eps")] = 0.0
@@ -111,27 +112,26 @@ def forced_guess(model: GeneratedModel, p: Array, edges: Array, m: int = STAGES)
 
 def interpolate(orbit: Discretisation, edges: Array) -> Discretisation:
     """Return `orbit` evaluated on another mesh by its own collocation polynomials."""
-    m = orbit.stages.shape[-2]
-    nodes = np.concatenate([[0.0], gauss(m).nodes])
-    phases = edges[:-1, None] + np.diff(edges)[:, None] * gauss(m).nodes
+    nodes = np.concatenate([[0.0], gauss().nodes])
+    phases = edges[:-1, None] + np.diff(edges)[:, None] * gauss().nodes
 
     def at(tau: Array) -> Array:
         cell = np.clip(np.searchsorted(orbit.edges, tau, side="right") - 1, 0, len(orbit.edges) - 2)
         s = (tau - orbit.edges[cell]) / orbit.steps[cell]
-        basis = _lagrange(nodes, s)  # (..., m+1)
         values = np.concatenate([orbit.x[..., None, :], orbit.stages], axis=-2)[..., cell, :, :]
-        return np.einsum("...k,...kn->...n", basis, values)
+        return np.einsum("...k,...kn->...n", lagrange(nodes, s), values)
 
     return Discretisation(at(edges[:-1]), at(phases), edges)
 
 
-def _lagrange(nodes: Array, s: Array) -> Array:
-    """Return the Lagrange polynomials on `nodes` at `s`, with one axis more."""
-    columns = []
-    for i, node in enumerate(nodes):
-        others = np.delete(nodes, i)
-        columns.append(np.prod((s[..., None] - others) / (node - others), axis=-1))
-    return np.stack(columns, axis=-1)
+def lagrange(nodes: Array, at: Array) -> Array:
+    """Return the Lagrange polynomials on `nodes` (..., k) at the places `at` (...), (..., k)."""
+    weights = np.ones((*at.shape, nodes.shape[-1]))
+    for i in range(nodes.shape[-1]):
+        for j in range(nodes.shape[-1]):
+            if j != i:
+                weights[..., i] *= (at - nodes[..., j]) / (nodes[..., i] - nodes[..., j])
+    return weights
 
 
 def levels(count: int, stride: int = STRIDE) -> list[Array]:
@@ -148,19 +148,11 @@ def levels(count: int, stride: int = STRIDE) -> list[Array]:
 
 
 def neighbours(known: Array, new: Array, most: int = NEIGHBOURS) -> tuple[Array, Array]:
-    """Return, for each position `new`, which of the rising positions `known`, `most` of them, are around it, and their weights.
-
-    The weights are Lagrange's.
-    """
+    """Return the indices of the `most` rising positions `known` around each position `new`, and their Lagrange weights."""
     width = min(most, len(known))
     first = np.clip(np.searchsorted(known, new) - width // 2, 0, len(known) - width)
     index = first[:, None] + np.arange(width)  # (new, width)
-    weights, at = np.ones(index.shape), known[index]
-    for i in range(width):
-        for j in range(width):
-            if j != i:
-                weights[:, i] *= (new - at[:, j]) / (at[:, i] - at[:, j])
-    return index, weights
+    return index, lagrange(known[index], new)
 
 
 def between(orbit: Discretisation, known: Array, new: Array, most: int = NEIGHBOURS) -> Discretisation:
@@ -211,35 +203,8 @@ def join_orbits(parts: Sequence[OrbitBatch]) -> OrbitBatch:
     )
 
 
-def _solve_one(model: GeneratedModel, p: Array, guess: Discretisation, tol: float, max_iterations: int) -> OrbitBatch:
-    """Return a batch of one: without the batch axis parameters are plain floats, which takes half the time."""
-    q, size, n = p[:, 0], scales(model, p[:, 0]), len(model.states)
-    orbit = Discretisation(guess.x[0].copy(), guess.stages[0].copy(), guess.edges)
-    identity, converged, monodromy, iteration = np.eye(n), False, np.full((n, n), np.nan), 0
-    with np.errstate(all="ignore"):
-        while iteration < max_iterations:
-            iteration += 1
-            try:
-                linear = condense(model, q, orbit)
-                monodromy = linear.monodromy
-                start = np.linalg.solve(identity - monodromy, linear.prefix[-1, :n, n])
-            except np.linalg.LinAlgError:
-                break
-            dx, dstages = expand(linear, start)
-            limit, change = float(step_limit(model, dx, dstages)), float((np.abs(dx) / size).max())
-            if not (np.isfinite(change) and np.isfinite(dstages).all()):
-                break
-            orbit.x += limit * dx
-            orbit.stages += limit * dstages
-            if change < tol:
-                converged = True
-                break
-    whole = Discretisation(orbit.x[None], orbit.stages[None], orbit.edges)
-    return OrbitBatch(p, whole, monodromy[None], np.array([converged]), iteration)
-
-
 def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: float, max_iterations: int) -> OrbitBatch:
-    library = kernel(model) if guess.stages.shape[-2] == STAGES else None
+    library = kernel(model)
     if library is not None:
         found = Discretisation(guess.x.copy(), guess.stages.copy(), guess.edges)
         size = np.ascontiguousarray(scales(model, p))
@@ -247,8 +212,6 @@ def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: fl
             library, (found.phases, found.steps), p, found.x, found.stages, size, tol, max_iterations
         )
         return OrbitBatch(p, found, monodromy, converged, used)
-    if p.shape[1] == 1:
-        return _solve_one(model, p, guess, tol, max_iterations)
     B, n = p.shape[1], len(model.states)
     x, stages = guess.x.copy(), guess.stages.copy()
     monodromy = np.full((B, n, n), np.nan)
@@ -276,38 +239,10 @@ def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: fl
 def newton_step(model: GeneratedModel, p: Array, orbit: Discretisation) -> tuple[Condensed, Array, Array, Array]:
     """Return the linearisation and the Newton corrections; the last array says which points are finite."""
     n = orbit.x.shape[-1]
-    try:
-        linear = condense(model, p, orbit)
-    except np.linalg.LinAlgError:  # one singular block spoils the batch: take the points one by one
-        linear = _condense_each(model, p, orbit)
+    linear = condense(model, p, orbit)
     matrix = np.eye(n) - linear.monodromy
-    right = linear.prefix[..., -1, :n, n]
-    finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
-    matrix = np.where(finite[..., None, None], matrix, np.eye(n))
-    singular = finite & (np.abs(np.linalg.det(matrix)) < 1e-300)
-    matrix[singular] = np.eye(n)
-    start = np.linalg.solve(matrix, np.where(finite[..., None], right, 0.0)[..., None])[..., 0]
-    dx, dstages = expand(linear, start)
-    finite &= ~singular & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
-    return linear, dx, dstages, finite
-
-
-def _condense_each(model: GeneratedModel, p: Array, orbit: Discretisation) -> Condensed:
-    parts = []
-    for b in range(p.shape[1]):
-        one = Discretisation(orbit.x[b : b + 1], orbit.stages[b : b + 1], orbit.edges)
-        try:
-            parts.append(condense(model, p[:, b : b + 1], one))
-        except np.linalg.LinAlgError:
-            n, size = orbit.x.shape[-1], orbit.stages.shape[-2] * orbit.stages.shape[-1]
-            N = orbit.x.shape[-2]
-            nan = np.full((1, N, size // n, n, n + 1), np.nan)
-            parts.append(
-                Condensed(
-                    np.full((1, N, size, size), np.nan),
-                    nan,
-                    np.full((1, N, n + 1, n + 1), np.nan),
-                    np.full((1, N + 1, n + 1, n + 1), np.nan),
-                )
-            )
-    return Condensed(*(np.concatenate([getattr(q, k) for q in parts]) for k in ("block", "local", "maps", "prefix")))
+    start = solved(matrix, linear.prefix[..., -1, :n, n:])
+    head = np.concatenate([start, np.ones_like(start[..., :1, :])], axis=-2)
+    dx, dstages = (change[..., 0] for change in respond(linear, head))
+    finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(dx).all(axis=(-1, -2))
+    return linear, dx, dstages, finite & np.isfinite(dstages).all(axis=(-1, -2, -3))

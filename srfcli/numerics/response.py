@@ -13,7 +13,7 @@ import numpy as np
 
 from srfcli.codegen.model import COMPLEX_STEP, Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.numerics.collocation import Discretisation, gauss, mesh_error, stage_parameters, wanted_mesh
+from srfcli.numerics.collocation import mesh_error, stage_parameters, wanted_mesh
 from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.orbit import OrbitBatch, interpolate, uniform_mesh
 
@@ -145,12 +145,10 @@ def mean_friction(model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mes
 
 def _means(model: GeneratedModel, batch: OrbitBatch, j: int) -> tuple[float, float]:
     """Return the means of mu and of mu W/W0 by Gauss quadrature over the mesh."""
-    orbit = Discretisation(batch.orbit.x[j], batch.orbit.stages[j], batch.orbit.edges)
-    ps = stage_parameters(batch.p[:, j])
+    orbit, ps = batch.orbit.part(j), stage_parameters(batch.p[:, j])
     mu = model.cycle_friction(orbit.phases, orbit.stages, ps)
     load = model.cycle_load(orbit.phases, orbit.stages, ps) / batch.p[model.index("W0"), j]
-    weight = orbit.steps[:, None] * gauss(orbit.stages.shape[-2]).weights
-    return float((mu * weight).sum()), float((mu * load * weight).sum())
+    return float((mu * orbit.weights).sum()), float((mu * load * orbit.weights).sum())
 
 
 def _growth(batch: OrbitBatch, j: int) -> float:

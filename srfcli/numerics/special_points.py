@@ -267,7 +267,7 @@ class _Chord:
     def between(model: GeneratedModel, plane: Plane, a: BoundaryPoint, b: BoundaryPoint) -> _Chord:
         """Return the chord from `a` to `b`, its ends on the finer mesh of the two."""
         edges = max((e.orbit.edges for e in (a, b)), key=len)
-        ends = [interpolate(Discretisation(e.orbit.x[0], e.orbit.stages[0], e.orbit.edges), edges) for e in (a, b)]
+        ends = [interpolate(e.orbit.part(0), edges) for e in (a, b)]
         q = [plane.coordinates(model, e.p) for e in (a, b)]
         across = metric(model, a.p, 0.5 * (ends[0].x[0] + ends[1].x[0]), ends[1].x[0] - ends[0].x[0])
         return _Chord(q[1] - q[0], across, [(0.0, q[0], ends[0], a.rho), (1.0, q[1], ends[1], b.rho)])
@@ -277,9 +277,8 @@ class _Chord:
         k = next((k for k, known in enumerate(self.found) if known[0] > s), len(self.found) - 1)
         (s0, q0, a, rho0), (s1, q1, b, rho1) = self.found[k - 1], self.found[k]
         w = (s - s0) / (s1 - s0)
-        blend = Discretisation((1 - w) * a.x + w * b.x, (1 - w) * a.stages + w * b.stages, a.edges)
         rho = rho0 if w < 0.5 else rho1
-        point = correct(model, plane, (1 - w) * q0 + w * q1, blend, rho, self.q, self.across, tol=1e-6)
+        point = correct(model, plane, (1 - w) * q0 + w * q1, (1 - w) * a + w * b, rho, self.q, self.across, tol=1e-6)
         if point is not None and point.correction > EXACT:  # the tangent is that of the place a correction starts at
             point = correct(model, plane, point.q, point.orbit, point.rho, self.q, self.across, tol=1e-6)
         if point is None:
@@ -323,8 +322,7 @@ def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: A
     right = np.take_along_axis(vectors, chosen[..., None], -1)[..., 0].astype(complex)
     real = np.abs(mu.imag) < REAL * np.abs(mu)
     wave = _carried(c, right)
-    weight = orbit.steps[:, None] * gauss(orbit.stages.shape[-2]).weights
-    size = np.sqrt((weight * np.abs(wave[..., model.states.index("ln_v")]) ** 2).sum(axis=(-1, -2)))
+    size = np.sqrt((orbit.weights * np.abs(wave[..., model.states.index("ln_v")]) ** 2).sum(axis=(-1, -2)))
     q, wave = right / size[..., None], wave / size[..., None, None, None]
     along = wave.real, wave.imag
     nearby = orbit.stages + 1j * STEP * np.stack(along)  # (2, ..., N, m, n)
@@ -364,7 +362,7 @@ def _forced(c: Condensed, sources: Sequence[ComplexArray]) -> list[tuple[Complex
         own = (alone[..., 2 * k] + 1j * alone[..., 2 * k + 1]).reshape(*batch, m, n)
         maps = np.zeros((*batch, n + 1, n + 1), complex)
         maps[..., :n, :n], maps[..., n, n] = c.maps[..., :n, :n], 1.0
-        maps[..., :n, n] = np.einsum("m,...mn->...n", gauss(m).step, own)
+        maps[..., :n, n] = np.einsum("m,...mn->...n", gauss().step, own)
         y = running_products(maps)[..., :n, n]
         found.append((own + (c.local[..., :n] @ y[..., :-1, None, :, None])[..., 0], y[..., -1, :]))
     return found
