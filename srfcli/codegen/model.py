@@ -89,6 +89,15 @@ class GeneratedModel:
             merged[name] = value
         return np.array(np.broadcast_arrays(*merged.values()), dtype=float)
 
+    def with_values(self, p: NDArray[Any], **values: Any) -> NDArray[Any]:
+        """Return a copy of `p` (n_parameters, ...) with other values of some parameters, broadcast to their shape (...)."""
+        shape = np.broadcast_shapes(p.shape[1:], *(np.shape(value) for value in values.values()))
+        moved = np.empty((len(p), *shape))
+        moved[...] = p.reshape(len(p), *(1,) * (len(shape) - p.ndim + 1), *p.shape[1:])
+        for name, value in values.items():
+            moved[self.index(name)] = value
+        return moved
+
     def check_changing_load(self, p: NDArray[np.float64]) -> None:
         """Raise SrfError, naming the parameter, where a value of 0 leaves the rates under a changing load without a value."""
         if self.has_rates(p).all():

@@ -43,6 +43,11 @@ def pick_multiplier(multipliers: Array, target: Array) -> Array:
     return np.argmin(distance, axis=-1)
 
 
+def upper_half(rho: ComplexArray) -> ComplexArray:
+    """Return multipliers with those below the real axis replaced by their conjugates."""
+    return rho.real + 1j * np.abs(rho.imag)
+
+
 def linearise_boundary(
     model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array
 ) -> BoundaryLinear:

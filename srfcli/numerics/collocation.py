@@ -77,8 +77,8 @@ def newton_orbits(
     size: Array,
     tol: float,
     max_iterations: int,
-) -> tuple[Array, Array, int]:
-    """Bring the orbits `x` (B, N, n), `stages` (B, N, m, n) to convergence in place; monodromy, converged, most iterations.
+) -> tuple[Array, Array]:
+    """Bring the orbits `x` (B, N, n), `stages` (B, N, m, n) to convergence in place; return monodromy and converged.
 
     `frame` holds the Gauss points' phases (N, m) and the steps (N,), `p` is (n_parameters, B), `size` (B, n).
     """
@@ -91,7 +91,7 @@ def newton_orbits(
     )  # fmt: skip
     if used < 0:
         raise MemoryError
-    return monodromy, converged.astype(bool), used
+    return monodromy, converged.astype(bool)
 
 
 @dataclass
@@ -206,8 +206,15 @@ class Discretisation:
         return self.steps[:, None] * gauss().weights
 
     def part(self, index: Any) -> Discretisation:
-        """Return the orbits of a batch that `index` selects; a whole number selects one orbit without the batch's axis."""
+        """Return the orbits of a batch that `index` selects.
+
+        A whole number selects one orbit, without the batch's axis; None makes a batch of one orbit.
+        """
         return Discretisation(self.x[index], self.stages[index], self.edges)
+
+    def unchanged(self) -> Discretisation:
+        """Return the change 0 of this orbit."""
+        return Discretisation(np.zeros_like(self.x), np.zeros_like(self.stages), self.edges)
 
     def __add__(self, other: Discretisation) -> Discretisation:
         return Discretisation(self.x + other.x, self.stages + other.stages, self.edges)
@@ -229,6 +236,17 @@ def join(parts: Sequence[Discretisation]) -> Discretisation:
     return Discretisation(
         np.concatenate([o.x for o in parts]), np.concatenate([o.stages for o in parts]), parts[0].edges
     )
+
+
+def stack(orbits: Sequence[Discretisation]) -> Discretisation:
+    """Return orbits on one mesh as a batch."""
+    return join([orbit.part(None) for orbit in orbits])
+
+
+def by_mesh(orbits: Sequence[Discretisation]) -> list[Array]:
+    """Return the indices of the orbits on each mesh, the coarsest first."""
+    meshes = np.array([len(orbit.edges) for orbit in orbits])
+    return [np.nonzero(meshes == edges)[0] for edges in sorted(set(meshes.tolist()))]  # np.unique imports numpy.ma
 
 
 @dataclass

@@ -170,17 +170,14 @@ def climbed(model: GeneratedModel, p: Array, finest: int) -> tuple[OrbitBatch, f
     The number says which share of eps was reached: below 1 a step of SMALLEST_CLIMB of eps failed, as where the branch of states
     turns back or velocities leave the range of numbers, and the orbit, of the last eps that went, is marked as not converged.
     """
-    eps = model.index("eps")
-    calm, edges = p.copy(), uniform_mesh(CLIMBED_ON)
-    calm[eps] = 0.0
+    eps, edges, calm = p[model.index("eps")], uniform_mesh(CLIMBED_ON), model.with_values(p, eps=0.0)
     batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=ROUNDED)
     reached, step, tries = 0.0, FIRST_CLIMB, 0
-    slope = 0.0 * batch.orbit
+    slope = batch.orbit.unchanged()
     while batch.converged[0] and reached < 1 and step > SMALLEST_CLIMB and tries < MOST_CLIMBS:
         tries += 1
         target = 1.0 if reached + step > 1 - SMALLEST_CLIMB else reached + step
-        q, before, ahead = p.copy(), batch.orbit, target - reached
-        q[eps] *= target
+        q, before, ahead = model.with_values(p, eps=target * eps), batch.orbit, target - reached
         found = solve_orbits(model, q, before + ahead * slope, tol=ROUNDED, max_iterations=CLIMBING)
         if not found.converged[0]:
             step /= 2

@@ -161,13 +161,11 @@ def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
     _, by_s, by_load = _polynomial(model, p, W0, 1j * Omega)
     roots = np.roots(np.asarray(model.characteristic(_with_load(model, p, W0)))[::-1])
     others = roots[np.abs(np.abs(roots.imag) - Omega) + np.abs(roots.real) > 1e-5 * Omega]
-    q = p.copy()
-    q[model.index("W0")] = W0
     return HopfPoint(
         W0=W0,
         Omega=Omega,
         crossing_rate=float(-(by_load / by_s).real),
-        lyapunov=lyapunov_coefficient(model, q, Omega),
+        lyapunov=lyapunov_coefficient(model, model.with_values(p, W0=W0), Omega),
         leading=bool(np.all(others.real < 0)),
         residual=float(residual),
     )

@@ -5,7 +5,7 @@ So is every stable state that ends beside a point without one: by a curve of fol
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,11 +13,21 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.boundary import BoundaryPoint, along, bifurcation_kind, polish
-from srfcli.numerics.collocation import Discretisation
-from srfcli.numerics.continuation import Atlas, AtlasSettings, Curve, CurvePoint, correct, polish_curve, trace
+from srfcli.numerics.collocation import stack
+from srfcli.numerics.continuation import (
+    Atlas,
+    AtlasSettings,
+    Curve,
+    CurvePoint,
+    Progress,
+    correct,
+    polish_curve,
+    trace_whole,
+    with_tangent,
+)
 from srfcli.numerics.critical import locate_crossings, scan_line
 from srfcli.numerics.map import Discontinuity, Seed, StabilityMap
-from srfcli.numerics.orbit import scales, solve_orbits
+from srfcli.numerics.orbit import scales, solve_orbits, steady_guess
 from srfcli.numerics.plane import Axis, Plane
 from srfcli.numerics.special_points import crossings_at
 
@@ -29,8 +39,6 @@ RETRIES = 3  # of a curve that jumped from one side of a tongue to the other
 UPRIGHT = 0.05  # of the tangent: where less points along x the slope at fixed x is not to be relied on
 PATIENCE = 24  # stable points in a row beside one without an orbit at which no fold is met: orbits were missed
 MARGIN = 0.5  # of a seed's length by which its boundary point may lie outside
-
-Progress = Callable[[str], None]
 
 
 @dataclass
@@ -108,11 +116,7 @@ def _conclude(atlas: Atlas, found: StabilityMap, missed: int) -> None:
         atlas.notes.append(
             "at a boundary of type fold a forced state ends: beyond it the map shows another one, where it finds any"
         )
-    if atlas.status is Status.OK and (missed or not all(pt.status.ok for b in atlas.branches for pt in b.points)):
-        atlas.status = Status.NO_CONVERGENCE
-    ends = {end for b in atlas.branches for end in (b.start, b.end)}
-    if atlas.status is Status.OK:
-        atlas.status = next((e for e in (Status.STEP_TOO_SMALL, Status.MAX_STEPS) if e in ends), Status.OK)
+    atlas.conclude(missed)
 
 
 def map_notes(found: StabilityMap) -> list[str]:
@@ -150,10 +154,7 @@ def starting_point(model: GeneratedModel, plane: Plane, seed: Seed, settings: At
         usable = [pt for pt in _searched(model, axis, seed, settings) if _inside(model, plane, pt, seed)]
     if not usable:
         return None
-    point = usable[0]
-    single = Discretisation(point.orbit.x[0], point.orbit.stages[0], point.orbit.edges)
-    q = plane.coordinates(model, point.p)
-    return correct(model, plane, q, single, point.rho, np.eye(2)[1 - seed.axis], np.zeros(single.x.shape[-1]))
+    return with_tangent(model, plane, usable[0], 1 - seed.axis)
 
 
 def _inside(model: GeneratedModel, plane: Plane, point: BoundaryPoint, seed: Seed) -> bool:
@@ -167,7 +168,7 @@ def _inside(model: GeneratedModel, plane: Plane, point: BoundaryPoint, seed: See
 
 def _searched(model: GeneratedModel, axis: Axis, seed: Seed, settings: AtlasSettings) -> list[BoundaryPoint]:
     """Return the crossings on the seed's line that a scan on twice its mesh shows."""
-    low, high = (float(np.asarray(axis.value(v))) for v in seed.ends[:, seed.axis])
+    low, high = axis.value(seed.ends[:, seed.axis]).tolist()
     margin = (high / low) ** 0.5
     values = np.geomspace(low / margin, high * margin, 9)
     scan = scan_line(
@@ -186,12 +187,7 @@ def follow_curve(
     """
     steps = settings.steps
     for _ in range(RETRIES + 1):
-        curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
-        try:
-            for curve in trace(model, plane, start, steps):
-                progress(f"{len(curve.points)} points")
-        except KeyboardInterrupt:
-            curve.end = Status.INTERRUPTED
+        curve = trace_whole(model, plane, start, steps, progress)
         if curve.end is Status.INTERRUPTED or _in_one_piece(curve):
             break
         steps = replace(
@@ -313,7 +309,7 @@ def unexplained(model: GeneratedModel, found: StabilityMap, atlas: Atlas) -> Arr
     values = p[model.index(atlas.plane.x.name), :, 0]
     left = []
     for i, heights in enumerate(crossings_at(model, atlas.plane, atlas.branches, values, folds=False)):
-        edges = np.asarray(atlas.plane.y.unit(np.array(heights))).reshape(-1)
+        edges = atlas.plane.y.unit(heights)
         order = np.arange(unit.shape[1])[:: -1 if flipped else 1]
         y, g = unit[i, order, 1], found.growth[i, order]
         clear = np.isfinite(g)
@@ -351,27 +347,20 @@ def not_continued(
     for discontinuity in discontinuities:
         by_mesh.setdefault(len(discontinuity.orbit.edges), []).append(discontinuity)
     for group in by_mesh.values():
-        edges, ends = group[0].orbit.edges, np.stack([b.ends for b in group])
-        x, stages = np.stack([b.orbit.x for b in group]), np.stack([b.orbit.stages for b in group])
-        before = _points(model, plane, ends[:, 0])
-        going, dx, dstages = np.ones(len(group), bool), np.zeros_like(x), np.zeros_like(stages)
+        ends, orbit = np.stack([b.ends for b in group]), stack([b.orbit for b in group])
+        before = plane.point(model, ends[:, 0])
+        going, change = np.ones(len(group), bool), orbit.unchanged()
         for share in np.arange(1, steps[0] + 1) / steps[0]:
-            p = _points(model, plane, ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))
-            shift = (model.steady(p) - model.steady(before))[:, None, :]
-            guess = Discretisation(x + shift + dx, stages + shift[:, None] + dstages, edges)
+            p = plane.point(model, ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))
+            shift = steady_guess(model, p, orbit.edges) - steady_guess(model, before, orbit.edges)
+            guess = orbit + shift + change
             found = solve_orbits(model, p, guess, tol=1e-7, max_iterations=10)
             off = (np.abs(found.orbit.x - guess.x) / scales(model, p)[:, None, :]).max(axis=(-1, -2))
             with np.errstate(invalid="ignore"):
                 going &= found.converged & (off < NEAR) & (np.abs(found.multipliers[:, 0]) < 1)
-            dx, dstages = found.orbit.x - x - shift, found.orbit.stages - stages - shift[:, None]
-            x, stages, before = found.orbit.x, found.orbit.stages, p
+            change, orbit, before = found.orbit - orbit - shift, found.orbit, p
         left += [discontinuity for discontinuity, reached in zip(group, going, strict=True) if not reached]
     return not_continued(model, plane, left, steps[1:]) if left and steps[1:] else left
-
-
-def _points(model: GeneratedModel, plane: Plane, q: Array) -> Array:
-    """Return the parameters (n_parameters, B) at unit coordinates q (B, 2)."""
-    return np.stack([plane.point(model, row) for row in q], axis=1)
 
 
 def continued_end(model: GeneratedModel, plane: Plane, discontinuity: Discontinuity) -> Discontinuity | None:
@@ -381,26 +370,22 @@ def continued_end(model: GeneratedModel, plane: Plane, discontinuity: Discontinu
     """
     here, way = discontinuity.ends[0], discontinuity.ends[1] - discontinuity.ends[0]
     share, step, orbit, rho = 0.0, 0.5, discontinuity.orbit, discontinuity.rho
-    p, dx, dstages = plane.point(model, here), np.zeros_like(orbit.x), np.zeros_like(orbit.stages)
+    p, slope = plane.point(model, here), orbit.unchanged()
     while step > FINEST:
         ahead = min(share + step, 1.0)
         q = plane.point(model, here + ahead * way)
-        shift, reach = model.steady(q) - model.steady(p), ahead - share
-        guess = Discretisation(
-            (orbit.x + shift + reach * dx)[None], (orbit.stages + shift + reach * dstages)[None], orbit.edges
-        )
-        found = solve_orbits(model, q[:, None], guess, max_iterations=10)
-        off = float((np.abs(found.orbit.x[0] - guess.x[0]) / scales(model, q)).max())
+        reach = ahead - share
+        shift = steady_guess(model, q, orbit.edges) - steady_guess(model, p, orbit.edges)
+        guess = orbit + shift + reach * slope
+        found = solve_orbits(model, q[:, None], guess.part(None), max_iterations=10)
+        off = float((np.abs(found.orbit.x[0] - guess.x) / scales(model, q)).max())
         leading = complex(found.multipliers[0, 0])
         if not found.converged[0] or off > NEAR or not abs(leading) < 1:
             step /= 2
             continue
-        dx, dstages = (
-            (found.orbit.x[0] - orbit.x - shift) / reach,
-            (found.orbit.stages[0] - orbit.stages - shift) / reach,
-        )
+        slope = (found.orbit.part(0) - orbit - shift) / reach
         share, rho, p, step = ahead, leading, q, 2 * step if off < NEAR / 4 else step
-        orbit = Discretisation(found.orbit.x[0], found.orbit.stages[0], orbit.edges)
+        orbit = found.orbit.part(0)
         if share == 1.0:
             return None
     return Discontinuity(np.array([here + share * way, discontinuity.ends[1]]), discontinuity.axis, rho, orbit)
@@ -410,8 +395,8 @@ def fold_at(model: GeneratedModel, plane: Plane, end: Discontinuity) -> CurvePoi
     """Return the fold at which a stable state ends, ready to be followed; None where its leading multiplier is not near +1."""
     if end.rho.real < MEETS or bifurcation_kind(end.rho) != "fold":
         return None
-    here, across, normal = end.ends[0], np.zeros(end.orbit.x.shape[-1]), np.eye(2)[1 - end.axis]
-    start = correct(model, plane, here, end.orbit, end.rho, normal, across, max_iterations=20)
+    here = end.ends[0]
+    start = correct(model, plane, here, end.orbit, end.rho, np.eye(2)[1 - end.axis], max_iterations=20)
     if start is None or bifurcation_kind(start.rho) != "fold" or not start.others < 1:
         return None
     return start if np.abs(start.q - here).max() < FOLD_REACH else None

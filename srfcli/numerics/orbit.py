@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,6 @@ from srfcli.numerics.collocation import (
     Discretisation,
     condense,
     gauss,
-    join,
     kernel,
     newton_orbits,
     respond,
@@ -37,20 +35,25 @@ class OrbitBatch:
     orbit: Discretisation
     monodromy: Array
     converged: Array
-    iterations: int
+
+    @classmethod
+    def empty(cls, p: Array, edges: Array, n: int) -> OrbitBatch:
+        """Return a batch for the points `p`, with `n` unknowns, in which no orbit is known yet."""
+        shape, N = p.shape[1:], len(edges) - 1
+        x, stages = np.full((*shape, N, n), np.nan), np.full((*shape, N, STAGES, n), np.nan)
+        return cls(p, Discretisation(x, stages, edges), np.full((*shape, n, n), np.nan), np.zeros(shape, bool))
 
     @property
     def multipliers(self) -> ComplexArray:
         """Return the Floquet multipliers (..., n), largest modulus first; NaN where the orbit did not converge."""
         return ordered_eigenvalues(self.monodromy, self.converged)
 
-    def part(self, index: Array) -> OrbitBatch:
+    def part(self, index: Any) -> OrbitBatch:
         """Return the orbits that `index` selects."""
-        return OrbitBatch(
-            self.p[:, index], self.orbit.part(index), self.monodromy[index], self.converged[index], self.iterations
-        )
+        p = self.p[:, *index] if isinstance(index, tuple) else self.p[:, index]
+        return OrbitBatch(p, self.orbit.part(index), self.monodromy[index], self.converged[index])
 
-    def replace(self, index: Array, other: OrbitBatch) -> None:
+    def replace(self, index: Array | tuple[Array, ...], other: OrbitBatch) -> None:
         """Put the orbits of `other` in the place of those at `index`, whatever became of them."""
         self.orbit.x[index], self.orbit.stages[index] = other.orbit.x, other.orbit.stages
         self.monodromy[index], self.converged[index] = other.monodromy, other.converged
@@ -96,8 +99,7 @@ def forced_guess(model: GeneratedModel, p: Array, edges: Array) -> Discretisatio
     """
     guess = steady_guess(model, p, edges)
     rest, n = model.steady(p), len(model.states)
-    calm = p.copy()
-    calm[model.index("eps")] = 0.0
+    calm = model.with_values(p, eps=0.0)
     tau = np.arange(16) / 16
     field = model.cycle(tau, np.broadcast_to(rest[..., None, :], (*rest.shape[:-1], 16, n)), p[..., None])
     forcing = np.fft.fft(field, axis=-2)[..., 1, :] / 8
@@ -155,14 +157,17 @@ def neighbours(known: Array, new: Array, most: int = NEIGHBOURS) -> tuple[Array,
     return index, lagrange(known[index], new)
 
 
+def combined(orbits: Discretisation, weights: Array) -> Discretisation:
+    """Return the sums over k of orbits (B, k, N, ...) times their weights (B, k)."""
+    return Discretisation(
+        np.einsum("bk,bkNn->bNn", weights, orbits.x), np.einsum("bk,bkNmn->bNmn", weights, orbits.stages), orbits.edges
+    )
+
+
 def between(orbit: Discretisation, known: Array, new: Array, most: int = NEIGHBOURS) -> Discretisation:
     """Return guesses at positions `new` through the orbits (B, N, ...) at the rising positions `known` (B,)."""
     index, weights = neighbours(known, new, most)
-    return Discretisation(
-        np.einsum("bk,bkNn->bNn", weights, orbit.x[index]),
-        np.einsum("bk,bkNmn->bNmn", weights, orbit.stages[index]),
-        orbit.edges,
-    )
+    return combined(orbit.part(index), weights)
 
 
 def step_limit(model: GeneratedModel, dx: Array, stages: Array) -> Array:
@@ -185,55 +190,39 @@ def solve_orbits(
 
     A point that does not converge in `max_iterations` keeps its last iterate and is marked so.
     """
-    parts = [
-        _solve_chunk(model, p[:, a : a + CHUNK], guess.part(slice(a, a + CHUNK)), tol, max_iterations)
-        for a in range(0, p.shape[1], CHUNK)
-    ]
-    return parts[0] if len(parts) == 1 else join_orbits(parts)
-
-
-def join_orbits(parts: Sequence[OrbitBatch]) -> OrbitBatch:
-    """Return several batches on one mesh as one."""
-    return OrbitBatch(
-        np.concatenate([b.p for b in parts], axis=1),
-        join([b.orbit for b in parts]),
-        np.concatenate([b.monodromy for b in parts]),
-        np.concatenate([b.converged for b in parts]),
-        max(b.iterations for b in parts),
-    )
-
-
-def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: float, max_iterations: int) -> OrbitBatch:
-    library = kernel(model)
-    if library is not None:
-        found = Discretisation(guess.x.copy(), guess.stages.copy(), guess.edges)
-        size = np.ascontiguousarray(scales(model, p))
-        monodromy, converged, used = newton_orbits(
-            library, (found.phases, found.steps), p, found.x, found.stages, size, tol, max_iterations
+    library, size = kernel(model), np.ascontiguousarray(scales(model, p))
+    found = OrbitBatch.empty(p, guess.edges, len(model.states))
+    found.orbit.x[:], found.orbit.stages[:] = guess.x, guess.stages
+    for a in range(0, p.shape[1], CHUNK):
+        cut = slice(a, a + CHUNK)
+        if library is None:
+            _newton(model, found, np.arange(len(size))[cut], size, tol, max_iterations)
+            continue
+        frame, orbit = (guess.phases, guess.steps), found.orbit.part(cut)
+        found.monodromy[cut], found.converged[cut] = newton_orbits(
+            library, frame, p[:, cut], orbit.x, orbit.stages, size[cut], tol, max_iterations
         )
-        return OrbitBatch(p, found, monodromy, converged, used)
-    B, n = p.shape[1], len(model.states)
-    x, stages = guess.x.copy(), guess.stages.copy()
-    monodromy = np.full((B, n, n), np.nan)
-    converged = np.zeros(B, dtype=bool)
-    size = scales(model, p)
-    active = np.arange(B)
-    iteration = 0
-    while active.size and iteration < max_iterations:
-        iteration += 1
-        part = Discretisation(x[active], stages[active], guess.edges)
+    return found
+
+
+def _newton(
+    model: GeneratedModel, batch: OrbitBatch, active: Array, size: Array, tol: float, max_iterations: int
+) -> None:
+    """Bring the orbits `active` of a batch to convergence in place, as the compiled equations do."""
+    for _ in range(max_iterations):
         with np.errstate(all="ignore"):  # a diverging point overflows; it is dropped below
-            linear, dx, dstages, finite = newton_step(model, p[:, active], part)
+            linear, dx, dstages, finite = newton_step(model, batch.p[:, active], batch.orbit.part(active))
             limit = step_limit(model, dx, dstages)
             change = (np.abs(dx) / size[active][:, None, :]).max(axis=(-1, -2))
         limit = np.where(finite, limit, 0.0)
-        x[active] += limit[:, None, None] * np.where(finite[:, None, None], dx, 0.0)
-        stages[active] += limit[:, None, None, None] * np.where(finite[:, None, None, None], dstages, 0.0)
-        monodromy[active] = linear.monodromy
+        batch.orbit.x[active] += limit[:, None, None] * np.where(finite[:, None, None], dx, 0.0)
+        batch.orbit.stages[active] += limit[:, None, None, None] * np.where(finite[:, None, None, None], dstages, 0.0)
+        batch.monodromy[active] = linear.monodromy
         done = finite & (change < tol)
-        converged[active[done]] = True
+        batch.converged[active[done]] = True
         active = active[finite & ~done]
-    return OrbitBatch(p, Discretisation(x, stages, guess.edges), monodromy, converged, iteration)
+        if not active.size:
+            break
 
 
 def newton_step(model: GeneratedModel, p: Array, orbit: Discretisation) -> tuple[Condensed, Array, Array, Array]:

@@ -41,8 +41,7 @@ class LinearResponse:
 
 def linear_response(model: GeneratedModel, p: Array) -> LinearResponse:
     """Return the response of steady sliding at `p` (n_parameters, ...), whose eps does not count."""
-    p = np.array(p, dtype=float)
-    p[model.index("eps")] = 0.0
+    p = model.with_values(p, eps=0.0)
     rest, n = model.steady(p), len(model.states)
     jacobian = model.cycle_jacobian(0.0, rest, p)
     by_eps = model.cycle_parameter("eps")
@@ -136,8 +135,7 @@ def mean_friction(model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mes
             edges, part = uniform_mesh(int(mesh)), batch.orbit.part(here)
             guess = interpolate(part, edges) if batch.converged[here].all() else None
             waiting.append((index[here], robust_orbits(model, p[:, index[here]], guess, edges, tol=1e-9)))
-    calm = p.copy()
-    calm[model.index("eps")] = 0.0
+    calm = model.with_values(p, eps=0.0)
     rest = model.steady(calm)
     steady = model.cycle_friction(0.0, rest, calm) * model.cycle_load(0.0, rest, calm) / p[model.index("W0")]
     return MeanFriction(p, columns[0], columns[1], steady, columns[2], columns[3], tuple(status))

@@ -19,6 +19,7 @@ from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind, left_vecto
 from srfcli.numerics.collocation import (
     Condensed,
     Discretisation,
+    by_mesh,
     condense,
     gauss,
     join,
@@ -28,13 +29,12 @@ from srfcli.numerics.collocation import (
 )
 from srfcli.numerics.continuation import Branch, CurvePoint, correct, metric
 from srfcli.numerics.orbit import interpolate
-from srfcli.numerics.plane import Plane
+from srfcli.numerics.plane import Plane, polyline_heights
 
 EXACT = 1e-9  # a correction so small leaves the tangent as it is
 CLOSE = 1e-8  # of the chord: where the search for a zero ends
 MEETING = 0.05  # of Re(rho) from +1 or -1: a Neimark-Sacker boundary that ends so near ends in a strong resonance
 CUSPED = 1e-3  # of the tangent in the plane beside a cusp: what is left of it at the cusp
-INSIDE = 1 - 1e-9  # of the window: its far edge as seen from within
 RESONANCES = {"1:3": 2 * np.pi / 3, "1:4": np.pi / 2}
 STRONG = {"fold": "1:1", "pd": "1:2"}  # where a pair of multipliers meets on the real axis
 
@@ -81,30 +81,15 @@ def crossings_at(
 
     Without `folds` those where a multiplier is +1 are left out.
     """
-    lines = [plane.coordinates(model, np.stack([pt.p for pt in b.points], axis=1)) for b in branches]
+    lines = [plane.coordinates(model, b.p) for b in branches]
     for line, branch in zip(lines, branches, strict=True):
         line[[not folds and pt.kind == "fold" for pt in branch.points]] = np.nan
-    heights = polyline_heights(lines, np.asarray(plane.x.unit(values)))
-    return [np.asarray(plane.y.value(np.array(h))).reshape(-1).tolist() for h in heights]
-
-
-def polyline_heights(lines: Sequence[Array], at: Array) -> list[list[float]]:
-    """Return for each unit coordinate `at` the heights, rising, at which polylines (points, 2) in unit coordinates pass it."""
-    out: list[list[float]] = []
-    for x in np.minimum(at, INSIDE):  # a curve ends on the window's edge, not beyond
-        heights: list[float] = []
-        for q in lines:
-            a, b = q[:-1], q[1:]
-            for k in np.nonzero((a[:, 0] <= x) != (b[:, 0] <= x))[0]:
-                share = (x - a[k, 0]) / (b[k, 0] - a[k, 0])
-                heights.append(float(a[k, 1] + share * (b[k, 1] - a[k, 1])))
-        out.append(sorted(heights))
-    return out
+    return [plane.y.value(heights).tolist() for heights in polyline_heights(lines, plane.x.unit(values))]
 
 
 def _turns(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[SpecialPoint]:
     """Yield the cusps, and the points at which one of the two parameters turns round."""
-    q = plane.coordinates(model, np.stack([pt.p for pt in branch.points], axis=1))
+    q = plane.coordinates(model, branch.p)
     steps = np.diff(q, axis=0)
     back = steps[:-1] * steps[1:] < 0  # (steps - 1, 2)
     for k in np.nonzero(back.any(axis=1))[0]:
@@ -330,13 +315,15 @@ def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: A
     slopes = model.cycle_jacobian(tau, nearby, ps).imag / STEP
     F2 = slopes[0] + 1j * slopes[1]  # its product with a is the field's second derivative F2(a, wave)
     sources = [np.einsum("...ij,...j->...i", F2, a) for a in (wave.conj(), wave)]
-    mean, double = (
-        own + _carried(c, np.linalg.solve(np.where(real[..., None, None], identity, s * identity - M), e[..., None])[..., 0])
-        for (own, e), s in zip(_forced(c, sources), (1.0, (mu * mu)[..., None, None]), strict=True)
-    )
+    forced = []
+    for (own, end), s in zip(_forced(c, sources), (1.0, (mu * mu)[..., None, None]), strict=True):
+        matrix = np.where(real[..., None, None], identity, s * identity - M)
+        forced.append(own + _carried(c, np.linalg.solve(matrix, end[..., None])[..., 0]))
+    mean, double = forced
     weights = weights_backwards(c, left_vector(M, mu, q))
     source = 2 * np.einsum("...ij,...j->...i", F2, mean) + np.einsum("...ij,...j->...i", F2.conj(), double)
-    third = np.zeros_like(wave)  # F3(wave, wave, conj(wave)) times the weights: F3(r, r, c) + F3(s, s, c) for c = r and i s
+    # F3(wave, wave, conj(wave)) times the weights: F3(r, r, c) + F3(s, s, c) for c = r and i s
+    third = np.zeros_like(wave)
     for part, unit in ((weights.real, 1.0), (weights.imag, 1j)):
         for a in along:
             gradient = model.cycle_bilinear(tau, nearby, ps, part, a).imag / STEP
@@ -371,9 +358,7 @@ def _forced(c: Condensed, sources: Sequence[ComplexArray]) -> list[tuple[Complex
 def branch_coefficients(model: GeneratedModel, branch: Branch) -> Array:
     """Return d at every point of a branch, NaN where the critical multiplier is real."""
     d, points = np.empty(len(branch.points)), branch.points
-    meshes = np.array([len(pt.orbit.edges) for pt in points])
-    for edges in sorted(set(meshes.tolist())):
-        index = np.nonzero(meshes == edges)[0]
+    for index in by_mesh([pt.orbit for pt in points]):
         for here in (index[a : a + TOGETHER] for a in range(0, len(index), TOGETHER)):
             p = np.stack([points[i].p for i in here], axis=1)
             rho = np.array([points[i].rho for i in here])
