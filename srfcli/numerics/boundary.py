@@ -52,10 +52,10 @@ def linearise_boundary(
     model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array
 ) -> BoundaryLinear:
     """Return the linearisation of {periodicity, ln |rho| = 0}; rho is the multiplier nearest to `target` (...,)."""
-    batch = orbit.x.shape[:-2]
-    if kernel(model) is None or not batch:
+    library = kernel(model)
+    if library is None or orbit.x.ndim == 2:  # one orbit without the batch's axis
         return _linearise(model, p, orbit, names, target)[1]
-    found = _compiled(model, p, orbit, names, np.asarray(target, complex))
+    found = linearised(library, model, p, orbit, names, np.asarray(target, complex))
     if not found.good.all():
         raise np.linalg.LinAlgError("Singular matrix")
     return found
@@ -63,18 +63,10 @@ def linearise_boundary(
 
 def periodic_map(model: GeneratedModel, p: Array, orbit: Discretisation, names: Names) -> Array:
     """Return the linearised map over one period less the state, (B, n, n+1+k), of orbits (B, N, ...)."""
-    if kernel(model) is None:
-        return _less_state(condense(model, p, orbit, names))
-    return _compiled(model, p, orbit, names).periodic
-
-
-def _compiled(
-    model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array | None = None, **options: Any
-) -> BoundaryLinear:
     library = kernel(model)
-    assert library is not None
-    which = np.array([model.index(name) for name in names], dtype=np.intc)
-    return linearised(library, (orbit.phases, orbit.steps), p, orbit, which, target, **options)
+    if library is None:
+        return _less_state(condense(model, p, orbit, names))
+    return linearised(library, model, p, orbit, names).periodic
 
 
 def _less_state(condensed: Condensed) -> Array:
@@ -116,9 +108,10 @@ def solve_boundary(
 
     The rows `across` (B, d-1, n+d) close them. A second column is the direction along the curve.
     """
+    library = kernel(model)
+    if library is not None:
+        return linearised(library, model, p, orbit, names, target, rate=rate, across=across, columns=columns)
     with np.errstate(all="ignore"):
-        if kernel(model) is not None:
-            return _compiled(model, p, orbit, names, target, rate=rate, across=across, columns=columns)
         (B, n), d = (len(orbit.x), orbit.x.shape[-1]), rate.shape[-1]
         try:
             condensed, linear = _linearise(model, p, orbit, names, target)

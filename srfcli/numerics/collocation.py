@@ -69,25 +69,18 @@ def kernel(model: GeneratedModel) -> ctypes.CDLL | None:
 
 
 def newton_orbits(
-    library: ctypes.CDLL,
-    frame: tuple[Array, Array],
-    p: Array,
-    x: Array,
-    stages: Array,
-    size: Array,
-    tol: float,
-    max_iterations: int,
+    library: ctypes.CDLL, p: Array, orbit: Discretisation, size: Array, tol: float, max_iterations: int
 ) -> tuple[Array, Array]:
-    """Bring the orbits `x` (B, N, n), `stages` (B, N, m, n) to convergence in place; return monodromy and converged.
+    """Bring orbits (B, N, ...) at the points `p` (n_parameters, B) to convergence in place; return monodromy and converged.
 
-    `frame` holds the Gauss points' phases (N, m) and the steps (N,), `p` is (n_parameters, B), `size` (B, n).
+    `size` (B, n) is that of the unknowns.
     """
-    B, N, n = x.shape
+    B, N, n = orbit.x.shape
     monodromy, converged = np.full((B, n, n), np.nan), np.zeros(B, dtype=np.uint8)
     parameters = np.ascontiguousarray(p.T)
     used = library.srf_orbits(
-        B, N, *map(_at, frame), _at(parameters), _at(x), _at(stages), _at(size), ctypes.c_double(tol), max_iterations,
-        _at(monodromy), _at(converged),
+        B, N, _at(orbit.phases), _at(orbit.steps), _at(parameters), _at(orbit.x), _at(orbit.stages), _at(size),
+        ctypes.c_double(tol), max_iterations, _at(monodromy), _at(converged),
     )  # fmt: skip
     if used < 0:
         raise MemoryError
@@ -128,10 +121,10 @@ class BoundaryLinear:
 
 def linearised(
     library: ctypes.CDLL,
-    frame: tuple[Array, Array],
+    model: GeneratedModel,
     p: Array,
     orbit: Discretisation,
-    which: Array,
+    names: Sequence[str],
     target: Array | None = None,
     *,
     rate: Array | None = None,
@@ -142,6 +135,7 @@ def linearised(
 
     `across` (B, d-1, n+d) closes them. Without a target only `periodic` is found.
     """
+    which = np.array([model.index(name) for name in names], dtype=np.intc)
     B, N, n = orbit.x.shape
     k, d = len(which), 0 if rate is None else rate.shape[-1]
     found = BoundaryLinear(
@@ -156,7 +150,7 @@ def linearised(
     x, stages, parameters = (np.ascontiguousarray(a) for a in (orbit.x, orbit.stages, p.T))
     given = (None if a is None else np.ascontiguousarray(a) for a in (target, rate, across))
     done = library.srf_boundary(
-        B, N, k, _at(which), d, columns, *map(_at, frame), _at(parameters), _at(x), _at(stages),
+        B, N, k, _at(which), d, columns, _at(orbit.phases), _at(orbit.steps), _at(parameters), _at(x), _at(stages),
         *[None if a is None else _at(a) for a in given], _at(found.periodic), _at(found.rho), _at(found.growth),
         _at(found.solution), _at(found.dx), _at(found.dstages), _at(found.good),
     )  # fmt: skip
@@ -167,8 +161,9 @@ def linearised(
 
 
 def _at(array: Array) -> ctypes.c_void_p:
+    """Return a pointer that keeps its array alive."""
     assert array.flags.c_contiguous
-    return ctypes.c_void_p(array.ctypes.data)
+    return array.ctypes.data_as(ctypes.c_void_p)
 
 
 # Gauss collocation over one forcing period, condensed interval by interval.

@@ -335,11 +335,8 @@ def reversed_tangent(point: CurvePoint) -> CurvePoint:
     return replace(point, tangent_q=-point.tangent_q, tangent_orbit=-1.0 * point.tangent_orbit)
 
 
-def trace(
-    model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings | None = None
-) -> Iterator[Curve]:
+def trace(model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings) -> Iterator[Curve]:
     """Yield the growing curve through `start` after each point, both ways; the last one yielded is complete."""
-    settings = settings or StepSettings()
     curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
     for item in follow(model, plane, start, settings):
         if isinstance(item, Status):

@@ -198,9 +198,8 @@ def solve_orbits(
         if library is None:
             _newton(model, found, np.arange(len(size))[cut], size, tol, max_iterations)
             continue
-        frame, orbit = (guess.phases, guess.steps), found.orbit.part(cut)
         found.monodromy[cut], found.converged[cut] = newton_orbits(
-            library, frame, p[:, cut], orbit.x, orbit.stages, size[cut], tol, max_iterations
+            library, p[:, cut], found.orbit.part(cut), size[cut], tol, max_iterations
         )
     return found
 

@@ -14,7 +14,7 @@ import numpy as np
 from srfcli.codegen.model import COMPLEX_STEP, Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.collocation import mesh_error, stage_parameters, wanted_mesh
-from srfcli.numerics.critical import robust_orbits
+from srfcli.numerics.critical import growth, robust_orbits
 from srfcli.numerics.orbit import OrbitBatch, interpolate, uniform_mesh
 
 INTERVALS = 16
@@ -125,9 +125,9 @@ def mean_friction(model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mes
         index, batch = waiting.pop()
         N = len(batch.orbit.edges) - 1
         error = np.where(batch.converged, mesh_error(model, batch.orbit), LOST)
-        finished = (error <= tol) | (max_mesh <= N)
+        exponents, finished = growth(batch)[1], (error <= tol) | (max_mesh <= N)
         for j in np.nonzero(finished & batch.converged)[0]:
-            columns[:, index[j]] = *_means(model, batch, int(j)), _growth(batch, int(j)), error[j]
+            columns[:, index[j]] = *_means(model, batch, int(j)), exponents[j], error[j]
             status[index[j]] = Status.OK if error[j] <= tol else Status.TOLERANCE
         wanted = wanted_mesh(error, N, tol, max_mesh)
         for mesh in np.unique(wanted[~finished]):
@@ -147,7 +147,3 @@ def _means(model: GeneratedModel, batch: OrbitBatch, j: int) -> tuple[float, flo
     mu = model.cycle_friction(orbit.phases, orbit.stages, ps)
     load = model.cycle_load(orbit.phases, orbit.stages, ps) / batch.p[model.index("W0"), j]
     return float((mu * orbit.weights).sum()), float((mu * load * orbit.weights).sum())
-
-
-def _growth(batch: OrbitBatch, j: int) -> float:
-    return float(np.log(np.abs(np.linalg.eigvals(batch.monodromy[j])).max()))
