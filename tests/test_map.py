@@ -10,10 +10,10 @@ from brute import Slider, shoot, steady
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.numerics.continuation import AtlasSettings, StepSettings, find_components
-from srfcli.numerics.critical import critical_line, robust_orbits
+from srfcli.numerics.critical import critical_line
 from srfcli.numerics.map import KINDS, _suspects, compute_map, join_tiles, kinds, neighbours, per_slip, solve_tile
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
-from srfcli.numerics.orbit import uniform_mesh
+from srfcli.numerics.orbit import robust_orbits, uniform_mesh
 from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane, tile_tasks
 from srfcli.numerics.special_points import crossings_at, special_points
 

@@ -32,8 +32,6 @@ from srfcli.numerics.collocation import (
 )
 from srfcli.numerics.orbit import CHUNK, interpolate, scales, step_limit, uniform_mesh
 
-# Points of a stability boundary: a forced periodic state one of whose multipliers lies on the unit circle.
-
 Names = tuple[str, ...]
 
 
@@ -214,11 +212,6 @@ class Direction:
     log: tuple[bool, ...]
     across: Array | None = None
 
-    @property
-    def distances(self) -> int:
-        """Return d, the number of distances that a point has."""
-        return int(self.vectors.shape[-1])
-
     def part(self, index: slice | Array) -> Direction:
         """Return the directions of a part of the batch."""
         return Direction(self.names, self.vectors[index], self.log, None if self.across is None else self.across[index])
@@ -234,9 +227,9 @@ class Direction:
         return np.where(log, values * np.exp(np.where(log, shift, 0)), values + shift)
 
 
-def along(name: str, count: int) -> Direction:
-    """Return the direction of ln(name) for `count` points."""
-    return Direction((name,), np.ones((count, 1, 1)), (True,))
+def along(name: str, count: int, *, log: bool = True, unit: float = 1.0) -> Direction:
+    """Return the direction of ln(name), or of the parameter `name` itself over `unit`, for `count` points."""
+    return Direction((name,), np.full((count, 1, 1), unit), (log,))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Laws brought to the same observables at one low velocity, and what their boundaries then say of each other.
+"""Laws adjusted to the same observables at one low velocity, so that they differ in form, not in calibration; their boundaries.
 
 A law is studied in a window of V and W0: its boundary components at each amplitude, from maps; where they cross lines of constant
 V; and the smallest amplitude at which a line meets more than one boundary (re-entrance).
@@ -19,8 +19,6 @@ from srfcli.numerics.hopf import critical_point, hopf_points, weakening
 from srfcli.numerics.map import compute_map, tile_model
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane, polyline_heights
-
-# Laws brought to the same observables at one low velocity, so that what still differs is the law and not its calibration.
 
 ADJUSTED = ("A", "B", "D0")  # what is adjusted to slope, critical load and critical period
 LEVEL = "mu0"  # adjusted to the level of friction, which is what a modulated load works on

@@ -25,8 +25,6 @@ from srfcli.numerics.critical import INTERVALS, LineScan, locate_crossings, scan
 from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
 from srfcli.numerics.plane import Plane, passes
 
-# Pseudo-arclength continuation of a stability boundary in a plane of two parameters.
-
 STALE = 0.3  # of the step: a larger correction, in the same norm, spoils the tangent
 ORBIT_SHARE = 0.1  # of the orbit's change in that norm
 ORDER = 0.3  # power of the share that a correction may grow by, which the step grows by: it goes with the fourth of the step

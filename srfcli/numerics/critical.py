@@ -25,21 +25,17 @@ from srfcli.numerics.boundary import BoundaryPoint, along, pick_multiplier, poli
 from srfcli.numerics.collocation import Discretisation, join, mesh_error, wanted_mesh
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.orbit import (
-    NEIGHBOURS,
-    STRIDE,
+    ROUGHEST,
     OrbitBatch,
     between,
-    forced_guess,
+    growth,
     interpolate,
     lagrange,
-    levels,
+    line_orbits,
     neighbours,
-    solve_orbits,
-    steady_guess,
+    robust_orbits,
     uniform_mesh,
 )
-
-# Every critical value of one parameter on a line: scanned, bracketed, polished, numbered from the low end.
 
 SAMPLES = 192
 INTERVALS = 16
@@ -84,7 +80,7 @@ def critical_line(
 ) -> CriticalLine:
     """Return every crossing of the stability boundary along `name` in [lo, hi] at the parameters `base` (n_parameters,).
 
-    Without a window the loads W0 are followed to where the growth rate settles (numerics/critical.py). A pair of crossings closer
+    Without a window the loads W0 are followed to where the growth rate settles. A pair of crossings closer
     than the scan's resolution (in ln name) may be missed; the notes say so where it may matter.
     """
     whole = lo is None or hi is None
@@ -292,7 +288,7 @@ def found_window(model: GeneratedModel, points: Sequence[Array]) -> LoadWindow:
 def follow_outwards(
     model: GeneratedModel, base: Array, low: LineScan, high: LineScan, *, resolution: float = 1e-3
 ) -> Reach:
-    """Return what lies below the scan `low` and above `high`, both along W0 at `base`, until the growth rate settles."""
+    """Return scans along W0 at `base` below the scan `low` and above `high`, as far as it takes the growth rate to settle."""
     below, settled_below = _follow(model, base, low, -1, resolution)
     above, settled_above = _follow(model, base, high, 1, resolution)
     return Reach(below, above, settled_below, settled_above)
@@ -356,10 +352,6 @@ def _quiet(g: Array, h: Array) -> bool:
 
 MESH_ERROR = 1e-5  # a hump of g lower than this cannot be told from none
 FINEST = 64
-FIRST_CLIMB, SMALLEST_CLIMB = 0.25, 2e-3  # steps in which eps is raised to its value, as shares of it
-CLIMBING = 12  # Newton steps at each
-ALMOST = 1 - 1e-12  # of eps
-ROUGHEST = 0.1  # estimated error of a climbed state's multipliers on its mesh; the true one is a hundredth of that
 
 
 @dataclass
@@ -390,76 +382,6 @@ class LineScan:
             int(i)
             for i in np.nonzero(np.isfinite(g[:-1]) & np.isfinite(g[1:]) & (g[:-1] * g[1:] <= 0) & (g[:-1] != 0))[0]
         ]
-
-
-def growth(batch: OrbitBatch) -> tuple[ComplexArray, Array]:
-    """Return the multipliers and ln |leading multiplier| of a batch, NaN where the orbit was not found."""
-    multipliers = batch.multipliers
-    return multipliers, np.log(np.abs(multipliers[:, 0]))
-
-
-def robust_orbits(
-    model: GeneratedModel, p: Array, guess: Discretisation | None, edges: Array, *, tol: float = 1e-7
-) -> OrbitBatch:
-    """Return orbits at `p`, from `guess`, else from the linear response, else by raising eps in steps."""
-    batch = solve_orbits(model, p, guess or forced_guess(model, p, edges), tol=tol, max_iterations=14 if guess else 40)
-    if guess is not None and not batch.converged.all():
-        bad = np.nonzero(~batch.converged)[0]
-        batch.replace(bad, solve_orbits(model, p[:, bad], forced_guess(model, p[:, bad], edges), tol=tol))
-    if not batch.converged.all():
-        bad = np.nonzero(~batch.converged)[0]
-        batch.replace(bad, climbed(model, p[:, bad], edges, tol=tol))
-    return batch
-
-
-def line_orbits(
-    model: GeneratedModel, p: Array, position: Array, guess: Discretisation | None, edges: Array
-) -> OrbitBatch:
-    """Return what `robust_orbits` does at points in order, at rising `position` (B,) along a line.
-
-    A few that are spread over the line come first; the others start from what was found around them.
-    """
-    count, stride = p.shape[1], STRIDE
-    while stride > 1 and count < stride * NEIGHBOURS:  # fewer to start from would foretell little
-        stride //= 2
-    first, *later = levels(count, stride)
-    orbits = OrbitBatch.empty(p, edges, len(model.states))
-    orbits.replace(first, robust_orbits(model, p[:, first], None if guess is None else guess.part(first), edges))
-    for level in later:
-        known = np.nonzero(orbits.converged)[0]
-        near = between(orbits.orbit.part(known), position[known], position[level]) if known.size else None
-        orbits.replace(level, robust_orbits(model, p[:, level], near, edges))
-    return orbits
-
-
-def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7) -> OrbitBatch:
-    """Return orbits at `p` (n_parameters, B) by raising eps from 0, each in steps of its own that are halved where one fails.
-
-    One that the mesh is too coarse for has not converged: a finer one may be climbed to.
-    """
-    eps, calm = p[model.index("eps")], model.with_values(p, eps=0.0)
-    batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=tol)
-    slope = batch.orbit.unchanged()
-    reached, step = np.zeros(p.shape[1]), np.full(p.shape[1], FIRST_CLIMB)
-    going = batch.converged.copy()
-    while going.any():
-        at = np.nonzero(going)[0]
-        step[at] = np.minimum(step[at], 1.0 - reached[at])
-        q = model.with_values(p[:, at], eps=eps[at] * (reached[at] + step[at]))
-        before = batch.orbit.part(at)
-        found = solve_orbits(model, q, before + step[at] * slope.part(at), tol=tol, max_iterations=CLIMBING)
-        new, got, lost = np.nonzero(found.converged)[0], at[found.converged], at[~found.converged]
-        change = (found.orbit.part(new) - before.part(new)) / step[got]
-        slope.x[got], slope.stages[got] = change.x, change.stages
-        batch.replace(got, found.part(new))
-        reached[got] += step[got]
-        step[got] *= 1.5
-        step[lost] /= 2
-        going = batch.converged & (reached < ALMOST) & (step > SMALLEST_CLIMB)
-    batch.p[:] = p
-    batch.converged &= reached >= ALMOST
-    batch.converged[batch.converged] = mesh_error(model, batch.orbit)[batch.converged] < ROUGHEST
-    return batch
 
 
 def scan_line(

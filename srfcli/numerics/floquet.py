@@ -18,12 +18,20 @@ from srfcli.numerics.collocation import (
     mesh_error,
     stage_parameters,
 )
-from srfcli.numerics.critical import CLIMBING, FIRST_CLIMB, robust_orbits
-from srfcli.numerics.orbit import OrbitBatch, interpolate, solve_orbits, steady_guess, uniform_mesh
+from srfcli.numerics.orbit import (
+    CLIMBING,
+    FIRST_CLIMB,
+    OrbitBatch,
+    interpolate,
+    robust_orbits,
+    solve_orbits,
+    steady_guess,
+    uniform_mesh,
+)
 
 FIRST_MESH = 16
 PATIENT = 256  # intervals up to which a state that was not found is looked for on a finer mesh
-STIFF = 3.0
+STIFF = 3.0  # e-foldings of volume within an interval, beyond which Liouville's identity is not checked
 NEWTON = 1e-10  # last step of Newton's method
 # the same where a multiplier next to 1 lets rounding grow beyond that; the error of the multipliers tells
 ROUNDED = 1e-7

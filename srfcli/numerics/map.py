@@ -23,7 +23,6 @@ from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
 from srfcli.numerics.boundary import periodic_map, upper_half
 from srfcli.numerics.collocation import STAGES, Discretisation, join, kernel, mesh_error
-from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.orbit import (
     CHUNK,
     OrbitBatch,
@@ -31,12 +30,11 @@ from srfcli.numerics.orbit import (
     interpolate,
     levels,
     neighbours,
+    robust_orbits,
     solve_orbits,
     uniform_mesh,
 )
 from srfcli.numerics.plane import MapGrid, MapSettings, TileTask, tile_tasks
-
-# Stability maps: the leading Floquet multiplier over a grid of two parameters, put together from its tiles.
 
 # of a point: no orbit found; stable; unstable by a multiplier off the real axis, a negative, a positive one
 KINDS = ("unresolved", "stable", "ns", "pd", "fold")

@@ -1,6 +1,7 @@
-"""The boundary components of a map, and the folds of the forced state that only end there.
+"""The boundary components of a map, and curves of folds where a forced periodic state ends.
 
-So is every stable state that ends beside a point without one: by a curve of folds.
+Every sign change of a map is accounted for by a curve that passes through it, or by a new curve that starts there. Every stable
+state that ends beside a point without one is accounted for by a curve of folds.
 """
 
 from __future__ import annotations
@@ -30,8 +31,6 @@ from srfcli.numerics.map import Discontinuity, Seed, StabilityMap
 from srfcli.numerics.orbit import scales, solve_orbits, steady_guess
 from srfcli.numerics.plane import Axis, Plane
 from srfcli.numerics.special_points import crossings_at
-
-# The boundary components of a map: every sign change accounted for by a curve that passes through it, or that starts there.
 
 DENSE = 12  # points of the cubic between two points of a curve, on which seeds are looked for
 CURVE_REACH = 1e-3  # of the window: seeds and curves are compared to this
@@ -143,9 +142,7 @@ def starting_point(model: GeneratedModel, plane: Plane, seed: Seed, settings: At
     """Return the boundary point of a seed, ready to be followed, or None where Newton's method leads elsewhere."""
     axis = (plane.x, plane.y)[seed.axis]
     tol = settings.steps.mesh_error
-    direction = replace(along(axis.name, 1), log=(axis.log,))
-    if not axis.log:
-        direction = replace(direction, vectors=np.full((1, 1, 1), axis.span))
+    direction = along(axis.name, 1, log=axis.log, unit=1.0 if axis.log else axis.span)
     points = polish(
         model, seed.p[:, None], seed.orbit, np.array([seed.rho]), direction, tol=tol, max_mesh=settings.max_mesh
     )
@@ -323,7 +320,7 @@ def unexplained(model: GeneratedModel, found: StabilityMap, atlas: Atlas) -> Arr
     return np.array(left, dtype=int).reshape(-1, 2)
 
 
-# Folds of the forced state, which a map shows only by what is missing: where a stable state ends, no neighbour tells.
+# Folds of the forced periodic state. A map shows them only indirectly: a stable state ends, and its neighbour has none.
 
 FINEST = 2.0**-12  # of the way to the neighbour: where the halving of steps ends
 NEAR = 0.5  # in logarithms, or V, or um: a larger step of the state is not taken for the same state

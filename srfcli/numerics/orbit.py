@@ -1,4 +1,4 @@
-"""Forced periodic states: Newton's method on the condensed collocation equations, for one parameter point or a batch."""
+"""Forced periodic states: first guesses, Newton's method on the condensed collocation equations, and a robust search."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from srfcli.numerics.collocation import (
     condense,
     gauss,
     kernel,
+    mesh_error,
     newton_orbits,
     respond,
     solved,
@@ -234,3 +235,81 @@ def newton_step(model: GeneratedModel, p: Array, orbit: Discretisation) -> tuple
     dx, dstages = (change[..., 0] for change in respond(linear, head))
     finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(dx).all(axis=(-1, -2))
     return linear, dx, dstages, finite & np.isfinite(dstages).all(axis=(-1, -2, -3))
+
+
+# Orbits wherever they can be found: from guesses, from each other, or by raising eps from 0.
+
+FIRST_CLIMB, SMALLEST_CLIMB = 0.25, 2e-3  # steps in which eps is raised to its value, as shares of it
+CLIMBING = 12  # Newton steps at each
+ALMOST = 1 - 1e-12  # of eps
+ROUGHEST = 0.1  # estimated error of a climbed state's multipliers on its mesh; the true one is a hundredth of that
+
+
+def growth(batch: OrbitBatch) -> tuple[ComplexArray, Array]:
+    """Return the multipliers and ln |leading multiplier| of a batch, NaN where the orbit was not found."""
+    multipliers = batch.multipliers
+    return multipliers, np.log(np.abs(multipliers[:, 0]))
+
+
+def robust_orbits(
+    model: GeneratedModel, p: Array, guess: Discretisation | None, edges: Array, *, tol: float = 1e-7
+) -> OrbitBatch:
+    """Return orbits at `p`, from `guess`, else from the linear response, else by raising eps in steps."""
+    batch = solve_orbits(model, p, guess or forced_guess(model, p, edges), tol=tol, max_iterations=14 if guess else 40)
+    if guess is not None and not batch.converged.all():
+        bad = np.nonzero(~batch.converged)[0]
+        batch.replace(bad, solve_orbits(model, p[:, bad], forced_guess(model, p[:, bad], edges), tol=tol))
+    if not batch.converged.all():
+        bad = np.nonzero(~batch.converged)[0]
+        batch.replace(bad, climbed(model, p[:, bad], edges, tol=tol))
+    return batch
+
+
+def line_orbits(
+    model: GeneratedModel, p: Array, position: Array, guess: Discretisation | None, edges: Array
+) -> OrbitBatch:
+    """Return what `robust_orbits` does at points in order, at rising `position` (B,) along a line.
+
+    A few that are spread over the line come first; the others start from what was found around them.
+    """
+    count, stride = p.shape[1], STRIDE
+    while stride > 1 and count < stride * NEIGHBOURS:  # fewer to start from would foretell little
+        stride //= 2
+    first, *later = levels(count, stride)
+    orbits = OrbitBatch.empty(p, edges, len(model.states))
+    orbits.replace(first, robust_orbits(model, p[:, first], None if guess is None else guess.part(first), edges))
+    for level in later:
+        known = np.nonzero(orbits.converged)[0]
+        near = between(orbits.orbit.part(known), position[known], position[level]) if known.size else None
+        orbits.replace(level, robust_orbits(model, p[:, level], near, edges))
+    return orbits
+
+
+def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7) -> OrbitBatch:
+    """Return orbits at `p` (n_parameters, B) by raising eps from 0, each in steps of its own that are halved where one fails.
+
+    One that the mesh is too coarse for has not converged: a finer one may be climbed to.
+    """
+    eps, calm = p[model.index("eps")], model.with_values(p, eps=0.0)
+    batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=tol)
+    slope = batch.orbit.unchanged()
+    reached, step = np.zeros(p.shape[1]), np.full(p.shape[1], FIRST_CLIMB)
+    going = batch.converged.copy()
+    while going.any():
+        at = np.nonzero(going)[0]
+        step[at] = np.minimum(step[at], 1.0 - reached[at])
+        q = model.with_values(p[:, at], eps=eps[at] * (reached[at] + step[at]))
+        before = batch.orbit.part(at)
+        found = solve_orbits(model, q, before + step[at] * slope.part(at), tol=tol, max_iterations=CLIMBING)
+        new, got, lost = np.nonzero(found.converged)[0], at[found.converged], at[~found.converged]
+        change = (found.orbit.part(new) - before.part(new)) / step[got]
+        slope.x[got], slope.stages[got] = change.x, change.stages
+        batch.replace(got, found.part(new))
+        reached[got] += step[got]
+        step[got] *= 1.5
+        step[lost] /= 2
+        going = batch.converged & (reached < ALMOST) & (step > SMALLEST_CLIMB)
+    batch.p[:] = p
+    batch.converged &= reached >= ALMOST
+    batch.converged[batch.converged] = mesh_error(model, batch.orbit)[batch.converged] < ROUGHEST
+    return batch

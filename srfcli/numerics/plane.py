@@ -16,8 +16,6 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError
 
-# A window in the plane of two parameters, mapped to the unit square in which arclength is measured.
-
 INSIDE = 1 - 1e-9  # of the window: its far edge as seen from within
 
 
