@@ -23,7 +23,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, lru_cache, singledispatch
+from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -246,49 +246,30 @@ def _safe(name: str) -> str:
     return name if name in _POINTERS else f"q_{name}"
 
 
-@singledispatch
 def _text(node: ast.AST) -> str:
+    """Return an expression of plain numbers as C."""
+    match node:
+        case ast.Constant(value=int() | float() as value):
+            return repr(float(value))
+        case ast.Name(id=name):
+            return _PI if name == "pi" else _safe(name)
+        case ast.Subscript(value=ast.Name(id=name), slice=ast.Constant(value=int() as index)):
+            return f"{name}[{index}]"
+        case ast.Subscript(value=ast.Name(id=name), slice=ast.Tuple(elts=[*_, ast.Constant(value=int() as index)])):
+            return f"{name}[{index}]"
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return f"(-{_text(operand)})"
+        case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+            return _text(operand)
+        case ast.BinOp(op=ast.Pow()):
+            return f"pow({_text(node.left)}, {_text(node.right)})"
+        case ast.BinOp():
+            return f"({_text(node.left)} {_OPERATORS[type(node.op)]} {_text(node.right)})"
+        case ast.Call(func=ast.Name(id=name)) if name in _FUNCTIONS:
+            return f"{_FUNCTIONS[name]}({', '.join(map(_text, node.args))})"
+        case ast.Call(func=ast.Name(id=name)):
+            raise NoForm(f"function {name} of a generated module has no form in C")
     raise NoForm(f"{type(node).__name__} in a generated function has no form in C")
-
-
-@_text.register
-def _(node: ast.Constant) -> str:
-    assert isinstance(node.value, (int, float))
-    return repr(float(node.value))
-
-
-@_text.register
-def _(node: ast.Name) -> str:
-    return _PI if node.id == "pi" else _safe(node.id)
-
-
-@_text.register
-def _(node: ast.Subscript) -> str:
-    index = node.slice.elts[-1] if isinstance(node.slice, ast.Tuple) else node.slice
-    assert isinstance(node.value, ast.Name) and isinstance(index, ast.Constant) and isinstance(index.value, int)
-    return f"{node.value.id}[{index.value}]"
-
-
-@_text.register
-def _(node: ast.UnaryOp) -> str:
-    assert isinstance(node.op, (ast.USub, ast.UAdd))
-    return f"(-{_text(node.operand)})" if isinstance(node.op, ast.USub) else _text(node.operand)
-
-
-@_text.register
-def _(node: ast.BinOp) -> str:
-    left, right = _text(node.left), _text(node.right)
-    if isinstance(node.op, ast.Pow):
-        return f"pow({left}, {right})"
-    return f"({left} {_OPERATORS[type(node.op)]} {right})"
-
-
-@_text.register
-def _(node: ast.Call) -> str:
-    assert isinstance(node.func, ast.Name)
-    if node.func.id not in _FUNCTIONS:
-        raise NoForm(f"function {node.func.id} of a generated module has no form in C")
-    return f"{_FUNCTIONS[node.func.id]}({', '.join(_text(a) for a in node.args)})"
 
 
 # Integrator, filter and periodic orbits in C, compiled with a model's own rates by what C compiler there is, kept by content.

@@ -1,10 +1,14 @@
-"""Law files: TOML in the format `srf-law/1` to law values, and the commented files that `srf law new` writes."""
+"""Law files: TOML in the format `srf-law/1` to law values, and the commented files that `srf law new` writes.
+
+The error for a file that breaks the format names the file, the key, what was found and what was expected.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -17,8 +21,6 @@ from srfcli.laws.values import AgeingLaw, AgeingModifier, Check, Effect, Frictio
 
 if TYPE_CHECKING:
     import sympy
-
-# Law files: TOML in the format `srf-law/1` to law values; a breach names file, key, what was found and expected.
 
 FORMAT = "srf-law/1"
 KINDS = ("friction", "ageing", "modifier", "interface")
@@ -148,6 +150,17 @@ class LawReader:
     def fail(self, key: str, message: str, hint: str | None = None) -> NoReturn:
         raise SrfError(f"{self.path}: {key}: {message}", hint)
 
+    @contextlib.contextmanager
+    def placed(self, key: str = "") -> Iterator[None]:
+        """Write the file, and the key, in front of an error that is raised inside."""
+        where = f"{self.path}: {key}: " if key else f"{self.path}: "
+        try:
+            yield
+        except ExpressionError as error:
+            raise ExpressionError(where + error.message, error.hint, text=error.text, column=error.column) from None
+        except SrfError as error:
+            raise SrfError(where + error.message, error.hint) from None
+
     def keys(self, where: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
         for key in table:
             if key not in tuple(known):
@@ -187,7 +200,8 @@ class LawReader:
         return name
 
     def law(self) -> Law:
-        kind, key = self.kind(), FORMULA[self.kind()]
+        kind = self.kind()
+        key = FORMULA[kind]
         self.keys("", self.table, (*_COMMON_KEYS, key, *(("states",) if kind == "friction" else ())))
         common: dict[str, Any] = {
             "name": self.name(),
@@ -199,19 +213,15 @@ class LawReader:
         if kind == "friction":
             common["states"] = self.states()
         states = common.get("states", ())
-        try:
+        with self.placed():
             check_parameters(common["parameters"], kind=kind, states=states)
             check_states(states, common["parameters"])
-        except SrfError as error:
-            raise SrfError(f"{self.path}: {error.message}", error.hint) from None
         names = known_symbols(kind, (p.name for p in common["parameters"]), states)
         common["checks"] = self.checks(key, names)
         common[key] = self.formula(key, kind, names)
         law = LAW_CLASSES[kind](**common)
-        try:
+        with self.placed():
             check_uses(law)
-        except SrfError as error:
-            raise SrfError(f"{self.path}: {error.message}", error.hint) from None
         return law
 
     def formula(self, key: str, kind: str, names: tuple[str, ...]) -> sympy.Expr | None:
@@ -224,11 +234,9 @@ class LawReader:
             if key in self.table.get("parameters", {}):
                 hint = "It stands below [parameters]; move it above the first [table]."
             self.fail(key, "missing", hint)
-        try:
-            return parse_expression(self.text(key), names)
-        except ExpressionError as error:
-            message = f"{self.path}: {key}: {error.message}"
-            raise ExpressionError(message, error.hint, text=error.text, column=error.column) from None
+        text = self.text(key)
+        with self.placed(key):
+            return parse_expression(text, names)
 
     def cites(self) -> tuple[str, ...]:
         cites = self.table.get("cites", [])

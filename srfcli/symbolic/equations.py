@@ -319,9 +319,7 @@ class _Builder:
     def along(self) -> list[tuple[sp.Symbol, sp.Expr]]:
         """Return the unknowns beside v and the ages that a formula may hold, and their rates."""
         s, system = symbol, self.system
-        found = [(s(a), self.aux_rate(a)) for a in self.aux] + [
-            (s(e.name), self.extra_rate(e)) for e in self.extras
-        ]
+        found = [(s(a), self.aux_rate(a)) for a in self.aux] + [(s(e.name), self.extra_rate(e)) for e in self.extras]
         if system.inertia:
             found.append((s("u"), self.V - (s("z") if system.elastic else s("v"))))
         return found
