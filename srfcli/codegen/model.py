@@ -87,7 +87,7 @@ class GeneratedModel:
             merged[name] = value
         return np.array(np.broadcast_arrays(*merged.values()), dtype=float)
 
-    def with_values(self, p: NDArray[Any], **values: Any) -> NDArray[Any]:
+    def with_values(self, p: NDArray[Any], /, **values: Any) -> NDArray[Any]:
         """Return a copy of `p` (n_parameters, ...) with other values of some parameters, broadcast to their shape (...)."""
         shape = np.broadcast_shapes(p.shape[1:], *(np.shape(value) for value in values.values()))
         moved = np.empty((len(p), *shape))

@@ -258,13 +258,13 @@ def _name(function: Callable[..., Any], name: str | None, what: str, example: st
 
 
 def _told(function: Callable[..., Any], about: str) -> dict[str, Any]:
-    """Return what is told of a function's law, else the first line of its docstring, and the file that it stands in."""
+    """Return the description of a function's law, which is the first line of its docstring by default, and its source file."""
     first_line = (inspect.getdoc(function) or "").split("\n")[0]
     return {"about": about or first_line, "source": inspect.getsourcefile(function) or ""}
 
 
 def _called(function: Callable[..., Any], variables: list[str], parameters: tuple[str, ...]) -> Any:
-    """Return what a function makes of symbols: its arguments are `variables`, and p, the `parameters`."""
+    """Return the result of a function called with symbols: some of `variables` by name, and p, the `parameters`."""
     arguments: dict[str, Any] = {}
     for argument in inspect.signature(function).parameters:
         if argument != "p" and argument not in variables:
@@ -297,7 +297,7 @@ def _formula(function: Callable[..., Any], kind: str, parameters: tuple[Paramete
 def _changes(
     function: Callable[..., Any], parameters: Iterable[str], known: tuple[str, ...], states: tuple[str, ...]
 ) -> tuple[tuple[tuple[str, sympy.Expr], ...], tuple[ExtraState, ...]]:
-    """Return what an effect's function makes of each slot, and the unknowns that it adds."""
+    """Return the formula that an effect's function gives for each slot, and the unknowns that it adds."""
     where, own, variables = function.__name__, tuple(parameters), [n for n in known if n not in tuple(parameters)]
     result = _called(function, variables, own)
     if not isinstance(result, Mapping):

@@ -156,7 +156,7 @@ def parse_expression(text: str, known: Iterable[str]) -> sp.Expr:
 
 
 class _Reader:
-    """One formula on its way from text to sp."""
+    """One formula on its way from text to sympy."""
 
     def __init__(self, text: str, known: Iterable[str]) -> None:
         self.text = text

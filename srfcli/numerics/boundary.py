@@ -77,7 +77,7 @@ def _less_state(condensed: Condensed) -> Array:
 def _linearise(
     model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array
 ) -> tuple[Condensed, BoundaryLinear]:
-    """Return what the compiled equations are, in NumPy."""
+    """Return the condensed collocation equations and, in NumPy, the linearisation that the compiled equations give."""
     condensed = condense(model, p, orbit, names)
     values, right_vectors = np.linalg.eig(condensed.monodromy)
     values, right_vectors = values.astype(complex), right_vectors.astype(complex)
@@ -387,7 +387,7 @@ def _step(model: GeneratedModel, r: _Polished, index: Array, direction: Directio
 
 
 def _renew(model: GeneratedModel, r: _Polished, direction: Direction, tol: float) -> None:
-    """Bring multipliers and slopes up to date, in place, where those before the last step would show.
+    """Compute multipliers and slopes anew, in place, where those from before the last Newton step are not accurate enough.
 
     That is everywhere at a tight tolerance, and beside folds, where the slope may have the wrong sign.
     """

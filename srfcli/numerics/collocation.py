@@ -186,6 +186,11 @@ class Discretisation:
     __array_ufunc__ = None  # an array on the left leaves the product to __rmul__
 
     @property
+    def intervals(self) -> int:
+        """Return the number of intervals, N."""
+        return len(self.edges) - 1
+
+    @property
     def steps(self) -> Array:
         """Return the interval lengths, (N,)."""
         return np.diff(self.edges)

@@ -27,7 +27,7 @@ STEP, LARGEST, SMALLEST, TOLERANCE = 1e-6, 0.7, 1e-4, 1e-9
 
 @dataclass(frozen=True)
 class Observables:
-    """What an experiment at low velocity V knows: friction, -d mu_ss/d ln V, critical load (N) and frequency (rad/s) there."""
+    """What an experiment at a low velocity V measures: friction, -d mu_ss/d ln V, critical load (N) and frequency (rad/s)."""
 
     V: float
     friction: float

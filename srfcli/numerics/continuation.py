@@ -23,7 +23,7 @@ from srfcli.numerics.boundary import BoundaryPoint, Direction, largest_other, po
 from srfcli.numerics.collocation import Discretisation, by_mesh, mesh_error, stack
 from srfcli.numerics.critical import INTERVALS, LineScan, locate_crossings, scan_line
 from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
-from srfcli.numerics.plane import Plane, passes
+from srfcli.numerics.plane import Plane, meets, passes
 
 STALE = 0.3  # of the step: a larger correction, in the same norm, spoils the tangent
 ORBIT_SHARE = 0.1  # of the orbit's change in that norm
@@ -254,7 +254,7 @@ def follow(
 
 def remeshed(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: StepSettings) -> CurvePoint | None:
     """Return `point` on a finer mesh where its own is too coarse, on a coarser one that suffices, None where it may stay."""
-    N, error = len(point.orbit.edges) - 1, float(mesh_error(model, point.orbit))
+    N, error = point.orbit.intervals, float(mesh_error(model, point.orbit))
     mesh = suited_mesh(error, N, settings)
     if (error <= settings.mesh_error and mesh > COARSER * N) or mesh == N:
         return None
@@ -503,12 +503,10 @@ def _heights(curves: list[Curve], x: float) -> list[tuple[float, bool]]:
     found = []
     for curve in curves:
         q = curve.q
-        for k in range(len(q) - 1):
-            a, b = q[k], q[k + 1]
-            if min(a[0], b[0]) - 1e-9 <= x <= max(a[0], b[0]) + 1e-9 and a[0] != b[0]:
-                share = np.clip((x - a[0]) / (b[0] - a[0]), 0.0, 1.0)
+        for k, share, height in zip(*meets(q, x), strict=True):
+            if q[k, 0] != q[k + 1, 0]:
                 nearest = curve.points[k if share < 0.5 else k + 1]
-                found.append((float(a[1] + share * (b[1] - a[1])), nearest.slope_y > 0))
+                found.append((float(height), nearest.slope_y > 0))
     return found
 
 

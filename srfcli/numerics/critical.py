@@ -139,7 +139,7 @@ def locate_crossings(
             found.append(point)
             continue
         values = np.geomspace(lower / margin, upper * margin, 9)
-        finer = 2 * (len(scan.orbit.edges) - 1)
+        finer = 2 * scan.orbit.intervals
         again = scan_line(model, base, scan.name, values, intervals=finer, resolution=1e-6, tongues=False)
         found += locate_crossings(model, base, again, tol=tol, max_mesh=max_mesh, depth=depth + 1, outer=across)
     return _distinct(sorted(found, key=lambda q: q.value(model, scan.name)), model, scan.name)
@@ -432,7 +432,7 @@ def _samples(model: GeneratedModel, name: str, batch: OrbitBatch) -> LineScan:
 
 def _on_sufficient_mesh(model: GeneratedModel, batch: OrbitBatch) -> OrbitBatch:
     """Return the batch on a mesh that shows a growth rate as small as MESH_ERROR, up to FINEST intervals."""
-    N = len(batch.orbit.edges) - 1
+    N = batch.orbit.intervals
     if batch.converged.all():
         worst = mesh_error(model, batch.orbit).max(keepdims=True)
         mesh = int(wanted_mesh(worst, N, MESH_ERROR, FINEST)[0])
@@ -549,7 +549,7 @@ def _resonances(position: Array, scan: LineScan, resolution: float) -> tuple[Arr
     d, psi = scan.swing[:, 0], scan.swing[:, 1]
     low, high = np.fmin(psi[:-1], psi[1:]), np.fmax(psi[:-1], psi[1:])
     damping = np.fmin(-d[:-1], -d[1:])
-    most = 2 * np.pi * HARMONICS * (len(scan.orbit.edges) - 1)
+    most = 2 * np.pi * HARMONICS * scan.orbit.intervals
     with np.errstate(invalid="ignore"):
         usable = (damping > 0) & (damping < DAMPED) & (high < most) & (np.diff(position) > resolution)
     left, share = [], []

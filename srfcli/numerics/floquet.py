@@ -129,10 +129,6 @@ def solve_floquet(
     )
 
 
-def _intervals(batch: OrbitBatch) -> int:
-    return len(batch.orbit.edges) - 1
-
-
 def _split(edges: Array, intervals: int) -> Array:
     """Return the edges with each interval split evenly, so that there are at least so many."""
     parts = -(-intervals // (len(edges) - 1))
@@ -148,8 +144,8 @@ def _solved(model: GeneratedModel, p: Array, guess: Discretisation) -> OrbitBatc
 def _refined(model: GeneratedModel, batch: OrbitBatch, tol: float, max_mesh: int) -> tuple[OrbitBatch, float]:
     """Return one orbit on its mesh halved until the error is below `tol`, and that error; infinite where there is no orbit."""
     error = np.inf
-    while batch.converged[0] and error > tol and 2 * _intervals(batch) <= max_mesh:
-        fine = _solved(model, batch.p, interpolate(batch.orbit, _split(batch.orbit.edges, 2 * _intervals(batch))))
+    while batch.converged[0] and error > tol and 2 * batch.orbit.intervals <= max_mesh:
+        fine = _solved(model, batch.p, interpolate(batch.orbit, _split(batch.orbit.edges, 2 * batch.orbit.intervals)))
         after, before = (np.sort_complex(b.multipliers[0]) for b in (fine, batch))
         shift = (np.abs(after - before) / np.maximum(1.0, np.abs(after))).max()
         error = max(float(shift) / RELIED_ON, float(mesh_error(model, fine.orbit)[0])) + 1e-12
@@ -190,8 +186,8 @@ def climbed(model: GeneratedModel, p: Array, finest: int) -> tuple[OrbitBatch, f
         if not found.converged[0]:
             step /= 2
             continue
-        finer = 2 if mesh_error(model, found.orbit)[0] > WHILE_CLIMBING and 2 * _intervals(found) <= finest else 1
-        moved = interpolate(found.orbit, _laid(model, found.orbit, finer * _intervals(found)))
+        finer = 2 if mesh_error(model, found.orbit)[0] > WHILE_CLIMBING and 2 * found.orbit.intervals <= finest else 1
+        moved = interpolate(found.orbit, _laid(model, found.orbit, finer * found.orbit.intervals))
         again = solve_orbits(model, q, moved, tol=ROUNDED, max_iterations=CLIMBING)
         if again.converged[0]:
             found, before = again, interpolate(before, again.orbit.edges)

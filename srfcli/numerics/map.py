@@ -301,7 +301,7 @@ def _coarse(model: GeneratedModel, p: Array, task: TileTask) -> OrbitBatch:
 
 def _sufficient(model: GeneratedModel, batch: OrbitBatch, task: TileTask) -> int:
     """Return the intervals that keep the mesh's error below the settings', twice as many where an orbit was not found."""
-    N = len(batch.orbit.edges) - 1
+    N = batch.orbit.intervals
     if not batch.converged.all():  # a finer mesh may find what this one could not
         return min(2 * N, task.settings.finest)
     ratio = float(mesh_error(model, batch.orbit).max()) / task.settings.mesh_error
@@ -617,7 +617,7 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
     suspect[:, :2] += corner
     return {
         "leading": leading[:count].reshape(task.shape),
-        "mesh": np.array(len(samples.orbit.edges) - 1),
+        "mesh": np.array(samples.orbit.intervals),
         "extra_at": samples.at[count:] + corner,
         "extra_leading": leading[count:],
         "suspect": suspect,

@@ -29,7 +29,7 @@ from srfcli.numerics.continuation import (
 from srfcli.numerics.critical import locate_crossings, scan_line
 from srfcli.numerics.map import Discontinuity, Seed, StabilityMap
 from srfcli.numerics.orbit import scales, solve_orbits, steady_guess
-from srfcli.numerics.plane import Axis, Plane
+from srfcli.numerics.plane import Axis, Plane, meets
 from srfcli.numerics.special_points import crossings_at
 
 DENSE = 12  # points of the cubic between two points of a curve, on which seeds are looked for
@@ -169,7 +169,7 @@ def _searched(model: GeneratedModel, axis: Axis, seed: Seed, settings: AtlasSett
     margin = (high / low) ** 0.5
     values = np.geomspace(low / margin, high * margin, 9)
     scan = scan_line(
-        model, seed.p, axis.name, values, intervals=2 * (len(seed.orbit.edges) - 1), resolution=settings.resolution
+        model, seed.p, axis.name, values, intervals=2 * seed.orbit.intervals, resolution=settings.resolution
     )
     return locate_crossings(model, seed.p, scan, tol=settings.steps.mesh_error, max_mesh=settings.max_mesh, depth=2)
 
@@ -264,17 +264,10 @@ def ends_state(traced: _Traced, discontinuity: Discontinuity) -> bool:
     return bool((near & traced.fold[index]).any())
 
 
-def _met(traced: _Traced, ends: Array, k: int) -> tuple[Array, Array]:
-    """Return the parts of a curve that meet the line along axis `k` through `ends`, and whether they do between these."""
-    other = 1 - k
-    a, b = traced.line[:-1], traced.line[1:]
-    at = ends[0, other]
-    low, high = ends[:, k].min(), ends[:, k].max()
-    near = (np.minimum(a[:, other], b[:, other]) - 1e-9 <= at) & (at <= np.maximum(a[:, other], b[:, other]) + 1e-9)
-    index = np.nonzero(near)[0]
-    run = b[index, other] - a[index, other]
-    share = np.clip((at - a[index, other]) / np.where(run == 0, 1.0, run), 0.0, 1.0)
-    height = a[index, k] + share * (b[index, k] - a[index, k])
+def _met(traced: _Traced, ends: Array, axis: int) -> tuple[Array, Array]:
+    """Return the parts of a curve that meet the line along `axis` through `ends`, and whether they do between these."""
+    index, _, height = meets(traced.line, ends[0, 1 - axis], axis)
+    low, high = ends[:, axis].min(), ends[:, axis].max()
     reach = 0.25 * (high - low) + CURVE_REACH
     return index, (height >= low - reach) & (height <= high + reach)
 

@@ -180,12 +180,7 @@ def step_limit(model: GeneratedModel, dx: Array, stages: Array) -> Array:
 
 
 def solve_orbits(
-    model: GeneratedModel,
-    p: Array,
-    guess: Discretisation,
-    *,
-    tol: float = 1e-9,
-    max_iterations: int = 40,
+    model: GeneratedModel, p: Array, guess: Discretisation, *, tol: float = 1e-9, max_iterations: int = 40
 ) -> OrbitBatch:
     """Return the periodic orbits at the parameter points `p` (n_parameters, B) from `guess`; finished ones leave the batch.
 

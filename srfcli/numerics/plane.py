@@ -85,6 +85,20 @@ def passes(line: Array, x: float) -> tuple[Array, Array]:
     return segments, a[:, 1] + (x - a[:, 0]) / (b[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
 
 
+def meets(line: Array, at: float, axis: int = 1) -> tuple[Array, Array, Array]:
+    """Return which segments of the polyline `line` (points, 2) touch the line along `axis` at the other coordinate `at`.
+
+    Their shares of the way at which they do, and the coordinates along `axis`, follow.
+    """
+    a, b, other = line[:-1], line[1:], 1 - axis
+    low, high = np.minimum(a[:, other], b[:, other]), np.maximum(a[:, other], b[:, other])
+    segments = np.nonzero((low - 1e-9 <= at) & (at <= high + 1e-9))[0]
+    a, b = a[segments], b[segments]
+    run = b[:, other] - a[:, other]
+    share = np.clip((at - a[:, other]) / np.where(run == 0, 1.0, run), 0.0, 1.0)
+    return segments, share, a[:, axis] + share * (b[:, axis] - a[:, axis])
+
+
 def polyline_heights(lines: Sequence[Array], at: Array) -> list[list[float]]:
     """Return for each unit coordinate `at` the heights, rising, at which polylines (points, 2) in unit coordinates pass it."""
     inside = np.minimum(at, INSIDE)  # a curve ends on the window's edge, not beyond

@@ -122,7 +122,7 @@ def mean_friction(model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mes
     ]
     while waiting:
         index, batch = waiting.pop()
-        N = len(batch.orbit.edges) - 1
+        N = batch.orbit.intervals
         error = np.where(batch.converged, mesh_error(model, batch.orbit), LOST)
         exponents, finished = growth(batch)[1], (error <= tol) | (max_mesh <= N)
         for j in np.nonzero(finished & batch.converged)[0]:

@@ -275,7 +275,7 @@ class _Chord:
         return point
 
 
-# Which way a Neimark-Sacker bifurcation opens: the cubic coefficient of its normal form, for the map over one forcing period.
+# The normal form of a Neimark-Sacker bifurcation, for the map over one forcing period: its first Lyapunov coefficient d.
 #
 # On the critical manifold the period map is z -> rho z + c z |z|^2 (Kuznetsov, Elements of Applied Bifurcation Theory, sec. 5.4),
 # so that ln|z| grows by g + d |z|^2 a period, d = Re(c/rho): a stable torus of amplitude sqrt(-g/d) beyond the boundary if d < 0,
@@ -288,17 +288,13 @@ CRITICALITY = "criticality"
 TOGETHER = 16  # points whose derivatives fit the cache
 
 
-def cubic_coefficient(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> Array:
-    """Return d (...,) of the critical multipliers `rho` at points of a boundary, per forcing period; NaN where they are real.
+def normal_form(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> tuple[Array, ComplexArray]:
+    """Return the first Lyapunov coefficient d (...,) per forcing period and the critical eigenvectors at tau = 0 (..., n).
 
-    `p` is (n_parameters, ...). The unit of z is such that the disturbance of ln v, 2 Re(z q(tau)), has mean |q|^2 = 1 over
-    the period. At the resonance 1:3 the coefficient has a pole; at 1:4 it does not tell the whole story.
+    `p` is (n_parameters, ...), `rho` the critical multipliers at points of a boundary; both results are NaN where they are
+    real. The eigenvectors are in the unit of z: the disturbance of ln v, 2 Re(z q(tau)), has mean |q|^2 = 1 over the period. At
+    the resonance 1:3 the coefficient has a pole; at 1:4 it does not tell the whole story.
     """
-    return critical_mode(model, p, orbit, rho)[0]
-
-
-def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> tuple[Array, ComplexArray]:
-    """Return d (...,) and the critical eigenvectors at tau = 0 (..., n), in the unit that d is in."""
     c, rho = condense(model, p, orbit), np.asarray(rho, dtype=complex)
     M, identity = c.monodromy, np.eye(orbit.x.shape[-1])
     values, vectors = np.linalg.eig(M)
@@ -356,13 +352,13 @@ def _forced(c: Condensed, sources: Sequence[ComplexArray]) -> list[tuple[Complex
 
 
 def branch_coefficients(model: GeneratedModel, branch: Branch) -> Array:
-    """Return d at every point of a branch, NaN where the critical multiplier is real."""
+    """Return the first Lyapunov coefficient at every point of a branch, NaN where the critical multiplier is real."""
     d, points = np.empty(len(branch.points)), branch.points
     for index in by_mesh([pt.orbit for pt in points]):
         for here in (index[a : a + TOGETHER] for a in range(0, len(index), TOGETHER)):
             p = np.stack([points[i].p for i in here], axis=1)
             rho = np.array([points[i].rho for i in here])
-            d[here] = cubic_coefficient(model, p, join([points[i].orbit for i in here]), rho)
+            d[here] = normal_form(model, p, join([points[i].orbit for i in here]), rho)[0]
     return d
 
 
@@ -376,6 +372,6 @@ def criticality_points(
             continue
 
         def coefficient(point: CurvePoint) -> float:
-            return float(cubic_coefficient(model, point.p, point.orbit, np.asarray(point.rho)))
+            return float(normal_form(model, point.p, point.orbit, np.asarray(point.rho))[0])
 
         yield locate(model, plane, branch, (k, k + 1), coefficient, what=CRITICALITY)
