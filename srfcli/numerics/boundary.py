@@ -125,10 +125,7 @@ def solve_boundary(
             matrix[~linear.good] = np.eye(n + d)
             solution = np.linalg.solve(matrix, right)
         except np.linalg.LinAlgError:  # one singular point spoils the batch
-            lost = np.full((B, n, n + 1 + len(names)), np.nan)
-            shapes = (B, n + d), orbit.x.shape, orbit.stages.shape
-            blank = (np.full((columns, *shape), np.nan) for shape in shapes)
-            return BoundaryLinear(lost, lost[:, 0, 0] + 0j, lost[:, 0], np.full(B, False), *blank)
+            return BoundaryLinear.unsolved(orbit, len(names), d, columns)
         first = np.broadcast_to(np.eye(columns)[0], (B, 1, columns))
         dx, dstages = respond(condensed, np.concatenate([solution[:, :n], first, rate @ solution[:, n:]], axis=1))
         linear.solution, linear.dx, linear.dstages = (np.moveaxis(a, -1, 0) for a in (solution, dx, dstages))

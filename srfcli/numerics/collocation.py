@@ -105,6 +105,15 @@ class BoundaryLinear:
     dx: Array
     dstages: Array
 
+    @classmethod
+    def unsolved(cls, orbit: Discretisation, parameters: int, distances: int, columns: int) -> BoundaryLinear:
+        """Return equations at orbits (B, N, ...) of which nothing holds yet."""
+        B, _, n = orbit.x.shape
+        shapes = (B, n + distances), orbit.x.shape, orbit.stages.shape
+        solution, dx, dstages = (np.full((columns, *shape), np.nan) for shape in shapes)
+        periodic, rho = np.full((B, n, n + 1 + parameters), np.nan), np.full(B, np.nan + 0j)
+        return cls(periodic, rho, periodic[:, 0].copy(), np.zeros(B, bool), solution, dx, dstages)
+
     @property
     def g(self) -> Array:
         """Return ln |rho|, (...,)."""
@@ -136,27 +145,19 @@ def linearised(
     `across` (B, d-1, n+d) closes them. Without a target only `periodic` is found.
     """
     which = np.array([model.index(name) for name in names], dtype=np.intc)
-    B, N, n = orbit.x.shape
+    B, N = orbit.x.shape[:2]
     k, d = len(which), 0 if rate is None else rate.shape[-1]
-    found = BoundaryLinear(
-        np.empty((B, n, n + 1 + k)),
-        np.full(B, np.nan + 0j),
-        np.full((B, n + 1 + k), np.nan),
-        np.empty(B, dtype=np.uint8),
-        np.full((columns, B, n + d), np.nan),
-        np.full((columns, *orbit.x.shape), np.nan) if d else np.empty(0),
-        np.full((columns, *orbit.stages.shape), np.nan) if d else np.empty(0),
-    )
+    found, good = BoundaryLinear.unsolved(orbit, k, d, columns), np.zeros(B, dtype=np.uint8)
     x, stages, parameters = (np.ascontiguousarray(a) for a in (orbit.x, orbit.stages, p.T))
     given = (None if a is None else np.ascontiguousarray(a) for a in (target, rate, across))
     done = library.srf_boundary(
         B, N, k, _at(which), d, columns, _at(orbit.phases), _at(orbit.steps), _at(parameters), _at(x), _at(stages),
         *[None if a is None else _at(a) for a in given], _at(found.periodic), _at(found.rho), _at(found.growth),
-        _at(found.solution), _at(found.dx), _at(found.dstages), _at(found.good),
+        _at(found.solution), _at(found.dx), _at(found.dstages), _at(good),
     )  # fmt: skip
     if not done:
         raise MemoryError
-    found.good = found.good.astype(bool)
+    found.good = good.astype(bool)
     return found
 
 
@@ -213,7 +214,7 @@ class Discretisation:
         return Discretisation(self.x[index], self.stages[index], self.edges)
 
     def unchanged(self) -> Discretisation:
-        """Return the change 0 of this orbit."""
+        """Return a change of 0 on this orbit's mesh."""
         return Discretisation(np.zeros_like(self.x), np.zeros_like(self.stages), self.edges)
 
     def __add__(self, other: Discretisation) -> Discretisation:

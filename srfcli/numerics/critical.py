@@ -377,11 +377,8 @@ class LineScan:
 
     def brackets(self) -> list[int]:
         """Return the indices i for which g changes sign between values[i] and values[i+1]."""
-        g = self.g
-        return [
-            int(i)
-            for i in np.nonzero(np.isfinite(g[:-1]) & np.isfinite(g[1:]) & (g[:-1] * g[1:] <= 0) & (g[:-1] != 0))[0]
-        ]
+        left, right = self.g[:-1], self.g[1:]
+        return np.nonzero(np.isfinite(left) & np.isfinite(right) & (left * right <= 0) & (left != 0))[0].tolist()
 
 
 def scan_line(

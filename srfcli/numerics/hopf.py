@@ -123,13 +123,9 @@ def _hurwitz(a: Array) -> Array:
     n = a.shape[-1] - 1
     scale = np.abs(a[..., :1] / a[..., -1:]) ** (1.0 / n)  # roots of order one
     b = a / a[..., -1:] / scale ** np.arange(n, -1, -1)
-    matrix = np.zeros((*a.shape[:-1], n - 1, n - 1))
-    for i in range(n - 1):
-        for j in range(n - 1):
-            k = n - (2 * (j + 1) - (i + 1))
-            if 0 <= k <= n:
-                matrix[..., i, j] = b[..., k]
-    return np.linalg.det(matrix)
+    i, j = np.indices((n - 1, n - 1))
+    k = n - (2 * (j + 1) - (i + 1))
+    return np.linalg.det(np.where((k >= 0) & (k <= n), b[..., np.clip(k, 0, n)], 0.0))
 
 
 def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
