@@ -28,8 +28,8 @@ from srfcli.laws.registry import load_registry
 from srfcli.numerics import continuation as atlas_module
 from srfcli.numerics.collocation import Discretisation
 from srfcli.numerics.continuation import Atlas, AtlasSettings, StepSettings, find_components
-from srfcli.numerics.critical import critical_line, growth, robust_orbits
-from srfcli.numerics.orbit import interpolate, uniform_mesh
+from srfcli.numerics.critical import critical_line
+from srfcli.numerics.orbit import growth, interpolate, robust_orbits, uniform_mesh
 from srfcli.numerics.plane import Axis, Plane
 
 AMPLITUDES = (0.13, 0.18, 0.25, 0.4)

@@ -28,11 +28,10 @@ from orbit import shoot
 
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.laws.registry import load_registry
-from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.floquet import solve_floquet
 from srfcli.numerics.map import StabilityMap, compute_map
 from srfcli.numerics.map_boundaries import find_boundaries
-from srfcli.numerics.orbit import forced_guess, solve_orbits, uniform_mesh
+from srfcli.numerics.orbit import forced_guess, robust_orbits, solve_orbits, uniform_mesh
 from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings
 
 EPS = 0.18

@@ -13,9 +13,9 @@ from scipy.integrate import solve_ivp
 
 from srfcli.cli.main import cli
 from srfcli.numerics.collocation import mesh_error
-from srfcli.numerics.critical import climbed, critical_line, robust_orbits
+from srfcli.numerics.critical import critical_line
 from srfcli.numerics.floquet import solve_floquet
-from srfcli.numerics.orbit import forced_guess, solve_orbits, uniform_mesh
+from srfcli.numerics.orbit import climbed, forced_guess, robust_orbits, solve_orbits, uniform_mesh
 
 EPS, V = 0.18, 8.0
 

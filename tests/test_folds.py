@@ -9,10 +9,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 from srfcli.numerics.continuation import AtlasSettings
-from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.map import KINDS, compute_map, settle
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
-from srfcli.numerics.orbit import solve_orbits, uniform_mesh
+from srfcli.numerics.orbit import robust_orbits, solve_orbits, uniform_mesh
 from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings
 from srfcli.numerics.special_points import special_points
 

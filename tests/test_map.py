@@ -9,11 +9,12 @@ import pytest
 from brute import Slider, shoot, steady
 
 from srfcli.core.errors import SrfError, Status
+from srfcli.numerics.collocation import solved
 from srfcli.numerics.continuation import AtlasSettings, StepSettings, find_components
-from srfcli.numerics.critical import critical_line, robust_orbits
+from srfcli.numerics.critical import critical_line
 from srfcli.numerics.map import KINDS, _suspects, compute_map, join_tiles, kinds, neighbours, per_slip, solve_tile
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
-from srfcli.numerics.orbit import uniform_mesh
+from srfcli.numerics.orbit import forced_guess, robust_orbits, steady_guess, uniform_mesh
 from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane, tile_tasks
 from srfcli.numerics.special_points import crossings_at, special_points
 
@@ -294,3 +295,28 @@ def test_a_ratio_moves_its_second_part(model):
     p[model.index("W0")] = loads
     assert axis.quantity(model, p) == pytest.approx(axis.samples())
     assert (axis.between(np.array([0.0, 6.0])) == [0.005, 0.03]).all()
+
+
+def test_other_values_leave_the_rest_as_it_is(model):
+    p = model.vector()
+    q = model.with_values(p, V=np.array([1.0, 2.0]), eps=0.1)
+    assert q.shape == (len(p), 2) and (q[model.index("V")] == [1.0, 2.0]).all() and (q[model.index("eps")] == 0.1).all()
+    rest = [i for i, name in enumerate(model.names) if name not in ("V", "eps")]
+    assert (q[rest] == p[rest, None]).all() and (p == model.vector()).all()
+
+
+def test_orbits_on_one_mesh_are_added_and_scaled_one_by_one(model):
+    p = model.vector({"V": np.array([5.0, 10.0]), "eps": 0.1})
+    a, b = forced_guess(model, p, uniform_mesh(8)), steady_guess(model, p, uniform_mesh(8))
+    half = np.array([0.5, 0.25]) * (a - b) + b
+    for k, share in enumerate((0.5, 0.25)):
+        one = share * (a.part(k) - b.part(k)) + b.part(k)
+        assert (half.part(k).x == one.x).all() and (half.part(k).stages == one.stages).all()
+    assert ((a - b) / np.array([2.0, 4.0])).x == pytest.approx((half - b).x)
+    assert not (a + a.unchanged() - a).stages.any()
+
+
+def test_a_singular_matrix_spoils_no_other():
+    matrices, right = np.stack([np.eye(2), np.ones((2, 2)), 2 * np.eye(2)]), np.ones((3, 2, 1))
+    found = solved(matrices, right)
+    assert (found[0] == 1.0).all() and np.isnan(found[1]).all() and (found[2] == 0.5).all()

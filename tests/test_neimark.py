@@ -14,7 +14,7 @@ from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.orbit import solve_orbits
 from srfcli.numerics.plane import Axis, Plane
-from srfcli.numerics.special_points import branch_coefficients, critical_mode, criticality_points, cubic_coefficient
+from srfcli.numerics.special_points import branch_coefficients, criticality_points, normal_form
 
 LAWS = [{}, {"law": "log-log"}, {"ageing": "ruina"}, {"law": "two-state"}, {"interface": "rigid"}, {"inertia": False}]
 
@@ -41,7 +41,7 @@ def test_without_modulation_it_is_the_lyapunov_coefficient(make_model, names, V)
         model, model.vector({"V": V, "eps": eps}), lo=0.98 * hopf.W0, hi=1.02 * hopf.W0, tol=1e-9, samples=12
     )
     [point] = line.points
-    d = cubic_coefficient(model, point.p, single(point), point.rho)
+    d = normal_form(model, point.p, single(point), point.rho)[0]
     assert d == pytest.approx(hopf.lyapunov * hopf.Omega / 120.0, rel=2e-3)
 
 
@@ -50,7 +50,7 @@ class Stroboscope:
 
     def __init__(self, model, p, orbit, rho):
         self.model, self.p, self.rest = model, p, orbit.x[0]
-        self.d, self.q = critical_mode(model, p, orbit, rho)
+        self.d, self.q = normal_form(model, p, orbit, rho)
         values, vectors = np.linalg.eig(condense(model, p, orbit).monodromy)
         left = np.linalg.inv(vectors)[int(np.argmin(np.abs(values - (rho.real + 1j * abs(rho.imag)))))]
         self.left = left / (left @ self.q)
@@ -118,4 +118,4 @@ def test_criticality_changes_where_the_coefficient_vanishes(model):
 
 def test_a_real_multiplier_has_none(model):
     point = crossing(model, 1, V=8.0, eps=0.09)
-    assert np.isnan(cubic_coefficient(model, point.p, single(point), complex(0.3)))
+    assert np.isnan(normal_form(model, point.p, single(point), complex(0.3))[0])

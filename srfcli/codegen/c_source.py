@@ -23,7 +23,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, lru_cache, singledispatch
+from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -52,76 +52,6 @@ _POINTERS = ("x", "p", "_w", "_a")  # arguments that are vectors
 _OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 _PI = "3.14159265358979323846"
 
-# a table is a cubic spline with evenly spaced knots: offset of its numbers in p, first knot, spacing, how many numbers
-TABLES = """
-static int srf_cell(const double *p, int i, double x, double *share) {
-    const double *head = p + NP + 4 * i;
-    double r = (x - head[1]) / head[2], last = head[3] - 3.0;
-    if (!(r > 0.0)) r = 0.0;
-    if (r > last) r = last;
-    int j = (int)r;
-    if (j > (int)last - 1) j = (int)last - 1;
-    *share = r - j;
-    return j;
-}
-static void srf_weights(double f, double *b, double *d, double *e) {
-    double g = 1.0 - f;
-    b[0] = g * g * g / 6.0; b[3] = f * f * f / 6.0;
-    b[1] = (4.0 - 6.0 * f * f + 3.0 * f * f * f) / 6.0; b[2] = 1.0 - b[0] - b[1] - b[3];
-    d[0] = -0.5 * g * g; d[3] = 0.5 * f * f; d[1] = -2.0 * f + 1.5 * f * f; d[2] = -d[0] - d[1] - d[3];
-    e[0] = g; e[3] = f; e[1] = 3.0 * f - 2.0; e[2] = 1.0 - 3.0 * f;
-}
-static double srf_spline(const double *p, int i, double x, int order) {
-    const double *head = p + NP + 4 * i;
-    if (head[3] < 4.0) return 0.0;
-    double f, w[3][4], sum = 0.0;
-    int j = srf_cell(p, i, x, &f);
-    if (order && (x < head[1] || x > head[1] + head[2] * (head[3] - 3.0))) return 0.0;
-    srf_weights(f, w[0], w[1], w[2]);
-    for (int k = 0; k < 4; k++) sum += w[order][k] * p[(int)head[0] + j + k];
-    return order == 0 ? sum : order == 1 ? sum / head[2] : sum / (head[2] * head[2]);
-}
-static double srf_lut(const double *p, double i, double x) { return srf_spline(p, (int)i, x, 0); }
-static double srf_lut1(const double *p, double i, double x) { return srf_spline(p, (int)i, x, 1); }
-static double srf_lut2(const double *p, double i, double x) { return srf_spline(p, (int)i, x, 2); }
-"""
-
-LAMBERTW = """
-static double srf_lambertw(double x) { /* principal branch, x > -1/e */
-    double w = x < 1.0 ? x / (1.0 + x) : log(x) - log(1.0 + log(x));
-    for (int i = 0; i < 50; i++) {
-        double e = exp(w), f = w * e - x, step = f / (e * (w + 1.0) - (w + 2.0) * f / (2.0 * w + 2.0));
-        w -= step;
-        if (fabs(step) <= 1e-15 * (1.0 + fabs(w))) break;
-    }
-    return w;
-}
-"""
-
-DUAL = """
-typedef double lanes __attribute__((vector_size(8 * LANES), may_alias));
-typedef struct { double v; lanes d; } dual; /* a number and its derivatives in LANES directions */
-static inline dual srf_scaled(double v, double s, dual a) { dual r = {v, s * a.d}; return r; }
-static inline dual srf_plain(double v) { dual r = {v, (lanes){0.0}}; return r; }
-static inline dual srf_add(dual a, dual b) { dual r = {a.v + b.v, a.d + b.d}; return r; }
-static inline dual srf_sub(dual a, dual b) { dual r = {a.v - b.v, a.d - b.d}; return r; }
-static inline dual srf_mul(dual a, dual b) { dual r = {a.v * b.v, a.v * b.d + b.v * a.d}; return r; }
-static inline dual srf_div(dual a, dual b) { double i = 1.0 / b.v, q = a.v * i; dual r = {q, i * (a.d - q * b.d)}; return r; }
-static inline dual srf_add_c(dual a, double b) { a.v += b; return a; }
-static inline dual srf_mul_c(dual a, double b) { return srf_scaled(a.v * b, b, a); }
-static inline dual srf_c_div(double a, dual b) { double q = a / b.v; return srf_scaled(q, -q / b.v, b); }
-static inline dual srf_pow_c(dual a, double b) {
-    if (b == 2.0) return srf_scaled(a.v * a.v, 2.0 * a.v, a);
-    double q = pow(a.v, b - 1.0);
-    return srf_scaled(q * a.v, b * q, a);
-}
-static inline dual srf_pow(dual a, dual b) {
-    double q = pow(a.v, b.v);
-    dual r = {q, q * (b.v / a.v * a.d + log(a.v) * b.d)};
-    return r;
-}
-static inline dual srf_c_pow(double a, dual b) { double q = pow(a, b.v); return srf_scaled(q, q * log(a), b); }
-"""
 _DUAL_OPERATORS = {
     ast.Add: "srf_add", ast.Sub: "srf_sub", ast.Mult: "srf_mul", ast.Div: "srf_div", ast.Pow: "srf_pow",
 }  # fmt: skip
@@ -135,7 +65,7 @@ _SLOPES = {  # of f at x where f(x) = v
 
 def dual_arithmetic(source: str) -> str:
     """Return the C text of dual numbers, with the functions that a generated module calls."""
-    text = DUAL
+    text = _own("dual.c")
     for name, known in _FUNCTIONS.items():
         if known in _SLOPES and f"{name}(" in source:
             body = f"double v = {known}(a.v); return srf_scaled(v, {_SLOPES[known]}, a);"
@@ -246,49 +176,30 @@ def _safe(name: str) -> str:
     return name if name in _POINTERS else f"q_{name}"
 
 
-@singledispatch
 def _text(node: ast.AST) -> str:
+    """Return an expression of plain numbers as C."""
+    match node:
+        case ast.Constant(value=int() | float() as value):
+            return repr(float(value))
+        case ast.Name(id=name):
+            return _PI if name == "pi" else _safe(name)
+        case ast.Subscript(value=ast.Name(id=name), slice=ast.Constant(value=int() as index)):
+            return f"{name}[{index}]"
+        case ast.Subscript(value=ast.Name(id=name), slice=ast.Tuple(elts=[*_, ast.Constant(value=int() as index)])):
+            return f"{name}[{index}]"
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return f"(-{_text(operand)})"
+        case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+            return _text(operand)
+        case ast.BinOp(op=ast.Pow()):
+            return f"pow({_text(node.left)}, {_text(node.right)})"
+        case ast.BinOp():
+            return f"({_text(node.left)} {_OPERATORS[type(node.op)]} {_text(node.right)})"
+        case ast.Call(func=ast.Name(id=name)) if name in _FUNCTIONS:
+            return f"{_FUNCTIONS[name]}({', '.join(map(_text, node.args))})"
+        case ast.Call(func=ast.Name(id=name)):
+            raise NoForm(f"function {name} of a generated module has no form in C")
     raise NoForm(f"{type(node).__name__} in a generated function has no form in C")
-
-
-@_text.register
-def _(node: ast.Constant) -> str:
-    assert isinstance(node.value, (int, float))
-    return repr(float(node.value))
-
-
-@_text.register
-def _(node: ast.Name) -> str:
-    return _PI if node.id == "pi" else _safe(node.id)
-
-
-@_text.register
-def _(node: ast.Subscript) -> str:
-    index = node.slice.elts[-1] if isinstance(node.slice, ast.Tuple) else node.slice
-    assert isinstance(node.value, ast.Name) and isinstance(index, ast.Constant) and isinstance(index.value, int)
-    return f"{node.value.id}[{index.value}]"
-
-
-@_text.register
-def _(node: ast.UnaryOp) -> str:
-    assert isinstance(node.op, (ast.USub, ast.UAdd))
-    return f"(-{_text(node.operand)})" if isinstance(node.op, ast.USub) else _text(node.operand)
-
-
-@_text.register
-def _(node: ast.BinOp) -> str:
-    left, right = _text(node.left), _text(node.right)
-    if isinstance(node.op, ast.Pow):
-        return f"pow({left}, {right})"
-    return f"({left} {_OPERATORS[type(node.op)]} {right})"
-
-
-@_text.register
-def _(node: ast.Call) -> str:
-    assert isinstance(node.func, ast.Name)
-    if node.func.id not in _FUNCTIONS:
-        raise NoForm(f"function {node.func.id} of a generated module has no form in C")
-    return f"{_FUNCTIONS[node.func.id]}({', '.join(_text(a) for a in node.args)})"
 
 
 # Integrator, filter and periodic orbits in C, compiled with a model's own rates by what C compiler there is, kept by content.
@@ -313,17 +224,23 @@ _ONE = threading.Lock()  # one thread writes and compiles at a time; Python 3.11
 TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
 
 
+def _own(name: str) -> str:
+    """Return the C text that stands beside this file."""
+    return (files("srfcli") / "codegen" / name).read_text(encoding="utf-8")
+
+
 def c_source(model: GeneratedModel) -> str:
     """Return the C text of the integrator for this model, and of the filter where it has a random friction field."""
-    head = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n"
+    text = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n"
     tables, functions = model.namespace.get("TABLES", ()), FUNCTIONS
     if tables:
-        head += f"#define NT {len(tables)}\n"
+        text += f"#define NT {len(tables)}\n"
         functions = FUNCTIONS | TABLE_FUNCTIONS
-    needs = (LAMBERTW if "lambertw(" in model.source else "") + (TABLES if tables else "")
-    body = "\n".join(c_function(model.source, name, label=label) for name, label in functions.items())
-    own = "".join((files("srfcli") / "codegen" / name).read_text(encoding="utf-8") for name in ("radau.c", "dop853.c"))
-    return head + needs + body + own + (_filter_source(model) if "field_gain" in model.namespace else "")
+    text += _own("lambertw.c") if "lambertw(" in model.source else ""
+    text += _own("tables.c") if tables else ""
+    text += "\n".join(c_function(model.source, name, label=label) for name, label in functions.items())
+    text += _own("radau.c") + _own("dop853.c")
+    return text + (_filter_source(model) if "field_gain" in model.namespace else "")
 
 
 def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_step: float) -> str:
@@ -335,7 +252,7 @@ def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_
     for name, array in scheme.items():
         sizes = "".join(f"[{n}]" for n in array.shape)
         text += f"static const double {name}{sizes} = {{{', '.join(repr(float(v)) for v in array.ravel())}}};\n"
-    text += LAMBERTW if "lambertw(" in model.source else ""
+    text += _own("lambertw.c") if "lambertw(" in model.source else ""
     text += "\n".join(c_function(model.source, name, label=label) for name, label in ORBIT_FUNCTIONS.items())
     calls = {"CYCLE_PARAMETER": "", "CYCLE_BILINEAR_PARAMETER": ""}
     for table in calls:
@@ -355,7 +272,7 @@ def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_
     }
     for table, (head, before, after) in forms.items():
         text += f"{head} {{\n{before}    switch (which) {{\n{calls[table]}    }}\n{after}}}\n"
-    return text + (files("srfcli") / "codegen" / "orbit.c").read_text(encoding="utf-8")
+    return text + _own("orbit.c")
 
 
 def _filter_source(model: GeneratedModel) -> str:
@@ -368,7 +285,7 @@ def _filter_source(model: GeneratedModel) -> str:
             text += c_function(model.source, name, label=label, dual=True)
         else:  # the spring as it is, where that is what the gauge shows
             text += f"#define {label} {DUAL_FUNCTIONS[name.replace('spring', 'reading')]}\n"
-    return text + (files("srfcli") / "codegen" / "filter.c").read_text(encoding="utf-8")
+    return text + _own("filter.c")
 
 
 @cache

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from types import CodeType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,8 @@ from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import read_plain
 from srfcli.core.settings import Parameter
 from srfcli.core.units import from_base, to_base
+from srfcli.laws.registry import Registry, reading
 from srfcli.laws.values import Law
-
-if TYPE_CHECKING:
-    from srfcli.laws.registry import Registry
 
 Array = NDArray[Any]
 COMPLEX_STEP = 1e-30  # no difference is taken, and its square is nothing against 1
@@ -88,6 +86,15 @@ class GeneratedModel:
             self.index(name)
             merged[name] = value
         return np.array(np.broadcast_arrays(*merged.values()), dtype=float)
+
+    def with_values(self, p: NDArray[Any], /, **values: Any) -> NDArray[Any]:
+        """Return a copy of `p` (n_parameters, ...) with other values of some parameters, broadcast to their shape (...)."""
+        shape = np.broadcast_shapes(p.shape[1:], *(np.shape(value) for value in values.values()))
+        moved = np.empty((len(p), *shape))
+        moved[...] = p.reshape(len(p), *(1,) * (len(shape) - p.ndim + 1), *p.shape[1:])
+        for name, value in values.items():
+            moved[self.index(name)] = value
+        return moved
 
     def check_changing_load(self, p: NDArray[np.float64]) -> None:
         """Raise SrfError, naming the parameter, where a value of 0 leaves the rates under a changing load without a value."""
@@ -183,12 +190,9 @@ def _source(registry: Registry, kind: str, name: str) -> tuple[Law, str]:
     """Return a law without its formula, and the hash of its source: a registered name or a file, as Registry.get takes them."""
     if name.endswith((".toml", ".py")):
         registry.check_trusted(name)
-        try:
-            return Law(name, source=name), hashlib.sha256(read_plain(Path(name), what="a law")).hexdigest()
-        except FileNotFoundError:
-            raise SrfError(f"no file {name}", "Give the path of a .toml or .py file.") from None
-        except OSError as error:
-            raise SrfError(f"{name}: cannot be read: {error.strerror}", "Check path and permissions.") from error
+        path = Path(name)
+        with reading(path):
+            return Law(name, source=name), hashlib.sha256(read_plain(path, what="a law")).hexdigest()
     entry = registry.find(kind, name)
     return Law(entry.name, about=entry.about, source=str(entry.location)), registry.fingerprint(entry)
 

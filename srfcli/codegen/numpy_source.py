@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -83,6 +82,12 @@ def joined(parts: Sequence[Staged]) -> Staged:
     return Staged(tuple(itertools.chain.from_iterable(p.outputs for p in parts)), tuple(steps.items()), parts[0].names)
 
 
+def side_by_side(columns: Sequence[Staged]) -> Staged:
+    """Return the entries of a matrix with these columns, which have grown from one, row by row."""
+    rows = zip(*(column.outputs for column in columns), strict=True)
+    return joined(columns).with_outputs(list(itertools.chain.from_iterable(rows)))
+
+
 def _total(formula: sp.Expr, rates: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
     moving = sorted(formula.free_symbols & rates.keys(), key=str)
     return sp.Add(*(sp.diff(formula, s) * rates[s] for s in moving))
@@ -117,7 +122,6 @@ class Writer:
         vectors: Sequence[str] = (),
         shape: str = "",
         state: bool = True,
-        dtype: str | None = None,
     ) -> None:
         """Write one function; `outputs` are (index text, expression), index '' returns the expression itself."""
         outputs = [(i, e) for i, e in outputs if e != 0 or i in ("", "0")]
@@ -127,13 +131,8 @@ class Writer:
         else:
             shared, reduced = sp.cse([e for _, e in outputs], symbols=sp.numbered_symbols("_"), order="canonical")
         used = {str(s) for e in [*(e for _, e in shared), *reduced] for s in e.free_symbols}
-        arguments = [
-            *head,
-            *(["x"] if state else []),
-            *tail,
-            "p",
-            *(f"_{w}" for w in vectors),
-        ]  # a law may have a parameter c
+        # with an underscore: a law may have a parameter c
+        arguments = [*head, *(["x"] if state else []), *tail, "p", *(f"_{w}" for w in vectors)]
         lines = [f"def {name}({', '.join(arguments)}):", f'    """{doc}"""']
         lines += [f"    {line}" for line in self._unpack(used - set(tail), vectors, state)]
         lines += [f"    {s} = {self.text(e)}" for s, e in shared]
@@ -148,15 +147,21 @@ class Writer:
             lines.append("    return out")
         self.parts.append("\n".join(lines))
 
-    def vector(self, name: str, doc: str, formulas: Staged, **more: Any) -> None:
-        """Write a function of one output for each unknown."""
-        self.function(name, doc, [(str(i), e) for i, e in enumerate(formulas.outputs)], steps=formulas.steps, **more)
+    def scalar(self, name: str, doc: str, formula: sp.Expr, **more: Any) -> None:
+        """Write a function of one number."""
+        self.function(name, doc, [("", formula)], **more)
 
-    def square(self, name: str, doc: str, formulas: Staged, **more: Any) -> None:
-        """Write a function of a square matrix of outputs, given row by row."""
-        n = len(self.equations.unknowns)
-        indexed = [(f"{k // n}, {k % n}", e) for k, e in enumerate(formulas.outputs)]
-        self.function(name, doc, indexed, steps=formulas.steps, shape=f"({n}, {n})", **more)
+    def vector(self, name: str, doc: str, formulas: Staged | Sequence[sp.Expr], **more: Any) -> None:
+        """Write a function of one output for each formula."""
+        outputs, steps = (formulas.outputs, formulas.steps) if isinstance(formulas, Staged) else (formulas, ())
+        indexed = [(str(i), e) for i, e in enumerate(outputs)]
+        self.function(name, doc, indexed, steps=steps, shape=f"({len(indexed)},)", **more)
+
+    def matrix(self, name: str, doc: str, formulas: Staged, columns: int, **more: Any) -> None:
+        """Write a function of a matrix of outputs, given row by row."""
+        indexed = [(f"{k // columns}, {k % columns}", e) for k, e in enumerate(formulas.outputs)]
+        rows = len(indexed) // columns
+        self.function(name, doc, indexed, steps=formulas.steps, shape=f"({rows}, {columns})", **more)
 
     def text(self, expression: sp.Expr) -> str:
         return self.printer.doprint(renamed(expression))
@@ -191,26 +196,37 @@ def generate(system: System) -> str:
         polynomial, forms = linear.polynomial_degree, linear.names
     _write_rates(writer, still)
     _write_cycle(writer, eq)
+    facts = {"ELASTIC": system.elastic, "INERTIA": system.inertia, "HOPF_DEGREE": polynomial}
+    meanings = "\n".join(f'    "{k}": {v!r},' for k, v in forms.items())
+    text = _module(writer, eq, _STATICS, facts, more=f"NAMES = {{\n{meanings}\n}}\n")
+    return f"{text}\n\n\n{_tables(writer.parameters)}"
+
+
+def _module(
+    writer: Writer,
+    eq: Equations,
+    about: str,
+    facts: Mapping[str, object],
+    *,
+    imports: str = "",
+    more: str = "",
+    last: str = "",
+) -> str:
+    """Return the text of a module: its constants `facts`, then `more`, the functions of `writer` behind `last`."""
     body = "\n\n\n".join(writer.parts)
-    helpers = "".join(h for name, h in HELPERS.items() if f"{name}(" in body)
-    names = [f for f in NUMPY_FUNCTIONS if re.search(rf"\b{f}\b", body)]
-    return (
-        _HEAD.format(
-            title=system.title,
-            names=", ".join(names),
-            helpers=helpers,
-            states=tuple_text(eq.names),
-            logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
-            parameters=parameter_rows(writer.declared),
-            elastic=system.elastic,
-            inertia=system.inertia,
-            polynomial=polynomial,
-            forms=textwrap.indent("\n".join(f'"{k}": {v!r},' for k, v in forms.items()), "    "),
-        )
-        + body
-        + "\n\n\n"
-        + _tables(writer.parameters)
+    states = "(" + ", ".join(f'"{name}"' for name in eq.names) + ",)"
+    constants = {"STATES": states, "LOGARITHMIC": tuple(map(bool, eq.logarithmic)), **facts}
+    head = _HEAD.format(
+        title=writer.system.title,
+        about=about,
+        names=", ".join(f for f in NUMPY_FUNCTIONS if re.search(rf"\b{f}\b", body)),
+        imports=imports,
+        constants="\n".join(f"{name} = {value}" for name, value in constants.items()),
+        parameters="\n".join(f"    {_parameter(p)}," for p in writer.declared),
+        more=more,
     )
+    helpers = "".join(text for name, text in HELPERS.items() if f"{name}(" in body)
+    return f"{head}{_EMPTY}{helpers}{last}\n\n{body}"
 
 
 def _at_constant_load(eq: Equations) -> Equations:
@@ -220,19 +236,9 @@ def _at_constant_load(eq: Equations) -> Equations:
     return replace(eq, rates=rates, steady=steady, **{n: getattr(eq, n).subs(none) for n in ("spring", "load", "mu")})
 
 
-def parameter_rows(parameters: Sequence[Parameter]) -> str:
-    """Return the rows of PARAMETERS."""
-    return "\n".join(f"    {_parameter(p)}," for p in parameters)
-
-
 def _parameter(p: Parameter) -> str:
     bounds = [repr(float(b)).replace("inf", 'float("inf")') for b in (p.lower, p.upper)]
     return f"({p.name!r}, {float(p.default)!r}, {p.unit!r}, {bounds[0]}, {bounds[1]}, {p.about!r})"
-
-
-def tuple_text(names: Sequence[str]) -> str:
-    """Return the text of a tuple of names."""
-    return "(" + ", ".join(f'"{n}"' for n in names) + ",)"
 
 
 def _tables(parameters: Sequence[str]) -> str:
@@ -241,56 +247,38 @@ def _tables(parameters: Sequence[str]) -> str:
     return f"CYCLE_PARAMETER = {{\n{rows}\n}}\n\nCYCLE_BILINEAR_PARAMETER = {{\n{bilinear}\n}}\n"
 
 
+def _write_steady(writer: Writer, eq: Equations) -> None:
+    steady = [sp.log(e) if log else e for e, log in zip(eq.steady, eq.logarithmic, strict=True)]
+    writer.vector("steady", "Steady sliding at V under W0.", steady, state=False)
+
+
 def _write_statics(writer: Writer, eq: Equations, linear: Linearisation) -> None:
-    n = len(eq.unknowns)
-    steady = [
-        (str(i), sp.log(e) if log else e) for i, (e, log) in enumerate(zip(eq.steady, eq.logarithmic, strict=True))
-    ]
-    writer.function("steady", "Steady sliding at V under W0.", steady, shape=f"({n},)", state=False)
+    _write_steady(writer, eq)
     at_rest = dict(zip(eq.unknowns, eq.steady, strict=True)) | {symbol("W"): symbol("W0")}
-    writer.function(
-        "steady_friction", "Friction coefficient in steady sliding at V.", [("", eq.mu.subs(at_rest))], state=False
-    )
-    slopes = [("0", linear.mu_v), *((str(i + 1), e) for i, e in enumerate(linear.mu_phi))]
-    writer.function(
-        "slopes",
-        "d mu/d ln v, then d mu/d ln phi for each state, in steady sliding.",
-        slopes,
-        shape=f"({len(slopes)},)",
-        state=False,
-    )
-    polynomial = [(str(i), e) for i, e in enumerate(linear.characteristic)]
-    writer.function(
-        "characteristic",
-        "Real coefficients a_0..a_n of the characteristic polynomial in s.",
-        polynomial,
-        shape=f"({len(polynomial)},)",
-        state=False,
-    )
+    doc = "Friction coefficient in steady sliding at V."
+    writer.scalar("steady_friction", doc, eq.mu.subs(at_rest), state=False)
+    doc = "d mu/d ln v, then d mu/d ln phi for each state, in steady sliding."
+    writer.vector("slopes", doc, [linear.mu_v, *linear.mu_phi], state=False)
+    doc = "Real coefficients a_0..a_n of the characteristic polynomial in s."
+    writer.vector("characteristic", doc, linear.characteristic, state=False)
     if linear.hurwitz is not None:
-        writer.function(
-            "hurwitz_in_load",
-            "Coefficients, lowest first, of the last Hurwitz determinant but one in W0.",
-            [(str(i), e) for i, e in enumerate(linear.hurwitz)],
-            shape=f"({len(linear.hurwitz)},)",
-            state=False,
-        )
+        doc = "Coefficients, lowest first, of the last Hurwitz determinant but one in W0."
+        writer.vector("hurwitz_in_load", doc, linear.hurwitz, state=False)
 
 
 def _write_statics_by_rates(writer: Writer, eq: Equations) -> None:
     """Write steady sliding and its linear stability with effects: the polynomial is that of the rates' Jacobian."""
-    steady = [(str(i), sp.log(e) if log else e) for i, (e, log) in enumerate(zip(eq.steady, eq.logarithmic, strict=True))]
-    writer.function("steady", "Steady sliding at V under W0.", steady, shape=f"({len(steady)},)", state=False)
+    _write_steady(writer, eq)
     at_rest = dict(zip(eq.unknowns, eq.steady, strict=True)) | {symbol("W"): symbol("W0"), symbol("W_dot"): sp.S.Zero}
     mu = eq.mu.subs(symbol("W"), eq.load)
     doc = "Friction coefficient in steady sliding at V."
-    writer.function("steady_friction", doc, [("", mu.subs(at_rest))], state=False)
+    writer.scalar("steady_friction", doc, mu.subs(at_rest), state=False)
     v, V, rest = symbol("v"), symbol("V"), eq.names.index("ln_v") + 1
     slopes = [(v * sp.diff(mu, v)).subs(at_rest)]
     for s, value in zip(eq.unknowns[rest:], eq.steady[rest:], strict=True):
         slopes.append(-sp.diff(mu, s).subs(at_rest) * V * sp.diff(value, V))
     doc = "d mu/d ln v, then what each other state takes from d mu/d ln V, in steady sliding."
-    writer.function("slopes", doc, [(str(i), e) for i, e in enumerate(slopes)], shape=f"({len(slopes)},)", state=False)
+    writer.vector("slopes", doc, slopes, state=False)
     writer.parts.append(_CHARACTERISTIC.format(V=writer.parameters.index("V"), W0=writer.parameters.index("W0")))
 
 
@@ -315,53 +303,39 @@ def _write_closed(writer: Writer, system: System) -> None:
             if limits.omega_squared is not None:
                 value = value.subs(Omega_squared, limits.omega_squared)
             value = ratio(*sp.fraction(value, exact=True))  # exact: exp(-V/Vc) stays above
-        writer.function(name, doc, [("", in_law_parameters(system, value))], state=False)
+        writer.scalar(name, doc, in_law_parameters(system, value), state=False)
 
 
 def rates_functions(writer: Writer, eq: Equations) -> Staged:
     """Write the rates under any drive and load, their derivatives, friction and elongation; return the rates."""
     rates, inputs = staged(eq.rates), ("V", "W", "W_dot")
     doc = "dx/dt under drive V, imposed load W and its rate W_dot."
-    writer.vector("rates", doc, rates, tail=inputs, shape=f"({len(eq.unknowns)},)")
-    writer.square("rates_jacobian", "d(rates)/dx.", _jacobian(eq, rates), tail=inputs)
+    writer.vector("rates", doc, rates, tail=inputs)
+    writer.matrix("rates_jacobian", "d(rates)/dx.", _jacobian(eq, rates), len(eq.unknowns), tail=inputs)
     _write_rates_by_parameters(writer, rates, inputs)
-    writer.function("friction", "Friction coefficient.", [("", eq.mu)], tail=inputs)
-    writer.function("elongation", "Spring elongation u.", [("", eq.spring)], tail=inputs)
+    writer.scalar("friction", "Friction coefficient.", eq.mu, tail=inputs)
+    writer.scalar("elongation", "Spring elongation u.", eq.spring, tail=inputs)
     return rates
 
 
 def _write_rates(writer: Writer, eq: Equations) -> None:
     """Write what a simulator needs (any drive and load) and the multilinear forms of the normal form at rest."""
-    rates, n = rates_functions(writer, eq), range(len(eq.unknowns))
-    shape = f"({len(n)},)"
+    rates = rates_functions(writer, eq)
     calm = rates.substituted({symbol("W"): symbol("W0"), symbol("W_dot"): sp.S.Zero})
-    a, b, c = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "abc")
+    a, b, c = ([sp.Symbol(f"_{k}{i}") for i in range(len(eq.unknowns))] for k in "abc")
     second = calm.derivative(_direction(eq, a)).derivative(_direction(eq, b))
+    doc = "Second derivative of the rates at constant load, in the directions a, b."
+    writer.vector("second", doc, second, vectors=("a", "b"))
     third = second.derivative(_direction(eq, c))
-    writer.vector(
-        "second",
-        "Second derivative of the rates at constant load, in the directions a, b.",
-        second,
-        vectors=("a", "b"),
-        shape=shape,
-    )
-    writer.vector(
-        "third",
-        "Third derivative of the rates at constant load, in the directions a, b, c.",
-        third,
-        vectors=("a", "b", "c"),
-        shape=shape,
-    )
+    doc = "Third derivative of the rates at constant load, in the directions a, b, c."
+    writer.vector("third", doc, third, vectors=("a", "b", "c"))
 
 
 def _write_rates_by_parameters(writer: Writer, rates: Staged, inputs: Sequence[str]) -> None:
     """Write d(rates)/dp, a column for each parameter, as a fit's sensitivity equations need it."""
     columns = [rates.derivative({symbol(name): sp.S.One}) for name in writer.parameters]
-    both = joined(columns)
-    n, m = len(rates.outputs), len(columns)
-    indexed = [(f"{i}, {j}", columns[j].outputs[i]) for i in range(n) for j in range(m)]
     doc = "d(rates)/dp, a column for each of PARAMETERS."
-    writer.function("rates_parameters", doc, indexed, steps=both.steps, tail=inputs, shape=f"({n}, {m})")
+    writer.matrix("rates_parameters", doc, side_by_side(columns), len(columns), tail=inputs)
 
 
 def _direction(eq: Equations, by: Sequence[sp.Expr]) -> dict[sp.Symbol, sp.Expr]:
@@ -379,9 +353,8 @@ def _gradient(eq: Equations, formulas: Staged) -> list[Staged]:
 
 def _jacobian(eq: Equations, formulas: Staged) -> Staged:
     """Return the Jacobian, row by row."""
-    columns = _gradient(eq, formulas)
-    entries = [column.outputs[i] for i in range(len(eq.unknowns)) for column in columns]
-    return joined(columns).with_outputs(entries if joined(columns).steps else [tidy(e) for e in entries])
+    whole = side_by_side(_gradient(eq, formulas))
+    return whole if whole.steps else whole.with_outputs([tidy(e) for e in whole.outputs])
 
 
 def _write_cycle(writer: Writer, eq: Equations) -> None:
@@ -396,41 +369,23 @@ def _write_cycle(writer: Writer, eq: Equations) -> None:
         mu = mu.subs(symbol("W"), eq.load)
     field = staged(eq.rates).substituted(load)
     field = field.with_outputs([e / f for e in field.outputs])
-    shape = f"({len(n)},)"
-    jacobian = _jacobian(eq, field)
-    head = ("tau",)
-    writer.vector(
-        "cycle", "dx/dtau over one forcing period, W = W0 (1 + eps cos 2 pi tau).", field, head=head, shape=shape
-    )
-    writer.square("cycle_jacobian", "d(cycle)/dx.", jacobian, head=head)
-    writer.function("cycle_friction", "Friction coefficient.", [("", mu.subs(load))], head=head)
-    writer.function("cycle_load", "Normal load W.", [("", eq.load.subs(load))], head=head)
-    writer.function("cycle_elongation", "Spring elongation u.", [("", eq.spring.subs(load))], head=head)
+    jacobian, head = _jacobian(eq, field), ("tau",)
+    writer.vector("cycle", "dx/dtau over one forcing period, W = W0 (1 + eps cos 2 pi tau).", field, head=head)
+    writer.matrix("cycle_jacobian", "d(cycle)/dx.", jacobian, len(n), head=head)
+    writer.scalar("cycle_friction", "Friction coefficient.", mu.subs(load), head=head)
+    writer.scalar("cycle_load", "Normal load W.", eq.load.subs(load), head=head)
+    writer.scalar("cycle_elongation", "Spring elongation u.", eq.spring.subs(load), head=head)
     w, a = ([sp.Symbol(f"_{k}{i}") for i in n] for k in "wa")
     entries = {(i, j): jacobian.outputs[len(n) * i + j] for i in n for j in n}
     form = jacobian.with_outputs([sum((w[i] * entries[i, j] * a[j] for i in n for j in n), sp.S.Zero)])
-    writer.vector(
-        "cycle_bilinear",
-        "Gradient over x of w . (d(cycle)/dx) a.",
-        joined(_gradient(eq, form)),
-        head=head,
-        vectors=("w", "a"),
-        shape=shape,
-    )
+    doc, pair = "Gradient over x of w . (d(cycle)/dx) a.", ("w", "a")
+    writer.vector("cycle_bilinear", doc, joined(_gradient(eq, form)), head=head, vectors=pair)
     for name in writer.parameters:
         by = {symbol(name): sp.S.One}
-        writer.vector(
-            f"cycle_d_{python_name(name)}", f"d(cycle)/d({name}).", field.derivative(by), head=head, shape=shape
-        )
-        slope = form.derivative(by)
-        writer.function(
-            f"cycle_bilinear_d_{python_name(name)}",
-            f"d/d({name}) of w . (d(cycle)/dx) a.",
-            [("", slope.outputs[0])],
-            steps=slope.steps,
-            head=head,
-            vectors=("w", "a"),
-        )
+        writer.vector(f"cycle_d_{python_name(name)}", f"d(cycle)/d({name}).", field.derivative(by), head=head)
+        slope, doc = form.derivative(by), f"d/d({name}) of w . (d(cycle)/dx) a."
+        own = f"cycle_bilinear_d_{python_name(name)}"
+        writer.scalar(own, doc, slope.outputs[0], steps=slope.steps, head=head, vectors=pair)
 
 
 _CHARACTERISTIC = '''def characteristic(p):
@@ -476,126 +431,81 @@ def positive_ratio(above, below):
 
 HELPERS = {"lambertw": _LAMBERTW, "positive_ratio": _RATIO, "principal_minors": _MINORS}
 
-_HEAD = '''"""Generated by srf from {title}.
-
-Arrays of any leading shape, real or complex; x[..., i] are the STATES, p[i] the PARAMETERS, units um, s, N.
-"""
-
-from numpy import asarray, iscomplexobj, result_type, zeros, broadcast_shapes
-from numpy import {names}
-
-STATES = {states}
-LOGARITHMIC = {logarithmic}
-ELASTIC = {elastic}
-INERTIA = {inertia}
-HOPF_DEGREE = {polynomial}
-PARAMETERS = (
-{parameters}
-)
-NAMES = {{
-{forms}
-}}
-
+_EMPTY = '''
 
 def _empty(like, trailing):
     """Zeros of the shape that the arguments share, with `trailing` axes added."""
     arrays = [a if hasattr(a, "dtype") else asarray(a) for a in like]
-    shapes = {{a.shape for a in arrays}}
+    shapes = {a.shape for a in arrays}
     common = shapes.pop() if len(shapes) == 1 else broadcast_shapes(*shapes)
-    return zeros(common + trailing, dtype=result_type(float, *{{a.dtype for a in arrays}}))
-{helpers}
-
+    return zeros(common + trailing, dtype=result_type(float, *{a.dtype for a in arrays}))
 '''
+
+_HEAD = '''"""Generated by srf from {title}.
+
+{about}
+"""
+
+from numpy import asarray, iscomplexobj, result_type, zeros, broadcast_shapes
+from numpy import {names}
+{imports}
+{constants}
+PARAMETERS = (
+{parameters}
+)
+{more}'''
+
+_STATICS = (
+    "Arrays of any leading shape, real or complex; x[..., i] are the STATES, p[i] the PARAMETERS, units um, s, N."
+)
+_MOTION = """Motion only. Arrays of any leading shape; x[..., i] are the STATES, p[i] the PARAMETERS, the numbers of tables \
+after them."""
 
 
 # The part of a generated module that motion in time needs, for systems with effects and tables; no stability analysis.
-
-_MOTION_HEAD = '''"""Generated by srf from {title}.
-
-Motion only. Arrays of any leading shape; x[..., i] are the STATES, p[i] the PARAMETERS, the numbers of tables after them.
-"""
-
-from numpy import asarray, iscomplexobj, result_type, zeros, broadcast_shapes
-from numpy import {names}
-{tables}
-STATES = {states}
-LOGARITHMIC = {logarithmic}
-TABLES = {arguments}
-OBSERVED = {observed!r}
-PARAMETERS = (
-{parameters}
-)
-
-
-def _empty(like, trailing):
-    """Zeros of the shape that the arguments share, with `trailing` axes added."""
-    arrays = [a if hasattr(a, "dtype") else asarray(a) for a in like]
-    shapes = {{a.shape for a in arrays}}
-    common = shapes.pop() if len(shapes) == 1 else broadcast_shapes(*shapes)
-    return zeros(common + trailing, dtype=result_type(float, *{{a.dtype for a in arrays}}))
-{helpers}
-
-'''
 
 
 def generate_motion(system: System) -> str:
     """Return the source of a module with steady state, rates and their derivatives by state, parameters and tables."""
     eq = equations_of(system)
     writer = Writer(system, eq)
-    steady = [
-        (str(i), sp.log(e) if log else e) for i, (e, log) in enumerate(zip(eq.steady, eq.logarithmic, strict=True))
-    ]
-    writer.function("steady", "Steady sliding at V under W0.", steady, shape=f"({len(steady)},)", state=False)
+    _write_steady(writer, eq)
     rates = rates_functions(writer, eq)
     unknown = {s: name for s, name in zip(eq.unknowns, eq.names, strict=True) if str(s) == name}
     inputs = ("V", "W", "W_dot")
-    writer.function("reading", "What the gauge shows of the elongation.", [("", eq.reading)], tail=inputs)
-    writer.function("stiffness", "Stiffness of the spring.", [("", eq.stiffness)], tail=inputs)
+    writer.scalar("reading", "What the gauge shows of the elongation.", eq.reading, tail=inputs)
+    writer.scalar("stiffness", "Stiffness of the spring.", eq.stiffness, tail=inputs)
     if RANDOM_FIELD in system.effects:
         _write_filter(writer, eq, rates)
     if system.tables:
         _write_tables(writer, system)
-    body = "\n\n\n".join(writer.parts)
-    return (
-        _MOTION_HEAD.format(
-            title=system.title,
-            names=", ".join(f for f in NUMPY_FUNCTIONS if re.search(rf"\b{f}\b", body)),
-            tables="from srfcli.codegen.splines import tables_after\n" if system.tables else "",
-            states=tuple_text(eq.names),
-            logarithmic=repr(tuple(bool(b) for b in eq.logarithmic)),
-            arguments=repr(system.tables),
-            observed=unknown.get(eq.reading, ""),
-            parameters=parameter_rows(system.parameters),
-            helpers="".join(h for name, h in HELPERS.items() if f"{name}(" in body)
-            + ("\nlut, lut1, lut2 = tables_after(len(PARAMETERS))\n" if system.tables else ""),
-        )
-        + body
-        + "\n"
-    )
+    facts = {"TABLES": system.tables, "OBSERVED": repr(unknown.get(eq.reading, ""))}
+    imports, last = "", ""
+    if system.tables:
+        imports = "from srfcli.codegen.splines import tables_after\n"
+        last = "\nlut, lut1, lut2 = tables_after(len(PARAMETERS))\n"
+    return _module(writer, eq, _MOTION, facts, imports=imports, last=last) + "\n"
 
 
 def _write_filter(writer: Writer, eq: Equations, rates: Staged) -> None:
     """Write what a Kalman filter asks for besides: where the field's white noise enters, and what a reading's gradient is."""
-    inputs, shape = ("V", "W", "W_dot"), f"({len(eq.unknowns)},)"
+    inputs = ("V", "W", "W_dot")
     gain = rates.derivative({symbol("field_noise"): sp.S.One})
-    writer.vector("field_gain", "d(rates)/d(field_noise).", gain, tail=inputs, shape=shape)
+    writer.vector("field_gain", "d(rates)/d(field_noise).", gain, tail=inputs)
     formulas = {"reading": eq.reading}
     if eq.shown != eq.reading:  # an effect of the gauge
         formulas["spring"] = eq.shown
-        writer.function("spring", "What a gauge without this effect shows of the elongation.", [("", eq.shown)], tail=inputs)
+        writer.scalar("spring", "What a gauge without this effect shows of the elongation.", eq.shown, tail=inputs)
     for name, formula in formulas.items():
-        gradient = [(str(j), eq.derivative(formula, j)) for j in range(len(eq.unknowns))]
-        writer.function(f"{name}_gradient", f"d({name})/dx.", gradient, tail=inputs, shape=shape)
+        gradient = [eq.derivative(formula, j) for j in range(len(eq.unknowns))]
+        writer.vector(f"{name}_gradient", f"d({name})/dx.", gradient, tail=inputs)
 
 
 def _write_tables(writer: Writer, system: System) -> None:
     """Write what each table is a function of, and the slopes of the rates by its value and its first derivative."""
     eq, inputs = equations_of(system), ("V", "W", "W_dot")
     names = [symbol(argument) for _, argument in system.tables]
-    writer.function(
-        "table_arguments", "What each table is a function of.", [(str(i), s) for i, s in enumerate(names)],
-        tail=inputs, shape=f"({len(names)},)",
-    )  # fmt: skip
+    writer.vector("table_arguments", "What each table is a function of.", names, tail=inputs)
     stand_ins = {}
     for i, s in enumerate(names):
         stand_ins[lut(sp.Integer(i), s)] = sp.Symbol(f"T{i}")
@@ -605,9 +515,5 @@ def _write_tables(writer: Writer, system: System) -> None:
     columns = []
     for i in range(len(names)):
         columns += [rates.derivative({sp.Symbol(f"T{i}"): sp.S.One}), rates.derivative({sp.Symbol(f"T{i}d"): sp.S.One})]
-    both = joined(columns).substituted(back)
-    n, m = len(eq.rates), len(columns)
-    place = {(i, j): both.outputs[j * n + i] for i in range(n) for j in range(m)}
-    indexed = [(f"{i}, {j}", place[i, j]) for i in range(n) for j in range(m)]
     doc = "d(rates)/d(value of table i) in column 2 i, by its slope in column 2 i + 1."
-    writer.function("rates_tables", doc, indexed, steps=both.steps, tail=inputs, shape=f"({n}, {m})")
+    writer.matrix("rates_tables", doc, side_by_side(columns).substituted(back), len(columns), tail=inputs)

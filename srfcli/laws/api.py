@@ -180,18 +180,15 @@ def effect(
     """
 
     def decorate(function: Callable[..., Any]) -> Effect:
-        own = name or function.__name__.replace("_", "-")
-        if not valid_name(own):
-            raise SrfError(f"effect name {own!r}: expected small letters, digits and single dashes", "Like my-effect.")
+        own = _name(function, name, "effect", "my-effect")
         listed, brought, needed = _parameter_list(parameters), tuple(states), tuple(needs)
         check_names(listed)
         sizes = dict(neutral or {})
         known = (*known_names([p.name for p in listed], brought, needed), *SLOTS)
         changes, extra = _changes(function, [*(p.name for p in listed), *COMMON, *needed], known, brought)
-        told = about or (inspect.getdoc(function) or "").split("\n")[0]
         return finished(
             Effect(
-                name=own, parameters=listed, about=told, cites=tuple(cites), source=inspect.getsourcefile(function) or "",
+                name=own, parameters=listed, cites=tuple(cites), **_told(function, about),
                 changes=changes, states=extra, neutral=tuple((n, float(v)) for n, v in sizes.items()),
                 scans=tuple((p.name, SCAN) for p in listed if p.name not in sizes), needs=needed, lacks=tuple(lacks),
                 observed=observed, constitutive=constitutive,
@@ -211,16 +208,13 @@ def reader(
     """Turn a function of a path, which returns a `Source` or a mapping from headings to arrays, into a `Reader`."""
 
     def decorate(function: Callable[[Path], Source | Mapping[str, Any]]) -> Reader:
-        own = name or function.__name__.replace("_", "-")
-        if not valid_name(own):
-            raise SrfError(f"reader name {own!r}: expected small letters, digits and single dashes", "Like my-logger.")
+        own = _name(function, name, "reader", "my-logger")
         endings = tuple(suffixes)
         if not all(isinstance(s, str) and s.startswith(".") for s in endings):
             raise SrfError(
                 f"reader '{own}': suffixes are {endings!r}", 'Write them with their dot: suffixes=(".dat",).'
             )
-        told = about or (inspect.getdoc(function) or "").split("\n")[0]
-        return Reader(own, function, endings, sniff, told, inspect.getsourcefile(function) or "")
+        return Reader(own, function, endings, sniff, **_told(function, about))
 
     return decorate
 
@@ -235,9 +229,7 @@ def _decorator(
     **more: Any,
 ) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
-        law_name = name or function.__name__.replace("_", "-")
-        if not valid_name(law_name):
-            raise SrfError(f"law name {law_name!r}: expected small letters, digits and single dashes", "Like my-law.")
+        law_name = _name(function, name, "law", "my-law")
         listed = _parameter_list(parameters)
         states = more.get("states", ())
         check_parameters(listed, kind=kind, states=states)
@@ -246,16 +238,41 @@ def _decorator(
         common: dict[str, Any] = {
             "name": law_name,
             "parameters": listed,
-            "about": about or (inspect.getdoc(function) or "").split("\n")[0],
             "cites": tuple(cites),
             "checks": tuple(checks),
-            "source": inspect.getsourcefile(function) or "",
+            **_told(function, about),
         }
         law = LAW_CLASSES[kind](**common, **more, **{FORMULA[kind]: _formula(function, kind, listed, known)})
         check_uses(law)
         return law
 
     return decorate
+
+
+def _name(function: Callable[..., Any], name: str | None, what: str, example: str) -> str:
+    """Return the name that an author gave, else that of the function; SrfError where it is no name."""
+    own = name or function.__name__.replace("_", "-")
+    if not valid_name(own):
+        raise SrfError(f"{what} name {own!r}: expected small letters, digits and single dashes", f"Like {example}.")
+    return own
+
+
+def _told(function: Callable[..., Any], about: str) -> dict[str, Any]:
+    """Return the description of a function's law, which is the first line of its docstring by default, and its source file."""
+    first_line = (inspect.getdoc(function) or "").split("\n")[0]
+    return {"about": about or first_line, "source": inspect.getsourcefile(function) or ""}
+
+
+def _called(function: Callable[..., Any], variables: list[str], parameters: tuple[str, ...]) -> Any:
+    """Return the result of a function called with symbols: some of `variables` by name, and p, the `parameters`."""
+    arguments: dict[str, Any] = {}
+    for argument in inspect.signature(function).parameters:
+        if argument != "p" and argument not in variables:
+            raise SrfError(
+                f"{function.__name__}: unknown argument '{argument}'", did_you_mean(argument, [*variables, "p"])
+            )
+        arguments[argument] = Symbols(parameters) if argument == "p" else symbol(argument)
+    return function(**arguments)
 
 
 def _parameter_list(parameters: Parameters) -> tuple[Parameter, ...]:
@@ -271,14 +288,7 @@ def _formula(function: Callable[..., Any], kind: str, parameters: tuple[Paramete
     own = [p.name for p in parameters]
     names = (*COMMON, *own) if kind in ("ageing", "modifier") else tuple(own)
     variables = [n for n in known if n not in names] if kind != "ageing" else list(AGEING_SYMBOLS)
-    arguments: dict[str, Any] = {}
-    for argument in inspect.signature(function).parameters:
-        if argument != "p" and argument not in variables:
-            raise SrfError(
-                f"{function.__name__}: unknown argument '{argument}'", did_you_mean(argument, [*variables, "p"])
-            )
-        arguments[argument] = Symbols(names) if argument == "p" else symbol(argument)
-    result = function(**arguments)
+    result = _called(function, variables, names)
     if result is None and kind == "interface":
         return None  # rigid
     return _exact(function.__name__, result, known)
@@ -287,14 +297,9 @@ def _formula(function: Callable[..., Any], kind: str, parameters: tuple[Paramete
 def _changes(
     function: Callable[..., Any], parameters: Iterable[str], known: tuple[str, ...], states: tuple[str, ...]
 ) -> tuple[tuple[tuple[str, sympy.Expr], ...], tuple[ExtraState, ...]]:
-    """Return what an effect's function makes of each slot, and the unknowns that it adds."""
+    """Return the formula that an effect's function gives for each slot, and the unknowns that it adds."""
     where, own, variables = function.__name__, tuple(parameters), [n for n in known if n not in tuple(parameters)]
-    arguments: dict[str, Any] = {}
-    for argument in inspect.signature(function).parameters:
-        if argument != "p" and argument not in variables:
-            raise SrfError(f"{where}: unknown argument '{argument}'", did_you_mean(argument, [*variables, "p"]))
-        arguments[argument] = Symbols(own) if argument == "p" else symbol(argument)
-    result = function(**arguments)
+    result = _called(function, variables, own)
     if not isinstance(result, Mapping):
         raise SrfError(f"{where}: returned {type(result).__name__}, expected a mapping", 'Like {"mu": mu + ...}.')
     for key, value in result.items():

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from srfcli.core.errors import ExpressionError, SrfError, did_you_mean
+from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
 from srfcli.core.units import describe, dimension, dimension_of, find_unit
 from srfcli.laws.expression import check_identifier, parse_expression, symbol
@@ -47,14 +47,12 @@ def check_names(parameters: Sequence[Parameter], constants: Sequence[Parameter] 
     for p in (*parameters, *constants):
         check_identifier(p.name, "parameter", taken=_TAKEN | names)
         names.add(p.name)
-    plain = [replace(p, name=f"own{i}") for i, p in enumerate((*parameters, *constants))]
-    for p, renamed in zip(
-        (*parameters, *constants), plain, strict=True
-    ):  # a drift's rate is called rate, a law's is not
+    for i, p in enumerate((*parameters, *constants)):
+        plain = f"own{i}"  # a drift's rate is called rate, a law's is not
         try:
-            check_parameters([renamed], kind="effect")
+            check_parameters([replace(p, name=plain)], kind="effect")
         except SrfError as error:
-            raise SrfError(error.message.replace(renamed.name, p.name), error.hint) from None
+            raise SrfError(error.message.replace(plain, p.name), error.hint) from None
 
 
 def finished(effect: Effect) -> Effect:
@@ -122,10 +120,8 @@ class EffectReader(LawReader):
         self.keys("", self.table, KEYS)
         self.kind()
         parameters, constants = self.parameters(), self.constants()
-        try:
+        with self.placed():
             check_names(parameters, constants)
-        except SrfError as error:
-            raise SrfError(f"{self.path}: {error.message}", error.hint) from None
         known = set(known_names((p.name for p in (*parameters, *constants)), self.state_names(), self.listed("needs")))
         neutral, scans = self.sizes()
         effect = Effect(
@@ -137,10 +133,8 @@ class EffectReader(LawReader):
             scaled=tuple(self.scaled(parameters)), on_request=self.flag("on_request", False),
             fixed=tuple(n for n, e in self.table.get("parameters", {}).items() if e.get("fixed")),
         )  # fmt: skip
-        try:
+        with self.placed():
             return finished(effect)
-        except SrfError as error:
-            raise SrfError(f"{self.path}: {error.message}", error.hint) from None
 
     def sizes(self) -> tuple[tuple[tuple[str, float], ...], tuple[tuple[str, int], ...]]:
         """Return the neutral values of the sizes, and at how many values each other parameter is tried."""
@@ -159,7 +153,9 @@ class EffectReader(LawReader):
                 continue
             if entry.get("fixed"):
                 if "scan" in entry:
-                    self.fail(f"{where}.scan", "given together with fixed", "What is never fitted is tried at no values.")
+                    self.fail(
+                        f"{where}.scan", "given together with fixed", "What is never fitted is tried at no values."
+                    )
                 continue
             count = self.number(f"{where}.scan", entry.get("scan", SCAN))
             if not (count.is_integer() and 1 <= count <= MOST):
@@ -179,16 +175,10 @@ class EffectReader(LawReader):
             for which, key, text in stated:
                 if not isinstance(text, str):
                     self.fail(f"{where}.{key}", f"found {text!r}, expected a formula in quotes")
-                try:
-                    formula = parse_expression(text, SCALES)
-                except ExpressionError as error:
-                    message = f"{self.path}: {where}.{key}: {error.message}"
-                    raise ExpressionError(message, error.hint, text=error.text, column=error.column) from None
                 units = {name: dimension(unit) for name, unit in SCALES.items()}
-                try:
+                with self.placed(f"{where}.{key}"):
+                    formula = parse_expression(text, SCALES)
                     found, wanted = dimension_of(formula, units), dimension(p.unit)
-                except SrfError as error:
-                    self.fail(f"{where}.{key}", error.message, error.hint)
                 if formula.free_symbols and found != wanted:
                     self.fail(f"{where}.{key}", f"'{text}' is in {describe(found)}, {p.name} in {p.unit}")
                 yield p.name, which, formula
@@ -220,11 +210,9 @@ class EffectReader(LawReader):
 
     def slot(self, slot: str, known: Iterable[str]) -> sympy.Expr:
         """Return the formula of a slot."""
-        try:
-            return parse_expression(self.text(slot), known)
-        except ExpressionError as error:
-            message = f"{self.path}: {slot}: {error.message}"
-            raise ExpressionError(message, error.hint, text=error.text, column=error.column) from None
+        text = self.text(slot)
+        with self.placed(slot):
+            return parse_expression(text, known)
 
     def state_tables(self) -> list[Mapping[str, Any]]:
         """Return the tables under `states`."""

@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
-import sympy
 import sympy as sp
 from sympy.printing.numpy import NumPyPrinter
 from sympy.printing.pretty.pretty import PrettyPrinter
@@ -31,49 +30,49 @@ MAX_PLAIN = 100
 MAX_NAME = 32
 
 
-class log1p(sympy.Function):  # small letters: the name is that in generated code
+class log1p(sp.Function):  # small letters: the name is that in generated code
     """log(1 + x), kept whole so that generated code calls np.log1p."""
 
     nargs = 1
 
     @classmethod
-    def eval(cls, arg: sympy.Expr) -> sympy.Expr | None:
+    def eval(cls, arg: sp.Expr) -> sp.Expr | None:
         """Fold the argument 0 and nothing else."""
-        return sympy.S.Zero if arg.is_zero else None
+        return sp.S.Zero if arg.is_zero else None
 
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
         """Return the derivative 1/(1 + x)."""
         return 1 / (1 + self.args[0])
 
-    def _eval_rewrite_as_log(self, arg: sympy.Expr, **_kwargs: Any) -> sympy.Expr:
-        return sympy.log(1 + arg)
+    def _eval_rewrite_as_log(self, arg: sp.Expr, **_kwargs: Any) -> sp.Expr:
+        return sp.log(1 + arg)
 
-    def _eval_evalf(self, prec: int) -> sympy.Expr:
-        return self.rewrite(sympy.log)._eval_evalf(prec)
+    def _eval_evalf(self, prec: int) -> sp.Expr:
+        return self.rewrite(sp.log)._eval_evalf(prec)
 
     def _eval_is_real(self) -> bool | None:
         return (1 + self.args[0]).is_positive or None
 
 
-class expm1(sympy.Function):
+class expm1(sp.Function):
     """exp(x) - 1, kept whole so that generated code calls np.expm1."""
 
     nargs = 1
 
     @classmethod
-    def eval(cls, arg: sympy.Expr) -> sympy.Expr | None:
+    def eval(cls, arg: sp.Expr) -> sp.Expr | None:
         """Fold the argument 0 and nothing else."""
-        return sympy.S.Zero if arg.is_zero else None
+        return sp.S.Zero if arg.is_zero else None
 
-    def fdiff(self, argindex: int = 1) -> sympy.Expr:
+    def fdiff(self, argindex: int = 1) -> sp.Expr:
         """Return the derivative exp(x)."""
-        return sympy.exp(self.args[0])
+        return sp.exp(self.args[0])
 
-    def _eval_rewrite_as_exp(self, arg: sympy.Expr, **_kwargs: Any) -> sympy.Expr:
-        return sympy.exp(arg) - 1
+    def _eval_rewrite_as_exp(self, arg: sp.Expr, **_kwargs: Any) -> sp.Expr:
+        return sp.exp(arg) - 1
 
-    def _eval_evalf(self, prec: int) -> sympy.Expr:
-        return self.rewrite(sympy.exp)._eval_evalf(prec)
+    def _eval_evalf(self, prec: int) -> sp.Expr:
+        return self.rewrite(sp.exp)._eval_evalf(prec)
 
     def _eval_is_real(self) -> bool | None:
         return self.args[0].is_real
@@ -81,21 +80,21 @@ class expm1(sympy.Function):
 
 # abs, min, max, floor are left out: a law must have derivatives, and complex-step must find them.
 FUNCTIONS: dict[str, Callable[..., Any]] = {
-    "exp": sympy.exp,
-    "log": sympy.log,
-    "ln": sympy.log,
+    "exp": sp.exp,
+    "log": sp.log,
+    "ln": sp.log,
     "log1p": log1p,
     "expm1": expm1,
-    "sqrt": sympy.sqrt,
-    "sin": sympy.sin,
-    "cos": sympy.cos,
-    "sinh": sympy.sinh,
-    "cosh": sympy.cosh,
-    "tanh": sympy.tanh,
-    "asinh": sympy.asinh,
-    "atan": sympy.atan,
-    "lambertw": sympy.LambertW,
-    "LambertW": sympy.LambertW,
+    "sqrt": sp.sqrt,
+    "sin": sp.sin,
+    "cos": sp.cos,
+    "sinh": sp.sinh,
+    "cosh": sp.cosh,
+    "tanh": sp.tanh,
+    "asinh": sp.asinh,
+    "atan": sp.atan,
+    "lambertw": sp.LambertW,
+    "LambertW": sp.LambertW,
 }
 _HYPERBOLIC = frozenset({"sinh", "cosh", "tanh", "asinh", "atan"})
 # Names that generated modules use themselves; a parameter of that name would shadow them.
@@ -119,9 +118,9 @@ _ADVICE = {
 _LANGUAGE = "A formula has numbers, names, + - * / **, round brackets and the functions " + ", ".join(sorted(FUNCTIONS))
 
 
-def symbol(name: str) -> sympy.Symbol:
+def symbol(name: str) -> sp.Symbol:
     """Return the symbol of that name with the assumptions all modules share: it is real."""
-    return sympy.Symbol(name, real=True)
+    return sp.Symbol(name, real=True)
 
 
 def check_identifier(name: str, what: str = "name", *, taken: Iterable[str] = ()) -> str:
@@ -139,7 +138,7 @@ def check_identifier(name: str, what: str = "name", *, taken: Iterable[str] = ()
     return name
 
 
-def parse_expression(text: str, known: Iterable[str]) -> sympy.Expr:
+def parse_expression(text: str, known: Iterable[str]) -> sp.Expr:
     """Return the formula `text` in symbols of the names `known`; decimals become exact rationals.
 
     Raises `ExpressionError` with the place of the fault for anything that is not such a formula; the size of the text
@@ -167,7 +166,7 @@ class _Reader:
     def fail(self, message: str, column: int | None, hint: str | None = None) -> NoReturn:
         raise ExpressionError(message, hint, text=re.sub(r"\s", " ", self.text), column=column)
 
-    def read(self) -> sympy.Expr:
+    def read(self) -> sp.Expr:
         code = self.tokenise()
         lead = len(code) - len(code.lstrip())
         try:
@@ -180,7 +179,7 @@ class _Reader:
             if hasattr(node, "col_offset"):
                 node.col_offset += lead
         result = self.build(tree.body, 0)
-        if result.has(sympy.Abs, sympy.sign, sympy.re, sympy.im, sympy.arg, sympy.I, sympy.nan, sympy.zoo, sympy.oo):
+        if result.has(sp.Abs, sp.sign, sp.re, sp.im, sp.arg, sp.I, sp.nan, sp.zoo, sp.oo):
             self.fail("the formula is not smooth and real: it reduces to " + str(result)[:80], None)
         return result
 
@@ -235,7 +234,7 @@ class _Reader:
         hint = _ADVICE.get(sign)
         self.fail(f"{sign!r} is not part of a formula", position, hint + "." if hint else _LANGUAGE + ".")
 
-    def build(self, node: ast.AST, depth: int) -> sympy.Expr:
+    def build(self, node: ast.AST, depth: int) -> sp.Expr:
         column = getattr(node, "col_offset", None)
         if depth > MAX_DEPTH:
             self.fail(f"the formula is nested more than {MAX_DEPTH} deep", column, "Use brackets sparingly or split.")
@@ -255,7 +254,7 @@ class _Reader:
                 return self.call(node, depth)
         self.fail("this is not part of a formula", column, _LANGUAGE + ".")
 
-    def number(self, word: str, column: int) -> sympy.Expr:
+    def number(self, word: str, column: int) -> sp.Expr:
         mantissa, _, exponent = word.lower().partition("e")
         if sum(c.isdigit() for c in mantissa) > MAX_DIGITS:
             self.fail(f"the number has more than {MAX_DIGITS} digits", column)
@@ -263,17 +262,17 @@ class _Reader:
             self.fail(f"the exponent of the number is beyond {MAX_DECIMAL_EXPONENT}", column)
         whole, _, part = mantissa.partition(".")
         scale = int(exponent or "0") - len(part)
-        digits = sympy.Integer(int((whole + part) or "0"))
-        return digits * sympy.Integer(10) ** scale
+        digits = sp.Integer(int((whole + part) or "0"))
+        return digits * sp.Integer(10) ** scale
 
-    def name(self, word: str, column: int) -> sympy.Expr:
+    def name(self, word: str, column: int) -> sp.Expr:
         if word in self.known:
             return symbol(word)
         if word in FUNCTIONS:
             self.fail(f"the function '{word}' needs an argument in brackets", column, f"Write {word}(...).")
         self.fail(f"unknown name '{word}'", column, did_you_mean(word, self.known))
 
-    def binary(self, node: ast.BinOp, left: sympy.Expr, right: sympy.Expr) -> sympy.Expr:
+    def binary(self, node: ast.BinOp, left: sp.Expr, right: sp.Expr) -> sp.Expr:
         match node.op:
             case ast.Add():
                 return left + right
@@ -292,21 +291,21 @@ class _Reader:
                 return left**right
         self.fail("this operator is not part of a formula", node.col_offset, _LANGUAGE + ".")
 
-    def bound_power(self, base: sympy.Expr, exponent: sympy.Expr, column: int) -> None:
+    def bound_power(self, base: sp.Expr, exponent: sp.Expr, column: int) -> None:
         """Refuse a power whose exact constants would outgrow `MAX_BITS`, before it is computed.
 
         sympy distributes (2 x)**n and joins (x**m)**n, so the constants inside a symbolic base count too.
         """
-        size = max((abs(n) for n in exponent.atoms(sympy.Rational)), default=sympy.S.One)
-        root = max((n.q for n in exponent.atoms(sympy.Rational)), default=1)
+        size = max((abs(n) for n in exponent.atoms(sp.Rational)), default=sp.S.One)
+        root = max((n.q for n in exponent.atoms(sp.Rational)), default=1)
         if exponent.is_Rational and size > MAX_POWER:
             self.fail(f"the exponent is beyond {MAX_POWER}", column)
         if _bits(base) and root > MAX_ROOT:  # 9**(1e-9) is a root of degree 1e9 to sympy
             self.fail("the exponent of this constant has too many decimals", column, "Make it a parameter.")
-        if _bits(base) * max(size, sympy.S.One) > MAX_BITS or _bits(exponent) > MAX_BITS:
+        if _bits(base) * max(size, sp.S.One) > MAX_BITS or _bits(exponent) > MAX_BITS:
             self.fail("the constants of this power are too large to compute exactly", column)
 
-    def call(self, node: ast.Call, depth: int) -> sympy.Expr:
+    def call(self, node: ast.Call, depth: int) -> sp.Expr:
         assert isinstance(node.func, ast.Name)
         word, column = self.at[node.func.col_offset], node.func.col_offset
         if word not in FUNCTIONS:
@@ -316,34 +315,33 @@ class _Reader:
         if len(node.args) != 1 or isinstance(node.args[0], ast.Starred):
             self.fail(f"'{word}' takes one argument, here are {len(node.args)}", column)
         argument = self.build(node.args[0], depth + 1)
-        if word == "exp" and argument.has(sympy.log):  # exp(n log 9) is 9**n to sympy
+        if word == "exp" and argument.has(sp.log):  # exp(n log 9) is 9**n to sympy
             self.bound_power(argument, argument, column)
         if argument.is_number and abs(_value(argument)) > 700:
             self.fail(f"the constant argument of '{word}' is out of range", column)
-        if argument.is_number and argument.has(
-            sympy.Function
-        ):  # sympy may ponder the sign of log(cosh(9) - ...) for long
+        # sympy may ponder the sign of log(cosh(9) - ...) for long
+        if argument.is_number and argument.has(sp.Function):
             self.fail(f"'{word}' is taken of a constant that holds a function", column, "Write the number.")
         # where sympy does not know a power to be real it divides polynomials of the degree of its exponents
-        long = any(abs(n.p) > MAX_PLAIN or n.q > MAX_PLAIN for n in argument.atoms(sympy.Rational))
+        long = any(abs(n.p) > MAX_PLAIN or n.q > MAX_PLAIN for n in argument.atoms(sp.Rational))
         if word in _HYPERBOLIC and argument.is_real is None and long:
             self.fail(f"the constants in the argument of '{word}' are too long", column, "Make them parameters.")
         return self.checked(FUNCTIONS[word](argument), column)
 
-    def checked(self, result: sympy.Expr, column: int) -> sympy.Expr:
+    def checked(self, result: sp.Expr, column: int) -> sp.Expr:
         """Return `result` unless it is a constant that is not a finite real number."""
-        if result in (sympy.zoo, sympy.nan, sympy.oo, -sympy.oo):
+        if result in (sp.zoo, sp.nan, sp.oo, -sp.oo):
             self.fail("this constant is not a finite number", column)
         if result.is_number and (not math.isfinite(_value(result)) or result.is_real is False):
             self.fail("this constant is not a finite real number", column)
         return result
 
 
-def _bits(expr: sympy.Expr) -> int:
-    return sum(int(n.p).bit_length() + int(n.q).bit_length() - 1 for n in expr.atoms(sympy.Rational) if abs(n) != 1)
+def _bits(expr: sp.Expr) -> int:
+    return sum(int(n.p).bit_length() + int(n.q).bit_length() - 1 for n in expr.atoms(sp.Rational) if abs(n) != 1)
 
 
-def _value(expr: sympy.Expr) -> float:
+def _value(expr: sp.Expr) -> float:
     """Return a constant as a float, nan where it is not one."""
     try:
         return float(expr)
@@ -366,21 +364,8 @@ _NAMES = {
     "phi": r"\phi",
 }
 _GREEK = (
-    "alpha",
-    "beta",
-    "gamma",
-    "delta",
-    "epsilon",
-    "eta",
-    "kappa",
-    "lambda",
-    "mu",
-    "phi",
-    "rho",
-    "sigma",
-    "tau",
-    "theta",
-)
+    "alpha", "beta", "gamma", "delta", "epsilon", "eta", "kappa", "lambda", "mu", "phi", "rho", "sigma", "tau", "theta",
+)  # fmt: skip
 
 
 class _Text(StrPrinter):
@@ -439,21 +424,8 @@ def _spelled(expression: sp.Expr) -> sp.Expr:
 # Sympy expressions as NumPy source: small powers as products, Python's keywords renamed.
 
 NUMPY_FUNCTIONS = (
-    "arcsinh",
-    "arctan",
-    "cos",
-    "cosh",
-    "exp",
-    "expm1",
-    "log",
-    "log1p",
-    "pi",
-    "sin",
-    "sinh",
-    "sqrt",
-    "tan",
-    "tanh",
-)
+    "arcsinh", "arctan", "cos", "cosh", "exp", "expm1", "log", "log1p", "pi", "sin", "sinh", "sqrt", "tan", "tanh",
+)  # fmt: skip
 
 
 class NumPyText(NumPyPrinter):

@@ -1,8 +1,12 @@
-"""Names of laws to files and entry points; Python plugins are read before they are run."""
+"""Names of laws to files and entry points.
+
+A listing imports nothing: a Python plugin is read, and run when one of its laws is used. A broken plugin stops only its user.
+"""
 
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import hashlib
 import importlib
@@ -15,14 +19,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from srfcli.core.cache import header_key, known_headers
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import check_plain, open_plain, read_plain
 from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, read_header, read_toml, valid_name
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Law, Reader
-
-# Names of laws to files and entry points: a listing imports nothing, a broken plugin stops nobody but its user.
 
 GROUP = "srf.laws"
 ASKED = ("--plugins", "SRF_PLUGINS")
@@ -67,8 +70,7 @@ class Registry:
         self.problems = tuple(problems)
         self._trust = trust
         self._own = {_resolved(path) for path in (*named, *(e.location for e in self._entries))}
-        self._loaded: dict[Entry, Law] = {}
-        self._readers: dict[Entry, Reader] = {}
+        self._loaded: dict[Entry, Any] = {}
 
     def entries(self, kind: str | None = None) -> tuple[Entry, ...]:
         """Return all entries, or those of one kind, sorted by kind and name; clashing ones are all there."""
@@ -83,7 +85,7 @@ class Registry:
     def find(self, kind: str, name: str) -> Entry:
         """Return the one entry of that kind and name; raises `SrfError` where there is none, or more than one."""
         found = [e for e in self.entries(kind) if e.name == name]
-        what = kind if kind == "reader" else f"{kind} law"
+        what = _what(kind)
         if len(found) == 1:
             return found[0]
         if found:
@@ -117,17 +119,15 @@ class Registry:
     def load(self, entry: Entry) -> Law:
         """Return the law of an entry, imported or parsed at the first call."""
         if entry not in self._loaded:
-            if entry.location.suffix == ".toml":
-                self._loaded[entry] = read_law(entry.location)
-            else:
-                self._loaded[entry] = find_law(entry.location, entry.module, entry.kind, entry.name)
+            toml = entry.location.suffix == ".toml"
+            self._loaded[entry] = read_law(entry.location) if toml else find_value(entry)
         return self._loaded[entry]
 
     def reader(self, entry: Entry) -> Reader:
         """Return the reader of an entry, imported at the first call."""
-        if entry not in self._readers:
-            self._readers[entry] = find_reader(entry.location, entry.module, entry.name)
-        return self._readers[entry]
+        if entry not in self._loaded:
+            self._loaded[entry] = find_value(entry)
+        return self._loaded[entry]
 
     def ageing(self, spelling: str) -> tuple[AgeingLaw, tuple[AgeingModifier, ...]]:
         """Return the ageing law and the modifiers of a spelling such as `dieterich+linker-dieterich`."""
@@ -155,6 +155,10 @@ class Registry:
     def fingerprint(self, entry: Entry) -> str:
         """Return the sha256 of the file that holds a law."""
         return hashlib.sha256(read_plain(entry.location)).hexdigest()
+
+
+def _what(kind: str) -> str:
+    return kind if kind == "reader" else f"{kind} law"
 
 
 def _resolved(path: Path) -> Path:
@@ -242,19 +246,26 @@ def read_law(path: Path) -> Law:
     return LawReader(path, table).law()
 
 
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Raise `SrfError` where the law's file `path` cannot be opened inside."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise SrfError(f"no file {path}", "Give the path of a .toml or .py file.") from None
+    except OSError as error:
+        raise SrfError(f"{path}: cannot be read: {error.strerror}", CHECK_PATH) from error
+
+
 def read_file(path: Path) -> tuple[Law, ...]:
     """Return the laws in one file, TOML or Python; a Python file is run."""
     if path.suffix not in (".toml", ".py"):
         raise SrfError(f"{path}: neither .toml nor .py", "Laws are written as TOML or Python.")
-    try:
+    with reading(path):
         open_plain(path).close()
-    except FileNotFoundError:
-        raise SrfError(f"no file {path}", "Give the path of a .toml or .py file.") from None
-    except OSError as error:
-        raise SrfError(f"{path}: cannot be read: {error.strerror}", CHECK_PATH) from None
     if path.suffix == ".toml":
         return (read_law(path),)
-    laws = tuple(laws_in(load_module(path, None)))
+    laws = tuple(value for value in vars(load_module(path, None)).values() if isinstance(value, Law))
     if not laws:
         raise SrfError(f"{path}: holds no law", f"Decorate a function with @friction_law(...) from {API}.")
     return laws
@@ -420,25 +431,12 @@ def load_module(location: Path, module: str | None) -> ModuleType:
         ) from error
 
 
-def laws_in(module: ModuleType) -> Iterator[Law]:
-    """Yield the law values among a module's attributes."""
-    return (value for value in vars(module).values() if isinstance(value, Law))
-
-
-def find_law(location: Path, module: str | None, kind: str, name: str) -> Law:
-    """Return the law of that kind and name from a plugin, imported now."""
-    for law in laws_in(load_module(location, module)):
-        if kind_of(law) == kind and law.name == name:
-            return law
-    raise SrfError(f"{location}: once imported, there is no {kind} law '{name}' in it")
-
-
-def find_reader(location: Path, module: str | None, name: str) -> Reader:
-    """Return the reader of that name from a plugin, imported now."""
-    for value in vars(load_module(location, module)).values():
-        if isinstance(value, Reader) and value.name == name:
+def find_value(entry: Entry) -> Law | Reader:
+    """Return the law or reader of an entry from its Python plugin, imported now."""
+    for value in vars(load_module(entry.location, entry.module)).values():
+        if isinstance(value, Law | Reader) and (kind_of(value), value.name) == (entry.kind, entry.name):
             return value
-    raise SrfError(f"{location}: once imported, there is no reader '{name}' in it")
+    raise SrfError(f"{entry.location}: once imported, there is no {_what(entry.kind)} '{entry.name}' in it")
 
 
 def _from_file(path: Path) -> ModuleType:
@@ -468,12 +466,9 @@ def _decorator_names(tree: ast.Module) -> tuple[dict[str, str], bool]:
             for item in node.names:
                 if item.name in DECORATORS:
                     aliases[item.asname or item.name] = DECORATORS[item.name]
-        elif isinstance(node, ast.ImportFrom) and node.module == package:
-            prefixes = [item.asname or item.name for item in node.names if item.name == module]
-            imports_api = imports_api or bool(prefixes)
-            aliases |= {f"{prefix}.{name}": kind for prefix in prefixes for name, kind in DECORATORS.items()}
-        elif isinstance(node, ast.Import):
-            prefixes = [item.asname or item.name for item in node.names if item.name == API]
+        elif isinstance(node, ast.Import) or (isinstance(node, ast.ImportFrom) and node.module == package):
+            whole = API if isinstance(node, ast.Import) else module
+            prefixes = [item.asname or item.name for item in node.names if item.name == whole]
             imports_api = imports_api or bool(prefixes)
             aliases |= {f"{prefix}.{name}": kind for prefix in prefixes for name, kind in DECORATORS.items()}
     return aliases, imports_api

@@ -12,8 +12,6 @@ from srfcli.core.settings import Parameter
 if TYPE_CHECKING:
     import sympy
 
-# Laws are values: frozen, stateless, comparable; their formulas are sympy expressions in named symbols.
-
 
 @dataclass(frozen=True)
 class State:

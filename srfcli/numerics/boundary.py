@@ -21,18 +21,16 @@ from srfcli.numerics.collocation import (
     Discretisation,
     condense,
     gauss,
-    join,
     kernel,
     linearised,
     mesh_error,
     respond,
     running_products,
+    solved,
     stage_parameters,
     wanted_mesh,
 )
 from srfcli.numerics.orbit import CHUNK, interpolate, scales, step_limit, uniform_mesh
-
-# Points of a stability boundary: a forced periodic state one of whose multipliers lies on the unit circle.
 
 Names = tuple[str, ...]
 
@@ -43,14 +41,19 @@ def pick_multiplier(multipliers: Array, target: Array) -> Array:
     return np.argmin(distance, axis=-1)
 
 
+def upper_half(rho: ComplexArray) -> ComplexArray:
+    """Return multipliers with those below the real axis replaced by their conjugates."""
+    return rho.real + 1j * np.abs(rho.imag)
+
+
 def linearise_boundary(
     model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array
 ) -> BoundaryLinear:
     """Return the linearisation of {periodicity, ln |rho| = 0}; rho is the multiplier nearest to `target` (...,)."""
-    batch = orbit.x.shape[:-2]
-    if kernel(model) is None or not batch:
+    library = kernel(model)
+    if library is None or orbit.x.ndim == 2:  # one orbit without the batch's axis
         return _linearise(model, p, orbit, names, target)[1]
-    found = _compiled(model, p, orbit, names, np.asarray(target, complex))
+    found = linearised(library, model, p, orbit, names, np.asarray(target, complex))
     if not found.good.all():
         raise np.linalg.LinAlgError("Singular matrix")
     return found
@@ -58,18 +61,10 @@ def linearise_boundary(
 
 def periodic_map(model: GeneratedModel, p: Array, orbit: Discretisation, names: Names) -> Array:
     """Return the linearised map over one period less the state, (B, n, n+1+k), of orbits (B, N, ...)."""
-    if kernel(model) is None:
-        return _less_state(condense(model, p, orbit, names))
-    return _compiled(model, p, orbit, names).periodic
-
-
-def _compiled(
-    model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array | None = None, **options: Any
-) -> BoundaryLinear:
     library = kernel(model)
-    assert library is not None
-    which = np.array([model.index(name) for name in names], dtype=np.intc)
-    return linearised(library, (orbit.phases, orbit.steps), p, orbit, which, target, **options)
+    if library is None:
+        return _less_state(condense(model, p, orbit, names))
+    return linearised(library, model, p, orbit, names).periodic
 
 
 def _less_state(condensed: Condensed) -> Array:
@@ -82,7 +77,7 @@ def _less_state(condensed: Condensed) -> Array:
 def _linearise(
     model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array
 ) -> tuple[Condensed, BoundaryLinear]:
-    """Return what the compiled equations are, in NumPy."""
+    """Return the condensed collocation equations and, in NumPy, the linearisation that the compiled equations give."""
     condensed = condense(model, p, orbit, names)
     values, right_vectors = np.linalg.eig(condensed.monodromy)
     values, right_vectors = values.astype(complex), right_vectors.astype(complex)
@@ -111,9 +106,10 @@ def solve_boundary(
 
     The rows `across` (B, d-1, n+d) close them. A second column is the direction along the curve.
     """
+    library = kernel(model)
+    if library is not None:
+        return linearised(library, model, p, orbit, names, target, rate=rate, across=across, columns=columns)
     with np.errstate(all="ignore"):
-        if kernel(model) is not None:
-            return _compiled(model, p, orbit, names, target, rate=rate, across=across, columns=columns)
         (B, n), d = (len(orbit.x), orbit.x.shape[-1]), rate.shape[-1]
         try:
             condensed, linear = _linearise(model, p, orbit, names, target)
@@ -129,10 +125,7 @@ def solve_boundary(
             matrix[~linear.good] = np.eye(n + d)
             solution = np.linalg.solve(matrix, right)
         except np.linalg.LinAlgError:  # one singular point spoils the batch
-            lost = np.full((B, n, n + 1 + len(names)), np.nan)
-            shapes = (B, n + d), orbit.x.shape, orbit.stages.shape
-            blank = (np.full((columns, *shape), np.nan) for shape in shapes)
-            return BoundaryLinear(lost, lost[:, 0, 0] + 0j, lost[:, 0], np.full(B, False), *blank)
+            return BoundaryLinear.unsolved(orbit, len(names), d, columns)
         first = np.broadcast_to(np.eye(columns)[0], (B, 1, columns))
         dx, dstages = respond(condensed, np.concatenate([solution[:, :n], first, rate @ solution[:, n:]], axis=1))
         linear.solution, linear.dx, linear.dstages = (np.moveaxis(a, -1, 0) for a in (solution, dx, dstages))
@@ -161,7 +154,7 @@ def weights_backwards(c: Condensed, l: Array) -> ComplexArray:
     # l carried backwards: l_{i+1} = (l G_{N-1} ... G_{i+1}); G_i is the n x n corner of the interval's map
     backwards = running_products(np.swapaxes(c.maps[..., ::-1, :n, :n], -1, -2))  # transposes, from the end
     l_mesh = (backwards[..., -2::-1, :, :] @ l[..., None, :, None])[..., 0]
-    seed = (gauss(m).step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
+    seed = (gauss().step[:, None] * l_mesh[..., None, :]).reshape(*l_mesh.shape[:-1], m * n)
     w = np.linalg.solve(np.swapaxes(c.block, -1, -2), np.stack([seed.real, seed.imag], axis=-1))
     return np.asarray((w[..., 0] + 1j * w[..., 1]).reshape(*l_mesh.shape[:-1], m, n))
 
@@ -191,19 +184,13 @@ def _growth_row(
 def slope_in_last(linear: BoundaryLinear) -> Array:
     """Return d ln|rho| / d(last parameter) along the branch of orbits, the other parameters fixed, (...,); NaN at its fold."""
     n = linear.periodic.shape[-2]
-    inner, last = linear.periodic[..., :n], linear.periodic[..., -1:]
-    try:
-        response = np.linalg.solve(inner, last)[..., 0]
-    except np.linalg.LinAlgError:  # one singular point spoils the batch
-        with np.errstate(over="ignore"):  # a huge determinant is not a singular one
-            usable = np.abs(np.linalg.det(np.nan_to_num(inner))) > 1e-300
-        response = np.linalg.solve(np.where(usable[..., None, None], inner, np.eye(n)), last)[..., 0]
-        response = np.where(usable[..., None], response, np.nan)
+    response = solved(linear.periodic[..., :n], linear.periodic[..., -1:])[..., 0]
     return linear.growth[..., -1] - np.einsum("...n,...n->...", linear.growth[..., :n], response)
 
 
 # Boundary points to full precision: Newton's method in one parameter, then meshes doubled until the error is met.
 
+MOST_ITERATIONS = 14
 LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
 FINE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
 SHALLOW = 0.02  # slopes in ln|rho| per ln(parameter) below this are computed anew
@@ -222,11 +209,6 @@ class Direction:
     log: tuple[bool, ...]
     across: Array | None = None
 
-    @property
-    def distances(self) -> int:
-        """Return d, the number of distances that a point has."""
-        return int(self.vectors.shape[-1])
-
     def part(self, index: slice | Array) -> Direction:
         """Return the directions of a part of the batch."""
         return Direction(self.names, self.vectors[index], self.log, None if self.across is None else self.across[index])
@@ -238,16 +220,13 @@ class Direction:
     def moved(self, values: Array, distances: Array) -> Array:
         """Return `values` (k, B) moved by `distances` (B, d)."""
         shift = np.einsum("bkd,bd->kb", self.vectors, distances)
-        return np.where(
-            np.array(self.log)[:, None],
-            values * np.exp(np.where(np.array(self.log)[:, None], shift, 0)),
-            values + shift,
-        )
+        log = np.array(self.log)[:, None]
+        return np.where(log, values * np.exp(np.where(log, shift, 0)), values + shift)
 
 
-def along(name: str, count: int) -> Direction:
-    """Return the direction of ln(name) for `count` points."""
-    return Direction((name,), np.ones((count, 1, 1)), (True,))
+def along(name: str, count: int, *, log: bool = True, unit: float = 1.0) -> Direction:
+    """Return the direction of ln(name), or of the parameter `name` itself over `unit`, for `count` points."""
+    return Direction((name,), np.full((count, 1, 1), unit), (log,))
 
 
 @dataclass(frozen=True)
@@ -295,6 +274,8 @@ def bifurcation_kind(rho: complex) -> str:
 
 @dataclass
 class _Polished:
+    """Points (B,) on one mesh on their way to the boundary, with what is known of each after its last Newton step."""
+
     p: Array
     orbit: Discretisation
     rho: ComplexArray
@@ -302,9 +283,6 @@ class _Polished:
     others: Array
     slope: Array
     converged: Array
-
-
-_POINTWISE = ("rho", "residual", "others", "slope", "converged")
 
 
 def polish(
@@ -322,20 +300,17 @@ def polish(
     `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess. A point that does not converge, or whose estimated
     error stays above `tol` on `max_mesh` intervals, says so in its status.
     """
-    count = p.shape[1]
-    points: list[BoundaryPoint | None] = [None] * count
-    blank = (*(np.full(count, np.nan),) * 3, np.ones(count, bool))
-    waiting = [(np.arange(count), _Polished(p, orbit, target, *blank))]
+    points: list[BoundaryPoint | None] = [None] * p.shape[1]
+    waiting = [(np.arange(p.shape[1]), p, orbit, target)]
     while waiting:
-        index, coarse = waiting.pop()
-        N = coarse.orbit.x.shape[-2]
-        wanted = wanted_mesh(mesh_error(model, coarse.orbit), N, tol, max_mesh)
+        index, p, orbit, target = waiting.pop()
+        N = orbit.x.shape[-2]
+        wanted = wanted_mesh(mesh_error(model, orbit), N, tol, max_mesh)
         for mesh in sorted(set(wanted.tolist())):  # np.unique imports numpy.ma
             here = np.nonzero(wanted == mesh)[0]
-            part = _select(coarse, here)
-            start = part.orbit if mesh == N else interpolate(part.orbit, uniform_mesh(int(mesh)))
+            start = orbit.part(here) if mesh == N else interpolate(orbit.part(here), uniform_mesh(int(mesh)))
             lines = direction.part(index[here])
-            fine = _newton(model, part.p, start, part.rho, lines, tol)
+            fine = _newton(model, p[:, here], start, target[here], lines, tol)
             error = mesh_error(model, fine.orbit) + np.where(fine.converged, fine.residual, 0.0)
             _renew(model, fine, lines, tol)
             done = (error <= tol) | ~fine.converged | (mesh >= max_mesh)
@@ -344,7 +319,7 @@ def polish(
                 points[end] = _point(model, fine, int(j), direction.names[-1], float(error[j]), tol)
             again = np.nonzero(~done)[0]
             if again.size:
-                waiting.append((index[here[again]], _select(fine, again)))
+                waiting.append((index[here[again]], fine.p[:, again], fine.orbit.part(again), fine.rho[again]))
     return [q for q in points if q is not None]
 
 
@@ -366,51 +341,21 @@ def _point(model: GeneratedModel, r: _Polished, j: int, name: str, error: float,
     )
 
 
-def _select(r: _Polished, keep: Array) -> _Polished:
-    fields = (getattr(r, k)[keep] for k in _POINTWISE)
-    return _Polished(r.p[:, keep], r.orbit.part(keep), *fields)
-
-
 def _newton(
     model: GeneratedModel, p: Array, orbit: Discretisation, target: ComplexArray, direction: Direction, tol: float
 ) -> _Polished:
-    parts = []
-    for a in range(0, p.shape[1], CHUNK):
-        cut = slice(a, a + CHUNK)
-        parts.append(_newton_chunk(model, p[:, cut], orbit.part(cut), target[cut], direction.part(cut), tol))
-    if len(parts) == 1:
-        return parts[0]
-    fields = (np.concatenate([getattr(q, k) for q in parts]) for k in _POINTWISE)
-    return _Polished(np.concatenate([q.p for q in parts], axis=1), join([q.orbit for q in parts]), *fields)
-
-
-def _newton_chunk(
-    model: GeneratedModel,
-    p: Array,
-    orbit: Discretisation,
-    target: ComplexArray,
-    direction: Direction,
-    tol: float,
-    *,
-    max_iterations: int = 14,
-) -> _Polished:
-    """Solve {periodicity, ln |rho| = 0} in (orbit, distance along `direction`) for a batch on one mesh."""
-    B = p.shape[1]
-    r = _Polished(
-        p.copy(),
-        Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges),
-        target.astype(complex).copy(),
-        np.full(B, np.nan),
-        np.full(B, np.nan),
-        np.full(B, np.nan),
-        np.zeros(B, bool),
-    )
-    active = np.arange(B)
-    for _ in range(max_iterations):
-        active = _step(model, r, active, direction.part(active), tol)
-        if not active.size:
-            break
-    return r
+    """Return the solutions of {periodicity, ln |rho| = 0} in (orbit, distance along `direction`) on one mesh."""
+    count = p.shape[1]
+    start = Discretisation(orbit.x.copy(), orbit.stages.copy(), orbit.edges)
+    residual, others, slope = np.full((3, count), np.nan)
+    found = _Polished(p.copy(), start, target.astype(complex), residual, others, slope, np.zeros(count, bool))
+    for a in range(0, count, CHUNK):
+        active = np.arange(a, min(a + CHUNK, count))
+        for _ in range(MOST_ITERATIONS):
+            active = _step(model, found, active, direction.part(active), tol)
+            if not active.size:
+                break
+    return found
 
 
 def _step(model: GeneratedModel, r: _Polished, index: Array, direction: Direction, tol: float) -> Array:
@@ -439,7 +384,7 @@ def _step(model: GeneratedModel, r: _Polished, index: Array, direction: Directio
 
 
 def _renew(model: GeneratedModel, r: _Polished, direction: Direction, tol: float) -> None:
-    """Bring multipliers and slopes up to date, in place, where those before the last step would show.
+    """Compute multipliers and slopes anew, in place, where those from before the last Newton step are not accurate enough.
 
     That is everywhere at a tight tolerance, and beside folds, where the slope may have the wrong sign.
     """

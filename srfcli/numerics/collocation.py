@@ -9,6 +9,7 @@ Leading axes are a batch of parameter points throughout.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +17,11 @@ from functools import cache, lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from srfcli.codegen.c_source import NoForm, compiler, library_of, orbit_source
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 
-# The Gauss-Legendre scheme of collocation, and the bound on a Newton step: what NumPy and compiled code must share.
+# The Gauss-Legendre scheme of collocation, and the bound on a Newton step: NumPy and compiled code share them.
 
 STAGES = 4
 LOG_STEP = 3.0  # a Newton step changes no velocity or age by more than a factor e^3
@@ -37,12 +37,12 @@ class Scheme:
     weights: Array
 
 
-@lru_cache
-def gauss(m: int = STAGES) -> Scheme:
-    """Return the Gauss-Legendre scheme of `m` stages (order 2m at the mesh points)."""
-    points, weights = np.polynomial.legendre.leggauss(m)
+@cache
+def gauss() -> Scheme:
+    """Return the Gauss-Legendre scheme of STAGES points (order 2 STAGES at the mesh points)."""
+    points, weights = np.polynomial.legendre.leggauss(STAGES)
     nodes = (points + 1) / 2
-    powers = np.arange(1, m + 1)
+    powers = np.arange(1, STAGES + 1)
     vandermonde = nodes[:, None] ** (powers - 1)
     integral = (nodes[:, None] ** powers / powers) @ np.linalg.inv(vandermonde)
     inverse = np.linalg.inv(integral)
@@ -69,29 +69,22 @@ def kernel(model: GeneratedModel) -> ctypes.CDLL | None:
 
 
 def newton_orbits(
-    library: ctypes.CDLL,
-    frame: tuple[Array, Array],
-    p: Array,
-    x: Array,
-    stages: Array,
-    size: Array,
-    tol: float,
-    max_iterations: int,
-) -> tuple[Array, Array, int]:
-    """Bring the orbits `x` (B, N, n), `stages` (B, N, m, n) to convergence in place; monodromy, converged, most iterations.
+    library: ctypes.CDLL, p: Array, orbit: Discretisation, size: Array, tol: float, max_iterations: int
+) -> tuple[Array, Array]:
+    """Bring orbits (B, N, ...) at the points `p` (n_parameters, B) to convergence in place; return monodromy and converged.
 
-    `frame` holds the Gauss points' phases (N, m) and the steps (N,), `p` is (n_parameters, B), `size` (B, n).
+    `size` (B, n) is that of the unknowns.
     """
-    B, N, n = x.shape
+    B, N, n = orbit.x.shape
     monodromy, converged = np.full((B, n, n), np.nan), np.zeros(B, dtype=np.uint8)
     parameters = np.ascontiguousarray(p.T)
     used = library.srf_orbits(
-        B, N, *map(_at, frame), _at(parameters), _at(x), _at(stages), _at(size), ctypes.c_double(tol), max_iterations,
-        _at(monodromy), _at(converged),
+        B, N, _at(orbit.phases), _at(orbit.steps), _at(parameters), _at(orbit.x), _at(orbit.stages), _at(size),
+        ctypes.c_double(tol), max_iterations, _at(monodromy), _at(converged),
     )  # fmt: skip
     if used < 0:
         raise MemoryError
-    return monodromy, converged.astype(bool), used
+    return monodromy, converged.astype(bool)
 
 
 @dataclass
@@ -112,6 +105,15 @@ class BoundaryLinear:
     dx: Array
     dstages: Array
 
+    @classmethod
+    def unsolved(cls, orbit: Discretisation, parameters: int, distances: int, columns: int) -> BoundaryLinear:
+        """Return equations at orbits (B, N, ...) of which nothing holds yet."""
+        B, _, n = orbit.x.shape
+        shapes = (B, n + distances), orbit.x.shape, orbit.stages.shape
+        solution, dx, dstages = (np.full((columns, *shape), np.nan) for shape in shapes)
+        periodic, rho = np.full((B, n, n + 1 + parameters), np.nan), np.full(B, np.nan + 0j)
+        return cls(periodic, rho, periodic[:, 0].copy(), np.zeros(B, bool), solution, dx, dstages)
+
     @property
     def g(self) -> Array:
         """Return ln |rho|, (...,)."""
@@ -128,10 +130,10 @@ class BoundaryLinear:
 
 def linearised(
     library: ctypes.CDLL,
-    frame: tuple[Array, Array],
+    model: GeneratedModel,
     p: Array,
     orbit: Discretisation,
-    which: Array,
+    names: Sequence[str],
     target: Array | None = None,
     *,
     rate: Array | None = None,
@@ -142,33 +144,27 @@ def linearised(
 
     `across` (B, d-1, n+d) closes them. Without a target only `periodic` is found.
     """
-    B, N, n = orbit.x.shape
+    which = np.array([model.index(name) for name in names], dtype=np.intc)
+    B, N = orbit.x.shape[:2]
     k, d = len(which), 0 if rate is None else rate.shape[-1]
-    found = BoundaryLinear(
-        np.empty((B, n, n + 1 + k)),
-        np.full(B, np.nan + 0j),
-        np.full((B, n + 1 + k), np.nan),
-        np.empty(B, dtype=np.uint8),
-        np.full((columns, B, n + d), np.nan),
-        np.full((columns, *orbit.x.shape), np.nan) if d else np.empty(0),
-        np.full((columns, *orbit.stages.shape), np.nan) if d else np.empty(0),
-    )
+    found, good = BoundaryLinear.unsolved(orbit, k, d, columns), np.zeros(B, dtype=np.uint8)
     x, stages, parameters = (np.ascontiguousarray(a) for a in (orbit.x, orbit.stages, p.T))
     given = (None if a is None else np.ascontiguousarray(a) for a in (target, rate, across))
     done = library.srf_boundary(
-        B, N, k, _at(which), d, columns, *map(_at, frame), _at(parameters), _at(x), _at(stages),
+        B, N, k, _at(which), d, columns, _at(orbit.phases), _at(orbit.steps), _at(parameters), _at(x), _at(stages),
         *[None if a is None else _at(a) for a in given], _at(found.periodic), _at(found.rho), _at(found.growth),
-        _at(found.solution), _at(found.dx), _at(found.dstages), _at(found.good),
+        _at(found.solution), _at(found.dx), _at(found.dstages), _at(good),
     )  # fmt: skip
     if not done:
         raise MemoryError
-    found.good = found.good.astype(bool)
+    found.good = good.astype(bool)
     return found
 
 
 def _at(array: Array) -> ctypes.c_void_p:
+    """Return a pointer that keeps its array alive."""
     assert array.flags.c_contiguous
-    return ctypes.c_void_p(array.ctypes.data)
+    return array.ctypes.data_as(ctypes.c_void_p)
 
 
 # Gauss collocation over one forcing period, condensed interval by interval.
@@ -179,11 +175,21 @@ COVERING_RIGID = 30.0  # without the interface's compliance the slip velocity fo
 
 @dataclass
 class Discretisation:
-    """An orbit on a mesh: `x` (..., N, n) at the mesh points, `stages` (..., N, m, n) between, `edges` (N+1,) in [0, 1]."""
+    """An orbit on a mesh: `x` (..., N, n) at the mesh points, `stages` (..., N, m, n) between, `edges` (N+1,) in [0, 1].
+
+    Orbits on one mesh are added, subtracted, and multiplied by a number, or by one for each orbit of a batch (B,).
+    """
 
     x: Array
     stages: Array
     edges: Array
+
+    __array_ufunc__ = None  # an array on the left leaves the product to __rmul__
+
+    @property
+    def intervals(self) -> int:
+        """Return the number of intervals, N."""
+        return len(self.edges) - 1
 
     @property
     def steps(self) -> Array:
@@ -193,11 +199,37 @@ class Discretisation:
     @property
     def phases(self) -> Array:
         """Return tau at the Gauss points, (N, m)."""
-        return _frame(self.edges.tobytes(), *self.stages.shape[-2:]).phases
+        return _frame(self.edges.tobytes(), self.x.shape[-1]).phases
 
-    def part(self, index: slice | Array | NDArray[np.intp]) -> Discretisation:
-        """Return the orbits of a batch that `index` selects."""
+    @property
+    def weights(self) -> Array:
+        """Return the weights of Gauss quadrature over the period, (N, m)."""
+        return self.steps[:, None] * gauss().weights
+
+    def part(self, index: Any) -> Discretisation:
+        """Return the orbits of a batch that `index` selects.
+
+        A whole number selects one orbit, without the batch's axis; None makes a batch of one orbit.
+        """
         return Discretisation(self.x[index], self.stages[index], self.edges)
+
+    def unchanged(self) -> Discretisation:
+        """Return a change of 0 on this orbit's mesh."""
+        return Discretisation(np.zeros_like(self.x), np.zeros_like(self.stages), self.edges)
+
+    def __add__(self, other: Discretisation) -> Discretisation:
+        return Discretisation(self.x + other.x, self.stages + other.stages, self.edges)
+
+    def __sub__(self, other: Discretisation) -> Discretisation:
+        return Discretisation(self.x - other.x, self.stages - other.stages, self.edges)
+
+    def __rmul__(self, factor: Array | float) -> Discretisation:
+        each = np.asarray(factor)[..., None, None]
+        return Discretisation(each * self.x, each[..., None] * self.stages, self.edges)
+
+    def __truediv__(self, divisor: Array | float) -> Discretisation:
+        each = np.asarray(divisor)[..., None, None]
+        return Discretisation(self.x / each, self.stages / each[..., None], self.edges)
 
 
 def join(parts: Sequence[Discretisation]) -> Discretisation:
@@ -205,6 +237,17 @@ def join(parts: Sequence[Discretisation]) -> Discretisation:
     return Discretisation(
         np.concatenate([o.x for o in parts]), np.concatenate([o.stages for o in parts]), parts[0].edges
     )
+
+
+def stack(orbits: Sequence[Discretisation]) -> Discretisation:
+    """Return orbits on one mesh as a batch."""
+    return join([orbit.part(None) for orbit in orbits])
+
+
+def by_mesh(orbits: Sequence[Discretisation]) -> list[Array]:
+    """Return the indices of the orbits on each mesh, the coarsest first."""
+    meshes = np.array([len(orbit.edges) for orbit in orbits])
+    return [np.nonzero(meshes == edges)[0] for edges in sorted(set(meshes.tolist()))]  # np.unique imports numpy.ma
 
 
 @dataclass
@@ -243,13 +286,13 @@ class _Frame:
 
 
 @lru_cache(maxsize=64)
-def _frame(edges: bytes, m: int, n: int) -> _Frame:
+def _frame(edges: bytes, n: int) -> _Frame:
     mesh = np.frombuffer(edges)
     h = np.diff(mesh)
-    scheme = gauss(m)
+    scheme = gauss()
     inverse = scheme.inverse / h[:, None, None]
     block = inverse[:, :, None, :, None] * np.eye(n)[:, None, :]
-    first = (inverse.sum(axis=-1)[..., None, None] * np.eye(n)).reshape(len(h), m * n, n)
+    first = (inverse.sum(axis=-1)[..., None, None] * np.eye(n)).reshape(len(h), -1, n)
     return _Frame(mesh[:-1, None] + h[:, None] * scheme.nodes, inverse, block, first)
 
 
@@ -261,8 +304,8 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     x, X = orbit.x, orbit.stages
     m, n = X.shape[-2:]
     k, size, batch = len(names), m * n, X.shape[:-2]  # batch includes the intervals
-    step = gauss(m).step
-    frame = _frame(orbit.edges.tobytes(), m, n)
+    step = gauss().step
+    frame = _frame(orbit.edges.tobytes(), n)
     tau, ps = frame.phases, stage_parameters(p)
     block = np.empty((*batch, m, n, m, n))
     block[...] = frame.block
@@ -275,7 +318,7 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     right[..., n] = (model.cycle(tau, X, ps) - frame.inverse @ away).reshape(*batch, size)
     for column, name in enumerate(names):
         right[..., n + 1 + column] = model.cycle_parameter(name)(tau, X, ps).reshape(*batch, size)
-    local = np.linalg.solve(block, right)
+    local = solved(block, right)
     maps = np.zeros((*batch, n + 1 + k, n + 1 + k))
     maps[..., :n, :] = (step @ local.reshape(*batch, m, n * (n + 1 + k))).reshape(*batch, n, n + 1 + k)
     diagonal = np.einsum("...aa->...a", maps)
@@ -286,15 +329,26 @@ def condense(model: GeneratedModel, p: Array, orbit: Discretisation, names: tupl
     return Condensed(block, local.reshape(*batch, m, n, n + 1 + k), maps, running_products(maps))
 
 
+def solved(matrix: Array, right: Array) -> Array:
+    """Return the solutions of the linear systems `matrix` (..., n, n), `right` (..., n, c), NaN for a singular matrix."""
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:  # one singular matrix spoils the batch: they are taken one by one
+        solution = np.full(right.shape, np.nan)
+        for index in np.ndindex(matrix.shape[:-2]):
+            with contextlib.suppress(np.linalg.LinAlgError):
+                solution[index] = np.linalg.solve(matrix[index], right[index])
+        return solution
+
+
 def log_determinant(condensed: Condensed, orbit: Discretisation) -> float:
     """Return ln |det M| of one orbit's monodromy matrix, also where its entries are far below rounding.
 
     An interval's map r I + D L^-1 B has the determinant r^n det(L + B D/r) / det L, two well-conditioned determinants.
     """
-    m, n = orbit.stages.shape[-2:]
-    step = gauss(m).step
+    n, step = orbit.x.shape[-1], gauss().step
     r = 1 - step.sum()
-    outer = _frame(orbit.edges.tobytes(), m, n).first @ np.kron(step, np.eye(n)) / r
+    outer = _frame(orbit.edges.tobytes(), n).first @ np.kron(step, np.eye(n)) / r
     above = np.linalg.slogdet(condensed.block + outer)[1]
     return float((above - np.linalg.slogdet(condensed.block)[1] + n * np.log(abs(r))).sum())
 
@@ -317,43 +371,29 @@ def running_products(maps: Array) -> Array:
     return out
 
 
-def expand(condensed: Condensed, start: Array, parameters: Array | None = None) -> tuple[Array, Array]:
-    """Return the Newton corrections of mesh values and stages for a correction `start` (..., n) at tau = 0."""
-    n = start.shape[-1]
-    k = condensed.local.shape[-1] - n - 1
-    head = np.zeros((*start.shape[:-1], n + 1 + k, 1))
-    head[..., :n, 0] = start
-    head[..., n, 0] = 1
-    if parameters is not None:
-        head[..., n + 1 :, 0] = parameters
-    dx, dstages = respond(condensed, head)
-    return dx[..., 0], dstages[..., 0]
-
-
 def respond(condensed: Condensed, head: Array) -> tuple[Array, Array]:
     """Return mesh values (..., N, n, c) and stages (..., N, m, n, c) for columns `head` (..., n+1+k, c).
 
     A column holds the change at tau = 0, the share of the residual to be removed, and the changes of the parameters.
     """
     n, width = condensed.local.shape[-2:]
-    full = (
-        condensed.prefix[..., :-1, :, :] @ head[..., None, :, :]
-    )  # the last 1 + k rows of each map are those of identity
+    # the last 1 + k rows of each map are those of identity
+    full = condensed.prefix[..., :-1, :, :] @ head[..., None, :, :]
     local = condensed.local.reshape(*condensed.local.shape[:-3], -1, width)
     stages = local @ full
     return full[..., :n, :], stages.reshape(*condensed.local.shape[:-1], head.shape[-1])
 
 
-@lru_cache
-def _top_coefficient(m: int) -> Array:
-    """Return the weights that give the Legendre coefficient of degree m from the values at 0 and at the m Gauss points."""
-    nodes = 2 * np.concatenate([[0.0], gauss(m).nodes]) - 1
-    return np.linalg.inv(np.polynomial.legendre.legvander(nodes, m))[m]
+@cache
+def _top_coefficient() -> Array:
+    """Return the weights that give the Legendre coefficient of degree STAGES from the values at 0 and at the Gauss points."""
+    nodes = 2 * np.concatenate([[0.0], gauss().nodes]) - 1
+    return np.linalg.inv(np.polynomial.legendre.legvander(nodes, STAGES))[STAGES]
 
 
 def last_coefficient(model: GeneratedModel, orbit: Discretisation) -> Array:
     """Return what the polynomials still carry in their last Legendre coefficient, over the logarithmic unknowns, (..., N)."""
-    weights = _top_coefficient(orbit.stages.shape[-2])
+    weights = _top_coefficient()
     top = weights[0] * orbit.x + np.einsum("j,...jn->...n", weights[1:], orbit.stages)
     return np.linalg.norm(top[..., list(model.logarithmic)], axis=-1)
 

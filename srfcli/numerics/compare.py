@@ -1,4 +1,4 @@
-"""Laws brought to the same observables at one low velocity, and what their boundaries then say of each other.
+"""Laws adjusted to the same observables at one low velocity, so that they differ in form, not in calibration; their boundaries.
 
 A law is studied in a window of V and W0: its boundary components at each amplitude, from maps; where they cross lines of constant
 V; and the smallest amplitude at which a line meets more than one boundary (re-entrance).
@@ -18,10 +18,7 @@ from srfcli.numerics.continuation import AtlasSettings, Branch, find_components
 from srfcli.numerics.hopf import critical_point, hopf_points, weakening
 from srfcli.numerics.map import compute_map, tile_model
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
-from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane
-from srfcli.numerics.special_points import polyline_heights
-
-# Laws brought to the same observables at one low velocity, so that what still differs is the law and not its calibration.
+from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane, polyline_heights
 
 ADJUSTED = ("A", "B", "D0")  # what is adjusted to slope, critical load and critical period
 LEVEL = "mu0"  # adjusted to the level of friction, which is what a modulated load works on
@@ -30,7 +27,7 @@ STEP, LARGEST, SMALLEST, TOLERANCE = 1e-6, 0.7, 1e-4, 1e-9
 
 @dataclass(frozen=True)
 class Observables:
-    """What an experiment at low velocity V knows: friction, -d mu_ss/d ln V, critical load (N) and frequency (rad/s) there."""
+    """What an experiment at a low velocity V measures: friction, -d mu_ss/d ln V, critical load (N) and frequency (rad/s)."""
 
     V: float
     friction: float
@@ -41,15 +38,18 @@ class Observables:
 
 def observe(model: GeneratedModel, p: Array, V: float) -> Observables | None:
     """Return the observables at velocity `V` of the model with parameters `p` (n_parameters,), None without a Hopf point."""
-    q = p.copy()
-    q[model.index("V")] = V
+    q = model.with_values(p, V=V)
     point, _ = critical_point(model, q)
     slope = weakening(model, q)
     if point is None or not slope > 0:
         return None
-    q[model.index("W0")] = point.W0
-    friction = float(model.cycle_friction(0.0, model.steady(q), [*q.tolist()]))
+    friction = _friction(model, model.with_values(q, W0=point.W0))
     return Observables(V, friction, slope, point.W0, point.Omega)
+
+
+def _friction(model: GeneratedModel, p: Array) -> float:
+    """Return the friction coefficient in steady sliding at `p` (n_parameters,)."""
+    return float(model.cycle_friction(0.0, model.steady(p), p.tolist()))
 
 
 @dataclass(frozen=True)
@@ -127,14 +127,12 @@ def _miss(model: GeneratedModel, p: Array, goal: Observables) -> Array | None:
 
 def _levelled(model: GeneratedModel, p: Array, goal: Observables) -> Array:
     """Return `p` with mu0 such that friction at the goal's velocity is the goal's, by secants: mu0 may not be additive."""
-    q, row = p.copy(), model.index(LEVEL)
-    q[model.index("V")], q[model.index("W0")] = goal.V, goal.W0
+    q = model.with_values(p, V=goal.V, W0=goal.W0)
 
     def off(value: float) -> float:
-        q[row] = value
-        return float(model.cycle_friction(0.0, model.steady(q), [*q.tolist()])) - goal.friction
+        return _friction(model, model.with_values(q, **{LEVEL: value})) - goal.friction
 
-    a = float(p[row])
+    a = float(p[model.index(LEVEL)])
     fa = off(a)
     for _ in range(30):
         h = 1e-6 * max(abs(a), 1e-3)
@@ -145,9 +143,7 @@ def _levelled(model: GeneratedModel, p: Array, goal: Observables) -> Array:
         fa = off(a)
         if abs(fa) < 1e-14:
             break
-    out = p.copy()
-    out[row] = a
-    return out
+    return model.with_values(p, **{LEVEL: a})
 
 
 # One law's boundaries at several amplitudes, and what two laws' boundaries say of each other.
@@ -275,8 +271,7 @@ def study_law(task: LawTask) -> LawStudy:
 def _boundaries(model: GeneratedModel, task: LawTask, eps: float) -> tuple[list[Array], int, int, Status]:
     """Return components, folds in V, unexplained map points and the status at one amplitude, from a map."""
     window = task.window
-    base = task.p.copy()
-    base[model.index("eps")] = eps
+    base = model.with_values(task.p, eps=eps)
     grid = MapGrid(base, MapAxis("V", *window.V, window.columns), MapAxis("W0", *window.W0, window.rows))
     found = compute_map(model, grid, MapSettings(depth=3))
     *_, atlas = find_boundaries(model, found, AtlasSettings(tol=task.tol))
@@ -290,8 +285,7 @@ def _boundaries(model: GeneratedModel, task: LawTask, eps: float) -> tuple[list[
 
 def _curve(model: GeneratedModel, branch: Branch) -> Array:
     """Return V and W0 of a branch, (points, 2)."""
-    p = np.stack([pt.p for pt in branch.points], axis=1)
-    return np.stack([p[model.index("V")], p[model.index("W0")]], axis=1)
+    return branch.p[[model.index("V"), model.index("W0")]].T
 
 
 def _without(model: GeneratedModel, task: LawTask) -> tuple[list[Array], int, int, Status]:
@@ -299,9 +293,7 @@ def _without(model: GeneratedModel, task: LawTask) -> tuple[list[Array], int, in
     low, high = task.window.W0
     by_number: dict[int, list[tuple[float, float]]] = {}
     for V in task.window.velocities():
-        p = task.p.copy()
-        p[model.index("V")] = V
-        loads = [q.W0 for q in hopf_points(model, p) if q.leading and low <= q.W0 <= high]
+        loads = [q.W0 for q in hopf_points(model, model.with_values(task.p, V=V)) if q.leading and low <= q.W0 <= high]
         for number, load in enumerate(loads):
             by_number.setdefault(number, []).append((float(V), load))
     return [np.array(points) for points in by_number.values()], 0, 0, Status.OK
@@ -317,9 +309,8 @@ def turns(values: Array) -> int:
 def _heights(curves: Sequence[Array], window: Window) -> list[list[float]]:
     """Return for each line of the window the loads, rising, at which the curves cross it."""
     x, y = Axis("V", *window.V), Axis("W0", *window.W0)
-    lines = [np.stack([np.asarray(x.unit(c[:, 0])), np.asarray(y.unit(c[:, 1]))], axis=1) for c in curves]
-    found = polyline_heights(lines, np.asarray(x.unit(window.velocities())))
-    return [np.asarray(y.value(np.array(h))).reshape(-1).tolist() for h in found]
+    lines = [np.stack([x.unit(c[:, 0]), y.unit(c[:, 1])], axis=1) for c in curves]
+    return [y.value(heights).tolist() for heights in polyline_heights(lines, x.unit(window.velocities()))]
 
 
 def _padded(curves: Sequence[Array], window: Window) -> Array:
@@ -368,8 +359,7 @@ def _reentrance(
 
 def _followed(model: GeneratedModel, task: LawTask, eps: float) -> Iterator[list[Array]]:
     """Yield the components at one amplitude, as they are found by a search on lines, which is quicker than a map."""
-    base = task.p.copy()
-    base[model.index("eps")] = eps
+    base = model.with_values(task.p, eps=eps)
     plane = Plane(base, Axis("V", *task.window.V), Axis("W0", *task.window.W0))
     for atlas in find_components(model, plane, AtlasSettings(lines=8, tol=1e-4)):
         if atlas.status is Status.INTERRUPTED:

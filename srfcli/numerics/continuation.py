@@ -13,18 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.boundary import BoundaryPoint, Direction, largest_other, polish, slope_in_last, solve_boundary
-from srfcli.numerics.collocation import Discretisation, mesh_error
+from srfcli.numerics.collocation import Discretisation, by_mesh, mesh_error, stack
 from srfcli.numerics.critical import INTERVALS, LineScan, locate_crossings, scan_line
 from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
-from srfcli.numerics.plane import Plane
-
-# Pseudo-arclength continuation of a stability boundary in a plane of two parameters.
+from srfcli.numerics.plane import Plane, meets, passes
 
 STALE = 0.3  # of the step: a larger correction, in the same norm, spoils the tangent
 ORBIT_SHARE = 0.1  # of the orbit's change in that norm
@@ -32,6 +31,8 @@ ORDER = 0.3  # power of the share that a correction may grow by, which the step 
 FEWEST = 16  # intervals of a mesh that is followed
 COARSER = 0.75  # of a mesh: one that suffices with this share of the intervals takes its place
 ORBIT_WEIGHT = 0.05  # of the orbit's change in the arclength: regular where the curve has a cusp in the plane
+
+Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def correct(
     orbit: Discretisation,
     rho: complex,
     normal_q: Array,
-    normal_x: Array,
+    normal_x: Array | None = None,
     *,
     orientation: CurvePoint | None = None,
     tol: float = 1e-5,
@@ -99,20 +100,20 @@ def correct(
 ) -> CurvePoint | None:
     """Return the boundary point on the hyperplane through (orbit, q) with normal (normal_x, normal_q), or None.
 
-    `normal_x` (n,) weighs the state at tau = 0 and may be zero: with normal_q a unit vector the point lies on that grid line.
+    `normal_x` (n,) weighs the state at tau = 0. Without it the hyperplane is a line of the plane: with a unit vector for
+    `normal_q` one parameter keeps its value.
     `reach` is the size of the step that led here (`change_size`): a correction that is not small against it makes the tangent
     stale, and the linearisation is taken anew.
     """
     n = orbit.x.shape[-1]
-    q, x, stages, edges = q.copy(), orbit.x.copy(), orbit.stages.copy(), orbit.edges
-    across = np.concatenate([normal_x, normal_q])[None, None]
+    across = np.concatenate([np.zeros(n) if normal_x is None else normal_x, normal_q])[None, None]
     previous = first = np.inf
     for iteration in range(max_iterations):
         p = plane.point(model, q)
         linear = solve_boundary(
             model,
             p[:, None],
-            Discretisation(x[None], stages[None], edges),
+            orbit.part(None),
             plane.names,
             np.array([rho]),
             np.diag(plane.rates(model, p))[None],
@@ -121,8 +122,9 @@ def correct(
         )
         if not (linear.good[0] and np.isfinite(linear.solution).all()):
             return None
-        dq, dx = linear.solution[0, 0, n:], linear.dx[0, 0]
-        change = change_size(model, p, dq, dx)
+        step, tangent = (Discretisation(linear.dx[k, 0], linear.dstages[k, 0], orbit.edges) for k in (0, 1))
+        dq = linear.solution[0, 0, n:]
+        change = change_size(model, p, dq, step.x)
         if iteration and change > 0.7 * previous:
             return None
         previous = change
@@ -130,19 +132,17 @@ def correct(
         if change > 0.5:
             return None
         small = change < min(np.sqrt(tol), STALE * reach)
-        q = q + dq
-        x += dx
-        stages += linear.dstages[0, 0]
+        q, orbit = q + dq, orbit + step
         rho = complex(linear.rho[0])
         if change < tol or small:  # a full Newton step leaves an error of order change^2
             point = CurvePoint(
                 q,
                 plane.point(model, q),
-                Discretisation(x, stages, edges),
+                orbit,
                 rho,
                 float(largest_other(linear.multipliers, linear.rho)[0]),
                 linear.solution[1, 0, n:],
-                Discretisation(linear.dx[1, 0], linear.dstages[1, 0], edges),
+                tangent,
                 float(slope_in_last(linear)[0]),
                 correction=first,
             )
@@ -174,9 +174,7 @@ def _normalised(model: GeneratedModel, point: CurvePoint, orientation: CurvePoin
         before = orientation.tangent_orbit.x[0] / size * ORBIT_WEIGHT
         if point.tangent_q @ orientation.tangent_q + along_x @ before < 0:
             length = -length
-    t = point.tangent_orbit
-    scaled = Discretisation(t.x / length, t.stages / length, t.edges)
-    return replace(point, tangent_q=point.tangent_q / length, tangent_orbit=scaled)
+    return replace(point, tangent_q=point.tangent_q / length, tangent_orbit=point.tangent_orbit / length)
 
 
 def predict(a: CurvePoint, b: CurvePoint | None, ds: float) -> tuple[Array, Discretisation]:
@@ -186,15 +184,12 @@ def predict(a: CurvePoint, b: CurvePoint | None, ds: float) -> tuple[Array, Disc
     bent = ds * ds / a.step if known else 0.0
     b = b if b is not None else a
 
-    def ahead(here: Array, tangent: Array, there: Array, other: Array) -> Array:
+    def ahead(here: Any, tangent: Any, there: Any, other: Any) -> Any:
         moved = here + (ds + bent + beyond) * tangent
         return moved + beyond * other - (bent + 2 * beyond) / a.step * (here - there) if known else moved
 
-    return ahead(a.q, a.tangent_q, b.q, b.tangent_q), Discretisation(
-        ahead(a.orbit.x, a.tangent_orbit.x, b.orbit.x, b.tangent_orbit.x),
-        ahead(a.orbit.stages, a.tangent_orbit.stages, b.orbit.stages, b.tangent_orbit.stages),
-        a.orbit.edges,
-    )
+    q = ahead(a.q, a.tangent_q, b.q, b.tangent_q)
+    return q, ahead(a.orbit, a.tangent_orbit, b.orbit, b.tangent_orbit)
 
 
 def follow(
@@ -259,7 +254,7 @@ def follow(
 
 def remeshed(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: StepSettings) -> CurvePoint | None:
     """Return `point` on a finer mesh where its own is too coarse, on a coarser one that suffices, None where it may stay."""
-    N, error = len(point.orbit.edges) - 1, float(mesh_error(model, point.orbit))
+    N, error = point.orbit.intervals, float(mesh_error(model, point.orbit))
     mesh = suited_mesh(error, N, settings)
     if (error <= settings.mesh_error and mesh > COARSER * N) or mesh == N:
         return None
@@ -330,21 +325,16 @@ def _land(
         return None
     q, orbit = predict(current, before, ds)
     q[axis] = coordinate
-    normal_x = np.zeros(orbit.x.shape[-1])
-    return correct(model, plane, q, orbit, current.rho, np.eye(2)[axis], normal_x, orientation=current)
+    return correct(model, plane, q, orbit, current.rho, np.eye(2)[axis], orientation=current)
 
 
 def reversed_tangent(point: CurvePoint) -> CurvePoint:
     """Return `point` with its tangent turned round."""
-    t = point.tangent_orbit
-    return replace(point, tangent_q=-point.tangent_q, tangent_orbit=Discretisation(-t.x, -t.stages, t.edges))
+    return replace(point, tangent_q=-point.tangent_q, tangent_orbit=-1.0 * point.tangent_orbit)
 
 
-def trace(
-    model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings | None = None
-) -> Iterator[Curve]:
+def trace(model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings) -> Iterator[Curve]:
     """Yield the growing curve through `start` after each point, both ways; the last one yielded is complete."""
-    settings = settings or StepSettings()
     curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
     for item in follow(model, plane, start, settings):
         if isinstance(item, Status):
@@ -361,6 +351,22 @@ def trace(
         else:
             curve.points.insert(0, reversed_tangent(item))
         yield curve
+
+
+def trace_whole(
+    model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings, progress: Progress, name: str = ""
+) -> Curve:
+    """Return the curve through `start`, both ways; after a KeyboardInterrupt as far as it was followed.
+
+    `progress` is told the number of points after each, behind the curve's `name`.
+    """
+    curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
+    try:
+        for curve in trace(model, plane, start, settings):
+            progress(f"{name}{len(curve.points)} points")
+    except KeyboardInterrupt:
+        curve.end = Status.INTERRUPTED
+    return curve
 
 
 # All components of a stability boundary in a window: looked for on lines, followed by continuation, polished together.
@@ -386,6 +392,11 @@ class Branch:
     start: Status
     end: Status
 
+    @property
+    def p(self) -> Array:
+        """Return the parameters of the points, (n_parameters, count)."""
+        return np.stack([point.p for point in self.points], axis=1)
+
 
 @dataclass
 class Atlas:
@@ -397,9 +408,18 @@ class Atlas:
     notes: list[str]
     status: Status = Status.OK
 
+    def conclude(self, missed: int) -> None:
+        """Set the status of a finished search that left `missed` sign changes without a boundary point."""
+        if self.status is not Status.OK:
+            return
+        ends = {end for branch in self.branches for end in (branch.start, branch.end)}
+        if missed or not all(point.status.ok for branch in self.branches for point in branch.points):
+            self.status = Status.NO_CONVERGENCE
+        else:
+            self.status = next((s for s in (Status.STEP_TOO_SMALL, Status.MAX_STEPS) if s in ends), Status.OK)
+
 
 SAME = 1e-3  # of the window's height
-Progress = Callable[[str], None]
 
 
 def find_components(
@@ -429,7 +449,7 @@ def find_components(
                     abs(h - start.q[1]) < SAME and up == (start.slope_y > 0) for h, up in _heights(curves, start.q[0])
                 ):
                     continue  # a curve that was followed already, met again from a bracket that the scan's mesh misplaced
-                curve = _follow(model, plane, start, settings, lambda n: progress(_said(curves, n)))
+                curve = trace_whole(model, plane, start, settings.steps, progress, f"component {len(curves) + 1}: ")
                 if len(curve.points) > 1:
                     curves.append(curve)
                     atlas.branches.extend(polish_curve(model, plane, curve, settings))
@@ -439,29 +459,8 @@ def find_components(
     except KeyboardInterrupt:
         atlas.status = Status.INTERRUPTED
     atlas.notes = _notes(atlas, settings, missed)
-    if atlas.status is Status.OK and (missed or not all(pt.status.ok for b in atlas.branches for pt in b.points)):
-        atlas.status = Status.NO_CONVERGENCE
-    ends = {end for b in atlas.branches for end in (b.start, b.end)}
-    if atlas.status is Status.OK:
-        atlas.status = next((e for e in (Status.STEP_TOO_SMALL, Status.MAX_STEPS) if e in ends), Status.OK)
+    atlas.conclude(missed)
     yield atlas
-
-
-def _said(curves: list[Curve], points: int) -> str:
-    return f"component {len(curves) + 1}: {points} points"
-
-
-def _follow(
-    model: GeneratedModel, plane: Plane, start: CurvePoint, settings: AtlasSettings, count: Callable[[int], None]
-) -> Curve:
-    """Return the curve through `start`, both ways; after a KeyboardInterrupt as far as it was followed."""
-    curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
-    try:
-        for curve in trace(model, plane, start, settings.steps):
-            count(len(curve.points))
-    except KeyboardInterrupt:
-        curve.end = Status.INTERRUPTED
-    return curve
 
 
 def _scan_lines(model: GeneratedModel, plane: Plane, settings: AtlasSettings, progress: Progress) -> Iterator[LineScan]:
@@ -470,11 +469,9 @@ def _scan_lines(model: GeneratedModel, plane: Plane, settings: AtlasSettings, pr
     guess: Discretisation | None = None
     for i, x in enumerate(plane.x.samples(max(2, settings.lines))):
         progress(f"line {i + 1} of {settings.lines}")
-        base = plane.base.copy()
-        base[model.index(plane.x.name)] = x
         scan = scan_line(
             model,
-            base,
+            model.with_values(plane.base, **{plane.x.name: x}),
             plane.y.name,
             values,
             intervals=INTERVALS,
@@ -491,8 +488,8 @@ def _scan_lines(model: GeneratedModel, plane: Plane, settings: AtlasSettings, pr
 
 def _unclaimed(model: GeneratedModel, plane: Plane, scan: LineScan, curves: list[Curve]) -> Iterator[int]:
     """Yield, one by one, the sign changes of `scan` that none of `curves` (which may grow meanwhile) passes through."""
-    x = float(np.asarray(plane.x.unit(scan.p[model.index(plane.x.name), 0])))
-    y = np.asarray(plane.y.unit(scan.values))
+    x = float(plane.x.unit(scan.p[model.index(plane.x.name), 0]))
+    y = plane.y.unit(scan.values)
     for i in scan.brackets():
         reach = 0.5 * (y[i + 1] - y[i]) + 2e-3
         if not any(
@@ -506,12 +503,10 @@ def _heights(curves: list[Curve], x: float) -> list[tuple[float, bool]]:
     found = []
     for curve in curves:
         q = curve.q
-        for k in range(len(q) - 1):
-            a, b = q[k], q[k + 1]
-            if min(a[0], b[0]) - 1e-9 <= x <= max(a[0], b[0]) + 1e-9 and a[0] != b[0]:
-                share = np.clip((x - a[0]) / (b[0] - a[0]), 0.0, 1.0)
+        for k, share, height in zip(*meets(q, x), strict=True):
+            if q[k, 0] != q[k + 1, 0]:
                 nearest = curve.points[k if share < 0.5 else k + 1]
-                found.append((float(a[1] + share * (b[1] - a[1])), nearest.slope_y > 0))
+                found.append((float(height), nearest.slope_y > 0))
     return found
 
 
@@ -528,9 +523,13 @@ def _starting_point(
         return None
     middle = np.log(scan.values[bracket] * scan.values[bracket + 1]) / 2
     point = min(usable, key=lambda q: abs(np.log(q.value(model, scan.name)) - middle))
-    single = Discretisation(point.orbit.x[0], point.orbit.stages[0], point.orbit.edges)
+    return with_tangent(model, plane, point, 0)
+
+
+def with_tangent(model: GeneratedModel, plane: Plane, point: BoundaryPoint, axis: int) -> CurvePoint | None:
+    """Return a polished point with its tangent, ready to be followed; its parameter on `axis` of the plane stays as it is."""
     q = plane.coordinates(model, point.p)
-    return correct(model, plane, q, single, point.rho, np.array([1.0, 0.0]), np.zeros(single.x.shape[-1]))
+    return correct(model, plane, q, point.orbit.part(0), point.rho, np.eye(2)[axis])
 
 
 def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: AtlasSettings) -> list[Branch]:
@@ -542,18 +541,12 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
     pts = curve.points
     direction = _across(model, plane, pts)
     polished: list[BoundaryPoint | None] = [None] * len(pts)
-    meshes = np.array([len(pt.orbit.edges) for pt in pts])
-    for edges in sorted(set(meshes.tolist())):  # np.unique imports numpy.ma
-        index = np.nonzero(meshes == edges)[0]
+    for index in by_mesh([pt.orbit for pt in pts]):
         group = [pts[i] for i in index]
         found = polish(
             model,
             np.stack([pt.p for pt in group], axis=1),
-            Discretisation(
-                np.stack([pt.orbit.x for pt in group]),
-                np.stack([pt.orbit.stages for pt in group]),
-                group[0].orbit.edges,
-            ),
+            stack([pt.orbit for pt in group]),
             np.array([pt.rho for pt in group]),
             direction.part(index),
             tol=settings.tol,
@@ -584,9 +577,8 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
 def _across(model: GeneratedModel, plane: Plane, points: Sequence[CurvePoint]) -> Direction:
     """Return the hyperplanes across a curve's tangents at its points, along the edge for those on the window's edge."""
     axes = (plane.x, plane.y)
-    length = np.array(
-        [1.0 if a.log else a.span for a in axes]
-    )  # of a unit distance: in ln(parameter), or of the window
+    # of a unit distance: in ln(parameter), or of the window
+    length = np.array([1.0 if a.log else a.span for a in axes])
     unit = np.array([1 / a.span if a.log else 1.0 for a in axes])
     rows = []
     for point in points:
@@ -625,7 +617,7 @@ def crossing_numbers(model: GeneratedModel, atlas: Atlas) -> list[list[int | Non
     and where a multiplier is +1.
     """
     plane = atlas.plane
-    lines = [plane.coordinates(model, np.stack([pt.p for pt in b.points], axis=1)) for b in atlas.branches]
+    lines = [plane.coordinates(model, b.p) for b in atlas.branches]
     lowest = [bool(s.g[np.isfinite(s.g)][0] < 0) if np.isfinite(s.g).any() else True for s in atlas.scans]
     first = 1 if all(lowest) or not lowest else 2
     numbers: list[list[int | None]] = []
@@ -645,14 +637,11 @@ def crossing_numbers(model: GeneratedModel, atlas: Atlas) -> list[list[int | Non
 
 def _crossings_below(q: Array, at: Array, *, skip: int | None) -> int:
     """Return how often the polyline `q` passes x = at[0] below y = at[1]; segments touching point `skip` do not count."""
-    a, b = q[:-1], q[1:]
-    passes = (a[:, 0] <= at[0]) != (b[:, 0] <= at[0])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        y = a[:, 1] + (at[0] - a[:, 0]) / (b[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
-    count = passes & (y < at[1])
+    segments, heights = passes(q, at[0])
+    counted = heights < at[1]
     if skip is not None:
-        count[max(skip - 1, 0) : skip + 1] = False
-    return int(count.sum())
+        counted &= (segments != skip - 1) & (segments != skip)
+    return int(counted.sum())
 
 
 def _other_side_below(branch: Branch, q: Array, i: int) -> bool:

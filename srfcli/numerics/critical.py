@@ -21,23 +21,21 @@ import numpy as np
 
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.numerics.boundary import BoundaryPoint, along, pick_multiplier, polish
+from srfcli.numerics.boundary import BoundaryPoint, along, pick_multiplier, polish, upper_half
 from srfcli.numerics.collocation import Discretisation, join, mesh_error, wanted_mesh
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.orbit import (
-    NEIGHBOURS,
-    STRIDE,
+    ROUGHEST,
     OrbitBatch,
     between,
-    forced_guess,
+    growth,
     interpolate,
-    levels,
-    solve_orbits,
-    steady_guess,
+    lagrange,
+    line_orbits,
+    neighbours,
+    robust_orbits,
     uniform_mesh,
 )
-
-# Every critical value of one parameter on a line: scanned, bracketed, polished, numbered from the low end.
 
 SAMPLES = 192
 INTERVALS = 16
@@ -82,7 +80,7 @@ def critical_line(
 ) -> CriticalLine:
     """Return every crossing of the stability boundary along `name` in [lo, hi] at the parameters `base` (n_parameters,).
 
-    Without a window the loads W0 are followed to where the growth rate settles (numerics/critical.py). A pair of crossings closer
+    Without a window the loads W0 are followed to where the growth rate settles. A pair of crossings closer
     than the scan's resolution (in ln name) may be missed; the notes say so where it may matter.
     """
     whole = lo is None or hi is None
@@ -141,7 +139,7 @@ def locate_crossings(
             found.append(point)
             continue
         values = np.geomspace(lower / margin, upper * margin, 9)
-        finer = 2 * (len(scan.orbit.edges) - 1)
+        finer = 2 * scan.orbit.intervals
         again = scan_line(model, base, scan.name, values, intervals=finer, resolution=1e-6, tongues=False)
         found += locate_crossings(model, base, again, tol=tol, max_mesh=max_mesh, depth=depth + 1, outer=across)
     return _distinct(sorted(found, key=lambda q: q.value(model, scan.name)), model, scan.name)
@@ -174,20 +172,13 @@ def polish_brackets(
     left = np.array(brackets, dtype=int)
     g0, g1 = scan.g[left], scan.g[left + 1]
     share = g0 / (g0 - g1)
-    p = scan.p[:, left].copy()
     lower, upper = scan.values[left], scan.values[left + 1]
-    p[model.index(scan.name)] = lower * (upper / lower) ** share
-    blend = share[:, None, None]
-    x = (1 - blend) * scan.orbit.x[left] + blend * scan.orbit.x[left + 1]
-    stages = (1 - blend[..., None]) * scan.orbit.stages[left] + blend[..., None] * scan.orbit.stages[left + 1]
+    p = model.with_values(scan.p[:, left], **{scan.name: lower * (upper / lower) ** share})
+    guess = (1 - share) * scan.orbit.part(left) + share * scan.orbit.part(left + 1)
     near = scan.multipliers[np.where(share < 0.5, left, left + 1)]
-    leading = scan.multipliers[
-        np.where(g0 > 0, left, left + 1), 0
-    ]  # of the unstable end: on the stable one another may lead
-    chosen = pick_multiplier(near, leading.real + 1j * np.abs(leading.imag))
-    target = np.take_along_axis(near, chosen[:, None], axis=-1)[:, 0]
-    target = target.real + 1j * np.abs(target.imag)
-    guess = Discretisation(x, stages, scan.orbit.edges)
+    unstable = np.where(g0 > 0, left, left + 1)  # on the stable end another multiplier may lead
+    chosen = pick_multiplier(near, upper_half(scan.multipliers[unstable, 0]))
+    target = upper_half(np.take_along_axis(near, chosen[:, None], axis=-1)[:, 0])
     return polish(model, p, guess, target, along(scan.name, len(left)), tol=tol, max_mesh=max_mesh)
 
 
@@ -237,10 +228,8 @@ BELOW, ABOVE = 0.4, 40.0  # times the critical load at eps = 0
 STRENGTHENING = (1.0, 400.0)  # um K: where steady sliding is stable at every load
 DECADE = 10.0
 PER_DECADE = 40  # loads looked at first in each further decade
-WINDOW_INTERVALS = {
-    -1: 32,
-    1: 64,
-}  # below and above: on a coarser mesh stiff multipliers resonate with the intervals at high loads
+# below and above: on a coarser mesh stiff multipliers resonate with the intervals at high loads
+WINDOW_INTERVALS = {-1: 32, 1: 64}
 OVERLAP = 3  # samples that neighbouring pieces share: a crossing at their seam is in one of them
 FARTHEST = 4  # decades followed beyond either end
 UNEVEN = 0.02  # of the growth rate: what a settled one may differ from its quadratic
@@ -299,7 +288,7 @@ def found_window(model: GeneratedModel, points: Sequence[Array]) -> LoadWindow:
 def follow_outwards(
     model: GeneratedModel, base: Array, low: LineScan, high: LineScan, *, resolution: float = 1e-3
 ) -> Reach:
-    """Return what lies below the scan `low` and above `high`, both along W0 at `base`, until the growth rate settles."""
+    """Return scans along W0 at `base` below the scan `low` and above `high`, as far as it takes the growth rate to settle."""
     below, settled_below = _follow(model, base, low, -1, resolution)
     above, settled_above = _follow(model, base, high, 1, resolution)
     return Reach(below, above, settled_below, settled_above)
@@ -342,9 +331,7 @@ def _swing_settled(model: GeneratedModel, scan: LineScan) -> bool:
     Towards high loads it meets one after another, of ever higher harmonics of the forcing, which the growth rate shows to fade.
     """
     d, psi, _ = scan.swing[0]
-    p = scan.p[:, 0].copy()
-    p[model.index(scan.name)] *= UNLOADED
-    p[model.index("eps")] = 0.0
+    p = model.with_values(scan.p[:, 0], eps=0.0, **{scan.name: scan.values[0] * UNLOADED})
     fastest = max(np.linalg.eigvals(model.cycle_jacobian(0.0, model.steady(p), p)), key=lambda value: value.imag)
     ahead = np.floor(np.array([fastest.imag, psi]) / np.pi)
     return bool(ahead[0] == ahead[1] or min(-d, -fastest.real) > DAMPED)
@@ -365,10 +352,6 @@ def _quiet(g: Array, h: Array) -> bool:
 
 MESH_ERROR = 1e-5  # a hump of g lower than this cannot be told from none
 FINEST = 64
-FIRST_CLIMB, SMALLEST_CLIMB = 0.25, 2e-3  # steps in which eps is raised to its value, as shares of it
-CLIMBING = 12  # Newton steps at each
-ALMOST = 1 - 1e-12  # of eps
-ROUGHEST = 0.1  # estimated error of a climbed state's multipliers on its mesh; the true one is a hundredth of that
 
 
 @dataclass
@@ -394,92 +377,8 @@ class LineScan:
 
     def brackets(self) -> list[int]:
         """Return the indices i for which g changes sign between values[i] and values[i+1]."""
-        g = self.g
-        return [
-            int(i)
-            for i in np.nonzero(np.isfinite(g[:-1]) & np.isfinite(g[1:]) & (g[:-1] * g[1:] <= 0) & (g[:-1] != 0))[0]
-        ]
-
-
-def growth(batch: OrbitBatch) -> tuple[ComplexArray, Array]:
-    """Return the multipliers and ln |leading multiplier| of a batch, NaN where the orbit was not found."""
-    multipliers = batch.multipliers
-    return multipliers, np.log(np.abs(multipliers[:, 0]))
-
-
-def robust_orbits(
-    model: GeneratedModel, p: Array, guess: Discretisation | None, edges: Array, *, tol: float = 1e-7
-) -> OrbitBatch:
-    """Return orbits at `p`, from `guess`, else from the linear response, else by raising eps in steps."""
-    batch = solve_orbits(model, p, guess or forced_guess(model, p, edges), tol=tol, max_iterations=14 if guess else 40)
-    if guess is not None and not batch.converged.all():
-        bad = np.nonzero(~batch.converged)[0]
-        batch.replace(bad, solve_orbits(model, p[:, bad], forced_guess(model, p[:, bad], edges), tol=tol))
-    if not batch.converged.all():
-        bad = np.nonzero(~batch.converged)[0]
-        batch.replace(bad, climbed(model, p[:, bad], edges, tol=tol))
-    return batch
-
-
-def line_orbits(
-    model: GeneratedModel, p: Array, position: Array, guess: Discretisation | None, edges: Array
-) -> OrbitBatch:
-    """Return what `robust_orbits` does at points in order, at rising `position` (B,) along a line.
-
-    A few that are spread over the line come first; the others start from what was found around them.
-    """
-    count, orbits, stride = p.shape[1], None, STRIDE
-    while stride > 1 and count < stride * NEIGHBOURS:  # fewer to start from would foretell little
-        stride //= 2
-    for level in levels(count, stride):
-        if orbits is None:
-            first = robust_orbits(model, p[:, level], None if guess is None else guess.part(level), edges)
-            shape = first.orbit.x.shape[1:], first.orbit.stages.shape[1:], first.monodromy.shape[1:]
-            x, stages, monodromy = (np.full((count, *tail), np.nan) for tail in shape)
-            orbits = OrbitBatch(p, Discretisation(x, stages, edges), monodromy, np.zeros(count, bool), first.iterations)
-            orbits.replace(level, first)
-            continue
-        known = np.nonzero(orbits.converged)[0]
-        near = between(orbits.orbit.part(known), position[known], position[level]) if known.size else None
-        orbits.replace(level, robust_orbits(model, p[:, level], near, edges))
-    assert orbits is not None
-    return orbits
-
-
-def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7) -> OrbitBatch:
-    """Return orbits at `p` (n_parameters, B) by raising eps from 0, each in steps of its own that are halved where one fails.
-
-    One that the mesh is too coarse for has not converged: a finer one may be climbed to.
-    """
-    eps, B = model.index("eps"), p.shape[1]
-    calm = p.copy()
-    calm[eps] = 0.0
-    batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=tol)
-    slope_x, slope_stages = np.zeros_like(batch.orbit.x), np.zeros_like(batch.orbit.stages)
-    reached, step = np.zeros(B), np.full(B, FIRST_CLIMB)
-    going = batch.converged.copy()
-    while going.any():
-        at = np.nonzero(going)[0]
-        step[at] = np.minimum(step[at], 1.0 - reached[at])
-        q, ahead = p[:, at].copy(), step[at][:, None, None]
-        q[eps] *= reached[at] + step[at]
-        before = batch.orbit.part(at)
-        guess = Discretisation(
-            before.x + ahead * slope_x[at], before.stages + ahead[..., None] * slope_stages[at], edges
-        )
-        found = solve_orbits(model, q, guess, tol=tol, max_iterations=CLIMBING)
-        new, got, lost = np.nonzero(found.converged)[0], at[found.converged], at[~found.converged]
-        slope_x[got] = (found.orbit.x[new] - before.x[new]) / ahead[new]
-        slope_stages[got] = (found.orbit.stages[new] - before.stages[new]) / ahead[new][..., None]
-        batch.replace(got, found.part(new))
-        reached[got] += step[got]
-        step[got] *= 1.5
-        step[lost] /= 2
-        going = batch.converged & (reached < ALMOST) & (step > SMALLEST_CLIMB)
-    batch.p[:] = p
-    batch.converged &= reached >= ALMOST
-    batch.converged[batch.converged] = mesh_error(model, batch.orbit)[batch.converged] < ROUGHEST
-    return batch
+        left, right = self.g[:-1], self.g[1:]
+        return np.nonzero(np.isfinite(left) & np.isfinite(right) & (left * right <= 0) & (left != 0))[0].tolist()
 
 
 def scan_line(
@@ -499,14 +398,11 @@ def scan_line(
     `resolution` is the smallest spacing, in ln(value) where `log`, that halving reaches; `tongues`: whether the places are
     looked at where the slider's swing meets the forcing.
     """
-    p = np.repeat(base[:, None], len(values), axis=1)
-    p[model.index(name)] = values
+    p = model.with_values(base, **{name: values})
     coordinate = np.log if log else np.asarray
     edges = uniform_mesh(intervals) if guess is None else guess.edges
     batch = _on_sufficient_mesh(model, line_orbits(model, p, coordinate(values), guess, edges))
-    multipliers, g = growth(batch)
-    swing = swing_pair(model, p, batch.orbit, multipliers)
-    scan = LineScan(name, p, np.asarray(values, float), multipliers, g, batch.orbit, swing, np.inf)
+    scan = _samples(model, name, batch)
     for count in itertools.count():
         position = coordinate(scan.values)
         tongues &= count < ROUNDS
@@ -524,9 +420,16 @@ def scan_line(
     return scan
 
 
+def _samples(model: GeneratedModel, name: str, batch: OrbitBatch) -> LineScan:
+    """Return orbits along parameter `name` as a scan, its resolution unknown."""
+    multipliers, g = growth(batch)
+    swing = swing_pair(model, batch.p, batch.orbit, multipliers)
+    return LineScan(name, batch.p, batch.p[model.index(name)], multipliers, g, batch.orbit, swing, np.inf)
+
+
 def _on_sufficient_mesh(model: GeneratedModel, batch: OrbitBatch) -> OrbitBatch:
     """Return the batch on a mesh that shows a growth rate as small as MESH_ERROR, up to FINEST intervals."""
-    N = len(batch.orbit.edges) - 1
+    N = batch.orbit.intervals
     if batch.converged.all():
         worst = mesh_error(model, batch.orbit).max(keepdims=True)
         mesh = int(wanted_mesh(worst, N, MESH_ERROR, FINEST)[0])
@@ -559,18 +462,9 @@ def _suspects(position: Array, g: Array, resolution: float) -> Array:
 
 def _closest_inside(position: Array, g: Array) -> Array:
     """Return how near to zero, on its ends' side, the cubic through four samples comes in each interval; below 0 if across."""
-    count = len(g) - 1
-    first = np.clip(np.arange(count) - 1, 0, max(count - 3, 0))
-    window = first[:, None] + np.arange(min(4, len(g)))
-    xs, ys = position[window], g[window]  # (intervals, 4)
     at = position[:-1, None] + np.diff(position)[:, None] * np.linspace(0.1, 0.9, 9)
-    value = np.zeros_like(at)
-    for i in range(xs.shape[1]):
-        basis = np.ones_like(at)
-        for j in range(xs.shape[1]):
-            if j != i:
-                basis *= (at - xs[:, j, None]) / (xs[:, i, None] - xs[:, j, None])
-        value += ys[:, i, None] * basis
+    index, weights = neighbours(position, at.ravel(), 4)
+    value = (weights * g[index]).sum(axis=-1).reshape(at.shape)
     return (value * np.sign(g[:-1])[:, None]).min(axis=1)
 
 
@@ -579,16 +473,8 @@ def interpolation_error(position: Array, g: Array) -> Array:
     error = np.zeros_like(g)
     if len(g) < 5:
         return error
-    middle = position[2:-2]
-    around = [position[:-4], position[1:-3], position[3:-1], position[4:]]
-    values = [g[:-4], g[1:-3], g[3:-1], g[4:]]
-    estimate = np.zeros_like(middle)
-    for i, (xi, gi) in enumerate(zip(around, values, strict=True)):
-        basis = np.ones_like(middle)
-        for j, xj in enumerate(around):
-            if j != i:
-                basis *= (middle - xj) / (xi - xj)
-        estimate += gi * basis
+    around = np.arange(len(g) - 4)[:, None] + [0, 1, 3, 4]
+    estimate = (lagrange(position[around], position[2:-2]) * g[around]).sum(axis=-1)
     error[2:-2] = np.nan_to_num(np.abs(g[2:-2] - estimate))
     error[:2], error[-2:] = error[2], error[-3]
     return error
@@ -602,22 +488,15 @@ def _with_samples(
     fresh = a * (b / a) ** share if log else a + share * (b - a)
     coordinate, known = np.log if log else np.asarray, np.nonzero(np.isfinite(scan.g))[0]
     guess = between(scan.orbit.part(known), coordinate(scan.values[known]), coordinate(fresh), 4)
-    p = np.repeat(base[:, None], len(fresh), axis=1)
-    p[model.index(scan.name)] = fresh
-    batch = robust_orbits(model, p, guess, scan.orbit.edges)
-    multipliers, g = growth(batch)
-    values = np.concatenate([scan.values, fresh])
-    order = np.argsort(values)
-    return LineScan(
-        scan.name,
-        np.concatenate([scan.p, p], axis=1)[:, order],
-        values[order],
-        np.concatenate([scan.multipliers, multipliers])[order],
-        np.concatenate([scan.g, g])[order],
-        join([scan.orbit, batch.orbit]).part(order),
-        np.concatenate([scan.swing, swing_pair(model, p, batch.orbit, multipliers)])[order],
-        scan.resolution,
+    p = model.with_values(base, **{scan.name: fresh})
+    added = _samples(model, scan.name, robust_orbits(model, p, guess, scan.orbit.edges))
+    order = np.argsort(np.concatenate([scan.values, added.values]))
+    values, multipliers, g, swing = (
+        np.concatenate([getattr(part, name) for part in (scan, added)])[order]
+        for name in ("values", "multipliers", "g", "swing")
     )
+    p, orbit = np.concatenate([scan.p, p], axis=1)[:, order], join([scan.orbit, added.orbit]).part(order)
+    return LineScan(scan.name, p, values, multipliers, g, orbit, swing, scan.resolution)
 
 
 # Where the slider's own swing meets the forcing: tongues that are narrower than the samples' spacing.
@@ -667,7 +546,7 @@ def _resonances(position: Array, scan: LineScan, resolution: float) -> tuple[Arr
     d, psi = scan.swing[:, 0], scan.swing[:, 1]
     low, high = np.fmin(psi[:-1], psi[1:]), np.fmax(psi[:-1], psi[1:])
     damping = np.fmin(-d[:-1], -d[1:])
-    most = 2 * np.pi * HARMONICS * (len(scan.orbit.edges) - 1)
+    most = 2 * np.pi * HARMONICS * scan.orbit.intervals
     with np.errstate(invalid="ignore"):
         usable = (damping > 0) & (damping < DAMPED) & (high < most) & (np.diff(position) > resolution)
     left, share = [], []

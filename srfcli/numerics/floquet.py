@@ -9,6 +9,7 @@ import numpy as np
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.collocation import (
+    STAGES,
     Discretisation,
     condense,
     gauss,
@@ -17,16 +18,23 @@ from srfcli.numerics.collocation import (
     mesh_error,
     stage_parameters,
 )
-from srfcli.numerics.critical import CLIMBING, FIRST_CLIMB, robust_orbits
-from srfcli.numerics.orbit import OrbitBatch, interpolate, solve_orbits, steady_guess, uniform_mesh
+from srfcli.numerics.orbit import (
+    CLIMBING,
+    FIRST_CLIMB,
+    OrbitBatch,
+    interpolate,
+    robust_orbits,
+    solve_orbits,
+    steady_guess,
+    uniform_mesh,
+)
 
 FIRST_MESH = 16
 PATIENT = 256  # intervals up to which a state that was not found is looked for on a finer mesh
-STIFF = 3.0
+STIFF = 3.0  # e-foldings of volume within an interval, beyond which Liouville's identity is not checked
 NEWTON = 1e-10  # last step of Newton's method
-ROUNDED = (
-    1e-7  # the same where a multiplier next to 1 lets rounding grow beyond that; the error of the multipliers tells
-)
+# the same where a multiplier next to 1 lets rounding grow beyond that; the error of the multipliers tells
+ROUNDED = 1e-7
 CLIMBED_ON = 64  # intervals of the first mesh that is laid where the state needs it
 CALM = 0.2  # share of the intervals that are spread evenly
 SMALLEST_CLIMB, MOST_CLIMBS = 1e-4, 200  # shares of eps
@@ -102,7 +110,7 @@ def solve_floquet(
         if smaller < error:
             batch, error = laid, smaller
     status = Status.NO_CONVERGENCE if not batch.converged[0] else Status.OK if error <= tol else Status.TOLERANCE
-    orbit = Discretisation(batch.orbit.x[0], batch.orbit.stages[0], batch.orbit.edges)
+    orbit = batch.orbit.part(0)
     rest = float(model.steady_friction(p))
     finer = interpolate(orbit, _split(orbit.edges, 8 * (harmonics + 8)))
     at = finer.phases, finer.stages, stage_parameters(p)
@@ -121,10 +129,6 @@ def solve_floquet(
     )
 
 
-def _intervals(batch: OrbitBatch) -> int:
-    return len(batch.orbit.edges) - 1
-
-
 def _split(edges: Array, intervals: int) -> Array:
     """Return the edges with each interval split evenly, so that there are at least so many."""
     parts = -(-intervals // (len(edges) - 1))
@@ -140,8 +144,8 @@ def _solved(model: GeneratedModel, p: Array, guess: Discretisation) -> OrbitBatc
 def _refined(model: GeneratedModel, batch: OrbitBatch, tol: float, max_mesh: int) -> tuple[OrbitBatch, float]:
     """Return one orbit on its mesh halved until the error is below `tol`, and that error; infinite where there is no orbit."""
     error = np.inf
-    while batch.converged[0] and error > tol and 2 * _intervals(batch) <= max_mesh:
-        fine = _solved(model, batch.p, interpolate(batch.orbit, _split(batch.orbit.edges, 2 * _intervals(batch))))
+    while batch.converged[0] and error > tol and 2 * batch.orbit.intervals <= max_mesh:
+        fine = _solved(model, batch.p, interpolate(batch.orbit, _split(batch.orbit.edges, 2 * batch.orbit.intervals)))
         after, before = (np.sort_complex(b.multipliers[0]) for b in (fine, batch))
         shift = (np.abs(after - before) / np.maximum(1.0, np.abs(after))).max()
         error = max(float(shift) / RELIED_ON, float(mesh_error(model, fine.orbit)[0])) + 1e-12
@@ -155,7 +159,7 @@ def _laid(model: GeneratedModel, orbit: Discretisation, intervals: int) -> Array
     An interval of width h carries h^STAGES, so that its share of the intervals goes with the root of that; a share for all keeps
     the mesh from leaving the calm part of the period to a few.
     """
-    density = last_coefficient(model, orbit)[0] ** (1 / orbit.stages.shape[-2]) / orbit.steps
+    density = last_coefficient(model, orbit)[0] ** (1 / STAGES) / orbit.steps
     density = np.maximum(density, np.maximum(np.roll(density, 1), np.roll(density, -1)))
     density += CALM * float((density * orbit.steps).sum())
     reached = np.concatenate([[0.0], np.cumsum(density * orbit.steps)])
@@ -170,30 +174,24 @@ def climbed(model: GeneratedModel, p: Array, finest: int) -> tuple[OrbitBatch, f
     The number says which share of eps was reached: below 1 a step of SMALLEST_CLIMB of eps failed, as where the branch of states
     turns back or velocities leave the range of numbers, and the orbit, of the last eps that went, is marked as not converged.
     """
-    eps = model.index("eps")
-    calm, edges = p.copy(), uniform_mesh(CLIMBED_ON)
-    calm[eps] = 0.0
+    eps, edges, calm = p[model.index("eps")], uniform_mesh(CLIMBED_ON), model.with_values(p, eps=0.0)
     batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=ROUNDED)
     reached, step, tries = 0.0, FIRST_CLIMB, 0
-    slope = Discretisation(np.zeros_like(batch.orbit.x), np.zeros_like(batch.orbit.stages), edges)
+    slope = batch.orbit.unchanged()
     while batch.converged[0] and reached < 1 and step > SMALLEST_CLIMB and tries < MOST_CLIMBS:
         tries += 1
         target = 1.0 if reached + step > 1 - SMALLEST_CLIMB else reached + step
-        q, before, ahead = p.copy(), batch.orbit, target - reached
-        q[eps] *= target
-        guess = Discretisation(before.x + ahead * slope.x, before.stages + ahead * slope.stages, before.edges)
-        found = solve_orbits(model, q, guess, tol=ROUNDED, max_iterations=CLIMBING)
+        q, before, ahead = model.with_values(p, eps=target * eps), batch.orbit, target - reached
+        found = solve_orbits(model, q, before + ahead * slope, tol=ROUNDED, max_iterations=CLIMBING)
         if not found.converged[0]:
             step /= 2
             continue
-        finer = 2 if mesh_error(model, found.orbit)[0] > WHILE_CLIMBING and 2 * _intervals(found) <= finest else 1
-        moved = interpolate(found.orbit, _laid(model, found.orbit, finer * _intervals(found)))
+        finer = 2 if mesh_error(model, found.orbit)[0] > WHILE_CLIMBING and 2 * found.orbit.intervals <= finest else 1
+        moved = interpolate(found.orbit, _laid(model, found.orbit, finer * found.orbit.intervals))
         again = solve_orbits(model, q, moved, tol=ROUNDED, max_iterations=CLIMBING)
         if again.converged[0]:
             found, before = again, interpolate(before, again.orbit.edges)
-        slope = Discretisation(
-            (found.orbit.x - before.x) / ahead, (found.orbit.stages - before.stages) / ahead, found.orbit.edges
-        )
+        slope = (found.orbit - before) / ahead
         batch, reached, step = found, target, 1.5 * step
     batch.converged &= reached >= 1
     batch.p[:] = p
@@ -215,7 +213,7 @@ def waveforms(model: GeneratedModel, p: Array, orbit: Discretisation, samples: i
 
 def _harmonics(orbit: Discretisation, values: Array, count: int) -> ComplexArray:
     """Return c_0..c_count of values (N, m) at the Gauss points, by their quadrature: the mean, then amplitudes with phases."""
-    weighted = values * orbit.steps[:, None] * gauss(orbit.stages.shape[-2]).weights
+    weighted = values * orbit.steps[:, None] * gauss().weights
     waves = np.exp(-2j * np.pi * np.arange(count + 1)[:, None, None] * orbit.phases)
     amplitudes = (waves * weighted).sum(axis=(-1, -2))
     amplitudes[1:] *= 2
@@ -229,7 +227,7 @@ def _liouville(model: GeneratedModel, p: Array, orbit: Discretisation) -> float:
     is far below rounding against 1, but not by its right factor.
     """
     trace = np.trace(model.cycle_jacobian(orbit.phases, orbit.stages, stage_parameters(p)), axis1=-2, axis2=-1)
-    exponents = (trace @ gauss(orbit.stages.shape[-2]).weights) * orbit.steps
+    exponents = (trace @ gauss().weights) * orbit.steps
     if np.abs(exponents).max() > STIFF:
         return float("nan")
     return float(abs(np.expm1(log_determinant(condense(model, p, orbit), orbit) - exponents.sum())))

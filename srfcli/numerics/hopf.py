@@ -123,13 +123,9 @@ def _hurwitz(a: Array) -> Array:
     n = a.shape[-1] - 1
     scale = np.abs(a[..., :1] / a[..., -1:]) ** (1.0 / n)  # roots of order one
     b = a / a[..., -1:] / scale ** np.arange(n, -1, -1)
-    matrix = np.zeros((*a.shape[:-1], n - 1, n - 1))
-    for i in range(n - 1):
-        for j in range(n - 1):
-            k = n - (2 * (j + 1) - (i + 1))
-            if 0 <= k <= n:
-                matrix[..., i, j] = b[..., k]
-    return np.linalg.det(matrix)
+    i, j = np.indices((n - 1, n - 1))
+    k = n - (2 * (j + 1) - (i + 1))
+    return np.linalg.det(np.where((k >= 0) & (k <= n), b[..., np.clip(k, 0, n)], 0.0))
 
 
 def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
@@ -161,13 +157,11 @@ def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
     _, by_s, by_load = _polynomial(model, p, W0, 1j * Omega)
     roots = np.roots(np.asarray(model.characteristic(_with_load(model, p, W0)))[::-1])
     others = roots[np.abs(np.abs(roots.imag) - Omega) + np.abs(roots.real) > 1e-5 * Omega]
-    q = p.copy()
-    q[model.index("W0")] = W0
     return HopfPoint(
         W0=W0,
         Omega=Omega,
         crossing_rate=float(-(by_load / by_s).real),
-        lyapunov=lyapunov_coefficient(model, q, Omega),
+        lyapunov=lyapunov_coefficient(model, model.with_values(p, W0=W0), Omega),
         leading=bool(np.all(others.real < 0)),
         residual=float(residual),
     )

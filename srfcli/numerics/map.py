@@ -9,6 +9,7 @@ taken from second differences of the grid, and in a cell that was halved from ho
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -20,22 +21,20 @@ from srfcli.codegen.model import Array, ComplexArray, GeneratedModel, load_sourc
 from srfcli.core.parallel import run_here
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
-from srfcli.numerics.boundary import periodic_map
+from srfcli.numerics.boundary import periodic_map, upper_half
 from srfcli.numerics.collocation import STAGES, Discretisation, join, kernel, mesh_error
-from srfcli.numerics.critical import robust_orbits
 from srfcli.numerics.orbit import (
     CHUNK,
     OrbitBatch,
+    combined,
     interpolate,
     levels,
     neighbours,
-    ordered_eigenvalues,
+    robust_orbits,
     solve_orbits,
     uniform_mesh,
 )
 from srfcli.numerics.plane import MapGrid, MapSettings, TileTask, tile_tasks
-
-# Stability maps: the leading Floquet multiplier over a grid of two parameters, put together from its tiles.
 
 # of a point: no orbit found; stable; unstable by a multiplier off the real axis, a negative, a positive one
 KINDS = ("unresolved", "stable", "ns", "pd", "fold")
@@ -203,41 +202,22 @@ def join_tiles(
 
 def _tile_discontinuities(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Discontinuity]:
     """Return the discontinuities of a tile, in the plane's unit coordinates."""
-    ends = tile["discontinuity_ends"]
-    if not len(ends):
-        return []
-    unit = grid.plane(model).coordinates(model, grid.points(model, *_grid_quantities(grid, ends)))
-    edges = np.linspace(0.0, 1.0, int(tile["mesh"]) + 1)
-    return [
-        Discontinuity(
-            unit[k],
-            int(axis),
-            complex(tile["discontinuity_rho"][k]),
-            Discretisation(tile["discontinuity_x"][k], tile["discontinuity_stages"][k], edges),
-        )
-        for k, axis in enumerate(tile["discontinuity_axis"])
-    ]
-
-
-def _grid_quantities(grid: MapGrid, places: Array) -> tuple[Array, Array]:
-    """Return the quantities along x and y at places (..., 2) in grid steps."""
-    return grid.x.between(places[..., 0]), grid.y.between(places[..., 1])
+    unit = grid.plane(model).coordinates(model, grid.at(model, tile["discontinuity_ends"]))  # (K, 2, 2)
+    orbits = Discretisation(tile["discontinuity_x"], tile["discontinuity_stages"], uniform_mesh(int(tile["mesh"])))
+    places = zip(tile["discontinuity_axis"].tolist(), tile["discontinuity_rho"].tolist(), strict=True)
+    return [Discontinuity(unit[k], axis, rho, orbits.part(k)) for k, (axis, rho) in enumerate(places)]
 
 
 def _tile_seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
     """Return the seeds of a tile, in the plane's unit coordinates."""
-    plane, ends = grid.plane(model), tile["seed_ends"]
-    if not len(ends):
-        return []
-    unit = plane.coordinates(model, grid.points(model, *_grid_quantities(grid, ends)))  # (E, 2, 2)
-    edges = np.linspace(0.0, 1.0, int(tile["mesh"]) + 1)
+    unit = grid.plane(model).coordinates(model, grid.at(model, tile["seed_ends"]))  # (E, 2, 2)
+    orbits = Discretisation(tile["seed_x"], tile["seed_stages"], uniform_mesh(int(tile["mesh"])))
     seeds = []
     for k, axis in enumerate(tile["seed_axis"].tolist()):
         order = np.argsort(unit[k, :, axis])
         g = tile["seed_g"][k][order]
-        orbit = Discretisation(tile["seed_x"][k : k + 1], tile["seed_stages"][k : k + 1], edges)
         p, rho = tile["seed_p"][:, k], complex(tile["seed_rho"][k])
-        seeds.append(Seed(unit[k][order], axis, bool(g[0] <= g[1]), p, rho, orbit))
+        seeds.append(Seed(unit[k][order], axis, bool(g[0] <= g[1]), p, rho, orbits.part(slice(k, k + 1))))
     return seeds
 
 
@@ -273,39 +253,36 @@ def tile_model(source: str, key: str) -> GeneratedModel:
     return load_source(source, key=key)
 
 
-def tile_points(task: TileTask) -> tuple[GeneratedModel, Array, Array, Array]:
-    """Return the model, the quantities along x and y of the tile, and its parameters (n_parameters, columns, rows)."""
+def tile_points(task: TileTask) -> tuple[GeneratedModel, Array]:
+    """Return the model and the parameters (n_parameters, columns, rows) of a tile."""
     model, grid = tile_model(task.source, task.key), task.grid
     xs = grid.x.samples()[task.columns[0] : task.columns[1] + 1]
     ys = grid.y.samples()[task.rows[0] : task.rows[1] + 1]
-    return model, xs, ys, grid.points(model, *np.meshgrid(xs, ys, indexing="ij"))
+    return model, grid.points(model, *np.meshgrid(xs, ys, indexing="ij"))
 
 
 def solve_block(task: TileTask) -> Samples:
     """Return the orbits at all grid points of a tile, columns first."""
-    model, xs, ys, p = tile_points(task)
-    shape, settings = (len(xs), len(ys)), task.settings
-    columns, rows = (levels(count) for count in shape)
-    first = np.ix_(columns[0], rows[0])
-    start = _coarse(model, p[:, first[0], first[1]].reshape(len(p), -1), task)
-    block = _Block.empty(model, p, start.orbit.edges)
-    block.put(columns[0], rows[0], regular(start))
+    model, p = tile_points(task)
+    count, tol = p.shape[1:], task.settings.tol
+    columns, rows = (levels(points) for points in count)
+    c, r = _pairs(columns[0], rows[0])
+    start = regular(_coarse(model, p[:, c, r], task))
+    block = _Block(model, OrbitBatch.empty(p, start.orbit.edges, len(model.states)), tol)
+    block.orbits.replace((c, r), start)
     for level in range(1, len(rows)):
-        known, new = np.concatenate(rows[:level]), rows[level]
-        block.fill(columns[0], new, block.along_rows(columns[0], known, new), settings.tol)
-    every = np.arange(shape[1])
+        block.fill_rows(columns[0], np.sort(np.concatenate(rows[:level])), rows[level])
     for level in range(1, len(columns)):
-        known, new = np.concatenate(columns[:level]), columns[level]
-        block.fill(new, every, block.along_columns(known, new), settings.tol)
-    block.spread(settings.tol)
-    at = np.stack(np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij"), axis=-1).reshape(-1, 2)
-    flat = Discretisation(
-        block.x.reshape(-1, *block.x.shape[2:]), block.stages.reshape(-1, *block.stages.shape[2:]), block.edges
-    )
-    count = shape[0] * shape[1]
-    n = len(model.states)
-    multipliers = ordered_eigenvalues(block.monodromy.reshape(count, n, n), block.converged.reshape(count))
-    return Samples(at.astype(float), p.reshape(len(p), -1), flat, multipliers)
+        block.fill_columns(np.sort(np.concatenate(columns[:level])), columns[level])
+    block.spread()
+    every = _pairs(*map(np.arange, count))
+    found = block.orbits.part(every)
+    return Samples(np.stack(every, axis=-1).astype(float), found.p, found.orbit, found.multipliers)
+
+
+def _pairs(columns: Array, rows: Array) -> tuple[Array, Array]:
+    """Return column and row (B,) of the points at the crossings of `columns` and `rows`, columns first."""
+    return np.repeat(columns, len(rows)), np.tile(rows, len(columns))
 
 
 def _coarse(model: GeneratedModel, p: Array, task: TileTask) -> OrbitBatch:
@@ -324,7 +301,7 @@ def _coarse(model: GeneratedModel, p: Array, task: TileTask) -> OrbitBatch:
 
 def _sufficient(model: GeneratedModel, batch: OrbitBatch, task: TileTask) -> int:
     """Return the intervals that keep the mesh's error below the settings', twice as many where an orbit was not found."""
-    N = len(batch.orbit.edges) - 1
+    N = batch.orbit.intervals
     if not batch.converged.all():  # a finer mesh may find what this one could not
         return min(2 * N, task.settings.finest)
     ratio = float(mesh_error(model, batch.orbit).max()) / task.settings.mesh_error
@@ -335,127 +312,95 @@ def _sufficient(model: GeneratedModel, batch: OrbitBatch, task: TileTask) -> int
 
 @dataclass
 class _Block:
-    """The orbits of a tile while it fills: arrays with the axes columns, rows, then those of Discretisation."""
+    """The orbits (columns, rows) of a tile while it fills."""
 
     model: GeneratedModel
-    p: Array
-    x: Array
-    stages: Array
-    monodromy: Array
-    converged: Array
-    edges: Array
+    orbits: OrbitBatch
+    tol: float
 
-    @staticmethod
-    def empty(model: GeneratedModel, p: Array, edges: Array) -> _Block:
-        """Return a block of NaN for the parameters `p` (n_parameters, columns, rows)."""
-        shape, n, N = p.shape[1:], len(model.states), len(edges) - 1
-        return _Block(
-            model,
-            p,
-            np.full((*shape, N, n), np.nan),
-            np.full((*shape, N, STAGES, n), np.nan),
-            np.full((*shape, n, n), np.nan),
-            np.zeros(shape, bool),
-            edges,
-        )
+    def fill_rows(self, columns: Array, known: Array, new: Array) -> None:
+        """Solve the orbits at rows `new` of `columns` from those at the rows `known`."""
+        c, r = _pairs(columns, new)
+        index, weights = neighbours(known, r)
+        self._fill(c, r, combined(self.orbits.orbit.part((c[:, None], known[index])), weights))
 
-    def put(self, columns: Array, rows: Array, batch: OrbitBatch) -> None:
-        """Store a batch at the crossings of `columns` and `rows`."""
-        place, shape = np.ix_(columns, rows), (len(columns), len(rows))
-        self.x[place] = batch.orbit.x.reshape(*shape, *self.x.shape[2:])
-        self.stages[place] = batch.orbit.stages.reshape(*shape, *self.stages.shape[2:])
-        self.monodromy[place] = batch.monodromy.reshape(*shape, *self.monodromy.shape[2:])
-        self.converged[place] = batch.converged.reshape(shape)
+    def fill_columns(self, known: Array, new: Array) -> None:
+        """Solve the orbits at columns `new` from those at the columns `known`."""
+        c, r = _pairs(new, np.arange(self.orbits.converged.shape[1]))
+        index, weights = neighbours(known, c)
+        self._fill(c, r, combined(self.orbits.orbit.part((known[index], r[:, None])), weights))
 
-    def along_rows(self, columns: Array, known: Array, new: Array) -> Discretisation:
-        """Return guesses at rows `new` of `columns` from the rows `known`."""
-        known = np.sort(known)
-        index, weights = neighbours(known, new)
-        place = columns[:, None, None], known[index][None]
-        x = np.einsum("rk,crkNn->crNn", weights, self.x[place])
-        stages = np.einsum("rk,crkNmn->crNmn", weights, self.stages[place])
-        return Discretisation(x.reshape(-1, *x.shape[2:]), stages.reshape(-1, *stages.shape[2:]), self.edges)
+    def _fill(self, c: Array, r: Array, guess: Discretisation) -> None:
+        """Store the orbits at columns `c`, rows `r` from `guess`, also those that do not converge."""
+        self.orbits.replace((c, r), regular_orbits(self.model, self.orbits.p[:, c, r], guess, self.tol))
 
-    def along_columns(self, known: Array, new: Array) -> Discretisation:
-        """Return guesses at all rows of columns `new` from the columns `known`."""
-        known = np.sort(known)
-        index, weights = neighbours(known, new)
-        x = np.einsum("ck,ckrNn->crNn", weights, self.x[known[index]])
-        stages = np.einsum("ck,ckrNmn->crNmn", weights, self.stages[known[index]])
-        return Discretisation(x.reshape(-1, *x.shape[2:]), stages.reshape(-1, *stages.shape[2:]), self.edges)
-
-    def fill(self, columns: Array, rows: Array, guess: Discretisation, tol: float) -> None:
-        """Solve the orbits at the crossings of `columns` and `rows` from `guess`, and store them."""
-        p = self.p[:, columns[:, None], rows[None]].reshape(len(self.p), -1)
-        self.put(columns, rows, regular_orbits(self.model, p, guess, tol))
-
-    def spread(self, tol: float) -> None:
+    def spread(self) -> None:
         """Solve the orbits that were not found from those beside them, again and again until none is added.
 
         Steps from point to point lead round a cusp to a state that grows out of nothing else nearby. Where they lead nowhere,
         orbits are looked for anew, and the motion is simulated at a few points until it may have settled.
         """
-        self._spread(self.converged.copy(), tol)
-        if not self.converged.all():
-            self._spread(self._robust(tol), tol)
+        converged = self.orbits.converged
+        self._spread(converged.copy())
+        if not converged.all():
+            self._spread(self._robust())
         in_vain = 0
         for attempt in range(SETTLINGS):
-            if self.converged.all() or in_vain == IN_VAIN:
+            if converged.all() or in_vain == IN_VAIN:
                 return
-            fresh = self._settled(attempt * GOLDEN % 1, tol)
+            fresh = self._settled(attempt * GOLDEN % 1)
             in_vain = 0 if fresh.any() else in_vain + 1
-            self._spread(fresh, tol)
+            self._spread(fresh)
 
-    def _robust(self, tol: float) -> Array:
+    def _robust(self) -> Array:
         """Look for the missing orbits without a guess, and mark those that are found."""
-        found = ~self.converged
-        c, r = np.nonzero(found)
-        self._keep(c, r, regular(robust_orbits(self.model, self.p[:, c, r], None, self.edges, tol=tol)))
-        return found & self.converged
+        missing = ~self.orbits.converged
+        c, r = np.nonzero(missing)
+        orbits = robust_orbits(self.model, self.orbits.p[:, c, r], None, self.orbits.orbit.edges, tol=self.tol)
+        self._keep(c, r, regular(orbits))
+        return missing & self.orbits.converged
 
-    def _settled(self, share: float, tol: float) -> Array:
+    def _settled(self, share: float) -> Array:
         """Mark the point, if any, at which a simulation ends in a periodic state; it begins with the state of one beside it.
 
         Of all such points that is tried which lies a share of the way through their list.
         """
-        found = np.zeros_like(self.converged)
-        discontinuities = [
+        orbits, converged = self.orbits, self.orbits.converged
+        found = np.zeros_like(converged)
+        beside = [
             (c, r, c - dc, r - dr)
             for dc, dr in STEPS
-            for c, r in np.argwhere(_moved(self.converged, dc, dr) & ~self.converged).tolist()
+            for c, r in np.argwhere(_moved(converged, dc, dr) & ~converged).tolist()
         ]
-        if discontinuities:
-            c, r, from_c, from_r = discontinuities[int(share * len(discontinuities))]
-            guess = settle(self.model, self.p[:, c, r], self.x[from_c, from_r, 0], self.edges)
+        if beside:
+            c, r, from_c, from_r = beside[int(share * len(beside))]
+            guess = settle(self.model, orbits.p[:, c, r], orbits.orbit.x[from_c, from_r, 0], orbits.orbit.edges)
             if guess is not None:
-                self._solve(np.array([c]), np.array([r]), guess, tol)
-                found[c, r] = self.converged[c, r]
+                self._solve(np.array([c]), np.array([r]), guess)
+                found[c, r] = converged[c, r]
         return found
 
-    def _spread(self, fresh: Array, tol: float) -> None:
+    def _spread(self, fresh: Array) -> None:
         """Solve the points beside `fresh` ones from these, and so on."""
-        while fresh.any() and not self.converged.all():
+        converged = self.orbits.converged
+        while fresh.any() and not converged.all():
             added = np.zeros_like(fresh)
             for dc, dr in STEPS:
-                to_c, to_r = np.nonzero(_moved(fresh, dc, dr) & ~self.converged)
+                to_c, to_r = np.nonzero(_moved(fresh, dc, dr) & ~converged)
                 if not to_c.size:
                     continue
-                from_c, from_r = to_c - dc, to_r - dr
-                guess = Discretisation(self.x[from_c, from_r], self.stages[from_c, from_r], self.edges)
-                self._solve(to_c, to_r, guess, tol)
-                added[to_c, to_r] = self.converged[to_c, to_r]
+                self._solve(to_c, to_r, self.orbits.orbit.part((to_c - dc, to_r - dr)))
+                added[to_c, to_r] = converged[to_c, to_r]
             fresh = added
 
-    def _solve(self, c: Array, r: Array, guess: Discretisation, tol: float) -> None:
+    def _solve(self, c: Array, r: Array, guess: Discretisation) -> None:
         """Solve the orbits at columns `c`, rows `r` from `guess`, and keep those that are found."""
-        self._keep(c, r, regular_orbits(self.model, self.p[:, c, r], guess, tol))
+        self._keep(c, r, regular_orbits(self.model, self.orbits.p[:, c, r], guess, self.tol))
 
     def _keep(self, c: Array, r: Array, batch: OrbitBatch) -> None:
         """Store those of a batch that were found, at columns `c`, rows `r`."""
-        good = np.nonzero(batch.converged)[0]
-        place = c[good], r[good]
-        self.x[place], self.stages[place] = batch.orbit.x[good], batch.orbit.stages[good]
-        self.monodromy[place], self.converged[place] = batch.monodromy[good], True
+        good = batch.converged
+        self.orbits.replace((c[good], r[good]), batch.part(good))
 
 
 def settle(model: GeneratedModel, p: Array, start: Array, edges: Array) -> Discretisation | None:
@@ -564,8 +509,7 @@ class _Points:
             return
         old, places = self.samples, np.array([place for place, _ in fresh.values()]) / self.unit
         sources = [above for _, above in fresh.values()]
-        xs, ys = _quantities(task, places)
-        p = task.grid.points(model, xs, ys)
+        p = task.grid.at(model, task.corner + places)
         x = np.stack([old.orbit.x[k].mean(axis=0) for k in sources])
         stages = np.stack([old.orbit.stages[k].mean(axis=0) for k in sources])
         batch = regular_orbits(model, p, Discretisation(x, stages, old.orbit.edges), task.settings.tol)
@@ -582,12 +526,6 @@ class _Points:
             join([old.orbit, batch.orbit]),
             np.concatenate([old.multipliers, batch.multipliers]),
         )
-
-
-def _quantities(task: TileTask, at: Array) -> tuple[Array, Array]:
-    """Return the quantities along x and y at places (B, 2), in grid steps from the tile's corner."""
-    grid = task.grid
-    return grid.x.between(task.columns[0] + at[:, 0]), grid.y.between(task.rows[0] + at[:, 1])
 
 
 def refine(task: TileTask, samples: Samples) -> Refined:
@@ -614,7 +552,7 @@ def refine(task: TileTask, samples: Samples) -> Refined:
 
 def _grid_cells(task: TileTask, samples: Samples, unit: int) -> Cells:
     """Return the cells of the tile's grid, with the interpolation errors that second differences show."""
-    nc, nr = task.columns[1] - task.columns[0] + 1, task.rows[1] - task.rows[0] + 1
+    nc, nr = task.shape
     g = samples.g[: nc * nr].reshape(nc, nr)
     error = SAFETY * (_interpolation_error(g, 0) + _interpolation_error(g, 1))
     around = np.stack([error[:-1, :-1], error[1:, :-1], error[:-1, 1:], error[1:, 1:]])
@@ -670,17 +608,16 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
     """
     done = refine(task, solve_block(task))
     samples = done.samples
-    nc, nr = task.columns[1] - task.columns[0] + 1, task.rows[1] - task.rows[0] + 1
-    count, corner = nc * nr, np.array([task.columns[0], task.rows[0]])
-    leading = _upper(samples.multipliers[:, 0])
+    count, corner = math.prod(task.shape), task.corner
+    leading = upper_half(samples.multipliers[:, 0])
     names = task.grid.x.moved, task.grid.y.moved
     crossed, apart = _crossed(samples), _apart(samples, tile_points(task)[0], names)
     sides = _sides(done, 2**task.settings.depth, lambda i, j: crossed(i, j) | apart(i, j))
     suspect = done.suspect.copy()
     suspect[:, :2] += corner
     return {
-        "leading": leading[:count].reshape(nc, nr),
-        "mesh": np.array(len(samples.orbit.edges) - 1),
+        "leading": leading[:count].reshape(task.shape),
+        "mesh": np.array(samples.orbit.intervals),
         "extra_at": samples.at[count:] + corner,
         "extra_leading": leading[count:],
         "suspect": suspect,
@@ -731,27 +668,22 @@ def _unlike(model: GeneratedModel, samples: Samples, names: tuple[str, str], i: 
     return np.asarray(~(np.abs(change - told)[:, logs].max(axis=-1) < LEFT))
 
 
-def _upper(rho: Array) -> Array:
-    """Return multipliers with those below the real axis replaced by their conjugates."""
-    return rho.real + 1j * np.abs(rho.imag)
-
-
 def _seeds(task: TileTask, samples: Samples, sides: Array, corner: Array) -> dict[str, Array]:
     """Return the sign changes on `sides` (E, 3), with an orbit and a multiplier between the two ends of each."""
     g, (i, j, axis) = samples.g, sides.T
     share = g[i] / np.where(g[i] == g[j], 1.0, g[i] - g[j])
     nearer = np.where(share < 0.5, i, j)
-    blend, orbit = share[:, None, None], samples.orbit
+    orbit = (1 - share) * samples.orbit.part(i) + share * samples.orbit.part(j)
     at = (1 - share)[:, None] * samples.at[i] + share[:, None] * samples.at[j]
     model = tile_points(task)[0]
     return {
         "seed_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
         "seed_axis": axis,
         "seed_g": np.stack([g[i], g[j]], axis=1),
-        "seed_p": task.grid.points(model, *_quantities(task, at)),
-        "seed_rho": _upper(samples.multipliers[nearer, 0]),
-        "seed_x": (1 - blend) * orbit.x[i] + blend * orbit.x[j],
-        "seed_stages": (1 - blend[..., None]) * orbit.stages[i] + blend[..., None] * orbit.stages[j],
+        "seed_p": task.grid.at(model, corner + at),
+        "seed_rho": upper_half(samples.multipliers[nearer, 0]),
+        "seed_x": orbit.x,
+        "seed_stages": orbit.stages,
     }
 
 
@@ -762,7 +694,7 @@ def _discontinuities(samples: Samples, sides: Array, corner: Array) -> dict[str,
     return {
         "discontinuity_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
         "discontinuity_axis": axis,
-        "discontinuity_rho": _upper(samples.multipliers[i, 0]),
+        "discontinuity_rho": upper_half(samples.multipliers[i, 0]),
         "discontinuity_x": samples.orbit.x[i],
         "discontinuity_stages": samples.orbit.stages[i],
     }

@@ -1,11 +1,12 @@
-"""The boundary components of a map, and the folds of the forced state that only end there.
+"""The boundary components of a map, and curves of folds where a forced periodic state ends.
 
-So is every stable state that ends beside a point without one: by a curve of folds.
+Every sign change of a map is accounted for by a curve that passes through it, or by a new curve that starts there. Every stable
+state that ends beside a point without one is accounted for by a curve of folds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,15 +14,23 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.boundary import BoundaryPoint, along, bifurcation_kind, polish
-from srfcli.numerics.collocation import Discretisation
-from srfcli.numerics.continuation import Atlas, AtlasSettings, Curve, CurvePoint, correct, polish_curve, trace
+from srfcli.numerics.collocation import stack
+from srfcli.numerics.continuation import (
+    Atlas,
+    AtlasSettings,
+    Curve,
+    CurvePoint,
+    Progress,
+    correct,
+    polish_curve,
+    trace_whole,
+    with_tangent,
+)
 from srfcli.numerics.critical import locate_crossings, scan_line
 from srfcli.numerics.map import Discontinuity, Seed, StabilityMap
-from srfcli.numerics.orbit import scales, solve_orbits
-from srfcli.numerics.plane import Axis, Plane
+from srfcli.numerics.orbit import scales, solve_orbits, steady_guess
+from srfcli.numerics.plane import Axis, Plane, meets
 from srfcli.numerics.special_points import crossings_at
-
-# The boundary components of a map: every sign change accounted for by a curve that passes through it, or that starts there.
 
 DENSE = 12  # points of the cubic between two points of a curve, on which seeds are looked for
 CURVE_REACH = 1e-3  # of the window: seeds and curves are compared to this
@@ -29,8 +38,6 @@ RETRIES = 3  # of a curve that jumped from one side of a tongue to the other
 UPRIGHT = 0.05  # of the tangent: where less points along x the slope at fixed x is not to be relied on
 PATIENCE = 24  # stable points in a row beside one without an orbit at which no fold is met: orbits were missed
 MARGIN = 0.5  # of a seed's length by which its boundary point may lie outside
-
-Progress = Callable[[str], None]
 
 
 @dataclass
@@ -108,11 +115,7 @@ def _conclude(atlas: Atlas, found: StabilityMap, missed: int) -> None:
         atlas.notes.append(
             "at a boundary of type fold a forced state ends: beyond it the map shows another one, where it finds any"
         )
-    if atlas.status is Status.OK and (missed or not all(pt.status.ok for b in atlas.branches for pt in b.points)):
-        atlas.status = Status.NO_CONVERGENCE
-    ends = {end for b in atlas.branches for end in (b.start, b.end)}
-    if atlas.status is Status.OK:
-        atlas.status = next((e for e in (Status.STEP_TOO_SMALL, Status.MAX_STEPS) if e in ends), Status.OK)
+    atlas.conclude(missed)
 
 
 def map_notes(found: StabilityMap) -> list[str]:
@@ -139,9 +142,7 @@ def starting_point(model: GeneratedModel, plane: Plane, seed: Seed, settings: At
     """Return the boundary point of a seed, ready to be followed, or None where Newton's method leads elsewhere."""
     axis = (plane.x, plane.y)[seed.axis]
     tol = settings.steps.mesh_error
-    direction = replace(along(axis.name, 1), log=(axis.log,))
-    if not axis.log:
-        direction = replace(direction, vectors=np.full((1, 1, 1), axis.span))
+    direction = along(axis.name, 1, log=axis.log, unit=1.0 if axis.log else axis.span)
     points = polish(
         model, seed.p[:, None], seed.orbit, np.array([seed.rho]), direction, tol=tol, max_mesh=settings.max_mesh
     )
@@ -150,10 +151,7 @@ def starting_point(model: GeneratedModel, plane: Plane, seed: Seed, settings: At
         usable = [pt for pt in _searched(model, axis, seed, settings) if _inside(model, plane, pt, seed)]
     if not usable:
         return None
-    point = usable[0]
-    single = Discretisation(point.orbit.x[0], point.orbit.stages[0], point.orbit.edges)
-    q = plane.coordinates(model, point.p)
-    return correct(model, plane, q, single, point.rho, np.eye(2)[1 - seed.axis], np.zeros(single.x.shape[-1]))
+    return with_tangent(model, plane, usable[0], 1 - seed.axis)
 
 
 def _inside(model: GeneratedModel, plane: Plane, point: BoundaryPoint, seed: Seed) -> bool:
@@ -167,11 +165,11 @@ def _inside(model: GeneratedModel, plane: Plane, point: BoundaryPoint, seed: See
 
 def _searched(model: GeneratedModel, axis: Axis, seed: Seed, settings: AtlasSettings) -> list[BoundaryPoint]:
     """Return the crossings on the seed's line that a scan on twice its mesh shows."""
-    low, high = (float(np.asarray(axis.value(v))) for v in seed.ends[:, seed.axis])
+    low, high = axis.value(seed.ends[:, seed.axis]).tolist()
     margin = (high / low) ** 0.5
     values = np.geomspace(low / margin, high * margin, 9)
     scan = scan_line(
-        model, seed.p, axis.name, values, intervals=2 * (len(seed.orbit.edges) - 1), resolution=settings.resolution
+        model, seed.p, axis.name, values, intervals=2 * seed.orbit.intervals, resolution=settings.resolution
     )
     return locate_crossings(model, seed.p, scan, tol=settings.steps.mesh_error, max_mesh=settings.max_mesh, depth=2)
 
@@ -186,12 +184,7 @@ def follow_curve(
     """
     steps = settings.steps
     for _ in range(RETRIES + 1):
-        curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
-        try:
-            for curve in trace(model, plane, start, steps):
-                progress(f"{len(curve.points)} points")
-        except KeyboardInterrupt:
-            curve.end = Status.INTERRUPTED
+        curve = trace_whole(model, plane, start, steps, progress)
         if curve.end is Status.INTERRUPTED or _in_one_piece(curve):
             break
         steps = replace(
@@ -271,17 +264,10 @@ def ends_state(traced: _Traced, discontinuity: Discontinuity) -> bool:
     return bool((near & traced.fold[index]).any())
 
 
-def _met(traced: _Traced, ends: Array, k: int) -> tuple[Array, Array]:
-    """Return the parts of a curve that meet the line along axis `k` through `ends`, and whether they do between these."""
-    other = 1 - k
-    a, b = traced.line[:-1], traced.line[1:]
-    at = ends[0, other]
-    low, high = ends[:, k].min(), ends[:, k].max()
-    near = (np.minimum(a[:, other], b[:, other]) - 1e-9 <= at) & (at <= np.maximum(a[:, other], b[:, other]) + 1e-9)
-    index = np.nonzero(near)[0]
-    run = b[index, other] - a[index, other]
-    share = np.clip((at - a[index, other]) / np.where(run == 0, 1.0, run), 0.0, 1.0)
-    height = a[index, k] + share * (b[index, k] - a[index, k])
+def _met(traced: _Traced, ends: Array, axis: int) -> tuple[Array, Array]:
+    """Return the parts of a curve that meet the line along `axis` through `ends`, and whether they do between these."""
+    index, _, height = meets(traced.line, ends[0, 1 - axis], axis)
+    low, high = ends[:, axis].min(), ends[:, axis].max()
     reach = 0.25 * (high - low) + CURVE_REACH
     return index, (height >= low - reach) & (height <= high + reach)
 
@@ -313,7 +299,7 @@ def unexplained(model: GeneratedModel, found: StabilityMap, atlas: Atlas) -> Arr
     values = p[model.index(atlas.plane.x.name), :, 0]
     left = []
     for i, heights in enumerate(crossings_at(model, atlas.plane, atlas.branches, values, folds=False)):
-        edges = np.asarray(atlas.plane.y.unit(np.array(heights))).reshape(-1)
+        edges = atlas.plane.y.unit(heights)
         order = np.arange(unit.shape[1])[:: -1 if flipped else 1]
         y, g = unit[i, order, 1], found.growth[i, order]
         clear = np.isfinite(g)
@@ -327,7 +313,7 @@ def unexplained(model: GeneratedModel, found: StabilityMap, atlas: Atlas) -> Arr
     return np.array(left, dtype=int).reshape(-1, 2)
 
 
-# Folds of the forced state, which a map shows only by what is missing: where a stable state ends, no neighbour tells.
+# Folds of the forced periodic state. A map shows them only indirectly: a stable state ends, and its neighbour has none.
 
 FINEST = 2.0**-12  # of the way to the neighbour: where the halving of steps ends
 NEAR = 0.5  # in logarithms, or V, or um: a larger step of the state is not taken for the same state
@@ -351,27 +337,20 @@ def not_continued(
     for discontinuity in discontinuities:
         by_mesh.setdefault(len(discontinuity.orbit.edges), []).append(discontinuity)
     for group in by_mesh.values():
-        edges, ends = group[0].orbit.edges, np.stack([b.ends for b in group])
-        x, stages = np.stack([b.orbit.x for b in group]), np.stack([b.orbit.stages for b in group])
-        before = _points(model, plane, ends[:, 0])
-        going, dx, dstages = np.ones(len(group), bool), np.zeros_like(x), np.zeros_like(stages)
+        ends, orbit = np.stack([b.ends for b in group]), stack([b.orbit for b in group])
+        before = plane.point(model, ends[:, 0])
+        going, change = np.ones(len(group), bool), orbit.unchanged()
         for share in np.arange(1, steps[0] + 1) / steps[0]:
-            p = _points(model, plane, ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))
-            shift = (model.steady(p) - model.steady(before))[:, None, :]
-            guess = Discretisation(x + shift + dx, stages + shift[:, None] + dstages, edges)
+            p = plane.point(model, ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))
+            shift = steady_guess(model, p, orbit.edges) - steady_guess(model, before, orbit.edges)
+            guess = orbit + shift + change
             found = solve_orbits(model, p, guess, tol=1e-7, max_iterations=10)
             off = (np.abs(found.orbit.x - guess.x) / scales(model, p)[:, None, :]).max(axis=(-1, -2))
             with np.errstate(invalid="ignore"):
                 going &= found.converged & (off < NEAR) & (np.abs(found.multipliers[:, 0]) < 1)
-            dx, dstages = found.orbit.x - x - shift, found.orbit.stages - stages - shift[:, None]
-            x, stages, before = found.orbit.x, found.orbit.stages, p
+            change, orbit, before = found.orbit - orbit - shift, found.orbit, p
         left += [discontinuity for discontinuity, reached in zip(group, going, strict=True) if not reached]
     return not_continued(model, plane, left, steps[1:]) if left and steps[1:] else left
-
-
-def _points(model: GeneratedModel, plane: Plane, q: Array) -> Array:
-    """Return the parameters (n_parameters, B) at unit coordinates q (B, 2)."""
-    return np.stack([plane.point(model, row) for row in q], axis=1)
 
 
 def continued_end(model: GeneratedModel, plane: Plane, discontinuity: Discontinuity) -> Discontinuity | None:
@@ -381,26 +360,22 @@ def continued_end(model: GeneratedModel, plane: Plane, discontinuity: Discontinu
     """
     here, way = discontinuity.ends[0], discontinuity.ends[1] - discontinuity.ends[0]
     share, step, orbit, rho = 0.0, 0.5, discontinuity.orbit, discontinuity.rho
-    p, dx, dstages = plane.point(model, here), np.zeros_like(orbit.x), np.zeros_like(orbit.stages)
+    p, slope = plane.point(model, here), orbit.unchanged()
     while step > FINEST:
         ahead = min(share + step, 1.0)
         q = plane.point(model, here + ahead * way)
-        shift, reach = model.steady(q) - model.steady(p), ahead - share
-        guess = Discretisation(
-            (orbit.x + shift + reach * dx)[None], (orbit.stages + shift + reach * dstages)[None], orbit.edges
-        )
-        found = solve_orbits(model, q[:, None], guess, max_iterations=10)
-        off = float((np.abs(found.orbit.x[0] - guess.x[0]) / scales(model, q)).max())
+        reach = ahead - share
+        shift = steady_guess(model, q, orbit.edges) - steady_guess(model, p, orbit.edges)
+        guess = orbit + shift + reach * slope
+        found = solve_orbits(model, q[:, None], guess.part(None), max_iterations=10)
+        off = float((np.abs(found.orbit.x[0] - guess.x) / scales(model, q)).max())
         leading = complex(found.multipliers[0, 0])
         if not found.converged[0] or off > NEAR or not abs(leading) < 1:
             step /= 2
             continue
-        dx, dstages = (
-            (found.orbit.x[0] - orbit.x - shift) / reach,
-            (found.orbit.stages[0] - orbit.stages - shift) / reach,
-        )
+        slope = (found.orbit.part(0) - orbit - shift) / reach
         share, rho, p, step = ahead, leading, q, 2 * step if off < NEAR / 4 else step
-        orbit = Discretisation(found.orbit.x[0], found.orbit.stages[0], orbit.edges)
+        orbit = found.orbit.part(0)
         if share == 1.0:
             return None
     return Discontinuity(np.array([here + share * way, discontinuity.ends[1]]), discontinuity.axis, rho, orbit)
@@ -410,8 +385,8 @@ def fold_at(model: GeneratedModel, plane: Plane, end: Discontinuity) -> CurvePoi
     """Return the fold at which a stable state ends, ready to be followed; None where its leading multiplier is not near +1."""
     if end.rho.real < MEETS or bifurcation_kind(end.rho) != "fold":
         return None
-    here, across, normal = end.ends[0], np.zeros(end.orbit.x.shape[-1]), np.eye(2)[1 - end.axis]
-    start = correct(model, plane, here, end.orbit, end.rho, normal, across, max_iterations=20)
+    here = end.ends[0]
+    start = correct(model, plane, here, end.orbit, end.rho, np.eye(2)[1 - end.axis], max_iterations=20)
     if start is None or bifurcation_kind(start.rho) != "fold" or not start.others < 1:
         return None
     return start if np.abs(start.q - here).max() < FOLD_REACH else None

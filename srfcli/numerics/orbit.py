@@ -1,8 +1,7 @@
-"""Forced periodic states: Newton's method on the condensed collocation equations, for one parameter point or a batch."""
+"""Forced periodic states: first guesses, Newton's method on the condensed collocation equations, and a robust search."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,11 +14,12 @@ from srfcli.numerics.collocation import (
     Condensed,
     Discretisation,
     condense,
-    expand,
     gauss,
-    join,
     kernel,
+    mesh_error,
     newton_orbits,
+    respond,
+    solved,
 )
 
 CHUNK = 48  # parameter points solved together: their blocks fit the cache
@@ -36,20 +36,25 @@ class OrbitBatch:
     orbit: Discretisation
     monodromy: Array
     converged: Array
-    iterations: int
+
+    @classmethod
+    def empty(cls, p: Array, edges: Array, n: int) -> OrbitBatch:
+        """Return a batch for the points `p`, with `n` unknowns, in which no orbit is known yet."""
+        shape, N = p.shape[1:], len(edges) - 1
+        x, stages = np.full((*shape, N, n), np.nan), np.full((*shape, N, STAGES, n), np.nan)
+        return cls(p, Discretisation(x, stages, edges), np.full((*shape, n, n), np.nan), np.zeros(shape, bool))
 
     @property
     def multipliers(self) -> ComplexArray:
         """Return the Floquet multipliers (..., n), largest modulus first; NaN where the orbit did not converge."""
         return ordered_eigenvalues(self.monodromy, self.converged)
 
-    def part(self, index: Array) -> OrbitBatch:
+    def part(self, index: Any) -> OrbitBatch:
         """Return the orbits that `index` selects."""
-        return OrbitBatch(
-            self.p[:, index], self.orbit.part(index), self.monodromy[index], self.converged[index], self.iterations
-        )
+        p = self.p[:, *index] if isinstance(index, tuple) else self.p[:, index]
+        return OrbitBatch(p, self.orbit.part(index), self.monodromy[index], self.converged[index])
 
-    def replace(self, index: Array, other: OrbitBatch) -> None:
+    def replace(self, index: Array | tuple[Array, ...], other: OrbitBatch) -> None:
         """Put the orbits of `other` in the place of those at `index`, whatever became of them."""
         self.orbit.x[index], self.orbit.stages[index] = other.orbit.x, other.orbit.stages
         self.monodromy[index], self.converged[index] = other.monodromy, other.converged
@@ -79,24 +84,23 @@ def uniform_mesh(intervals: int) -> Array:
     return np.linspace(0.0, 1.0, intervals + 1)
 
 
-def steady_guess(model: GeneratedModel, p: Array, edges: Array, m: int = STAGES) -> Discretisation:
+def steady_guess(model: GeneratedModel, p: Array, edges: Array) -> Discretisation:
     """Return steady sliding under the mean load as a first guess of the orbit."""
     rest = model.steady(p)
     N, n = len(edges) - 1, rest.shape[-1]
     x = np.broadcast_to(rest[..., None, :], (*rest.shape[:-1], N, n)).copy()
-    stages = np.broadcast_to(rest[..., None, None, :], (*rest.shape[:-1], N, m, n)).copy()
+    stages = np.broadcast_to(rest[..., None, None, :], (*rest.shape[:-1], N, STAGES, n)).copy()
     return Discretisation(x, stages, edges)
 
 
-def forced_guess(model: GeneratedModel, p: Array, edges: Array, m: int = STAGES) -> Discretisation:
+def forced_guess(model: GeneratedModel, p: Array, edges: Array) -> Discretisation:
     """Return steady sliding with its linear response to the modulation as a first guess of the orbits at `p` (n_parameters, B).
 
     The response is scaled down where a logarithm would swing by more than LARGEST_SWING either way.
     """
-    guess = steady_guess(model, p, edges, m)
+    guess = steady_guess(model, p, edges)
     rest, n = model.steady(p), len(model.states)
-    calm = p.copy()
-    calm[model.index("eps")] = 0.0
+    calm = model.with_values(p, eps=0.0)
     tau = np.arange(16) / 16
     field = model.cycle(tau, np.broadcast_to(rest[..., None, :], (*rest.shape[:-1], 16, n)), p[..., None])
     forcing = np.fft.fft(field, axis=-2)[..., 1, :] / 8
@@ -111,27 +115,26 @@ def forced_guess(model: GeneratedModel, p: Array, edges: Array, m: int = STAGES)
 
 def interpolate(orbit: Discretisation, edges: Array) -> Discretisation:
     """Return `orbit` evaluated on another mesh by its own collocation polynomials."""
-    m = orbit.stages.shape[-2]
-    nodes = np.concatenate([[0.0], gauss(m).nodes])
-    phases = edges[:-1, None] + np.diff(edges)[:, None] * gauss(m).nodes
+    nodes = np.concatenate([[0.0], gauss().nodes])
+    phases = edges[:-1, None] + np.diff(edges)[:, None] * gauss().nodes
 
     def at(tau: Array) -> Array:
         cell = np.clip(np.searchsorted(orbit.edges, tau, side="right") - 1, 0, len(orbit.edges) - 2)
         s = (tau - orbit.edges[cell]) / orbit.steps[cell]
-        basis = _lagrange(nodes, s)  # (..., m+1)
         values = np.concatenate([orbit.x[..., None, :], orbit.stages], axis=-2)[..., cell, :, :]
-        return np.einsum("...k,...kn->...n", basis, values)
+        return np.einsum("...k,...kn->...n", lagrange(nodes, s), values)
 
     return Discretisation(at(edges[:-1]), at(phases), edges)
 
 
-def _lagrange(nodes: Array, s: Array) -> Array:
-    """Return the Lagrange polynomials on `nodes` at `s`, with one axis more."""
-    columns = []
-    for i, node in enumerate(nodes):
-        others = np.delete(nodes, i)
-        columns.append(np.prod((s[..., None] - others) / (node - others), axis=-1))
-    return np.stack(columns, axis=-1)
+def lagrange(nodes: Array, at: Array) -> Array:
+    """Return the Lagrange polynomials on `nodes` (..., k) at the places `at` (...), (..., k)."""
+    weights = np.ones((*at.shape, nodes.shape[-1]))
+    for i in range(nodes.shape[-1]):
+        for j in range(nodes.shape[-1]):
+            if j != i:
+                weights[..., i] *= (at - nodes[..., j]) / (nodes[..., i] - nodes[..., j])
+    return weights
 
 
 def levels(count: int, stride: int = STRIDE) -> list[Array]:
@@ -148,29 +151,24 @@ def levels(count: int, stride: int = STRIDE) -> list[Array]:
 
 
 def neighbours(known: Array, new: Array, most: int = NEIGHBOURS) -> tuple[Array, Array]:
-    """Return, for each position `new`, which of the rising positions `known`, `most` of them, are around it, and their weights.
-
-    The weights are Lagrange's.
-    """
+    """Return the indices of the `most` rising positions `known` around each position `new`, and their Lagrange weights."""
     width = min(most, len(known))
     first = np.clip(np.searchsorted(known, new) - width // 2, 0, len(known) - width)
     index = first[:, None] + np.arange(width)  # (new, width)
-    weights, at = np.ones(index.shape), known[index]
-    for i in range(width):
-        for j in range(width):
-            if j != i:
-                weights[:, i] *= (new - at[:, j]) / (at[:, i] - at[:, j])
-    return index, weights
+    return index, lagrange(known[index], new)
+
+
+def combined(orbits: Discretisation, weights: Array) -> Discretisation:
+    """Return the sums over k of orbits (B, k, N, ...) times their weights (B, k)."""
+    return Discretisation(
+        np.einsum("bk,bkNn->bNn", weights, orbits.x), np.einsum("bk,bkNmn->bNmn", weights, orbits.stages), orbits.edges
+    )
 
 
 def between(orbit: Discretisation, known: Array, new: Array, most: int = NEIGHBOURS) -> Discretisation:
     """Return guesses at positions `new` through the orbits (B, N, ...) at the rising positions `known` (B,)."""
     index, weights = neighbours(known, new, most)
-    return Discretisation(
-        np.einsum("bk,bkNn->bNn", weights, orbit.x[index]),
-        np.einsum("bk,bkNmn->bNmn", weights, orbit.stages[index]),
-        orbit.edges,
-    )
+    return combined(orbit.part(index), weights)
 
 
 def step_limit(model: GeneratedModel, dx: Array, stages: Array) -> Array:
@@ -182,132 +180,131 @@ def step_limit(model: GeneratedModel, dx: Array, stages: Array) -> Array:
 
 
 def solve_orbits(
-    model: GeneratedModel,
-    p: Array,
-    guess: Discretisation,
-    *,
-    tol: float = 1e-9,
-    max_iterations: int = 40,
+    model: GeneratedModel, p: Array, guess: Discretisation, *, tol: float = 1e-9, max_iterations: int = 40
 ) -> OrbitBatch:
     """Return the periodic orbits at the parameter points `p` (n_parameters, B) from `guess`; finished ones leave the batch.
 
     A point that does not converge in `max_iterations` keeps its last iterate and is marked so.
     """
-    parts = [
-        _solve_chunk(model, p[:, a : a + CHUNK], guess.part(slice(a, a + CHUNK)), tol, max_iterations)
-        for a in range(0, p.shape[1], CHUNK)
-    ]
-    return parts[0] if len(parts) == 1 else join_orbits(parts)
-
-
-def join_orbits(parts: Sequence[OrbitBatch]) -> OrbitBatch:
-    """Return several batches on one mesh as one."""
-    return OrbitBatch(
-        np.concatenate([b.p for b in parts], axis=1),
-        join([b.orbit for b in parts]),
-        np.concatenate([b.monodromy for b in parts]),
-        np.concatenate([b.converged for b in parts]),
-        max(b.iterations for b in parts),
-    )
-
-
-def _solve_one(model: GeneratedModel, p: Array, guess: Discretisation, tol: float, max_iterations: int) -> OrbitBatch:
-    """Return a batch of one: without the batch axis parameters are plain floats, which takes half the time."""
-    q, size, n = p[:, 0], scales(model, p[:, 0]), len(model.states)
-    orbit = Discretisation(guess.x[0].copy(), guess.stages[0].copy(), guess.edges)
-    identity, converged, monodromy, iteration = np.eye(n), False, np.full((n, n), np.nan), 0
-    with np.errstate(all="ignore"):
-        while iteration < max_iterations:
-            iteration += 1
-            try:
-                linear = condense(model, q, orbit)
-                monodromy = linear.monodromy
-                start = np.linalg.solve(identity - monodromy, linear.prefix[-1, :n, n])
-            except np.linalg.LinAlgError:
-                break
-            dx, dstages = expand(linear, start)
-            limit, change = float(step_limit(model, dx, dstages)), float((np.abs(dx) / size).max())
-            if not (np.isfinite(change) and np.isfinite(dstages).all()):
-                break
-            orbit.x += limit * dx
-            orbit.stages += limit * dstages
-            if change < tol:
-                converged = True
-                break
-    whole = Discretisation(orbit.x[None], orbit.stages[None], orbit.edges)
-    return OrbitBatch(p, whole, monodromy[None], np.array([converged]), iteration)
-
-
-def _solve_chunk(model: GeneratedModel, p: Array, guess: Discretisation, tol: float, max_iterations: int) -> OrbitBatch:
-    library = kernel(model) if guess.stages.shape[-2] == STAGES else None
-    if library is not None:
-        found = Discretisation(guess.x.copy(), guess.stages.copy(), guess.edges)
-        size = np.ascontiguousarray(scales(model, p))
-        monodromy, converged, used = newton_orbits(
-            library, (found.phases, found.steps), p, found.x, found.stages, size, tol, max_iterations
+    library, size = kernel(model), np.ascontiguousarray(scales(model, p))
+    found = OrbitBatch.empty(p, guess.edges, len(model.states))
+    found.orbit.x[:], found.orbit.stages[:] = guess.x, guess.stages
+    for a in range(0, p.shape[1], CHUNK):
+        cut = slice(a, a + CHUNK)
+        if library is None:
+            _newton(model, found, np.arange(len(size))[cut], size, tol, max_iterations)
+            continue
+        found.monodromy[cut], found.converged[cut] = newton_orbits(
+            library, p[:, cut], found.orbit.part(cut), size[cut], tol, max_iterations
         )
-        return OrbitBatch(p, found, monodromy, converged, used)
-    if p.shape[1] == 1:
-        return _solve_one(model, p, guess, tol, max_iterations)
-    B, n = p.shape[1], len(model.states)
-    x, stages = guess.x.copy(), guess.stages.copy()
-    monodromy = np.full((B, n, n), np.nan)
-    converged = np.zeros(B, dtype=bool)
-    size = scales(model, p)
-    active = np.arange(B)
-    iteration = 0
-    while active.size and iteration < max_iterations:
-        iteration += 1
-        part = Discretisation(x[active], stages[active], guess.edges)
+    return found
+
+
+def _newton(
+    model: GeneratedModel, batch: OrbitBatch, active: Array, size: Array, tol: float, max_iterations: int
+) -> None:
+    """Bring the orbits `active` of a batch to convergence in place, as the compiled equations do."""
+    for _ in range(max_iterations):
         with np.errstate(all="ignore"):  # a diverging point overflows; it is dropped below
-            linear, dx, dstages, finite = newton_step(model, p[:, active], part)
+            linear, dx, dstages, finite = newton_step(model, batch.p[:, active], batch.orbit.part(active))
             limit = step_limit(model, dx, dstages)
             change = (np.abs(dx) / size[active][:, None, :]).max(axis=(-1, -2))
         limit = np.where(finite, limit, 0.0)
-        x[active] += limit[:, None, None] * np.where(finite[:, None, None], dx, 0.0)
-        stages[active] += limit[:, None, None, None] * np.where(finite[:, None, None, None], dstages, 0.0)
-        monodromy[active] = linear.monodromy
+        batch.orbit.x[active] += limit[:, None, None] * np.where(finite[:, None, None], dx, 0.0)
+        batch.orbit.stages[active] += limit[:, None, None, None] * np.where(finite[:, None, None, None], dstages, 0.0)
+        batch.monodromy[active] = linear.monodromy
         done = finite & (change < tol)
-        converged[active[done]] = True
+        batch.converged[active[done]] = True
         active = active[finite & ~done]
-    return OrbitBatch(p, Discretisation(x, stages, guess.edges), monodromy, converged, iteration)
+        if not active.size:
+            break
 
 
 def newton_step(model: GeneratedModel, p: Array, orbit: Discretisation) -> tuple[Condensed, Array, Array, Array]:
     """Return the linearisation and the Newton corrections; the last array says which points are finite."""
     n = orbit.x.shape[-1]
-    try:
-        linear = condense(model, p, orbit)
-    except np.linalg.LinAlgError:  # one singular block spoils the batch: take the points one by one
-        linear = _condense_each(model, p, orbit)
+    linear = condense(model, p, orbit)
     matrix = np.eye(n) - linear.monodromy
-    right = linear.prefix[..., -1, :n, n]
-    finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(right).all(axis=-1)
-    matrix = np.where(finite[..., None, None], matrix, np.eye(n))
-    singular = finite & (np.abs(np.linalg.det(matrix)) < 1e-300)
-    matrix[singular] = np.eye(n)
-    start = np.linalg.solve(matrix, np.where(finite[..., None], right, 0.0)[..., None])[..., 0]
-    dx, dstages = expand(linear, start)
-    finite &= ~singular & np.isfinite(dx).all(axis=(-1, -2)) & np.isfinite(dstages).all(axis=(-1, -2, -3))
-    return linear, dx, dstages, finite
+    start = solved(matrix, linear.prefix[..., -1, :n, n:])
+    head = np.concatenate([start, np.ones_like(start[..., :1, :])], axis=-2)
+    dx, dstages = (change[..., 0] for change in respond(linear, head))
+    finite: Any = np.isfinite(matrix).all(axis=(-1, -2)) & np.isfinite(dx).all(axis=(-1, -2))
+    return linear, dx, dstages, finite & np.isfinite(dstages).all(axis=(-1, -2, -3))
 
 
-def _condense_each(model: GeneratedModel, p: Array, orbit: Discretisation) -> Condensed:
-    parts = []
-    for b in range(p.shape[1]):
-        one = Discretisation(orbit.x[b : b + 1], orbit.stages[b : b + 1], orbit.edges)
-        try:
-            parts.append(condense(model, p[:, b : b + 1], one))
-        except np.linalg.LinAlgError:
-            n, size = orbit.x.shape[-1], orbit.stages.shape[-2] * orbit.stages.shape[-1]
-            N = orbit.x.shape[-2]
-            nan = np.full((1, N, size // n, n, n + 1), np.nan)
-            parts.append(
-                Condensed(
-                    np.full((1, N, size, size), np.nan),
-                    nan,
-                    np.full((1, N, n + 1, n + 1), np.nan),
-                    np.full((1, N + 1, n + 1, n + 1), np.nan),
-                )
-            )
-    return Condensed(*(np.concatenate([getattr(q, k) for q in parts]) for k in ("block", "local", "maps", "prefix")))
+# Orbits wherever they can be found: from guesses, from each other, or by raising eps from 0.
+
+FIRST_CLIMB, SMALLEST_CLIMB = 0.25, 2e-3  # steps in which eps is raised to its value, as shares of it
+CLIMBING = 12  # Newton steps at each
+ALMOST = 1 - 1e-12  # of eps
+ROUGHEST = 0.1  # estimated error of a climbed state's multipliers on its mesh; the true one is a hundredth of that
+
+
+def growth(batch: OrbitBatch) -> tuple[ComplexArray, Array]:
+    """Return the multipliers and ln |leading multiplier| of a batch, NaN where the orbit was not found."""
+    multipliers = batch.multipliers
+    return multipliers, np.log(np.abs(multipliers[:, 0]))
+
+
+def robust_orbits(
+    model: GeneratedModel, p: Array, guess: Discretisation | None, edges: Array, *, tol: float = 1e-7
+) -> OrbitBatch:
+    """Return orbits at `p`, from `guess`, else from the linear response, else by raising eps in steps."""
+    batch = solve_orbits(model, p, guess or forced_guess(model, p, edges), tol=tol, max_iterations=14 if guess else 40)
+    if guess is not None and not batch.converged.all():
+        bad = np.nonzero(~batch.converged)[0]
+        batch.replace(bad, solve_orbits(model, p[:, bad], forced_guess(model, p[:, bad], edges), tol=tol))
+    if not batch.converged.all():
+        bad = np.nonzero(~batch.converged)[0]
+        batch.replace(bad, climbed(model, p[:, bad], edges, tol=tol))
+    return batch
+
+
+def line_orbits(
+    model: GeneratedModel, p: Array, position: Array, guess: Discretisation | None, edges: Array
+) -> OrbitBatch:
+    """Return what `robust_orbits` does at points in order, at rising `position` (B,) along a line.
+
+    A few that are spread over the line come first; the others start from what was found around them.
+    """
+    count, stride = p.shape[1], STRIDE
+    while stride > 1 and count < stride * NEIGHBOURS:  # fewer to start from would foretell little
+        stride //= 2
+    first, *later = levels(count, stride)
+    orbits = OrbitBatch.empty(p, edges, len(model.states))
+    orbits.replace(first, robust_orbits(model, p[:, first], None if guess is None else guess.part(first), edges))
+    for level in later:
+        known = np.nonzero(orbits.converged)[0]
+        near = between(orbits.orbit.part(known), position[known], position[level]) if known.size else None
+        orbits.replace(level, robust_orbits(model, p[:, level], near, edges))
+    return orbits
+
+
+def climbed(model: GeneratedModel, p: Array, edges: Array, *, tol: float = 1e-7) -> OrbitBatch:
+    """Return orbits at `p` (n_parameters, B) by raising eps from 0, each in steps of its own that are halved where one fails.
+
+    One that the mesh is too coarse for has not converged: a finer one may be climbed to.
+    """
+    eps, calm = p[model.index("eps")], model.with_values(p, eps=0.0)
+    batch = solve_orbits(model, calm, steady_guess(model, calm, edges), tol=tol)
+    slope = batch.orbit.unchanged()
+    reached, step = np.zeros(p.shape[1]), np.full(p.shape[1], FIRST_CLIMB)
+    going = batch.converged.copy()
+    while going.any():
+        at = np.nonzero(going)[0]
+        step[at] = np.minimum(step[at], 1.0 - reached[at])
+        q = model.with_values(p[:, at], eps=eps[at] * (reached[at] + step[at]))
+        before = batch.orbit.part(at)
+        found = solve_orbits(model, q, before + step[at] * slope.part(at), tol=tol, max_iterations=CLIMBING)
+        new, got, lost = np.nonzero(found.converged)[0], at[found.converged], at[~found.converged]
+        change = (found.orbit.part(new) - before.part(new)) / step[got]
+        slope.x[got], slope.stages[got] = change.x, change.stages
+        batch.replace(got, found.part(new))
+        reached[got] += step[got]
+        step[got] *= 1.5
+        step[lost] /= 2
+        going = batch.converged & (reached < ALMOST) & (step > SMALLEST_CLIMB)
+    batch.p[:] = p
+    batch.converged &= reached >= ALMOST
+    batch.converged[batch.converged] = mesh_error(model, batch.orbit)[batch.converged] < ROUGHEST
+    return batch

@@ -16,7 +16,7 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError
 
-# A window in the plane of two parameters, mapped to the unit square in which arclength is measured.
+INSIDE = 1 - 1e-9  # of the window: its far edge as seen from within
 
 
 @dataclass(frozen=True)
@@ -33,27 +33,20 @@ class Axis:
         """Return the length of the axis, in ln(value) where logarithmic."""
         return float(np.log(self.hi / self.lo)) if self.log else self.hi - self.lo
 
-    def unit(self, value: Array | float) -> Array | float:
+    def unit(self, value: Array | Sequence[float] | float) -> Array:
         """Return `value` as a coordinate that is 0 at `lo` and 1 at `hi`."""
-        return (
-            np.log(np.asarray(value) / self.lo) / self.span if self.log else (np.asarray(value) - self.lo) / self.span
-        )
+        value = np.asarray(value)
+        return np.asarray(np.log(value / self.lo) / self.span if self.log else (value - self.lo) / self.span)
 
-    def value(self, unit: Array | float) -> Array | float:
+    def value(self, unit: Array | Sequence[float] | float) -> Array:
         """Return the parameter at a unit coordinate."""
         unit = np.asarray(unit)
         inside = self.lo * np.exp(unit * self.span) if self.log else self.lo + unit * self.span
         return np.where(unit == 1.0, self.hi, inside)  # the window's edge exactly
 
-    def rate(self, value: Array | float) -> Array | float:
-        """Return d(value)/d(unit coordinate)."""
-        return np.asarray(value) * self.span if self.log else self.span
-
     def samples(self, count: int) -> Array:
         """Return `count` values, evenly spaced on the axis' scale, both ends among them."""
-        values = np.asarray(self.value(np.linspace(0.0, 1.0, count)))
-        values[0], values[-1] = self.lo, self.hi
-        return values
+        return self.value(np.linspace(0.0, 1.0, count))
 
 
 @dataclass(frozen=True)
@@ -71,17 +64,45 @@ class Plane:
 
     def coordinates(self, model: GeneratedModel, p: Array) -> Array:
         """Return the unit coordinates (..., 2) of parameter points `p` (n_parameters, ...)."""
-        return np.stack([np.asarray(a.unit(p[model.index(a.name)])) for a in (self.x, self.y)], axis=-1)
+        return np.stack([a.unit(p[model.index(a.name)]) for a in (self.x, self.y)], axis=-1)
 
     def point(self, model: GeneratedModel, q: Array) -> Array:
-        """Return the parameters (n_parameters,) at unit coordinates q (2,)."""
-        p = self.base.copy()
-        p[model.index(self.x.name)], p[model.index(self.y.name)] = self.x.value(q[0]), self.y.value(q[1])
-        return p
+        """Return the parameters (n_parameters, ...) at unit coordinates q (..., 2)."""
+        return model.with_values(
+            self.base, **{self.x.name: self.x.value(q[..., 0]), self.y.name: self.y.value(q[..., 1])}
+        )
 
     def rates(self, model: GeneratedModel, p: Array) -> Array:
         """Return dp/dq of the two parameters at `p` (n_parameters,), as (2,)."""
-        return np.array([float(a.rate(p[model.index(a.name)])) for a in (self.x, self.y)])
+        return np.array([a.span * p[model.index(a.name)] if a.log else a.span for a in (self.x, self.y)])
+
+
+def passes(line: Array, x: float) -> tuple[Array, Array]:
+    """Return which segments of the polyline `line` (points, 2) pass the unit coordinate `x`, and the heights at which they do."""
+    a, b = line[:-1], line[1:]
+    segments = np.nonzero((a[:, 0] <= x) != (b[:, 0] <= x))[0]
+    a, b = a[segments], b[segments]
+    return segments, a[:, 1] + (x - a[:, 0]) / (b[:, 0] - a[:, 0]) * (b[:, 1] - a[:, 1])
+
+
+def meets(line: Array, at: float, axis: int = 1) -> tuple[Array, Array, Array]:
+    """Return which segments of the polyline `line` (points, 2) touch the line along `axis` at the other coordinate `at`.
+
+    Their shares of the way at which they do, and the coordinates along `axis`, follow.
+    """
+    a, b, other = line[:-1], line[1:], 1 - axis
+    low, high = np.minimum(a[:, other], b[:, other]), np.maximum(a[:, other], b[:, other])
+    segments = np.nonzero((low - 1e-9 <= at) & (at <= high + 1e-9))[0]
+    a, b = a[segments], b[segments]
+    run = b[:, other] - a[:, other]
+    share = np.clip((at - a[:, other]) / np.where(run == 0, 1.0, run), 0.0, 1.0)
+    return segments, share, a[:, axis] + share * (b[:, axis] - a[:, axis])
+
+
+def polyline_heights(lines: Sequence[Array], at: Array) -> list[list[float]]:
+    """Return for each unit coordinate `at` the heights, rising, at which polylines (points, 2) in unit coordinates pass it."""
+    inside = np.minimum(at, INSIDE)  # a curve ends on the window's edge, not beyond
+    return [sorted(float(height) for line in lines for height in passes(line, x)[1]) for x in inside]
 
 
 # The grid of a stability map: two axes, each a parameter or the ratio of two, and its division into tiles.
@@ -147,10 +168,12 @@ class MapGrid:
 
     def points(self, model: GeneratedModel, xs: Array, ys: Array) -> Array:
         """Return the parameters (n_parameters, ...) at quantities `xs` and `ys` of one shape."""
-        p = np.repeat(self.base[:, None], xs.size, axis=1).reshape(len(self.base), *xs.shape)
-        p[model.index(self.x.moved)] = self.x.parameter(model, self.base, xs)
-        p[model.index(self.y.moved)] = self.y.parameter(model, self.base, ys)
-        return p
+        moved = {axis.moved: axis.parameter(model, self.base, v) for axis, v in ((self.x, xs), (self.y, ys))}
+        return model.with_values(self.base, **moved)
+
+    def at(self, model: GeneratedModel, places: Array) -> Array:
+        """Return the parameters (n_parameters, ...) at `places` (..., 2) in grid steps along x and y, whole or not."""
+        return self.points(model, self.x.between(places[..., 0]), self.y.between(places[..., 1]))
 
 
 MOST_POINTS = 10_000_000  # of a grid: an hour and more, and a GB
@@ -218,6 +241,16 @@ class TileTask:
     columns: tuple[int, int]
     rows: tuple[int, int]
     settings: MapSettings
+
+    @property
+    def corner(self) -> Array:
+        """Return the first column and row, (2,)."""
+        return np.array([self.columns[0], self.rows[0]])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return the numbers of columns and rows."""
+        return self.columns[1] - self.columns[0] + 1, self.rows[1] - self.rows[0] + 1
 
 
 def tile_tasks(model: GeneratedModel, grid: MapGrid, settings: MapSettings | None = None) -> list[TileTask]:

@@ -13,9 +13,8 @@ import numpy as np
 
 from srfcli.codegen.model import COMPLEX_STEP, Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.numerics.collocation import Discretisation, gauss, mesh_error, stage_parameters, wanted_mesh
-from srfcli.numerics.critical import robust_orbits
-from srfcli.numerics.orbit import OrbitBatch, interpolate, uniform_mesh
+from srfcli.numerics.collocation import mesh_error, stage_parameters, wanted_mesh
+from srfcli.numerics.orbit import OrbitBatch, growth, interpolate, robust_orbits, uniform_mesh
 
 INTERVALS = 16
 LOST = 1e9  # the error of an orbit that was not found: the mesh grows as fast as it may
@@ -41,8 +40,7 @@ class LinearResponse:
 
 def linear_response(model: GeneratedModel, p: Array) -> LinearResponse:
     """Return the response of steady sliding at `p` (n_parameters, ...), whose eps does not count."""
-    p = np.array(p, dtype=float)
-    p[model.index("eps")] = 0.0
+    p = model.with_values(p, eps=0.0)
     rest, n = model.steady(p), len(model.states)
     jacobian = model.cycle_jacobian(0.0, rest, p)
     by_eps = model.cycle_parameter("eps")
@@ -124,11 +122,11 @@ def mean_friction(model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mes
     ]
     while waiting:
         index, batch = waiting.pop()
-        N = len(batch.orbit.edges) - 1
+        N = batch.orbit.intervals
         error = np.where(batch.converged, mesh_error(model, batch.orbit), LOST)
-        finished = (error <= tol) | (max_mesh <= N)
+        exponents, finished = growth(batch)[1], (error <= tol) | (max_mesh <= N)
         for j in np.nonzero(finished & batch.converged)[0]:
-            columns[:, index[j]] = *_means(model, batch, int(j)), _growth(batch, int(j)), error[j]
+            columns[:, index[j]] = *_means(model, batch, int(j)), exponents[j], error[j]
             status[index[j]] = Status.OK if error[j] <= tol else Status.TOLERANCE
         wanted = wanted_mesh(error, N, tol, max_mesh)
         for mesh in np.unique(wanted[~finished]):
@@ -136,8 +134,7 @@ def mean_friction(model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mes
             edges, part = uniform_mesh(int(mesh)), batch.orbit.part(here)
             guess = interpolate(part, edges) if batch.converged[here].all() else None
             waiting.append((index[here], robust_orbits(model, p[:, index[here]], guess, edges, tol=1e-9)))
-    calm = p.copy()
-    calm[model.index("eps")] = 0.0
+    calm = model.with_values(p, eps=0.0)
     rest = model.steady(calm)
     steady = model.cycle_friction(0.0, rest, calm) * model.cycle_load(0.0, rest, calm) / p[model.index("W0")]
     return MeanFriction(p, columns[0], columns[1], steady, columns[2], columns[3], tuple(status))
@@ -145,13 +142,7 @@ def mean_friction(model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mes
 
 def _means(model: GeneratedModel, batch: OrbitBatch, j: int) -> tuple[float, float]:
     """Return the means of mu and of mu W/W0 by Gauss quadrature over the mesh."""
-    orbit = Discretisation(batch.orbit.x[j], batch.orbit.stages[j], batch.orbit.edges)
-    ps = stage_parameters(batch.p[:, j])
+    orbit, ps = batch.orbit.part(j), stage_parameters(batch.p[:, j])
     mu = model.cycle_friction(orbit.phases, orbit.stages, ps)
     load = model.cycle_load(orbit.phases, orbit.stages, ps) / batch.p[model.index("W0"), j]
-    weight = orbit.steps[:, None] * gauss(orbit.stages.shape[-2]).weights
-    return float((mu * weight).sum()), float((mu * load * weight).sum())
-
-
-def _growth(batch: OrbitBatch, j: int) -> float:
-    return float(np.log(np.abs(np.linalg.eigvals(batch.monodromy[j])).max()))
+    return float((mu * orbit.weights).sum()), float((mu * load * orbit.weights).sum())

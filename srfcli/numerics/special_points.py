@@ -19,6 +19,7 @@ from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind, left_vecto
 from srfcli.numerics.collocation import (
     Condensed,
     Discretisation,
+    by_mesh,
     condense,
     gauss,
     join,
@@ -28,13 +29,12 @@ from srfcli.numerics.collocation import (
 )
 from srfcli.numerics.continuation import Branch, CurvePoint, correct, metric
 from srfcli.numerics.orbit import interpolate
-from srfcli.numerics.plane import Plane
+from srfcli.numerics.plane import Plane, polyline_heights
 
 EXACT = 1e-9  # a correction so small leaves the tangent as it is
 CLOSE = 1e-8  # of the chord: where the search for a zero ends
 MEETING = 0.05  # of Re(rho) from +1 or -1: a Neimark-Sacker boundary that ends so near ends in a strong resonance
 CUSPED = 1e-3  # of the tangent in the plane beside a cusp: what is left of it at the cusp
-INSIDE = 1 - 1e-9  # of the window: its far edge as seen from within
 RESONANCES = {"1:3": 2 * np.pi / 3, "1:4": np.pi / 2}
 STRONG = {"fold": "1:1", "pd": "1:2"}  # where a pair of multipliers meets on the real axis
 
@@ -81,30 +81,15 @@ def crossings_at(
 
     Without `folds` those where a multiplier is +1 are left out.
     """
-    lines = [plane.coordinates(model, np.stack([pt.p for pt in b.points], axis=1)) for b in branches]
+    lines = [plane.coordinates(model, b.p) for b in branches]
     for line, branch in zip(lines, branches, strict=True):
         line[[not folds and pt.kind == "fold" for pt in branch.points]] = np.nan
-    heights = polyline_heights(lines, np.asarray(plane.x.unit(values)))
-    return [np.asarray(plane.y.value(np.array(h))).reshape(-1).tolist() for h in heights]
-
-
-def polyline_heights(lines: Sequence[Array], at: Array) -> list[list[float]]:
-    """Return for each unit coordinate `at` the heights, rising, at which polylines (points, 2) in unit coordinates pass it."""
-    out: list[list[float]] = []
-    for x in np.minimum(at, INSIDE):  # a curve ends on the window's edge, not beyond
-        heights: list[float] = []
-        for q in lines:
-            a, b = q[:-1], q[1:]
-            for k in np.nonzero((a[:, 0] <= x) != (b[:, 0] <= x))[0]:
-                share = (x - a[k, 0]) / (b[k, 0] - a[k, 0])
-                heights.append(float(a[k, 1] + share * (b[k, 1] - a[k, 1])))
-        out.append(sorted(heights))
-    return out
+    return [plane.y.value(heights).tolist() for heights in polyline_heights(lines, plane.x.unit(values))]
 
 
 def _turns(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[SpecialPoint]:
     """Yield the cusps, and the points at which one of the two parameters turns round."""
-    q = plane.coordinates(model, np.stack([pt.p for pt in branch.points], axis=1))
+    q = plane.coordinates(model, branch.p)
     steps = np.diff(q, axis=0)
     back = steps[:-1] * steps[1:] < 0  # (steps - 1, 2)
     for k in np.nonzero(back.any(axis=1))[0]:
@@ -267,7 +252,7 @@ class _Chord:
     def between(model: GeneratedModel, plane: Plane, a: BoundaryPoint, b: BoundaryPoint) -> _Chord:
         """Return the chord from `a` to `b`, its ends on the finer mesh of the two."""
         edges = max((e.orbit.edges for e in (a, b)), key=len)
-        ends = [interpolate(Discretisation(e.orbit.x[0], e.orbit.stages[0], e.orbit.edges), edges) for e in (a, b)]
+        ends = [interpolate(e.orbit.part(0), edges) for e in (a, b)]
         q = [plane.coordinates(model, e.p) for e in (a, b)]
         across = metric(model, a.p, 0.5 * (ends[0].x[0] + ends[1].x[0]), ends[1].x[0] - ends[0].x[0])
         return _Chord(q[1] - q[0], across, [(0.0, q[0], ends[0], a.rho), (1.0, q[1], ends[1], b.rho)])
@@ -277,9 +262,8 @@ class _Chord:
         k = next((k for k, known in enumerate(self.found) if known[0] > s), len(self.found) - 1)
         (s0, q0, a, rho0), (s1, q1, b, rho1) = self.found[k - 1], self.found[k]
         w = (s - s0) / (s1 - s0)
-        blend = Discretisation((1 - w) * a.x + w * b.x, (1 - w) * a.stages + w * b.stages, a.edges)
         rho = rho0 if w < 0.5 else rho1
-        point = correct(model, plane, (1 - w) * q0 + w * q1, blend, rho, self.q, self.across, tol=1e-6)
+        point = correct(model, plane, (1 - w) * q0 + w * q1, (1 - w) * a + w * b, rho, self.q, self.across, tol=1e-6)
         if point is not None and point.correction > EXACT:  # the tangent is that of the place a correction starts at
             point = correct(model, plane, point.q, point.orbit, point.rho, self.q, self.across, tol=1e-6)
         if point is None:
@@ -291,7 +275,7 @@ class _Chord:
         return point
 
 
-# Which way a Neimark-Sacker bifurcation opens: the cubic coefficient of its normal form, for the map over one forcing period.
+# The normal form of a Neimark-Sacker bifurcation, for the map over one forcing period: its first Lyapunov coefficient d.
 #
 # On the critical manifold the period map is z -> rho z + c z |z|^2 (Kuznetsov, Elements of Applied Bifurcation Theory, sec. 5.4),
 # so that ln|z| grows by g + d |z|^2 a period, d = Re(c/rho): a stable torus of amplitude sqrt(-g/d) beyond the boundary if d < 0,
@@ -304,17 +288,13 @@ CRITICALITY = "criticality"
 TOGETHER = 16  # points whose derivatives fit the cache
 
 
-def cubic_coefficient(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> Array:
-    """Return d (...,) of the critical multipliers `rho` at points of a boundary, per forcing period; NaN where they are real.
+def normal_form(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> tuple[Array, ComplexArray]:
+    """Return the first Lyapunov coefficient d (...,) per forcing period and the critical eigenvectors at tau = 0 (..., n).
 
-    `p` is (n_parameters, ...). The unit of z is such that the disturbance of ln v, 2 Re(z q(tau)), has mean |q|^2 = 1 over
-    the period. At the resonance 1:3 the coefficient has a pole; at 1:4 it does not tell the whole story.
+    `p` is (n_parameters, ...), `rho` the critical multipliers at points of a boundary; both results are NaN where they are
+    real. The eigenvectors are in the unit of z: the disturbance of ln v, 2 Re(z q(tau)), has mean |q|^2 = 1 over the period. At
+    the resonance 1:3 the coefficient has a pole; at 1:4 it does not tell the whole story.
     """
-    return critical_mode(model, p, orbit, rho)[0]
-
-
-def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> tuple[Array, ComplexArray]:
-    """Return d (...,) and the critical eigenvectors at tau = 0 (..., n), in the unit that d is in."""
     c, rho = condense(model, p, orbit), np.asarray(rho, dtype=complex)
     M, identity = c.monodromy, np.eye(orbit.x.shape[-1])
     values, vectors = np.linalg.eig(M)
@@ -323,8 +303,7 @@ def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: A
     right = np.take_along_axis(vectors, chosen[..., None], -1)[..., 0].astype(complex)
     real = np.abs(mu.imag) < REAL * np.abs(mu)
     wave = _carried(c, right)
-    weight = orbit.steps[:, None] * gauss(orbit.stages.shape[-2]).weights
-    size = np.sqrt((weight * np.abs(wave[..., model.states.index("ln_v")]) ** 2).sum(axis=(-1, -2)))
+    size = np.sqrt((orbit.weights * np.abs(wave[..., model.states.index("ln_v")]) ** 2).sum(axis=(-1, -2)))
     q, wave = right / size[..., None], wave / size[..., None, None, None]
     along = wave.real, wave.imag
     nearby = orbit.stages + 1j * STEP * np.stack(along)  # (2, ..., N, m, n)
@@ -332,13 +311,15 @@ def critical_mode(model: GeneratedModel, p: Array, orbit: Discretisation, rho: A
     slopes = model.cycle_jacobian(tau, nearby, ps).imag / STEP
     F2 = slopes[0] + 1j * slopes[1]  # its product with a is the field's second derivative F2(a, wave)
     sources = [np.einsum("...ij,...j->...i", F2, a) for a in (wave.conj(), wave)]
-    mean, double = (
-        own + _carried(c, np.linalg.solve(np.where(real[..., None, None], identity, s * identity - M), e[..., None])[..., 0])
-        for (own, e), s in zip(_forced(c, sources), (1.0, (mu * mu)[..., None, None]), strict=True)
-    )
+    forced = []
+    for (own, end), s in zip(_forced(c, sources), (1.0, (mu * mu)[..., None, None]), strict=True):
+        matrix = np.where(real[..., None, None], identity, s * identity - M)
+        forced.append(own + _carried(c, np.linalg.solve(matrix, end[..., None])[..., 0]))
+    mean, double = forced
     weights = weights_backwards(c, left_vector(M, mu, q))
     source = 2 * np.einsum("...ij,...j->...i", F2, mean) + np.einsum("...ij,...j->...i", F2.conj(), double)
-    third = np.zeros_like(wave)  # F3(wave, wave, conj(wave)) times the weights: F3(r, r, c) + F3(s, s, c) for c = r and i s
+    # F3(wave, wave, conj(wave)) times the weights: F3(r, r, c) + F3(s, s, c) for c = r and i s
+    third = np.zeros_like(wave)
     for part, unit in ((weights.real, 1.0), (weights.imag, 1j)):
         for a in along:
             gradient = model.cycle_bilinear(tau, nearby, ps, part, a).imag / STEP
@@ -364,22 +345,20 @@ def _forced(c: Condensed, sources: Sequence[ComplexArray]) -> list[tuple[Complex
         own = (alone[..., 2 * k] + 1j * alone[..., 2 * k + 1]).reshape(*batch, m, n)
         maps = np.zeros((*batch, n + 1, n + 1), complex)
         maps[..., :n, :n], maps[..., n, n] = c.maps[..., :n, :n], 1.0
-        maps[..., :n, n] = np.einsum("m,...mn->...n", gauss(m).step, own)
+        maps[..., :n, n] = np.einsum("m,...mn->...n", gauss().step, own)
         y = running_products(maps)[..., :n, n]
         found.append((own + (c.local[..., :n] @ y[..., :-1, None, :, None])[..., 0], y[..., -1, :]))
     return found
 
 
 def branch_coefficients(model: GeneratedModel, branch: Branch) -> Array:
-    """Return d at every point of a branch, NaN where the critical multiplier is real."""
+    """Return the first Lyapunov coefficient at every point of a branch, NaN where the critical multiplier is real."""
     d, points = np.empty(len(branch.points)), branch.points
-    meshes = np.array([len(pt.orbit.edges) for pt in points])
-    for edges in sorted(set(meshes.tolist())):
-        index = np.nonzero(meshes == edges)[0]
+    for index in by_mesh([pt.orbit for pt in points]):
         for here in (index[a : a + TOGETHER] for a in range(0, len(index), TOGETHER)):
             p = np.stack([points[i].p for i in here], axis=1)
             rho = np.array([points[i].rho for i in here])
-            d[here] = cubic_coefficient(model, p, join([points[i].orbit for i in here]), rho)
+            d[here] = normal_form(model, p, join([points[i].orbit for i in here]), rho)[0]
     return d
 
 
@@ -393,6 +372,6 @@ def criticality_points(
             continue
 
         def coefficient(point: CurvePoint) -> float:
-            return float(cubic_coefficient(model, point.p, point.orbit, np.asarray(point.rho)))
+            return float(normal_form(model, point.p, point.orbit, np.asarray(point.rho))[0])
 
         yield locate(model, plane, branch, (k, k + 1), coefficient, what=CRITICALITY)

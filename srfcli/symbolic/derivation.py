@@ -1,4 +1,4 @@
-"""A derivation as sections of named formulas, written out as text, LaTeX, JSON or NumPy."""
+"""A derivation as sections of named formulas in the paper's letters and normalisation, as text, LaTeX, JSON or NumPy."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ from srfcli.symbolic.derive import (
     in_law_parameters,
     interface_meaning,
     paper_coefficients,
-    slope_symbols,
+    slope_meaning,
     weakening_first,
 )
 from srfcli.symbolic.equations import equations_of, steady_states
 from srfcli.symbolic.paper import Finding
 from srfcli.symbolic.system import System, state_rate
-
-# A derivation as a reader sees it: sections of named formulas, in the paper's letters and normalisation.
 
 EXTRAS = ("jacobian", "parameters")
 
@@ -92,9 +90,7 @@ def _steady(system: System) -> Section:
 
 
 def _slopes(system: System) -> Section:
-    mu_v, mu_phi, _ = friction_slopes(system)
-    m_v, m_phi = slope_symbols(system)
-    formulas = [_one(str(m_v), mu_v), *(_one(str(m), e) for m, e in zip(m_phi, mu_phi, strict=True))]
+    formulas = [_one(str(m), e) for m, e in slope_meaning(system)[:-1]]
     weakening = _one("-d mu_ss/d ln V", weakening_slope(system), r"-\frac{\partial \mu_{ss}}{\partial \ln V}")
     note = "mu_v = d mu/d ln v and mu_phi = d mu/d ln phi in steady sliding"
     return Section("slopes", "Slopes of friction", (*formulas, weakening), (note,))
@@ -163,15 +159,13 @@ def _dispersion(system: System) -> Section:
     notes = [
         f"perturbations as exp(i Omega t): C0 + C1 Omega + ... + C{len(coefficients) - 1} Omega^{len(coefficients) - 1} = 0"
     ]
-    if system.interface.kappa is not None:
-        kappa = system.interface.kappa.subs(symbol("W"), symbol("W0"))
-        if any(c.has(symbol("eta")) for c in coefficients):
-            formulas.append(_one("eta", 1 + symbol("K") / symbol("kappa")))
-        formulas.append(_one("kappa", kappa))
-        if any(c.has(symbol("kappa_W")) for c in coefficients):
-            formulas.append(
-                _one("kappa_W", sp.diff(system.interface.kappa, symbol("W")).subs(symbol("W"), symbol("W0")))
-            )
+    known = dict(interface_meaning(system))
+    if known and any(c.has(symbol("eta")) for c in coefficients):
+        formulas.append(_one("eta", 1 + symbol("K") / symbol("kappa")))
+    if known:
+        formulas.append(_one("kappa", known[symbol("kappa")]))
+    if known and any(c.has(symbol("kappa_W")) for c in coefficients):
+        formulas.append(_one("kappa_W", known[symbol("kappa_W")]))
     return Section("dispersion", "Dispersion relation", tuple(formulas), tuple(notes))
 
 
@@ -356,10 +350,7 @@ def to_python(system: System) -> str:
 
 def _meaning(system: System) -> list[tuple[str, sp.Expr]]:
     """Return the abbreviations of the coefficients and what they stand for, in the order in which they can be computed."""
-    mu_v, mu_phi, mu_ss = friction_slopes(system)
-    m_v, m_phi = slope_symbols(system)
-    pairs = [(str(m_v), mu_v), *((str(m), e) for m, e in zip(m_phi, mu_phi, strict=True)), ("mu_ss", mu_ss)]
-    pairs += [(str(s), e) for s, e in interface_meaning(system)]
+    pairs = [(str(s), e) for s, e in (*slope_meaning(system), *interface_meaning(system))]
     if system.elastic:
         pairs.append(("eta", 1 + symbol("K") / symbol("kappa")))
     return pairs

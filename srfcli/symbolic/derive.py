@@ -9,7 +9,6 @@ The odd part is linear in W0; put into the even part it leaves one factor linear
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -20,19 +19,16 @@ from srfcli.laws.values import Interface
 from srfcli.symbolic.equations import settle, steady_states
 from srfcli.symbolic.system import System, state_rate
 
-# Steady state, linear stability and the dispersion relation of any system, in the paper's form and normalisation.
-
 
 @dataclass(frozen=True)
 class Linearisation:
     """The characteristic polynomial sum a_k s^k about steady sliding; C_k = i^k a_k with s = i Omega.
 
-    `characteristic` is in the law's own parameters, `symbolic` in mu_v, mu_phi, kappa, eta and the apparatus'.
+    `characteristic` is in the law's own parameters.
     `hurwitz` lists the coefficients in W0, lowest first, of the Hurwitz determinant that vanishes at a Hopf bifurcation,
     or is None where that is no polynomial in W0.
     """
 
-    symbolic: tuple[sp.Expr, ...]
     characteristic: tuple[sp.Expr, ...]
     mu_v: sp.Expr
     mu_phi: tuple[sp.Expr, ...]
@@ -53,21 +49,20 @@ def slope_symbols(system: System) -> tuple[sp.Symbol, tuple[sp.Symbol, ...]]:
 
 def linearise(system: System) -> Linearisation:
     """Return the linear stability problem of `system` about steady sliding at V under W0."""
-    mu_v, mu_phi, mu_ss = friction_slopes(system)
     abbreviated, back = abbreviated_polynomial(system)
     symbolic = tuple(c.xreplace(back) for c in abbreviated)
-    m_v, m_phi = slope_symbols(system)
-    meaning: list[tuple[sp.Expr, sp.Expr]] = [(m_v, mu_v), *zip(m_phi, mu_phi, strict=True), (symbol("mu_ss"), mu_ss)]
+    meaning = slope_meaning(system)
     stiffness = interface_meaning(system)
     characteristic = tuple(e.subs([*meaning, *stiffness]) for e in symbolic)
     hurwitz = _hurwitz_in_load(abbreviated, stiffness)
     if hurwitz is not None:
         hurwitz = tuple(e.xreplace(back).subs(meaning) for e in hurwitz)
-    names = {"mu_v": str(mu_v), **{str(s): str(e) for s, e in zip(m_phi, mu_phi, strict=True)}}
-    return Linearisation(symbolic, characteristic, mu_v, mu_phi, hurwitz, names)
+    mu_v, mu_phi, _ = friction_slopes(system)
+    names = {str(s): str(e) for s, e in meaning[:-1]}
+    return Linearisation(characteristic, mu_v, mu_phi, hurwitz, names)
 
 
-@functools.lru_cache(maxsize=32)
+@lru_cache(maxsize=32)
 def friction_slopes(system: System) -> tuple[sp.Expr, tuple[sp.Expr, ...], sp.Expr]:
     """Return mu_v, mu_phi of each state and mu_ss, in steady sliding at V, in the law's own parameters."""
     v, V, mu = symbol("v"), symbol("V"), system.friction.mu
@@ -78,6 +73,13 @@ def friction_slopes(system: System) -> tuple[sp.Expr, tuple[sp.Expr, ...], sp.Ex
 
     mu_phi = tuple(settle(at_rest(p * sp.diff(mu, p))) for p in steady)
     return settle(at_rest(v * sp.diff(mu, v))), mu_phi, at_rest(mu)
+
+
+def slope_meaning(system: System) -> list[tuple[sp.Expr, sp.Expr]]:
+    """Return what mu_v, mu_phi of each state and mu_ss are in the law's own parameters, in this order."""
+    mu_v, mu_phi, mu_ss = friction_slopes(system)
+    m_v, m_phi = slope_symbols(system)
+    return [(m_v, mu_v), *zip(m_phi, mu_phi, strict=True), (symbol("mu_ss"), mu_ss)]
 
 
 def interface_meaning(system: System) -> list[tuple[sp.Expr, sp.Expr]]:
@@ -97,7 +99,7 @@ def characteristic_polynomial(system: System) -> tuple[sp.Expr, ...]:
     return tuple(c.xreplace(back) for c in coefficients)
 
 
-@functools.lru_cache(maxsize=32)
+@lru_cache(maxsize=32)
 def abbreviated_polynomial(system: System) -> tuple[tuple[sp.Expr, ...], dict[sp.Symbol, sp.Expr]]:
     """Return a_0..a_n with long slopes of the ageing law as single symbols, and what these stand for.
 
@@ -141,7 +143,7 @@ def _abbreviate(slope: sp.Expr, name: str, back: dict[sp.Symbol, sp.Expr]) -> sp
     return stand_in
 
 
-@functools.lru_cache(maxsize=32)
+@lru_cache(maxsize=32)
 def ageing_slopes(system: System) -> tuple[dict[str, sp.Expr], ...]:
     """Return for each state what d(ln phi)/dt changes by with ln v, ln phi, mu, W and the rates, in steady sliding."""
     v, V = symbol("v"), symbol("V")
@@ -187,9 +189,8 @@ def _hurwitz_in_load(
     whole = tuple(sp.cancel(n * common / d) for n, d in fractions)
     if not all(a.is_polynomial(W0) for a in whole):
         return None
-    parts: dict[
-        sp.Symbol, sp.Expr
-    ] = {}  # each coefficient of a power of W0 as one symbol: its inside plays no role here
+    # each coefficient of a power of W0 as one symbol: its inside plays no role here
+    parts: dict[sp.Symbol, sp.Expr] = {}
     short = []
     for k, a in enumerate(whole):
         terms = sp.Poly(a, W0).all_coeffs()[::-1]
@@ -273,10 +274,7 @@ def closed_limits(system: System) -> ClosedLimits | None:
 
 def in_law_parameters(system: System, expression: sp.Expr) -> sp.Expr:
     """Return `expression` with mu_v, mu_phi, mu_ss and kappa written out for the laws of `system`."""
-    mu_v, mu_phi, mu_ss = friction_slopes(system)
-    m_v, m_phi = slope_symbols(system)
-    meaning = [(m_v, mu_v), *zip(m_phi, mu_phi, strict=True), (symbol("mu_ss"), mu_ss), *interface_meaning(system)]
-    return expression.subs(meaning)
+    return expression.subs([*slope_meaning(system), *interface_meaning(system)])
 
 
 def _eliminate(system: System, *, stiffness: bool = True) -> tuple[sp.Expr, sp.Expr] | None:

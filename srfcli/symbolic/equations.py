@@ -251,7 +251,7 @@ class _Builder:
         rates += [solution[r] for r in (self.d_ln_v, *self.d_ln_phi)]
         spring = s("u") if system.inertia else (self.load * self.mu - self.force) / K
         at_drive = [e.subs(s("v"), V) for e in (s("v"), *self.steady)]
-        u_rest = (self.load_at_rest(mu_ss) * mu_ss - self.parts.force) / self.parts.K
+        u_rest = (self.load_at_rest() * mu_ss - self.parts.force) / self.parts.K
         resting = [u_rest, V][: len(unknowns) - len(at_drive)]
         steady = [self.settled(e, u_rest, mu_ss) for e in (*resting, *at_drive)]
         for extra in self.extras:
@@ -319,9 +319,7 @@ class _Builder:
     def along(self) -> list[tuple[sp.Symbol, sp.Expr]]:
         """Return the unknowns beside v and the ages that a formula may hold, and their rates."""
         s, system = symbol, self.system
-        found = [(s(a), self.aux_rate(a)) for a in self.aux] + [
-            (s(e.name), self.extra_rate(e)) for e in self.extras
-        ]
+        found = [(s(a), self.aux_rate(a)) for a in self.aux] + [(s(e.name), self.extra_rate(e)) for e in self.extras]
         if system.inertia:
             found.append((s("u"), self.V - (s("z") if system.elastic else s("v"))))
         return found
@@ -336,7 +334,7 @@ class _Builder:
         mu = self.parts.mu.subs(extra).subs(dict(zip(self.phis, self.steady, strict=True))).subs(s("v"), s("V"))
         return mu.subs(s("W"), self.parts.W) if self.system.effects else mu
 
-    def load_at_rest(self, mu_ss: sp.Expr) -> sp.Expr:
+    def load_at_rest(self) -> sp.Expr:
         """Return the asperities' load in steady sliding; W0 itself where nothing changes it, as under inclined loading."""
         return self.parts.W if self.system.effects else symbol("W0")
 

@@ -21,8 +21,6 @@ from srfcli.symbolic.derive import characteristic_polynomial, closed_limits, in_
 from srfcli.symbolic.equations import equations_of
 from srfcli.symbolic.system import System, build_system, state_rate
 
-# The paper's printed equations and claims, held against what the model gives: agreements, misprints, and how far claims hold.
-
 VELOCITIES = (1.0, 100.0)  # um/s, the paper's range
 THRESHOLD = 1e-3
 REPEATABILITY = 0.03  # of the measured critical load
@@ -115,12 +113,18 @@ def _defaults(system: System, **given: float) -> dict[sp.Symbol, float]:
 
 def _at_onset(system: System, expression: sp.Expr, **given: float) -> complex:
     """Return `expression` at the exact critical load and frequency, with Table I and `given` for the rest."""
-    limits = closed_limits(system)
-    assert limits is not None and limits.load is not None and limits.omega_squared is not None
+    exact, *_, squared = _closed(system)
     values, Omega_squared = _defaults(system, **given), symbol("Omega_c") ** 2
-    load = in_law_parameters(system, limits.load.subs(Omega_squared, limits.omega_squared))
+    load = in_law_parameters(system, exact.subs(Omega_squared, squared))
     values[symbol("W0")] = float(load.subs(values))
-    return complex(in_law_parameters(system, expression.subs(Omega_squared, limits.omega_squared)).subs(values))
+    return complex(in_law_parameters(system, expression.subs(Omega_squared, squared)).subs(values))
+
+
+def _closed(system: System) -> tuple[sp.Expr, sp.Expr, sp.Expr, sp.Expr]:
+    """Return load, limit_load, quasistatic_load and omega_squared of the closed forms, all of which the paper's system has."""
+    forms = closed_limits(system)
+    assert forms is not None
+    return forms.load, forms.limit_load, forms.quasistatic_load, forms.omega_squared
 
 
 def _number(system: System, expression: sp.Expr, **given: float) -> float:
@@ -132,9 +136,8 @@ def _both_ends(system: System, expression: sp.Expr) -> tuple[float, ...]:
 
 
 def _finite_stiffness(system: System) -> tuple[str, str]:
-    limits = closed_limits(system)
-    assert limits is not None and limits.load is not None and limits.limit_load is not None
-    off = sp.cancel(limits.limit_load / limits.load) - 1
+    load, limit_load, *_ = _closed(system)
+    off = sp.cancel(limit_load / load) - 1
     low, high = _both_ends(system, off)
     verdict = "holds" if max(low, high) < REPEATABILITY else "fails"
     shift = f"the limit kappa to infinity exceeds the exact W0c by {100 * low:.1f} % at 1 um/s, {100 * high:.1f} % at 100 um/s"
@@ -152,9 +155,8 @@ def _strengthening_velocity(system: System) -> tuple[str, str]:
 
 
 def _inertia_midrange(system: System) -> tuple[str, str]:
-    limits = closed_limits(system)
-    assert limits is not None and limits.limit_load is not None and limits.quasistatic_load is not None
-    off = limits.quasistatic_load / limits.limit_load - 1
+    _, limit_load, quasistatic_load, _ = _closed(system)
+    off = quasistatic_load / limit_load - 1
     at = {v: _number(system, off, V=v) for v in (10.0, 50.0, 100.0)}
     text = ", ".join(f"{100 * x:.1f} % at {v:g} um/s" for v, x in at.items())
     return ("holds" if at[10.0] < REPEATABILITY else "fails"), f"without inertia W0c is too large by {text}"
@@ -166,9 +168,7 @@ def _perturbation_parameter(system: System) -> tuple[str, str]:
 
 
 def _frequency_real(system: System) -> tuple[str, str]:
-    limits = closed_limits(system)
-    assert limits is not None and limits.omega_squared is not None
-    squares = _both_ends(system, limits.omega_squared)
+    squares = _both_ends(system, _closed(system)[3])
     c = paper_coefficients(characteristic_polynomial(system))
     Omega = symbol("Omega")
     polynomial = sum((x * Omega**k for k, x in enumerate(c)), sp.S.Zero)
@@ -312,18 +312,15 @@ def _coefficient(k: int) -> Form:
 def critical_stiffness(system: System) -> sp.Expr:
     """Return K D0/W0c for kappa to infinity."""
     K, W0, D0, Omega = _s("K W0 D0 Omega_c")
-    limits = closed_limits(system)
-    assert limits is not None and limits.limit_load is not None and limits.omega_squared is not None
-    load = limits.limit_load.subs(Omega**2, limits.omega_squared)
+    _, limit_load, _, squared = _closed(system)
+    load = limit_load.subs(Omega**2, squared)
     return sp.factor(sp.solve(sp.Eq(W0, load), K)[0] * D0 / W0)
 
 
 def critical_frequency(system: System) -> sp.Expr:
     """Return D0 Omega_c/V."""
     V, D0 = _s("V D0")
-    limits = closed_limits(system)
-    assert limits is not None and limits.omega_squared is not None
-    return sp.sqrt(sp.cancel(limits.omega_squared * D0**2 / V**2))
+    return sp.sqrt(sp.cancel(_closed(system)[3] * D0**2 / V**2))
 
 
 def _weakening(system: System) -> sp.Expr:
@@ -366,8 +363,5 @@ FORMS: dict[str, Form] = {
 
 def exact_estimate(system: System) -> sp.Expr:
     """Return C4 Omega_c^4/C0 at the exact Omega_c and W0c, in the law's parameters."""
-    limits = closed_limits(system)
-    assert limits is not None and limits.load is not None and limits.omega_squared is not None
     c = paper_coefficients(characteristic_polynomial(system))
-    ratio = c[4] * limits.omega_squared**2 / c[0]
-    return in_law_parameters(system, ratio)
+    return in_law_parameters(system, c[4] * _closed(system)[3] ** 2 / c[0])

@@ -65,7 +65,11 @@ RANDOM_FIELD = Effect(  # correlation (1 + r) exp(-r), r = sqrt(3) d/length (Mat
     neutral=(("field_amplitude", 0.0),),
 )  # fmt: skip
 EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "gauge", "kappa", "force", "rate", "V")
-PASSING = {"slip": "slip", "stage": "the stage's position", "time": "time"}  # what an effect may name that never comes back
+PASSING = {
+    "slip": "slip",
+    "stage": "the stage's position",
+    "time": "time",
+}  # what an effect may name that never comes back
 LOADINGS = ("vertical", "inclined")
 
 
