@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from srfcli.core.errors import SrfError, Status
+from srfcli.core.parallel import Run as Spread
+from srfcli.core.parallel import run_here
 from srfcli.core.units import from_base
 from srfcli.data.values import Run
 from srfcli.inference.noise import lag_one
@@ -26,7 +28,6 @@ LONG = 2.0  # slip lengths in that part, and a time constant of the spring's: a 
 SURE = 3.0  # standard errors of a slope that is one
 DRIFT = 0.02  # of B (A where it is larger) that friction may change by over a slip length in steady sliding
 BAD = 1.3  # rms over noise from which the fit is flagged
-Runner = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def fit_campaign(
     options: Mapping[str, Any] | None = None,
     reader: str | None = None,
     plugins: Sequence[str | Path] = (),
-    run: Runner | None = None,
+    run: Spread = run_here,
     done: Callable[[CampaignResult], None] = lambda so_far: None,
 ) -> CampaignResult:
     """Return the fits of many experiments, a row each in the order of `paths`.
@@ -61,7 +62,7 @@ def fit_campaign(
         Reader of all data files.
     plugins : sequence of path
         Folders in which laws and readers are looked for, too.
-    run : callable, optional
+    run : callable
         Spreads the work, as `srfcli.core.parallel` does; one after the other in this process if left out.
     done : callable
         Told the rows so far after each experiment.
@@ -82,16 +83,12 @@ def fit_campaign(
         return CampaignResult([rows[k] for k in sorted(rows)], len(tasks), worst if status is Status.OK else status)
 
     try:
-        for index, kept in (run or _here)(fit_one, tasks):
+        for index, kept in run(fit_one, tasks):
             rows[index] = json.loads(np.asarray(kept["row"]).tobytes().decode("utf-8"))
             done(so_far())
     except KeyboardInterrupt:
         return so_far(Status.INTERRUPTED)
     return so_far()
-
-
-def _here(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-    yield from ((k, function(task)) for k, task in enumerate(tasks))
 
 
 def _digest(path: Path) -> str:
