@@ -16,6 +16,7 @@ from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.files import open_plain
 from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit
+from srfcli.data.clock import Mask, Place
 from srfcli.data.description import ROLES, ColumnSpec, RunDescription, check_unit
 from srfcli.data.values import BESIDE, OBSERVABLES
 from srfcli.laws.registry import Entry, Registry
@@ -198,6 +199,19 @@ class Columns:
     notices: tuple[Notice, ...]
     remarks: Mapping[str, str] = field(default_factory=dict)
 
+    def kept(self, keep: Mask) -> Columns:
+        """Return the columns with these samples (n,) alone."""
+        arrays = {role: values[keep] for role, values in self.arrays.items()}
+        return replace(self, rows=self.rows[keep], seconds=self.seconds[keep], arrays=arrays)
+
+    def place(self, role: str) -> Place:
+        """Return where a role's numbers stand in the file."""
+        return Place(self.path, self.channels[role].heading, self.rows, self.seconds)
+
+    def role(self, *roles: str) -> str | None:
+        """Return the first of these roles that a column plays, None where none does."""
+        return next((role for role in roles if role in self.arrays), None)
+
 
 def split_heading(heading: str) -> tuple[str, str | None]:
     """Return the name and the unit of `name [unit]` or `name (unit)`; the unit is None for a bare name."""
@@ -216,7 +230,7 @@ def read_columns(
     geometry: Geometry = NO_GEOMETRY,
 ) -> Columns:
     """Return what the run needs of its file; raises SrfError for a missing column, a wrong unit or too large a recording."""
-    finder = _Finder(run.file, source.headings, specs, geometry)
+    finder = Finder(run.file, source.headings, specs, geometry)
     channels = _needed(run, finder)
     notices = list(finder.notices)
     _refuse_large(run, source, len(channels), limit)
@@ -230,11 +244,15 @@ def read_columns(
     return Columns(run.file, first, rows, kept[0], arrays, named, tuple(notices), remarks)
 
 
-class _Finder:
-    """The headings of a file, looked up by role."""
+class Finder:
+    """The headings of a file, looked up by role; `specs` are those of [columns]."""
 
     def __init__(
-        self, path: Path, headings: tuple[str, ...], specs: Mapping[str, ColumnSpec], geometry: Geometry
+        self,
+        path: Path,
+        headings: tuple[str, ...],
+        specs: Mapping[str, ColumnSpec],
+        geometry: Geometry = NO_GEOMETRY,
     ) -> None:
         self.path, self.headings, self.specs, self.geometry = path, headings, specs, geometry
         self.parts = [split_heading(h) for h in headings]
@@ -302,7 +320,7 @@ def _plain(name: str) -> str:
     return re.sub(r"[\s_\-]+", "_", name.strip().lower())
 
 
-def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
+def _needed(run: RunDescription, finder: Finder) -> list[Channel]:
     """Return the channels of a run, the time first."""
     time = finder.find("time")
     names = [name for name, _ in finder.parts]
@@ -348,7 +366,7 @@ def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
     return [*channels, *([moves] if moves else []), *weights[:1]]
 
 
-def _wanted(run: RunDescription, finder: _Finder) -> list[Channel]:
+def _wanted(run: RunDescription, finder: Finder) -> list[Channel]:
     """Return the channels of the observables that a run lists, one of the spring first."""
     found = []
     for number, role in enumerate(run.observables):

@@ -1,4 +1,7 @@
-"""`experiment.toml` in the format `srf-experiment/1`, read without opening a data file; a breach names file, line and key."""
+"""`experiment.toml` in the format `srf-experiment/1`, read and validated without opening a data file.
+
+What breaks the format is answered with file, line and key.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import contextlib
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -23,8 +26,6 @@ from srfcli.core.units import (
     split_quantity,
     unit_factor,
 )
-
-# `experiment.toml` in the format `srf-experiment/1`, read and validated without opening any data file.
 
 FORMAT = "srf-experiment/1"
 FILE_NAME = "experiment.toml"
@@ -48,21 +49,9 @@ GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys o
 _TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs", "thresholds")
 _COLUMN = ("name", "unit", "scale", "offset", "integrate")
 _RUN = (
-    "name",
-    "file",
-    "format",
-    "holdout",
-    "window",
-    "drive",
-    "start",
-    "load",
-    "modulation",
-    "initial",
-    "direction",
-    "corrections",
-    "observables",
-    "segments",
-)
+    "name", "file", "format", "holdout", "window", "drive", "start", "load", "modulation", "initial", "direction",
+    "corrections", "observables", "segments",
+)  # fmt: skip
 _THRESHOLDS = ("name", "file", "holdout", "frequency")
 _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
 _TABLES = '[[thresholds]] with file = "....csv" for each table of critical loads.'
@@ -304,10 +293,8 @@ def _run(node: Node, geometry: Geometry) -> RunDescription:
         file.expected("the name of a data file")
     holdout, format, start, initial = (node.get(key) for key in ("holdout", "format", "start", "initial"))
     drive, load, window, direction = (node.get(key) for key in ("drive", "load", "window", "direction"))
-    if direction and direction.text() not in ("forward", "backward"):
-        direction.expected('"forward" or "backward"', did_you_mean(direction.text(), ("forward", "backward")))
-    if initial and initial.text() not in ("steady", "free"):
-        initial.expected('"steady" or "free"', did_you_mean(initial.text(), ("steady", "free")))
+    way = direction.choice(("forward", "backward")) if direction else "forward"
+    begins = initial.choice(("steady", "free")) if initial else "steady"
     weight = load.quantity("N", geometry) if load else None
     if load and weight is not None and not weight > 0:
         load.expected('a load above 0, as "5 N"')
@@ -322,9 +309,9 @@ def _run(node: Node, geometry: Geometry) -> RunDescription:
         start=start.quantity("um") if start else 0.0,
         load=weight,
         modulation=_modulation(modulation) if modulation else None,
-        initial=initial.text() if initial else "steady",
+        initial=begins,
         node=node,
-        backward=direction is not None and direction.text() == "backward",
+        backward=way == "backward",
         corrections=_corrections(node.get("corrections")),
         observables=_observables(node.get("observables")),
         segments=_segments(node.get("segments")),
@@ -335,9 +322,8 @@ def _segments(node: Node | None) -> tuple[float, ...]:
     """Return the times at which a run may be cut, rising."""
     if node is None:
         return ()
-    if not isinstance(node.value, list):
-        node.expected("a list of times in s of the file's own clock", "Write segments = [120.0, 240.0].")
-    times = [node.child(i).quantity("s") for i in range(len(node.value))]
+    listed = node.items("times in s of the file's own clock", "Write segments = [120.0, 240.0].")
+    times = [entry.quantity("s") for entry in listed]
     if any(b <= a for a, b in pairwise(times)):
         node.fail("the times do not rise", "Give the earlier time first.")
     return tuple(times)
@@ -348,7 +334,9 @@ def _thresholds(node: Node, machine: Apparatus, runs: tuple[RunDescription, ...]
     stress = "counts stresses" if machine.geometry.area or is_stress(machine.stated) else ""
     if machine.per_load or stress:
         which = stress or "has a stiffness in friction per micron, which leaves no load to be critical"
-        entries[0].fail(f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.')
+        entries[0].fail(
+            f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.'
+        )
     found: list[ThresholdsDescription] = []
     for entry in entries:
         entry.keys(_THRESHOLDS)
@@ -362,7 +350,9 @@ def _thresholds(node: Node, machine: Apparatus, runs: tuple[RunDescription, ...]
             frequency.expected("a frequency above 0")
         called = name.text() if name else Path(file.text()).stem
         if called in {*(run.name for run in runs), *(other.name for other in found)}:
-            (name or file).fail(f"'{called}' is the name of another run or table", 'Give it one of its own: name = "...".')
+            (name or file).fail(
+                f"'{called}' is the name of another run or table", 'Give it one of its own: name = "...".'
+            )
         found.append(
             ThresholdsDescription(
                 called,
@@ -379,32 +369,30 @@ def _corrections(node: Node | None) -> frozenset[str]:
     """Return which of the corrections that `srf check` proposes are made."""
     if node is None:
         return frozenset()
-    if not isinstance(node.value, list):
-        node.expected("a list of corrections", f"Write corrections = {list(CORRECTIONS)}, or one of them.")
-    for index in range(len(node.value)):
-        entry = node.child(index)
+    for entry in node.items("corrections", f"Write corrections = {list(CORRECTIONS)}, or one of them."):
         if entry.text() not in CORRECTIONS:
             entry.fail(f"unknown correction '{entry.text()}'", did_you_mean(entry.text(), CORRECTIONS))
     return frozenset(node.value)
 
 
 def _observables(node: Node | None) -> tuple[str, ...]:
-    """Return which columns of a run are compared with the model together; none listed, the reader's rule chooses one."""
+    """Return which columns of a run are compared with the model together; none for the one that `read_columns` chooses."""
     if node is None:
         return ()
-    example = 'Write observables = ["elongation", "slip"].'
-    if not isinstance(node.value, list) or not node.value:
-        node.expected("a list of observables", example)
-    names = [node.child(index).text() for index in range(len(node.value))]
-    for index, name in enumerate(names):
+    listed = node.items("observables", 'Write observables = ["elongation", "slip"].', fewest=1)
+    names = [entry.text() for entry in listed]
+    for index, (entry, name) in enumerate(zip(listed, names, strict=True)):
         if name not in READABLE:
-            node.child(index).fail(f"unknown observable '{name}'", did_you_mean(name, READABLE))
+            entry.fail(f"unknown observable '{name}'", did_you_mean(name, READABLE))
         if name in names[:index] or ({"force", "shear_stress"} <= set(names)):
-            node.child(index).fail(f"'{name}' is the same observable as another one", "Name each once.")
+            entry.fail(f"'{name}' is the same observable as another one", "Name each once.")
     if len(names) > MOST_OBSERVABLES:
         node.fail(f"{len(names)} observables", f"A run has {MOST_OBSERVABLES} at most.")
     if not set(names) - {"slip", "contact_area"}:
-        node.fail(f"{' and '.join(names)} without a force", "One of elongation, force, shear_stress, friction is needed besides.")
+        node.fail(
+            f"{' and '.join(names)} without a force",
+            "One of elongation, force, shear_stress, friction is needed besides.",
+        )
     return tuple(names)
 
 
@@ -472,6 +460,14 @@ class Node:
         """Raise SrfError that names this place."""
         raise SrfError(printable(f"{self.where}: {message}", line=True), hint)
 
+    @contextlib.contextmanager
+    def blamed(self) -> Iterator[None]:
+        """Name this place in an SrfError that is raised meanwhile."""
+        try:
+            yield
+        except SrfError as error:
+            self.fail(error.message, error.hint)
+
     def expected(self, what: str, hint: str | None = None) -> NoReturn:
         """Raise SrfError that says what was found here and what was expected."""
         self.fail(f"found {shown(self.value)}, expected {what}", hint)
@@ -509,11 +505,23 @@ class Node:
         for index in range(len(self.value)):
             yield self.child(index).table(example)
 
+    def items(self, what: str, hint: str, *, fewest: int = 0) -> list[Node]:
+        """Return the elements of this value, which must be a list of `what`."""
+        if not isinstance(self.value, list) or len(self.value) < fewest:
+            self.expected(f"a list of {what}", hint)
+        return [self.child(index) for index in range(len(self.value))]
+
     def text(self) -> str:
         """Return this value, which must be text."""
         if not isinstance(self.value, str):
             self.expected("text in quotes")
         return self.value
+
+    def choice(self, known: Sequence[str]) -> str:
+        """Return this value, which must be one of these words."""
+        if self.text() not in known:
+            self.expected(" or ".join(f'"{word}"' for word in known), did_you_mean(self.text(), known))
+        return self.text()
 
     def boolean(self) -> bool:
         """Return this value, which must be true or false."""
@@ -531,9 +539,7 @@ class Node:
             number = math.inf
         if not math.isfinite(number):
             self.expected("a finite number")
-        if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
-            self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g}")
-        return number
+        return self._sized(number)
 
     def quantity(self, unit: str, geometry: Geometry = NO_GEOMETRY) -> float:
         """Return this value in `unit`: a number in that unit, or text with a unit of its dimension."""
@@ -542,15 +548,17 @@ class Node:
                 example = "0.5" if unit == "1" else f'0.5 or "0.5 {unit}"'
                 self.expected(f"a number in {unit}" if unit != "1" else "a number", f"Write {example}.")
             return self.number()
-        try:
-            name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
+        name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
+        with self.blamed():
             number, written = split_quantity(self.value, name=name, example=f"0.5 {unit}" if unit != "1" else "0.5")
             number *= unit_factor(written, unit, geometry) if written else 1.0
-            if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
-                self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g} {unit}")
-            return number
-        except SrfError as error:
-            self.fail(error.message, error.hint)
+        return self._sized(number, f" {unit}")
+
+    def _sized(self, number: float, unit: str = "") -> float:
+        """Return a number, which must be 0 or of a size that can be computed with."""
+        if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
+            self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g}{unit}")
+        return number
 
 
 def open_node(path: Path) -> Node:
@@ -584,8 +592,12 @@ def _spelled(place: Place) -> str:
 
 Place = tuple[str | int, ...]
 
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
+_KEY = re.compile(r"""[ \t]*(?:"((?:\\.|[^"\\])*)"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*(\.?)""")
+_STRING = re.compile(
+    r"""\"{3}(?:\\.|[^"\\]|"{1,2}(?!"))*"{3,5}|'{3}(?:[^']|'{1,2}(?!'))*'{3,5}|"(?:\\.|[^"\\])*"|'[^']*'""", re.DOTALL
+)
 _SCALAR = re.compile(r"[^,\]}#\n]+")
+_SPACE = re.compile(r"[ \t]*")
 _BLANK = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
 
 
@@ -612,19 +624,17 @@ class _Scanner:
     def note(self, place: Place) -> None:
         self.lines.setdefault(place, bisect_right(self.starts, self.at))
 
-    def blank(self) -> None:
-        match = _BLANK.match(self.text, self.at)
+    def skip(self, pattern: re.Pattern[str]) -> re.Match[str]:
+        """Pass what stands here, which is of this pattern."""
+        match = pattern.match(self.text, self.at)
         assert match is not None
         self.at = match.end()
-
-    def spaces(self) -> None:
-        while self.text[self.at : self.at + 1] in (" ", "\t"):
-            self.at += 1
+        return match
 
     def document(self) -> None:
         table: Place = ()
         while True:
-            self.blank()
+            self.skip(_BLANK)
             if self.at >= len(self.text):
                 return
             if self.text[self.at] == "[":
@@ -633,37 +643,30 @@ class _Scanner:
                 self.pair(table)
 
     def header(self) -> Place:
-        double = self.text.startswith("[[", self.at)
-        self.at += 2 if double else 1
-        keys = self.keys()
+        """Pass [table] or [[table]]; return its place, with the number of the element where it is one of an array."""
+        brackets = 2 if self.text.startswith("[[", self.at) else 1
+        self.at += brackets
         place: Place = ()
-        for index, key in enumerate(keys):
+        keys = self.keys()
+        for index, key in enumerate(keys, 1):
             place = (*place, key)
-            last = index == len(keys) - 1
-            if double and last:
+            if brackets == 2 and index == len(keys):
                 self.counts[place] = self.counts.get(place, 0) + 1
             self.note(place)
             if place in self.counts:
                 place = (*place, self.counts[place] - 1)
                 self.note(place)
-        self.at += 2 if double else 1
+        self.at += brackets
         return place
 
     def keys(self) -> tuple[str, ...]:
+        """Pass a dotted key and return its parts; escapes in them are left as they are."""
         found = []
         while True:
-            self.spaces()
-            if self.text[self.at] in "\"'":
-                found.append(self.string())
-            else:
-                match = _BARE.match(self.text, self.at)
-                assert match is not None
-                found.append(match[0])
-                self.at = match.end()
-            self.spaces()
-            if self.text[self.at] != ".":
+            match = self.skip(_KEY)
+            found.append(next(part for part in match.groups()[:3] if part is not None))
+            if not match[4]:
                 return tuple(found)
-            self.at += 1
 
     def pair(self, table: Place) -> None:
         start, place = self.at, table
@@ -676,62 +679,27 @@ class _Scanner:
         self.value(place)
 
     def value(self, place: Place) -> None:
-        self.spaces()
+        self.skip(_SPACE)
         opening = self.text[self.at]
-        if opening in "\"'":
-            self.string()
-        elif opening == "[":
-            self.array(place)
+        if opening == "[":
+            for index, _ in enumerate(self.members("]")):
+                self.note((*place, index))
+                self.value((*place, index))
         elif opening == "{":
-            self.inline(place)
+            for _ in self.members("}"):
+                self.pair(place)
         else:
-            match = _SCALAR.match(self.text, self.at)
-            assert match is not None
-            self.at = match.end()
+            self.skip(_STRING if opening in "\"'" else _SCALAR)
 
-    def array(self, place: Place) -> None:
+    def members(self, closing: str) -> Iterator[None]:
+        """Stop at each member of an array or inline table, which the caller passes, and pass the brackets and commas."""
         self.at += 1
-        index = 0
         while True:
-            self.blank()
-            if self.text[self.at] == "]":
+            self.skip(_BLANK)
+            if self.text[self.at] == closing:
                 self.at += 1
                 return
             if self.text[self.at] == ",":
                 self.at += 1
-                continue
-            self.note((*place, index))
-            self.value((*place, index))
-            index += 1
-
-    def inline(self, place: Place) -> None:
-        self.at += 1
-        while True:
-            self.blank()
-            if self.text[self.at] == "}":
-                self.at += 1
-                return
-            if self.text[self.at] == ",":
-                self.at += 1
-                continue
-            self.pair(place)
-
-    def string(self) -> str:
-        """Pass a string and return what stands between its quotes; escapes in a key are left as they are."""
-        quote = self.text[self.at]
-        if self.text.startswith(3 * quote, self.at):
-            return self.long_string(quote)
-        start = self.at = self.at + 1
-        while self.text[self.at] != quote:
-            self.at += 2 if quote == '"' and self.text[self.at] == "\\" else 1
-        self.at += 1
-        return self.text[start : self.at - 1]
-
-    def long_string(self, quote: str) -> str:
-        start = self.at = self.at + 3
-        while not self.text.startswith(3 * quote, self.at):
-            self.at += 2 if quote == '"' and self.text[self.at] == "\\" else 1
-        while self.text[self.at + 3 : self.at + 4] == quote:  # up to two quotes may stand before the closing three
-            self.at += 1
-        self.at += 3
-        return self.text[start : self.at - 3]
+            else:
+                yield

@@ -17,9 +17,8 @@ from srfcli.core.settings import Parameter
 from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, is_stress, parse_quantity, split_quantity
 from srfcli.data.columns import open_source, read_columns, split_heading
 from srfcli.data.description import ROLES, check_unit, read_description
-from srfcli.data.experiment import moved, read_choice, read_experiment, read_parameters
-from srfcli.data.imposed import Stroke, find_modulation, strokes
-from srfcli.data.values import OBSERVABLES as OBSERVED
+from srfcli.data.experiment import read_choice, read_experiment, read_parameters, strokes_of
+from srfcli.data.imposed import Stroke, find_modulation
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
 
@@ -295,7 +294,9 @@ def missing(columns: Sequence[Named], wish: Wish, path: Path, headings: Sequence
         option = "--drive VELOCITY, or --column load_point_displacement=HEADING"
         lacks.append((option, f"{path}: no column has the load point's velocity or displacement"))
     if wish.load is None and not roles & {"normal_load", "normal_stress", "friction"}:
-        lacks.append(("--load '5 N', or --column normal_stress=HEADING", f"{path}: no column has the normal load or stress"))
+        lacks.append(
+            ("--load '5 N', or --column normal_stress=HEADING", f"{path}: no column has the normal load or stress")
+        )
     return lacks
 
 
@@ -371,9 +372,7 @@ def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
             source = open_source(run.file, registry=registry, format=run.format)
             columns = read_columns(run, source, described.columns, geometry=described.apparatus.geometry)
             rising = np.isfinite(columns.seconds) & (np.diff(columns.seconds, prepend=-np.inf) > 0)
-            arrays = {role: values[rising] for role, values in columns.arrays.items()}
-            t, observed = columns.seconds[rising], arrays[next(r for r in OBSERVED if r in arrays)]
-            found = strokes(t, moved(t, arrays), observed)
+            found = strokes_of(columns.kept(rising))
             shown = found[:STROKES]
             files += [run.file] * max(len(shown), 1)
             names += [f"{run.name}-{k + 1}" for k in range(len(shown))] or [run.name]
@@ -573,7 +572,8 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
     surface = registry.get("interface", wish.interface)
     listed: list[Parameter] = [p for each in (law, base, *modifiers, surface) for p in each.parameters]
     V = float(np.median([abs(run.drive(run.t[:1])[0]) or 1.0 for run in runs]))
-    mu = float(np.median(np.concatenate([_friction(run)[run.used] for run in runs])))
+    friction = [(run.observed * run.friction_factor(run.load(run.t)[0]))[run.used] for run in runs]
+    mu = float(np.median(np.concatenate(friction)))
     lines = []
     for p in listed:
         about = f"   # {p.about}" if p.about else ""
@@ -593,13 +593,6 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
     pair = f'lower = "{_short(number / 2)} {unit}", upper = "{_short(2 * number)} {unit}"'
     lines.append(f'# K = {{ value = "{wish.stiffness}", {pair} }}   # take the # away to fit the stiffness, too')
     return lines
-
-
-def _friction(run: Run) -> np.ndarray:
-    """Return what is recorded as a friction coefficient (n,)."""
-    W = run.load(run.t)[0]
-    factor = {"elongation": run.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[run.observable]
-    return np.asarray(run.observed * factor)
 
 
 def _short(value: float) -> float:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from srfcli.core.settings import Parameter
-from srfcli.core.units import find_unit, to_base
+from srfcli.core.units import from_base, to_base
 from srfcli.data.values import CriticalLoads, FitParameter, Run
 from srfcli.laws.values import Effect
 
@@ -40,9 +40,8 @@ def _of_tables(tables: Sequence[CriticalLoads]) -> dict[str, float]:
 def _of_runs(fitted: Sequence[Run]) -> dict[str, float]:
     slips, moving = [], []
     for run in fitted:
-        edges = [float(run.t[0]), *(b for b in run.drive.breaks if run.t[0] < b < run.t[-1]), float(run.t[-1])]
-        middle = 0.5 * (np.array(edges[1:]) + np.array(edges[:-1]))
-        V = np.abs(run.drive(middle))
+        edges = np.array(run.edges)
+        V = np.abs(run.drive(0.5 * (edges[1:] + edges[:-1])))
         slips.append((V * np.diff(edges)).tolist())
         moving.append(V[1e-3 * V.max() < V] if V.any() else V)
     V = np.concatenate(moving)
@@ -106,8 +105,8 @@ def own_bounds(
 
 
 def _moved(p: Parameter, stated: Mapping[str, float]) -> Parameter:
-    factor = find_unit(p.unit).factor
-    said = {which: value / factor for which, value in stated.items()}
+    """Return a parameter with the bounds and default that are stated, in um, s, N, where these bounds rise."""
+    said = {which: from_base(value, p.unit) for which, value in stated.items()}
     lower, upper = said.get("lower", p.lower), said.get("upper", p.upper)
     if not stated or not lower < upper:
         return p

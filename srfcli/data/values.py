@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError
-from srfcli.core.units import factor_between, find_unit, split_quantity
+from srfcli.core.units import factor_between, find_unit, split_quantity, to_base
 from srfcli.data.clock import Sampling, find_sampling
 from srfcli.data.thresholds import Thresholds
 from srfcli.motion.imposed import Drive, Load
@@ -123,6 +123,16 @@ class Run:
         return replace(self, **own, others=others, proposed=None if self.proposed is None else self.proposed[which])
 
     @property
+    def edges(self) -> list[float]:
+        """Return the times (s) at which the pieces of the drive begin within the run, and its end."""
+        begin, end = float(self.t[0]), float(self.t[-1])
+        return [begin, *(b for b in self.drive.breaks if begin < b < end), end]
+
+    def friction_factor(self, W: Array | float) -> Array | float:
+        """Return what the observable is multiplied by to be a friction coefficient under the loads W (N)."""
+        return {"elongation": self.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[self.observable]
+
+    @property
     def load_unit(self) -> str:
         """Return the unit of the load as it is shown: N or MPa."""
         return shown_unit("N", stress=self.stress)
@@ -177,7 +187,9 @@ class Experiment:
     def check_recorded(self, purpose: str) -> None:
         """Raise SrfError where there is no recording, only critical loads."""
         if not self.runs:
-            raise SrfError(f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`.")
+            raise SrfError(
+                f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`."
+            )
 
     def fitted(self) -> Experiment:
         """Return the experiment without what is held out."""
@@ -188,7 +200,7 @@ class Experiment:
     def stiffness(self) -> float:
         """Return the stated stiffness in N/um, or in 1/um where it is friction per micron."""
         number, unit = split_quantity(self.stiffness_text, name="stiffness")
-        return number * find_unit(unit).factor
+        return to_base(number, unit)
 
     @property
     def stress(self) -> bool:

@@ -199,10 +199,8 @@ def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
 
 def _slopes(run: Run, length: float) -> Iterator[tuple[float, float]]:
     """Yield d mu/d slip (1/um) and its error for the end of each segment of constant velocity that is long enough."""
-    W = run.load(run.t)[0]
-    mu = run.observed * {"elongation": run.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[run.observable]
-    starts = [float(run.t[0]), *(b for b in run.drive.breaks if run.t[0] < b < run.t[-1]), float(run.t[-1])]
-    for begin, end in pairwise(starts):
+    mu = run.observed * run.friction_factor(run.load(run.t)[0])
+    for begin, end in pairwise(run.edges):
         V, rate, _ = run.drive.piece(begin)
         part = (run.t >= end - TAIL * (end - begin)) & (run.t <= end) & run.used
         if rate or V <= 0 or V * TAIL * (end - begin) < LONG * length or part.sum() < 16:
