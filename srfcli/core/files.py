@@ -104,6 +104,28 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         raise SrfError(f"{path}: not TOML: {error}", "Write numbers as in 1.5e-3.") from None
 
 
+def toml_lines(table: Mapping[str, Any]) -> list[str]:
+    """Return a table as lines of TOML, one `key = value` for each entry."""
+    return [f"{_toml_key(key)} = {toml_value(value)}" for key, value in table.items()]
+
+
+def toml_value(value: object) -> str:
+    """Return text, a truth value, a number, a list or a table as TOML; tables are inline, numbers keep every digit."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):  # TOML's basic strings are JSON's, but for DEL
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(toml_lines(value))} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    return repr(value)
+
+
+def _toml_key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
+
+
 def parse_json(text: str | bytes, where: object) -> Any:
     """Return what a JSON text holds; raises SrfError, beginning with `where`, for anything else."""
     try:

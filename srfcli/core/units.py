@@ -63,11 +63,21 @@ _SPELLED = {  # in small letters, as headings of recordings have them
 SQUARE_MILLIMETRE = 1e6  # um^2: a stress is taken as the force on this area
 
 LONGEST = 200  # characters of a number with its unit
+LONGEST_HEADING = 500  # characters of a heading that are looked through for its unit
+_HEADING = re.compile(r"\s*(.*?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
 # A product of names with one-digit powers: pint never sees a tower of powers that it would have to work out.
 _FACTOR = r"(?:1|[A-Za-zµ°Ωθ%_]+(?:\^-?[1-9])?)"
 _UNIT = re.compile(rf"{_FACTOR}(?:\s*[*/ ]\s*{_FACTOR})*")
 _PART = re.compile(r"\s*([*/ ]?)\s*([^\s*/^]+)(?:\^(-?\d))?")
+
+
+def split_heading(heading: str) -> tuple[str, str | None]:
+    """Return the name and the unit of `name [unit]` or `name (unit)`; the unit is None for a bare name."""
+    match = _HEADING.fullmatch(heading) if len(heading) <= LONGEST_HEADING else None
+    if match is None:
+        return heading.strip(), None
+    return match[1], match[2] if match[2] is not None else match[3]
 
 
 def to_base(value: float, unit: str) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.files import open_plain
-from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit
+from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, split_heading
 from srfcli.data.clock import Mask, Place
 from srfcli.data.description import ROLES, ColumnSpec, RunDescription, check_unit
 from srfcli.data.values import BESIDE, OBSERVABLES
@@ -167,8 +167,6 @@ def _guarded(source: Source, columns: tuple[int, ...], reader: Reader, path: Pat
 
 LIMIT = 512 * 2**20  # bytes of needed columns that are held at a time
 HUGE = 1e30  # um, s, N: no measurement, but a gauge's word for none
-LONGEST = 500  # characters of a heading that are looked through for its unit
-_HEADING = re.compile(r"\s*(.*?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
 
 
 @dataclass(frozen=True)
@@ -211,14 +209,6 @@ class Columns:
     def role(self, *roles: str) -> str | None:
         """Return the first of these roles that a column plays, None where none does."""
         return next((role for role in roles if role in self.arrays), None)
-
-
-def split_heading(heading: str) -> tuple[str, str | None]:
-    """Return the name and the unit of `name [unit]` or `name (unit)`; the unit is None for a bare name."""
-    match = _HEADING.fullmatch(heading) if len(heading) <= LONGEST else None
-    if match is None:
-        return heading.strip(), None
-    return match[1], match[2] if match[2] is not None else match[3]
 
 
 def read_columns(

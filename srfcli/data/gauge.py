@@ -21,8 +21,16 @@ from srfcli.codegen.model import Array
 from srfcli.data.clock import Mask
 from srfcli.data.noise import white_level
 
-PROCESSES = ("relaxation", "oscillation")  # of coloured noise: e' = -e / tau + w, or e'' + (omega / q) e' + omega^2 e = w
-CORRELATION_TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
+PROCESSES = (
+    "relaxation",
+    "oscillation",
+)  # of coloured noise: e' = -e / tau + w, or e'' + (omega / q) e' + omega^2 e = w
+CORRELATION_TIMES = (
+    0.02,
+    0.3,
+    0.6,
+    0.9,
+)  # of the way from the shortest correlation time to the longest, where colour begins
 QUALITIES = (0.5, 3.0, 30.0)  # of an oscillation, where it begins: smooth noise, a broad line and a narrow one
 QUALITY = (0.2, 1000.0)  # of an oscillation: one of a smaller quality is a relaxation
 FASTEST = 1.0  # frequency of an oscillation times the spacing: smooth noise may end beyond half of the sampling rate
@@ -33,8 +41,13 @@ RISE = 1.5  # times what shorter ones foretell there, at most: their noise is to
 SLOWEST = 2.0  # periods of an oscillation in a stretch
 FEWEST = 32  # samples in which a colour can be seen
 ENOUGH = 4  # stretches among which some can be wild
-TAIL, ROUNDS = 1e-3, 4  # share of stretches of noise that are held to be wilder, and how often the calm ones are chosen anew
-NEIGHBOURS = 1.94  # powers at one frequency over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
+TAIL, ROUNDS = (
+    1e-3,
+    4,
+)  # share of stretches of noise that are held to be wilder, and how often the calm ones are chosen anew
+NEIGHBOURS = (
+    1.94  # powers at one frequency over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
+)
 WHITE = 1e-3  # of the whole noise, at least: a spectrum without a floor is none
 LEAST = 1e-150  # standard deviation whose square is still a number
 STEP = 1e-5  # of the central differences by which a covariance is differentiated, in the logarithms of its parameters
@@ -55,7 +68,10 @@ def transition(colour: tuple[float, ...], lag: Array) -> Array:
     root = np.sqrt((a**2 - b**2).astype(complex))
     small = np.abs(root) < 1e-6
     grown, fallen = np.exp(root - a), np.exp(-root - a)
-    c, s = ((grown + fallen) / 2).real, np.where(small, np.exp(-a), ((grown - fallen) / (2 * np.where(small, 1, root))).real)
+    c, s = (
+        ((grown + fallen) / 2).real,
+        np.where(small, np.exp(-a), ((grown - fallen) / (2 * np.where(small, 1, root))).real),
+    )
     return np.stack([np.stack([c + a * s, b * s], -1), np.stack([-b * s, c - a * s], -1)], -2)
 
 
@@ -98,7 +114,9 @@ class GaugeNoise:
 
     def covariance(self, lag: Array) -> Array:
         """Return the covariance at lags >= 0 (s), of which 0 is a sample with itself."""
-        return np.where(lag == 0, self.floor, 0.0) + sum((covariance(c, lag) for c in self.colours), np.zeros(np.shape(lag)))
+        return np.where(lag == 0, self.floor, 0.0) + sum(
+            (covariance(c, lag) for c in self.colours), np.zeros(np.shape(lag))
+        )
 
 
 def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t: Array, columns: Array) -> Array:
@@ -106,6 +124,8 @@ def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t
 
     `rate` (n,) says which of the noises holds at a sample; `begins` (n,) where one begins that owes nothing to the one before.
     """
+    from scipy.linalg import block_diag
+
     floor = np.array([noise.floor for noise in noises])[rate]
     if not any(noise.colours for noise in noises):
         return np.asarray(columns / np.sqrt(floor)[:, None])
@@ -122,7 +142,8 @@ def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t
         else:
             now = (int(rate[k]), float(f"{steps[k]:.9g}"))
             if now not in known:
-                known[now] = _joined([transition(c, np.array(now[1])) for c in noise.colours])
+                steps_of = [transition(c, np.array(now[1])) for c in noise.colours]
+                known[now] = block_diag(np.zeros((0, 0)), *steps_of)  # (0, 0) where there is none
             F, settled, key = known[now], settled and now == key, now
             x = F @ x
             P = P if settled else V + F @ (P - V) @ F.T
@@ -137,19 +158,12 @@ def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t
     return out
 
 
-def _joined(blocks: Sequence[Array]) -> Array:
-    size = [b.shape[0] for b in blocks]
-    out, at = np.zeros((sum(size), sum(size))), 0
-    for block, n in zip(blocks, size, strict=True):
-        out[at : at + n, at : at + n] = block
-        at += n
-    return out
-
-
 # How it is found.
 
 
-def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0, cycles: float | None = None) -> GaugeNoise:
+def find_noise(
+    pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0, cycles: float | None = None
+) -> GaugeNoise:
     """Return the noise in evenly sampled pieces of a recording, `spacing` s between samples, about a parabola over each stretch.
 
     `cycles`, in periods per sample, is a modulation whose first three harmonics are taken out, too. Stretches in which the signal
@@ -159,7 +173,9 @@ def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0,
     """
     longest = max(piece.size for piece in pieces)
     lengths = [n for n in STRETCHES if n <= longest] or [longest]
-    least = max(1e-9 * max(float(np.ptp(piece)) for piece in pieces), LEAST)  # the rounding of numbers, where there is no noise
+    least = max(
+        1e-9 * max(float(np.ptp(piece)) for piece in pieces), LEAST
+    )  # the rounding of numbers, where there is no noise
     if lengths[0] < FEWEST:
         return GaugeNoise(max(white_level(max(pieces, key=len)), least), quantum)
     found: GaugeNoise | None = None
@@ -168,7 +184,9 @@ def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0,
         whittle = _Whittle(calm, spacing, quantum, least)
         if found is not None:
             slow = calm.mean[:SLOW] / whittle.expected(found)[:SLOW]
-            if whittle.samples < found.samples / 2 or slow.mean() > RISE * (1 + 2 * np.sqrt(NEIGHBOURS / (SLOW * calm.count))):
+            if whittle.samples < found.samples / 2 or slow.mean() > RISE * (
+                1 + 2 * np.sqrt(NEIGHBOURS / (SLOW * calm.count))
+            ):
                 break
         found = whittle.noise()
     assert found is not None
@@ -248,7 +266,9 @@ def _calm(pieces: Sequence[Array], window: _Window) -> _Calm:
     if total.size <= ENOUGH:
         return of(np.arange(total.size))
     found = of(np.argsort(total)[: max(total.size // 4, 1)])
-    shape = 1 / max(found.spread, 1e-6) ** 2  # a stretch's power is a gamma variate, of which the lowest quarter has this mean
+    shape = (
+        1 / max(found.spread, 1e-6) ** 2
+    )  # a stretch's power is a gamma variate, of which the lowest quarter has this mean
     level = float(found.mean.sum()) / max(float(gammainc(shape + 1, gammaincinv(shape, 0.25))) / 0.25, 0.1)
     for _ in range(ROUNDS):
         shape = 1 / max(found.spread, 1e-6) ** 2
@@ -358,7 +378,9 @@ class _Whittle:
         else:
             white, colours = self.split(x, kinds)
             over = self.calm.mean / self.expected(GaugeNoise(white, self.quantum, tuple(colours)))
-            peaks = np.array([self.calm.window.bins[int(np.argmax(over))] / self.calm.window.n, 0.03, 0.15]) / self.spacing
+            peaks = (
+                np.array([self.calm.window.bins[int(np.argmax(over))] / self.calm.window.n, 0.03, 0.15]) / self.spacing
+            )
             places = [*product(np.log(peaks), np.log(QUALITIES))]
         levels = [0, *(2 + i for i in self.places(kinds))]
         variance = float(np.sum(np.exp(2 * x[levels])))

@@ -52,6 +52,7 @@ WIDEST_SPIKE = 3  # samples of a spike
 BESIDE = 5  # samples before and after that tell the level
 FACTOR = 8.0  # robust standard deviations
 CREST = 0.5  # share of a spike's size by which it is off a cubic through its neighbours, at least
+NEARBY = 101  # samples that share a level of noise
 FEW = 0.02  # share of samples that move: below it they are the accidents of a constant, and not its noise
 SATURATED = 10  # samples in a row at the extreme value
 LARGE = 0.05  # share of the level from which a jump is a transducer's for certain
@@ -88,12 +89,12 @@ def quantisation(x: Array) -> float:
     return quantum if (off <= 0.05 * quantum + 2 * rounding).all() else 0.0
 
 
-def local_scale(x: Array, m: Array, width: int = 101) -> Array:
+def local_scale(x: Array, m: Array) -> Array:
     """Return a robust standard deviation of x about its running median m near each sample."""
     from scipy.ndimage import median_filter
 
     rest = np.abs(x - m)
-    near = median_filter(rest, size=min(width, x.size), mode="nearest")
+    near = median_filter(rest, size=min(NEARBY, x.size), mode="nearest")
     moving = rest[rest > 0]
     overall = float(np.median(moving)) if moving.size > FEW * x.size else 0.0
     return np.asarray(2.0 * np.maximum(near, 0.5 * overall))  # the running median follows the noise by a quarter
@@ -191,8 +192,12 @@ def observable_jumps(x: Array, t: Array, rate: Array, steady: Mask, quantum: flo
             continue
         allowed = float(rate[max(i - 20, 0) : i + 22].max() * (t[i + 1] - t[i]))
         certain = abs(jump.size) > max(20 * allowed, LARGE * float(np.median(np.abs(x))))
-        outruns = jump.size > 3 * allowed and _stays(x, t, i, jump.size)
-        if outruns or (jump.size < 0 and _goes_on(x, t, i, float(rate[i]), abs(jump.size))):
+        before, after = (slice(max(i - 19, 0), i + 1), slice(i + 1, i + 21))  # twenty samples on each side
+        slopes = [float(np.polyfit(t[s] - t[i], x[s], 1)[0]) for s in (before, after)]
+        bend = abs(slopes[1] - slopes[0]) * float(t[after][-1] - t[i])  # of the level: none if no reloading begins
+        outruns = jump.size > 3 * allowed and bend < 0.5 * jump.size
+        flat = min(x[before].size, x[after].size) >= 10 and all(abs(s) < 0.3 * float(rate[i]) for s in slopes)
+        if outruns or (jump.size < 0 and flat and bend < 0.2 * abs(jump.size)):
             found.append(Jump(i, jump.size, certain))
     return found if len(jumps) <= MOST_RESETS else []
 
@@ -227,23 +232,6 @@ def _levels(x: Array) -> tuple[Array, Array]:
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, BESIDE, mode="edge"), BESIDE)
     medians = np.median(windows, axis=1)
     return medians[1 : x.size], medians[BESIDE + 1 : x.size + BESIDE]
-
-
-def _stays(x: Array, t: Array, i: int, size: float) -> bool:
-    """Return whether the level goes on after a step as before it, for the twenty samples on each side: no reloading begins."""
-    left, right = slice(max(i - 19, 0), i + 1), slice(i + 1, i + 21)
-    slopes = [float(np.polyfit(t[s] - t[i], x[s], 1)[0]) for s in (left, right)]
-    return abs(slopes[1] - slopes[0]) * float(t[right][-1] - t[i]) < 0.5 * abs(size)
-
-
-def _goes_on(x: Array, t: Array, i: int, rate: float, size: float) -> bool:
-    """Return whether the level is as flat after the step as before it, for the twenty samples on each side."""
-    left, right = slice(max(i - 19, 0), i + 1), slice(i + 1, i + 21)
-    if min(x[left].size, x[right].size) < 10:
-        return False
-    slopes = [float(np.polyfit(t[s] - t[i], x[s], 1)[0]) for s in (left, right)]
-    spread = float(t[right][-1] - t[i])
-    return all(abs(s) < 0.3 * rate for s in slopes) and abs(slopes[1] - slopes[0]) * spread < 0.2 * size
 
 
 def rejoined(x: Array, jumps: list[Jump]) -> tuple[Array, NDArray[np.bool_]]:
@@ -315,10 +303,7 @@ def quantised(values: Array, quantum: float) -> Array:
 # A rough track to simulate on: mu0 wanders along it by a Gaussian random function of slip position, fixed by a seed.
 
 KNOTS = 8  # to a correlation length: halfway between two of them the variance falls short by 4e-4
-WIDEST_KNOTS, FINEST_KNOTS = (
-    0.8,
-    0.01,
-)  # um between knots; a fit's are as wide, and contacts are a tenth of a micron or more
+WIDEST_KNOTS, FINEST_KNOTS = 0.8, 0.01  # um between knots: as wide as a fit's; contacts are 0.1 um or more
 MOST = 2_000_000  # knots between position 0 and the far end of a record
 ECHO = 32  # knots over which a spline's numbers feel a value: sqrt(3) - 2 to this power is below the last bit
 
