@@ -17,7 +17,7 @@ from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel, load_sourc
 from srfcli.codegen.numpy_source import generate_motion
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
-from srfcli.core.units import QUANTITY_UNITS, SYMBOL_UNITS, Dimension, describe, dimension, dimension_of, find_unit
+from srfcli.core.units import QUANTITY_UNITS, SYMBOL_UNITS, Dimension, describe, dimension, dimension_of, to_base
 from srfcli.laws.effect_file import summary
 from srfcli.laws.expression import expm1, log1p, symbol
 from srfcli.laws.law_file import COMMON, FORMULA, formula_of, kind_of
@@ -90,10 +90,10 @@ def check_units(law: Law, registry: Registry) -> str:
     units |= {state.name: units["phi"] for state in states}
     units |= {p.name: dimension(p.unit) for p in _parameters(law, registry)}
     for state in states:
-        _expect(units[state.length], "um", f"length '{state.length}' of state '{state.name}'")
-        _expect(units[state.weight], "1", f"weight '{state.weight}' of state '{state.name}'")
+        _expect(units[state.length], dimension("um"), f"length '{state.length}' of state '{state.name}'")
+        _expect(units[state.weight], dimension("1"), f"weight '{state.weight}' of state '{state.name}'")
     unit = QUANTITY_UNITS[quantity]
-    _expect(dimension_of(formula, units), unit, quantity)
+    _expect(dimension_of(formula, units), dimension(unit), quantity)
     return f"{quantity} is in {unit}"
 
 
@@ -106,7 +106,9 @@ def check_steady_state(law: Law, registry: Registry) -> str:
         names = []
         for ageing in _ageing_laws(registry):
             for v in VELOCITIES:
-                _finite(law, evaluate(law.mu, {**values, **_steady(law, ageing, v), "v": v}), v, ageing)
+                mu = evaluate(law.mu, {**values, **_steady(law, ageing, v), "v": v})
+                if not np.isfinite(mu):
+                    raise SrfError(f"mu = {mu} at v = {v:g} um/s in steady sliding with {ageing.name}")
             names.append(ageing.name)
         return f"mu is finite from {VELOCITIES[0]:g} to {VELOCITIES[-1]:g} um/s with {', '.join(names)}"
     rate = law.rate if isinstance(law, AgeingLaw) else formula_of(law) + _ageing(registry, "dieterich").rate
@@ -168,10 +170,10 @@ def check_worked_values(law: Law, registry: Registry) -> str:
         raise Skipped("the law gives none; add [[checks]]")
     if formula is None:
         raise SrfError("a rigid interface has no formula to check")
-    units = {p.name: find_unit(p.unit).factor for p in _parameters(law, registry)}
+    units = {p.name: p.unit for p in _parameters(law, registry)}
     for number, check in enumerate(law.checks):
         values = reference_values(_parameters(law, registry))
-        values |= {name: value * units.get(name, 1.0) for name, value in check.at}
+        values |= {name: to_base(value, units.get(name, "1")) for name, value in check.at}
         missing = sorted({s.name for s in formula.free_symbols} - set(values))
         if missing:
             raise SrfError(f"checks[{number}]: no value for '{missing[0]}'", "Add it to the table 'at'.")
@@ -226,14 +228,12 @@ def _steady_of(state: State, ageing: AgeingLaw, v: float, own: Mapping[str, floa
     return phi
 
 
-def _finite(law: FrictionLaw, value: float, v: float, ageing: AgeingLaw) -> None:
-    if not np.isfinite(value):
-        raise SrfError(f"mu = {value} at v = {v:g} um/s in steady sliding with {ageing.name}")
-
-
-def _expect(found: Dimension, unit: str, what: str) -> None:
-    if found != dimension(unit):
-        raise SrfError(f"{what} is in {describe(found)}, expected {unit}", "Look at the units under [parameters].")
+def _expect(found: Dimension, wanted: Dimension, what: str) -> None:
+    """Raise `SrfError` where a formula has another dimension than it should."""
+    if found != wanted:
+        raise SrfError(
+            f"{what} is in {describe(found)}, expected {describe(wanted)}", "Look at the units under [parameters]."
+        )
 
 
 def _sample(law: Law, registry: Registry) -> list[dict[str, float]]:
@@ -308,19 +308,14 @@ class _Check:
         formulas = [*(f for _, f in self.effect.written or self.effect.changes)]
         formulas += [f for s in self.effect.states for f in (s.rate, s.steady)]
         used = {str(s) for f in formulas for s in f.free_symbols}
-        if self.effect.settings:
-            used |= {p.name for name in self._own_interface() for p in name.parameters}
+        if isinstance(interface := dict(self.effect.settings).get("interface"), str):
+            used |= {p.name for p in self.registry.get("interface", interface).parameters}
         constants = {c.name for c in self.effect.constants}
         idle = [n for n in (*(p.name for p in self.effect.parameters), *constants) if n not in used]
         if idle:
             raise SrfError(f"declared and not used: {', '.join(idle)}", "Remove them or mend the formula.")
         sizes = ", ".join(f"{name} = {value:g}" for name, value in self.effect.neutral)
         return f"{len(self.effect.parameters)}, all used" + (f"; the baseline has {sizes}" if sizes else "")
-
-    def _own_interface(self) -> list[Interface]:
-        name = dict(self.effect.settings).get("interface")
-        law = self.registry.get("interface", name) if isinstance(name, str) else None
-        return [law] if isinstance(law, Interface) else []
 
     def units(self) -> str:
         formulas = self.effect.written or self.effect.changes
@@ -332,13 +327,11 @@ class _Check:
         for state in self.effect.states:
             found = dimension_of(state.rate, units)
             own = units[state.name]
-            _expect_in_effect(found, (own[0], own[1] - 1, own[2]), f"rate of {state.name}")
+            _expect(found, (own[0], own[1] - 1, own[2]), f"rate of {state.name}")
         for slot, formula in formulas:
-            _expect_in_effect(dimension_of(formula, units), dimension(SLOT_UNITS[slot]), slot)
+            _expect(dimension_of(formula, units), dimension(SLOT_UNITS[slot]), slot)
         if self.effect.observed:
-            _expect_in_effect(
-                units[self.effect.observed], dimension("um"), f"observed '{self.effect.observed}'"
-            )
+            _expect(units[self.effect.observed], dimension("um"), f"observed '{self.effect.observed}'")
         return ", ".join([*(f"{slot} is in {SLOT_UNITS[slot]}" for slot, _ in formulas),
                           *(f"{s.name} in {describe(units[s.name])}" for s in self.effect.states)])  # fmt: skip
 
@@ -445,10 +438,14 @@ class _Check:
 
         plain = read(self.plain, self.plain.vector(self._values(self.plain)))
         if not (off := _difference(read(self.model, self._vector(self._neutral_values())), plain)) < RTOL:
-            raise SrfError(f"at the neutral values the reading differs by {off:.2g} of its size", "It must be gauge there.")
+            raise SrfError(
+                f"at the neutral values the reading differs by {off:.2g} of its size", "It must be gauge there."
+            )
         moved = _difference(read(self.model, self._vector()), plain)
         if moved < 1e-12:
-            raise SrfError("at the default values the gauge shows what it did", "Give the size a default off its neutral value.")
+            raise SrfError(
+                "at the default values the gauge shows what it did", "Give the size a default off its neutral value."
+            )
         return f"at the default values the reading moves by up to {moved:.2g} of the largest"
 
     def steady_start(self) -> str:
@@ -492,8 +489,8 @@ class _Check:
         return {n: v for n, v in run.items() if n in model.names}
 
     def _neutral_values(self) -> dict[str, float]:
-        units = {p.name: find_unit(p.unit).factor for p in self.effect.parameters}
-        return {n: v * units[n] for n, v in self.effect.neutral}
+        units = {p.name: p.unit for p in self.effect.parameters}
+        return {n: to_base(v, units[n]) for n, v in self.effect.neutral}
 
     def _vector(self, values: Mapping[str, float] | None = None) -> Array:
         """Return p with the effect's defaults, the sizes' at the values given; a default that is neutral moves off."""
@@ -555,13 +552,6 @@ def _difference(found: Array, expected: Array) -> float:
 def _to(size: float, before: str = " to", after: str = "") -> str:
     """Return how far something is off as words, none where it is not."""
     return f"{before} {size:.0e}{after}" if size else ""
-
-
-def _expect_in_effect(found: Dimension, wanted: Dimension, what: str) -> None:
-    if found != wanted:
-        raise SrfError(
-            f"{what} is in {describe(found)}, expected {describe(wanted)}", "Look at the units under [parameters]."
-        )
 
 
 # What checks of laws and of effects share: outcomes, and the numbers of formulas.
@@ -643,4 +633,4 @@ def evaluate(expr: sympy.Expr, values: Values) -> Any:
 
 def reference_values(parameters: Iterable[Parameter]) -> dict[str, float]:
     """Return the defaults of parameters in um, s, N."""
-    return {p.name: p.default * find_unit(p.unit).factor for p in parameters}
+    return {p.name: to_base(p.default, p.unit) for p in parameters}
