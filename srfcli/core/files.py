@@ -53,9 +53,8 @@ def check_plain(path: Path) -> os.stat_result:
         kind = next((name for is_kind, name in _KINDS if is_kind(found.st_mode)), "no regular file")
         hint = "Name a file in it." if kind == "a folder" else "Name a file; save first what comes through a pipe."
         raise SrfError(f"no file {path}, but {kind}", hint)
-    if (
-        path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix"
-    ):  # said to be files; reading may wait or fail
+    # said to be files; reading may wait or fail
+    if path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix":
         raise SrfError(
             f"no file {path}, but a part of the running system", "Name a file; copy what is meant to one first."
         )
@@ -220,22 +219,24 @@ def recover(target: Path) -> None:
     if not target.parent.is_dir() or os.path.lexists(note):  # another process is at it
         return
     for part in _parts(target):
-        with contextlib.suppress(OSError):
-            if (lock := _locked(part)) is None:
-                continue
-            with lock:
-                if (part / OLD).is_dir() and not os.path.lexists(target):
-                    (part / OLD).rename(target)  # it died between the two moves of a folder
-                shutil.rmtree(part) if part.is_dir() else part.unlink()
+        _remove_abandoned(part, target)
 
 
 def clear(folder: Path) -> None:
     """Remove from a folder the parts of files that dead processes were writing into it, whatever their names."""
     for part in folder.glob(".*.part") if fcntl is not None else ():
-        with contextlib.suppress(OSError):
-            if (lock := _locked(part)) is not None:
-                with lock:
-                    shutil.rmtree(part) if part.is_dir() else part.unlink()
+        _remove_abandoned(part)
+
+
+def _remove_abandoned(part: Path, target: Path | None = None) -> None:
+    """Remove a part unless a living process has locked it; the old folder in it returns to `target` if that is gone."""
+    with contextlib.suppress(OSError):
+        if (lock := _locked(part)) is None:
+            return
+        with lock:
+            if target is not None and (part / OLD).is_dir() and not os.path.lexists(target):
+                (part / OLD).rename(target)  # its writer died between the two moves of a folder
+            shutil.rmtree(part) if part.is_dir() else part.unlink()
 
 
 def _note(target: Path) -> Path:
@@ -301,14 +302,11 @@ def _locked(place: Path) -> contextlib.ExitStack | None:
     except OSError:
         held.close()
         return None
-    if (there.st_dev, there.st_ino) != (mine.st_dev, mine.st_ino) or not _plain(mine.st_mode):
+    plain = stat.S_ISREG(mine.st_mode) or stat.S_ISDIR(mine.st_mode)
+    if (there.st_dev, there.st_ino) != (mine.st_dev, mine.st_ino) or not plain:
         held.close()
         return None
     return held
-
-
-def _plain(mode: int) -> bool:
-    return stat.S_ISREG(mode) or stat.S_ISDIR(mode)
 
 
 def _fill(part: Path, data: bytes, mode: int) -> None:

@@ -19,7 +19,7 @@ from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, split_heading
 from srfcli.data.clock import Mask, Place
 from srfcli.data.description import ROLES, ColumnSpec, RunDescription, check_unit
 from srfcli.data.values import BESIDE, OBSERVABLES
-from srfcli.laws.registry import Entry, Registry
+from srfcli.laws.registry import Registry
 from srfcli.laws.values import Reader, Source
 
 # From a file to its columns: which reader opens it, and that what the reader gives is what readers promise.
@@ -34,7 +34,7 @@ def open_source(path: Path, *, registry: Registry, format: str | None = None) ->
     Raises SrfError where the file is missing or empty, where no reader or more than one knows it, and for what readers refuse.
     """
     head = _head(path)
-    reader = _named(registry, format) if format else _sniffed(path, head, registry)
+    reader = registry.reader(registry.find("reader", format)) if format else _sniffed(path, head, registry)
     try:
         found = reader.read(path)
     except SrfError:
@@ -44,14 +44,7 @@ def open_source(path: Path, *, registry: Registry, format: str | None = None) ->
     source = found if isinstance(found, Source) else _from_mapping(found, reader, path)
     if not source.headings or not all(isinstance(h, str) for h in source.headings):
         raise SrfError(f"{path}: the reader '{reader.name}' finds no columns", "Check the file, or name its kind.")
-    return Source(
-        source.headings,
-        lambda columns: _guarded(source, columns, reader, path),
-        source.rows,
-        source.whole,
-        source.remarks,
-        source.about,
-    )
+    return replace(source, blocks=lambda columns: _guarded(source, columns, reader, path))
 
 
 def _head(path: Path) -> bytes:
@@ -70,10 +63,6 @@ def _head(path: Path) -> bytes:
     return head
 
 
-def _named(registry: Registry, name: str) -> Reader:
-    return registry.reader(registry.find("reader", name))
-
-
 def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
     """Return the reader whose test the first bytes pass; one that has no test goes by the file's ending, and comes first."""
     readers = [(entry, registry.reader(entry)) for entry in registry.entries("reader")]
@@ -87,15 +76,9 @@ def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
     if not found:
         raise SrfError(f"{path}: no reader knows this kind of file", f'Name one with format = "...": {names}.')
     if len(found) > 1:
-        raise SrfError(
-            f"{path}: {_listed([e for e, _ in found])} would read this file",
-            f'Choose with format = "{found[0][0].name}".',
-        )
+        listed = " and ".join(f"'{e.name}' ({e.origin})" for e, _ in found)
+        raise SrfError(f"{path}: {listed} would read this file", f'Choose with format = "{found[0][0].name}".')
     return found[0][1]
-
-
-def _listed(entries: Sequence[Entry]) -> str:
-    return " and ".join(f"'{e.name}' ({e.origin})" for e in entries)
 
 
 def _passes(reader: Reader, head: bytes) -> bool:
@@ -438,9 +421,8 @@ def _collect(
         row += inside.size
     columns = [np.concatenate([p[k] for p in pieces]) if pieces else np.empty(0) for k in range(len(channels))]
     known = np.flatnonzero(np.isfinite(columns[0]))
-    part = (
-        slice(known[0], known[-1] + 1) if known.size else slice(0, 0)
-    )  # what has no time belongs where its neighbours are
+    # what has no time belongs where its neighbours are
+    part = slice(known[0], known[-1] + 1) if known.size else slice(0, 0)
     return [c[part] for c in columns], np.concatenate([np.empty(0, np.int64), *numbers])[part], first
 
 

@@ -74,10 +74,8 @@ SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
 STRESSES = {"normal_load": "normal_stress", "force": "shear_stress"}
 FORCES = {stress: force for force, stress in STRESSES.items()}
 OBSERVABLES = ("elongation", "force", "shear_stress", "friction")
-STILL, HELD = (
-    1e-3,
-    0.05,
-)  # of the fastest velocity, below which nothing slides; of the slowest sliding, below which is a hold
+STILL = 1e-3  # of the fastest velocity, below which nothing slides
+HELD = 0.05  # of the slowest sliding, below which is a hold
 SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps
 STROKES = 40  # of a file that are written
 LETTERS = "A is a, B is b, D0 is Dc (or L), mu is tau/sigma, W is sigma, K is k; a stress in MPa counts as the force on 1 mm^2"
@@ -344,12 +342,13 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         if name not in sketch.names:
             raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, sketch.names))
     runs, free = _read(sketch, registry)
-    kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs)
+    modulations = _modulations(runs)
+    kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
     remarks.append(f"kind of experiment: {kind}, {why}")
     if still := [name for name in free if name not in sketch.strokes]:
         remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(still)}")
     sketch = replace(
-        sketch, kind=kind, why=why, free=free, modulations=_modulations(runs) if kind == "oscillation" else {},
+        sketch, kind=kind, why=why, free=free, modulations=modulations if kind == "oscillation" else {},
         durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
     )  # fmt: skip
     text = sketch.text(_parameters(sketch, runs, registry))
@@ -528,10 +527,10 @@ def _check(text: str, registry: Registry) -> None:
         read_parameters(described.parameters, known, choice)
 
 
-def _kind(runs: Sequence[Run]) -> tuple[str, str]:
+def _kind(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, float]]) -> tuple[str, str]:
     """Return what kind of experiment the runs are, and the reason."""
-    if _modulations(runs):
-        name, (f, eps, _) = next(iter(_modulations(runs).items()))
+    if modulations:
+        name, (f, eps, _) = next(iter(modulations.items()))
         return "oscillation", f"as the load of {name} oscillates by {100 * eps:.3g} % at {f:.4g} Hz"
     for run in runs:
         V = np.abs(run.drive(run.t))
