@@ -1,8 +1,8 @@
-"""Files: read with suspicion, written whole or not at all.
+"""Files: checked before they are read, written whole or not at all.
 
-Everything is written beside its place, under a name that begins with a dot and ends in `.part`, and moved there when it is
-complete. The writer holds a lock on its part for as long as it lives: a part that nobody has locked is of a dead process. The
-next writer to the same place removes it, or, where the process died between two moves, ends what it had begun.
+A file is written beside its place, under a name that begins with a dot and ends in `.part`, and moved there when it is complete.
+The writer holds a lock on this part for as long as it lives, so that a part without a lock belongs to a dead process. The next
+writer to the same place removes such a part or, where its writer died between two moves, makes the moves that are missing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import tomli
 
 from srfcli.core.errors import SrfError
 
-# Reading of files that others may have made: by kind before they are opened, and no more of them than makes sense.
+# Reading files that others may have made: their kind is checked before they are opened, and their size while they are read.
 
 TEXT = 4 * 2**20  # bytes of a law, of settings or of an answer
 
@@ -135,7 +135,7 @@ def parse_json(text: str | bytes, where: object) -> Any:
         raise SrfError(f"{where}: not JSON: {error}") from None
 
 
-# Writing that a kill at any moment leaves whole: files, a result with its sidecar, folders; and what is left is cleared away.
+# Writing files, a result with its sidecar, and folders, whole even if the process is killed; removing what a killed one left.
 
 try:
     import fcntl

@@ -39,7 +39,7 @@ from srfcli.core.files import clear, parse_json, read_plain, write_atomic
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Tasks on processes of this machine. A worker that dies costs the task it was at, which another one does again.
+# Tasks on processes of this machine. The task of a worker that died is done again by another one.
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

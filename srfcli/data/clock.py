@@ -1,4 +1,4 @@
-"""The clock of a recording: which samples can be placed in time, at which rates they were taken, and where some are missing."""
+"""The clock of a recording: which samples have a valid time, at which rates they were taken, and where samples are missing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHANGE = 1.25  # of the sampling interval
 GAP = 2.5  # sampling intervals
 _BRIDGED = "drive and load are bridged, nothing is compared in it"
 SHORTEST = 8  # samples that make a rate
-TOLD_APART = 60  # samples at a rate from which its noise can be told from that at another
+TOLD_APART = 60  # samples at a rate from which its noise is estimated apart from that at others
 MOST_NOTICES = 8  # of one kind before they are told together
 
 
@@ -43,7 +43,10 @@ class Sampling:
 
     @cached_property
     def _groups(self) -> list[list[Rate]]:
-        """Rates in groups of like intervals, rising; uneven sampling is one rate, and so is one with those in between."""
+        """Groups of rates by rising interval; in a group each interval is less than CHANGE times the one before.
+
+        Groups with too few samples to estimate a noise are left out.
+        """
         groups: list[list[Rate]] = []
         for rate in sorted(self.rates, key=lambda r: r.interval):
             if groups and rate.interval < CHANGE * groups[-1][-1].interval:
@@ -55,12 +58,12 @@ class Sampling:
 
     @cached_property
     def spacings(self) -> tuple[float, ...]:
-        """Return the sampling intervals (s), rising, that are told apart: at each there are enough samples for a noise."""
+        """Return the sampling intervals (s), rising, at each of which there are enough samples to estimate a noise."""
         return tuple(max(g, key=lambda r: r.last - r.first).interval for g in self._groups)
 
     @cached_property
     def at(self) -> NDArray[np.intc]:
-        """Return which of the spacings each sample (n,) was taken at; the nearest, where there are few such samples."""
+        """Return the index in `spacings` of each sample (n,): the nearest spacing where its own has too few samples."""
         logs = np.log(self.spacings)
         near = [int(np.argmin(np.abs(np.log(r.interval) - logs))) for r in self.rates]
         count = [r.last - r.first for r in self.rates]
@@ -197,7 +200,7 @@ def find_sampling(t: Array) -> Sampling:
 
 
 def _trimmed(rate: Rate, steps: Array, before: Rate | None) -> Rate:
-    """Return the rate with its beginning where its own interval begins, which a running median misses by a few samples."""
+    """Return the rate with its beginning corrected, which the running median of intervals misses by a few samples."""
     if before is None:
         return rate
     middle = 0.5 * np.log(rate.interval / before.interval)
@@ -215,7 +218,7 @@ def _local_median(steps: Array) -> Array:
 
 
 def _spread(steps: Array) -> Array:
-    """Return an upper quintile of the intervals nearby: uneven sampling is no string of gaps."""
+    """Return the 80th percentile of the intervals nearby, so that uneven sampling does not count as gaps."""
     from scipy.ndimage import percentile_filter
 
     return np.asarray(percentile_filter(steps, 80, size=min(8 * SHORTEST + 1, steps.size), mode="nearest"))

@@ -22,7 +22,7 @@ from srfcli.data.values import BESIDE, OBSERVABLES
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Reader, Source
 
-# From a file to its columns: which reader opens it, and that what the reader gives is what readers promise.
+# From a file to its columns: which reader opens it, and a check of what the reader returns.
 
 SNIFFED = 4096  # bytes
 SLICE = 2**18  # rows that are taken from an array at a time
@@ -64,7 +64,7 @@ def _head(path: Path) -> bytes:
 
 
 def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
-    """Return the reader whose test the first bytes pass; one that has no test goes by the file's ending, and comes first."""
+    """Return the reader of a file: one that goes by its ending alone, else the one whose test the first bytes pass."""
     readers = [(entry, registry.reader(entry)) for entry in registry.entries("reader")]
     by_suffix = [(e, r) for e, r in readers if r.sniff is None and path.suffix.lower() in r.suffixes]
     found = by_suffix or [(e, r) for e, r in readers if r.sniff is not None and _passes(r, head)]
@@ -129,7 +129,7 @@ def _from_mapping(found: object, reader: Reader, path: Path) -> Source:
 
 
 def _guarded(source: Source, columns: tuple[int, ...], reader: Reader, path: Path) -> Iterator[Sequence[Array]]:
-    """Yield blocks of float arrays of equal length, whatever the reader does."""
+    """Yield the reader's blocks as float arrays of equal length; raises SrfError for anything else that it does."""
     blocks = iter(source.blocks(columns))
     while True:
         try:

@@ -130,7 +130,7 @@ def _read_table(described: ThresholdsDescription) -> CriticalLoads:
     return CriticalLoads(described.name, described.file, described.holdout, described.frequency or 1.0, table)
 
 
-# The model of an experiment and its parameters, judged by the laws themselves.
+# The model of an experiment and its parameters, checked against the laws.
 
 _ENTRY = ("value", "lower", "upper", "fixed")
 _IMPOSED = {
@@ -201,11 +201,11 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
             )
         names.append(name)
         found.append(effect)
-    return tuple(names), tuple(_roomy(p, effect) for effect in apart(found) for p in effect.parameters)
+    return tuple(names), tuple(_unbounded(p, effect) for effect in apart(found) for p in effect.parameters)
 
 
-def _roomy(p: Parameter, effect: Effect) -> Parameter:
-    """Return an effect's parameter without the bounds of its file where those follow the recording, which is not read yet."""
+def _unbounded(p: Parameter, effect: Effect) -> Parameter:
+    """Return an effect's parameter without bounds if these depend on the recording, which has not been read yet."""
     if not any(name == p.name and which != "default" for name, which, _ in effect.scaled):
         return p
     return replace(p, lower=0.0 if p.lower >= 0 else -math.inf, upper=math.inf)
@@ -364,13 +364,13 @@ def read_run(
 
 
 def _signal(columns: Columns, role: str) -> tuple[Signal, list[Notice]]:
-    """Return what was observed besides, as it is: spikes, resets and saturation are looked for in the first observable alone."""
+    """Return an observable besides the first one, which alone is searched for spikes, resets and saturation."""
     known, filled, notices = _numbers(columns.place(role), columns.arrays[role])
     return Signal(role, filled, known, quantisation(filled[known])), notices
 
 
 def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
-    """Return which readings (n,) are numbers, the readings with others in the place of what is none, and notices of these."""
+    """Return which readings (n,) are numbers, the readings with the others interpolated, and notices of the others."""
     known = np.isfinite(x)
     if known.sum() < 8:
         raise SrfError(
@@ -409,7 +409,7 @@ def _refuse_strokes(run: RunDescription, columns: Columns) -> None:
 
 
 def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[str, bool]:
-    """Return for each force of the run, by name, whether it is stated as a stress, which with an area it is."""
+    """Return for each force of the run, by name, whether it counts as a stress; with an area all do."""
     if apparatus.geometry.area:
         return {"all": True}
     found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in FORCES}
@@ -458,8 +458,8 @@ def _load(run: RunDescription, columns: Columns) -> tuple[Load, list[Notice]]:
 
 # The recorded observable: which of its samples can be compared with a simulation, and what is wrong with the others.
 
-CALM = 1e-3  # relative change of the load between samples within which a jump of the observable is none of the load's
-COARSE = 0.5  # quantisation step over white noise from which it is told
+CALM = 1e-3  # relative change of the load between samples below which the load does not make the observable jump
+COARSE = 0.5  # quantisation step over white noise above which there is a notice
 
 
 def clean_observable(
@@ -524,7 +524,7 @@ def _without_jumps(
     return level, beside, notices
 
 
-# What a recording is like: sampling, flaws, noise, and the history of drive and load, as found in the data.
+# The check of a recording: sampling, flaws, noise, and the history of drive and load, as found in the data.
 
 KINDS = {  # of notices, as --fail-on takes them
     "gap": "samples are missing",
@@ -563,7 +563,7 @@ class LoadHistory:
 
 @dataclass(frozen=True)
 class RunCheck:
-    """What was found in one run; `noises` are those of the gauge at each of its spacings, `noise` that of most samples.
+    """What was found in one run; `noises` are the gauge's at each sampling interval, `noise` is that of most samples.
 
     `friction_noise` is the noise of a sample in units of the friction coefficient. `drive` holds (from s, um/s, um/s^2).
     """
@@ -590,7 +590,7 @@ class RunCheck:
 
 
 def check_run(run: Run) -> RunCheck:
-    """Return what can be said of a recording without simulating anything."""
+    """Return what the data of a run show without a simulation."""
     sampling = find_sampling(run.t)
     load = load_history(run.load, run.t)
     x = np.interp(run.t, run.t[run.used], run.observed[run.used])

@@ -1,9 +1,9 @@
-"""The noise of a gauge: white, with relaxations and oscillations besides, as fits have it; found without a model of the slider.
+"""The noise of a gauge, white and coloured by relaxations and oscillations; found without a model of the slider.
 
 A recording is cut into stretches, a parabola is taken out of each, and the mean of their periodograms is compared with its
-expectation: the debiased Whittle likelihood (Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 2019). What is
-expected is exact for stretches of any length, with the parabola and the window: neither trend, leakage nor aliasing bias it. One
-evaluation is a product with a matrix, however long the recording is.
+expectation: the debiased Whittle likelihood (Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 2019). The
+expectation is exact for stretches of any length, with the parabola and the window, so that neither trend, leakage nor aliasing
+bias the result. One evaluation is a product with a matrix, however long the recording is.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def transition(colour: tuple[float, ...], lag: Array) -> Array:
 
 
 def colour_text(colour: tuple[float, ...]) -> str:
-    """Return a process in words: an oscillation of a quality of a half is noise that is smooth, of a large one a line."""
+    """Return a process in words; an oscillation is smooth noise at a quality of a half, a spectral line at a large one."""
     told = f"{colour[1]:.3g} correlated over {colour[0]:.3g} s"
     return told if len(colour) == 2 else f"{colour[1]:.3g} about {colour[0]:.3g} Hz, of quality {colour[2]:.2g}"
 

@@ -168,13 +168,13 @@ def _count(number: int) -> str:
 
 # A drive that turns back: the laws hold for sliding in one direction, so that each stroke is a run of its own.
 
-TURN = 0.2  # of the range of displacements: what turns back by less is no stroke
-OPPOSED = 0.5  # of the median observable: what opposes sliding by more slides, or is on the way to it
+TURN = 0.2  # of the range of displacements: a turn by less begins no stroke
+OPPOSED = 0.5  # of the median observable: above it the slider slides, or is about to
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """Sliding in one direction from `begin` to `end` s: after a turn from where the force has come to half its usual size."""
+    """Sliding in one direction from `begin` to `end` s; after a turn it begins where the force reaches half its usual size."""
 
     begin: float
     end: float
@@ -208,7 +208,7 @@ def strokes(t: Array, moved: Array, observed: Array) -> list[Stroke]:
 
 def _turns(x: Array, least: float) -> list[int]:
     """Return the indices of the extremes between which x (n,) moves by more than `least`, without the two ends."""
-    turns, extreme, rising = [], 0, 0  # one pass: an extreme is one once x has come back from it by `least`
+    turns, extreme, rising = [], 0, 0  # one pass: an extreme counts once x has come back from it by `least`
     for i, value in enumerate(x.tolist()):
         if rising == 0 and abs(value - x[0]) > least:
             rising, extreme = (1 if value > x[0] else -1), i
@@ -225,14 +225,14 @@ def _turns(x: Array, least: float) -> list[int]:
 FEWEST = 5  # samples of a piece
 ROUNDS = 40  # of the search for the places of the corners
 STRETCH = 128  # samples over which noise has its colour
-BURST = 100  # samples for which a gauge may go astray
-AROUND = 15  # stretches that share their colour
+BURST = 100  # samples of a burst of noise, at most
+AROUND = 15  # neighbouring stretches from which the noise of one is estimated
 NEARBY = 101  # samples that share a level of white noise
 CLEAR = 8.0  # standard deviations about the lines beside it that a level jump exceeds
 NEAR = 200  # samples on each side by which a jump is told from a corner
-EVEN = 1e-5  # of the largest noise: what is quieter would be lost in the rounding of the running sums
-LEAST = 1e-100  # um or um/s: what is squared must not vanish
-WOBBLE = 0.02  # relative change of slope that is none
+EVEN = 1e-5  # of the largest noise, at least: smaller ones would be lost in the rounding of the running sums
+LEAST = 1e-100  # um or um/s: a noise whose square is still a number
+WOBBLE = 0.02  # relative change of slope below which there is no corner
 
 
 @dataclass(frozen=True)
@@ -306,10 +306,10 @@ class _Sums:
 
 
 def coloured_noise(t: Array, x: Array) -> Array:
-    """Return the standard deviation near each sample of the white noise that misfits a line by as much as the noise in x (n,).
+    """Return for each sample the standard deviation of white noise that misfits a line as much as the noise in x (n,) does.
 
-    The noise is what parabolas over 128 samples leave, in the upper quartile of fifteen stretches: bursts of a gauge count, and
-    corners are in few of them.
+    The noise is the residual of parabolas over 128 samples, in the upper quartile of fifteen stretches: a gauge's bursts count,
+    while corners, which are in few stretches, do not.
     """
     from scipy.ndimage import percentile_filter
 
@@ -335,12 +335,11 @@ def coloured_noise(t: Array, x: Array) -> Array:
 
 
 def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
-    """Return the continuous line of straight pieces that x (n,) over t supports, once the level jumps are taken out of x.
+    """Return the continuous line of straight pieces that x (n,) over t supports, and the level jumps in x.
 
-    Without `correct` the jumps are found and stay.
-
-    The number of pieces follows from BIC, in which the noise counts with the colour that it has over 128 samples; their places
-    follow from least squares. A change of slope by less than 2 % is the wobble of a servo, and is not followed.
+    With `correct` the jumps are taken out of x first, in place. The Bayesian information criterion chooses the number of pieces;
+    the noise enters it with its correlation over 128 samples. Least squares place the knots. A change of slope by less than 2 %
+    comes from the servo and is not followed.
     """
     sigma = coloured_noise(t, x)
     penalty, jumps = 3 * np.log(t.size), []
@@ -367,9 +366,9 @@ def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
 
 
 def _without_bursts(t: Array, sigma: Array, knots: Array, heights: Array) -> Array:
-    """Return the knots without those of pieces, a hundred samples or fewer in all, after which the line goes on as before.
+    """Return the knots without those of bursts: of a hundred samples or fewer, after which the line continues as before.
 
-    A hold is none of them: after it the line is late.
+    A hold is no burst: after it the line continues later.
     """
     slopes = np.diff(heights) / np.diff(knots)
     places = np.searchsorted(t, knots)
@@ -435,7 +434,7 @@ def _places(t: Array, x: Array, breaks: list[int]) -> Array:
 
 
 def _pruned(t: Array, x: Array, sigma: Array, knots: Array, penalty: float) -> Array:
-    """Return the knots that the line needs: what a split into independent pieces found may be none."""
+    """Return the knots that the line needs: those without which its misfit grows by more than the penalty allows."""
     costs = [_cost_without(t, x, sigma, knots, k) for k in range(1, knots.size - 1)]
     while costs:
         weakest = int(np.argmin(costs))
@@ -546,11 +545,11 @@ def _step(t: Array, x: Array, sigma: Array, knots: Array, heights: Array, dampin
 
 # The normal load of a run: from its column, made as smooth as its noise demands, or the constant of its description.
 
-NEGLIGIBLE = 1e-5  # of the range: noise that an interpolation may keep
-BLOCKS = 16  # in which a constant load has one mean
-ACCIDENTS = 5  # spikes that a load may have, and one more in 500 samples; so many more are what was imposed
+NEGLIGIBLE = 1e-5  # of the load's range: noise below it is interpolated and not smoothed
+BLOCKS = 16  # whose means are compared to see whether a load is constant
+ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
 NOTHING = 1e-15  # N: no contact
-SMALLEST = 5e-4  # relative amplitude of a modulation: a servo wobbles by less
+SMALLEST = 5e-4  # relative amplitude of a modulation, at least: a servo varies the load by less
 
 
 def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:

@@ -1,4 +1,4 @@
-"""What is large and small in a recording, and an effect's bounds and sizes in these terms, not in those of one slider."""
+"""The scales of a recording (slips, times, velocities, load), and the bounds and sizes of effects that follow from them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _of_runs(fitted: Sequence[Run]) -> dict[str, float]:
 
 
 def at_scale(effect: Effect, scales: Mapping[str, float]) -> Effect:
-    """Return the effect with bounds and default sizes as the recording has them, where its file states them in its scales.
+    """Return the effect with bounds and defaults in numbers, where its file states them as formulas of a recording's scales.
 
     A parameter of which a scale is missing, or whose bounds would not rise, keeps the numbers of its file.
     """
@@ -76,7 +76,8 @@ def own_bounds(
     """Return the parameters of an experiment with the bounds that the recording gives those of its effects.
 
     `stated` has by name which of lower, upper and fixed the experiment says itself: these stay. Bounds make room for the start
-    value. What an effect never fits is added where the experiment does not list it, and held where it does not say otherwise.
+    value. A parameter that its effect never fits is added where the experiment does not list it, and is fixed unless the
+    experiment says otherwise.
     """
     scales, found, out = scales_of(runs, parameters, tables), dict[str, Parameter](), []
     held = {name for effect in effects for name in effect.fixed}

@@ -1,4 +1,4 @@
-"""What an experiment is once it has been read: frozen values in um, s, N."""
+"""The values that reading an experiment gives: frozen, in um, s, N."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ class Experiment:
         return any(run.stress for run in self.runs)
 
     def rescaled(self) -> str:
-        """Return, of a stiffness stated in 1/um, what it is under the load of each run, as a sentence; "" for any other."""
+        """Return a sentence on what a stiffness stated in 1/um is under each run's load; "" for any other stiffness."""
         number, unit = split_quantity(self.stiffness_text, name="stiffness")
         if find_unit(unit).powers[2]:
             return ""

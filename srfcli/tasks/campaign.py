@@ -23,11 +23,11 @@ from srfcli.results.campaign import PAIRS, CampaignResult
 from srfcli.results.fit import FitResult, unit_of
 from srfcli.tasks.recordings import fit, read_experiment
 
-TAIL = 1 / 3  # of a segment, at its end, that is looked at for steady sliding
-LONG = 2.0  # slip lengths in that part, and a time constant of the spring's: a shorter one tells nothing
-SURE = 3.0  # standard errors of a slope that is one
+TAIL = 1 / 3  # of a segment, at its end, that is checked for steady sliding
+LONG = 2.0  # slip lengths that this part must be long
+SURE = 3.0  # standard errors from which a slope is significant
 DRIFT = 0.02  # of B (A where it is larger) that friction may change by over a slip length in steady sliding
-BAD = 1.3  # rms over noise from which the fit is flagged
+BAD = 1.3  # residual rms over noise from which the fit is flagged
 
 
 @dataclass(frozen=True)
