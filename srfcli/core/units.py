@@ -100,6 +100,7 @@ class Geometry:
 
 
 NO_GEOMETRY = Geometry()
+GEOMETRY_UNITS = {"radius": "um", "thickness": "um", "area": "mm^2"}
 
 
 def parse_quantity(text: str, unit: str, *, name: str) -> float:

@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 from srfcli.core.errors import SrfError, did_you_mean, printable, shown
 from srfcli.core.files import check_plain, parse_toml, read_text, recover
 from srfcli.core.units import (
+    GEOMETRY_UNITS,
     NO_GEOMETRY,
     Geometry,
     find_unit,
@@ -26,6 +27,7 @@ from srfcli.core.units import (
     split_quantity,
     unit_factor,
 )
+from srfcli.data.values import BESIDE, OBSERVABLES
 
 FORMAT = "srf-experiment/1"
 FILE_NAME = "experiment.toml"
@@ -35,14 +37,11 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
     "load_point_displacement": "um",
     "normal_load": "N",
     "normal_stress": "MPa",
-    "elongation": "um",
-    "force": "N",
+    **OBSERVABLES,
     "shear_stress": "MPa",
-    "friction": "1",
-    "slip": "um",
-    "contact_area": "1",
+    **BESIDE,
 }
-READABLE = ("elongation", "force", "shear_stress", "friction", "slip", "contact_area")  # what `observables` may list
+READABLE = (*OBSERVABLES, "shear_stress", *BESIDE)  # what `observables` may list
 MOST_OBSERVABLES = 3  # of a run
 CORRECTIONS = ("reset", "spike")  # of a run: what is proposed, and made only where it is asked for
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
@@ -61,16 +60,20 @@ _TABLES = '[[thresholds]] with file = "....csv" for each table of critical loads
 class Apparatus:
     """The loading stage: `stiffness` in N/um, or in 1/um where `per_load` (friction per micron), and the mass or None.
 
-    `text` states it in N/um or 1/um, `unit` is which of the two, `stated` the unit that the description has.
+    `text` states it in N/um or 1/um, `stated` is the unit that the description has.
     """
 
     stiffness: float
     per_load: bool
     text: str
-    unit: str
     stated: str
     mass: float | None
     geometry: Geometry = NO_GEOMETRY
+
+    @property
+    def unit(self) -> str:
+        """Return the unit of `stiffness`."""
+        return "1/um" if self.per_load else "N/um"
 
 
 @dataclass(frozen=True)
@@ -181,7 +184,7 @@ def find_file(path: Path) -> Path:
 
 
 def _apparatus(node: Node) -> Apparatus:
-    node.keys(("stiffness", "mass", "radius", "thickness", "area"))
+    node.keys(("stiffness", "mass", *GEOMETRY))
     geometry = _geometry(node)
     hint = 'Write stiffness = "0.21 N/um", "1.5 MPa/mm", or "1.0e-3 1/um" for friction per micron.'
     stiffness = node.require("stiffness", hint)
@@ -192,7 +195,8 @@ def _apparatus(node: Node) -> Apparatus:
         if not unit:
             stiffness.fail(f"'{stiffness.value}' has no unit, and two are possible", hint)
         per_load = same_dimension(unit, "1/um")
-        value = number * unit_factor(unit, "1/um" if per_load else "N/um", geometry)
+        base = "1/um" if per_load else "N/um"
+        value = number * unit_factor(unit, base, geometry)
     except SrfError as error:
         if error.message.startswith(str(node.file)):
             raise
@@ -206,17 +210,16 @@ def _apparatus(node: Node) -> Apparatus:
         mass.expected('a mass of 0 or more, as "2.37 kg"')
     if mass and kilograms and geometry.area:
         mass.fail("a mass beside an area, with which forces count as stresses", "Leave one of the two out.")
-    base = "1/um" if per_load else "N/um"
     plain = not is_stress(unit) and (per_load or find_unit(unit).powers == (-1, 0, 1, 0)) and not geometry.area
     text = stiffness.value if plain else f"{value!r} {base}"  # nothing below this knows of stresses and of geometry
     stated = "MPa/um" if geometry.area and not per_load else unit if plain or is_stress(unit) else base
-    return Apparatus(value, per_load, text, base, stated, kilograms * 1e-6 if kilograms else None, geometry)
+    return Apparatus(value, per_load, text, stated, kilograms * 1e-6 if kilograms else None, geometry)
 
 
 def _geometry(node: Node) -> Geometry:
     """Return what turns torques, angles, strains and forces into what is compared."""
     found: dict[str, float] = {}
-    for key, unit in (("radius", "um"), ("thickness", "um"), ("area", "mm^2")):
+    for key, unit in GEOMETRY_UNITS.items():
         entry = node.get(key)
         if entry is None:
             continue
@@ -388,7 +391,7 @@ def _observables(node: Node | None) -> tuple[str, ...]:
             entry.fail(f"'{name}' is the same observable as another one", "Name each once.")
     if len(names) > MOST_OBSERVABLES:
         node.fail(f"{len(names)} observables", f"A run has {MOST_OBSERVABLES} at most.")
-    if not set(names) - {"slip", "contact_area"}:
+    if not set(names) - BESIDE.keys():
         node.fail(
             f"{' and '.join(names)} without a force",
             "One of elongation, force, shear_stress, friction is needed besides.",

@@ -15,7 +15,16 @@ import numpy as np
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import toml_value
 from srfcli.core.settings import Parameter
-from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, is_stress, parse_quantity, split_heading, split_quantity
+from srfcli.core.units import (
+    GEOMETRY_UNITS,
+    NO_GEOMETRY,
+    Geometry,
+    find_unit,
+    is_stress,
+    parse_quantity,
+    split_heading,
+    split_quantity,
+)
 from srfcli.data.columns import open_source, read_columns
 from srfcli.data.description import ROLES, check_unit, read_description
 from srfcli.data.experiment import read_choice, read_experiment, read_parameters, strokes_of
@@ -116,8 +125,7 @@ class Wish:
 
     def geometry(self) -> Geometry:
         """Return what the rig says, in um and mm^2."""
-        units = {"radius": "um", "thickness": "um", "area": "mm^2"}
-        return Geometry(**{k: parse_quantity(v, units[k], name=f"--{k}") for k, v in self.rig.items()})
+        return Geometry(**{k: parse_quantity(v, GEOMETRY_UNITS[k], name=f"--{k}") for k, v in self.rig.items()})
 
 
 @dataclass(frozen=True)
