@@ -293,7 +293,7 @@ class _Whittle:
 
     def noise(self) -> GaugeNoise:
         """Return the noise with as many processes as Schwarz's criterion wants."""
-        best = self.climb((), [[self.white_only()]])
+        best = self.climb((), [[np.array([np.log(self.level)])]])
         kinds: tuple[str, ...] = ()
         while len(kinds) < GAUGE_PROCESSES:
             wider = [(self.climb((*kinds, kind), self.starts(best[1], kinds, kind)), kind) for kind in PROCESSES]
@@ -308,9 +308,6 @@ class _Whittle:
     def expected(self, noise: GaugeNoise) -> Array:
         """Return the expected periodogram (f,) of a noise."""
         return np.asarray(self.calm.window.expected @ noise.covariance(self.lag))
-
-    def white_only(self) -> Array:
-        return np.array([np.log(self.level)])
 
     def criterion(self, likelihood: float, x: Array) -> float:
         return likelihood - 0.5 * x.size * float(np.log(self.samples))

@@ -154,16 +154,13 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         notices.append(Notice("reset", where, what))
     slopes = np.diff(line.heights) / np.diff(line.knots)
     drive = Drive.steps(list(zip([float(t[0]), *line.knots[1:-1].tolist()], slopes.tolist(), strict=True)))
+    pieces = "straight piece" if slopes.size == 1 else "straight pieces"
     told = ", ".join(f"{v:.5g}" for v in slopes[:12]) + (", ..." if slopes.size > 12 else "")
     what = (
-        f"a continuous line of {_count(slopes.size)}, {told} um/s, fitted through the displacements, "
+        f"a continuous line of {slopes.size} {pieces}, {told} um/s, fitted through the displacements, "
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
     return drive, [*notices, Notice("drive-fitted", where, what)]
-
-
-def _count(number: int) -> str:
-    return f"{number} straight piece" + ("s" if number != 1 else "")
 
 
 # A drive that turns back: the laws hold for sliding in one direction, so that each stroke is a run of its own.

@@ -128,6 +128,11 @@ class Run:
         begin, end = float(self.t[0]), float(self.t[-1])
         return [begin, *(b for b in self.drive.breaks if begin < b < end), end]
 
+    @property
+    def first_load(self) -> float:
+        """Return the load (N) at the first sample, without a modulation."""
+        return self.load.rest(float(self.t[0]))
+
     def friction_factor(self, W: Array | float) -> Array | float:
         """Return what the observable is multiplied by to be a friction coefficient under the loads W (N)."""
         return {"elongation": self.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[self.observable]
@@ -203,18 +208,23 @@ class Experiment:
         return to_base(number, unit)
 
     @property
+    def per_load(self) -> bool:
+        """Return whether the stiffness is stated in 1/um, as friction per micron."""
+        return not find_unit(split_quantity(self.stiffness_text, name="stiffness")[1]).powers[2]
+
+    @property
     def stress(self) -> bool:
         """Return whether stresses were recorded, so that forces are shown in MPa."""
         return any(run.stress for run in self.runs)
 
     def rescaled(self) -> str:
         """Return a sentence on what a stiffness stated in 1/um is under each run's load; "" for any other stiffness."""
-        number, unit = split_quantity(self.stiffness_text, name="stiffness")
-        if find_unit(unit).powers[2]:
+        if not self.per_load:
             return ""
+        number, unit = split_quantity(self.stiffness_text, name="stiffness")
         under: dict[str, str] = {}
         for run in self.runs:
-            W = run.load.rest(float(run.t[0]))
+            W = run.first_load
             told = f"{run.stiffness:.4g} {run.load_unit}/um under {W:.4g} {run.load_unit}"
             if W != 1.0 and told not in under:
                 under[told] = run.name

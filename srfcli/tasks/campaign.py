@@ -158,10 +158,9 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
         both = 2 * float(covariance[place["A"], place["B"]]) if {"A", "B"} <= place.keys() else 0.0
         row["A_minus_B"] = values["A"] - values["B"]
         row["A_minus_B_stderr"] = _number(float(np.sqrt(max(sum(variances) - both, 0.0)))) if place else None
-    unit, factor = experiment.shown("1/um" if _per_load(experiment.stiffness_text) else "N/um")
-    stated = float(
-        values.get("K", runs[0].stiffness / (_first(runs[0]) if _per_load(experiment.stiffness_text) else 1.0))
-    )
+    unit, factor = experiment.shown("1/um" if experiment.per_load else "N/um")
+    own_stiffness = runs[0].stiffness / (runs[0].first_load if experiment.per_load else 1.0)
+    stated = float(values.get("K", own_stiffness))
     row |= {"k": stated * factor, "k_unit": unit, "k_stderr": table["K"][2] if "K" in table else None}
     length = float(values.get("D0", 10.0))
     allowed = DRIFT * max(abs(values.get("A", 0.0)), abs(values.get("B", 0.0))) / length
@@ -175,14 +174,6 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
 
 def _number(value: float | None) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
-
-
-def _per_load(text: str) -> bool:
-    return "N" not in text and "Pa" not in text
-
-
-def _first(run: Run) -> float:
-    return float(run.load.rest(float(run.t[0])))
 
 
 def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
