@@ -258,7 +258,7 @@ _DAMAGED = (  # what reading a file of arrays raises that is not one
     OSError, SrfError, ValueError, EOFError, KeyError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 Arrays = Mapping[str, "NDArray[Any]"]
-Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
+Runner = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 
 
 @dataclass
@@ -344,7 +344,7 @@ def fingerprint(tasks: Sequence[Any]) -> str:
 
 
 def stored(
-    run: Run, store: Store, function: Callable[[Any], Arrays], tasks: Sequence[Any]
+    run: Runner, store: Store, function: Callable[[Any], Arrays], tasks: Sequence[Any]
 ) -> Iterator[tuple[int, Arrays]]:
     """Yield every task's result: those in the store as they were kept, the others by `run`, kept as they come."""
     store.open(tasks)

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.core.errors import SrfError, Status
-from srfcli.core.parallel import Run as Spread
-from srfcli.core.parallel import run_here
+from srfcli.core.parallel import Runner, run_here
 from srfcli.core.units import from_base
 from srfcli.data.values import Run
 from srfcli.inference.noise import lag_one
@@ -47,7 +46,7 @@ def fit_campaign(
     options: Mapping[str, Any] | None = None,
     reader: str | None = None,
     plugins: Sequence[str | Path] = (),
-    run: Spread = run_here,
+    run: Runner = run_here,
     done: Callable[[CampaignResult], None] = lambda so_far: None,
 ) -> CampaignResult:
     """Return the fits of many experiments, a row each in the order of `paths`.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.core.errors import SrfError, Status
-from srfcli.core.parallel import Run, run_here
+from srfcli.core.parallel import Runner, run_here
 from srfcli.core.settings import require_parameter
 from srfcli.core.units import to_base
 from srfcli.numerics.compare import (
@@ -51,7 +51,7 @@ def map(  # the command's own name
     curves: AtlasSettings | None = None,
     boundaries: bool = True,
     criticality: bool = True,
-    run: Run = run_here,
+    run: Runner = run_here,
     tiles: Callable[[int, int], None] = lambda done, count: None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> MapResult:
@@ -167,7 +167,7 @@ def compare(
     V: tuple[float, float] = (1.0, 100.0),
     K_over_W0: tuple[float, float] | None = None,
     points: Mapping[str, int] | None = None,
-    run: Run = run_here,
+    run: Runner = run_here,
     progress: Callable[[str, float], None] = lambda name, share: None,
 ) -> ComparisonResult:
     """Return where laws differ once each is brought to the first one's observables at one low velocity.
