@@ -27,8 +27,8 @@ from srfcli.core.units import (
 )
 from srfcli.data.columns import open_source, read_columns
 from srfcli.data.description import ROLES, check_unit, read_description
-from srfcli.data.experiment import read_choice, read_experiment, read_parameters, strokes_of
-from srfcli.data.imposed import Stroke, find_modulation
+from srfcli.data.experiment import read_choice, read_experiment, read_parameters
+from srfcli.data.imposed import Stroke, find_modulation, strokes
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
 
@@ -378,7 +378,7 @@ def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
             source = open_source(run.file, registry=registry, format=run.format)
             columns = read_columns(run, source, described.columns, geometry=described.apparatus.geometry)
             rising = np.isfinite(columns.seconds) & (np.diff(columns.seconds, prepend=-np.inf) > 0)
-            found = strokes_of(columns.kept(rising))
+            found = strokes(columns.kept(rising))
             shown = found[:STROKES]
             files += [run.file] * max(len(shown), 1)
             names += [f"{run.name}-{k + 1}" for k in range(len(shown))] or [run.name]

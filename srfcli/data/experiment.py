@@ -32,7 +32,6 @@ from srfcli.data.imposed import (
     DIFFERS,
     LOADS,
     FoundModulation,
-    Stroke,
     check_start,
     declared_drive,
     drive_differs,
@@ -381,23 +380,11 @@ def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
     return known, np.interp(place.t, place.t[known], x[known]), notices
 
 
-def strokes_of(columns: Columns) -> list[Stroke]:
-    """Return the strokes of a recording with a column of the load point's displacement or velocity."""
-    t, arrays = columns.seconds, columns.arrays
-    if "load_point_displacement" in arrays:
-        moved = arrays["load_point_displacement"]
-    else:
-        V = arrays["load_point_velocity"]
-        steps = np.where(np.isfinite(V[:-1]), V[:-1], 0.0) * np.diff(t)
-        moved = np.concatenate([[0.0], np.cumsum(steps)])
-    return strokes(t, moved, arrays[next(r for r in OBSERVABLES if r in arrays)])
-
-
 def _refuse_strokes(run: RunDescription, columns: Columns) -> None:
     """Raise SrfError for a run that slides in both directions."""
     if run.drive is not None or not columns.role(*DRIVES):
         return
-    found = strokes_of(columns)
+    found = strokes(columns)
     if not found:
         return
     turn = found[1] if len(found) > 1 else found[0]

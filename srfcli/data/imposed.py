@@ -16,6 +16,7 @@ from srfcli.data.clock import Place, kept_samples
 from srfcli.data.columns import LIMIT, Columns, Finder, open_source
 from srfcli.data.description import RunDescription
 from srfcli.data.noise import quantisation, saturation, spikes, white_level
+from srfcli.data.values import OBSERVABLES
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 
@@ -178,12 +179,19 @@ class Stroke:
     backward: bool
 
 
-def strokes(t: Array, moved: Array, observed: Array) -> list[Stroke]:
+def strokes(columns: Columns) -> list[Stroke]:
     """Return the strokes of a recording whose drive turns back and slides there; none where it only goes on or unloads.
 
-    `moved` (n,) is the displacement of the load point, `observed` (n,) elongation, force or friction of either sign. After a turn
-    the slider sticks while the spring is unloaded, so that what comes before the change of sign is left out.
+    The recording has a column of the load point's displacement or velocity. After a turn the slider sticks while the spring is
+    unloaded, so that what comes before the change of sign of the observable is left out.
     """
+    t, arrays = columns.seconds, columns.arrays
+    observed = arrays[next(role for role in OBSERVABLES if role in arrays)]
+    if "load_point_displacement" in arrays:
+        moved = arrays["load_point_displacement"]
+    else:
+        V = arrays["load_point_velocity"]
+        moved = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(V[:-1]), V[:-1], 0.0) * np.diff(t))])
     known = np.isfinite(moved) & np.isfinite(observed)
     t, x, y = t[known], moved[known], observed[known]
     if t.size < 2 * FEWEST or not np.ptp(x) > 0:
