@@ -221,11 +221,7 @@ class Finder:
     """The headings of a file, looked up by role; `specs` are those of [columns]."""
 
     def __init__(
-        self,
-        path: Path,
-        headings: tuple[str, ...],
-        specs: Mapping[str, ColumnSpec],
-        geometry: Geometry = NO_GEOMETRY,
+        self, path: Path, headings: tuple[str, ...], specs: Mapping[str, ColumnSpec], geometry: Geometry = NO_GEOMETRY
     ) -> None:
         self.path, self.headings, self.specs, self.geometry = path, headings, specs, geometry
         self.parts = [split_heading(h) for h in headings]

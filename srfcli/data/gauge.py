@@ -21,34 +21,23 @@ from srfcli.codegen.model import Array
 from srfcli.data.clock import Mask
 from srfcli.data.noise import white_level
 
-PROCESSES = (
-    "relaxation",
-    "oscillation",
-)  # of coloured noise: e' = -e / tau + w, or e'' + (omega / q) e' + omega^2 e = w
-CORRELATION_TIMES = (
-    0.02,
-    0.3,
-    0.6,
-    0.9,
-)  # of the way from the shortest correlation time to the longest, where colour begins
-QUALITIES = (0.5, 3.0, 30.0)  # of an oscillation, where it begins: smooth noise, a broad line and a narrow one
+PROCESSES = ("relaxation", "oscillation")  # of coloured noise: e' = -e/tau + w, or e'' + (omega/q) e' + omega^2 e = w
+# start values: shares of the way, in logarithms, from the shortest correlation time to the longest
+CORRELATION_TIMES = (0.02, 0.3, 0.6, 0.9)
+QUALITIES = (0.5, 3.0, 30.0)  # start values of an oscillation: smooth noise, a broad line and a narrow one
 QUALITY = (0.2, 1000.0)  # of an oscillation: one of a smaller quality is a relaxation
 FASTEST = 1.0  # frequency of an oscillation times the spacing: smooth noise may end beyond half of the sampling rate
 
-STRETCHES = (64, 128, 256)  # samples over which a parabola is the trend: the longest over which it leaves noise alone
-SLOW = 3  # lowest frequencies of stretches, which ones half as long do not show
-RISE = 1.5  # times what shorter ones foretell there, at most: their noise is told that well; a signal makes more
-SLOWEST = 2.0  # periods of an oscillation in a stretch
-FEWEST = 32  # samples in which a colour can be seen
-ENOUGH = 4  # stretches among which some can be wild
-TAIL, ROUNDS = (
-    1e-3,
-    4,
-)  # share of stretches of noise that are held to be wilder, and how often the calm ones are chosen anew
-NEIGHBOURS = (
-    1.94  # powers at one frequency over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
-)
-WHITE = 1e-3  # of the whole noise, at least: a spectrum without a floor is none
+STRETCHES = (64, 128, 256)  # samples over which a parabola is the trend: the longest that holds no signal is taken
+SLOW = 3  # lowest frequencies of stretches, which those half as long do not resolve
+RISE = 1.5  # power at these frequencies over that predicted from shorter stretches, at most; more is signal
+SLOWEST = 2.0  # periods of an oscillation in a stretch, at least
+FEWEST = 32  # samples from which coloured noise is estimated
+ENOUGH = 4  # stretches; if there are more, some may be rejected
+TAIL = 1e-3  # share of stretches of pure noise that are rejected
+ROUNDS = 4  # in which the calm stretches are chosen anew
+NEIGHBOURS = 1.94  # powers over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
+WHITE = 1e-3  # standard deviation of each part over that of the whole noise, at least
 LEAST = 1e-150  # standard deviation whose square is still a number
 STEP = 1e-5  # of the central differences by which a covariance is differentiated, in the logarithms of its parameters
 
@@ -166,16 +155,17 @@ def find_noise(
 ) -> GaugeNoise:
     """Return the noise in evenly sampled pieces of a recording, `spacing` s between samples, about a parabola over each stretch.
 
-    `cycles`, in periods per sample, is a modulation whose first three harmonics are taken out, too. Stretches in which the signal
-    bends faster, as at stick-slip events, are left out: what counts are the calmest quarter, the level corrected for the choice,
-    and then all that are no wilder than noise like theirs can be, nor at one frequency. They are as long as the noise found in
-    shorter ones foretells what is slow in them, and half of the samples are calm: in longer ones there is signal.
+    `cycles`, in periods per sample, is a modulation whose first three harmonics are taken out, too.
+
+    Stretches in which the signal bends faster, as at stick-slip events, are left out. The calmest quarter gives a first level,
+    corrected for the choice; then all stretches count whose power, in all and at each frequency, is within that of such noise.
+    Longer stretches are taken as long as the noise found in shorter ones predicts their lowest frequencies, and at least half as
+    many samples are calm; otherwise they hold signal.
     """
     longest = max(piece.size for piece in pieces)
     lengths = [n for n in STRETCHES if n <= longest] or [longest]
-    least = max(
-        1e-9 * max(float(np.ptp(piece)) for piece in pieces), LEAST
-    )  # the rounding of numbers, where there is no noise
+    # the rounding of numbers, where there is no noise
+    least = max(1e-9 * max(float(np.ptp(piece)) for piece in pieces), LEAST)
     if lengths[0] < FEWEST:
         return GaugeNoise(max(white_level(max(pieces, key=len)), least), quantum)
     found: GaugeNoise | None = None
@@ -200,7 +190,7 @@ def _slowest(colour: tuple[float, ...], stretch: float) -> bool:
 
 @dataclass(frozen=True)
 class _Window:
-    """Stretches of n samples: an orthonormal basis of the trend, Hann's window, and the powers that covariances make expected.
+    """Stretches of n samples: an orthonormal basis of the trend, Hann's window, and the matrix of expected periodograms.
 
     `expected` (f, n) times a covariance at the lags 0 to n - 1 is the expected periodogram at the `bins` that the trend leaves.
     """
@@ -266,9 +256,8 @@ def _calm(pieces: Sequence[Array], window: _Window) -> _Calm:
     if total.size <= ENOUGH:
         return of(np.arange(total.size))
     found = of(np.argsort(total)[: max(total.size // 4, 1)])
-    shape = (
-        1 / max(found.spread, 1e-6) ** 2
-    )  # a stretch's power is a gamma variate, of which the lowest quarter has this mean
+    # a stretch's power is a gamma variate, of which the lowest quarter has this mean
+    shape = 1 / max(found.spread, 1e-6) ** 2
     level = float(found.mean.sum()) / max(float(gammainc(shape + 1, gammaincinv(shape, 0.25))) / 0.25, 0.1)
     for _ in range(ROUNDS):
         shape = 1 / max(found.spread, 1e-6) ** 2

@@ -257,9 +257,8 @@ def local_noise(x: Array) -> Array:
     if x.size < 8:
         return np.full(x.size, max(float(np.std(x)), LEAST) if np.ptp(x) else 1.0)
     third = np.abs(np.diff(x, 3)) / np.sqrt(20.0)  # the sum of the squared weights 1, 3, 3, 1
-    level = (
-        median_filter(third, size=min(NEARBY, third.size), mode="reflect") / 0.6745
-    )  # the end is not its last sample
+    # the level at an end is not that of its last sample
+    level = median_filter(third, size=min(NEARBY, third.size), mode="reflect") / 0.6745
     padded = np.concatenate([[level[0]], level, [level[-1]] * 2])
     overall = float(np.median(third)) / 0.6745
     span = float(np.ptp(x)) or 1.0

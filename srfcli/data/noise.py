@@ -56,13 +56,13 @@ CREST = 0.5  # share of a spike's size by which it is off a cubic through its ne
 NEARBY = 101  # samples that share a level of noise
 FEW = 0.02  # share of samples off their running median, below which the channel counts as constant and without noise
 SATURATED = 10  # samples in a row at the extreme value
-LARGE = 0.05  # share of the level from which a jump is a transducer's for certain
+LARGE = 0.05  # share of the level from which a jump is certain
 MOST_RESETS = 5  # of a transducer in a recording; if there are more jumps, they are a signal
 
 
 @dataclass(frozen=True)
 class Jump:
-    """A level jump of a transducer: `size` is added between samples `at` and `at` + 1; `certain` if nothing else can be."""
+    """A level jump: `size` is added between samples `at` and `at` + 1; `certain` where only a transducer can make it."""
 
     at: int
     size: float
