@@ -9,11 +9,11 @@ import contextlib
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from srfcli.core.errors import SrfError, did_you_mean, printable, shown
 from srfcli.core.files import check_plain, parse_toml, read_text, recover
@@ -90,7 +90,10 @@ class ColumnSpec:
 
 @dataclass(frozen=True)
 class RunDescription:
-    """What the description says of one run; `drive` holds (duration, velocity) pairs, None where columns say it."""
+    """What the description says of one run; `drive` holds (duration, velocity) pairs, None where columns say it.
+
+    `observables` are the columns that are compared with the model together; where none is listed, `read_columns` chooses one.
+    """
 
     name: str
     file: Path
@@ -145,23 +148,20 @@ def read_description(path: Path) -> Description:
     if declared.value != FORMAT:
         declared.expected(f'"{FORMAT}"', start)
     root.keys(_TOP)
-    title = root.get("title")
     apparatus = root.require("apparatus", '[apparatus] with stiffness = "0.21 N/um".').table("[apparatus].")
-    parameters, columns, tables = root.get("parameters"), root.get("columns"), root.get("thresholds")
     machine = _apparatus(apparatus)
-    if tables is None:
+    if root.get("thresholds") is None:
         root.require("runs", _RUNS)
-    recorded = root.get("runs")
-    runs = _runs(recorded, machine.geometry) if recorded else ()
+    runs = root.read("runs", lambda node: _runs(node, machine.geometry), ())
     return Description(
         path=file,
-        title=title.text() if title else "",
+        title=root.read("title", Node.text, ""),
         apparatus=machine,
         model=root.require("model", '[model] with law = "srf-vsat" and ageing = "dieterich".').table("[model]."),
-        parameters=parameters.table("[parameters].") if parameters else None,
-        columns=_columns(columns.table("[columns]."), machine.geometry) if columns else {},
+        parameters=root.read("parameters", lambda node: node.table("[parameters]."), None),
+        columns=root.read("columns", lambda node: _columns(node.table("[columns]."), machine.geometry), {}),
         runs=runs,
-        thresholds=_thresholds(tables, machine, runs) if tables else (),
+        thresholds=root.read("thresholds", lambda node: _thresholds(node, machine, runs), ()),
     )
 
 
@@ -225,9 +225,7 @@ def _geometry(node: Node) -> Geometry:
             continue
         if not isinstance(entry.value, str):
             entry.expected("text with a number and its unit", f'Write {key} = "{GEOMETRY[key]}".')
-        found[key] = entry.quantity(unit)
-        if not found[key] > 0:
-            entry.expected(f"{'an' if key == 'area' else 'a'} {key} above 0")
+        found[key] = entry.positive(unit, f"{'an' if key == 'area' else 'a'} {key} above 0")
     return Geometry(**found)
 
 
@@ -241,7 +239,7 @@ def _columns(node: Node, geometry: Geometry) -> dict[str, ColumnSpec]:
             continue
         entry.table(f'{role} = {{ name = "...", unit = "{ROLES[role]}" }}.').keys(_COLUMN)
         name = entry.require("name", "Give the column's heading in the data file.").text()
-        unit, scale, offset, integrate = (entry.get(key) for key in _COLUMN[1:])
+        unit, scale, integrate = (entry.get(key) for key in ("unit", "scale", "integrate"))
         if unit:
             check_unit(unit.text(), role, unit, geometry=geometry)
         if scale and scale.number() == 0:
@@ -250,10 +248,10 @@ def _columns(node: Node, geometry: Geometry) -> dict[str, ColumnSpec]:
             integrate.fail("only the time may be integrated, from sample intervals", "Take `integrate` away.")
         specs[role] = ColumnSpec(
             name,
-            unit.text() if unit else None,
-            scale.number() if scale else 1.0,
-            offset.number() if offset else 0.0,
-            integrate.boolean() if integrate else False,
+            entry.read("unit", Node.text, None),
+            entry.read("scale", Node.number, 1.0),
+            entry.read("offset", Node.number, 0.0),
+            entry.read("integrate", Node.boolean, False),
             entry,
         )
     return specs
@@ -292,39 +290,27 @@ def _run(node: Node, geometry: Geometry) -> RunDescription:
     if not name.text().strip():
         name.expected("a name")
     file = node.require("file", 'Write file = "steps.csv", relative to the experiment\'s folder.')
-    if not file.text().strip() or "\0" in file.text():
-        file.expected("the name of a data file")
-    holdout, format, start, initial = (node.get(key) for key in ("holdout", "format", "start", "initial"))
-    drive, load, window, direction = (node.get(key) for key in ("drive", "load", "window", "direction"))
-    way = direction.choice(("forward", "backward")) if direction else "forward"
-    begins = initial.choice(("steady", "free")) if initial else "steady"
-    weight = load.quantity("N", geometry) if load else None
-    if load and weight is not None and not weight > 0:
-        load.expected('a load above 0, as "5 N"')
-    modulation = node.get("modulation")
     return RunDescription(
         name=name.text(),
-        file=node.file.parent / file.text(),
-        format=format.text() if format else None,
-        holdout=holdout.boolean() if holdout else False,
-        window=_window(window) if window else None,
-        drive=_drive(drive) if drive else None,
-        start=start.quantity("um") if start else 0.0,
-        load=weight,
-        modulation=_modulation(modulation) if modulation else None,
-        initial=begins,
+        file=file.beside("the name of a data file"),
+        format=node.read("format", Node.text, None),
+        holdout=node.read("holdout", Node.boolean, False),
+        window=node.read("window", _window, None),
+        drive=node.read("drive", _drive, None),
+        start=node.read("start", lambda start: start.quantity("um"), 0.0),
+        load=node.read("load", lambda load: load.positive("N", 'a load above 0, as "5 N"', geometry), None),
+        modulation=node.read("modulation", _modulation, None),
+        initial=node.read("initial", lambda initial: initial.choice(("steady", "free")), "steady"),
         node=node,
-        backward=way == "backward",
-        corrections=_corrections(node.get("corrections")),
-        observables=_observables(node.get("observables")),
-        segments=_segments(node.get("segments")),
+        backward=node.read("direction", lambda way: way.choice(("forward", "backward")), "forward") == "backward",
+        corrections=node.read("corrections", _corrections, frozenset()),
+        observables=node.read("observables", _observables, ()),
+        segments=node.read("segments", _segments, ()),
     )
 
 
-def _segments(node: Node | None) -> tuple[float, ...]:
+def _segments(node: Node) -> tuple[float, ...]:
     """Return the times at which a run may be cut, rising."""
-    if node is None:
-        return ()
     listed = node.items("times in s of the file's own clock", "Write segments = [120.0, 240.0].")
     times = [entry.quantity("s") for entry in listed]
     if any(b <= a for a, b in pairwise(times)):
@@ -344,44 +330,30 @@ def _thresholds(node: Node, machine: Apparatus, runs: tuple[RunDescription, ...]
     for entry in entries:
         entry.keys(_THRESHOLDS)
         file = entry.require("file", 'Write file = "critical-loads.csv", relative to the experiment\'s folder.')
-        if not file.text().strip() or "\0" in file.text():
-            file.expected("the name of a table of critical loads")
-        name, holdout, frequency = (entry.get(key) for key in ("name", "holdout", "frequency"))
+        place, name = file.beside("the name of a table of critical loads"), entry.get("name")
         if name and not name.text().strip():
             name.expected("a name")
-        if frequency and not frequency.quantity("Hz") > 0:
-            frequency.expected("a frequency above 0")
+        frequency = entry.read("frequency", lambda node: node.positive("Hz", "a frequency above 0"), None)
         called = name.text() if name else Path(file.text()).stem
         if called in {*(run.name for run in runs), *(other.name for other in found)}:
             (name or file).fail(
                 f"'{called}' is the name of another run or table", 'Give it one of its own: name = "...".'
             )
-        found.append(
-            ThresholdsDescription(
-                called,
-                entry.file.parent / file.text(),
-                holdout.boolean() if holdout else False,
-                frequency.quantity("Hz") if frequency else None,
-                entry,
-            )
-        )
+        holdout = entry.read("holdout", Node.boolean, False)
+        found.append(ThresholdsDescription(called, place, holdout, frequency, entry))
     return tuple(found)
 
 
-def _corrections(node: Node | None) -> frozenset[str]:
+def _corrections(node: Node) -> frozenset[str]:
     """Return which of the corrections that `srf check` proposes are made."""
-    if node is None:
-        return frozenset()
     for entry in node.items("corrections", f"Write corrections = {list(CORRECTIONS)}, or one of them."):
         if entry.text() not in CORRECTIONS:
             entry.fail(f"unknown correction '{entry.text()}'", did_you_mean(entry.text(), CORRECTIONS))
     return frozenset(node.value)
 
 
-def _observables(node: Node | None) -> tuple[str, ...]:
-    """Return which columns of a run are compared with the model together; none for the one that `read_columns` chooses."""
-    if node is None:
-        return ()
+def _observables(node: Node) -> tuple[str, ...]:
+    """Return which columns of a run are compared with the model together."""
     listed = node.items("observables", 'Write observables = ["elongation", "slip"].', fewest=1)
     names = [entry.text() for entry in listed]
     for index, (entry, name) in enumerate(zip(listed, names, strict=True)):
@@ -415,9 +387,7 @@ def _drive(node: Node) -> tuple[tuple[float, float], ...]:
         step.keys(("duration", "velocity"))
         duration = step.require("duration", "Every step of a drive has a duration in s.")
         velocity = step.require("velocity", "Every step of a drive has a velocity in um/s.").quantity("um/s")
-        if not duration.quantity("s") > 0:
-            duration.expected("a duration above 0")
-        steps.append((duration.quantity("s"), velocity))
+        steps.append((duration.positive("s", "a duration above 0"), velocity))
     return tuple(steps)
 
 
@@ -426,18 +396,18 @@ def _modulation(node: Node) -> tuple[float, float, float]:
     node.keys(("frequency", "amplitude", "onset"))
     frequency = node.require("frequency", "Give it in Hz: frequency = 120.0.")
     amplitude = node.require("amplitude", "Give it relative to the mean load: amplitude = 0.09.")
-    onset = node.get("onset")
-    if not frequency.quantity("Hz") > 0:
-        frequency.expected("a frequency above 0")
+    f = frequency.positive("Hz", "a frequency above 0")
     if not 0 <= amplitude.quantity("1") < 1:
         amplitude.expected("a relative amplitude from 0 to below 1", "At 1 the slider lifts off.")
-    return frequency.quantity("Hz"), amplitude.quantity("1"), onset.quantity("s") if onset else 0.0
+    return f, amplitude.quantity("1"), node.read("onset", lambda onset: onset.quantity("s"), 0.0)
 
 
 # A value in a TOML file that knows where it stands: every breach is told with file, line, key, finding and expectation.
 
 SMALLEST = 1e-30  # of a number that is not zero: powers and products of it are numbers, too
 LARGEST = 16 * 2**20  # bytes of a description
+Value = TypeVar("Value")
+Other = TypeVar("Other")
 
 
 @dataclass(frozen=True)
@@ -482,6 +452,11 @@ class Node:
     def get(self, key: str) -> Node | None:
         """Return the value under a key, None where there is none."""
         return self.child(key) if key in self.value else None
+
+    def read(self, key: str, how: Callable[[Node], Value], default: Other) -> Value | Other:
+        """Return what `how` makes of the value under a key, the default where there is none."""
+        node = self.get(key)
+        return default if node is None else how(node)
 
     def require(self, key: str, hint: str) -> Node:
         """Return the value under a key; raises SrfError where there is none."""
@@ -556,6 +531,19 @@ class Node:
             number, written = split_quantity(self.value, name=name, example=f"0.5 {unit}" if unit != "1" else "0.5")
             number *= unit_factor(written, unit, geometry) if written else 1.0
         return self._sized(number, f" {unit}")
+
+    def positive(self, unit: str, what: str, geometry: Geometry = NO_GEOMETRY) -> float:
+        """Return this value in `unit`; it must be above 0, which `what` says."""
+        value = self.quantity(unit, geometry)
+        if not value > 0:
+            self.expected(what)
+        return value
+
+    def beside(self, what: str) -> Path:
+        """Return the path that this text, relative to the file's folder, names; `what` says what it is."""
+        if not self.text().strip() or "\0" in self.text():
+            self.expected(what)
+        return self.file.parent / self.text()
 
     def _sized(self, number: float, unit: str = "") -> float:
         """Return a number, which must be 0 or of a size that can be computed with."""

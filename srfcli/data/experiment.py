@@ -143,10 +143,9 @@ _IMPOSED = {
 
 def read_groups(node: Node) -> tuple[tuple[str, ...], str]:
     """Return which parameters have a value of their own in each group, and what makes a group."""
-    vary, by = node.get("vary"), node.get("by")
-    listed = vary.items("parameters", 'Write vary = ["mu0"].') if vary else []
-    group = by.choice(BY) if by else "run"
-    return tuple(entry.text() for entry in listed), group
+    listed = node.read("vary", lambda vary: vary.items("parameters", 'Write vary = ["mu0"].'), ())
+    names = tuple(entry.text() for entry in listed)
+    return names, node.read("by", lambda by: by.choice(BY), "run")
 
 
 def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[ModelChoice, tuple[Parameter, ...]]:
@@ -248,8 +247,7 @@ def _unknown(entry: Node, name: str, declared: dict[str, Parameter], choice: Mod
 
 def _parameter(entry: Node, parameter: Parameter, geometry: Geometry) -> FitParameter:
     entry.table(f"{parameter.name} = {{ value = {parameter.default:g}, lower = ..., upper = ... }}.").keys(_ENTRY)
-    fixed = entry.get("fixed")
-    held = fixed.boolean() if fixed else False
+    held = entry.read("fixed", Node.boolean, False)
     numbers = {
         key: _stated(entry.child(key), parameter, geometry) if key in entry.value else default
         for key, default in (("value", parameter.default), ("lower", parameter.lower), ("upper", parameter.upper))
