@@ -264,6 +264,7 @@ SLOT_UNITS = {
 }  # fmt: skip
 PLACE_UNITS = {"slip": "um", "stage": "um", "time": "s", "theta": "1", "envelope": "1", "u": "um"}
 MOVING = {"slip", "stage", "time", "theta", "envelope"}  # an effect of these is steady nowhere
+RUN = {"V": 9.0, "W0": 6.0, "eps": 0.1, "f": 110.0, "psi": 0.4, "onset0": 0.5, "rise0": 0.3, "modulated": 1.0}
 POINTS = 24
 RTOL = 1e-9
 
@@ -396,12 +397,11 @@ class _Check:
     def neutral(self) -> str:
         if self.effect.settings:
             raise Skipped(f"the baseline is another system: {self.base.title}")
-        points, values = self._points(), self._neutral_values()
-        ours = points.rates(self.model, self._vector(values))[:, : len(self.plain.states)]
-        theirs = points.rates(self.plain, self.plain.vector(self._values(self.plain)))
-        worst = _difference(ours, theirs)
-        steady = np.asarray(self.model.steady(self._vector(values)))[: len(self.plain.states)]
-        start = _difference(steady, np.asarray(self.plain.steady(self.plain.vector(self._values(self.plain)))))
+        own = len(self.plain.states)
+        ours = self.points.rates(self.model, self.p_neutral)[:, :own]
+        worst = _difference(ours, self.points.rates(self.plain, self.p_plain))
+        steady = np.asarray(self.model.steady(self.p_neutral))[:own]
+        start = _difference(steady, np.asarray(self.plain.steady(self.p_plain)))
         told = ", ".join(f"{n} = {v:g}" for n, v in self.effect.neutral) or "any value"
         if not max(worst, start) < RTOL:
             where, size = ("the rates", worst) if not worst < RTOL else ("steady sliding", start)
@@ -417,9 +417,9 @@ class _Check:
             raise Skipped("it is what is fitted or observed that changes")
         if {slot for slot, _ in self.effect.changes} == {"gauge"}:
             return self._shown()
-        points, own = self._points(), len(self.plain.states)
-        away = points.rates(self.model, self._vector())[:, :own]
-        at = points.rates(self.model, self._vector(self._neutral_values()))[:, :own]
+        own = len(self.plain.states)
+        away = self.points.rates(self.model, self.p_default)[:, :own]
+        at = self.points.rates(self.model, self.p_neutral)[:, :own]
         moved = np.max(np.abs(away - at) / np.maximum(np.max(np.abs(at), axis=0), 1e-300))
         if not np.isfinite(away).all():
             raise SrfError("the rates are not finite at the default values", "Look at the formula and the defaults.")
@@ -431,17 +431,17 @@ class _Check:
 
     def _shown(self) -> str:
         """Return how far the reading moves at the default values; SrfError where it does not, or moves at the neutral ones."""
-        points = self._points()
+        points = self.points
 
         def read(model: GeneratedModel, p: Array) -> Array:
             return np.asarray(model.reading(points.x[:, : len(model.states)], points.V, points.W, points.W_dot, p))
 
-        plain = read(self.plain, self.plain.vector(self._values(self.plain)))
-        if not (off := _difference(read(self.model, self._vector(self._neutral_values())), plain)) < RTOL:
+        plain = read(self.plain, self.p_plain)
+        if not (off := _difference(read(self.model, self.p_neutral), plain)) < RTOL:
             raise SrfError(
                 f"at the neutral values the reading differs by {off:.2g} of its size", "It must be gauge there."
             )
-        moved = _difference(read(self.model, self._vector()), plain)
+        moved = _difference(read(self.model, self.p_default), plain)
         if moved < 1e-12:
             raise SrfError(
                 "at the default values the gauge shows what it did", "Give the size a default off its neutral value."
@@ -453,10 +453,9 @@ class _Check:
         used = {str(s) for f in formulas for s in f.free_symbols} & MOVING
         if used:
             raise Skipped(f"with {', '.join(sorted(used))} in the formula nothing is steady")
-        values = self._values(self.model)
-        x = np.asarray(self.model.steady(self._vector()))
-        rates = np.asarray(self.model.rates(x, values["V"], values["W0"], 0.0, self._vector()))
-        scale = np.max(np.abs(self._points().rates(self.model, self._vector())), axis=0)
+        p = self.p_default
+        rates = np.asarray(self.model.rates(np.asarray(self.model.steady(p)), RUN["V"], RUN["W0"], 0.0, p))
+        scale = np.max(np.abs(self.points.rates(self.model, p)), axis=0)
         worst = float(np.max(np.abs(rates) / np.maximum(scale, 1e-300)))
         if not worst < 1e-8:
             name = self.model.states[int(np.argmax(np.abs(rates) / np.maximum(scale, 1e-300)))]
@@ -467,7 +466,7 @@ class _Check:
         return f"nothing moves at V under W0{_to(worst, ' but for', ' of the usual rates')}"
 
     def derivatives(self) -> str:
-        points, model, p = self._points(), self.model, self._vector()
+        points, model, p = self.points, self.model, self.p_default
         x = points.x[:, : len(model.states)]
         given = (points.V, points.W, points.W_dot)
         exact = (model.rates_jacobian(x, *given, p), model.rates_parameters(x, *given, p))
@@ -484,36 +483,43 @@ class _Check:
 
     # ---- numbers
 
-    def _values(self, model: GeneratedModel) -> dict[str, float]:
-        run = {"V": 9.0, "W0": 6.0, "eps": 0.1, "f": 110.0, "psi": 0.4, "onset0": 0.5, "rise0": 0.3, "modulated": 1.0}
-        return {n: v for n, v in run.items() if n in model.names}
+    @cached_property
+    def p_plain(self) -> Array:
+        """The parameters of the baseline."""
+        return _vector(self.plain)
 
-    def _neutral_values(self) -> dict[str, float]:
+    @cached_property
+    def p_default(self) -> Array:
+        """The parameters of the model with the effect at its default values."""
+        return _vector(self.model)
+
+    @cached_property
+    def p_neutral(self) -> Array:
+        """The parameters of the model with the effect at its neutral values."""
         units = {p.name: p.unit for p in self.effect.parameters}
-        return {n: to_base(v, units[n]) for n, v in self.effect.neutral}
+        return _vector(self.model, {n: to_base(v, units[n]) for n, v in self.effect.neutral})
 
-    def _vector(self, values: Mapping[str, float] | None = None) -> Array:
-        """Return p with the effect's defaults, the sizes' at the values given; a default that is neutral moves off."""
-        return self.model.vector({**self._values(self.model), **(values or {})})
-
-    def _points(self) -> _Points:
-        """Return states around steady sliding, in which places and clock are anywhere in a run."""
+    @cached_property
+    def points(self) -> _Points:
+        """States around steady sliding; the slip, the stage's position and the time are anywhere in a run."""
         rng = np.random.default_rng(20)
-        x = np.asarray(self.model.steady(self._vector()))
+        x = np.asarray(self.model.steady(self.p_default))
         spread = {"slip": 40.0, "stage": 40.0, "time": 1.5}
         columns = []
         for name, log, at in zip(self.model.states, self.model.logarithmic, x, strict=True):
             r = rng.standard_normal(POINTS)
             at = at if np.isfinite(at) else 1.0
-            columns.append(
-                spread[name] * rng.uniform(size=POINTS)
-                if name in spread
-                else at + 0.5 * r
-                if log
-                else at * (1 + 0.1 * r)
-            )
+            if name in spread:
+                columns.append(spread[name] * rng.uniform(size=POINTS))
+            else:
+                columns.append(at + 0.5 * r if log else at * (1 + 0.1 * r))
         V, W = 9.0 * np.exp(0.3 * rng.standard_normal(POINTS)), 6.0 * (1 + 0.1 * rng.standard_normal(POINTS))
         return _Points(np.column_stack(columns), V, W, 300.0 * rng.standard_normal(POINTS))
+
+
+def _vector(model: GeneratedModel, values: Mapping[str, float] | None = None) -> Array:
+    """Return the parameters of a model at RUN, some of them at other values."""
+    return model.vector({n: v for n, v in RUN.items() if n in model.names} | dict(values or {}))
 
 
 def _stepped_states(model: GeneratedModel, points: _Points, p: Array) -> Array:
