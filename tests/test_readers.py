@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from recording_cases import TOML, data, write
 
 from srfcli.core.errors import SrfError
-from srfcli.data.columns import open_source, split_heading
+from srfcli.core.units import split_heading
+from srfcli.data.columns import open_source
 from srfcli.data.experiment import check_run, read_experiment
 from srfcli.laws.registry import load_registry
 from srfcli.laws.values import Source

@@ -16,9 +16,10 @@ from scipy.linalg import expm
 import srfcli
 from srfcli.cli.main import cli
 from srfcli.core.errors import SrfError
+from srfcli.data.clock import Place
 from srfcli.data.experiment import KINDS, check_run, read_experiment
 from srfcli.data.gauge import GaugeNoise, find_noise, whiten
-from srfcli.data.imposed import Place, find_modulation, load_from_column
+from srfcli.data.imposed import find_modulation, load_from_column
 from srfcli.data.noise import measured
 from srfcli.data.values import Run
 from srfcli.laws.registry import load_registry
@@ -169,7 +170,8 @@ def test_every_kind_of_notice_has_a_case() -> None:
     made = set()
     for path in Path(srfcli.__file__).parent.glob("data/*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("Notice", "spots"):
+            called = isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", ""))
+            if called in ("Notice", "spots"):
                 made |= {a.value for a in node.args[:1] if isinstance(a, ast.Constant)}
     assert made <= set(KINDS) and len(made) > 15
     text = (Path(__file__).resolve().parents[1] / "docs" / "recordings.md").read_text(encoding="utf-8")
@@ -350,7 +352,11 @@ def test_the_parts_of_the_noise_are_told_apart(seed: int) -> None:
     assert found.white == pytest.approx(0.03, rel=0.05)
     found = find_noise([slow(n) + white + 0.03 * oscillating(n, 5 * dt, 20.0, random)], dt)
     frequency, level, quality = found.colours[0]
-    assert (frequency, level, quality) == (pytest.approx(5, rel=0.01), pytest.approx(0.03, rel=0.15), pytest.approx(20, rel=0.4))
+    assert (frequency, level, quality) == (
+        pytest.approx(5, rel=0.01),
+        pytest.approx(0.03, rel=0.15),
+        pytest.approx(20, rel=0.4),
+    )
     assert found.white == pytest.approx(0.03, rel=0.05) and len(found.colours) == 1
     found = find_noise([slow(n) + 0.03 * oscillating(n, 0.05, 0.5, random)], dt)
     assert found.white < 0.003 and found.colours[0] == pytest.approx((5, 0.03, 0.5), rel=0.2)
@@ -371,7 +377,9 @@ def test_each_rate_has_a_noise_of_its_own_and_rounding_its_part(tmp_path: Path) 
     assert fast.colours[0] == (pytest.approx(5, rel=0.02), pytest.approx(0.03, rel=0.15), pytest.approx(10, rel=0.4))
     assert slow_.colours[0] == pytest.approx((0.5, 0.03), rel=0.35)
     assert (fast.quantum, slow_.quantum) == pytest.approx((0.02, 0.02))
-    assert fast.total == pytest.approx(np.std(c.u[n:]), rel=0.07) and slow_.total == pytest.approx(np.std(c.u[:n]), rel=0.07)
+    assert fast.total == pytest.approx(np.std(c.u[n:]), rel=0.07) and slow_.total == pytest.approx(
+        np.std(c.u[:n]), rel=0.07
+    )
     assert fast.white == pytest.approx(0.01, rel=0.15) and slow_.white == pytest.approx(0.02, rel=0.2)
 
 

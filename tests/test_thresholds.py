@@ -362,7 +362,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 def test_units_comments_and_assumed_errors(tmp_path: Path) -> None:
     path = tmp_path / "loads.csv"
     path.write_text(
-        "\ufeff# measured in June\nW0c [N];V [um/s];eps [%];sigma [%]\n8;10;9;5\n\n10;20;4.5;\n", encoding="utf-8"
+        "\ufeff# measured in June\nW0c (N);V [um/s];eps [%];sigma [%]\n8;10;9;5\n\n10;20;4.5;\n", encoding="utf-8"
     )
     table = read_thresholds(path)
     assert table.V.tolist() == [10, 20] and table.eps == pytest.approx([0.09, 0.045]) and table.lines == (3, 5)

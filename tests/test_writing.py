@@ -74,6 +74,11 @@ def test_every_value_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
         assert a.load == b.load
 
 
+def test_a_stiffness_is_per_load_by_its_dimension() -> None:
+    stated = {"0.21 N/um": False, "1.0e-3 1/um": True, "2e5 kg/s^2": False, "3 1/mm": True}
+    assert {text: experiment(stiffness_text=text).per_load for text in stated} == stated
+
+
 @pytest.mark.parametrize("observable", ["elongation", "force", "friction"])
 @pytest.mark.parametrize("stiffness", ["0.21 N/um", "1.0e-3 1/um"])
 def test_observables_and_stiffness_per_load(tmp_path: Path, observable: str, stiffness: str) -> None:

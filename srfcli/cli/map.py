@@ -104,7 +104,7 @@ def command(
     from srfcli.core.errors import SrfError
     from srfcli.numerics.continuation import AtlasSettings, StepSettings
     from srfcli.numerics.plane import MapSettings
-    from srfcli.tasks.map import map_grid
+    from srfcli.tasks import map as task
 
     if not 1e-4 <= step <= 0.5 or not 1e-8 <= mesh_error <= 0.1:
         raise SrfError(
@@ -129,9 +129,9 @@ def command(
             progress.total = None
             progress.advance(0, note=said)
 
-        found = map_grid(
-            slider, grid, grid=MapSettings(mesh_error=mesh_error, depth=depth), curves=settings, boundaries=boundaries,
-            criticality=criticality, run=spread.run, tiles=tiles, progress=then,
+        found = task.map(
+            slider, x=grid.x, y=grid.y, grid=MapSettings(mesh_error=mesh_error, depth=depth), curves=settings,
+            boundaries=boundaries, criticality=criticality, run=spread.run, tiles=tiles, progress=then,
         )  # fmt: skip
     timings = {"map": mapped, "boundaries": time.perf_counter() - begun - mapped}
     text, laws = output.format == "text" and found.followed, slider.model.laws

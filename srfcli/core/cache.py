@@ -1,13 +1,13 @@
 """Generated and compiled modules, kept by content or shipped: a second start needs neither sympy nor a compiler.
 
-What is kept is run when it is read back, so that the cache must be no way in: its folder must be the user's own and closed to
-others, and every entry carries a seal, an HMAC of its name and content under a secret of the user's that lies elsewhere. An
-entry without the right seal is never run; it is built anew. The cache can be lost, broken, read-only or refused: what it would
-have kept is then kept in memory.
+The cache holds code that is run when it is read back, and must therefore not let foreign code in. Its folder must be the user's
+own and closed to others. Every entry carries a seal: an HMAC of its name and content under a secret of the user's that lies
+elsewhere. An entry without the right seal is never run; it is built anew. Where the cache is lost, broken, read-only or refused,
+its content is kept in memory.
 
-`tools/prebuild.py` of a checkout writes them. Each names the key under which it was built: the content of the laws' files and of
-all that writes a module. It is used only where what is asked for has that very key, so that a law that was edited, or code that
-was changed, never gets an old module.
+Modules of shipped laws come with the package; `tools/prebuild.py` of a checkout writes them. Each states the key under which it
+was built, a hash of the laws' files and of all code that writes a module. It is used only for that key, so that an edited law or
+changed code never gets an old module.
 """
 
 from __future__ import annotations
@@ -30,8 +30,6 @@ from types import CodeType
 
 from srfcli.core.errors import SrfError
 from srfcli.core.files import read_plain
-
-# Generated modules and compiled ones kept by content, so that a second start skips sympy and the compiler.
 
 PREFIX = "# seal "
 SECRET = 32  # bytes
@@ -197,7 +195,7 @@ def _warn(text: str) -> None:
         _log.warning(text)
 
 
-# Generated modules of shipped laws that come with the package, so that a first start needs no sympy.
+# Generated modules that are shipped.
 
 FOLDER = Path(__file__).resolve().parents[1] / "codegen" / "models"
 MARK = "# built under "

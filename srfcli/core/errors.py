@@ -8,10 +8,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
-# Errors that a user can act on: what, where, what instead.
-
 # control characters but tab and newline, DEL and the second set, marks that are not seen or turn the line round, lone
 # surrogates (bytes of file names that are no text): what a terminal acts on, or shows as something else than it is
+LONGEST = 2000  # characters of a message
 _UNSEEN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
     "\ud800-\udfff\U000e0000-\U000e0fff]"
@@ -27,9 +26,9 @@ def printable(text: str, *, line: bool = False) -> str:
     return _UNSEEN.sub(lambda found: ascii(found.group())[1:-1], text)
 
 
-def shortened(text: str, most: int = 2000) -> str:
-    """Return the text, without its middle where it is longer than `most`: a key of 100 kB is told by its ends."""
-    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
+def shortened(text: str) -> str:
+    """Return the text, without its middle where it is longer than LONGEST: a key of 100 kB is told by its ends."""
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 4 :]}"
 
 
 def shown(value: object) -> str:
@@ -74,9 +73,8 @@ class ExpressionError(SrfError):
         """Return the expression with a caret under the offending column, or None when it has no place."""
         if self.column is None:
             return None
-        text = _UNSEEN.sub(
-            "?", self.text.replace("\n", " ").replace("\t", " ")
-        )  # one sign for one, as the caret counts
+        text = self.text.replace("\n", " ").replace("\t", " ")
+        text = _UNSEEN.sub("?", text)  # one sign for one, as the caret counts
         return f"  {text}\n  {' ' * self.column}^"
 
 

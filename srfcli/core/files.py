@@ -1,8 +1,8 @@
-"""Files: read with suspicion, written whole or not at all.
+"""Files: checked before they are read, written whole or not at all.
 
-Everything is written beside its place, under a name that begins with a dot and ends in `.part`, and moved there when it is
-complete. The writer holds a lock on its part for as long as it lives: a part that nobody has locked is of a dead process. The
-next writer to the same place removes it, or, where the process died between two moves, ends what it had begun.
+A file is written beside its place, under a name that begins with a dot and ends in `.part`, and moved there when it is complete.
+The writer holds a lock on this part for as long as it lives, so that a part without a lock belongs to a dead process. The next
+writer to the same place removes such a part or, where its writer died between two moves, makes the moves that are missing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import tomli
 
 from srfcli.core.errors import SrfError
 
-# Reading of files that others may have made: by kind before they are opened, and no more of them than makes sense.
+# Reading files that others may have made: their kind is checked before they are opened, and their size while they are read.
 
 TEXT = 4 * 2**20  # bytes of a law, of settings or of an answer
 
@@ -53,9 +53,8 @@ def check_plain(path: Path) -> os.stat_result:
         kind = next((name for is_kind, name in _KINDS if is_kind(found.st_mode)), "no regular file")
         hint = "Name a file in it." if kind == "a folder" else "Name a file; save first what comes through a pipe."
         raise SrfError(f"no file {path}, but {kind}", hint)
-    if (
-        path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix"
-    ):  # said to be files; reading may wait or fail
+    # said to be files; reading may wait or fail
+    if path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix":
         raise SrfError(
             f"no file {path}, but a part of the running system", "Name a file; copy what is meant to one first."
         )
@@ -104,6 +103,28 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         raise SrfError(f"{path}: not TOML: {error}", "Write numbers as in 1.5e-3.") from None
 
 
+def toml_lines(table: Mapping[str, Any]) -> list[str]:
+    """Return a table as lines of TOML, one `key = value` for each entry."""
+    return [f"{_toml_key(key)} = {toml_value(value)}" for key, value in table.items()]
+
+
+def toml_value(value: object) -> str:
+    """Return text, a truth value, a number, a list or a table as TOML; tables are inline, numbers keep every digit."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):  # TOML's basic strings are JSON's, but for DEL
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(toml_lines(value))} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    return repr(value)
+
+
+def _toml_key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
+
+
 def parse_json(text: str | bytes, where: object) -> Any:
     """Return what a JSON text holds; raises SrfError, beginning with `where`, for anything else."""
     try:
@@ -114,7 +135,7 @@ def parse_json(text: str | bytes, where: object) -> Any:
         raise SrfError(f"{where}: not JSON: {error}") from None
 
 
-# Writing that a kill at any moment leaves whole: files, a result with its sidecar, folders; and what is left is cleared away.
+# Writing files, a result with its sidecar, and folders, whole even if the process is killed; removing what a killed one left.
 
 try:
     import fcntl
@@ -198,22 +219,24 @@ def recover(target: Path) -> None:
     if not target.parent.is_dir() or os.path.lexists(note):  # another process is at it
         return
     for part in _parts(target):
-        with contextlib.suppress(OSError):
-            if (lock := _locked(part)) is None:
-                continue
-            with lock:
-                if (part / OLD).is_dir() and not os.path.lexists(target):
-                    (part / OLD).rename(target)  # it died between the two moves of a folder
-                shutil.rmtree(part) if part.is_dir() else part.unlink()
+        _remove_abandoned(part, target)
 
 
 def clear(folder: Path) -> None:
     """Remove from a folder the parts of files that dead processes were writing into it, whatever their names."""
     for part in folder.glob(".*.part") if fcntl is not None else ():
-        with contextlib.suppress(OSError):
-            if (lock := _locked(part)) is not None:
-                with lock:
-                    shutil.rmtree(part) if part.is_dir() else part.unlink()
+        _remove_abandoned(part)
+
+
+def _remove_abandoned(part: Path, target: Path | None = None) -> None:
+    """Remove a part unless a living process has locked it; the old folder in it returns to `target` if that is gone."""
+    with contextlib.suppress(OSError):
+        if (lock := _locked(part)) is None:
+            return
+        with lock:
+            if target is not None and (part / OLD).is_dir() and not os.path.lexists(target):
+                (part / OLD).rename(target)  # its writer died between the two moves of a folder
+            shutil.rmtree(part) if part.is_dir() else part.unlink()
 
 
 def _note(target: Path) -> Path:
@@ -279,14 +302,11 @@ def _locked(place: Path) -> contextlib.ExitStack | None:
     except OSError:
         held.close()
         return None
-    if (there.st_dev, there.st_ino) != (mine.st_dev, mine.st_ino) or not _plain(mine.st_mode):
+    plain = stat.S_ISREG(mine.st_mode) or stat.S_ISDIR(mine.st_mode)
+    if (there.st_dev, there.st_ino) != (mine.st_dev, mine.st_ino) or not plain:
         held.close()
         return None
     return held
-
-
-def _plain(mode: int) -> bool:
-    return stat.S_ISREG(mode) or stat.S_ISDIR(mode)
 
 
 def _fill(part: Path, data: bytes, mode: int) -> None:

@@ -1,9 +1,11 @@
 """Independent tasks on processes of this machine or on a dask.distributed cluster, the finished ones kept in a folder.
 
-`concurrent.futures` gives up the whole pool when one of its processes is killed; here every worker has its own pipe, so that
-the others never notice. A run that was killed goes on where it stopped, to the same bytes: every part in the folder ends in a
-seal over its run, its number and its content, under the user's secret. A part that was damaged, changed, moved from another
-place or run, or made by somebody else fails it, and its task is done again.
+`concurrent.futures` gives up the whole pool when one of its processes is killed. Here every worker has its own pipe, so that
+the death of one does not affect the others.
+
+A run that was killed continues from the finished tasks in the folder, to the same bytes. The file of each finished task (a part)
+ends in a seal over its run, its number and its content, under the user's secret. Where the seal does not fit, because the part
+was damaged, changed, moved from another place or run, or made by somebody else, the task is done again.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from srfcli.core.files import clear, parse_json, read_plain, write_atomic
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Tasks on processes of this machine. A worker that dies costs the task it was at, which another one does again.
+# Tasks on processes of this machine. The task of a worker that died is done again by another one.
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -91,12 +93,17 @@ def run_processes(
                 if answer is None:
                     index, crew[place] = worker.index, _started()
                     attempts[index] += 1
-                    if lost is not None and attempts[index] >= ATTEMPTS:
+                    if attempts[index] < ATTEMPTS:
+                        waiting.appendleft(index)
+                    elif lost is not None:
                         done += 1
                         yield index, lost(index)
-                        continue
-                    _check_attempts(attempts[index], worker)
-                    waiting.appendleft(index)
+                    else:
+                        raise SrfError(
+                            f"task {index} ended {ATTEMPTS} worker processes, "
+                            f"the last with exit code {worker.process.exitcode}",
+                            "Look whether memory is short; --workers 1 runs it in this process and shows what happens.",
+                        )
                     continue
                 index, worker.index = worker.index, None
                 if isinstance(answer, _Failure):
@@ -116,14 +123,6 @@ class _Failure:
     """What a task raised, sent back in place of its result."""
 
     error: BaseException
-
-
-def _check_attempts(count: int, worker: _Worker) -> None:
-    if count >= ATTEMPTS:
-        raise SrfError(
-            f"task {worker.index} ended {count} worker processes, the last with exit code {worker.process.exitcode}",
-            "Look whether memory is short; --workers 1 runs it in this process and shows what happens.",
-        )
 
 
 def _started() -> _Worker:
@@ -153,15 +152,12 @@ def _give(worker: _Worker, function: Callable[[Any], Any], tasks: Sequence[Any],
 
 def _answer(worker: _Worker) -> Any:
     """Return what a worker sent, or None where it died first."""
-    try:
-        return worker.pipe.recv() if worker.pipe.poll() else _gone(worker)
-    except (EOFError, OSError):
-        return _gone(worker)
-
-
-def _gone(worker: _Worker) -> None:
+    with contextlib.suppress(EOFError, OSError):
+        if worker.pipe.poll():
+            return worker.pipe.recv()
     worker.process.join()
     worker.pipe.close()
+    return None
 
 
 def _work(pipe: Connection) -> None:
@@ -258,8 +254,11 @@ def _result(future: Any, index: int) -> Any:
 NOTE = "srf-run.json"
 LARGEST = 2**30  # bytes of a finished task
 SEAL = 64  # hexadecimal digits at the end of a part
+_DAMAGED = (  # what reading a file of arrays raises that is not one
+    OSError, SrfError, ValueError, EOFError, KeyError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 Arrays = Mapping[str, "NDArray[Any]"]
-Run = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
+Runner = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
 
 
 @dataclass
@@ -312,17 +311,7 @@ class Store:
                 return None
             with np.load(io.BytesIO(content), allow_pickle=False) as data:
                 return {name: data[name] for name in data.files}
-        except (
-            OSError,
-            SrfError,
-            ValueError,
-            EOFError,
-            KeyError,
-            SyntaxError,
-            MemoryError,
-            zipfile.BadZipFile,
-            zlib.error,
-        ):
+        except _DAMAGED:
             return None
 
     def write(self, index: int, result: Arrays) -> None:
@@ -355,7 +344,7 @@ def fingerprint(tasks: Sequence[Any]) -> str:
 
 
 def stored(
-    run: Run, store: Store, function: Callable[[Any], Arrays], tasks: Sequence[Any]
+    run: Runner, store: Store, function: Callable[[Any], Arrays], tasks: Sequence[Any]
 ) -> Iterator[tuple[int, Arrays]]:
     """Yield every task's result: those in the store as they were kept, the others by `run`, kept as they come."""
     store.open(tasks)

@@ -145,35 +145,26 @@ def _refuse_unknown(given: Mapping[str, Any], known: Mapping[str, Any] | set[str
             raise SrfError(f"unknown {what}: {name!r}", did_you_mean(name, known))
 
 
-def choose(key: str, flag: Any, *, env: Mapping[str, str] | None = None, toml: TomlSettings | None = None) -> Setting:
+def choose(key: str, flag: Any, *, toml: TomlSettings | None = None) -> Setting:
     """Return the setting `key` of DEFAULTS: `flag` unless it is None, then SRF_KEY, then srf.toml, then the default."""
-    env = os.environ if env is None else env
     variable = f"SRF_{key.upper()}"
     if flag is not None:
         return Setting(flag, "flag")
-    if env.get(variable, "") != "":
-        return Setting(_typed(key, env[variable], variable), f"environment {variable}")
+    if text := os.environ.get(variable):
+        return Setting(_typed(key, text, variable), f"environment {variable}")
     if toml is not None and key in toml.defaults:
         return Setting(_typed(key, toml.defaults[key], toml.origin), toml.origin)
     return Setting(DEFAULTS[key].value, "default")
 
 
 def _typed(key: str, value: Any, where: str) -> Any:
+    """Return a value, as text or as TOML has it, in the type of the setting's default."""
     default = DEFAULTS[key].value
     if isinstance(default, bool):
-        words = {
-            "1": True,
-            "true": True,
-            "yes": True,
-            "on": True,
-            "0": False,
-            "false": False,
-            "no": False,
-            "off": False,
-        }
-        if str(value).lower() not in words:
-            raise SrfError(f"{where}: {key} = {value!r} is neither true nor false", f"Known: {', '.join(words)}")
-        return words[str(value).lower()]
+        yes, no = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
+        if str(value).lower() not in (*yes, *no):
+            raise SrfError(f"{where}: {key} = {value!r} is neither true nor false", f"Known: {', '.join((*yes, *no))}")
+        return str(value).lower() in yes
     if isinstance(default, float):
         return parse_quantity(value if isinstance(value, str) else shown(value), "1", name=f"{where}: {key}")
     if not isinstance(value, str):

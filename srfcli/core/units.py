@@ -10,14 +10,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import SrfError, did_you_mean
 
 if TYPE_CHECKING:
     import sympy
-
-# What a user types, in the unit they type it in, to um, s, N; angles to radians.
 
 
 @dataclass(frozen=True)
@@ -64,11 +63,21 @@ _SPELLED = {  # in small letters, as headings of recordings have them
 SQUARE_MILLIMETRE = 1e6  # um^2: a stress is taken as the force on this area
 
 LONGEST = 200  # characters of a number with its unit
+LONGEST_HEADING = 500  # characters of a heading that are looked through for its unit
+_HEADING = re.compile(r"\s*(.*?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
 # A product of names with one-digit powers: pint never sees a tower of powers that it would have to work out.
 _FACTOR = r"(?:1|[A-Za-zµ°Ωθ%_]+(?:\^-?[1-9])?)"
 _UNIT = re.compile(rf"{_FACTOR}(?:\s*[*/ ]\s*{_FACTOR})*")
 _PART = re.compile(r"\s*([*/ ]?)\s*([^\s*/^]+)(?:\^(-?\d))?")
+
+
+def split_heading(heading: str) -> tuple[str, str | None]:
+    """Return the name and the unit of `name [unit]` or `name (unit)`; the unit is None for a bare name."""
+    match = _HEADING.fullmatch(heading) if len(heading) <= LONGEST_HEADING else None
+    if match is None:
+        return heading.strip(), None
+    return match[1], match[2] if match[2] is not None else match[3]
 
 
 def to_base(value: float, unit: str) -> float:
@@ -91,15 +100,16 @@ class Geometry:
 
 
 NO_GEOMETRY = Geometry()
+GEOMETRY_UNITS = {"radius": "um", "thickness": "um", "area": "mm^2"}
 
 
-def parse_quantity(text: str, unit: str, *, name: str, geometry: Geometry = NO_GEOMETRY) -> float:
+def parse_quantity(text: str, unit: str, *, name: str) -> float:
     """Return the number that `text` states, in `unit`; a bare number is in that unit. `name` is for the error.
 
     `parse_quantity("210 N/mm", "N/um", name="K")` is 0.21. Raises SrfError for no finite number or a wrong unit.
     """
     number, written = split_quantity(text, name=name, example=f"0.5 {unit}" if unit != "1" else "0.5")
-    return convert(number, written, unit, name=name, geometry=geometry) if written else number
+    return convert(number, written, unit, name=name) if written else number
 
 
 def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float, str]:
@@ -121,10 +131,10 @@ def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float
     return number, match[2]
 
 
-def convert(number: float, written: str, unit: str, *, name: str, geometry: Geometry = NO_GEOMETRY) -> float:
+def convert(number: float, written: str, unit: str, *, name: str) -> float:
     """Return `number`, given in `written`, in `unit`; raises SrfError if the two do not measure the same thing."""
     where = f"{name} = {number:g} {written}"
-    found = number if written == unit else number * unit_factor(written, unit, geometry, where=where)
+    found = number if written == unit else number * unit_factor(written, unit, where=where)
     if not math.isfinite(found):
         raise SrfError(f"{where} is too large", "Write a finite number, as in 1e-3.")
     return found
@@ -215,8 +225,13 @@ def find_unit(text: str, *, where: str = "") -> Unit:
     return Unit(factor, (um, s, newton, rad))
 
 
-def _from_pint(text: str, prefix: str = "", word: str = "") -> Unit:
-    registry = _pint_registry(text, prefix, word)
+def _from_pint(text: str, prefix: str, word: str) -> Unit:
+    """Return a unit that the table lacks, as pint knows it; `word` is the name in it that is unknown here."""
+    try:
+        registry = _pint_registry()
+    except ImportError as error:
+        hint = f'{did_you_mean(word, _TABLE)}, products and powers of these; more with pip install "srfcli[units]"'
+        raise SrfError(f"{prefix}unknown unit {text!r}", hint) from error
     try:
         quantity = registry.Quantity(1.0, registry.Unit(text)).to_base_units()
         powers = {name: float(power) for name, power in quantity.unit_items()}
@@ -236,19 +251,11 @@ def _from_pint(text: str, prefix: str = "", word: str = "") -> Unit:
     return Unit(factor * 1e6 ** (um + mass) / 1e6**mass, (um, s, newton, rad))
 
 
-def _pint_registry(text: str, prefix: str, word: str) -> Any:
-    global _REGISTRY
-    if _REGISTRY is None:
-        try:
-            import pint
-        except ImportError as error:
-            hint = f'{did_you_mean(word, _TABLE)}, products and powers of these; more with pip install "srfcli[units]"'
-            raise SrfError(f"{prefix}unknown unit {text!r}", hint) from error
-        _REGISTRY = pint.UnitRegistry()
-    return _REGISTRY
+@cache
+def _pint_registry() -> Any:
+    import pint
 
-
-_REGISTRY: Any = None
+    return pint.UnitRegistry()
 
 
 # Dimensions of formulas: enough to see whether a law adds a length to a time.

@@ -1,4 +1,4 @@
-"""The clock of a recording: which samples can be placed in time, at which rates they were taken, and where some are missing."""
+"""The clock of a recording: which samples have a valid time, at which rates they were taken, and where samples are missing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHANGE = 1.25  # of the sampling interval
 GAP = 2.5  # sampling intervals
 _BRIDGED = "drive and load are bridged, nothing is compared in it"
 SHORTEST = 8  # samples that make a rate
-TOLD_APART = 60  # samples at a rate from which its noise can be told from that at another
+TOLD_APART = 60  # samples at a rate from which its noise is estimated apart from that at others
 MOST_NOTICES = 8  # of one kind before they are told together
 
 
@@ -43,7 +43,10 @@ class Sampling:
 
     @cached_property
     def _groups(self) -> list[list[Rate]]:
-        """Rates in groups of like intervals, rising; uneven sampling is one rate, and so is one with those in between."""
+        """Groups of rates by rising interval; in a group each interval is less than CHANGE times the one before.
+
+        Groups with too few samples to estimate a noise are left out.
+        """
         groups: list[list[Rate]] = []
         for rate in sorted(self.rates, key=lambda r: r.interval):
             if groups and rate.interval < CHANGE * groups[-1][-1].interval:
@@ -55,27 +58,17 @@ class Sampling:
 
     @cached_property
     def spacings(self) -> tuple[float, ...]:
-        """Return the sampling intervals (s), rising, that are told apart: at each there are enough samples for a noise."""
+        """Return the sampling intervals (s), rising, at each of which there are enough samples to estimate a noise."""
         return tuple(max(g, key=lambda r: r.last - r.first).interval for g in self._groups)
 
     @cached_property
     def at(self) -> NDArray[np.intc]:
-        """Return which of the spacings each sample (n,) was taken at; the nearest, where there are few such samples."""
+        """Return the index in `spacings` of each sample (n,): the nearest spacing where its own has too few samples."""
         logs = np.log(self.spacings)
         near = [int(np.argmin(np.abs(np.log(r.interval) - logs))) for r in self.rates]
         count = [r.last - r.first for r in self.rates]
         count[-1] += 1
         return np.repeat(near, count).astype(np.intc)
-
-
-def span(path: Path, rows: NDArray[np.int64], t: Array, first: int, last: int) -> str:
-    """Return `steps.csv: rows 120-130, t = 1.2 to 1.3 s`, for samples `first` to `last`."""
-    ends = (rows[first], rows[last])
-    at = f"row {ends[0]}" if first == last else f"rows {ends[0]}-{ends[1]}"
-    times = t[[first, last]]
-    if not np.isfinite(times).all():
-        return f"{path.name}: {at}"
-    return f"{path.name}: {at}, t = {times[0]:.7g}" + (" s" if first == last else f" to {times[1]:.7g} s")
 
 
 def runs_of(mask: Mask) -> list[tuple[int, int]]:
@@ -84,39 +77,60 @@ def runs_of(mask: Mask) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
 
-def kept_samples(path: Path, rows: NDArray[np.int64], t: Array, hint: str | None = None) -> tuple[Mask, list[Notice]]:
+@dataclass(frozen=True)
+class Place:
+    """Samples of a column, for notices and errors: file, heading, numbers of their rows (n,) and times (n,) in s."""
+
+    path: Path
+    heading: str
+    rows: NDArray[np.int64]
+    t: Array
+
+    @property
+    def column(self) -> str:
+        """Return `steps.csv: column 'mu'`."""
+        return f"{self.path.name}: column '{self.heading}'"
+
+    def span(self, first: int, last: int) -> str:
+        """Return `steps.csv: rows 120-130, t = 1.2 to 1.3 s`, for samples `first` to `last`."""
+        ends, times = self.rows[[first, last]], self.t[[first, last]]
+        at = f"{self.path.name}: row {ends[0]}" if first == last else f"{self.path.name}: rows {ends[0]}-{ends[1]}"
+        if not np.isfinite(times).all():
+            return at
+        return f"{at}, t = {times[0]:.7g}" + (" s" if first == last else f" to {times[1]:.7g} s")
+
+    def spots(self, kind: str, mask: Mask, told: str) -> list[Notice]:
+        """Return a notice for each run of True in `mask` (n,), or one for all of them where they are many."""
+        found = runs_of(mask)
+        if len(found) <= MOST_NOTICES:
+            counts = [f"{b - a + 1} sample{'s' if b > a else ''}" for a, b in found]
+            return [Notice(kind, self.span(*ends), f"{n} {told}") for ends, n in zip(found, counts, strict=True)]
+        first = ", ".join(str(self.rows[a]) for a, _ in found[:4])
+        where = f"{self.path.name}: {len(found)} places, the first at rows {first}"
+        return [Notice(kind, where, f"{int(mask.sum())} samples {told}")]
+
+
+def kept_samples(place: Place, hint: str | None = None) -> tuple[Mask, list[Notice]]:
     """Return which samples have a time of their own, later than the one before, and what was wrong with the others.
 
-    Raises SrfError where the clock was set back, or where too many stamps are repeated to call the others a recording.
+    Raises SrfError, with this hint if there is one, where the clock was set back, or where too many stamps are repeated to call
+    the others a recording.
     """
-    missing = np.isnan(t)
-    keep, repeated, wrong = _rising(path, rows, t, ~missing, hint)
+    missing = np.isnan(place.t)
+    keep, repeated, wrong = _rising(place, ~missing, hint)
     notices = [
-        *spots("nan", missing, path, rows, t, "without a time, left out"),
-        *spots("repeated-time", repeated, path, rows, t, "with the time of the sample before, left out"),
-        *spots("backward-time", wrong, path, rows, t, "whose time does not fit between its neighbours', left out"),
+        *place.spots("nan", missing, "without a time, left out"),
+        *place.spots("repeated-time", repeated, "with the time of the sample before, left out"),
+        *place.spots("backward-time", wrong, "whose time does not fit between its neighbours', left out"),
     ]
     if keep.sum() < SHORTEST:
-        raise SrfError(f"{path}: {keep.sum()} usable samples", f"A recording needs {SHORTEST} or more.")
+        raise SrfError(f"{place.path}: {keep.sum()} usable samples", f"A recording needs {SHORTEST} or more.")
     return keep, notices
 
 
-def spots(kind: str, mask: Mask, path: Path, rows: NDArray[np.int64], t: Array, told: str) -> list[Notice]:
-    """Return a notice for each run of True in `mask` (n,), or one for all of them where they are many."""
-    found = runs_of(mask)
-    if len(found) <= MOST_NOTICES:
-        return [Notice(kind, span(path, rows, t, a, b), f"{_count(b - a + 1, 'sample')} {told}") for a, b in found]
-    first = ", ".join(str(rows[a]) for a, _ in found[:4])
-    where = f"{path.name}: {len(found)} places, the first at rows {first}"
-    return [Notice(kind, where, f"{int(mask.sum())} samples {told}")]
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" + ("s" if number != 1 else "")
-
-
-def _rising(path: Path, rows: NDArray[np.int64], t: Array, keep: Mask, hint: str | None) -> tuple[Mask, Mask, Mask]:
+def _rising(place: Place, keep: Mask, hint: str | None) -> tuple[Mask, Mask, Mask]:
     """Return the samples that stay, those with a repeated and those with a wrong time."""
+    t = place.t
     repeated, wrong, keep = np.zeros(t.size, bool), np.zeros(t.size, bool), keep.copy()
     for _ in range(PASSES):
         index = np.flatnonzero(keep)
@@ -137,7 +151,7 @@ def _rising(path: Path, rows: NDArray[np.int64], t: Array, keep: Mask, hint: str
         if repeated.sum() > max(3, MOST_REPEATED * t.size):
             at = int(np.flatnonzero(repeated)[0])
             raise SrfError(
-                f"{span(path, rows, t, at, at)}: {repeated.sum()} of {t.size} samples have the time of the one before",
+                f"{place.span(at, at)}: {repeated.sum()} of {t.size} samples have the time of the one before",
                 hint or "The clock is too coarse for the sampling; give the time with more digits.",
             )
         if wrong.sum() > max(3, MOST_WRONG * t.size):
@@ -145,7 +159,7 @@ def _rising(path: Path, rows: NDArray[np.int64], t: Array, keep: Mask, hint: str
     index = np.flatnonzero(np.isfinite(t))
     at = int(index[1:][np.diff(t[index]) < 0][0])
     raise SrfError(
-        f"{span(path, rows, t, at, at)}: the time goes back, from {t[:at][np.isfinite(t[:at])][-1]:.10g} s, and stays back",
+        f"{place.span(at, at)}: the time goes back, from {t[:at][np.isfinite(t[:at])][-1]:.10g} s, and stays back",
         hint or "Two recordings in one file? Part them, or choose one with window = [from, to].",
     )
 
@@ -186,7 +200,7 @@ def find_sampling(t: Array) -> Sampling:
 
 
 def _trimmed(rate: Rate, steps: Array, before: Rate | None) -> Rate:
-    """Return the rate with its beginning where its own interval begins, which a running median misses by a few samples."""
+    """Return the rate with its beginning corrected, which the running median of intervals misses by a few samples."""
     if before is None:
         return rate
     middle = 0.5 * np.log(rate.interval / before.interval)
@@ -204,32 +218,32 @@ def _local_median(steps: Array) -> Array:
 
 
 def _spread(steps: Array) -> Array:
-    """Return an upper quintile of the intervals nearby: uneven sampling is no string of gaps."""
+    """Return the 80th percentile of the intervals nearby, so that uneven sampling does not count as gaps."""
     from scipy.ndimage import percentile_filter
 
     return np.asarray(percentile_filter(steps, 80, size=min(8 * SHORTEST + 1, steps.size), mode="nearest"))
 
 
-def sampling_notices(path: Path, rows: NDArray[np.int64], t: Array, sampling: Sampling) -> list[Notice]:
+def sampling_notices(place: Place, sampling: Sampling) -> list[Notice]:
     """Return a notice for every gap and every change of the sampling rate."""
-    notices = []
+    t, name, notices = place.t, place.path.name, []
     if sampling.gaps.size > MOST_NOTICES:
         longest = float(np.diff(t)[sampling.gaps].max())
-        first = ", ".join(str(r) for r in rows[sampling.gaps[:4]])
-        where = f"{path.name}: {sampling.gaps.size} places, the first after rows {first}"
+        first = ", ".join(str(r) for r in place.rows[sampling.gaps[:4]])
+        where = f"{name}: {sampling.gaps.size} places, the first after rows {first}"
         notices.append(Notice("gap", where, f"gaps of up to {longest:.4g} s; {_BRIDGED}"))
     else:
         for gap in sampling.gaps.tolist():
             usual = next(r.interval for r in sampling.rates if r.first <= gap < r.last)
             what = f"{t[gap + 1] - t[gap]:.4g} s without a sample, where one comes every {usual:.4g} s; {_BRIDGED}"
-            notices.append(Notice("gap", span(path, rows, t, gap, gap + 1), what))
+            notices.append(Notice("gap", place.span(gap, gap + 1), what))
     if len(sampling.rates) - 1 > MOST_NOTICES:
         rates = [1 / r.interval for r in sampling.rates]
         what = f"the sampling changes between {min(rates):.4g} Hz and {max(rates):.4g} Hz; each sample keeps its time"
-        notices.append(Notice("sampling-change", f"{path.name}: {len(rates) - 1} places", what))
+        notices.append(Notice("sampling-change", f"{name}: {len(rates) - 1} places", what))
         return notices
     for before, after in pairwise(sampling.rates):
         rates = [1 / before.interval, 1 / after.interval]
         what = f"the sampling changes from {rates[0]:.4g} Hz to {rates[1]:.4g} Hz; each sample keeps its time"
-        notices.append(Notice("sampling-change", span(path, rows, t, after.first, after.first), what))
+        notices.append(Notice("sampling-change", place.span(after.first, after.first), what))
     return notices

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.files import open_plain
-from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit
+from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, split_heading
+from srfcli.data.clock import Mask, Place
 from srfcli.data.description import ROLES, ColumnSpec, RunDescription, check_unit
 from srfcli.data.values import BESIDE, OBSERVABLES
-from srfcli.laws.registry import Entry, Registry
+from srfcli.laws.registry import Registry
 from srfcli.laws.values import Reader, Source
 
-# From a file to its columns: which reader opens it, and that what the reader gives is what readers promise.
+# From a file to its columns: which reader opens it, and a check of what the reader returns.
 
 SNIFFED = 4096  # bytes
 SLICE = 2**18  # rows that are taken from an array at a time
@@ -33,7 +34,7 @@ def open_source(path: Path, *, registry: Registry, format: str | None = None) ->
     Raises SrfError where the file is missing or empty, where no reader or more than one knows it, and for what readers refuse.
     """
     head = _head(path)
-    reader = _named(registry, format) if format else _sniffed(path, head, registry)
+    reader = registry.reader(registry.find("reader", format)) if format else _sniffed(path, head, registry)
     try:
         found = reader.read(path)
     except SrfError:
@@ -43,14 +44,7 @@ def open_source(path: Path, *, registry: Registry, format: str | None = None) ->
     source = found if isinstance(found, Source) else _from_mapping(found, reader, path)
     if not source.headings or not all(isinstance(h, str) for h in source.headings):
         raise SrfError(f"{path}: the reader '{reader.name}' finds no columns", "Check the file, or name its kind.")
-    return Source(
-        source.headings,
-        lambda columns: _guarded(source, columns, reader, path),
-        source.rows,
-        source.whole,
-        source.remarks,
-        source.about,
-    )
+    return replace(source, blocks=lambda columns: _guarded(source, columns, reader, path))
 
 
 def _head(path: Path) -> bytes:
@@ -69,12 +63,8 @@ def _head(path: Path) -> bytes:
     return head
 
 
-def _named(registry: Registry, name: str) -> Reader:
-    return registry.reader(registry.find("reader", name))
-
-
 def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
-    """Return the reader whose test the first bytes pass; one that has no test goes by the file's ending, and comes first."""
+    """Return the reader of a file: one that goes by its ending alone, else the one whose test the first bytes pass."""
     readers = [(entry, registry.reader(entry)) for entry in registry.entries("reader")]
     by_suffix = [(e, r) for e, r in readers if r.sniff is None and path.suffix.lower() in r.suffixes]
     found = by_suffix or [(e, r) for e, r in readers if r.sniff is not None and _passes(r, head)]
@@ -86,15 +76,9 @@ def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
     if not found:
         raise SrfError(f"{path}: no reader knows this kind of file", f'Name one with format = "...": {names}.')
     if len(found) > 1:
-        raise SrfError(
-            f"{path}: {_listed([e for e, _ in found])} would read this file",
-            f'Choose with format = "{found[0][0].name}".',
-        )
+        listed = " and ".join(f"'{e.name}' ({e.origin})" for e, _ in found)
+        raise SrfError(f"{path}: {listed} would read this file", f'Choose with format = "{found[0][0].name}".')
     return found[0][1]
-
-
-def _listed(entries: Sequence[Entry]) -> str:
-    return " and ".join(f"'{e.name}' ({e.origin})" for e in entries)
 
 
 def _passes(reader: Reader, head: bytes) -> bool:
@@ -145,7 +129,7 @@ def _from_mapping(found: object, reader: Reader, path: Path) -> Source:
 
 
 def _guarded(source: Source, columns: tuple[int, ...], reader: Reader, path: Path) -> Iterator[Sequence[Array]]:
-    """Yield blocks of float arrays of equal length, whatever the reader does."""
+    """Yield the reader's blocks as float arrays of equal length; raises SrfError for anything else that it does."""
     blocks = iter(source.blocks(columns))
     while True:
         try:
@@ -166,8 +150,6 @@ def _guarded(source: Source, columns: tuple[int, ...], reader: Reader, path: Pat
 
 LIMIT = 512 * 2**20  # bytes of needed columns that are held at a time
 HUGE = 1e30  # um, s, N: no measurement, but a gauge's word for none
-LONGEST = 500  # characters of a heading that are looked through for its unit
-_HEADING = re.compile(r"\s*(.*?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
 
 
 @dataclass(frozen=True)
@@ -198,13 +180,18 @@ class Columns:
     notices: tuple[Notice, ...]
     remarks: Mapping[str, str] = field(default_factory=dict)
 
+    def kept(self, keep: Mask) -> Columns:
+        """Return the columns with these samples (n,) alone."""
+        arrays = {role: values[keep] for role, values in self.arrays.items()}
+        return replace(self, rows=self.rows[keep], seconds=self.seconds[keep], arrays=arrays)
 
-def split_heading(heading: str) -> tuple[str, str | None]:
-    """Return the name and the unit of `name [unit]` or `name (unit)`; the unit is None for a bare name."""
-    match = _HEADING.fullmatch(heading) if len(heading) <= LONGEST else None
-    if match is None:
-        return heading.strip(), None
-    return match[1], match[2] if match[2] is not None else match[3]
+    def place(self, role: str) -> Place:
+        """Return where a role's numbers stand in the file."""
+        return Place(self.path, self.channels[role].heading, self.rows, self.seconds)
+
+    def role(self, *roles: str) -> str | None:
+        """Return the first of these roles that a column plays, None where none does."""
+        return next((role for role in roles if role in self.arrays), None)
 
 
 def read_columns(
@@ -216,7 +203,7 @@ def read_columns(
     geometry: Geometry = NO_GEOMETRY,
 ) -> Columns:
     """Return what the run needs of its file; raises SrfError for a missing column, a wrong unit or too large a recording."""
-    finder = _Finder(run.file, source.headings, specs, geometry)
+    finder = Finder(run.file, source.headings, specs, geometry)
     channels = _needed(run, finder)
     notices = list(finder.notices)
     _refuse_large(run, source, len(channels), limit)
@@ -230,11 +217,11 @@ def read_columns(
     return Columns(run.file, first, rows, kept[0], arrays, named, tuple(notices), remarks)
 
 
-class _Finder:
-    """The headings of a file, looked up by role."""
+class Finder:
+    """The headings of a file, looked up by role; `specs` are those of [columns]."""
 
     def __init__(
-        self, path: Path, headings: tuple[str, ...], specs: Mapping[str, ColumnSpec], geometry: Geometry
+        self, path: Path, headings: tuple[str, ...], specs: Mapping[str, ColumnSpec], geometry: Geometry = NO_GEOMETRY
     ) -> None:
         self.path, self.headings, self.specs, self.geometry = path, headings, specs, geometry
         self.parts = [split_heading(h) for h in headings]
@@ -302,7 +289,7 @@ def _plain(name: str) -> str:
     return re.sub(r"[\s_\-]+", "_", name.strip().lower())
 
 
-def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
+def _needed(run: RunDescription, finder: Finder) -> list[Channel]:
     """Return the channels of a run, the time first."""
     time = finder.find("time")
     names = [name for name, _ in finder.parts]
@@ -348,7 +335,7 @@ def _needed(run: RunDescription, finder: _Finder) -> list[Channel]:
     return [*channels, *([moves] if moves else []), *weights[:1]]
 
 
-def _wanted(run: RunDescription, finder: _Finder) -> list[Channel]:
+def _wanted(run: RunDescription, finder: Finder) -> list[Channel]:
     """Return the channels of the observables that a run lists, one of the spring first."""
     found = []
     for number, role in enumerate(run.observables):
@@ -430,9 +417,8 @@ def _collect(
         row += inside.size
     columns = [np.concatenate([p[k] for p in pieces]) if pieces else np.empty(0) for k in range(len(channels))]
     known = np.flatnonzero(np.isfinite(columns[0]))
-    part = (
-        slice(known[0], known[-1] + 1) if known.size else slice(0, 0)
-    )  # what has no time belongs where its neighbours are
+    # what has no time belongs where its neighbours are
+    part = slice(known[0], known[-1] + 1) if known.size else slice(0, 0)
     return [c[part] for c in columns], np.concatenate([np.empty(0, np.int64), *numbers])[part], first
 
 

@@ -1,4 +1,7 @@
-"""`experiment.toml` in the format `srf-experiment/1`, read without opening a data file; a breach names file, line and key."""
+"""`experiment.toml` in the format `srf-experiment/1`, read and validated without opening a data file.
+
+What breaks the format is answered with file, line and key.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,16 @@ import contextlib
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from srfcli.core.errors import SrfError, did_you_mean, printable, shown
 from srfcli.core.files import check_plain, parse_toml, read_text, recover
 from srfcli.core.units import (
+    GEOMETRY_UNITS,
     NO_GEOMETRY,
     Geometry,
     find_unit,
@@ -23,8 +27,7 @@ from srfcli.core.units import (
     split_quantity,
     unit_factor,
 )
-
-# `experiment.toml` in the format `srf-experiment/1`, read and validated without opening any data file.
+from srfcli.data.values import BESIDE, OBSERVABLES
 
 FORMAT = "srf-experiment/1"
 FILE_NAME = "experiment.toml"
@@ -34,35 +37,20 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
     "load_point_displacement": "um",
     "normal_load": "N",
     "normal_stress": "MPa",
-    "elongation": "um",
-    "force": "N",
+    **OBSERVABLES,
     "shear_stress": "MPa",
-    "friction": "1",
-    "slip": "um",
-    "contact_area": "1",
+    **BESIDE,
 }
-READABLE = ("elongation", "force", "shear_stress", "friction", "slip", "contact_area")  # what `observables` may list
+READABLE = (*OBSERVABLES, "shear_stress", *BESIDE)  # what `observables` may list
 MOST_OBSERVABLES = 3  # of a run
 CORRECTIONS = ("reset", "spike")  # of a run: what is proposed, and made only where it is asked for
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
 _TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs", "thresholds")
 _COLUMN = ("name", "unit", "scale", "offset", "integrate")
 _RUN = (
-    "name",
-    "file",
-    "format",
-    "holdout",
-    "window",
-    "drive",
-    "start",
-    "load",
-    "modulation",
-    "initial",
-    "direction",
-    "corrections",
-    "observables",
-    "segments",
-)
+    "name", "file", "format", "holdout", "window", "drive", "start", "load", "modulation", "initial", "direction",
+    "corrections", "observables", "segments",
+)  # fmt: skip
 _THRESHOLDS = ("name", "file", "holdout", "frequency")
 _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
 _TABLES = '[[thresholds]] with file = "....csv" for each table of critical loads.'
@@ -72,16 +60,20 @@ _TABLES = '[[thresholds]] with file = "....csv" for each table of critical loads
 class Apparatus:
     """The loading stage: `stiffness` in N/um, or in 1/um where `per_load` (friction per micron), and the mass or None.
 
-    `text` states it in N/um or 1/um, `unit` is which of the two, `stated` the unit that the description has.
+    `text` states it in N/um or 1/um, `stated` is the unit that the description has.
     """
 
     stiffness: float
     per_load: bool
     text: str
-    unit: str
     stated: str
     mass: float | None
     geometry: Geometry = NO_GEOMETRY
+
+    @property
+    def unit(self) -> str:
+        """Return the unit of `stiffness`."""
+        return "1/um" if self.per_load else "N/um"
 
 
 @dataclass(frozen=True)
@@ -98,7 +90,10 @@ class ColumnSpec:
 
 @dataclass(frozen=True)
 class RunDescription:
-    """What the description says of one run; `drive` holds (duration, velocity) pairs, None where columns say it."""
+    """What the description says of one run; `drive` holds (duration, velocity) pairs, None where columns say it.
+
+    `observables` are the columns that are compared with the model together; where none is listed, `read_columns` chooses one.
+    """
 
     name: str
     file: Path
@@ -153,23 +148,20 @@ def read_description(path: Path) -> Description:
     if declared.value != FORMAT:
         declared.expected(f'"{FORMAT}"', start)
     root.keys(_TOP)
-    title = root.get("title")
     apparatus = root.require("apparatus", '[apparatus] with stiffness = "0.21 N/um".').table("[apparatus].")
-    parameters, columns, tables = root.get("parameters"), root.get("columns"), root.get("thresholds")
     machine = _apparatus(apparatus)
-    if tables is None:
+    if root.get("thresholds") is None:
         root.require("runs", _RUNS)
-    recorded = root.get("runs")
-    runs = _runs(recorded, machine.geometry) if recorded else ()
+    runs = root.read("runs", lambda node: _runs(node, machine.geometry), ())
     return Description(
         path=file,
-        title=title.text() if title else "",
+        title=root.read("title", Node.text, ""),
         apparatus=machine,
         model=root.require("model", '[model] with law = "srf-vsat" and ageing = "dieterich".').table("[model]."),
-        parameters=parameters.table("[parameters].") if parameters else None,
-        columns=_columns(columns.table("[columns]."), machine.geometry) if columns else {},
+        parameters=root.read("parameters", lambda node: node.table("[parameters]."), None),
+        columns=root.read("columns", lambda node: _columns(node.table("[columns]."), machine.geometry), {}),
         runs=runs,
-        thresholds=_thresholds(tables, machine, runs) if tables else (),
+        thresholds=root.read("thresholds", lambda node: _thresholds(node, machine, runs), ()),
     )
 
 
@@ -192,7 +184,7 @@ def find_file(path: Path) -> Path:
 
 
 def _apparatus(node: Node) -> Apparatus:
-    node.keys(("stiffness", "mass", "radius", "thickness", "area"))
+    node.keys(("stiffness", "mass", *GEOMETRY))
     geometry = _geometry(node)
     hint = 'Write stiffness = "0.21 N/um", "1.5 MPa/mm", or "1.0e-3 1/um" for friction per micron.'
     stiffness = node.require("stiffness", hint)
@@ -203,7 +195,8 @@ def _apparatus(node: Node) -> Apparatus:
         if not unit:
             stiffness.fail(f"'{stiffness.value}' has no unit, and two are possible", hint)
         per_load = same_dimension(unit, "1/um")
-        value = number * unit_factor(unit, "1/um" if per_load else "N/um", geometry)
+        base = "1/um" if per_load else "N/um"
+        value = number * unit_factor(unit, base, geometry)
     except SrfError as error:
         if error.message.startswith(str(node.file)):
             raise
@@ -217,25 +210,22 @@ def _apparatus(node: Node) -> Apparatus:
         mass.expected('a mass of 0 or more, as "2.37 kg"')
     if mass and kilograms and geometry.area:
         mass.fail("a mass beside an area, with which forces count as stresses", "Leave one of the two out.")
-    base = "1/um" if per_load else "N/um"
     plain = not is_stress(unit) and (per_load or find_unit(unit).powers == (-1, 0, 1, 0)) and not geometry.area
     text = stiffness.value if plain else f"{value!r} {base}"  # nothing below this knows of stresses and of geometry
     stated = "MPa/um" if geometry.area and not per_load else unit if plain or is_stress(unit) else base
-    return Apparatus(value, per_load, text, base, stated, kilograms * 1e-6 if kilograms else None, geometry)
+    return Apparatus(value, per_load, text, stated, kilograms * 1e-6 if kilograms else None, geometry)
 
 
 def _geometry(node: Node) -> Geometry:
     """Return what turns torques, angles, strains and forces into what is compared."""
     found: dict[str, float] = {}
-    for key, unit in (("radius", "um"), ("thickness", "um"), ("area", "mm^2")):
+    for key, unit in GEOMETRY_UNITS.items():
         entry = node.get(key)
         if entry is None:
             continue
         if not isinstance(entry.value, str):
             entry.expected("text with a number and its unit", f'Write {key} = "{GEOMETRY[key]}".')
-        found[key] = entry.quantity(unit)
-        if not found[key] > 0:
-            entry.expected(f"{'an' if key == 'area' else 'a'} {key} above 0")
+        found[key] = entry.positive(unit, f"{'an' if key == 'area' else 'a'} {key} above 0")
     return Geometry(**found)
 
 
@@ -249,7 +239,7 @@ def _columns(node: Node, geometry: Geometry) -> dict[str, ColumnSpec]:
             continue
         entry.table(f'{role} = {{ name = "...", unit = "{ROLES[role]}" }}.').keys(_COLUMN)
         name = entry.require("name", "Give the column's heading in the data file.").text()
-        unit, scale, offset, integrate = (entry.get(key) for key in _COLUMN[1:])
+        unit, scale, integrate = (entry.get(key) for key in ("unit", "scale", "integrate"))
         if unit:
             check_unit(unit.text(), role, unit, geometry=geometry)
         if scale and scale.number() == 0:
@@ -258,10 +248,10 @@ def _columns(node: Node, geometry: Geometry) -> dict[str, ColumnSpec]:
             integrate.fail("only the time may be integrated, from sample intervals", "Take `integrate` away.")
         specs[role] = ColumnSpec(
             name,
-            unit.text() if unit else None,
-            scale.number() if scale else 1.0,
-            offset.number() if offset else 0.0,
-            integrate.boolean() if integrate else False,
+            entry.read("unit", Node.text, None),
+            entry.read("scale", Node.number, 1.0),
+            entry.read("offset", Node.number, 0.0),
+            entry.read("integrate", Node.boolean, False),
             entry,
         )
     return specs
@@ -300,44 +290,29 @@ def _run(node: Node, geometry: Geometry) -> RunDescription:
     if not name.text().strip():
         name.expected("a name")
     file = node.require("file", 'Write file = "steps.csv", relative to the experiment\'s folder.')
-    if not file.text().strip() or "\0" in file.text():
-        file.expected("the name of a data file")
-    holdout, format, start, initial = (node.get(key) for key in ("holdout", "format", "start", "initial"))
-    drive, load, window, direction = (node.get(key) for key in ("drive", "load", "window", "direction"))
-    if direction and direction.text() not in ("forward", "backward"):
-        direction.expected('"forward" or "backward"', did_you_mean(direction.text(), ("forward", "backward")))
-    if initial and initial.text() not in ("steady", "free"):
-        initial.expected('"steady" or "free"', did_you_mean(initial.text(), ("steady", "free")))
-    weight = load.quantity("N", geometry) if load else None
-    if load and weight is not None and not weight > 0:
-        load.expected('a load above 0, as "5 N"')
-    modulation = node.get("modulation")
     return RunDescription(
         name=name.text(),
-        file=node.file.parent / file.text(),
-        format=format.text() if format else None,
-        holdout=holdout.boolean() if holdout else False,
-        window=_window(window) if window else None,
-        drive=_drive(drive) if drive else None,
-        start=start.quantity("um") if start else 0.0,
-        load=weight,
-        modulation=_modulation(modulation) if modulation else None,
-        initial=initial.text() if initial else "steady",
+        file=file.beside("the name of a data file"),
+        format=node.read("format", Node.text, None),
+        holdout=node.read("holdout", Node.boolean, False),
+        window=node.read("window", _window, None),
+        drive=node.read("drive", _drive, None),
+        start=node.read("start", lambda start: start.quantity("um"), 0.0),
+        load=node.read("load", lambda load: load.positive("N", 'a load above 0, as "5 N"', geometry), None),
+        modulation=node.read("modulation", _modulation, None),
+        initial=node.read("initial", lambda initial: initial.choice(("steady", "free")), "steady"),
         node=node,
-        backward=direction is not None and direction.text() == "backward",
-        corrections=_corrections(node.get("corrections")),
-        observables=_observables(node.get("observables")),
-        segments=_segments(node.get("segments")),
+        backward=node.read("direction", lambda way: way.choice(("forward", "backward")), "forward") == "backward",
+        corrections=node.read("corrections", _corrections, frozenset()),
+        observables=node.read("observables", _observables, ()),
+        segments=node.read("segments", _segments, ()),
     )
 
 
-def _segments(node: Node | None) -> tuple[float, ...]:
+def _segments(node: Node) -> tuple[float, ...]:
     """Return the times at which a run may be cut, rising."""
-    if node is None:
-        return ()
-    if not isinstance(node.value, list):
-        node.expected("a list of times in s of the file's own clock", "Write segments = [120.0, 240.0].")
-    times = [node.child(i).quantity("s") for i in range(len(node.value))]
+    listed = node.items("times in s of the file's own clock", "Write segments = [120.0, 240.0].")
+    times = [entry.quantity("s") for entry in listed]
     if any(b <= a for a, b in pairwise(times)):
         node.fail("the times do not rise", "Give the earlier time first.")
     return tuple(times)
@@ -348,63 +323,51 @@ def _thresholds(node: Node, machine: Apparatus, runs: tuple[RunDescription, ...]
     stress = "counts stresses" if machine.geometry.area or is_stress(machine.stated) else ""
     if machine.per_load or stress:
         which = stress or "has a stiffness in friction per micron, which leaves no load to be critical"
-        entries[0].fail(f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.')
+        entries[0].fail(
+            f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.'
+        )
     found: list[ThresholdsDescription] = []
     for entry in entries:
         entry.keys(_THRESHOLDS)
         file = entry.require("file", 'Write file = "critical-loads.csv", relative to the experiment\'s folder.')
-        if not file.text().strip() or "\0" in file.text():
-            file.expected("the name of a table of critical loads")
-        name, holdout, frequency = (entry.get(key) for key in ("name", "holdout", "frequency"))
+        place, name = file.beside("the name of a table of critical loads"), entry.get("name")
         if name and not name.text().strip():
             name.expected("a name")
-        if frequency and not frequency.quantity("Hz") > 0:
-            frequency.expected("a frequency above 0")
+        frequency = entry.read("frequency", lambda node: node.positive("Hz", "a frequency above 0"), None)
         called = name.text() if name else Path(file.text()).stem
         if called in {*(run.name for run in runs), *(other.name for other in found)}:
-            (name or file).fail(f"'{called}' is the name of another run or table", 'Give it one of its own: name = "...".')
-        found.append(
-            ThresholdsDescription(
-                called,
-                entry.file.parent / file.text(),
-                holdout.boolean() if holdout else False,
-                frequency.quantity("Hz") if frequency else None,
-                entry,
+            (name or file).fail(
+                f"'{called}' is the name of another run or table", 'Give it one of its own: name = "...".'
             )
-        )
+        holdout = entry.read("holdout", Node.boolean, False)
+        found.append(ThresholdsDescription(called, place, holdout, frequency, entry))
     return tuple(found)
 
 
-def _corrections(node: Node | None) -> frozenset[str]:
+def _corrections(node: Node) -> frozenset[str]:
     """Return which of the corrections that `srf check` proposes are made."""
-    if node is None:
-        return frozenset()
-    if not isinstance(node.value, list):
-        node.expected("a list of corrections", f"Write corrections = {list(CORRECTIONS)}, or one of them.")
-    for index in range(len(node.value)):
-        entry = node.child(index)
+    for entry in node.items("corrections", f"Write corrections = {list(CORRECTIONS)}, or one of them."):
         if entry.text() not in CORRECTIONS:
             entry.fail(f"unknown correction '{entry.text()}'", did_you_mean(entry.text(), CORRECTIONS))
     return frozenset(node.value)
 
 
-def _observables(node: Node | None) -> tuple[str, ...]:
-    """Return which columns of a run are compared with the model together; none listed, the reader's rule chooses one."""
-    if node is None:
-        return ()
-    example = 'Write observables = ["elongation", "slip"].'
-    if not isinstance(node.value, list) or not node.value:
-        node.expected("a list of observables", example)
-    names = [node.child(index).text() for index in range(len(node.value))]
-    for index, name in enumerate(names):
+def _observables(node: Node) -> tuple[str, ...]:
+    """Return which columns of a run are compared with the model together."""
+    listed = node.items("observables", 'Write observables = ["elongation", "slip"].', fewest=1)
+    names = [entry.text() for entry in listed]
+    for index, (entry, name) in enumerate(zip(listed, names, strict=True)):
         if name not in READABLE:
-            node.child(index).fail(f"unknown observable '{name}'", did_you_mean(name, READABLE))
+            entry.fail(f"unknown observable '{name}'", did_you_mean(name, READABLE))
         if name in names[:index] or ({"force", "shear_stress"} <= set(names)):
-            node.child(index).fail(f"'{name}' is the same observable as another one", "Name each once.")
+            entry.fail(f"'{name}' is the same observable as another one", "Name each once.")
     if len(names) > MOST_OBSERVABLES:
         node.fail(f"{len(names)} observables", f"A run has {MOST_OBSERVABLES} at most.")
-    if not set(names) - {"slip", "contact_area"}:
-        node.fail(f"{' and '.join(names)} without a force", "One of elongation, force, shear_stress, friction is needed besides.")
+    if not set(names) - BESIDE.keys():
+        node.fail(
+            f"{' and '.join(names)} without a force",
+            "One of elongation, force, shear_stress, friction is needed besides.",
+        )
     return tuple(names)
 
 
@@ -424,9 +387,7 @@ def _drive(node: Node) -> tuple[tuple[float, float], ...]:
         step.keys(("duration", "velocity"))
         duration = step.require("duration", "Every step of a drive has a duration in s.")
         velocity = step.require("velocity", "Every step of a drive has a velocity in um/s.").quantity("um/s")
-        if not duration.quantity("s") > 0:
-            duration.expected("a duration above 0")
-        steps.append((duration.quantity("s"), velocity))
+        steps.append((duration.positive("s", "a duration above 0"), velocity))
     return tuple(steps)
 
 
@@ -435,18 +396,18 @@ def _modulation(node: Node) -> tuple[float, float, float]:
     node.keys(("frequency", "amplitude", "onset"))
     frequency = node.require("frequency", "Give it in Hz: frequency = 120.0.")
     amplitude = node.require("amplitude", "Give it relative to the mean load: amplitude = 0.09.")
-    onset = node.get("onset")
-    if not frequency.quantity("Hz") > 0:
-        frequency.expected("a frequency above 0")
+    f = frequency.positive("Hz", "a frequency above 0")
     if not 0 <= amplitude.quantity("1") < 1:
         amplitude.expected("a relative amplitude from 0 to below 1", "At 1 the slider lifts off.")
-    return frequency.quantity("Hz"), amplitude.quantity("1"), onset.quantity("s") if onset else 0.0
+    return f, amplitude.quantity("1"), node.read("onset", lambda onset: onset.quantity("s"), 0.0)
 
 
 # A value in a TOML file that knows where it stands: every breach is told with file, line, key, finding and expectation.
 
 SMALLEST = 1e-30  # of a number that is not zero: powers and products of it are numbers, too
 LARGEST = 16 * 2**20  # bytes of a description
+Value = TypeVar("Value")
+Other = TypeVar("Other")
 
 
 @dataclass(frozen=True)
@@ -472,6 +433,14 @@ class Node:
         """Raise SrfError that names this place."""
         raise SrfError(printable(f"{self.where}: {message}", line=True), hint)
 
+    @contextlib.contextmanager
+    def blamed(self) -> Iterator[None]:
+        """Name this place in an SrfError that is raised meanwhile."""
+        try:
+            yield
+        except SrfError as error:
+            self.fail(error.message, error.hint)
+
     def expected(self, what: str, hint: str | None = None) -> NoReturn:
         """Raise SrfError that says what was found here and what was expected."""
         self.fail(f"found {shown(self.value)}, expected {what}", hint)
@@ -483,6 +452,11 @@ class Node:
     def get(self, key: str) -> Node | None:
         """Return the value under a key, None where there is none."""
         return self.child(key) if key in self.value else None
+
+    def read(self, key: str, how: Callable[[Node], Value], default: Other) -> Value | Other:
+        """Return what `how` makes of the value under a key, the default where there is none."""
+        node = self.get(key)
+        return default if node is None else how(node)
 
     def require(self, key: str, hint: str) -> Node:
         """Return the value under a key; raises SrfError where there is none."""
@@ -509,11 +483,23 @@ class Node:
         for index in range(len(self.value)):
             yield self.child(index).table(example)
 
+    def items(self, what: str, hint: str, *, fewest: int = 0) -> list[Node]:
+        """Return the elements of this value, which must be a list of `what`."""
+        if not isinstance(self.value, list) or len(self.value) < fewest:
+            self.expected(f"a list of {what}", hint)
+        return [self.child(index) for index in range(len(self.value))]
+
     def text(self) -> str:
         """Return this value, which must be text."""
         if not isinstance(self.value, str):
             self.expected("text in quotes")
         return self.value
+
+    def choice(self, known: Sequence[str]) -> str:
+        """Return this value, which must be one of these words."""
+        if self.text() not in known:
+            self.expected(" or ".join(f'"{word}"' for word in known), did_you_mean(self.text(), known))
+        return self.text()
 
     def boolean(self) -> bool:
         """Return this value, which must be true or false."""
@@ -531,9 +517,7 @@ class Node:
             number = math.inf
         if not math.isfinite(number):
             self.expected("a finite number")
-        if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
-            self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g}")
-        return number
+        return self._sized(number)
 
     def quantity(self, unit: str, geometry: Geometry = NO_GEOMETRY) -> float:
         """Return this value in `unit`: a number in that unit, or text with a unit of its dimension."""
@@ -542,15 +526,30 @@ class Node:
                 example = "0.5" if unit == "1" else f'0.5 or "0.5 {unit}"'
                 self.expected(f"a number in {unit}" if unit != "1" else "a number", f"Write {example}.")
             return self.number()
-        try:
-            name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
+        name = next((key for key in reversed(self.place) if isinstance(key, str)), "value")
+        with self.blamed():
             number, written = split_quantity(self.value, name=name, example=f"0.5 {unit}" if unit != "1" else "0.5")
             number *= unit_factor(written, unit, geometry) if written else 1.0
-            if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
-                self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g} {unit}")
-            return number
-        except SrfError as error:
-            self.fail(error.message, error.hint)
+        return self._sized(number, f" {unit}")
+
+    def positive(self, unit: str, what: str, geometry: Geometry = NO_GEOMETRY) -> float:
+        """Return this value in `unit`; it must be above 0, which `what` says."""
+        value = self.quantity(unit, geometry)
+        if not value > 0:
+            self.expected(what)
+        return value
+
+    def beside(self, what: str) -> Path:
+        """Return the path that this text, relative to the file's folder, names; `what` says what it is."""
+        if not self.text().strip() or "\0" in self.text():
+            self.expected(what)
+        return self.file.parent / self.text()
+
+    def _sized(self, number: float, unit: str = "") -> float:
+        """Return a number, which must be 0 or of a size that can be computed with."""
+        if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
+            self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g}{unit}")
+        return number
 
 
 def open_node(path: Path) -> Node:
@@ -584,8 +583,12 @@ def _spelled(place: Place) -> str:
 
 Place = tuple[str | int, ...]
 
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
+_KEY = re.compile(r"""[ \t]*(?:"((?:\\.|[^"\\])*)"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*(\.?)""")
+_STRING = re.compile(
+    r"""\"{3}(?:\\.|[^"\\]|"{1,2}(?!"))*"{3,5}|'{3}(?:[^']|'{1,2}(?!'))*'{3,5}|"(?:\\.|[^"\\])*"|'[^']*'""", re.DOTALL
+)
 _SCALAR = re.compile(r"[^,\]}#\n]+")
+_SPACE = re.compile(r"[ \t]*")
 _BLANK = re.compile(r"(?:[ \t\r\n]|#[^\n]*)*")
 
 
@@ -612,19 +615,17 @@ class _Scanner:
     def note(self, place: Place) -> None:
         self.lines.setdefault(place, bisect_right(self.starts, self.at))
 
-    def blank(self) -> None:
-        match = _BLANK.match(self.text, self.at)
+    def skip(self, pattern: re.Pattern[str]) -> re.Match[str]:
+        """Pass what stands here, which is of this pattern."""
+        match = pattern.match(self.text, self.at)
         assert match is not None
         self.at = match.end()
-
-    def spaces(self) -> None:
-        while self.text[self.at : self.at + 1] in (" ", "\t"):
-            self.at += 1
+        return match
 
     def document(self) -> None:
         table: Place = ()
         while True:
-            self.blank()
+            self.skip(_BLANK)
             if self.at >= len(self.text):
                 return
             if self.text[self.at] == "[":
@@ -633,37 +634,30 @@ class _Scanner:
                 self.pair(table)
 
     def header(self) -> Place:
-        double = self.text.startswith("[[", self.at)
-        self.at += 2 if double else 1
-        keys = self.keys()
+        """Pass [table] or [[table]]; return its place, with the number of the element where it is one of an array."""
+        brackets = 2 if self.text.startswith("[[", self.at) else 1
+        self.at += brackets
         place: Place = ()
-        for index, key in enumerate(keys):
+        keys = self.keys()
+        for index, key in enumerate(keys, 1):
             place = (*place, key)
-            last = index == len(keys) - 1
-            if double and last:
+            if brackets == 2 and index == len(keys):
                 self.counts[place] = self.counts.get(place, 0) + 1
             self.note(place)
             if place in self.counts:
                 place = (*place, self.counts[place] - 1)
                 self.note(place)
-        self.at += 2 if double else 1
+        self.at += brackets
         return place
 
     def keys(self) -> tuple[str, ...]:
+        """Pass a dotted key and return its parts; escapes in them are left as they are."""
         found = []
         while True:
-            self.spaces()
-            if self.text[self.at] in "\"'":
-                found.append(self.string())
-            else:
-                match = _BARE.match(self.text, self.at)
-                assert match is not None
-                found.append(match[0])
-                self.at = match.end()
-            self.spaces()
-            if self.text[self.at] != ".":
+            match = self.skip(_KEY)
+            found.append(next(part for part in match.groups()[:3] if part is not None))
+            if not match[4]:
                 return tuple(found)
-            self.at += 1
 
     def pair(self, table: Place) -> None:
         start, place = self.at, table
@@ -676,62 +670,27 @@ class _Scanner:
         self.value(place)
 
     def value(self, place: Place) -> None:
-        self.spaces()
+        self.skip(_SPACE)
         opening = self.text[self.at]
-        if opening in "\"'":
-            self.string()
-        elif opening == "[":
-            self.array(place)
+        if opening == "[":
+            for index, _ in enumerate(self.members("]")):
+                self.note((*place, index))
+                self.value((*place, index))
         elif opening == "{":
-            self.inline(place)
+            for _ in self.members("}"):
+                self.pair(place)
         else:
-            match = _SCALAR.match(self.text, self.at)
-            assert match is not None
-            self.at = match.end()
+            self.skip(_STRING if opening in "\"'" else _SCALAR)
 
-    def array(self, place: Place) -> None:
+    def members(self, closing: str) -> Iterator[None]:
+        """Stop at each member of an array or inline table, which the caller passes, and pass the brackets and commas."""
         self.at += 1
-        index = 0
         while True:
-            self.blank()
-            if self.text[self.at] == "]":
+            self.skip(_BLANK)
+            if self.text[self.at] == closing:
                 self.at += 1
                 return
             if self.text[self.at] == ",":
                 self.at += 1
-                continue
-            self.note((*place, index))
-            self.value((*place, index))
-            index += 1
-
-    def inline(self, place: Place) -> None:
-        self.at += 1
-        while True:
-            self.blank()
-            if self.text[self.at] == "}":
-                self.at += 1
-                return
-            if self.text[self.at] == ",":
-                self.at += 1
-                continue
-            self.pair(place)
-
-    def string(self) -> str:
-        """Pass a string and return what stands between its quotes; escapes in a key are left as they are."""
-        quote = self.text[self.at]
-        if self.text.startswith(3 * quote, self.at):
-            return self.long_string(quote)
-        start = self.at = self.at + 1
-        while self.text[self.at] != quote:
-            self.at += 2 if quote == '"' and self.text[self.at] == "\\" else 1
-        self.at += 1
-        return self.text[start : self.at - 1]
-
-    def long_string(self, quote: str) -> str:
-        start = self.at = self.at + 3
-        while not self.text.startswith(3 * quote, self.at):
-            self.at += 2 if quote == '"' and self.text[self.at] == "\\" else 1
-        while self.text[self.at + 3 : self.at + 4] == quote:  # up to two quotes may stand before the closing three
-            self.at += 1
-        self.at += 3
-        return self.text[start : self.at - 3]
+            else:
+                yield

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.files import toml_value
 from srfcli.core.settings import Parameter
-from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, is_stress, parse_quantity, split_quantity
-from srfcli.data.columns import open_source, read_columns, split_heading
+from srfcli.core.units import (
+    GEOMETRY_UNITS,
+    NO_GEOMETRY,
+    Geometry,
+    find_unit,
+    is_stress,
+    parse_quantity,
+    split_heading,
+    split_quantity,
+)
+from srfcli.data.columns import open_source, read_columns
 from srfcli.data.description import ROLES, check_unit, read_description
-from srfcli.data.experiment import moved, read_choice, read_experiment, read_parameters
+from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.imposed import Stroke, find_modulation, strokes
-from srfcli.data.values import OBSERVABLES as OBSERVED
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
 
@@ -74,10 +83,8 @@ SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
 STRESSES = {"normal_load": "normal_stress", "force": "shear_stress"}
 FORCES = {stress: force for force, stress in STRESSES.items()}
 OBSERVABLES = ("elongation", "force", "shear_stress", "friction")
-STILL, HELD = (
-    1e-3,
-    0.05,
-)  # of the fastest velocity, below which nothing slides; of the slowest sliding, below which is a hold
+STILL = 1e-3  # of the fastest velocity, below which nothing slides
+HELD = 0.05  # of the slowest sliding, below which is a hold
 SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps
 STROKES = 40  # of a file that are written
 LETTERS = "A is a, B is b, D0 is Dc (or L), mu is tau/sigma, W is sigma, K is k; a stress in MPa counts as the force on 1 mm^2"
@@ -118,8 +125,7 @@ class Wish:
 
     def geometry(self) -> Geometry:
         """Return what the rig says, in um and mm^2."""
-        units = {"radius": "um", "thickness": "um", "area": "mm^2"}
-        return Geometry(**{k: parse_quantity(v, units[k], name=f"--{k}") for k, v in self.rig.items()})
+        return Geometry(**{k: parse_quantity(v, GEOMETRY_UNITS[k], name=f"--{k}") for k, v in self.rig.items()})
 
 
 @dataclass(frozen=True)
@@ -295,7 +301,9 @@ def missing(columns: Sequence[Named], wish: Wish, path: Path, headings: Sequence
         option = "--drive VELOCITY, or --column load_point_displacement=HEADING"
         lacks.append((option, f"{path}: no column has the load point's velocity or displacement"))
     if wish.load is None and not roles & {"normal_load", "normal_stress", "friction"}:
-        lacks.append(("--load '5 N', or --column normal_stress=HEADING", f"{path}: no column has the normal load or stress"))
+        lacks.append(
+            ("--load '5 N', or --column normal_stress=HEADING", f"{path}: no column has the normal load or stress")
+        )
     return lacks
 
 
@@ -342,12 +350,13 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         if name not in sketch.names:
             raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, sketch.names))
     runs, free = _read(sketch, registry)
-    kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs)
+    modulations = _modulations(runs)
+    kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
     remarks.append(f"kind of experiment: {kind}, {why}")
     if still := [name for name in free if name not in sketch.strokes]:
         remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(still)}")
     sketch = replace(
-        sketch, kind=kind, why=why, free=free, modulations=_modulations(runs) if kind == "oscillation" else {},
+        sketch, kind=kind, why=why, free=free, modulations=modulations if kind == "oscillation" else {},
         durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
     )  # fmt: skip
     text = sketch.text(_parameters(sketch, runs, registry))
@@ -359,9 +368,7 @@ def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
     """Return the sketch with a run for each stroke of the files whose drive turns back, and what to say of it."""
     if sketch.wish.drive is not None:
         return sketch, []
-    with tempfile.TemporaryDirectory() as home:
-        file = Path(home) / "experiment.toml"
-        file.write_text(sketch.text((), absolute=True), encoding="utf-8")
+    with _as_file(sketch.text((), absolute=True)) as file:
         described = read_description(file)
         files: list[Path] = []
         names: list[str] = []
@@ -371,9 +378,7 @@ def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
             source = open_source(run.file, registry=registry, format=run.format)
             columns = read_columns(run, source, described.columns, geometry=described.apparatus.geometry)
             rising = np.isfinite(columns.seconds) & (np.diff(columns.seconds, prepend=-np.inf) > 0)
-            arrays = {role: values[rising] for role, values in columns.arrays.items()}
-            t, observed = columns.seconds[rising], arrays[next(r for r in OBSERVED if r in arrays)]
-            found = strokes(t, moved(t, arrays), observed)
+            found = strokes(columns.kept(rising))
             shown = found[:STROKES]
             files += [run.file] * max(len(shown), 1)
             names += [f"{run.name}-{k + 1}" for k in range(len(shown))] or [run.name]
@@ -384,6 +389,15 @@ def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
                     f"{run.name} slides to and fro: {len(found)} strokes{some}, a run each, from half the force on"
                 )
     return replace(sketch, files=tuple(files), names=names, strokes=parts, free=tuple(parts)), told
+
+
+@contextmanager
+def _as_file(text: str) -> Iterator[Path]:
+    """Give a file that holds a description, as long as it is read."""
+    with tempfile.TemporaryDirectory() as home:
+        file = Path(home) / "experiment.toml"
+        file.write_text(text, encoding="utf-8")
+        yield file
 
 
 def _run_names(files: Sequence[Path]) -> list[str]:
@@ -421,33 +435,33 @@ class _Sketch:
     def text(self, parameters: Sequence[str], *, absolute: bool = False) -> str:
         """Return the whole file."""
         wish = self.wish
-        lines = ['format = "srf-experiment/1"', f"title = {_quoted(wish.title or ', '.join(self.names))}"]
+        lines = ['format = "srf-experiment/1"', f"title = {toml_value(wish.title or ', '.join(self.names))}"]
         lines += ["", f"# Letters: {LETTERS}.", "", "[apparatus]"]
         lines += [
-            f"stiffness = {_quoted(wish.stiffness)}   # of the machine: N/um, MPa/mm, or 1/um for friction per micron"
+            f"stiffness = {toml_value(wish.stiffness)}   # of the machine: N/um, MPa/mm, or 1/um for friction per micron"
         ]
-        lines += [f"{key} = {_quoted(value)}   # {RIG[key]}" for key, value in wish.rig.items()]
+        lines += [f"{key} = {toml_value(value)}   # {RIG[key]}" for key, value in wish.rig.items()]
         if wish.mass:
-            lines += [f"mass = {_quoted(wish.mass)}"]
+            lines += [f"mass = {toml_value(wish.mass)}"]
         else:
             lines += ['# mass = "2.37 kg"   # of the slider; without it the slider is quasi-static']
         lines += [
             "",
             "[model]   # `srf laws` lists the laws",
-            f"law = {_quoted(wish.law)}",
-            f"ageing = {_quoted(self.ageing)}",
+            f"law = {toml_value(wish.law)}",
+            f"ageing = {toml_value(self.ageing)}",
         ]
         if not wish.ageing:
             lines[-1] += '   # ageing law; "ruina" is the slip law'
-        lines += [f"interface = {_quoted(wish.interface)}", f"inertia = {'true' if wish.mass else 'false'}"]
+        lines += [f"interface = {toml_value(wish.interface)}", f"inertia = {toml_value(bool(wish.mass))}"]
         if parameters:
             lines += ["", "[parameters]   # start values and bounds of what is fitted; a wide bound costs little"]
             lines += parameters
         said = [n for n in self.columns if n.said]
         if said:
             lines += ["", "[columns]   # what the headings of the data files mean"]
-            lines += [f"{n.role} = {{ name = {_quoted(split_heading(n.heading)[0] if self._alone(n) else n.heading)}, "
-                      f"unit = {_quoted(n.unit)} }}" for n in said]  # fmt: skip
+            lines += [f"{n.role} = {{ name = {toml_value(split_heading(n.heading)[0] if self._alone(n) else n.heading)}, "
+                      f"unit = {toml_value(n.unit)} }}" for n in said]  # fmt: skip
         if self.kind in KINDS and self.why:
             lines += ["", f"# The runs, of kind {self.kind}: {self.why}."]
         for path, name in zip(self.files, self.names, strict=True):
@@ -463,36 +477,33 @@ class _Sketch:
         home = self.folder.resolve()
         inside = home in place.parents and not absolute
         lines = [
-            f"name = {_quoted(name)}",
-            f"file = {_quoted(place.relative_to(home).as_posix() if inside else str(place))}",
+            f"name = {toml_value(name)}",
+            f"file = {toml_value(place.relative_to(home).as_posix() if inside else str(place))}",
         ]
         if wish.reader:
-            lines.append(f"format = {_quoted(wish.reader)}")
-        lines.append(f"holdout = {'true' if name in wish.holdout else 'false'}   # true: never fitted, judges the fit")
+            lines.append(f"format = {toml_value(wish.reader)}")
+        lines.append(f"holdout = {toml_value(name in wish.holdout)}   # true: never fitted, judges the fit")
         stroke = self.strokes.get(name)
         if stroke:
-            lines.append(f"window = [{stroke.begin!r}, {stroke.end!r}]   # s of the file's clock: one stroke")
+            lines.append(f"window = {toml_value([stroke.begin, stroke.end])}   # s of the file's clock: one stroke")
             lines += ['direction = "backward"   # drive and observable count with the other sign'] * stroke.backward
         elif wish.window:
-            lines.append(f"window = [{wish.window[0]!r}, {wish.window[1]!r}]   # s of the file's clock")
+            lines.append(f"window = {toml_value(wish.window)}   # s of the file's clock")
         elif not absolute:
             lines.append("# window = [0.0, 100.0]   # only this part of the recording, s of the file's clock")
-        if isinstance(wish.drive, float):
-            length = self.durations.get(name, 1e9)
-            lines.append(f"drive = [{{ duration = {length!r}, velocity = {wish.drive!r} }}]   # s, um/s")
-        elif wish.drive:
-            steps = ", ".join(f"{{ duration = {d!r}, velocity = {v!r} }}" for d, v in wish.drive)
-            lines.append(f"drive = [{steps}]   # s, um/s")
+        steps = wish.drive or ()
+        if isinstance(steps, float):
+            steps = [(self.durations.get(name, 1e9), steps)]
+        if steps:
+            lines.append(f"drive = {toml_value([{'duration': d, 'velocity': v} for d, v in steps])}   # s, um/s")
         if wish.load:
-            lines.append(f"load = {_quoted(wish.load)}")
+            lines.append(f"load = {toml_value(wish.load)}")
         if name in self.free:
             lines.append('initial = "free"   # the state at the first sample is estimated, not steady sliding')
         if name in self.modulations:
-            f, eps, onset = self.modulations[name]
-            lines.append(
-                f"modulation = {{ frequency = {f!r}, amplitude = {eps!r}, onset = {onset!r} }}"
-                "   # Hz, of the mean load, s; found in the column, which counts"
-            )
+            wave = dict(zip(("frequency", "amplitude", "onset"), self.modulations[name], strict=True))
+            told = "Hz, of the mean load, s; found in the column, which counts"
+            lines.append(f"modulation = {toml_value(wave)}   # {told}")
         return lines
 
 
@@ -500,10 +511,7 @@ def _read(sketch: _Sketch, registry: Registry) -> tuple[list[Run], tuple[str, ..
     """Return the runs as an experiment reads them, and those that have to begin from a free state."""
     free = sketch.free
     while True:
-        text = replace(sketch, free=free).text((), absolute=True)
-        with tempfile.TemporaryDirectory() as home:
-            file = Path(home) / "experiment.toml"
-            file.write_text(text, encoding="utf-8")
+        with _as_file(replace(sketch, free=free).text((), absolute=True)) as file:
             try:
                 return list(read_experiment(file, registry=registry).runs), free
             except SrfError as error:
@@ -521,18 +529,16 @@ def _read(sketch: _Sketch, registry: Registry) -> tuple[list[Run], tuple[str, ..
 
 def _check(text: str, registry: Registry) -> None:
     """Raise SrfError where a description, its model or its parameters are none."""
-    with tempfile.TemporaryDirectory() as home:
-        file = Path(home) / "experiment.toml"
-        file.write_text(text, encoding="utf-8")
+    with _as_file(text) as file:
         described = read_description(file)
         choice, known = read_choice(described.model, described.apparatus, registry)
         read_parameters(described.parameters, known, choice)
 
 
-def _kind(runs: Sequence[Run]) -> tuple[str, str]:
+def _kind(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, float]]) -> tuple[str, str]:
     """Return what kind of experiment the runs are, and the reason."""
-    if _modulations(runs):
-        name, (f, eps, _) = next(iter(_modulations(runs).items()))
+    if modulations:
+        name, (f, eps, _) = next(iter(modulations.items()))
         return "oscillation", f"as the load of {name} oscillates by {100 * eps:.3g} % at {f:.4g} Hz"
     for run in runs:
         V = np.abs(run.drive(run.t))
@@ -573,7 +579,8 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
     surface = registry.get("interface", wish.interface)
     listed: list[Parameter] = [p for each in (law, base, *modifiers, surface) for p in each.parameters]
     V = float(np.median([abs(run.drive(run.t[:1])[0]) or 1.0 for run in runs]))
-    mu = float(np.median(np.concatenate([_friction(run)[run.used] for run in runs])))
+    friction = [(run.observed * run.friction_factor(run.load(run.t)[0]))[run.used] for run in runs]
+    mu = float(np.median(np.concatenate(friction)))
     lines = []
     for p in listed:
         about = f"   # {p.about}" if p.about else ""
@@ -595,19 +602,8 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
     return lines
 
 
-def _friction(run: Run) -> np.ndarray:
-    """Return what is recorded as a friction coefficient (n,)."""
-    W = run.load(run.t)[0]
-    factor = {"elongation": run.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[run.observable]
-    return np.asarray(run.observed * factor)
-
-
 def _short(value: float) -> float:
     return float(f"{value:.3g}")
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def looks_like_recording(path: Path, *, registry: Registry) -> bool:

@@ -1,4 +1,4 @@
-"""An experiment, read and validated: the public door to recordings."""
+"""An experiment, read and validated: its model and parameters, its runs, and what is found in the data of each."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import math
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.settings import Parameter
 from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
-from srfcli.data.clock import Mask, Sampling, find_sampling, kept_samples, sampling_notices, span, spots
+from srfcli.data.clock import Mask, Place, Sampling, find_sampling, kept_samples, sampling_notices
 from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
 from srfcli.data.description import (
     Apparatus,
@@ -31,12 +31,13 @@ from srfcli.data.groups import BY, grouped
 from srfcli.data.imposed import (
     ACCIDENTS,
     DIFFERS,
-    Found,
-    Place,
+    LOADS,
+    FoundModulation,
     check_start,
     declared_drive,
     drive_differs,
-    drive_from_column,
+    drive_from_displacement,
+    drive_from_velocity,
     find_modulation,
     load_from_column,
     modulation_notices,
@@ -65,10 +66,6 @@ from srfcli.data.values import (
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation
-
-# An experiment, read and validated: the public door to recordings.
-
-__all__ = ["Array", "Experiment", "FitParameter", "ModelChoice", "Notice", "Run", "read_experiment"]
 
 
 def read_experiment(
@@ -132,7 +129,9 @@ def _check_acting(experiment: Experiment, described: Description) -> None:
 def _read_table(described: ThresholdsDescription) -> CriticalLoads:
     """Return the table of critical loads in a description's file."""
     if not described.file.exists():
-        described.node.child("file").fail(f"no file {described.file}", "Its path is relative to the experiment's folder.")
+        described.node.child("file").fail(
+            f"no file {described.file}", "Its path is relative to the experiment's folder."
+        )
     table = read_thresholds(described.file)
     if described.frequency is None and table.eps.max() > 0:
         line = table.lines[int(np.argmax(table.eps > 0))]
@@ -143,7 +142,7 @@ def _read_table(described: ThresholdsDescription) -> CriticalLoads:
     return CriticalLoads(described.name, described.file, described.holdout, described.frequency or 1.0, table)
 
 
-# The model of an experiment and its parameters, judged by the laws themselves.
+# The model of an experiment and its parameters, checked against the laws.
 
 _ENTRY = ("value", "lower", "upper", "fixed", "runs", "elsewhere")
 _IMPOSED = {
@@ -157,13 +156,9 @@ _IMPOSED = {
 
 def read_groups(node: Node) -> tuple[tuple[str, ...], str]:
     """Return which parameters have a value of their own in each group, and what makes a group."""
-    vary, by = node.get("vary"), node.get("by")
-    if vary is not None and not isinstance(vary.value, list):
-        vary.expected("a list of parameters", 'Write vary = ["mu0"].')
-    if by is not None and by.text() not in BY:
-        by.expected(" or ".join(f'"{word}"' for word in BY), did_you_mean(by.text(), BY))
-    names = tuple(vary.child(i).text() for i in range(len(vary.value))) if vary is not None else ()
-    return names, by.text() if by is not None else "run"
+    listed = node.read("vary", lambda vary: vary.items("parameters", 'Write vary = ["mu0"].'), ())
+    names = tuple(entry.text() for entry in listed)
+    return names, node.read("by", lambda by: by.choice(BY), "run")
 
 
 def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[ModelChoice, tuple[Parameter, ...]]:
@@ -175,19 +170,13 @@ def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[M
     names = [_place(law.text(), node), "+".join(_place(word, node) for word in ageing.text().split("+"))]
     surface = _place(interface.text(), node) if interface else "elastic"
     parameters: list[Parameter] = []
-    try:
+    with law.blamed():
         parameters += registry.get("friction", names[0]).parameters
-    except SrfError as error:
-        law.fail(error.message, error.hint)
-    try:
+    with ageing.blamed():
         base, modifiers = registry.ageing(names[1])
         parameters += [p for each in (base, *modifiers) for p in each.parameters]
-    except SrfError as error:
-        ageing.fail(error.message, error.hint)
-    try:
+    with (interface or node).blamed():
         parameters += registry.get("interface", surface).parameters
-    except SrfError as error:
-        (interface or node).fail(error.message, error.hint)
     moving = apparatus.mass is not None
     if inertia and inertia.boolean() and not moving:
         inertia.fail("inertia without a mass", 'Give [apparatus] mass = "2.37 kg", or inertia = false.')
@@ -204,20 +193,14 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
     """Return the effects that a model has besides its laws, as `open_model` names them, and their parameters."""
     from srfcli.symbolic.system import apart  # only for a description that has effects
 
-    if not isinstance(node.value, list):
-        node.expected(
-            "a list of effects", 'Write effects = ["load-transmission"]; `srf laws --kind effect` lists them.'
-        )
     names, found = [], []
-    for index in range(len(node.value)):
-        entry = node.child(index)
+    hint = 'Write effects = ["load-transmission"]; `srf laws --kind effect` lists them.'
+    for entry in node.items("effects", hint):
         name = _place(entry.text(), node)
         if name in names:
             entry.fail(f"'{name}' is named twice", "Once is enough.")
-        try:
+        with entry.blamed():
             effect = registry.get("effect", name)
-        except SrfError as error:
-            entry.fail(error.message, error.hint)
         assert isinstance(effect, Effect)
         if effect.settings or effect.frees:
             instead = [f"{key} = {str(value).lower()} in [model]" for key, value in effect.settings]
@@ -229,11 +212,11 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
             )
         names.append(name)
         found.append(effect)
-    return tuple(names), tuple(_roomy(p, effect) for effect in apart(found) for p in effect.parameters)
+    return tuple(names), tuple(_unbounded(p, effect) for effect in apart(found) for p in effect.parameters)
 
 
-def _roomy(p: Parameter, effect: Effect) -> Parameter:
-    """Return an effect's parameter without the bounds of its file where those follow the recording, which is not read yet."""
+def _unbounded(p: Parameter, effect: Effect) -> Parameter:
+    """Return an effect's parameter without bounds if these depend on the recording, which has not been read yet."""
     if not any(name == p.name and which != "default" for name, which, _ in effect.scaled):
         return p
     return replace(p, lower=0.0 if p.lower >= 0 else -math.inf, upper=math.inf)
@@ -277,8 +260,7 @@ def _unknown(entry: Node, name: str, declared: dict[str, Parameter], choice: Mod
 
 def _parameter(entry: Node, parameter: Parameter, geometry: Geometry) -> FitParameter:
     entry.table(f"{parameter.name} = {{ value = {parameter.default:g}, lower = ..., upper = ... }}.").keys(_ENTRY)
-    fixed = entry.get("fixed")
-    held = fixed.boolean() if fixed else False
+    held = entry.read("fixed", Node.boolean, False)
     numbers = {
         key: _stated(entry.child(key), parameter, geometry) if key in entry.value else default
         for key, default in (("value", parameter.default), ("lower", parameter.lower), ("upper", parameter.upper))
@@ -338,7 +320,8 @@ def _stated(node: Node, parameter: Parameter, geometry: Geometry) -> float:
 
 # One recording, from its description and its file to a run that can be compared with a simulation.
 
-FORCES = ("force", "normal_load", "normal_stress")
+DRIVES = ("load_point_velocity", "load_point_displacement")
+FORCES = ("force", *LOADS)
 
 
 def read_run(
@@ -360,32 +343,31 @@ def read_run(
             run.node.child("format").fail(error.message, error.hint)
         raise
     columns = read_columns(run, source, specs, limit=limit, geometry=apparatus.geometry)
-    keep, notices = kept_samples(run.file, columns.rows, columns.seconds, columns.remarks.get("time"))
-    t, rows = columns.seconds[keep], columns.rows[keep]
-    arrays = {role: values[keep] for role, values in columns.arrays.items()}
-    notices = [*columns.notices, *notices, *sampling_notices(run.file, rows, t, find_sampling(t))]
-    if not apparatus.per_load and not {"normal_load", "normal_stress"} & arrays.keys() and run.load is None:
+    keep, notices = kept_samples(columns.place("time"), columns.remarks.get("time"))
+    columns = columns.kept(keep)
+    t = columns.seconds
+    notices = [*columns.notices, *notices, *sampling_notices(columns.place("time"), find_sampling(t))]
+    if not apparatus.per_load and not columns.role(*LOADS) and run.load is None:
         raise SrfError(
             f"{run.node.where}: friction is recorded without a load, and the stiffness is in {apparatus.stated}",
             'Give the run load = "20 MPa", or the stiffness as friction per micron, in 1/um.',
         )
-    _refuse_strokes(run, t, arrays)
-    drive, told = _drive(run, columns, t, arrays)
-    load, weighed = _load(run, columns, rows, t, arrays)
+    _refuse_strokes(run, columns)
+    drive, told = _drive(run, columns)
+    load, weighed = _load(run, columns)
     check_start(run, drive, float(t[0]))
     role, *beside = [c.role for c in columns.channels.values() if c.role in OBSERVABLES | BESIDE]
     at_start = load.rest(float(t[0]))
     stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
     rise = np.abs(drive(t)) * {"elongation": 1.0, "force": stiffness, "friction": stiffness / at_start}[role]
-    place = Place(run.file, columns.channels[role].heading, rows, t)
     units = _units(run, columns, apparatus)
     if len(set(units.values())) > 1:
         named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())
         notices.append(Notice("unit", run.file.name, f"{named}: a stress counts as the force on 1 mm^2"))
     observed, used, quantum, flaws, proposed = clean_observable(
-        place, arrays[role], rise=rise, load=load, corrections=run.corrections
+        columns.place(role), columns.arrays[role], rise=rise, load=load, corrections=run.corrections
     )
-    others = [_signal(run, columns, name, rows, t, arrays[name]) for name in beside]
+    others = [_signal(columns, name) for name in beside]
     return Run(
         name=run.name,
         file=run.file,
@@ -410,42 +392,29 @@ def read_run(
     )
 
 
-def _signal(
-    run: RunDescription, columns: Columns, role: str, rows: NDArray[np.int64], t: Array, x: Array
-) -> tuple[Signal, list[Notice]]:
-    """Return what was observed besides, as it is: spikes, resets and saturation are looked for in the first observable alone."""
-    place = Place(run.file, columns.channels[role].heading, rows, t)
-    known, filled, notices = _numbers(place, x)
+def _signal(columns: Columns, role: str) -> tuple[Signal, list[Notice]]:
+    """Return an observable besides the first one, which alone is searched for spikes, resets and saturation."""
+    known, filled, notices = _numbers(columns.place(role), columns.arrays[role])
     return Signal(role, filled, known, quantisation(filled[known])), notices
 
 
 def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
-    """Return which readings (n,) are numbers, the readings with others in the place of what is none, and notices of these."""
+    """Return which readings (n,) are numbers, the readings with the others interpolated, and notices of the others."""
     known = np.isfinite(x)
     if known.sum() < 8:
         raise SrfError(
-            f"{place.path.name}: column '{place.heading}' has {int(known.sum())} numbers in {x.size} samples",
+            f"{place.column} has {int(known.sum())} numbers in {x.size} samples",
             "A recording needs 8 or more.",
         )
-    told = f"without a number in '{place.heading}', not compared"
-    notices = spots("nan", ~known, place.path, place.rows, place.t, told)
+    notices = place.spots("nan", ~known, f"without a number in '{place.heading}', not compared")
     return known, np.interp(place.t, place.t[known], x[known]), notices
 
 
-def moved(t: Array, arrays: Mapping[str, Array]) -> Array:
-    """Return the displacement of the load point at the times t (n,), from its column or the integral of the velocities."""
-    if "load_point_displacement" in arrays:
-        return arrays["load_point_displacement"]
-    V = arrays["load_point_velocity"]
-    steps = np.where(np.isfinite(V[:-1]), V[:-1], 0.0) * np.diff(t)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _refuse_strokes(run: RunDescription, t: Array, arrays: Mapping[str, Array]) -> None:
+def _refuse_strokes(run: RunDescription, columns: Columns) -> None:
     """Raise SrfError for a run that slides in both directions."""
-    if run.drive is not None or not {"load_point_displacement", "load_point_velocity"} & arrays.keys():
+    if run.drive is not None or not columns.role(*DRIVES):
         return
-    found = strokes(t, moved(t, arrays), arrays[next(r for r in OBSERVABLES if r in arrays)])
+    found = strokes(columns)
     if not found:
         return
     turn = found[1] if len(found) > 1 else found[0]
@@ -457,7 +426,7 @@ def _refuse_strokes(run: RunDescription, t: Array, arrays: Mapping[str, Array]) 
 
 
 def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[str, bool]:
-    """Return for each force of the run, by name, whether it is stated as a stress, which with an area it is."""
+    """Return for each force of the run, by name, whether it counts as a stress; with an area all do."""
     if apparatus.geometry.area:
         return {"all": True}
     found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in FORCES}
@@ -468,41 +437,46 @@ def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[
     return found
 
 
-def _drive(run: RunDescription, columns: Columns, t: Array, arrays: dict[str, Array]) -> tuple[Drive, list[Notice]]:
-    role = next((r for r in ("load_point_velocity", "load_point_displacement") if r in arrays), "")
-    where = f"{run.file.name}: column '{columns.channels[role].heading}'" if role else ""
-    if run.drive is None:
-        return drive_from_column(role, t, arrays[role], where, correct="reset" in run.corrections)
-    drive = declared_drive(run, columns, t)
-    return drive, drive_differs(drive, t, arrays[role], where) if role else []
+def _drive(run: RunDescription, columns: Columns) -> tuple[Drive, list[Notice]]:
+    """Return the drive that the run declares, else that of its column, and what is to be told of it."""
+    declared = None if run.drive is None else declared_drive(run, columns)
+    role = columns.role(*DRIVES)
+    if role is None:
+        assert declared is not None  # `read_columns` asks for one of the two
+        return declared, []
+    t, values, where = columns.seconds, columns.arrays[role], columns.place(role).column
+    if declared is not None:
+        return declared, drive_differs(declared, t, values, where)
+    if role == "load_point_velocity":
+        return drive_from_velocity(t, values, where)
+    return drive_from_displacement(t, values, where, correct="reset" in run.corrections)
 
 
-def _load(
-    run: RunDescription, columns: Columns, rows: NDArray[np.int64], t: Array, arrays: dict[str, Array]
-) -> tuple[Load, list[Notice]]:
-    role = next((r for r in ("normal_load", "normal_stress") if r in arrays), None)
+def _load(run: RunDescription, columns: Columns) -> tuple[Load, list[Notice]]:
+    """Return the load in the run's column, else the one that it states, and what is to be told of it."""
+    role = columns.role(*LOADS)
     if role is None:
         W0 = 1.0 if run.load is None else run.load
         if run.modulation is None:
             return ConstantLoad(W0), []
         f, eps, onset = run.modulation
         return Modulation(W0, eps, f, onset), []
-    place = Place(run.file, columns.channels[role].heading, rows, t)
-    load, notices = load_from_column(place, arrays[role])
-    first = load.rest(float(t[0]))
+    place, values = columns.place(role), columns.arrays[role]
+    load, notices = load_from_column(place, values)
+    first = load.rest(float(place.t[0]))
     if run.load is not None and abs(run.load - first) > DIFFERS * first:
         run.node.child("load").fail(
             f"the load is {run.load:g} N, but {place.column} begins with {first:g} N", "Take one of the two away."
         )
     if run.modulation is not None:
-        notices += modulation_notices(place, run.modulation, arrays[role])
+        notices += modulation_notices(place, run.modulation, values)
     return load, notices
 
 
 # The recorded observable: which of its samples can be compared with a simulation, and what is wrong with the others.
 
-CALM = 1e-3  # relative change of the load between samples within which a jump of the observable is none of the load's
-COARSE = 0.5  # quantisation step over white noise from which it is told
+CALM = 1e-3  # relative change of the load between samples below which the load does not make the observable jump
+COARSE = 0.5  # quantisation step over white noise above which there is a notice
 
 
 def clean_observable(
@@ -515,20 +489,20 @@ def clean_observable(
     samples beside them are not compared. What is proposed is the observable (n,) with all of this done, None where nothing is.
     Raises SrfError where nothing is left.
     """
-    t, path, rows = place.t, place.path, place.rows
+    t = place.t
     known, filled, notices = _numbers(place, x)
     quantum = quantisation(filled[known])
     clipped = saturation(filled)
     if clipped.any():
         edge = float(filled[np.flatnonzero(clipped)[0]])
         told = f"at the extreme value {edge:.6g} of '{place.heading}': saturated, not compared"
-        notices += spots("saturation", clipped, path, rows, t, told)
+        notices += place.spots("saturation", clipped, told)
     steps = np.append(np.diff(t), t[-1] - t[-2])
     spiky = spikes(filled, quantum, rise * steps) & ~clipped
     if spiky.sum() > ACCIDENTS + x.size // 500:  # the tail of the noise, and no accidents
         spiky[:] = False
     left = "not compared" if "spike" in corrections else 'compared as they are; corrections = ["spike"] leaves them out'
-    notices += spots("spike", spiky, path, rows, t, f"standing out in '{place.heading}', {left}")
+    notices += place.spots("spike", spiky, f"standing out in '{place.heading}', {left}")
     calm = np.interp(t, t[~spiky], filled[~spiky])
     level, beside, told_jumps = _without_jumps(place, calm, rise, load, quantum, taken_out="reset" in corrections)
     proposed = level if spiky.any() or (level != calm).any() else None
@@ -538,12 +512,10 @@ def clean_observable(
     white = white_level(calm)
     if quantum > COARSE * white > 0:
         what = f"steps of {quantum:.4g}, {quantum / white:.2g} times the white noise, which they add to"
-        notices.append(Notice("quantisation", f"{path.name}: column '{place.heading}'", what))
+        notices.append(Notice("quantisation", place.column, what))
     used = known & ~clipped & ~spiky & ~beside
     if used.sum() < 8:
-        raise SrfError(
-            f"{path.name}: column '{place.heading}': {int(used.sum())} samples can be compared", "8 are needed."
-        )
+        raise SrfError(f"{place.column}: {int(used.sum())} samples can be compared", "8 are needed.")
     return observed, used, quantum, [*notices, *told_jumps], proposed
 
 
@@ -556,7 +528,6 @@ def _without_jumps(
     level, beside = rejoined(x, jumps)
     notices = []
     for jump in jumps:
-        where = span(place.path, place.rows, place.t, jump.at, jump.at + 1)
         if not jump.certain:
             done = "faster than the drive moves, but too little to be sure of a transducer set anew; left as it is"
         elif taken_out:
@@ -566,11 +537,11 @@ def _without_jumps(
         else:
             done = 'faster than the drive moves; left as it is; corrections = ["reset"] moves what follows back by that much'
         what = f"'{place.heading}' jumps by {jump.size:.4g}: {done}"
-        notices.append(Notice("reset", where, what))
+        notices.append(Notice("reset", place.span(jump.at, jump.at + 1), what))
     return level, beside, notices
 
 
-# What a recording is like: sampling, flaws, noise, and the history of drive and load, as found in the data.
+# The check of a recording: sampling, flaws, noise, and the history of drive and load, as found in the data.
 
 KINDS = {  # of notices, as --fail-on takes them
     "gap": "samples are missing",
@@ -604,12 +575,12 @@ class LoadHistory:
     lowest: float
     highest: float
     rate: float
-    modulation: Found | None
+    modulation: FoundModulation | None
 
 
 @dataclass(frozen=True)
 class RunCheck:
-    """What was found in one run; `noises` are those of the gauge at each of its spacings, `noise` that of most samples.
+    """What was found in one run; `noises` are the gauge's at each sampling interval, `noise` is that of most samples.
 
     `friction_noise` is the noise of a sample in units of the friction coefficient. `drive` holds (from s, um/s, um/s^2).
     """
@@ -636,7 +607,7 @@ class RunCheck:
 
 
 def check_run(run: Run) -> RunCheck:
-    """Return what can be said of a recording without simulating anything."""
+    """Return what the data of a run show without a simulation."""
     sampling = find_sampling(run.t)
     load = load_history(run.load, run.t)
     x = np.interp(run.t, run.t[run.used], run.observed[run.used])
@@ -647,17 +618,16 @@ def check_run(run: Run) -> RunCheck:
         cycles = load.modulation.frequency * dt if load.modulation else None
         noises.append(find_noise(parts, dt, quantum=run.quantum, cycles=cycles))
     noise = noises[int(np.argmax(np.bincount(sampling.at)))]
-    driven, slowest, fastest = _drive_pieces(run.drive, run.t)
-    factor = {"elongation": run.stiffness / load.mean, "force": 1 / load.mean, "friction": 1.0}[run.observable]
-    return RunCheck(run, sampling, noise, tuple(noises), noise.total * factor, driven, slowest, fastest, load)
+    driven, slowest, fastest = _drive_pieces(run)
+    friction_noise = float(noise.total * run.friction_factor(load.mean))
+    return RunCheck(run, sampling, noise, tuple(noises), friction_noise, driven, slowest, fastest, load)
 
 
-def _drive_pieces(drive: Drive, t: Array) -> tuple[tuple[tuple[float, float, float], ...], float, float]:
+def _drive_pieces(run: Run) -> tuple[tuple[tuple[float, float, float], ...], float, float]:
     """Return the pieces of the drive during the run, and its smallest and largest velocity."""
-    starts = [float(t[0]), *(b for b in drive.breaks if t[0] < b < t[-1])]
     pieces, values = [], []
-    for begin, end in zip(starts, [*starts[1:], float(t[-1])], strict=True):
-        V, rate, since = drive.piece(begin)
+    for begin, end in pairwise(run.edges):
+        V, rate, since = run.drive.piece(begin)
         pieces.append((begin, V + rate * (begin - since), rate))
         values += [V + rate * (begin - since), V + rate * (end - since)]
     return tuple(pieces), min(values), max(values)

@@ -1,9 +1,9 @@
-"""The noise of a gauge: white, with relaxations and oscillations besides, as fits have it; found without a model of the slider.
+"""The noise of a gauge, white and coloured by relaxations and oscillations; found without a model of the slider.
 
 A recording is cut into stretches, a parabola is taken out of each, and the mean of their periodograms is compared with its
-expectation: the debiased Whittle likelihood (Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 2019). What is
-expected is exact for stretches of any length, with the parabola and the window: neither trend, leakage nor aliasing bias it. One
-evaluation is a product with a matrix, however long the recording is.
+expectation: the debiased Whittle likelihood (Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 2019). The
+expectation is exact for stretches of any length, with the parabola and the window, so that neither trend, leakage nor aliasing
+bias the result. One evaluation is a product with a matrix, however long the recording is.
 """
 
 from __future__ import annotations
@@ -21,21 +21,23 @@ from srfcli.codegen.model import Array
 from srfcli.data.clock import Mask
 from srfcli.data.noise import white_level
 
-PROCESSES = ("relaxation", "oscillation")  # of coloured noise: e' = -e / tau + w, or e'' + (omega / q) e' + omega^2 e = w
-CORRELATION_TIMES = (0.02, 0.3, 0.6, 0.9)  # of the way from the shortest correlation time to the longest, where colour begins
-QUALITIES = (0.5, 3.0, 30.0)  # of an oscillation, where it begins: smooth noise, a broad line and a narrow one
+PROCESSES = ("relaxation", "oscillation")  # of coloured noise: e' = -e/tau + w, or e'' + (omega/q) e' + omega^2 e = w
+# start values: shares of the way, in logarithms, from the shortest correlation time to the longest
+CORRELATION_TIMES = (0.02, 0.3, 0.6, 0.9)
+QUALITIES = (0.5, 3.0, 30.0)  # start values of an oscillation: smooth noise, a broad line and a narrow one
 QUALITY = (0.2, 1000.0)  # of an oscillation: one of a smaller quality is a relaxation
 FASTEST = 1.0  # frequency of an oscillation times the spacing: smooth noise may end beyond half of the sampling rate
 
-STRETCHES = (64, 128, 256)  # samples over which a parabola is the trend: the longest over which it leaves noise alone
-SLOW = 3  # lowest frequencies of stretches, which ones half as long do not show
-RISE = 1.5  # times what shorter ones foretell there, at most: their noise is told that well; a signal makes more
-SLOWEST = 2.0  # periods of an oscillation in a stretch
-FEWEST = 32  # samples in which a colour can be seen
-ENOUGH = 4  # stretches among which some can be wild
-TAIL, ROUNDS = 1e-3, 4  # share of stretches of noise that are held to be wilder, and how often the calm ones are chosen anew
-NEIGHBOURS = 1.94  # powers at one frequency over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
-WHITE = 1e-3  # of the whole noise, at least: a spectrum without a floor is none
+STRETCHES = (64, 128, 256)  # samples over which a parabola is the trend: the longest that holds no signal is taken
+SLOW = 3  # lowest frequencies of stretches, which those half as long do not resolve
+RISE = 1.5  # power at these frequencies over that predicted from shorter stretches, at most; more is signal
+SLOWEST = 2.0  # periods of an oscillation in a stretch, at least
+FEWEST = 32  # samples from which coloured noise is estimated
+ENOUGH = 4  # stretches; if there are more, some may be rejected
+TAIL = 1e-3  # share of stretches of pure noise that are rejected
+ROUNDS = 4  # in which the calm stretches are chosen anew
+NEIGHBOURS = 1.94  # powers over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
+WHITE = 1e-3  # standard deviation of each part over that of the whole noise, at least
 LEAST = 1e-150  # standard deviation whose square is still a number
 STEP = 1e-5  # of the central differences by which a covariance is differentiated, in the logarithms of its parameters
 
@@ -55,12 +57,15 @@ def transition(colour: tuple[float, ...], lag: Array) -> Array:
     root = np.sqrt((a**2 - b**2).astype(complex))
     small = np.abs(root) < 1e-6
     grown, fallen = np.exp(root - a), np.exp(-root - a)
-    c, s = ((grown + fallen) / 2).real, np.where(small, np.exp(-a), ((grown - fallen) / (2 * np.where(small, 1, root))).real)
+    c, s = (
+        ((grown + fallen) / 2).real,
+        np.where(small, np.exp(-a), ((grown - fallen) / (2 * np.where(small, 1, root))).real),
+    )
     return np.stack([np.stack([c + a * s, b * s], -1), np.stack([-b * s, c - a * s], -1)], -2)
 
 
 def colour_text(colour: tuple[float, ...]) -> str:
-    """Return a process in words: an oscillation of a quality of a half is noise that is smooth, of a large one a line."""
+    """Return a process in words; an oscillation is smooth noise at a quality of a half, a spectral line at a large one."""
     told = f"{colour[1]:.3g} correlated over {colour[0]:.3g} s"
     return told if len(colour) == 2 else f"{colour[1]:.3g} about {colour[0]:.3g} Hz, of quality {colour[2]:.2g}"
 
@@ -98,7 +103,9 @@ class GaugeNoise:
 
     def covariance(self, lag: Array) -> Array:
         """Return the covariance at lags >= 0 (s), of which 0 is a sample with itself."""
-        return np.where(lag == 0, self.floor, 0.0) + sum((covariance(c, lag) for c in self.colours), np.zeros(np.shape(lag)))
+        return np.where(lag == 0, self.floor, 0.0) + sum(
+            (covariance(c, lag) for c in self.colours), np.zeros(np.shape(lag))
+        )
 
 
 def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t: Array, columns: Array) -> Array:
@@ -106,6 +113,8 @@ def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t
 
     `rate` (n,) says which of the noises holds at a sample; `begins` (n,) where one begins that owes nothing to the one before.
     """
+    from scipy.linalg import block_diag
+
     floor = np.array([noise.floor for noise in noises])[rate]
     if not any(noise.colours for noise in noises):
         return np.asarray(columns / np.sqrt(floor)[:, None])
@@ -122,7 +131,8 @@ def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t
         else:
             now = (int(rate[k]), float(f"{steps[k]:.9g}"))
             if now not in known:
-                known[now] = _joined([transition(c, np.array(now[1])) for c in noise.colours])
+                steps_of = [transition(c, np.array(now[1])) for c in noise.colours]
+                known[now] = block_diag(np.zeros((0, 0)), *steps_of)  # (0, 0) where there is none
             F, settled, key = known[now], settled and now == key, now
             x = F @ x
             P = P if settled else V + F @ (P - V) @ F.T
@@ -137,29 +147,25 @@ def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t
     return out
 
 
-def _joined(blocks: Sequence[Array]) -> Array:
-    size = [b.shape[0] for b in blocks]
-    out, at = np.zeros((sum(size), sum(size))), 0
-    for block, n in zip(blocks, size, strict=True):
-        out[at : at + n, at : at + n] = block
-        at += n
-    return out
-
-
 # How it is found.
 
 
-def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0, cycles: float | None = None) -> GaugeNoise:
+def find_noise(
+    pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0, cycles: float | None = None
+) -> GaugeNoise:
     """Return the noise in evenly sampled pieces of a recording, `spacing` s between samples, about a parabola over each stretch.
 
-    `cycles`, in periods per sample, is a modulation whose first three harmonics are taken out, too. Stretches in which the signal
-    bends faster, as at stick-slip events, are left out: what counts are the calmest quarter, the level corrected for the choice,
-    and then all that are no wilder than noise like theirs can be, nor at one frequency. They are as long as the noise found in
-    shorter ones foretells what is slow in them, and half of the samples are calm: in longer ones there is signal.
+    `cycles`, in periods per sample, is a modulation whose first three harmonics are taken out, too.
+
+    Stretches in which the signal bends faster, as at stick-slip events, are left out. The calmest quarter gives a first level,
+    corrected for the choice; then all stretches count whose power, in all and at each frequency, is within that of such noise.
+    Longer stretches are taken as long as the noise found in shorter ones predicts their lowest frequencies, and at least half as
+    many samples are calm; otherwise they hold signal.
     """
     longest = max(piece.size for piece in pieces)
     lengths = [n for n in STRETCHES if n <= longest] or [longest]
-    least = max(1e-9 * max(float(np.ptp(piece)) for piece in pieces), LEAST)  # the rounding of numbers, where there is no noise
+    # the rounding of numbers, where there is no noise
+    least = max(1e-9 * max(float(np.ptp(piece)) for piece in pieces), LEAST)
     if lengths[0] < FEWEST:
         return GaugeNoise(max(white_level(max(pieces, key=len)), least), quantum)
     found: GaugeNoise | None = None
@@ -168,7 +174,9 @@ def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0,
         whittle = _Whittle(calm, spacing, quantum, least)
         if found is not None:
             slow = calm.mean[:SLOW] / whittle.expected(found)[:SLOW]
-            if whittle.samples < found.samples / 2 or slow.mean() > RISE * (1 + 2 * np.sqrt(NEIGHBOURS / (SLOW * calm.count))):
+            if whittle.samples < found.samples / 2 or slow.mean() > RISE * (
+                1 + 2 * np.sqrt(NEIGHBOURS / (SLOW * calm.count))
+            ):
                 break
         found = whittle.noise()
     assert found is not None
@@ -182,7 +190,7 @@ def _slowest(colour: tuple[float, ...], stretch: float) -> bool:
 
 @dataclass(frozen=True)
 class _Window:
-    """Stretches of n samples: an orthonormal basis of the trend, Hann's window, and the powers that covariances make expected.
+    """Stretches of n samples: an orthonormal basis of the trend, Hann's window, and the matrix of expected periodograms.
 
     `expected` (f, n) times a covariance at the lags 0 to n - 1 is the expected periodogram at the `bins` that the trend leaves.
     """
@@ -248,7 +256,8 @@ def _calm(pieces: Sequence[Array], window: _Window) -> _Calm:
     if total.size <= ENOUGH:
         return of(np.arange(total.size))
     found = of(np.argsort(total)[: max(total.size // 4, 1)])
-    shape = 1 / max(found.spread, 1e-6) ** 2  # a stretch's power is a gamma variate, of which the lowest quarter has this mean
+    # a stretch's power is a gamma variate, of which the lowest quarter has this mean
+    shape = 1 / max(found.spread, 1e-6) ** 2
     level = float(found.mean.sum()) / max(float(gammainc(shape + 1, gammaincinv(shape, 0.25))) / 0.25, 0.1)
     for _ in range(ROUNDS):
         shape = 1 / max(found.spread, 1e-6) ** 2
@@ -273,7 +282,7 @@ class _Whittle:
 
     def noise(self) -> GaugeNoise:
         """Return the noise with as many processes as Schwarz's criterion wants."""
-        best = self.climb((), [[self.white_only()]])
+        best = self.climb((), [[np.array([np.log(self.level)])]])
         kinds: tuple[str, ...] = ()
         while len(kinds) < GAUGE_PROCESSES:
             wider = [(self.climb((*kinds, kind), self.starts(best[1], kinds, kind)), kind) for kind in PROCESSES]
@@ -288,9 +297,6 @@ class _Whittle:
     def expected(self, noise: GaugeNoise) -> Array:
         """Return the expected periodogram (f,) of a noise."""
         return np.asarray(self.calm.window.expected @ noise.covariance(self.lag))
-
-    def white_only(self) -> Array:
-        return np.array([np.log(self.level)])
 
     def criterion(self, likelihood: float, x: Array) -> float:
         return likelihood - 0.5 * x.size * float(np.log(self.samples))
@@ -358,7 +364,9 @@ class _Whittle:
         else:
             white, colours = self.split(x, kinds)
             over = self.calm.mean / self.expected(GaugeNoise(white, self.quantum, tuple(colours)))
-            peaks = np.array([self.calm.window.bins[int(np.argmax(over))] / self.calm.window.n, 0.03, 0.15]) / self.spacing
+            peaks = (
+                np.array([self.calm.window.bins[int(np.argmax(over))] / self.calm.window.n, 0.03, 0.15]) / self.spacing
+            )
             places = [*product(np.log(peaks), np.log(QUALITIES))]
         levels = [0, *(2 + i for i in self.places(kinds))]
         variance = float(np.sum(np.exp(2 * x[levels])))

@@ -12,12 +12,12 @@ from scipy.linalg import solveh_banded
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError
-from srfcli.data.clock import kept_samples, span, spots
-from srfcli.data.columns import LIMIT, Columns, open_source, split_heading
-from srfcli.data.description import ROLES, RunDescription, check_unit
+from srfcli.data.clock import Place, kept_samples
+from srfcli.data.columns import LIMIT, Columns, Finder, open_source
+from srfcli.data.description import RunDescription
 from srfcli.data.noise import quantisation, saturation, spikes, white_level
+from srfcli.data.values import OBSERVABLES
 from srfcli.laws.registry import Registry
-from srfcli.laws.values import Source
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 
 # The driving velocity of a run: from its description, from a column of velocities, or from one of displacements.
@@ -25,9 +25,10 @@ from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 DIFFERS = 0.05  # relative difference from a column that is told
 
 
-def declared_drive(run: RunDescription, columns: Columns, t: Array) -> Drive:
+def declared_drive(run: RunDescription, columns: Columns) -> Drive:
     """Return the drive that the description lists, which begins at the first sample of the file."""
     assert run.drive is not None
+    t = columns.seconds
     ends = columns.first + np.cumsum([duration for duration, _ in run.drive])
     interval = float(np.median(np.diff(t)))
     if ends[-1] < t[-1] - 1.5 * interval:
@@ -64,15 +65,6 @@ def drive_differs(drive: Drive, t: Array, V: Array, where: str) -> list[Notice]:
         f"against {told[at]:.5g} um/s at t = {t[at]:.6g} s; the declared drive counts"
     )
     return [Notice("drive-differs", where, what)]
-
-
-def drive_from_column(
-    role: str, t: Array, values: Array, where: str, *, correct: bool = False
-) -> tuple[Drive, list[Notice]]:
-    """Return the drive in the column of that role, and how it was found; to `correct` a displacement its jumps are taken out."""
-    if role == "load_point_velocity":
-        return drive_from_velocity(t, values, where)
-    return drive_from_displacement(t, values, where, correct=correct)
 
 
 def drive_from_velocity(t: Array, V: Array, where: str) -> tuple[Drive, list[Notice]]:
@@ -127,7 +119,7 @@ def _segmented(t: Array, V: Array) -> tuple[Drive, int]:
     """Return straight pieces of a noisy velocity, constant where a slope is not needed, and their number."""
     sigma = coloured_noise(t, V)
     penalty = 3 * np.log(V.size)
-    breaks = split(t, V, sigma, straight=True, penalty=penalty)
+    breaks = split(t, V, sigma, penalty)
     pieces = [_piece(t[a:b], V[a:b], sigma[a:b], penalty) for a, b in pairwise([0, *breaks, V.size])]
     times = [t[0], *(t[b] for b in breaks)]
     return Drive(tuple(map(float, times)), tuple(v for v, _ in pieces), tuple(s for _, s in pieces)), len(pieces)
@@ -144,7 +136,10 @@ def _piece(t: Array, V: Array, sigma: Array, penalty: float) -> tuple[float, flo
 
 
 def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = False) -> tuple[Drive, list[Notice]]:
-    """Return the drive in a column of displacements: the slopes of a continuous line of straight pieces through it."""
+    """Return the drive in a column of displacements: the slopes of a continuous line of straight pieces through it.
+
+    With `correct` level jumps of the transducer are taken out.
+    """
     known = np.isfinite(X)
     if known.sum() < 8:
         raise SrfError(f"{where}: {int(known.sum())} displacements in it", "Give the run a drive.")
@@ -160,39 +155,43 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         notices.append(Notice("reset", where, what))
     slopes = np.diff(line.heights) / np.diff(line.knots)
     drive = Drive.steps(list(zip([float(t[0]), *line.knots[1:-1].tolist()], slopes.tolist(), strict=True)))
+    pieces = "straight piece" if slopes.size == 1 else "straight pieces"
     told = ", ".join(f"{v:.5g}" for v in slopes[:12]) + (", ..." if slopes.size > 12 else "")
     what = (
-        f"a continuous line of {_count(slopes.size)}, {told} um/s, fitted through the displacements, "
+        f"a continuous line of {slopes.size} {pieces}, {told} um/s, fitted through the displacements, "
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
     return drive, [*notices, Notice("drive-fitted", where, what)]
 
 
-def _count(number: int) -> str:
-    return f"{number} straight piece" + ("s" if number != 1 else "")
-
-
 # A drive that turns back: the laws hold for sliding in one direction, so that each stroke is a run of its own.
 
-TURN = 0.2  # of the range of displacements: what turns back by less is no stroke
-OPPOSED = 0.5  # of the median observable: what opposes sliding by more slides, or is on the way to it
+TURN = 0.2  # of the range of displacements: a turn by less begins no stroke
+OPPOSED = 0.5  # of the median observable: above it the slider slides, or is about to
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """Sliding in one direction from `begin` to `end` s: after a turn from where the force has come to half its usual size."""
+    """Sliding in one direction from `begin` to `end` s; after a turn it begins where the force reaches half its usual size."""
 
     begin: float
     end: float
     backward: bool
 
 
-def strokes(t: Array, moved: Array, observed: Array) -> list[Stroke]:
+def strokes(columns: Columns) -> list[Stroke]:
     """Return the strokes of a recording whose drive turns back and slides there; none where it only goes on or unloads.
 
-    `moved` (n,) is the displacement of the load point, `observed` (n,) elongation, force or friction of either sign. After a turn
-    the slider sticks while the spring is unloaded, so that what comes before the change of sign is left out.
+    The recording has a column of the load point's displacement or velocity. After a turn the slider sticks while the spring is
+    unloaded, so that what comes before the change of sign of the observable is left out.
     """
+    t, arrays = columns.seconds, columns.arrays
+    observed = arrays[next(role for role in OBSERVABLES if role in arrays)]
+    if "load_point_displacement" in arrays:
+        moved = arrays["load_point_displacement"]
+    else:
+        V = arrays["load_point_velocity"]
+        moved = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(V[:-1]), V[:-1], 0.0) * np.diff(t))])
     known = np.isfinite(moved) & np.isfinite(observed)
     t, x, y = t[known], moved[known], observed[known]
     if t.size < 2 * FEWEST or not np.ptp(x) > 0:
@@ -214,7 +213,7 @@ def strokes(t: Array, moved: Array, observed: Array) -> list[Stroke]:
 
 def _turns(x: Array, least: float) -> list[int]:
     """Return the indices of the extremes between which x (n,) moves by more than `least`, without the two ends."""
-    turns, extreme, rising = [], 0, 0  # one pass: an extreme is one once x has come back from it by `least`
+    turns, extreme, rising = [], 0, 0  # one pass: an extreme counts once x has come back from it by `least`
     for i, value in enumerate(x.tolist()):
         if rising == 0 and abs(value - x[0]) > least:
             rising, extreme = (1 if value > x[0] else -1), i
@@ -231,13 +230,14 @@ def _turns(x: Array, least: float) -> list[int]:
 FEWEST = 5  # samples of a piece
 ROUNDS = 40  # of the search for the places of the corners
 STRETCH = 128  # samples over which noise has its colour
-BURST = 100  # samples for which a gauge may go astray
-AROUND = 15  # stretches that share their colour
+BURST = 100  # samples of a burst of noise, at most
+AROUND = 15  # neighbouring stretches from which the noise of one is estimated
+NEARBY = 101  # samples that share a level of white noise
 CLEAR = 8.0  # standard deviations about the lines beside it that a level jump exceeds
 NEAR = 200  # samples on each side by which a jump is told from a corner
-EVEN = 1e-5  # of the largest noise: what is quieter would be lost in the rounding of the running sums
-LEAST = 1e-100  # um or um/s: what is squared must not vanish
-WOBBLE = 0.02  # relative change of slope that is none
+EVEN = 1e-5  # of the largest noise, at least: smaller ones would be lost in the rounding of the running sums
+LEAST = 1e-100  # um or um/s: a noise whose square is still a number
+WOBBLE = 0.02  # relative change of slope below which there is no corner
 
 
 @dataclass(frozen=True)
@@ -250,26 +250,27 @@ class Line:
     jumps: tuple[tuple[int, float], ...]
 
 
-def local_noise(x: Array, width: int = 101) -> Array:
+def local_noise(x: Array) -> Array:
     """Return the standard deviation of white noise near each sample of x (n,), from its third differences."""
     from scipy.ndimage import median_filter
 
     if x.size < 8:
         return np.full(x.size, max(float(np.std(x)), LEAST) if np.ptp(x) else 1.0)
     third = np.abs(np.diff(x, 3)) / np.sqrt(20.0)  # the sum of the squared weights 1, 3, 3, 1
-    level = median_filter(third, size=min(width, third.size), mode="reflect") / 0.6745  # the end is not its last sample
+    # the level at an end is not that of its last sample
+    level = median_filter(third, size=min(NEARBY, third.size), mode="reflect") / 0.6745
     padded = np.concatenate([[level[0]], level, [level[-1]] * 2])
     overall = float(np.median(third)) / 0.6745
     span = float(np.ptp(x)) or 1.0
     return np.maximum(padded, max(0.05 * overall, 1e-9 * span, LEAST))
 
 
-def split(t: Array, x: Array, sigma: Array, *, straight: bool, penalty: float) -> list[int]:
-    """Return the indices at which pieces of x begin, other than the first: lines where `straight`, else constants.
+def split(t: Array, x: Array, sigma: Array, penalty: float) -> list[int]:
+    """Return the indices at which straight pieces of x (n,) over t begin, other than the first.
 
     A piece is split where that lowers the weighted sum of squares by more than `penalty`.
     """
-    sums = _Sums(t - t[0], x - x[0], sigma, straight)
+    sums = _Sums(t - t[0], x - x[0], sigma)
     found: list[int] = []
     waiting = [(0, t.size)]
     while waiting:
@@ -284,20 +285,16 @@ def split(t: Array, x: Array, sigma: Array, *, straight: bool, penalty: float) -
 class _Sums:
     """Running weighted sums, from which the misfit of any piece follows at once."""
 
-    def __init__(self, t: Array, x: Array, sigma: Array, straight: bool) -> None:
+    def __init__(self, t: Array, x: Array, sigma: Array) -> None:
         w = 1.0 / np.maximum(sigma, EVEN * float(sigma.max())) ** 2
-        self.straight = straight
         columns = [w, w * t, w * t * t, w * x, w * t * x, w * x * x]
         self.sums = [np.concatenate([[0.0], np.cumsum(c)]) for c in columns]
 
     def misfit(self, a: NDArray[np.int64] | int, b: NDArray[np.int64] | int) -> Array:
-        """Return the weighted sum of squares about the best line or constant through samples a to b - 1."""
+        """Return the weighted sum of squares about the best line through samples a to b - 1."""
         w, wt, wtt, wx, wtx, wxx = (s[b] - s[a] for s in self.sums)
-        total = wxx - wx * wx / w
-        if self.straight:
-            spread = wtt - wt * wt / w
-            cross = wtx - wt * wx / w
-            total = total - np.divide(cross * cross, spread, out=np.zeros_like(total), where=spread > 0)
+        total, spread, cross = wxx - wx * wx / w, wtt - wt * wt / w, wtx - wt * wx / w
+        total = total - np.divide(cross * cross, spread, out=np.zeros_like(total), where=spread > 0)
         return np.asarray(np.maximum(total, 0.0))
 
     def best(self, a: int, b: int) -> tuple[int, float]:
@@ -313,10 +310,10 @@ class _Sums:
 
 
 def coloured_noise(t: Array, x: Array) -> Array:
-    """Return the standard deviation near each sample of the white noise that misfits a line by as much as the noise in x (n,).
+    """Return for each sample the standard deviation of white noise that misfits a line as much as the noise in x (n,) does.
 
-    The noise is what parabolas over 128 samples leave, in the upper quartile of fifteen stretches: bursts of a gauge count, and
-    corners are in few of them.
+    The noise is the residual of parabolas over 128 samples, in the upper quartile of fifteen stretches: a gauge's bursts count,
+    while corners, which are in few stretches, do not.
     """
     from scipy.ndimage import percentile_filter
 
@@ -342,17 +339,16 @@ def coloured_noise(t: Array, x: Array) -> Array:
 
 
 def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
-    """Return the continuous line of straight pieces that x (n,) over t supports, once the level jumps are taken out of x.
+    """Return the continuous line of straight pieces that x (n,) over t supports, and the level jumps in x.
 
-    Without `correct` the jumps are found and stay.
-
-    The number of pieces follows from BIC, in which the noise counts with the colour that it has over 128 samples; their places
-    follow from least squares. A change of slope by less than 2 % is the wobble of a servo, and is not followed.
+    With `correct` the jumps are taken out of x first, in place. The Bayesian information criterion chooses the number of pieces;
+    the noise enters it with its correlation over 128 samples. Least squares place the knots. A change of slope by less than 2 %
+    comes from the servo and is not followed.
     """
     sigma = coloured_noise(t, x)
     penalty, jumps = 3 * np.log(t.size), []
     for _ in range(4):
-        breaks = split(t, x, sigma, straight=True, penalty=penalty)
+        breaks = split(t, x, sigma, penalty)
         found = _jumps(t, x, sigma, breaks, penalty)
         jumps += found
         if not found or not correct:
@@ -374,9 +370,9 @@ def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
 
 
 def _without_bursts(t: Array, sigma: Array, knots: Array, heights: Array) -> Array:
-    """Return the knots without those of pieces, a hundred samples or fewer in all, after which the line goes on as before.
+    """Return the knots without those of bursts: of a hundred samples or fewer, after which the line continues as before.
 
-    A hold is none of them: after it the line is late.
+    A hold is no burst: after it the line continues later.
     """
     slopes = np.diff(heights) / np.diff(knots)
     places = np.searchsorted(t, knots)
@@ -442,7 +438,7 @@ def _places(t: Array, x: Array, breaks: list[int]) -> Array:
 
 
 def _pruned(t: Array, x: Array, sigma: Array, knots: Array, penalty: float) -> Array:
-    """Return the knots that the line needs: what a split into independent pieces found may be none."""
+    """Return the knots that the line needs: those without which its misfit grows by more than the penalty allows."""
     costs = [_cost_without(t, x, sigma, knots, k) for k in range(1, knots.size - 1)]
     while costs:
         weakest = int(np.argmin(costs))
@@ -553,25 +549,11 @@ def _step(t: Array, x: Array, sigma: Array, knots: Array, heights: Array, dampin
 
 # The normal load of a run: from its column, made as smooth as its noise demands, or the constant of its description.
 
-NEGLIGIBLE = 1e-5  # of the range: noise that an interpolation may keep
-BLOCKS = 16  # in which a constant load has one mean
-ACCIDENTS = 5  # spikes that a load may have, and one more in 500 samples; so many more are what was imposed
+NEGLIGIBLE = 1e-5  # of the load's range: noise below it is interpolated and not smoothed
+BLOCKS = 16  # whose means are compared to see whether a load is constant
+ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
 NOTHING = 1e-15  # N: no contact
-SMALLEST = 5e-4  # relative amplitude of a modulation: a servo wobbles by less
-
-
-@dataclass(frozen=True)
-class Place:
-    """The column of loads in its file, for notices and errors."""
-
-    path: Path
-    heading: str
-    rows: NDArray[np.int64]
-    t: Array
-
-    @property
-    def column(self) -> str:
-        return f"{self.path.name}: column '{self.heading}'"
+SMALLEST = 5e-4  # relative amplitude of a modulation, at least: a servo varies the load by less
 
 
 def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
@@ -580,17 +562,16 @@ def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
     Empty cells and spikes are bridged. A load that varies no more than its noise is constant; noise that would show in dW/dt is
     smoothed away. Raises SrfError for a load that is missing, not positive or saturated.
     """
-    t, path, rows = place.t, place.path, place.rows
-    known = np.isfinite(W)
+    t, known = place.t, np.isfinite(W)
     if not known.any():
         raise SrfError(f"{place.column}: no number in it", 'Give the run load = "5 N", or the column its numbers.')
-    notices = spots("nan", ~known, path, rows, t, f"without a number in '{place.heading}'; the load is bridged")
+    notices = place.spots("nan", ~known, f"without a number in '{place.heading}'; the load is bridged")
     filled = np.interp(t, t[known], W[known])
     clipped = saturation(filled, fewest=4)  # one such plateau may be the load that was set
     if clipped.any():
         first, last = np.flatnonzero(clipped)[[0, -1]]
         raise SrfError(
-            f"{span(path, rows, t, first, last)}, column '{place.heading}': {int(clipped.sum())} samples sit at the extreme "
+            f"{place.span(first, last)}, column '{place.heading}': {int(clipped.sum())} samples sit at the extreme "
             f"value {filled[first]:.6g} N: the gauge is saturated, the load unknown",
             "Take a window without this part.",
         )
@@ -598,13 +579,13 @@ def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
     bad = spikes(filled, min(quantisation(filled), least), least=least)  # a spike on a constant is a lattice of its own
     if bad.sum() > ACCIDENTS + W.size // 500:  # a modulation that begins in mid-record looks like this
         bad[:] = False
-    notices += spots("spike", bad, path, rows, t, f"standing out in '{place.heading}'; the load is bridged")
+    notices += place.spots("spike", bad, f"standing out in '{place.heading}'; the load is bridged")
     good = known & ~bad
     filled = np.interp(t, t[good], filled[good])
     if filled.min() < NOTHING:
         at = int(filled.argmin())
         raise SrfError(
-            f"{span(path, rows, t, at, at)}, column '{place.heading}': the load is {filled[at]:.6g} N",
+            f"{place.span(at, at)}, column '{place.heading}': the load is {filled[at]:.6g} N",
             "The slider must stay in contact: zero the gauge ([columns] offset), or take a window without this part.",
         )
     load, told = _smooth(place, filled)
@@ -643,7 +624,7 @@ def is_constant(W: Array, noise: float) -> bool:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundModulation:
     """A modulation found in a load: frequency (Hz), amplitude over the mean load, and when half of it is reached (s), or -inf."""
 
     frequency: float
@@ -651,7 +632,7 @@ class Found:
     onset: float
 
 
-def find_modulation(t: Array, W: Array) -> Found | None:
+def find_modulation(t: Array, W: Array) -> FoundModulation | None:
     """Return the modulation in the loads W (n,) at evenly spaced times, None where no line stands out of the spectrum.
 
     Frequency and amplitude are a least-squares fit of three harmonics to the later half of where it is on; the onset is where
@@ -674,7 +655,7 @@ def find_modulation(t: Array, W: Array) -> Found | None:
     mean = float(tail.mean())
     if amplitude < SMALLEST * mean:
         return None
-    return Found(frequency, amplitude / mean, _onset(even, values, frequency, amplitude))
+    return FoundModulation(frequency, amplitude / mean, _onset(even, values, frequency, amplitude))
 
 
 def _line(x: Array, dt: float) -> float | None:
@@ -746,54 +727,32 @@ def modulation_notices(place: Place, declared: tuple[float, float, float], W: Ar
 LOADS = ("normal_load", "normal_stress")
 
 
-def read_load(
-    path: Path, *, registry: Registry, format: str | None = None, limit: int = LIMIT
-) -> tuple[Load, Array, tuple[Notice, ...]]:
+def read_load(path: Path, *, registry: Registry, format: str | None = None) -> tuple[Load, Array, tuple[Notice, ...]]:
     """Return the load in the columns `time` and `normal_load` (or `normal_stress`) of a data file, its times (n,) in s, and
     what was found in the data. Units are those of the headings, else s, N and MPa. `format` names the file's reader.
 
-    Raises SrfError for a missing column, fewer than four samples, and more than `limit` bytes.
+    Raises SrfError for a missing column, fewer than eight samples, and a file too large to hold.
     """
     source = open_source(path, registry=registry, format=format)
-    columns, heading = _find(path, source)
-    t, W = _read(path, source, columns, limit)
-    rows = np.arange(1, t.size + 1)
-    keep, notices = kept_samples(path, rows, t)
-    place = Place(path, heading, rows[keep], t[keep])
-    load, told = load_from_column(place, W[keep])
-    return load, place.t, (*notices, *told)
-
-
-def _find(path: Path, source: Source) -> tuple[tuple[tuple[int, float], ...], str]:
-    """Return (column, factor to base units) of the times and of the loads, and the heading of the loads."""
-    parts = [split_heading(h) for h in source.headings]
-    names = [name.strip().lower().replace(" ", "_") for name, _ in parts]
-    role = next((r for r in LOADS if r in names), None)
-    if "time" not in names or role is None:
-        missing = "time" if "time" not in names else " or ".join(LOADS)
+    finder = Finder(path, source.headings, {})
+    time, loads = finder.find("time"), next((c for role in LOADS if (c := finder.find(role))), None)
+    if time is None or loads is None:
+        missing = "time" if time is None else " or ".join(LOADS)
         raise SrfError(
             f"{path}: no column {missing}; found: {', '.join(source.headings)}",
             "Head the columns time [s],normal_load [N].",
         )
-    found = []
-    for name in ("time", role):
-        column = names.index(name)
-        unit = parts[column][1]
-        where = f"{path}: column '{source.headings[column]}'"
-        found.append((column, check_unit(ROLES[name] if unit is None else unit, name, None, where)))
-    return tuple(found), source.headings[names.index(role)]
-
-
-def _read(path: Path, source: Source, columns: tuple[tuple[int, float], ...], limit: int) -> tuple[Array, Array]:
-    blocks: list[Array] = []
-    held = 0
-    for block in source.blocks(tuple(column for column, _ in columns)):
-        part = np.array([np.asarray(b, float) * factor for b, (_, factor) in zip(block, columns, strict=True)])
-        held += part.nbytes
-        if held > limit:
+    blocks, held = [np.empty((2, 0))], 0
+    for block in source.blocks((time.column, loads.column)):
+        blocks.append(np.array([block[0] * time.factor, block[1] * loads.factor]))
+        held += blocks[-1].nbytes
+        if held > LIMIT:
             raise SrfError(
-                f"{path}: more than {limit / 2**20:g} MB of loads", "Cut the file to the times that are needed."
+                f"{path}: more than {LIMIT / 2**20:g} MB of loads", "Cut the file to the times that are needed."
             )
-        blocks.append(part)
-    t, W = np.concatenate(blocks, axis=1) if blocks else np.empty((2, 0))
-    return t, W
+    t, W = np.concatenate(blocks, axis=1)
+    rows = np.arange(1, t.size + 1)
+    keep, notices = kept_samples(Place(path, time.heading, rows, t))
+    place = Place(path, loads.heading, rows[keep], t[keep])
+    load, told = load_from_column(place, W[keep])
+    return load, place.t, (*notices, *told)

@@ -17,15 +17,16 @@ from srfcli.data.clock import Mask, runs_of
 from srfcli.motion.imposed import unforetold
 
 SEGMENT = 256  # samples of a periodogram
-NEIGHBOURS = 16  # samples that foretell one between them: sines of five samples a period or more, to 1e-4 of them
-JITTER = 1e-3  # spacings by which times that are taken as even may be off
+NEIGHBOURS = 16  # from which a sample is interpolated: to 1e-4 for sines of five samples a period or more
+JITTER = 1e-3  # sampling intervals by which times may be off and still count as even
 
 
 def white_level(x: Array, t: Array | None = None) -> float:
-    """Return the standard deviation of white noise whose floor the spectrum of x (n,) shows above half the Nyquist frequency.
+    """Return the standard deviation of the white noise in x (n,): the floor of its spectrum above half the Nyquist frequency.
 
-    The median over frequencies and stretches: lines, events and a slow signal do not raise it. Coloured noise counts as signal.
-    A signal that is read at uneven times looks like noise: where those are given, t (n,), it is what neighbours do not foretell.
+    The floor is the median over frequencies and stretches, so that lines, events and a slow signal do not raise it. Coloured
+    noise counts as signal. Where the times t (n,) are given and uneven, at which a signal looks like noise, it is the median
+    error of interpolation from neighbouring samples.
     """
     if t is not None and x.size > 4 * NEIGHBOURS and np.median(np.abs(np.diff(t, 2))) > JITTER * np.median(np.diff(t)):
         missed, unit = unforetold(t, x, NEIGHBOURS // 2)
@@ -52,15 +53,16 @@ WIDEST_SPIKE = 3  # samples of a spike
 BESIDE = 5  # samples before and after that tell the level
 FACTOR = 8.0  # robust standard deviations
 CREST = 0.5  # share of a spike's size by which it is off a cubic through its neighbours, at least
-FEW = 0.02  # share of samples that move: below it they are the accidents of a constant, and not its noise
+NEARBY = 101  # samples that share a level of noise
+FEW = 0.02  # share of samples off their running median, below which the channel counts as constant and without noise
 SATURATED = 10  # samples in a row at the extreme value
-LARGE = 0.05  # share of the level from which a jump is a transducer's for certain
-MOST_RESETS = 5  # more jumps than this are what the recording is about
+LARGE = 0.05  # share of the level from which a jump is certain
+MOST_RESETS = 5  # of a transducer in a recording; if there are more jumps, they are a signal
 
 
 @dataclass(frozen=True)
 class Jump:
-    """A level jump of a transducer: `size` is added between samples `at` and `at` + 1; `certain` if nothing else can be."""
+    """A level jump: `size` is added between samples `at` and `at` + 1; `certain` where only a transducer can make it."""
 
     at: int
     size: float
@@ -88,23 +90,23 @@ def quantisation(x: Array) -> float:
     return quantum if (off <= 0.05 * quantum + 2 * rounding).all() else 0.0
 
 
-def local_scale(x: Array, m: Array, width: int = 101) -> Array:
+def local_scale(x: Array, m: Array) -> Array:
     """Return a robust standard deviation of x about its running median m near each sample."""
     from scipy.ndimage import median_filter
 
     rest = np.abs(x - m)
-    near = median_filter(rest, size=min(width, x.size), mode="nearest")
+    near = median_filter(rest, size=min(NEARBY, x.size), mode="nearest")
     moving = rest[rest > 0]
     overall = float(np.median(moving)) if moving.size > FEW * x.size else 0.0
     return np.asarray(2.0 * np.maximum(near, 0.5 * overall))  # the running median follows the noise by a quarter
 
 
 def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: float = 0.0) -> Mask:
-    """Return which samples of x (n,) stand out from both sides for up to three samples and then are back where they were.
+    """Return which samples of x (n,) are spikes: up to three that stand out from both sides, with the same level after them.
 
-    A slip event or any other step is none: the level after it is another. `rise` (n,), if given, is the largest rise from
-    each sample to the next that the drive allows: what goes up at that pace is reloading, and no spike. None is smaller
-    than `least`.
+    A slip event or any other step is no spike, as the level after it is another. `rise` (n,), if given, is the largest rise from
+    each sample to the next that the drive allows: a rise at that pace is reloading, and no spike. No spike is smaller than
+    `least`.
     """
     from scipy.ndimage import median_filter
 
@@ -133,7 +135,7 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
 def _off_neighbours(x: Array, first: NDArray[np.intp], width: int) -> Array:
     """Return by how much groups of samples that begin at `first` are off the cubics through two samples on each side, at least.
 
-    The crest of a wave of eight samples and more is foretold by its neighbours, a spike is not.
+    These cubics predict the crest of a wave of eight samples or more, but no spike.
     """
     at = np.array([-2.0, -1.0, width, width + 1.0])
     sides = np.stack([x[first - 2], x[first - 1], x[first + width], x[first + width + 1]])
@@ -191,14 +193,18 @@ def observable_jumps(x: Array, t: Array, rate: Array, steady: Mask, quantum: flo
             continue
         allowed = float(rate[max(i - 20, 0) : i + 22].max() * (t[i + 1] - t[i]))
         certain = abs(jump.size) > max(20 * allowed, LARGE * float(np.median(np.abs(x))))
-        outruns = jump.size > 3 * allowed and _stays(x, t, i, jump.size)
-        if outruns or (jump.size < 0 and _goes_on(x, t, i, float(rate[i]), abs(jump.size))):
+        before, after = (slice(max(i - 19, 0), i + 1), slice(i + 1, i + 21))  # twenty samples on each side
+        slopes = [float(np.polyfit(t[s] - t[i], x[s], 1)[0]) for s in (before, after)]
+        bend = abs(slopes[1] - slopes[0]) * float(t[after][-1] - t[i])  # of the level: none if no reloading begins
+        outruns = jump.size > 3 * allowed and bend < 0.5 * jump.size
+        flat = min(x[before].size, x[after].size) >= 10 and all(abs(s) < 0.3 * float(rate[i]) for s in slopes)
+        if outruns or (jump.size < 0 and flat and bend < 0.2 * abs(jump.size)):
             found.append(Jump(i, jump.size, certain))
     return found if len(jumps) <= MOST_RESETS else []
 
 
 def _level_jumps(x: Array, quantum: float) -> list[Jump]:
-    """Return the steps between two samples that exceed the noise, and all that happens nearby, by far."""
+    """Return the steps between two samples that are far larger than the noise and than all changes nearby."""
     from scipy.ndimage import median_filter
 
     if x.size < 8 * BESIDE:
@@ -229,23 +235,6 @@ def _levels(x: Array) -> tuple[Array, Array]:
     return medians[1 : x.size], medians[BESIDE + 1 : x.size + BESIDE]
 
 
-def _stays(x: Array, t: Array, i: int, size: float) -> bool:
-    """Return whether the level goes on after a step as before it, for the twenty samples on each side: no reloading begins."""
-    left, right = slice(max(i - 19, 0), i + 1), slice(i + 1, i + 21)
-    slopes = [float(np.polyfit(t[s] - t[i], x[s], 1)[0]) for s in (left, right)]
-    return abs(slopes[1] - slopes[0]) * float(t[right][-1] - t[i]) < 0.5 * abs(size)
-
-
-def _goes_on(x: Array, t: Array, i: int, rate: float, size: float) -> bool:
-    """Return whether the level is as flat after the step as before it, for the twenty samples on each side."""
-    left, right = slice(max(i - 19, 0), i + 1), slice(i + 1, i + 21)
-    if min(x[left].size, x[right].size) < 10:
-        return False
-    slopes = [float(np.polyfit(t[s] - t[i], x[s], 1)[0]) for s in (left, right)]
-    spread = float(t[right][-1] - t[i])
-    return all(abs(s) < 0.3 * rate for s in slopes) and abs(slopes[1] - slopes[0]) * spread < 0.2 * size
-
-
 def rejoined(x: Array, jumps: list[Jump]) -> tuple[Array, NDArray[np.bool_]]:
     """Return x with its certain jumps taken out, and the samples on each side of one, whose level is uncertain."""
     out, beside = x.copy(), np.zeros(x.size, bool)
@@ -255,7 +244,7 @@ def rejoined(x: Array, jumps: list[Jump]) -> tuple[Array, NDArray[np.bool_]]:
     return out, beside
 
 
-# What a gauge would make of a simulated record: noise of a given size and colour, and steps of a given height.
+# The reading of a gauge in a simulation: noise of a given size and correlation, and rounding to steps.
 
 
 def measured(
@@ -275,7 +264,7 @@ def measured(
 
 
 def check_gauge(*, noise: float, lag1: float, quantum: float, seed: int) -> None:
-    """Raise SrfError for what no gauge does."""
+    """Raise SrfError for sizes, a correlation or a seed that a gauge cannot have."""
     for name, value in (("noise", noise), ("quantum", quantum)):
         if not (math.isfinite(value) and value >= 0):
             raise SrfError(f"{name} = {value:g} is not a size", f"give {name} as 0 or more")
@@ -312,15 +301,12 @@ def quantised(values: Array, quantum: float) -> Array:
     return np.asarray(np.round(np.round(values / quantum) * quantum, max(-exponent, 0)), dtype=float)
 
 
-# A rough track to simulate on: mu0 wanders along it by a Gaussian random function of slip position, fixed by a seed.
+# A random friction field along slip, to simulate with: mu0 varies with slip position by a Gaussian process that a seed fixes.
 
 KNOTS = 8  # to a correlation length: halfway between two of them the variance falls short by 4e-4
-WIDEST_KNOTS, FINEST_KNOTS = (
-    0.8,
-    0.01,
-)  # um between knots; a fit's are as wide, and contacts are a tenth of a micron or more
+WIDEST_KNOTS, FINEST_KNOTS = 0.8, 0.01  # um between knots: as wide as a fit's; contacts are 0.1 um or more
 MOST = 2_000_000  # knots between position 0 and the far end of a record
-ECHO = 32  # knots over which a spline's numbers feel a value: sqrt(3) - 2 to this power is below the last bit
+ECHO = 32  # knots over which a value acts on a spline's coefficients: sqrt(3) - 2 to this power is below the last bit
 
 
 @dataclass(frozen=True)
@@ -365,7 +351,7 @@ class RoughTrack:
         last = max(last, first + 1)
         values = self._values(first - 1 - ECHO, last + 1 + ECHO)
         count = last - first + 3
-        # the numbers whose weighted means 1/6, 4/6, 1/6 are the values; summed so that no bit depends on the window
+        # the coefficients whose weighted means 1/6, 4/6, 1/6 are the values; summed so that no bit depends on the window
         pole, numbers = math.sqrt(3) - 2, np.zeros(count)
         for j in range(-ECHO, ECHO + 1):
             numbers += math.sqrt(3) * pole ** abs(j) * values[ECHO + j : ECHO + j + count]

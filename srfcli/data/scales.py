@@ -1,4 +1,4 @@
-"""What is large and small in a recording, and an effect's bounds and sizes in these terms, not in those of one slider."""
+"""The scales of a recording (slips, times, velocities, load), and the bounds and sizes of effects that follow from them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from srfcli.core.settings import Parameter
-from srfcli.core.units import find_unit, to_base
+from srfcli.core.units import from_base, to_base
 from srfcli.data.values import CriticalLoads, FitParameter, Run
 from srfcli.laws.values import Effect
 
@@ -40,9 +40,8 @@ def _of_tables(tables: Sequence[CriticalLoads]) -> dict[str, float]:
 def _of_runs(fitted: Sequence[Run]) -> dict[str, float]:
     slips, moving = [], []
     for run in fitted:
-        edges = [float(run.t[0]), *(b for b in run.drive.breaks if run.t[0] < b < run.t[-1]), float(run.t[-1])]
-        middle = 0.5 * (np.array(edges[1:]) + np.array(edges[:-1]))
-        V = np.abs(run.drive(middle))
+        edges = np.array(run.edges)
+        V = np.abs(run.drive(0.5 * (edges[1:] + edges[:-1])))
         slips.append((V * np.diff(edges)).tolist())
         moving.append(V[1e-3 * V.max() < V] if V.any() else V)
     V = np.concatenate(moving)
@@ -56,7 +55,7 @@ def _of_runs(fitted: Sequence[Run]) -> dict[str, float]:
 
 
 def at_scale(effect: Effect, scales: Mapping[str, float]) -> Effect:
-    """Return the effect with bounds and default sizes as the recording has them, where its file states them in its scales.
+    """Return the effect with bounds and defaults in numbers, where its file states them as formulas of a recording's scales.
 
     A parameter of which a scale is missing, or whose bounds would not rise, keeps the numbers of its file.
     """
@@ -77,7 +76,8 @@ def own_bounds(
     """Return the parameters of an experiment with the bounds that the recording gives those of its effects.
 
     `stated` has by name which of lower, upper and fixed the experiment says itself: these stay. Bounds make room for the start
-    value. What an effect never fits is added where the experiment does not list it, and held where it does not say otherwise.
+    value. A parameter that its effect never fits is added where the experiment does not list it, and is fixed unless the
+    experiment says otherwise.
     """
     scales, found, out = scales_of(runs, parameters, tables), dict[str, Parameter](), []
     held = {name for effect in effects for name in effect.fixed}
@@ -106,8 +106,8 @@ def own_bounds(
 
 
 def _moved(p: Parameter, stated: Mapping[str, float]) -> Parameter:
-    factor = find_unit(p.unit).factor
-    said = {which: value / factor for which, value in stated.items()}
+    """Return a parameter with the bounds and default that are stated, in um, s, N, where these bounds rise."""
+    said = {which: from_base(value, p.unit) for which, value in stated.items()}
     lower, upper = said.get("lower", p.lower), said.get("upper", p.upper)
     if not stated or not lower < upper:
         return p

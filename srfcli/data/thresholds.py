@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +13,13 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import read_text
-from srfcli.core.units import find_unit, tidy
+from srfcli.core.units import find_unit, split_heading, tidy
 
 UNITS = {"V": "um/s", "eps": "1", "W0c": "N", "sigma": "N"}
 REQUIRED = ("V", "eps", "W0c")
 RELATIVE_ERROR = 0.03  # of the critical load, where the table gives none: the paper's "typically 3 %"
 PERCENT = ("eps", "sigma")  # columns that may be given in %
 LARGEST = 64 * 2**20  # bytes of a table
-CELL = 500  # characters of a heading that are looked through for its unit
-_HEADER = re.compile(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*")
 
 
 @dataclass(frozen=True)
@@ -114,7 +111,7 @@ def _columns(header: str, where: str) -> list[tuple[str, float]]:
     """Return name and factor to base units of each column; the factor of a relative sigma is negative."""
     found: list[tuple[str, float]] = []
     for cell in _split(header):
-        name, unit = _name_and_unit(cell)
+        name, unit = split_heading(cell)
         if name not in UNITS:
             hint = f"{did_you_mean(name, UNITS)}; other columns have no place in a table of critical loads."
             raise SrfError(f"{where}: unknown column {name!r}", hint)
@@ -128,11 +125,6 @@ def _columns(header: str, where: str) -> list[tuple[str, float]]:
             "A table has V, eps and W0c and, if known, sigma: V [um/s],eps,W0c [N],sigma [N]",
         )
     return found
-
-
-def _name_and_unit(cell: str) -> tuple[str, str | None]:
-    match = _HEADER.fullmatch(cell) if len(cell) <= CELL else None
-    return (match[1], match[2]) if match else (cell.strip(), None)
 
 
 def _factor(name: str, unit: str | None, where: str) -> float:
@@ -161,9 +153,9 @@ def _row(cells: list[str], columns: list[tuple[str, float]], where: str) -> tupl
         if name == "sigma" and not cell.strip():
             continue
         values[name] = factor * _number(name, cell, where)
-    for name, low, text in (("V", 0.0, "above 0"), ("W0c", 0.0, "above 0")):
-        if not values[name] > low:
-            raise SrfError(f"{where}: {name} = {values[name]:g} {UNITS[name]} is not {text}", "Correct or remove it.")
+    for name in ("V", "W0c"):
+        if not values[name] > 0:
+            raise SrfError(f"{where}: {name} = {values[name]:g} {UNITS[name]} is not above 0", "Correct or remove it.")
     if not 0 <= values["eps"] < 1:
         raise SrfError(
             f"{where}: eps = {values['eps']:g} is not in [0, 1)", "eps is relative to W0; in percent head it eps [%]."

@@ -1,4 +1,4 @@
-"""What an experiment is once it has been read: frozen values in um, s, N."""
+"""The values that reading an experiment gives: frozen, in um, s, N."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError
-from srfcli.core.units import factor_between, find_unit, split_quantity
+from srfcli.core.units import factor_between, find_unit, split_quantity, to_base
 from srfcli.data.clock import Sampling, find_sampling
 from srfcli.data.thresholds import Thresholds
 from srfcli.motion.imposed import Drive, Load
@@ -128,6 +128,21 @@ class Run:
         return replace(self, **own, others=others, proposed=None if self.proposed is None else self.proposed[which])
 
     @property
+    def edges(self) -> list[float]:
+        """Return the times (s) at which the pieces of the drive begin within the run, and its end."""
+        begin, end = float(self.t[0]), float(self.t[-1])
+        return [begin, *(b for b in self.drive.breaks if begin < b < end), end]
+
+    @property
+    def first_load(self) -> float:
+        """Return the load (N) at the first sample, without a modulation."""
+        return self.load.rest(float(self.t[0]))
+
+    def friction_factor(self, W: Array | float) -> Array | float:
+        """Return what the observable is multiplied by to be a friction coefficient under the loads W (N)."""
+        return {"elongation": self.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[self.observable]
+
+    @property
     def load_unit(self) -> str:
         """Return the unit of the load as it is shown: N or MPa."""
         return shown_unit("N", stress=self.stress)
@@ -182,7 +197,9 @@ class Experiment:
     def check_recorded(self, purpose: str) -> None:
         """Raise SrfError where there is no recording, only critical loads."""
         if not self.runs:
-            raise SrfError(f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`.")
+            raise SrfError(
+                f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`."
+            )
 
     def elsewhere(self, run: Run) -> dict[str, float]:
         """Return the parameters that act in other runs alone, at what they are in this one."""
@@ -197,7 +214,12 @@ class Experiment:
     def stiffness(self) -> float:
         """Return the stated stiffness in N/um, or in 1/um where it is friction per micron."""
         number, unit = split_quantity(self.stiffness_text, name="stiffness")
-        return number * find_unit(unit).factor
+        return to_base(number, unit)
+
+    @property
+    def per_load(self) -> bool:
+        """Return whether the stiffness is stated in 1/um, as friction per micron."""
+        return not find_unit(split_quantity(self.stiffness_text, name="stiffness")[1]).powers[2]
 
     @property
     def stress(self) -> bool:
@@ -205,13 +227,13 @@ class Experiment:
         return any(run.stress for run in self.runs)
 
     def rescaled(self) -> str:
-        """Return, of a stiffness stated in 1/um, what it is under the load of each run, as a sentence; "" for any other."""
-        number, unit = split_quantity(self.stiffness_text, name="stiffness")
-        if find_unit(unit).powers[2]:
+        """Return a sentence on what a stiffness stated in 1/um is under each run's load; "" for any other stiffness."""
+        if not self.per_load:
             return ""
+        number, unit = split_quantity(self.stiffness_text, name="stiffness")
         under: dict[str, str] = {}
         for run in self.runs:
-            W = run.load.rest(float(run.t[0]))
+            W = run.first_load
             told = f"{run.stiffness:.4g} {run.load_unit}/um under {W:.4g} {run.load_unit}"
             if W != 1.0 and told not in under:
                 under[told] = run.name

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from srfcli.core.errors import SrfError
-from srfcli.core.files import SIDECAR, clear, parse_toml, read_text, recover, whole_folder
+from srfcli.core.files import SIDECAR, clear, parse_toml, read_text, recover, toml_lines, whole_folder
 from srfcli.core.units import find_unit
 from srfcli.data.description import LARGEST
 from srfcli.data.thresholds import thresholds_csv
@@ -108,7 +106,9 @@ def run_csv(run: Run) -> str:
     header = ["time [s]", "load_point_velocity [um/s]", "normal_stress [MPa]" if run.stress else "normal_load [N]"]
     for signal, name in zip(run.signals, observables(run), strict=True):
         header.append(f"{name} [{run.unit_of(signal.observable)}]")
-        texts.append(repr(y) if used else "" for y, used in zip(signal.observed.tolist(), signal.used.tolist(), strict=True))
+        texts.append(
+            repr(y) if used else "" for y, used in zip(signal.observed.tolist(), signal.used.tolist(), strict=True)
+        )
     return "\n".join([",".join(header), *map(",".join, zip(*texts, strict=True))]) + "\n"
 
 
@@ -131,50 +131,46 @@ def _velocity_column(drive: Drive, t: np.ndarray) -> np.ndarray:
 
 def _description(experiment: Experiment, files: list[str]) -> str:
     choice = experiment.choice
-    lines = ['format = "srf-experiment/1"', f"title = {_text(experiment.title)}", "", "[apparatus]"]
-    lines.append(f"stiffness = {_text(experiment.stiffness_text)}")
+    head = {"format": "srf-experiment/1", "title": experiment.title}
+    apparatus = {"stiffness": experiment.stiffness_text}
     if experiment.mass:
-        lines.append(f"mass = {_text(f'{shortest(experiment.mass, KILOGRAM)!r} kg')}")
-    lines += ["", "[model]", f"law = {_text(choice.law)}", f"ageing = {_text(choice.ageing)}"]
-    lines += [f"interface = {_text(choice.interface)}", f"inertia = {_truth(choice.inertia)}"]
+        apparatus["mass"] = f"{shortest(experiment.mass, KILOGRAM)!r} kg"
+    model = {"law": choice.law, "ageing": choice.ageing, "interface": choice.interface, "inertia": choice.inertia}
     if choice.effects:
-        lines.append(f"effects = [{', '.join(map(_text, choice.effects))}]")
+        model["effects"] = choice.effects
+    lines = [*toml_lines(head), "", "[apparatus]", *toml_lines(apparatus), "", "[model]", *toml_lines(model)]
     if experiment.parameters:
-        lines += ["", "[parameters]", *map(parameter_line, experiment.parameters)]
+        lines += ["", "[parameters]", *toml_lines({p.name: parameter_table(p) for p in experiment.parameters})]
     for run, file in zip(experiment.runs, files, strict=False):
-        lines += ["", "[[runs]]", *_run_lines(run, file)]
+        lines += ["", "[[runs]]", *toml_lines(_run(run, file))]
     for table, file in zip(experiment.thresholds, files[len(experiment.runs) :], strict=True):
-        lines += ["", "[[thresholds]]", f"name = {_text(table.name)}", f"file = {_text(file)}"]
-        lines += [f"holdout = {_truth(table.holdout)}", f"frequency = {float(table.frequency)!r}"]
+        own = {"name": table.name, "file": file, "holdout": table.holdout, "frequency": float(table.frequency)}
+        lines += ["", "[[thresholds]]", *toml_lines(own)]
     return "\n".join(lines) + "\n"
 
 
-def parameter_line(p: FitParameter, unit: str = "") -> str:
+def parameter_table(p: FitParameter, unit: str = "") -> dict[str, object]:
     """Return a parameter as [parameters] has it, in `unit` if that is not the one it is declared in."""
     factor = find_unit(unit or p.unit).factor
     cells = {"value": p.value, "lower": p.lower, "upper": p.upper}
-    parts = [f"{name} = {shortest(value, factor)!r}" for name, value in cells.items() if np.isfinite(value)]
-    parts += ["fixed = true"] if p.fixed else []
-    if p.runs:
-        parts += [f"runs = [{', '.join(map(_text, p.runs))}]", f"elsewhere = {shortest(p.elsewhere, factor)!r}"]
-    return f"{_key(p.name)} = {{ {', '.join(parts)} }}"
+    stated: dict[str, object] = {name: shortest(value, factor) for name, value in cells.items() if np.isfinite(value)}
+    stated |= {"fixed": True} if p.fixed else {}
+    return stated | ({"runs": p.runs, "elsewhere": shortest(p.elsewhere, factor)} if p.runs else {})
 
 
-def _run_lines(run: Run, file: str) -> list[str]:
-    lines = [f"name = {_text(run.name)}", f"file = {_text(file)}", f"holdout = {_truth(run.holdout)}"]
+def _run(run: Run, file: str) -> dict[str, object]:
+    table: dict[str, object] = {"name": run.name, "file": file, "holdout": run.holdout}
     if run.start:
-        lines.append(f"start = {float(run.start)!r}")
+        table["start"] = float(run.start)
     if run.initial != "steady":
-        lines.append(f"initial = {_text(run.initial)}")
+        table["initial"] = run.initial
     if not any(run.drive.accelerations):
-        steps = [f"{{ duration = {d!r}, velocity = {V!r} }}" for d, V in drive_steps(run.drive, run.t)]
-        lines.append(f"drive = [{', '.join(steps)}]")
+        table["drive"] = [{"duration": d, "velocity": V} for d, V in drive_steps(run.drive, run.t)]
     if run.others:
-        lines.append(f"observables = [{', '.join(map(_text, observables(run)))}]")
+        table["observables"] = observables(run)
     if run.modulation is not None:
-        f, eps, onset = map(float, run.modulation)
-        lines.append(f"modulation = {{ frequency = {f!r}, amplitude = {eps!r}, onset = {onset!r} }}")
-    return lines
+        table["modulation"] = dict(zip(("frequency", "amplitude", "onset"), map(float, run.modulation), strict=True))
+    return table
 
 
 def drive_steps(drive: Drive, t: np.ndarray) -> list[tuple[float, float]]:
@@ -183,7 +179,7 @@ def drive_steps(drive: Drive, t: np.ndarray) -> list[tuple[float, float]]:
     edges = [start, *(b for b in drive.breaks if start < b < end), end]
     steps, reached = [], start
     for a, b in pairwise(edges):
-        duration = _plain(b - reached)
+        duration = shortest(b - reached, 1.0, slack=1e-13)  # without the digits that subtraction rounded
         if b == end:
             while reached + duration < end:  # rounding must not leave the last sample without a drive
                 duration = float(np.nextafter(duration, np.inf))
@@ -195,11 +191,6 @@ def drive_steps(drive: Drive, t: np.ndarray) -> list[tuple[float, float]]:
 def stiffness_text(K: float) -> str:
     """Return a stiffness in N/um as experiment.toml says it."""
     return f"{shortest(K, 1.0)!r} N/um"
-
-
-def _plain(value: float) -> float:
-    """Return the number of twelve digits that `value` misses by rounding alone, else `value` itself."""
-    return shortest(value, 1.0, slack=1e-13)
 
 
 def shortest(value: float, factor: float, *, slack: float = 0.0) -> float:
@@ -221,17 +212,3 @@ def _file_names(runs: list[str]) -> list[str]:
             name, number = f"{stem}-{number}.csv", number + 1
         names.append(name)
     return names
-
-
-def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False).replace(
-        "\x7f", "\\u007f"
-    )  # TOML's basic strings are JSON's, but for DEL
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _text(name)
-
-
-def _truth(value: Any) -> str:
-    return "true" if value else "false"

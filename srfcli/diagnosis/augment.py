@@ -6,7 +6,6 @@ know (position, time, the load in a friction coefficient), stays an effect besid
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
@@ -19,11 +18,12 @@ import numpy as np
 import sympy as sp
 
 from srfcli.core.errors import SrfError
+from srfcli.core.files import toml_lines
 from srfcli.core.settings import Parameter
 from srfcli.core.units import find_unit, from_base, split_quantity
 from srfcli.data.description import GEOMETRY, open_node
 from srfcli.data.values import Experiment, ModelChoice
-from srfcli.data.writing import DESCRIPTION, KILOGRAM, parameter_line, shortest
+from srfcli.data.writing import DESCRIPTION, KILOGRAM, parameter_table, shortest
 from srfcli.diagnosis.hypotheses import Hypothesis
 from srfcli.inference.state_space import StateSpaceFit
 from srfcli.laws.effect_file import formula_text
@@ -92,22 +92,20 @@ def augment(
     title = experiment.title + (
         f" (augmented with {', '.join(hypothesis.reported)})" if hypothesis.reported else " (fitted)"
     )
-    lines = ['format = "srf-experiment/1"', f"title = {_value(title.strip())}", "", "[apparatus]"]
     text = experiment.stiffness_text if "K" not in values else f"{shortest(K, 1.0)!r} {base}"
     rig = {key: description["apparatus"][key] for key in GEOMETRY if key in description["apparatus"]}
     text = text.replace(" N/um", " MPa/um") if "area" in rig else text  # beside an area a force would be divided by it
-    lines += [f"{key} = {_value(value)}" for key, value in rig.items()]
-    lines += [f"stiffness = {_value(text)}"] + ([f'mass = "{shortest(mass, KILOGRAM)!r} kg"'] if mass else [])
-    lines += ["", "[model]", *(f'{"law" if kind == "friction" else kind} = "{kind}.toml"' for kind in LAWS)]
-    lines += [f"inertia = {_value(inertia)}"] + ([f"effects = {_value(list(effects))}"] if effects else [])
-    lines += [f"vary = {_value(list(experiment.vary))}", f"by = {_value(experiment.by)}"] if experiment.vary else []
-    lines += ["", "[parameters]", *(parameter_line(q, base if q.name == "K" else "") for q in listed)]
-    if "columns" in description:
-        lines += ["", "[columns]", *(f"{_key(k)} = {_value(v)}" for k, v in description["columns"].items())]
-    for run in runs:
-        lines += ["", "[[runs]]", *(f"{_key(k)} = {_value(v)}" for k, v in run.items())]
-    for table in parts[len(recorded) :]:
-        lines += ["", "[[thresholds]]", *(f"{_key(k)} = {_value(v)}" for k, v in table.items())]
+    rig |= {"stiffness": text} | ({"mass": f"{shortest(mass, KILOGRAM)!r} kg"} if mass else {})
+    model: dict[str, object] = {"law" if kind == "friction" else kind: f"{kind}.toml" for kind in LAWS}
+    model |= {"inertia": inertia} | ({"effects": effects} if effects else {})
+    model |= {"vary": experiment.vary, "by": experiment.by} if experiment.vary else {}
+    lines = toml_lines({"format": "srf-experiment/1", "title": title.strip()})
+    tables = [("[apparatus]", rig), ("[model]", model)]
+    tables.append(("[parameters]", {q.name: parameter_table(q, base if q.name == "K" else "") for q in listed}))
+    tables += [("[columns]", description["columns"])] if "columns" in description else []
+    tables += [("[[runs]]", run) for run in runs] + [("[[thresholds]]", table) for table in parts[len(recorded) :]]
+    for heading, table in tables:
+        lines += ["", heading, *toml_lines(table)]
     files = {DESCRIPTION: "\n".join(lines) + "\n", **law_files(laws, values)}
     files |= {name: path.read_text(encoding="utf-8") for name, path in sources.items()}
     return Augmented(files, copies, tuple(e.name for e in laws.left), (K, mass / KILOGRAM if mass else None))
@@ -163,23 +161,6 @@ def _parts(
             names[path], copies[name] = name, path
         runs.append({**run, "file": names[path]})
     return runs, copies
-
-
-def _value(value: Any) -> str:
-    """Return a value as TOML, tables inline."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    return repr(value)
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _value(name)
 
 
 # Laws with effects written into them: friction, ageing and interface files that say what a fitted model says.
@@ -312,16 +293,15 @@ def law_files(laws: Folded, values: Mapping[str, float]) -> dict[str, str]:
     for slot, kind in KINDS.items():
         law, formula = laws.law(slot), laws.formula(slot)
         suffix = "augmented" if kind in laws.changed else "fitted"
-        lines = [f'format = "{FORMAT}"', f'kind = "{kind}"', f"name = {_text(_name(law.name, suffix))}"]
-        lines += [f"about = {_text(law.about)}"] if law.about else []
-        lines += [f"cites = [{', '.join(map(_text, law.cites))}]"] if law.cites else []
-        lines += [f"{slot} = {_text(formula_text(formula))}"] if formula is not None else []
+        head: dict[str, object] = {"format": FORMAT, "kind": kind, "name": _name(law.name, suffix)}
+        head |= {"about": law.about} if law.about else {}
+        head |= {"cites": law.cites} if law.cites else {}
+        head |= {slot: formula_text(formula)} if formula is not None else {}
         if slot == "mu" and laws.friction.states != (State(),):
-            states = (
-                f'{{ name = "{s.name}", length = "{s.length}", weight = "{s.weight}" }}' for s in laws.friction.states
-            )
-            lines.append(f"states = [{', '.join(states)}]")
-        lines += ["", "[parameters]", *(_law_parameter(p, values) for p in law.parameters)] if law.parameters else []
+            head["states"] = [{"name": s.name, "length": s.length, "weight": s.weight} for s in laws.friction.states]
+        lines = toml_lines(head)
+        if law.parameters:
+            lines += ["", "[parameters]", *toml_lines({p.name: _law_parameter(p, values) for p in law.parameters})]
         out[f"{kind}.toml"] = "\n".join(lines) + "\n"
     return out
 
@@ -333,14 +313,8 @@ def _name(name: str, suffix: str) -> str:
     return f"{stem[:50].rstrip('-')}-{suffix}"
 
 
-def _law_parameter(p: Parameter, values: Mapping[str, float]) -> str:
+def _law_parameter(p: Parameter, values: Mapping[str, float]) -> dict[str, object]:
     value = from_base(values[p.name], p.unit) if p.name in values else p.default
-    value = min(max(value, p.lower), p.upper)
-    parts = [f"default = {float(value)!r}", f"unit = {_text(p.unit)}"]
-    parts += [f"{key} = {float(x)!r}" for key, x in (("lower", p.lower), ("upper", p.upper)) if math.isfinite(x)]
-    parts += [f"about = {_text(p.about)}"] if p.about else []
-    return f"{p.name} = {{ {', '.join(parts)} }}"
-
-
-def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    bounds = {key: float(x) for key, x in (("lower", p.lower), ("upper", p.upper)) if math.isfinite(x)}
+    found: dict[str, object] = {"default": float(min(max(value, p.lower), p.upper)), "unit": p.unit, **bounds}
+    return found | ({"about": p.about} if p.about else {})

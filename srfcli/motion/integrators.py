@@ -1,10 +1,11 @@
 """States over time and their derivatives: Radau IIA compiled where that is possible, else LSODA.
 
-The sensitivities solve S' = f_x S + f_p. The compiled integrator differentiates its own discrete solution, so that a gradient
-belongs to the very number it is the gradient of; LSODA carries S along as further unknowns.
+The sensitivities S solve S' = f_x S + f_p. The compiled integrator differentiates its own discrete solution, so that a gradient
+is that of the very number which is returned. LSODA carries S along as further unknowns.
 
-The text of the generated module is the only source: `x[..., i]` becomes `x[i]`, `out[..., i] = e` an entry of a tuple, and
-whatever depends on the parameters alone is computed once, when they are bound.
+LSODA calls functions of one state in Python floats. They are made from the text of the generated module: `x[..., i]` becomes
+`x[i]`, `out[..., i] = e` becomes an entry of a tuple, and what depends on the parameters alone is computed once, when they are
+bound.
 """
 
 from __future__ import annotations
@@ -29,14 +30,10 @@ from srfcli.codegen.splines import Spline, appended, tables_after
 from srfcli.core.errors import SrfError, Status
 from srfcli.motion.imposed import Drive, Load
 
-# States over time, and their derivatives by parameters and by the initial state: compiled where that is possible, else LSODA.
-
 PATIENCE = 0.1  # s between looks for a signal where waiting for a thread cannot be interrupted (Windows)
 MAX_STEPS = 20_000_000  # of the compiled integrator, in all; a hundred times an hour of modulation
 MAX_LSODA_STEPS = 200_000  # between two output times
-S_SHARE = (
-    100.0  # sensitivities are solved so much less closely than states; left out of the control altogether, they diverge
-)
+S_SHARE = 100.0  # sensitivities are solved so much less closely than states; without any control they diverge
 BEYOND = 1e100  # a rate where the formula overflows: the step is then rejected and cut
 
 Rates = Callable[[float, Array], object]
@@ -112,12 +109,12 @@ def _integrate_compiled(
     x, S = np.full((t.size, n), np.nan), np.full((t.size, n, k), np.nan)
     stats, stop = np.zeros(4), ctypes.c_int(0)
     arguments = (
-        *imposed_arguments(t, drive, load), doubles(np.asarray(p, dtype=float)), doubles(np.asarray(start, dtype=float)), k,
+        *imposed_arguments(t, drive, load), doubles(p), doubles(start), k,
         len(by), integers(columns), integers(np.array(by or [-1], dtype=np.intc)), doubles(sensitivity_scale(p, by)), doubles(S0),
         ctypes.c_double(rtol_of_estimate(rtol)),
         doubles(np.asarray(atol) * rtol_of_estimate(rtol) / rtol),
         ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(MAX_STEPS),
-        t.size, doubles(np.asarray(t, dtype=float)), doubles(x), doubles(S), doubles(stats), ctypes.byref(stop),
+        t.size, doubles(t), doubles(x), doubles(S), doubles(stats), ctypes.byref(stop),
     )  # fmt: skip
     filled = interruptible(lambda: library.srf_integrate(*arguments), stop)
     status = Status.OK if filled == t.size else Status.INTEGRATION
@@ -134,19 +131,12 @@ def imposed_arguments(t: Array, drive: Drive, load: Load) -> tuple[Any, ...]:
     high = np.clip(
         np.searchsorted(knots, edges[1:] - 1e-12 * np.abs(edges).max(), side="left"), low + 1, len(knots) - 1
     )
-    ranges = np.column_stack([low, high]).astype(np.intc)
+    ranges = np.column_stack([low, high])
     middle = np.array([drive.piece(0.5 * (a + b)) for a, b in segments], dtype=float)
-    count, degree = len(knots), coefficients.shape[1] - 1
     return (
-        len(segments),
-        doubles(edges),
-        doubles(middle),
-        integers(ranges),
-        count,
-        degree,
-        doubles(knots),
-        doubles(coefficients),
-    )
+        len(segments), doubles(edges), doubles(middle), integers(ranges),
+        len(knots), coefficients.shape[1] - 1, doubles(knots), doubles(coefficients),
+    )  # fmt: skip
 
 
 def interruptible(call: Callable[[], int], stop: ctypes.c_int) -> int:
@@ -180,18 +170,18 @@ def rtol_of_estimate(rtol: float) -> float:
 
 
 def doubles(array: Array) -> ctypes.c_void_p:
-    array = (
-        array if array.flags.c_contiguous and array.dtype == np.float64 else np.ascontiguousarray(array, dtype=float)
-    )
+    """Return a pointer to the array, or to a contiguous copy of doubles where it is none of these."""
+    return _pointer(np.ascontiguousarray(array, dtype=float))
+
+
+def integers(array: NDArray[Any]) -> ctypes.c_void_p:
+    """Return a pointer to the array, or to a contiguous copy of C's ints where it is none of these."""
+    return _pointer(np.ascontiguousarray(array, dtype=np.intc))
+
+
+def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:
     pointer = ctypes.c_void_p(array.ctypes.data)
     pointer.array = array  # type: ignore[attr-defined]  # keeps it alive through the call
-    return pointer
-
-
-def integers(array: Array) -> ctypes.c_void_p:
-    array = np.ascontiguousarray(array, dtype=np.intc)
-    pointer = ctypes.c_void_p(array.ctypes.data)
-    pointer.array = array  # type: ignore[attr-defined]
     return pointer
 
 

@@ -17,8 +17,6 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.motion.imposed import Drive, Load
 from srfcli.motion.integrators import integrate
 
-# Time integration of one slider under any drive and load, as an experimenter would plot it.
-
 
 @dataclass(frozen=True)
 class Trace:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.core.errors import SrfError, Status
+from srfcli.core.parallel import Runner, run_here
 from srfcli.core.units import from_base
 from srfcli.data.values import Run
 from srfcli.inference.noise import lag_one
@@ -21,12 +22,11 @@ from srfcli.results.campaign import PAIRS, CampaignResult
 from srfcli.results.fit import FitResult, unit_of
 from srfcli.tasks.recordings import fit, read_experiment
 
-TAIL = 1 / 3  # of a segment, at its end, that is looked at for steady sliding
-LONG = 2.0  # slip lengths in that part, and a time constant of the spring's: a shorter one tells nothing
-SURE = 3.0  # standard errors of a slope that is one
+TAIL = 1 / 3  # of a segment, at its end, that is checked for steady sliding
+LONG = 2.0  # slip lengths that this part must be long
+SURE = 3.0  # standard errors from which a slope is significant
 DRIFT = 0.02  # of B (A where it is larger) that friction may change by over a slip length in steady sliding
-BAD = 1.3  # rms over noise from which the fit is flagged
-Runner = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[int, Any]]]
+BAD = 1.3  # residual rms over noise from which the fit is flagged
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def fit_campaign(
     options: Mapping[str, Any] | None = None,
     reader: str | None = None,
     plugins: Sequence[str | Path] = (),
-    run: Runner | None = None,
+    run: Runner = run_here,
     done: Callable[[CampaignResult], None] = lambda so_far: None,
 ) -> CampaignResult:
     """Return the fits of many experiments, a row each in the order of `paths`.
@@ -61,7 +61,7 @@ def fit_campaign(
         Reader of all data files.
     plugins : sequence of path
         Folders in which laws and readers are looked for, too.
-    run : callable, optional
+    run : callable
         Spreads the work, as `srfcli.core.parallel` does; one after the other in this process if left out.
     done : callable
         Told the rows so far after each experiment.
@@ -82,16 +82,12 @@ def fit_campaign(
         return CampaignResult([rows[k] for k in sorted(rows)], len(tasks), worst if status is Status.OK else status)
 
     try:
-        for index, kept in (run or _here)(fit_one, tasks):
+        for index, kept in run(fit_one, tasks):
             rows[index] = json.loads(np.asarray(kept["row"]).tobytes().decode("utf-8"))
             done(so_far())
     except KeyboardInterrupt:
         return so_far(Status.INTERRUPTED)
     return so_far()
-
-
-def _here(function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
-    yield from ((k, function(task)) for k, task in enumerate(tasks))
 
 
 def _digest(path: Path) -> str:
@@ -161,10 +157,9 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
         both = 2 * float(covariance[place["A"], place["B"]]) if {"A", "B"} <= place.keys() else 0.0
         row["A_minus_B"] = values["A"] - values["B"]
         row["A_minus_B_stderr"] = _number(float(np.sqrt(max(sum(variances) - both, 0.0)))) if place else None
-    unit, factor = experiment.shown("1/um" if _per_load(experiment.stiffness_text) else "N/um")
-    stated = float(
-        values.get("K", runs[0].stiffness / (_first(runs[0]) if _per_load(experiment.stiffness_text) else 1.0))
-    )
+    unit, factor = experiment.shown("1/um" if experiment.per_load else "N/um")
+    own_stiffness = runs[0].stiffness / (runs[0].first_load if experiment.per_load else 1.0)
+    stated = float(values.get("K", own_stiffness))
     row |= {"k": stated * factor, "k_unit": unit, "k_stderr": table["K"][2] if "K" in table else None}
     length = float(values.get("D0", 10.0))
     allowed = DRIFT * max(abs(values.get("A", 0.0)), abs(values.get("B", 0.0))) / length
@@ -178,14 +173,6 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
 
 def _number(value: float | None) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
-
-
-def _per_load(text: str) -> bool:
-    return "N" not in text and "Pa" not in text
-
-
-def _first(run: Run) -> float:
-    return float(run.load.rest(float(run.t[0])))
 
 
 def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
@@ -202,10 +189,8 @@ def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
 
 def _slopes(run: Run, length: float) -> Iterator[tuple[float, float]]:
     """Yield d mu/d slip (1/um) and its error for the end of each segment of constant velocity that is long enough."""
-    W = run.load(run.t)[0]
-    mu = run.observed * {"elongation": run.stiffness / W, "force": 1 / W, "friction": np.ones_like(W)}[run.observable]
-    starts = [float(run.t[0]), *(b for b in run.drive.breaks if run.t[0] < b < run.t[-1]), float(run.t[-1])]
-    for begin, end in pairwise(starts):
+    mu = run.observed * run.friction_factor(run.load(run.t)[0])
+    for begin, end in pairwise(run.edges):
         V, rate, _ = run.drive.piece(begin)
         part = (run.t >= end - TAIL * (end - begin)) & (run.t <= end) & run.used
         if rate or V <= 0 or V * TAIL * (end - begin) < LONG * length or part.sum() < 16:

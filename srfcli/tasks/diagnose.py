@@ -36,8 +36,8 @@ def diagnose(
 ) -> DiagnosisResult:
     """Return which physics an experiment's model lacks, as far as its recordings and critical loads tell.
 
-    The baseline is fitted with a random friction field and the gauge's noise; every registered effect is scored against it, those
-    that promise most are fitted, and held-out runs judge the best.
+    The baseline is fitted with a random friction field and the gauge's noise. Every registered effect is scored against it, the
+    effects with the highest scores are fitted, and held-out runs judge the best model.
 
     Parameters
     ----------

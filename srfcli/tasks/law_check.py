@@ -17,7 +17,7 @@ from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel, load_sourc
 from srfcli.codegen.numpy_source import generate_motion
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
-from srfcli.core.units import QUANTITY_UNITS, SYMBOL_UNITS, Dimension, describe, dimension, dimension_of, find_unit
+from srfcli.core.units import QUANTITY_UNITS, SYMBOL_UNITS, Dimension, describe, dimension, dimension_of, to_base
 from srfcli.laws.effect_file import summary
 from srfcli.laws.expression import expm1, log1p, symbol
 from srfcli.laws.law_file import COMMON, FORMULA, formula_of, kind_of
@@ -90,10 +90,10 @@ def check_units(law: Law, registry: Registry) -> str:
     units |= {state.name: units["phi"] for state in states}
     units |= {p.name: dimension(p.unit) for p in _parameters(law, registry)}
     for state in states:
-        _expect(units[state.length], "um", f"length '{state.length}' of state '{state.name}'")
-        _expect(units[state.weight], "1", f"weight '{state.weight}' of state '{state.name}'")
+        _expect(units[state.length], dimension("um"), f"length '{state.length}' of state '{state.name}'")
+        _expect(units[state.weight], dimension("1"), f"weight '{state.weight}' of state '{state.name}'")
     unit = QUANTITY_UNITS[quantity]
-    _expect(dimension_of(formula, units), unit, quantity)
+    _expect(dimension_of(formula, units), dimension(unit), quantity)
     return f"{quantity} is in {unit}"
 
 
@@ -106,7 +106,9 @@ def check_steady_state(law: Law, registry: Registry) -> str:
         names = []
         for ageing in _ageing_laws(registry):
             for v in VELOCITIES:
-                _finite(law, evaluate(law.mu, {**values, **_steady(law, ageing, v), "v": v}), v, ageing)
+                mu = evaluate(law.mu, {**values, **_steady(law, ageing, v), "v": v})
+                if not np.isfinite(mu):
+                    raise SrfError(f"mu = {mu} at v = {v:g} um/s in steady sliding with {ageing.name}")
             names.append(ageing.name)
         return f"mu is finite from {VELOCITIES[0]:g} to {VELOCITIES[-1]:g} um/s with {', '.join(names)}"
     rate = law.rate if isinstance(law, AgeingLaw) else formula_of(law) + _ageing(registry, "dieterich").rate
@@ -168,10 +170,10 @@ def check_worked_values(law: Law, registry: Registry) -> str:
         raise Skipped("the law gives none; add [[checks]]")
     if formula is None:
         raise SrfError("a rigid interface has no formula to check")
-    units = {p.name: find_unit(p.unit).factor for p in _parameters(law, registry)}
+    units = {p.name: p.unit for p in _parameters(law, registry)}
     for number, check in enumerate(law.checks):
         values = reference_values(_parameters(law, registry))
-        values |= {name: value * units.get(name, 1.0) for name, value in check.at}
+        values |= {name: to_base(value, units.get(name, "1")) for name, value in check.at}
         missing = sorted({s.name for s in formula.free_symbols} - set(values))
         if missing:
             raise SrfError(f"checks[{number}]: no value for '{missing[0]}'", "Add it to the table 'at'.")
@@ -226,14 +228,12 @@ def _steady_of(state: State, ageing: AgeingLaw, v: float, own: Mapping[str, floa
     return phi
 
 
-def _finite(law: FrictionLaw, value: float, v: float, ageing: AgeingLaw) -> None:
-    if not np.isfinite(value):
-        raise SrfError(f"mu = {value} at v = {v:g} um/s in steady sliding with {ageing.name}")
-
-
-def _expect(found: Dimension, unit: str, what: str) -> None:
-    if found != dimension(unit):
-        raise SrfError(f"{what} is in {describe(found)}, expected {unit}", "Look at the units under [parameters].")
+def _expect(found: Dimension, wanted: Dimension, what: str) -> None:
+    """Raise `SrfError` where a formula has another dimension than it should."""
+    if found != wanted:
+        raise SrfError(
+            f"{what} is in {describe(found)}, expected {describe(wanted)}", "Look at the units under [parameters]."
+        )
 
 
 def _sample(law: Law, registry: Registry) -> list[dict[str, float]]:
@@ -264,6 +264,7 @@ SLOT_UNITS = {
 }  # fmt: skip
 PLACE_UNITS = {"slip": "um", "stage": "um", "time": "s", "theta": "1", "envelope": "1", "u": "um"}
 MOVING = {"slip", "stage", "time", "theta", "envelope"}  # an effect of these is steady nowhere
+RUN = {"V": 9.0, "W0": 6.0, "eps": 0.1, "f": 110.0, "psi": 0.4, "onset0": 0.5, "rise0": 0.3, "modulated": 1.0}
 POINTS = 24
 RTOL = 1e-9
 
@@ -308,19 +309,14 @@ class _Check:
         formulas = [*(f for _, f in self.effect.written or self.effect.changes)]
         formulas += [f for s in self.effect.states for f in (s.rate, s.steady)]
         used = {str(s) for f in formulas for s in f.free_symbols}
-        if self.effect.settings:
-            used |= {p.name for name in self._own_interface() for p in name.parameters}
+        if isinstance(interface := dict(self.effect.settings).get("interface"), str):
+            used |= {p.name for p in self.registry.get("interface", interface).parameters}
         constants = {c.name for c in self.effect.constants}
         idle = [n for n in (*(p.name for p in self.effect.parameters), *constants) if n not in used]
         if idle:
             raise SrfError(f"declared and not used: {', '.join(idle)}", "Remove them or mend the formula.")
         sizes = ", ".join(f"{name} = {value:g}" for name, value in self.effect.neutral)
         return f"{len(self.effect.parameters)}, all used" + (f"; the baseline has {sizes}" if sizes else "")
-
-    def _own_interface(self) -> list[Interface]:
-        name = dict(self.effect.settings).get("interface")
-        law = self.registry.get("interface", name) if isinstance(name, str) else None
-        return [law] if isinstance(law, Interface) else []
 
     def units(self) -> str:
         formulas = self.effect.written or self.effect.changes
@@ -332,13 +328,11 @@ class _Check:
         for state in self.effect.states:
             found = dimension_of(state.rate, units)
             own = units[state.name]
-            _expect_in_effect(found, (own[0], own[1] - 1, own[2]), f"rate of {state.name}")
+            _expect(found, (own[0], own[1] - 1, own[2]), f"rate of {state.name}")
         for slot, formula in formulas:
-            _expect_in_effect(dimension_of(formula, units), dimension(SLOT_UNITS[slot]), slot)
+            _expect(dimension_of(formula, units), dimension(SLOT_UNITS[slot]), slot)
         if self.effect.observed:
-            _expect_in_effect(
-                units[self.effect.observed], dimension("um"), f"observed '{self.effect.observed}'"
-            )
+            _expect(units[self.effect.observed], dimension("um"), f"observed '{self.effect.observed}'")
         return ", ".join([*(f"{slot} is in {SLOT_UNITS[slot]}" for slot, _ in formulas),
                           *(f"{s.name} in {describe(units[s.name])}" for s in self.effect.states)])  # fmt: skip
 
@@ -403,12 +397,11 @@ class _Check:
     def neutral(self) -> str:
         if self.effect.settings:
             raise Skipped(f"the baseline is another system: {self.base.title}")
-        points, values = self._points(), self._neutral_values()
-        ours = points.rates(self.model, self._vector(values))[:, : len(self.plain.states)]
-        theirs = points.rates(self.plain, self.plain.vector(self._values(self.plain)))
-        worst = _difference(ours, theirs)
-        steady = np.asarray(self.model.steady(self._vector(values)))[: len(self.plain.states)]
-        start = _difference(steady, np.asarray(self.plain.steady(self.plain.vector(self._values(self.plain)))))
+        own = len(self.plain.states)
+        ours = self.points.rates(self.model, self.p_neutral)[:, :own]
+        worst = _difference(ours, self.points.rates(self.plain, self.p_plain))
+        steady = np.asarray(self.model.steady(self.p_neutral))[:own]
+        start = _difference(steady, np.asarray(self.plain.steady(self.p_plain)))
         told = ", ".join(f"{n} = {v:g}" for n, v in self.effect.neutral) or "any value"
         if not max(worst, start) < RTOL:
             where, size = ("the rates", worst) if not worst < RTOL else ("steady sliding", start)
@@ -424,9 +417,9 @@ class _Check:
             raise Skipped("it is what is fitted or observed that changes")
         if {slot for slot, _ in self.effect.changes} == {"gauge"}:
             return self._shown()
-        points, own = self._points(), len(self.plain.states)
-        away = points.rates(self.model, self._vector())[:, :own]
-        at = points.rates(self.model, self._vector(self._neutral_values()))[:, :own]
+        own = len(self.plain.states)
+        away = self.points.rates(self.model, self.p_default)[:, :own]
+        at = self.points.rates(self.model, self.p_neutral)[:, :own]
         moved = np.max(np.abs(away - at) / np.maximum(np.max(np.abs(at), axis=0), 1e-300))
         if not np.isfinite(away).all():
             raise SrfError("the rates are not finite at the default values", "Look at the formula and the defaults.")
@@ -438,17 +431,21 @@ class _Check:
 
     def _shown(self) -> str:
         """Return how far the reading moves at the default values; SrfError where it does not, or moves at the neutral ones."""
-        points = self._points()
+        points = self.points
 
         def read(model: GeneratedModel, p: Array) -> Array:
             return np.asarray(model.reading(points.x[:, : len(model.states)], points.V, points.W, points.W_dot, p))
 
-        plain = read(self.plain, self.plain.vector(self._values(self.plain)))
-        if not (off := _difference(read(self.model, self._vector(self._neutral_values())), plain)) < RTOL:
-            raise SrfError(f"at the neutral values the reading differs by {off:.2g} of its size", "It must be gauge there.")
-        moved = _difference(read(self.model, self._vector()), plain)
+        plain = read(self.plain, self.p_plain)
+        if not (off := _difference(read(self.model, self.p_neutral), plain)) < RTOL:
+            raise SrfError(
+                f"at the neutral values the reading differs by {off:.2g} of its size", "It must be gauge there."
+            )
+        moved = _difference(read(self.model, self.p_default), plain)
         if moved < 1e-12:
-            raise SrfError("at the default values the gauge shows what it did", "Give the size a default off its neutral value.")
+            raise SrfError(
+                "at the default values the gauge shows what it did", "Give the size a default off its neutral value."
+            )
         return f"at the default values the reading moves by up to {moved:.2g} of the largest"
 
     def steady_start(self) -> str:
@@ -456,10 +453,9 @@ class _Check:
         used = {str(s) for f in formulas for s in f.free_symbols} & MOVING
         if used:
             raise Skipped(f"with {', '.join(sorted(used))} in the formula nothing is steady")
-        values = self._values(self.model)
-        x = np.asarray(self.model.steady(self._vector()))
-        rates = np.asarray(self.model.rates(x, values["V"], values["W0"], 0.0, self._vector()))
-        scale = np.max(np.abs(self._points().rates(self.model, self._vector())), axis=0)
+        p = self.p_default
+        rates = np.asarray(self.model.rates(np.asarray(self.model.steady(p)), RUN["V"], RUN["W0"], 0.0, p))
+        scale = np.max(np.abs(self.points.rates(self.model, p)), axis=0)
         worst = float(np.max(np.abs(rates) / np.maximum(scale, 1e-300)))
         if not worst < 1e-8:
             name = self.model.states[int(np.argmax(np.abs(rates) / np.maximum(scale, 1e-300)))]
@@ -470,7 +466,7 @@ class _Check:
         return f"nothing moves at V under W0{_to(worst, ' but for', ' of the usual rates')}"
 
     def derivatives(self) -> str:
-        points, model, p = self._points(), self.model, self._vector()
+        points, model, p = self.points, self.model, self.p_default
         x = points.x[:, : len(model.states)]
         given = (points.V, points.W, points.W_dot)
         exact = (model.rates_jacobian(x, *given, p), model.rates_parameters(x, *given, p))
@@ -487,36 +483,43 @@ class _Check:
 
     # ---- numbers
 
-    def _values(self, model: GeneratedModel) -> dict[str, float]:
-        run = {"V": 9.0, "W0": 6.0, "eps": 0.1, "f": 110.0, "psi": 0.4, "onset0": 0.5, "rise0": 0.3, "modulated": 1.0}
-        return {n: v for n, v in run.items() if n in model.names}
+    @cached_property
+    def p_plain(self) -> Array:
+        """The parameters of the baseline."""
+        return _vector(self.plain)
 
-    def _neutral_values(self) -> dict[str, float]:
-        units = {p.name: find_unit(p.unit).factor for p in self.effect.parameters}
-        return {n: v * units[n] for n, v in self.effect.neutral}
+    @cached_property
+    def p_default(self) -> Array:
+        """The parameters of the model with the effect at its default values."""
+        return _vector(self.model)
 
-    def _vector(self, values: Mapping[str, float] | None = None) -> Array:
-        """Return p with the effect's defaults, the sizes' at the values given; a default that is neutral moves off."""
-        return self.model.vector({**self._values(self.model), **(values or {})})
+    @cached_property
+    def p_neutral(self) -> Array:
+        """The parameters of the model with the effect at its neutral values."""
+        units = {p.name: p.unit for p in self.effect.parameters}
+        return _vector(self.model, {n: to_base(v, units[n]) for n, v in self.effect.neutral})
 
-    def _points(self) -> _Points:
-        """Return states around steady sliding, in which places and clock are anywhere in a run."""
+    @cached_property
+    def points(self) -> _Points:
+        """States around steady sliding; the slip, the stage's position and the time are anywhere in a run."""
         rng = np.random.default_rng(20)
-        x = np.asarray(self.model.steady(self._vector()))
+        x = np.asarray(self.model.steady(self.p_default))
         spread = {"slip": 40.0, "stage": 40.0, "time": 1.5}
         columns = []
         for name, log, at in zip(self.model.states, self.model.logarithmic, x, strict=True):
             r = rng.standard_normal(POINTS)
             at = at if np.isfinite(at) else 1.0
-            columns.append(
-                spread[name] * rng.uniform(size=POINTS)
-                if name in spread
-                else at + 0.5 * r
-                if log
-                else at * (1 + 0.1 * r)
-            )
+            if name in spread:
+                columns.append(spread[name] * rng.uniform(size=POINTS))
+            else:
+                columns.append(at + 0.5 * r if log else at * (1 + 0.1 * r))
         V, W = 9.0 * np.exp(0.3 * rng.standard_normal(POINTS)), 6.0 * (1 + 0.1 * rng.standard_normal(POINTS))
         return _Points(np.column_stack(columns), V, W, 300.0 * rng.standard_normal(POINTS))
+
+
+def _vector(model: GeneratedModel, values: Mapping[str, float] | None = None) -> Array:
+    """Return the parameters of a model at RUN, some of them at other values."""
+    return model.vector({n: v for n, v in RUN.items() if n in model.names} | dict(values or {}))
 
 
 def _stepped_states(model: GeneratedModel, points: _Points, p: Array) -> Array:
@@ -555,13 +558,6 @@ def _difference(found: Array, expected: Array) -> float:
 def _to(size: float, before: str = " to", after: str = "") -> str:
     """Return how far something is off as words, none where it is not."""
     return f"{before} {size:.0e}{after}" if size else ""
-
-
-def _expect_in_effect(found: Dimension, wanted: Dimension, what: str) -> None:
-    if found != wanted:
-        raise SrfError(
-            f"{what} is in {describe(found)}, expected {describe(wanted)}", "Look at the units under [parameters]."
-        )
 
 
 # What checks of laws and of effects share: outcomes, and the numbers of formulas.
@@ -643,4 +639,4 @@ def evaluate(expr: sympy.Expr, values: Values) -> Any:
 
 def reference_values(parameters: Iterable[Parameter]) -> dict[str, float]:
     """Return the defaults of parameters in um, s, N."""
-    return {p.name: p.default * find_unit(p.unit).factor for p in parameters}
+    return {p.name: to_base(p.default, p.unit) for p in parameters}

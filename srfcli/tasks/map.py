@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.core.errors import SrfError, Status
-from srfcli.core.parallel import Run, run_here
+from srfcli.core.parallel import Runner, run_here
 from srfcli.core.settings import require_parameter
 from srfcli.core.units import to_base
 from srfcli.numerics.compare import (
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
 def map(  # the command's own name
     system: SlidingSystem,
     *,
-    x: tuple[str, float, float, int],
-    y: tuple[str, float, float, int],
+    x: tuple[str, float, float, int] | MapAxis,
+    y: tuple[str, float, float, int] | MapAxis,
     log: Sequence[str] | None = None,
     grid: MapSettings | None = None,
     curves: AtlasSettings | None = None,
     boundaries: bool = True,
     criticality: bool = True,
-    run: Run = run_here,
+    run: Runner = run_here,
     tiles: Callable[[int, int], None] = lambda done, count: None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> MapResult:
@@ -61,7 +61,7 @@ def map(  # the command's own name
     ----------
     system : SlidingSystem
         The slider, from `srfcli.system`.
-    x, y : (name, low, high, points)
+    x, y : (name, low, high, points) or MapAxis
         The axes. A name is that of a parameter, its ends in its declared unit, or a ratio such as K/W0, in um, s, N, whose
         second part moves.
     log : sequence of str, optional
@@ -99,33 +99,19 @@ def map(  # the command's own name
     (5, 8)
     """
     model = system.model
-    system.model.check_changing_load(system.vector())
-    ends = MapGrid(system.vector(), *(_axis(model, axis, log) for axis in (x, y)))
-    check_grid(model, ends)
-    return map_grid(system, ends, grid=grid, curves=curves, boundaries=boundaries, criticality=criticality, run=run,
-                    tiles=tiles, progress=progress)  # fmt: skip
-
-
-def map_grid(
-    system: SlidingSystem,
-    axes: MapGrid,
-    *,
-    grid: MapSettings | None = None,
-    curves: AtlasSettings | None = None,
-    boundaries: bool = True,
-    criticality: bool = True,
-    run: Run = run_here,
-    tiles: Callable[[int, int], None] = lambda done, count: None,
-    progress: Callable[[str], None] = lambda text: None,
-) -> MapResult:
-    """Return what `map` does, on a grid that is made already."""
-    found = compute_map(system.model, axes, grid or MapSettings(), run=run, progress=tiles)
+    model.check_changing_load(system.vector())
+    axes = MapGrid(system.vector(), *(_axis(model, axis, log) for axis in (x, y)))
+    check_grid(model, axes)
+    found = compute_map(model, axes, grid or MapSettings(), run=run, progress=tiles)
     followed = boundaries and found.finished
-    atlas, special, cubic = _boundaries(system.model, found, curves or AtlasSettings(), followed, criticality, progress)
+    atlas, special, cubic = _boundaries(model, found, curves or AtlasSettings(), followed, criticality, progress)
     return MapResult(system, found, atlas, tuple(special), tuple(cubic), followed)
 
 
-def _axis(model: GeneratedModel, given: tuple[str, float, float, int], logs: Sequence[str] | None) -> MapAxis:
+def _axis(model: GeneratedModel, given: tuple[str, float, float, int] | MapAxis, logs: Sequence[str] | None) -> MapAxis:
+    """Return the axis that a name, its ends and a number of points mean."""
+    if isinstance(given, MapAxis):
+        return given
     name, lo, hi, count = given
     log = name in logs if logs is not None else hi >= 10 * lo > 0
     if not lo < hi or count < 2:
@@ -181,7 +167,7 @@ def compare(
     V: tuple[float, float] = (1.0, 100.0),
     K_over_W0: tuple[float, float] | None = None,
     points: Mapping[str, int] | None = None,
-    run: Run = run_here,
+    run: Runner = run_here,
     progress: Callable[[str, float], None] = lambda name, share: None,
 ) -> ComparisonResult:
     """Return where laws differ once each is brought to the first one's observables at one low velocity.
@@ -225,8 +211,6 @@ def compare(
     >>> found[["law", "stabilised"]].round(2).values.tolist()
     [['dieterich', 0.5], ['ruina', 0.67]]
     """
-    import numpy as np
-
     names, models = tuple(systems), [s.model for s in systems.values()]
     if len(names) < 2:
         raise SrfError(
