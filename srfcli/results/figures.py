@@ -16,7 +16,6 @@ from srfcli.results.plots import (
     decade_ticks,
     heading,
     house_style,
-    load_matplotlib,
     name_text,
     names_below,
     new_figure,
@@ -225,7 +224,6 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
     A run is {name, t, observed, label, used, V, W, holdout, gaps}: arrays (n,), `label` the observable with its unit, `gaps`
     pairs of times. Samples that are not used are marked, gaps are shaded.
     """
-    load_matplotlib()
     columns = 1 if len(runs) < 4 else 2
     rows = math.ceil(len(runs) / columns)
     with house_style():
@@ -412,7 +410,6 @@ def _names(figure: Figure, axes: Sequence[Axes]) -> None:
 
 
 def _grid(rows: int, columns: int, *, size: tuple[float, float]) -> tuple[Figure, list[list[Axes]]]:
-    load_matplotlib()
     figure = bare_figure(size)
     made = figure.subplots(rows, columns, sharex=("row" if columns > 1 else "col"), squeeze=False)
     return figure, [list(row) for row in made]

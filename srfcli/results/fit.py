@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -134,10 +134,34 @@ class FitResult(Result):
         """Return name -> standard error, in um, s, N."""
         return dict(self.found.fit.stderr)
 
+    def _shown(self, name: str, *values: float | None) -> tuple[str, list[Any]]:
+        """Return the unit in which a parameter is shown, and its values (um, s, N) in that unit."""
+        declared = unit_of(self.found.problem, name)
+        unit, factor = self.experiment.shown(declared)
+        return unit, [None if x is None else from_base(x, declared) * factor for x in values]
+
+    @property
+    def _observables(self) -> list[RunFit]:
+        """Return how each observable is fitted, run by run."""
+        fit = self.found.fit
+        return [f for first in fit.runs for f in (first, *(g for g in fit.others if g.name == first.name))]
+
     @cached_property
     def runs(self) -> Table | None:
         """Return a row for each run, fitted or held out: residual, noise, and what is left of them; None without runs."""
-        return run_table(self.found.fit, self.experiment) if self.experiment.runs else None
+        from srfcli.inference.noise import lag_one
+
+        rows, runs = [], {run.name: run for run in self.experiment.runs}
+        for f in self._observables:
+            observable = f.observable or runs[f.name].observable
+            size = sum(b - a for a, b in f.parts)
+            ratio = f.rms / f.white if f.white else None
+            unit = runs[f.name].unit_of(observable)
+            rows.append(
+                (f.name, observable, "held out" if f.holdout else "fit", size, f.rms, f.white, unit, ratio,
+                 lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
+            )  # fmt: skip
+        return Table("srf.fit.runs/1", RUNS, rows, "runs") if runs else None
 
     @cached_property
     def tables(self) -> Table | None:
@@ -158,39 +182,87 @@ class FitResult(Result):
 
     @cached_property
     def varied(self) -> Table | None:
-        """Return a row for each parameter that varies between runs or loads, None where none does."""
-        return varied_table(self.found)
+        """Return mean and scatter of each parameter that varies between runs or loads; None where none does."""
+        rows: list[tuple[Any, ...]] = []
+        for name, scatter in self.found.scatter.items():
+            if scatter is None:
+                rows.append(
+                    (name, None, None, None, self._shown(name)[0], None)
+                )  # one is at its bound: its error is not known
+                continue
+            unit, shown = self._shown(name, scatter.mean, scatter.stderr, scatter.scatter)
+            rows.append((name, *shown, unit, scatter.p_value))
+        return Table("srf.fit.varied/1", VARIED, rows, "what varies") if rows else None
 
     @cached_property
     def draws(self) -> Table | None:
-        """Return mean, spread and quantiles of the posterior draws, None where none were asked for."""
-        return None if self.posterior is None else posterior_table(self.found.problem, self.posterior)
+        """Return mean, spread and quantiles of the posterior draws, and what they are worth; None where none were asked for."""
+        import numpy as np
+
+        if self.posterior is None:
+            return None
+        rows = []
+        for k, name in enumerate(self.posterior.names):
+            draws = self.posterior.draws[:, k]
+            numbers = (draws.mean(), draws.std(ddof=1), *np.quantile(draws, (0.025, 0.5, 0.975)))
+            unit, shown = self._shown(name, *map(float, numbers))
+            rows.append((name, *shown, unit, float(self.posterior.effective[k]), float(self.posterior.r_hat[k])))
+        return Table("srf.fit.posterior/1", POSTERIOR, rows, "posterior")
 
     @cached_property
     def table(self) -> Table:
-        """Return a row for each parameter: estimate, standard error, interval, unit, and what is to be known of it."""
-        found = self.found
-        made = parameter_table(
-            found.problem, found.fit, self.intervals, found.starts, self.posterior, self.runs, self.worst
-        )
+        """Return a row for each parameter: estimate, standard error, interval, unit, and what is to be known of it.
+
+        `meta` has the runs, the correlations and all that has no column.
+        """
+        found, fit = self.found, self.found.fit
+        profiled = {i.name: i for i in self.intervals}
+        rows = []
+        for k, name in enumerate(fit.names):
+            value, error, interval = fit.values[name], fit.stderr[name], profiled.get(name)
+            ends = (value - 1.96 * error, value + 1.96 * error) if interval is None else (interval.low, interval.high)
+            unit, (*shown, start) = self._shown(name, value, error, *ends, float(found.problem.start[k]))
+            rows.append((name, *shown, unit, start, flag(fit, k)))
+        meta: dict[str, Any] = {
+            "runs": [] if self.runs is None else self.runs.records(),
+            "correlation": fit.correlation,
+            "log_likelihood": fit.log_likelihood,
+            "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
+            "evaluations": fit.evaluations,
+            "noise": {
+                f.name: {"innovation": f.noise.innovation, "coefficients": f.noise.coefficients, "colours": f.colours}
+                for f in fit.runs
+            },
+            "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in found.starts],
+            "posterior": None if self.posterior is None else _described(self.posterior),
+        }
         if self.tables is not None and self.loads is not None:
-            parts = {"tables": as_records(self.tables), "loads": as_records(self.loads)}
-            made = replace(made, notes=(*made.notes, *load_notes(found.fit)), meta={**made.meta, **parts})
+            meta |= {"tables": self.tables.records(), "loads": self.loads.records()}
+        if found.track is not None:
+            meta["track"] = asdict(found.track)
+        title = self.experiment.title
+        return Table("srf.fit/2", PARAMETERS, rows, title, tuple(self._notes()), {}, meta, status=self.worst.value)
+
+    def _notes(self) -> list[str]:
+        """Return what is to be known beside the numbers, in sentences."""
+        found = self.found
+        notes = _notes(found.fit, self.intervals, found.starts)
+        notes += filter(None, [self.experiment.rescaled()])
+        notes += [] if self.posterior is None else _posterior_notes(self.posterior)
+        notes += load_notes(found.fit) if found.fit.tables else []
         if found.track is not None:
             from srfcli.inference.state_space import typical_friction
 
-            told = [str(found.track)]
+            notes.append(str(found.track))
             share = found.track.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
             if share > BROAD:
-                told.append(
+                notes.append(
                     f"that field is {100 * share:.1g} % of the friction, more than a track has: it may stand in for physics that "
                     "the model lacks. Try another ageing law or friction law, or `srf diagnose`."
                 )
-            made = replace(made, notes=(*made.notes, *told), meta={**made.meta, "track": asdict(found.track)})
         if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
-            note = f"interrupted: {len(found.starts)} of {self.asked} starts were done"
-            made = replace(made, notes=(*made.notes, note))
-        return made
+            notes.append(f"interrupted: {len(found.starts)} of {self.asked} starts were done")
+        return notes
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return each run's recording and prediction above its residual, and each table's measured and computed loads."""
@@ -201,73 +273,25 @@ class FitResult(Result):
         from srfcli.results.report_text import NO_BREAK, bracketed, unit_text
 
         own_figure(ax, "a fit")
-        problem, fit, experiment = self.found.problem, self.found.fit, self.experiment
+        fit, experiment = self.found.fit, self.experiment
         runs = {r.name: r for r in experiment.runs}
         tables = [
-            (t.loads.name, t.loads.holdout, t.loads.table, np.where(t.match.missing, np.nan, t.match.loads)) for t in fit.tables
+            (t.loads.name, t.loads.holdout, t.loads.table, np.where(t.match.missing, np.nan, t.match.loads))
+            for t in fit.tables
         ]
         rows, told = [], []
-        for f in every_observable(fit):
+        for f in self._observables:
             run, what = runs[f.name], f.observable or runs[f.name].observable
             unit, signal = run.unit_of(what), next(s for s in run.signals if s.observable == what)
             label = run.quantity_of(what) + ("" if unit == "1" else f"\n[{unit.replace('um', 'µm')}]")
             rows.append((f.name, f.holdout, label, run.t, signal.observed, f.prediction.y, f.white))
         for name in fit.names:
-            declared = unit_of(problem, name)
-            unit, factor = experiment.shown(declared)
-            value, error = (from_base(x, declared) * factor for x in (fit.values[name], fit.stderr[name]))
+            unit, (value, error) = self._shown(name, fit.values[name], fit.stderr[name])
             shown = "" if unit == "1" else f"{NO_BREAK}{unit_text(unit)}"
             told.append(f"{symbol_text(name)} = {bracketed(value, error)}{shown}")
         choice = experiment.choice
         title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
         return fit_figure(rows, title=title, found=", ".join(told), tables=tables)
-
-
-def parameter_table(
-    problem: Problem,
-    fit: Fit,
-    intervals: Sequence[Interval],
-    starts: Sequence[tuple[float, bool]],
-    posterior: Posterior | None,
-    runs: Table | None,
-    status: Status,
-) -> Table:
-    """Return the estimates as a table whose `meta` has the runs, the correlations and all that has no column."""
-    by_name = {i.name: i for i in intervals}
-    rows = []
-    for k, name in enumerate(fit.names):
-        declared = unit_of(problem, name)
-        unit, factor = problem.experiment.shown(declared)
-        value, error = fit.values[name], fit.stderr[name]
-        found = by_name.get(name)
-        ends = (value - 1.96 * error, value + 1.96 * error) if found is None else (found.low, found.high)
-        cells = [value, error, *ends]
-        *shown, start = [
-            None if c is None else from_base(c, declared) * factor for c in (*cells, float(problem.start[k]))
-        ]
-        rows.append((name, *shown, unit, start, flag(fit, k)))
-    notes = _notes(fit, intervals, starts)
-    notes += filter(None, [problem.experiment.rescaled()])
-    notes += [] if posterior is None else _posterior_notes(posterior)
-    meta = {
-        "runs": [] if runs is None else as_records(runs),
-        "correlation": fit.correlation,
-        "log_likelihood": fit.log_likelihood,
-        "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
-        "evaluations": fit.evaluations,
-        "noise": {
-            f.name: {"innovation": f.noise.innovation, "coefficients": f.noise.coefficients, "colours": f.colours}
-            for f in fit.runs
-        },
-        "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in starts],
-        "posterior": None if posterior is None else _described(posterior),
-    }
-    return Table("srf.fit/2", PARAMETERS, rows, problem.experiment.title, tuple(notes), {}, meta, status=status.value)
-
-
-def as_records(table: Table) -> list[dict[str, Any]]:
-    """Return the rows of a table by the names of its columns."""
-    return [dict(zip((c.name for c in table.columns), row, strict=True)) for row in table.rows]
 
 
 def load_rows(table: Thresholds, match: Match) -> list[tuple[Any, ...]]:
@@ -297,20 +321,6 @@ def load_notes(fit: Fit) -> list[str]:
     return notes
 
 
-def posterior_table(problem: Problem, posterior: Posterior) -> Table:
-    """Return mean, spread and quantiles of each parameter, and what its draws are worth."""
-    import numpy as np
-
-    rows, draws = [], posterior.draws
-    for k, name in enumerate(posterior.names):
-        declared = unit_of(problem, name)
-        unit, factor = problem.experiment.shown(declared)
-        shown = [from_base(float(x), declared) * factor for x in (draws[:, k].mean(), draws[:, k].std(ddof=1),
-                 *np.quantile(draws[:, k], (0.025, 0.5, 0.975)))]  # fmt: skip
-        rows.append((name, *shown, unit, float(posterior.effective[k]), float(posterior.r_hat[k])))
-    return Table("srf.fit.posterior/1", POSTERIOR, rows, "posterior")
-
-
 def _described(posterior: Posterior) -> dict[str, Any]:
     return {
         "names": posterior.names, "draws": posterior.draws, "burn_in": posterior.burn_in, "accepted": posterior.accepted,
@@ -336,42 +346,6 @@ def _posterior_notes(posterior: Posterior) -> list[str]:
             f"posterior: intervals should rest on {ENOUGH:.0f} independent draws with R-hat up to {MIXED}: --sample {more}"
         )
     return notes
-
-
-def every_observable(fit: Fit) -> list[RunFit]:
-    """Return how each observable is fitted, run by run."""
-    return [f for first in fit.runs for f in (first, *(g for g in fit.others if g.name == first.name))]
-
-
-def run_table(fit: Fit, experiment: Experiment) -> Table:
-    """Return one row for each run, fitted or held out."""
-    from srfcli.inference.noise import lag_one
-
-    rows, runs = [], {run.name: run for run in experiment.runs}
-    for f in every_observable(fit):
-        observable = f.observable or runs[f.name].observable
-        size = sum(b - a for a, b in f.parts)
-        ratio = f.rms / f.white if f.white else None
-        unit = runs[f.name].unit_of(observable)
-        rows.append(
-            (f.name, observable, "held out" if f.holdout else "fit", size, f.rms, f.white, unit, ratio,
-             lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
-        )  # fmt: skip
-    return Table("srf.fit.runs/1", RUNS, rows, "runs")
-
-
-def varied_table(found: RecordingFit) -> Table | None:
-    """Return mean and scatter of what varies between groups of runs, and how likely that scatter is by chance."""
-    rows: list[tuple[Any, ...]] = []
-    for name, scatter in found.scatter.items():
-        declared = unit_of(found.problem, name)
-        unit, factor = found.problem.experiment.shown(declared)
-        if scatter is None:
-            rows.append((name, None, None, None, unit, None))  # one is at its bound: its error is not known
-            continue
-        shown = [from_base(x, declared) * factor for x in (scatter.mean, scatter.stderr, scatter.scatter)]
-        rows.append((name, *shown, unit, scatter.p_value))
-    return Table("srf.fit.varied/1", VARIED, rows, "what varies") if rows else None
 
 
 def unit_of(problem: Problem, name: str) -> str:

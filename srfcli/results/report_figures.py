@@ -17,9 +17,9 @@ from srfcli.results.plots import (
     DASHES,
     DOTTED,
     _gaps,
+    bare_figure,
     decade_ticks,
     house_style,
-    load_matplotlib,
     name_text,
     new_figure,
 )
@@ -149,19 +149,15 @@ def overview(traces: Sequence[Trace], *, narrow: bool = False) -> Figure:
 
     `narrow` sets the two models below each other, for a small screen.
     """
-    load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
-
     both = not all(x.same for x in traces)
     local = [(x, local_rms(x.t, x.before), local_rms(x.t, x.after)) for x in traces if x.t.size > 1]
     top = max((float(np.max(r)) for _, *two in local for _, r in two), default=1.0)
     with house_style():
+        from matplotlib.colors import LogNorm
+
         count = 2 if both else 1
         lines = count if narrow else 1
-        figure = Figure(figsize=(NARROW_FIGURE if narrow else 9.6, lines * (0.36 * len(local) + 0.7) + 0.8))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((NARROW_FIGURE if narrow else 9.6, lines * (0.36 * len(local) + 0.7) + 0.8))
         axes = figure.subplots(lines, count // lines, sharex=True, sharey=True, squeeze=False).ravel()
         for k, (axis, title) in enumerate(zip(axes, ("baseline", "augmented model"), strict=False)):
             for row, (one, *found) in enumerate(local):
@@ -208,17 +204,12 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
 
     `narrow` leaves the close-up out and gives the legend a row of its own, for a small screen.
     """
-    load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     imposed = [k for k in ("V", "W") if np.ptp(getattr(one, k)) > VARIES * float(np.abs(getattr(one, k)).max())]
     piece = None if narrow else close_up(one)
     friction = one.unexplained is not None
     heights = [3.0, 2.2, 1.1, *[1.3] * friction, *[0.75] * len(imposed)]
     with house_style():
-        figure = Figure(figsize=(NARROW_FIGURE if narrow else 10.4 if piece else 9.0, 0.72 * sum(heights) + 1.1))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((NARROW_FIGURE if narrow else 10.4 if piece else 9.0, 0.72 * sum(heights) + 1.1))
         widths = (1.75, 1.0) if piece else (1.0,)
         grid = figure.add_gridspec(len(heights), len(widths), height_ratios=heights, width_ratios=widths)
         axes = _column(figure, grid, 0, [slice(i, i + 1) for i in range(len(heights))])
@@ -523,10 +514,6 @@ def foremost(found: Sequence[Spot], *, each: int = 2, most: int = 12) -> list[Sp
 
 def atlas_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
     """Return a panel for each axis of the atlas with several bins, but runs and windows in time; None where there is none."""
-    load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     by_axis: dict[str, list[Spot]] = {}
     for spot in spots(rows):
         if spot.axis not in APART and spot.kind != "shape":
@@ -538,8 +525,7 @@ def atlas_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> 
     lines = math.ceil(len(shown) / columns)
     label = "−log$_{10}$ p" if any(finite(r.get("log_p")) for r in rows) else "|statistic|"
     with house_style():
-        figure = Figure(figsize=(NARROW_FIGURE if narrow else 3.5 * columns + 0.2, 2.3 * lines + 0.2))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((NARROW_FIGURE if narrow else 3.5 * columns + 0.2, 2.3 * lines + 0.2))
         panels = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
         for k, (axis, (name, found)) in enumerate(zip(panels, shown.items(), strict=False)):
             about, unit = AXES.get(name, (name_text(name, narrow=narrow), ""))
@@ -678,17 +664,12 @@ def _limits(values: Any, band: Any) -> tuple[Any, Any]:
 
 def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, unit: str = "N", narrow: bool = False) -> Figure | None:
     """Return the missing force of all runs against slip velocity, age and load, averaged in pieces; None without a state."""
-    load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     shown = [s for s in STATES if any(f.get(s[0]) is not None and np.ptp(f[s[0]]) > 0 for f in forces.values())]
     if not shown:
         return None
     with house_style():
         lines = len(shown) if narrow else 1
-        figure = Figure(figsize=(NARROW_FIGURE if narrow else 3.2 * len(shown) + 0.4, 0.5 + 2.6 * lines))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((NARROW_FIGURE if narrow else 3.2 * len(shown) + 0.4, 0.5 + 2.6 * lines))
         axes = figure.subplots(lines, len(shown) // lines, sharey=True, squeeze=False).ravel()
         for axis, (key, label, wide) in zip(axes, shown, strict=True):
             spans = [np.asarray(f[key], dtype=float) for f in forces.values() if f.get(key) is not None]

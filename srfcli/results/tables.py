@@ -66,6 +66,11 @@ class Table:
             if len(row) != len(self.columns):
                 raise ValueError(f"a row of {len(row)} cells under {len(self.columns)} columns in {self.schema}")
 
+    def records(self) -> list[dict[str, Any]]:
+        """Return each row as column name -> cell."""
+        names = [c.name for c in self.columns]
+        return [dict(zip(names, row, strict=True)) for row in self.rows]
+
 
 def plain_value(value: Any) -> Any:
     """Return `value` as Python's own numbers, text, lists and dicts; NaN and infinities become None."""
