@@ -10,7 +10,7 @@ import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
 from srfcli.cli.law import plugins_option
-from srfcli.cli.options import listed, vary_options
+from srfcli.cli.options import listed, reader_option, vary_options
 
 EXAMPLES = """
 srf diagnose EXPERIMENT                              a folder with experiment.toml, or that file
@@ -23,11 +23,12 @@ srf fit found/augmented                              the augmented model is an e
 
 @click.command("diagnose", cls=SrfCommand, epilog=EXAMPLES)
 @click.argument("source", metavar="EXPERIMENT", type=click.Path(path_type=Path))
-@click.option("--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable.")
-@click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
+@click.option(
+    "--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable."
+)
 @vary_options
 @plugins_option
-@click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
+@reader_option
 @click.option(
     "--seed",
     type=int,
@@ -74,9 +75,7 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
                 exit_code=EXIT_INTERRUPTED,
             ) from None
     if folder is not None:
-        found.write(
-            folder, force=options["force"], arguments=session.arguments, told=session.say, debug=session.debug
-        )
+        found.write(folder, force=options["force"], arguments=session.arguments, told=session.say, debug=session.debug)
         session.say(f"Wrote {folder}")
     if options["as_json"]:
         click.echo(json_text(found.answer, indent=2))
@@ -90,7 +89,9 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
             click.echo()
         if folder is not None:
             home = folder / "augmented"
-            laws = f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
+            laws = (
+                f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
+            )
             click.echo(f"The augmented model: srf fit {home}")
             click.echo(f"Its laws' diagram: srf linear {laws}")
     fitted = ", ".join(sorted(f.name for f in found.diagnosis.ranked))

@@ -17,6 +17,7 @@ from srfcli.cli.options import (
     listed,
     output_options,
     parse_over,
+    reader_option,
     stability_options,
     vary_options,
     worker_options,
@@ -65,7 +66,6 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
     "--starts", type=click.IntRange(1, 1000), default=1, show_default=True, help="Starting points to fit from."
 )
 @click.option("--profile", is_flag=True, help="Profile-likelihood intervals.")
-@click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
 @vary_options
 @click.option(
     "--prior/--no-prior",
@@ -83,7 +83,7 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
 )
 @click.option("--draws", metavar="FILE.nc", help="Keep the draws of --sample as ArviZ's netCDF.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of further starts and of the sampler.")
-@click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
+@reader_option
 @click.option(
     "--bounds", multiple=True, metavar="NAME=LO:HI", help="Bounds of a parameter, for a table of critical loads."
 )

@@ -27,23 +27,23 @@ COMMANDS = {
         "Print the generated NumPy module of a system: rates, Jacobians, derivatives by the parameters, "
         "characteristic polynomial.",
     ),
-    "linear": ("srfcli.cli.linear:command", "Critical load, K/W0 and frequency of steady sliding under constant load."),
-    "critical": ("srfcli.cli.critical:command", "Every critical load at the given velocities, numbered from low W0."),
+    "linear": ("srfcli.cli.stability:linear", "Critical load, K/W0 and frequency of steady sliding under constant load."),
+    "critical": ("srfcli.cli.stability:critical", "Every critical load at the given velocities, numbered from low W0."),
     "continue": (
-        "srfcli.cli.continue_:command",
+        "srfcli.cli.stability:continue_",
         "The stability boundary of the forced sliding state in a plane of two parameters.",
     ),
     "floquet": (
-        "srfcli.cli.floquet:command",
+        "srfcli.cli.stability:floquet",
         "The forced periodic state at one V, W0 and eps: multipliers, mean friction, harmonics.",
     ),
-    "map": ("srfcli.cli.map:command", "The stability of the forced sliding state over a plane of two parameters."),
+    "map": ("srfcli.cli.map:map_", "The stability of the forced sliding state over a plane of two parameters."),
     "response": (
         "srfcli.cli.response:command",
         "How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t).",
     ),
     "compare": (
-        "srfcli.cli.compare:command",
+        "srfcli.cli.map:compare",
         "Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment tells them apart.",
     ),
     "new": (

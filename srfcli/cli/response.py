@@ -9,16 +9,17 @@ import click
 
 from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
+    AMPLITUDE,
     OutputOptions,
     Range,
     SystemOptions,
     output_options,
     over_option,
     stability_options,
+    value_option,
     values_option,
 )
 from srfcli.core.errors import Status, worst
-from srfcli.core.settings import Parameter
 from srfcli.results.plots import titled
 
 if TYPE_CHECKING:
@@ -34,15 +35,14 @@ srf response --V 10 --W0 6 --over f=1:1000:200 --plot response.svg
 srf response --V 10 --W0 6 --over f=1:1000:200 --csv
 srf response --V 10 --W0 6 --mean --eps 0.05,0.1,0.2 --over f=20:400:30
 """
-AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation amplitudes, for --mean")
 QUANTITIES = ("friction", "force", "position", "velocity")
 
 
 @click.command("response", cls=SrfCommand, epilog=EXAMPLES)
 @stability_options
-@click.option("--V", "V", metavar="VALUE", help="Driving velocity in um/s.")
-@click.option("--W0", "W0", metavar="VALUE", help="Mean normal load in N.")
-@values_option(AMPLITUDE)
+@value_option("V", "Driving velocity in um/s.")
+@value_option("W0", "Mean normal load in N.")
+@values_option(AMPLITUDE, about="relative modulation amplitudes, for --mean")
 @over_option(
     default=("f=1:1000:200",), help="The frequencies (Hz), or another parameter: NAME=LOW:HIGH[:POINTS[:log|lin]]."
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import Session, SrfCommand
-from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options
+from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options, value_option
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.core.units import convert, parse_quantity, split_quantity
 from srfcli.laws.law_file import APPARATUS
@@ -47,105 +47,75 @@ OWN_RECORD = {  # what describes a record of one's own: an experiment brings its
 EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load_file"), ("load", "load_file"))
 
 
-def _options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `srf simulate` that it shares with no other command."""
-    options = [
-        click.argument("experiment", required=False, type=click.Path(exists=True, path_type=Path)),
-        click.option("--V", "V", metavar="VALUE", help="Constant driving velocity, in um/s."),
-        click.option("--W0", "W0", metavar="VALUE", help="Constant normal load, in N."),
-        click.option(
-            "--eps", "eps", metavar="VALUE", help="Relative amplitude of a modulation at --f, on top of any load."
-        ),
-        click.option(
-            "--for", "duration", metavar="TIME", help="Length of the record, in s.  [default: 40 um of driving]"
-        ),
-        click.option(
-            "--drive",
-            metavar="PIECES",
-            help="Driving velocity as DURATION:VELOCITY, ... in s and um/s; 0 is a hold, 5->20 a ramp.",
-        ),
-        click.option("--load", metavar="PIECES", help="Normal load as DURATION:LOAD, ... in s and N; 5->7 is a ramp."),
-        click.option(
-            "--load-rise",
-            metavar="TIME",
-            default=f"{RISE:g} s",
-            show_default=True,
-            help="Time over which steps and corners of --load are rounded.",
-        ),
-        click.option(
-            "--load-file",
-            type=click.Path(exists=True, dir_okay=False, path_type=Path),
-            help="A recorded load: a file with columns time and normal_load.",
-        ),
-        click.option(
-            "--format", "reader", metavar="READER", help="Read --load-file, or the runs' files, by this reader."
-        ),
-        click.option(
-            "--onset", metavar="TIME", help="When the modulation begins to rise.  [default: at the first sample]"
-        ),
-        click.option("--rate", metavar="HZ", help="Samples per second, or one rate for each piece of --drive."),
-        click.option(
-            "--start",
-            metavar="STATE",
-            default="steady",
-            show_default=True,
-            help="Steady sliding at the first velocity, at another (--start 10), or values: --start 'v=1e-3, phi=100 s'.",
-        ),
-        click.option(
-            "--rtol", type=float, default=1e-8, show_default=True, help="Local relative error of integration."
-        ),
-        click.option(
-            "--run", "runs", multiple=True, metavar="NAME", help="Only this run of EXPERIMENT; may be repeated."
-        ),
-        click.option(
-            "--observe",
-            "observable",
-            metavar="NAMES",
-            help="What the apparatus records: elongation, force or friction, and besides it another, slip or contact_area, "
-            "as force,slip.  [default: elongation]",
-        ),
-        click.option(
-            "--noise",
-            metavar="SIZE",
-            help="Standard deviation of the gauge's noise, in the observable's unit; of several one for each, as 0.01,0.2.",
-        ),
-        click.option("--lag1", type=float, default=0.0, help="Correlation of the noise from sample to sample, as 0.8."),
-        click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded."),
-        click.option(
-            "--roughness", metavar="SIZE", help="Standard deviation by which mu0 wanders along the track, as 3e-4."
-        ),
-        click.option(
-            "--roughness-length", metavar="UM", help="Correlation length of the track, in um.  [default: 10 um]"
-        ),
-        click.option(
-            "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is random."
-        ),
-        click.option(
-            "--out-dir",
-            "--experiment",
-            "folder",
-            type=click.Path(path_type=Path),
-            metavar="DIR",
-            help="Write the records as an experiment folder, whole or not at all.",
-        ),
-        click.option(
-            "--start-values",
-            default="true",
-            show_default=True,
-            metavar="true|perturb:10%",
-            help="Start values written to DIR: the true ones, or off by up to so much.",
-        ),
-        click.option(
-            "--free", metavar="NAMES", help="Parameters that DIR leaves to a fit.  [default: the law's, not V0]"
-        ),
-    ]
-    for option in reversed(options):
-        function = option(function)
-    return function
-
-
 @click.command("simulate", cls=SrfCommand, epilog=EXAMPLES)
-@_options
+@click.argument("experiment", required=False, type=click.Path(exists=True, path_type=Path))
+@value_option("V", "Constant driving velocity, in um/s.")
+@value_option("W0", "Constant normal load, in N.")
+@value_option("eps", "Relative amplitude of a modulation at --f, on top of any load.")
+@click.option("--for", "duration", metavar="TIME", help="Length of the record, in s.  [default: 40 um of driving]")
+@click.option(
+    "--drive",
+    metavar="PIECES",
+    help="Driving velocity as DURATION:VELOCITY, ... in s and um/s; 0 is a hold, 5->20 a ramp.",
+)
+@click.option("--load", metavar="PIECES", help="Normal load as DURATION:LOAD, ... in s and N; 5->7 is a ramp.")
+@click.option(
+    "--load-rise",
+    metavar="TIME",
+    default=f"{RISE:g} s",
+    show_default=True,
+    help="Time over which steps and corners of --load are rounded.",
+)
+@click.option(
+    "--load-file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="A recorded load: a file with columns time and normal_load.",
+)
+@click.option("--format", "reader", metavar="READER", help="Read --load-file, or the runs' files, by this reader.")
+@click.option("--onset", metavar="TIME", help="When the modulation begins to rise.  [default: at the first sample]")
+@click.option("--rate", metavar="HZ", help="Samples per second, or one rate for each piece of --drive.")
+@click.option(
+    "--start",
+    metavar="STATE",
+    default="steady",
+    show_default=True,
+    help="Steady sliding at the first velocity, at another (--start 10), or values: --start 'v=1e-3, phi=100 s'.",
+)
+@click.option("--rtol", type=float, default=1e-8, show_default=True, help="Local relative error of integration.")
+@click.option("--run", "runs", multiple=True, metavar="NAME", help="Only this run of EXPERIMENT; may be repeated.")
+@click.option(
+    "--observe",
+    "observable",
+    metavar="NAMES",
+    help="What the apparatus records: elongation, force or friction, and besides it another, slip or contact_area, "
+    "as force,slip.  [default: elongation]",
+)
+@click.option(
+    "--noise",
+    metavar="SIZE",
+    help="Standard deviation of the gauge's noise, in the observable's unit; of several one for each, as 0.01,0.2.",
+)
+@click.option("--lag1", type=float, default=0.0, help="Correlation of the noise from sample to sample, as 0.8.")
+@click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded.")
+@click.option("--roughness", metavar="SIZE", help="Standard deviation by which mu0 wanders along the track, as 3e-4.")
+@click.option("--roughness-length", metavar="UM", help="Correlation length of the track, in um.  [default: 10 um]")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is random.")
+@click.option(
+    "--out-dir",
+    "--experiment",
+    "folder",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Write the records as an experiment folder, whole or not at all.",
+)
+@click.option(
+    "--start-values",
+    default="true",
+    show_default=True,
+    metavar="true|perturb:10%",
+    help="Start values written to DIR: the true ones, or off by up to so much.",
+)
+@click.option("--free", metavar="NAMES", help="Parameters that DIR leaves to a fit.  [default: the law's, not V0]")
 @system_options
 @output_options
 def command(system: SystemOptions, experiment: Path | None, output: OutputOptions, **given: Any) -> None:
@@ -159,7 +129,7 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
 
     _check(given, experiment, output)
     warn_uncompiled("a simulation takes up to 34 times as long")
-    work = _own(system, given) if experiment is None else _repeated(system, experiment, given)
+    work = own_record(system, given) if experiment is None else repeated_runs(system, experiment, given)
     begun = time.perf_counter()
     with Progress("simulate", total=len(work.jobs)) as progress:
         found = simulate_work(
@@ -181,16 +151,6 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
     if folder is not None:
         _write(work, found.records, found.status, folder, given, output, timings)
     finish(found.status)
-
-
-def _own(system: SystemOptions, given: dict[str, Any]) -> Work:
-
-    return own_record(system, given)
-
-
-def _repeated(system: SystemOptions, experiment: Path, given: dict[str, Any]) -> Work:
-
-    return repeated_runs(system, experiment, given)
 
 
 def _check(given: dict[str, Any], experiment: Path | None, output: OutputOptions) -> None:
@@ -341,7 +301,8 @@ def read_gauges(given: Mapping[str, Any], observables: Sequence[str]) -> tuple[G
         sizes[name] = [parse_quantity(text, unit, name=f"--{name}") for text, unit in zip(texts, units, strict=True)]
     silent = any(sizes["noise"])  # a gauge without noise beside others; of none, a colour is told
     gauges = [
-        Gauge(n, given["lag1"] if n or not silent else 0.0, q, given["seed"]) for n, q in zip(*sizes.values(), strict=True)
+        Gauge(n, given["lag1"] if n or not silent else 0.0, q, given["seed"])
+        for n, q in zip(*sizes.values(), strict=True)
     ]
     for gauge in gauges:
         check_gauge(noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed)
@@ -479,8 +440,6 @@ def fit_parameters(model: GeneratedModel, values: Mapping[str, float], free: set
 
 def bounds(parameter: Parameter, value: float) -> tuple[float, float]:
     """Return the bounds of a fit around `value` (um, s, N), within the parameter's own."""
-    import math
-
     from srfcli.core.units import to_base
 
     lower, upper = (to_base(b, parameter.unit) for b in (parameter.lower, parameter.upper))
@@ -506,8 +465,6 @@ def parse_spread(text: str) -> float:
 
 def perturbed(parameters: Sequence[FitParameter], spread: float, seed: int) -> tuple[FitParameter, ...]:
     """Return the free parameters off by a factor drawn evenly from 1 - spread to 1 + spread, within their bounds."""
-    import dataclasses
-
     from srfcli.data.noise import generator
 
     rng = generator(seed, "start values")
@@ -642,7 +599,9 @@ def _job(model: GeneratedModel, experiment: Experiment, run: Run, flags: Mapping
         raise SrfError(f"run {run.name!r}: {error.message}", error.hint) from error
     ripple = run.modulation[0] if run.modulation else None
     beside = tuple(signal.observable for signal in run.others)
-    return Job(run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run, beside=beside)
+    return Job(
+        run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run, beside=beside
+    )
 
 
 def _asked_by_effects(model: GeneratedModel, run: Run) -> dict[str, float]:
