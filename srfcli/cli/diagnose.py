@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
-from srfcli.cli.law import plugins_option
-from srfcli.cli.options import listed, reader_option, vary_options
+from srfcli.cli.options import listed, open_registry, plugins_option, reader_option, vary_options
+from srfcli.core.errors import SrfError
 
 EXAMPLES = """
 srf diagnose EXPERIMENT                              a folder with experiment.toml, or that file
@@ -46,11 +45,9 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
     scored for what it could explain beyond these, and those that promise most are fitted. Held-out runs are opened when the
     models are final, and judge them. Verdicts are none, identified, ambiguous, unknown and inconclusive.
     """
-    from srfcli.cli.emit import Progress, finish
-    from srfcli.cli.options import open_registry
-    from srfcli.core.errors import SrfError
+    from srfcli.cli.emit import Progress, finish, show
     from srfcli.results.diagnosis import check_answer
-    from srfcli.results.tables import json_text, print_terminal, to_text
+    from srfcli.results.tables import json_text
     from srfcli.tasks.diagnose import diagnose
 
     folder = None if options["out"] is None else Path(options["out"]).expanduser()
@@ -82,10 +79,7 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
     else:
         click.echo(f"{found.sentence}\n")
         for table in (found.table, found.parameter_table, *(t for t in (found.run_table, found.load_table) if t.rows)):
-            if sys.stdout.isatty():
-                print_terminal(table, sys.stdout)
-            else:
-                click.echo(to_text(table), nl=False)
+            show(table)
             click.echo()
         if folder is not None:
             home = folder / "augmented"

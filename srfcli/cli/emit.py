@@ -16,15 +16,11 @@ from srfcli.cli.options import OutputOptions
 from srfcli.core.errors import SrfError, Status, printable
 from srfcli.core.files import check_target, write_atomic
 from srfcli.laws.values import Law
-from srfcli.results import tables
-from srfcli.results import tables as records
 from srfcli.results.provenance import Provenance, write_result
-from srfcli.results.tables import Table
+from srfcli.results.tables import Table, print_terminal, to_csv, to_json, to_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-# The way out of a command: a table to stdout or a file, a figure, their sidecars, progress and the exit code.
 
 PATIENCE, LITTLE = 2.0, 0.01  # s that nobody needs an estimate for; share of the work from which one can be made
 
@@ -60,7 +56,7 @@ def emit(
         for index, one in enumerate(shown):
             if index:
                 click.echo()
-            _to_stdout(one, options.format)
+            show(one, options.format)
     else:
         content = "\n".join(render(one, options.format) for one in shown).encode("utf-8")
         _write(options.out, content, provenance, options)
@@ -78,12 +74,13 @@ def emit(
 
 def render(table: Table, format: str) -> str:
     """Return the table as `format`: text (twelve digits), json or csv (full precision)."""
-    return {"text": tables.to_text, "json": records.to_json, "csv": records.to_csv}[format](table)
+    return {"text": to_text, "json": to_json, "csv": to_csv}[format](table)
 
 
-def _to_stdout(table: Table, format: str) -> None:
+def show(table: Table, format: str = "text") -> None:
+    """Print the table on stdout, formatted where that is a terminal and text is asked for."""
     if format == "text" and sys.stdout.isatty():
-        tables.print_terminal(table, sys.stdout)
+        print_terminal(table, sys.stdout)
     else:
         click.echo(render(table, format), nl=False)
 

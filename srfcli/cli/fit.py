@@ -23,6 +23,7 @@ from srfcli.cli.options import (
     worker_options,
 )
 from srfcli.core.errors import SrfError, Status
+from srfcli.results.tables import STATUS, Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,9 +32,6 @@ if TYPE_CHECKING:
     from srfcli.inference.free_parameters import Scale
     from srfcli.inference.thresholds import MethodFit, ThresholdFit, Trace
     from srfcli.results.campaign import CampaignResult
-    from srfcli.results.tables import Table
-
-# `srf fit`: parameters from recordings, or from a table of critical loads.
 
 METHOD = "powell, or least-squares with exact derivatives"
 EXAMPLES = """
@@ -338,12 +336,11 @@ def fit_thresholds(
             report=report,
         )
     described = {k: v for k, v in resolved.described().items() if k not in GIVEN}
-    loads, trace = _loads(fit), _trace(fit)
-    summary = _summary(fit)
+    more = [_summary(fit), _trace(fit), _loads(fit)]
     emit(
-        _parameters(fit, model.title, described, [summary, trace, loads]),
+        _parameters(fit, model.title, described, more),
         output,
-        more=[summary, trace, loads],
+        more=more,
         laws=model.laws,
         inputs=[path],
         timings={m.method: m.cpu for m in fit.methods},
@@ -369,8 +366,7 @@ def _bounds(text: str, parameters: Sequence[Parameter]) -> tuple[str, tuple[floa
 
 
 def _parameters(fit: ThresholdFit, title: str, described: Mapping[str, Any], rest: Sequence[Table]) -> Table:
-    from srfcli.results.tables import Column, Table
-
+    """Return the estimates of each method; `meta` holds the `rest`: methods, trace and loads."""
     columns = (
         Column("method", "", METHOD),
         Column("parameter", "", "name"),
@@ -390,23 +386,11 @@ def _parameters(fit: ThresholdFit, title: str, described: Mapping[str, Any], res
             rows.append(
                 (m.method, q.name, value, error, *ends, q.parameter.unit, start, m.uncertainty.flags[i] or "ok")
             )
-    names = [[c.name for c in t.columns] for t in rest]
-    meta: dict[str, Any] = {
-        key: [dict(zip(n, row, strict=True)) for row in t.rows]
-        for key, t, n in zip(("methods", "trace", "loads"), rest, names, strict=True)
-    }
+    meta: dict[str, Any] = {key: t.records() for key, t in zip(("methods", "trace", "loads"), rest, strict=True)}
     meta["information"] = {m.method: _information(fit.scale, m) for m in fit.methods}
     notes = (*fit.table.notes, *_remarks(fit))
-    return Table(
-        "srf.fit-thresholds/2",
-        columns,
-        rows,
-        f"{fit.table.source}, {len(fit.table)} critical loads; {title}",
-        notes,
-        described,
-        meta,
-        fit.status.value,
-    )
+    title = f"{fit.table.source}, {len(fit.table)} critical loads; {title}"
+    return Table("srf.fit-thresholds/2", columns, rows, title, notes, described, meta, fit.status.value)
 
 
 def _information(scale: Scale, m: MethodFit) -> dict[str, Any]:
@@ -422,14 +406,14 @@ def _information(scale: Scale, m: MethodFit) -> dict[str, Any]:
 
 def _remarks(fit: ThresholdFit) -> list[str]:
     """Return what a reader of the parameters has to know: fit or no fit, what is least determined, how data were matched."""
-    from scipy.stats import chi2
+    from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 
     notes, freedom = [], len(fit.table) - len(fit.scale)
     for m in fit.methods:
         if m.uncertainty.weakest:
             notes.append(f"{m.method}: least determined is {m.uncertainty.weakest}")
-        chance = float(chi2.sf(m.cost, freedom)) if freedom else 1.0
-        if m.status.ok and chance < 1e-3:
+        chance = chance_of(m.cost, freedom)
+        if m.status.ok and chance < IMPROBABLE:
             notes.append(
                 f"{m.method}: chi2 {m.cost:.4g} on {freedom} degrees of freedom: chance {chance:.1g}; the model does not"
                 " describe the data within sigma, and the errors do not allow for that"
@@ -439,8 +423,6 @@ def _remarks(fit: ThresholdFit) -> list[str]:
 
 
 def _summary(fit: ThresholdFit) -> Table:
-    from srfcli.results.tables import STATUS, Column, Table
-
     columns = (
         Column("method", "", METHOD),
         Column("status", "", STATUS),
@@ -462,8 +444,6 @@ def _summary(fit: ThresholdFit) -> Table:
 
 
 def _trace(fit: ThresholdFit) -> Table:
-    from srfcli.results.tables import Column, Table
-
     columns = (
         Column("method", "", METHOD),
         Column("evaluation", "1", "of the whole cost, counted from 1"),
@@ -475,7 +455,6 @@ def _trace(fit: ThresholdFit) -> Table:
 
 def _loads(fit: ThresholdFit) -> Table:
     from srfcli.results.fit import LOADS, load_rows
-    from srfcli.results.tables import Column, Table
 
     rows = [(m.method, *row) for m in fit.methods for row in load_rows(fit.table, m.match)]
     return Table("srf.fit-thresholds.loads/1", (Column("method", "", METHOD), *LOADS), rows, "Critical loads")

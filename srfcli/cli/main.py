@@ -19,15 +19,18 @@ COMMANDS = {
     "laws": ("srfcli.cli.law:laws", "List the laws that are found; none is imported for that."),
     "law": ("srfcli.cli.law:law", "Show, write and check laws."),
     "derive": (
-        "srfcli.cli.derive:command",
+        "srfcli.cli.system:derive",
         "Steady state, slopes, equations, dispersion relation and closed critical loads of a system, by algebra.",
     ),
     "code": (
-        "srfcli.cli.derive:code",
+        "srfcli.cli.system:code",
         "Print the generated NumPy module of a system: rates, Jacobians, derivatives by the parameters, "
         "characteristic polynomial.",
     ),
-    "linear": ("srfcli.cli.stability:linear", "Critical load, K/W0 and frequency of steady sliding under constant load."),
+    "linear": (
+        "srfcli.cli.stability:linear",
+        "Critical load, K/W0 and frequency of steady sliding under constant load.",
+    ),
     "critical": ("srfcli.cli.stability:critical", "Every critical load at the given velocities, numbered from low W0."),
     "continue": (
         "srfcli.cli.stability:continue_",
@@ -68,7 +71,7 @@ COMMANDS = {
         "Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding.",
     ),
     "prove": ("srfcli.cli.prove:command", "Prove the diagnosis on experiments whose truth nobody has seen."),
-    "config": ("srfcli.cli.config:command", "Show which values are used, and who set them."),
+    "config": ("srfcli.cli.system:config", "Show which values are used, and who set them."),
 }
 
 EPILOG = """

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import Session, SrfCommand
-from srfcli.cli.law import plugins_option
-from srfcli.cli.options import reader_option
+from srfcli.cli.options import plugins_option, reader_option
 from srfcli.core.errors import SrfError
 
 if TYPE_CHECKING:

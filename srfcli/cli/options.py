@@ -440,6 +440,16 @@ def _read_system(
     return SystemOptions(**chosen, flags=flags, plugins=(*plugins, *folders), toml=toml, effects=effects)
 
 
+plugins_option = click.option(
+    "--plugins",
+    "plugins",
+    multiple=True,
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Folder with law files of your own; may be given several times. Also SRF_PLUGINS.",
+)
+
+
 def value_option(name: str, help: str) -> Callable[[F], F]:
     """Add --NAME for one value of a parameter, as text with or without unit."""
     return click.option(f"--{name}", name, metavar="VALUE", help=help)

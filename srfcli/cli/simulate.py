@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from srfcli.core.settings import Parameter, Resolved
     from srfcli.data.noise import RoughTrack
     from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
-    from srfcli.laws.registry import Registry
     from srfcli.motion.imposed import Drive, Load
 
     Array = NDArray
@@ -225,7 +224,6 @@ def _write(
 
 # A record of one's own for `srf simulate`: drive, load and sampling from the options.
 
-DRIVE_EXAMPLE, LOAD_EXAMPLE = "0.5:12, 4:8", "2:5, 0.2:5->7, 4:7"
 REFERENCE = ("V0",)  # a velocity that mu0 refers to: no record tells the two apart
 FACTOR = 5.0  # bounds of a fit lie so far from a value
 NAME = "simulated"
@@ -321,7 +319,7 @@ def _track(system: SystemOptions, given: Mapping[str, Any]) -> RoughTrack | None
 def _drive_pieces(given: Mapping[str, Any], V: float, span: float | None) -> tuple[Piece, ...]:
     """Return the pieces of --drive, or one of constant velocity: as long as --for, the recorded load or --load, or 40 um."""
     if given["drive"] is not None:
-        return parse_pieces(given["drive"], "um/s", option="--drive", example=DRIVE_EXAMPLE)
+        return parse_pieces(given["drive"], "um/s", option="--drive", example="0.5:12, 4:8")
     if given["duration"] is not None:
         duration = parse_quantity(given["duration"], "s", name="--for")
         if not 0 < duration <= LONGEST:
@@ -329,11 +327,14 @@ def _drive_pieces(given: Mapping[str, Any], V: float, span: float | None) -> tup
     elif span is not None:
         duration = span
     elif given["load"] is not None:
-        pieces = parse_pieces(given["load"], "N", option="--load", example=LOAD_EXAMPLE)
-        duration = edges_of(pieces, 0.0)[-1]
+        duration = edges_of(_load_pieces(given), 0.0)[-1]
     else:
         duration = float(f"{TRAVEL / V:.3g}")
     return (Piece(duration, V, V),)
+
+
+def _load_pieces(given: Mapping[str, Any]) -> tuple[Piece, ...]:
+    return parse_pieces(given["load"], "N", option="--load", example="2:5, 0.2:5->7, 4:7")
 
 
 def _recorded_load(
@@ -363,8 +364,7 @@ def _sampling_notes(
             f"sampled {min(rates) / f:.2g} times a period of the modulation: from fewer than 8 the load is not read back"
         )
     if given["load"] is not None:
-        length = edges_of(parse_pieces(given["load"], "N", option="--load", example=LOAD_EXAMPLE), 0.0)[-1]
-        total = edges_of(pieces, 0.0)[-1]
+        length, total = (edges_of(made, 0.0)[-1] for made in (_load_pieces(given), pieces))
         if length < total * (1 - 1e-9):
             notes.append(f"--load ends at {length:g} s of {total:g} s; its last value holds on")
         elif length > total * (1 + 1e-9):
@@ -377,7 +377,7 @@ def _base_load(given: Mapping[str, Any], W0: float, begin: float) -> Load:
 
     if given["load"] is None:
         return ConstantLoad(W0)
-    pieces = parse_pieces(given["load"], "N", option="--load", example=LOAD_EXAMPLE)
+    pieces = _load_pieces(given)
     rise = parse_quantity(given["load_rise"], "s", name="--load-rise")
     return LoadSteps.sequence([(p.duration, p.first, p.last) for p in pieces], start=begin, rise=rise)
 
@@ -506,13 +506,14 @@ IMPOSED = ("V", "W0", "eps", "f")
 
 def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -> Work:
     """Return the runs of the experiment at `path`, to be simulated with its own values but for what flags set."""
+    from srfcli.codegen.model import open_model
     from srfcli.data.experiment import read_experiment
 
     registry = system.registry()
     experiment = read_experiment(path, registry=registry, format=given["reader"])
     experiment.check_recorded("to simulate")
     choice = _choice(system, experiment.choice)
-    model = _open(registry, choice)
+    model = open_model(registry, **dataclasses.asdict(choice))
     flags = _flags(system, model)
     runs = _chosen(experiment, given["runs"])
     observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in runs))
@@ -525,7 +526,7 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
     spread = parse_spread(given["start_values"])
     jobs, mover = tuple(_job(model, experiment, run, flags, given["start"]) for run in runs), model
     if (track := read_track(given)) is not None:
-        mover = _open(registry, choice, tables=TABLES)
+        mover = open_model(registry, **dataclasses.asdict(choice), tables=TABLES)
         jobs = tuple(on_track(model, mover, job, track, start=given["start"]) for job in jobs)
 
     def made(records: Sequence[Record]) -> Experiment:
@@ -536,7 +537,7 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
 
     described = _run_parameters(model, experiment, flags) | track_parameters(track, given)
     noted, told = track_notes(track)
-    inputs = (_description_file(path), *(run.file for run in runs))
+    inputs = (path / "experiment.toml" if path.is_dir() else path, *(run.file for run in runs))
     free = [run.name for run in runs if run.initial == "free"]
     notes = (f"initial state of {', '.join(free)} not known: begun in steady sliding",) if free else ()
     meta = {"title": experiment.title, "rtol": given["rtol"], **told}
@@ -549,20 +550,6 @@ def _choice(system: SystemOptions, choice: ModelChoice) -> ModelChoice:
         raise SrfError("the runs of an experiment are loaded from above", "Leave out --loading inclined.")
     named = {key: getattr(system, key) for key in ("law", "ageing", "interface", "inertia")}
     return dataclasses.replace(choice, **{k: s.value for k, s in named.items() if s.origin == "flag"})
-
-
-def _open(registry: Registry, choice: ModelChoice, *, tables: Sequence[tuple[str, str]] = ()) -> GeneratedModel:
-    from srfcli.codegen.model import open_model
-
-    return open_model(
-        registry,
-        law=choice.law,
-        ageing=choice.ageing,
-        interface=choice.interface,
-        inertia=choice.inertia,
-        effects=choice.effects,
-        tables=tables,
-    )
 
 
 def _flags(system: SystemOptions, model: GeneratedModel) -> dict[str, float]:
@@ -683,10 +670,6 @@ def _moved(p: FitParameter, value: float | None) -> FitParameter:
     return dataclasses.replace(p, value=value, lower=min(p.lower, value), upper=max(p.upper, value), unit=unit)
 
 
-def _description_file(path: Path) -> Path:
-    return path / "experiment.toml" if path.is_dir() else path
-
-
 # What `srf simulate` is told in words: pieces of drive and load, sampling rates, the state to start from.
 
 MOST_SAMPLES = 10_000_000
@@ -722,18 +705,13 @@ def _parse_piece(part: str, number: int, unit: str, option: str, example: str) -
     ends = [end.strip() for end in values_text.split("->")]
     if not colon or not duration_text.strip() or not all(ends) or len(ends) > 2:
         raise SrfError(f"{where} is not DURATION:VALUE or DURATION:FROM->TO", f"Write {option} '{example}'.")
-    duration = _number(duration_text, "s", f"{option}: the duration of piece {number}")
+    duration = parse_quantity(duration_text, "s", name=f"{option}: the duration of piece {number}")
     if not 0 < duration <= LONGEST:
         raise SrfError(f"{where} lasts {duration:g} s", f"Give each piece a duration above 0, up to {LONGEST:g} s.")
     split = [split_quantity(end, name=f"{option}: the value of piece {number}", example=f"5 {unit}") for end in ends]
     written = next((u for _, u in reversed(split) if u), unit)
     values = [convert(v, u or written, unit, name=f"{option}: piece {number}") for v, u in split]
     return Piece(duration, values[0], values[-1])
-
-
-def _number(text: str, unit: str, name: str) -> float:
-    value, written = split_quantity(text, name=name, example=f"0.5 {unit}")
-    return convert(value, written or unit, unit, name=name)
 
 
 def edges_of(pieces: Sequence[Piece], start: float) -> list[float]:
@@ -760,7 +738,7 @@ def build_drive(pieces: Sequence[Piece], start: float) -> Drive:
 
 def parse_rates(text: str, pieces: int) -> tuple[float, ...]:
     """Return the samples per second in each of so many pieces: one for all, or one for each."""
-    rates = tuple(_number(part, "Hz", "--rate") for part in text.split(","))
+    rates = tuple(parse_quantity(part, "Hz", name="--rate") for part in text.split(","))
     if not all(0 < rate <= 1e9 for rate in rates):
         raise SrfError(f"--rate {text}: a rate lies between 0 and 1e9 Hz", "Write --rate 1000.")
     if len(rates) not in (1, pieces):
@@ -845,7 +823,7 @@ def start_state(model: GeneratedModel, p: Array, text: str, *, drive: Drive, loa
 
 def _start_velocity(text: str) -> float:
     try:
-        V = _number(text, "um/s", "--start")
+        V = parse_quantity(text, "um/s", name="--start")
     except SrfError as error:
         raise SrfError(f"--start {text!r} is neither steady, nor a velocity, nor values", error.hint) from error
     if not 1e-12 <= V <= LARGEST_VELOCITY:
@@ -862,7 +840,7 @@ def _with_values(model: GeneratedModel, x: Array, text: str) -> Array:
         if name not in plain:
             raise SrfError(f"--start: {name!r} is no state of {model.title}", did_you_mean(name, plain))
         unit = {"u": "um", "z": "um/s", "v": "um/s"}.get(name, "s")
-        number, i = _number(value, unit, f"--start: {name}"), plain.index(name)
+        number, i = parse_quantity(value, unit, name=f"--start: {name}"), plain.index(name)
         if model.logarithmic[i] and not number > 0:
             raise SrfError(f"--start: {name} = {number:g} {unit} is not above 0", f"Write --start {name}=1e-6.")
         x[i] = math.log(number) if model.logarithmic[i] else number
