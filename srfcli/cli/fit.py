@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from srfcli.core.settings import Parameter
     from srfcli.inference.free_parameters import Scale
     from srfcli.inference.thresholds import MethodFit, ThresholdFit, Trace
-    from srfcli.results.campaign import CampaignResult
+    from srfcli.results.fit import CampaignResult
 
 METHOD = "powell, or least-squares with exact derivatives"
 EXAMPLES = """
