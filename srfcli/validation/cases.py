@@ -23,6 +23,7 @@ from srfcli.validation.apparatus import (
     PAPER,
     RIGS,
     SIZES,
+    TURN,
     Rig,
     Setting,
     disturbed,
@@ -36,8 +37,6 @@ from srfcli.validation.gauge import REDDEST, Array, Gauge, play, read_gauge
 from srfcli.validation.slider import SMOOTH, Physics, Plan, Trace, Track, move
 
 # What can be concealed: each effect, how strong it is drawn, and what the baseline is that lacks it.
-
-TURN = (0.0, 2 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -602,7 +601,7 @@ def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
         "noise": recipe.noise,
         "resembles": sorted({r for e in recipe.effects for r in e.resembles}),
         "sizes": dict(zip(names, recipe.sizes, strict=True)),
-        "truth": {n: v for n, v in _changed(recipe.physics, recipe.baseline).items()},
+        "truth": _changed(recipe.physics, recipe.baseline),
         "physics": asdict(recipe.physics),
         "baseline": asdict(recipe.baseline),
         "rough": recipe.physics.track.size,
@@ -615,9 +614,8 @@ def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
 
 
 def _changed(p: Physics, baseline: Physics) -> dict[str, Any]:
-    """Return the fields in which the truth departs from its baseline, or from neutral values."""
-    usual = baseline
-    return {f.name: getattr(p, f.name) for f in fields(p) if getattr(p, f.name) != getattr(usual, f.name)}
+    """Return the fields in which the truth departs from its baseline."""
+    return {f.name: getattr(p, f.name) for f in fields(p) if getattr(p, f.name) != getattr(baseline, f.name)}
 
 
 def known_physics(truth: Mapping[str, Any], *, baseline: bool = False) -> Physics:
@@ -800,8 +798,10 @@ def make_bank(
         raise SrfError(f"{apart} exists already", "Truths are never overwritten; name another file.")
     plan = plan_wide(n, seed, kinds=kinds) if bank == "wide" else [(None, p) for p in plan_bank(n, seed, kinds=kinds)]
     folder.mkdir(parents=True)
+    rough, own = TRACKS[track] if track else (None, None)
+    shared: dict[str, Any] = {"rough": rough, "own": own, "strengths": strengths, "bank": bank}
     tasks = [
-        (folder / f"case-{i:03d}", (seed, i), kind, names, track, strengths, bank)
+        {"folder": folder / f"case-{i:03d}", "seed": (seed, i), "kind": kind, "effects": names, **shared}
         for i, (kind, names) in enumerate(plan)
     ]
     truths: dict[str, Truth] = {}
@@ -865,11 +865,5 @@ def _counts(n: int, kinds: Sequence[str], every: Sequence[str], usual: Sequence[
     return counts
 
 
-Task = tuple[Path, tuple[int, int], str | None, tuple[str, ...], str | None, bool, str]
-
-
-def _make(task: Task) -> tuple[str, Truth]:
-    folder, seed, kind, names, track, strengths, bank = task
-    rough, own = TRACKS[track] if track else (None, None)
-    made = make_case(folder, seed, kind=kind, effects=names, rough=rough, own=own, strengths=strengths, bank=bank)
-    return folder.name, made
+def _make(task: Mapping[str, Any]) -> tuple[str, Truth]:
+    return task["folder"].name, make_case(**task)
