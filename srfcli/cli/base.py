@@ -70,29 +70,28 @@ def switches() -> list[click.Option]:
     ]
 
 
-class SrfCommand(click.Command):
-    """A command with the switches, whose epilog, the examples, is printed as it is written."""
+class WithExamples(click.Command):
+    """A command or a group whose epilog, the examples, is printed as it is written: a wrapped command line cannot be copied."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog, its common indentation replaced by two spaces."""
+        if self.epilog:
+            import inspect  # only for help
+
+            formatter.write("\nExamples:\n")
+            for line in inspect.cleandoc(self.epilog).splitlines():
+                formatter.write(f"  {line}".rstrip() + "\n")
+
+
+class SrfCommand(WithExamples):
+    """A command with examples and the switches."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.params.extend(switches())
 
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the epilog verbatim: a wrapped command line cannot be copied."""
-        write_epilog(self.epilog, formatter)
 
-
-def write_epilog(epilog: str | None, formatter: click.HelpFormatter) -> None:
-    """Write `epilog` as it stands, its common indentation replaced by two spaces."""
-    if epilog:
-        import inspect  # only for help
-
-        formatter.write("\nExamples:\n")
-        for line in inspect.cleandoc(epilog).splitlines():
-            formatter.write(f"  {line}".rstrip() + "\n")
-
-
-class SrfGroup(click.Group):
+class SrfGroup(WithExamples, click.Group):
     """A group that lists its commands in the order of their registration and tells errors the way `srf` does."""
 
     command_class = SrfCommand
@@ -119,10 +118,6 @@ class SrfGroup(click.Group):
         if name in self.commands or name.startswith("-") or ctx.resilient_parsing:
             return super().resolve_command(ctx, args)
         raise SrfError(f"no such command {name!r} of {ctx.command_path}", did_you_mean(name, self.commands))
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the epilog verbatim."""
-        write_epilog(self.epilog, formatter)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands with their first sentence, all of it."""

@@ -227,18 +227,17 @@ class DiagnosisResult(Result):
         from srfcli.diagnosis.answer import material, run_views
         from srfcli.diagnosis.augment import augment
         from srfcli.diagnosis.diagram import stability
-        from srfcli.results.provenance import Provenance, write_sidecar
+        from srfcli.results.provenance import Provenance, write_result
 
         folder, diagnosis, last, found = Path(folder), self.diagnosis, self.diagnosis.final, self.answer
         with whole_folder(folder, lambda: check_answer(folder, force=force)) as fresh:  # an hour may have passed
             text = (json_text(found, indent=2) + "\n").encode("utf-8")
-            write_atomic(fresh / ANSWER, text)
             made = Provenance(
                 arguments=tuple(arguments), laws=last.fit.likelihood.problem.model.laws,
                 inputs=(diagnosis.experiment.path, *diagnosis.experiment.files), seed=self.seed,
                 timings={"diagnose": self.seconds},
             )  # fmt: skip
-            write_sidecar(fresh / ANSWER, text, made)
+            write_result(fresh / ANSWER, text, made)
             views = run_views(diagnosis)
             for name, view in zip(prediction_names([v.run.name for v in views]), views, strict=True):
                 write_atomic(fresh / name, prediction_csv(view))

@@ -271,7 +271,7 @@ class FitResult(Result):
 
         from srfcli.results.figures import fit_figure
         from srfcli.results.plots import symbol_text
-        from srfcli.results.report_text import NO_BREAK, bracketed, unit_text
+        from srfcli.results.report_text import bracketed, with_unit
 
         own_figure(ax, "a fit")
         fit, experiment = self.found.fit, self.experiment
@@ -288,8 +288,7 @@ class FitResult(Result):
             rows.append((f.name, f.holdout, label, run.t, signal.observed, f.prediction.y, f.white))
         for name in fit.names:
             unit, (value, error) = self._shown(name, fit.values[name], fit.stderr[name])
-            shown = "" if unit == "1" else f"{NO_BREAK}{unit_text(unit)}"
-            told.append(f"{symbol_text(name)} = {bracketed(value, error)}{shown}")
+            told.append(f"{symbol_text(name)} = {with_unit(bracketed(value, error), unit)}")
         choice = experiment.choice
         title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
         return fit_figure(rows, title=title, found=", ".join(told), tables=tables)

@@ -53,13 +53,12 @@ from srfcli.results.report_text import (
     unit_text,
     verdict_sentence,
     with_error,
+    with_unit,
 )
 from srfcli.results.tables import plain_value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-# What stands in the report of a diagnosis, section by section, from the answer, its material and finished pictures.
 
 # What stands in the report of a diagnosis, section by section, from the answer, its material and finished pictures.
 
@@ -412,13 +411,8 @@ def held_out(matter: Matter) -> Markup:
     text = "These were opened only after the model was final."
     shown = [_run(matter, one) for one in matter.held[:SHOWN]]
     caption = "Residual over noise."
-    return section(
-        "held-out",
-        "Runs that the fit never saw",
-        tag("p", text),
-        table(heads, rows, caption=caption, numeric=(1, 2)),
-        shown,
-    )
+    found = table(heads, rows, caption=caption, numeric=(1, 2))
+    return section("held-out", "Runs that the fit never saw", tag("p", text), found, shown)
 
 
 def missing_force(matter: Matter) -> Markup:
@@ -674,8 +668,7 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     written: list[Path] = []
     pictures: dict[str, bytes] = {}
     if importlib.util.find_spec("matplotlib") is not None:
-        for name, content in _drawn(folder / FIGURES, traces, material, written):
-            pictures[name] = content
+        pictures = dict(_drawn(folder / FIGURES, traces, material, written))
     matter = Matter(plain_value(answer), tables, traces, pictures, folder)
     write_atomic(folder / PAGE, _page(matter))
     return (*written, folder / PAGE)
@@ -742,10 +735,8 @@ def _drawings(traces: tuple[Trace, ...], material: Mapping[str, Any]) -> Iterato
     if changed or not all(one.same for one in traces):
         yield "parameters", partial(parameters_figure, plain_value(material.get("parameters") or ()))
     force = material.get("force") or {}
-    unit, runs = (
-        str(force.get("unit", "N")),
-        {str(k): v for k, v in force.items() if isinstance(v, Mapping) and "t" in v},
-    )
+    unit = str(force.get("unit", "N"))
+    runs = {str(k): v for k, v in force.items() if isinstance(v, Mapping) and "t" in v}
     for name, one_force in runs.items():
         yield f"force {name}", partial(force_figure, name, one_force, unit=unit)
     if runs:
@@ -758,16 +749,8 @@ def _page(matter: Matter) -> str:
     sentence = verdict_sentence(matter.answer, matter.tables)
     verdict = str(matter.answer.get("verdict"))
     title = str(matter.tables.get("title") or "Diagnosis")
-    parts = [
-        places(matter),
-        left_out(matter),
-        missing_force(matter),
-        parameters(matter),
-        held_out(matter),
-        diagram(matter),
-        onward(matter),
-    ]
-    shown = [p for p in parts if p]
+    sections = (places, left_out, missing_force, parameters, held_out, diagram, onward)
+    shown = [made for made in (one(matter) for one in sections) if made]
     links = [
         tag("a", Markup(m[2]), href=f"#{m[1]}")
         for p in shown
@@ -856,19 +839,15 @@ def _headline(data: Mapping[str, Any]) -> str:
         told = []
         for row in rows:
             if row.get("method") == best.get("method"):
-                unit = unit_text(row.get("unit"))
-                value = bracketed(row.get("value"), row.get("stderr"))
-                told.append(f"{row['parameter']} = {value}" + (f"{NO_BREAK}{unit}" if unit else ""))
+                value = with_unit(bracketed(row.get("value"), row.get("stderr")), row.get("unit"))
+                told.append(f"{row['parameter']} = {value}")
         ratio = ((data.get("meta") or {}).get("rms_over_noise") or {}).get("fit")
         tail = f"; residuals are {number(ratio)} times the noise" if finite(ratio) else ""
         if finite(best.get("chi2")):
             tail = f"; χ² is {number(best['chi2'])} on {best.get('freedom')} degrees of freedom"
         return ", ".join(told) + tail + _state(data)
-    return (
-        f"{notes[0][:1].upper()}{notes[0][1:]}{_state(data)}"
-        if notes
-        else f"{_kind(data)}: {len(rows)} rows{_state(data)}"
-    )
+    found = f"{notes[0][:1].upper()}{notes[0][1:]}" if notes else f"{_kind(data)}: {len(rows)} rows"
+    return found + _state(data)
 
 
 def _state(data: Mapping[str, Any]) -> str:
@@ -888,22 +867,13 @@ def _result(folder: Path, path: Path, data: Mapping[str, Any]) -> Markup:
     parts.append(_table(data))
     flagged = [r for r in data.get("rows") or () if r.get("flag") not in (None, "", "ok")]
     if flagged:
-        parts.append(
-            tag(
-                "p",
-                "To be known before the values are used: "
-                + "; ".join(f"{r['parameter']}: {r['flag']}" for r in flagged)
-                + ".",
-            )
-        )
+        told = "; ".join(f"{r['parameter']}: {r['flag']}" for r in flagged)
+        parts.append(tag("p", f"To be known before the values are used: {told}."))
     runs = (data.get("meta") or {}).get("runs")
     if isinstance(runs, list) and runs and isinstance(runs[0], dict) and "rms_over_noise" in runs[0]:
         rows = [[r["run"], r["role"], r.get("used", r.get("samples")), number(r["rms_over_noise"])] for r in runs]
-        parts.append(
-            table(
-                ["run", "role", "samples", "residual / noise"], rows, caption="How each run is fitted.", numeric=(2, 3)
-            )
-        )
+        heads = ["run", "role", "samples", "residual / noise"]
+        parts.append(table(heads, rows, caption="How each run is fitted.", numeric=(2, 3)))
     notes = [str(n) for n in data.get("notes") or ()]
     if notes:
         parts.append(tag("ul", [tag("li", n) for n in notes]))
