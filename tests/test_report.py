@@ -313,7 +313,7 @@ def test_two_runs_whose_names_make_one_file_name_keep_both_figures(
 ) -> None:
     monkeypatch.setattr(report, "figure_bytes", lambda figure, suffix: f"{figure}{suffix}".encode())
     monkeypatch.setattr(report, "overview", lambda traces, narrow=False: None)
-    monkeypatch.setattr(report, "atlas_figure", lambda rows, narrow=False: None)
+    monkeypatch.setattr(report, "scan_figure", lambda rows, narrow=False: None)
     monkeypatch.setattr(report, "run_figure", lambda one, narrow=False: one.name)
     material = made_material("none")
     empty = made_run("empty") | {"used": np.zeros(900, dtype=bool)}  # nothing to draw
@@ -431,7 +431,7 @@ def test_windows_that_adjoin_are_one_in_words() -> None:
     assert merged([]) == []
 
 
-def test_the_atlas_is_read_in_both_forms() -> None:
+def test_the_residual_scan_is_read_in_both_forms() -> None:
     rows = [{"axis": "v", "low": 1.0, "high": 2.0, "log_p": -230.2585, "statistic": 9.0, "p_value": 1e-90},
             {"axis": "v", "low": 2.0, "high": 3.0, "log_p": -23.0, "statistic": 900.0, "p_value": 1e-3},
             {"axis": "v", "low": 3.0, "high": 4.0, "log_p": -1.0, "statistic": 1.0, "p_value": 0.9},

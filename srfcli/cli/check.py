@@ -406,7 +406,7 @@ def described(check: RunCheck, told: Reach | None) -> dict[str, Any]:
 
 
 def tells(told: Reach) -> dict[str, Any]:
-    """Return what one run or several can tell: errors that are infinite are null."""
+    """Return as plain data what one run, or all together, can identify."""
     simulation = {"status": told.status.value, "misfit": told.misfit, "believed": told.believed}
     return {
         "variation": told.variation,
@@ -427,13 +427,13 @@ def _noise(noise: GaugeNoise) -> dict[str, Any]:
 
 # What `srf check` says in words: what the loads of these recordings can and cannot identify, and how the noise was found.
 
-CONSTANT = 1e-5  # relative variation of a load that is none
+CONSTANT = 1e-5  # relative variation of a load below which it is constant
 LIMITS = {
     "alpha": (0.05, 0.5),
     "lambda": (0.1, 1.0),
     "n": (0.1, 1.0),
-}  # errors from which it can hardly, and cannot be known
-SEEN, HIDDEN = 3.0, 0.3  # times the noise of a sample: what stays below is hard to tell from drift, and cannot be told
+}  # errors above which a parameter can hardly, and cannot, be identified
+SEEN, HIDDEN = 3.0, 0.3  # peaks over the noise of a sample, below which a parameter can hardly, and cannot, be identified
 CAN = "can be identified"
 CHANGES = {"alpha": "alpha = 0.2", "lambda": "a change by 10 %", "n": "a change by 0.1"}
 SUBJECTS = {
@@ -448,7 +448,7 @@ NOISE = (
 
 
 def sentences(forecast: Forecast) -> list[str]:
-    """Return what the loads tell: the runs whose load is constant, a sentence for each name asked for, and what that rests on."""
+    """Return sentences on what the loads can identify: runs of constant load, each parameter, and the assumptions."""
     constant = [r.name for r in forecast.runs if r.variation < CONSTANT]
     told = [f"the load is constant in {joined(constant)}"] if constant else []
     told += [_not_believed(r) for r in forecast.runs if not r.believed or not r.status.ok]
@@ -492,7 +492,7 @@ def _sentence(name: str, judge: Reach, forecast: Forecast) -> str:
 
 
 def verdict_of(name: str, told: Reach) -> str:
-    """Return what error and peak mean: can, can hardly, or cannot be identified."""
+    """Return whether a parameter can, can hardly, or cannot be identified, from its error and peak."""
     clear, hardly = LIMITS[name]
     error, peak = told.errors[name], told.peaks[name]
     if error < clear and peak >= SEEN:

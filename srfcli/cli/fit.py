@@ -44,7 +44,7 @@ srf fit EXPERIMENT --track smooth                   no random friction field, wh
 srf fit A B C --table out.csv --workers 3           a campaign: each by itself, a row each
 srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c, sigma
 """
-USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seven runs, 63 in the other
+USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 24 to 29, the other 63
 
 
 @click.command("fit", cls=SrfCommand, epilog=EXAMPLES)
@@ -244,17 +244,16 @@ def _fit_campaign(
 
 
 class FitShare:
-    """The share of a fit that is done, from 0 to 1, by the steps that were told of each of its starts.
+    """Estimates the share of a fit that is done, from 0 to 1, from the steps that each start reports.
 
-    Most fits take some thirty steps, so that many are expected at first; one that takes more has, at any step, a quarter of its
-    own before it.
+    A start is expected to take USUAL_STEPS steps, or 4/3 of those it has made where that is more.
     """
 
     def __init__(self, starts: int = 1) -> None:
         self.starts, self.number, self.steps = starts, 1, 0
 
     def after(self, text: str) -> float:
-        """Return the share that is done once this step was told; `start 2 of 5: ...` begins the second."""
+        """Return the share that is done after this step; the text `start 2 of 5: ...` begins the second start."""
         told = re.match(r"start (\d+) of", text)
         if told and int(told[1]) != self.number:
             self.number, self.steps = int(told[1]), 0
@@ -263,7 +262,7 @@ class FitShare:
 
 
 def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> Path | None:
-    """Return where the draws go; raises SrfError now for what could not be written later."""
+    """Return the file of the draws; raises SrfError, before the fit, where it could not be written."""
     import importlib.util
 
     from srfcli.core.files import check_target
@@ -405,7 +404,7 @@ def _information(scale: Scale, m: MethodFit) -> dict[str, Any]:
 
 
 def _remarks(fit: ThresholdFit) -> list[str]:
-    """Return what a reader of the parameters has to know: fit or no fit, what is least determined, how data were matched."""
+    """Return notes: the least determined combination, whether the model describes the data, how data were matched."""
     from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 
     notes, freedom = [], len(fit.table) - len(fit.scale)

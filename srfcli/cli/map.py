@@ -179,7 +179,7 @@ def _boundary_output(boundary: str, output: OutputOptions) -> OutputOptions:
     return place
 
 
-# The axes of a map from the command line: parameters, or ratios of two such as K/W0.
+# The axes of a map: parameters, or ratios of two such as K/W0.
 
 COLUMNS, ROWS = 80, 120  # points of an axis for which none were given
 

@@ -159,7 +159,7 @@ def parse_overs(texts: Sequence[str]) -> tuple[Range, ...]:
 
 
 def names_of(kind: str) -> Callable[[click.Context, click.Parameter, str], list[Any]]:
-    """Return what completes the name of a law of this kind where the tab key is pressed: the laws that are found."""
+    """Return a shell completion for the names of laws of this kind."""
 
     def complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[Any]:
         from click.shell_completion import CompletionItem
@@ -300,7 +300,7 @@ class SystemOptions:
         return SlidingSystem(model, self.resolve(model.parameters, **given))
 
     def say_defaults(self, resolved: Resolved, names: Iterable[str]) -> None:
-        """Say on stderr which of these parameters have a value that nobody chose."""
+        """Say on stderr which of these parameters have the default of their law."""
         taken = [p for p in resolved.parameters if p.name in set(names) and resolved.origins[p.name] == "law default"]
         if taken:
             values = ", ".join(f"{p.name} = {p.default:g}{'' if p.unit == '1' else f' {p.unit}'}" for p in taken)
@@ -330,6 +330,7 @@ def open_registry(plugins: Sequence[Path], settings: Sequence[Setting] = ()) -> 
 
 
 def _by_person(setting: Setting) -> bool:
+    """Return whether a flag or an environment variable set it, and no file."""
     return setting.origin == "flag" or setting.origin.startswith("environment ")
 
 
@@ -421,7 +422,7 @@ def system_options(function: F) -> F:
 
 
 def stability_options(function: F) -> F:
-    """Add what `system_options` adds, and --effect, for a command whose results are those of sliding at one velocity for ever."""
+    """Add what `system_options` adds, and --effect: for commands on the stability of sliding."""
     return _as_one(function, "system", _read_system, SYSTEM_OPTIONS | EFFECT_OPTION)
 
 
@@ -520,7 +521,7 @@ def read_output(
     force: bool = False,
     provenance: bool = True,
 ) -> OutputOptions:
-    """Return the output options; raises SrfError now for what could not be written once all is computed."""
+    """Return the output options; raises SrfError, before anything is computed, for files that could not be written."""
     if as_json and as_csv:
         raise SrfError("--json and --csv exclude each other", "Choose one; a second run with the other costs little.")
     if out == "" or plot == "":

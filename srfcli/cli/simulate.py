@@ -39,7 +39,7 @@ srf simulate EXPERIMENT --run onset --plot onset.svg
 srf simulate EXPERIMENT --set lambda=0.5 --out-dir predicted
 srf simulate EXPERIMENT --roughness 3e-4 --roughness-length 10 --seed 1 --out-dir rough
 """
-OWN_RECORD = {  # what describes a record of one's own: an experiment brings its own
+OWN_RECORD = {  # options that describe a new record; they exclude EXPERIMENT, which has its own
     "V": "--V", "W0": "--W0", "eps": "--eps", "drive": "--drive", "load": "--load", "load_file": "--load-file",
     "onset": "--onset", "duration": "--for", "rate": "--rate", "observable": "--observe", "free": "--free",
 }  # fmt: skip
@@ -222,10 +222,10 @@ def _write(
     session.say(f"Wrote {folder} ({len(files) - 1} run{'s' if len(files) != 2 else ''})")
 
 
-# A record of one's own for `srf simulate`: drive, load and sampling from the options.
+# A new record: drive, load and sampling from the options.
 
-REFERENCE = ("V0",)  # a velocity that mu0 refers to: no record tells the two apart
-FACTOR = 5.0  # bounds of a fit lie so far from a value
+REFERENCE = ("V0",)  # the velocity that mu0 refers to: not identifiable beside mu0
+FACTOR = 5.0  # ratio of the bounds of a fit to the value
 NAME = "simulated"
 
 
@@ -499,7 +499,7 @@ def _experiment(
     )
 
 
-# The runs of an experiment for `srf simulate`: as they were driven, loaded and sampled, with any parameters and laws.
+# The runs of an experiment: as they were driven, loaded and sampled, with any parameters and laws.
 
 IMPOSED = ("V", "W0", "eps", "f")
 
@@ -670,11 +670,11 @@ def _moved(p: FitParameter, value: float | None) -> FitParameter:
     return dataclasses.replace(p, value=value, lower=min(p.lower, value), upper=max(p.upper, value), unit=unit)
 
 
-# What `srf simulate` is told in words: pieces of drive and load, sampling rates, the state to start from.
+# Reading of options: pieces of drive and load, sampling rates, the initial state.
 
 MOST_SAMPLES = 10_000_000
-FEW_SAMPLES, MANY_SAMPLES, USUAL_RATE = 1000, 100_000, 1000.0  # what --rate is without being given
-TRAVEL = 40.0  # um of driving where nothing says how long
+FEW_SAMPLES, MANY_SAMPLES, USUAL_RATE = 1000, 100_000, 1000.0  # of the default of --rate: see `usual_rate`
+TRAVEL = 40.0  # um of driving where no duration is given
 LARGEST_VELOCITY = 1e9  # um/s
 LONGEST = 1e12  # s
 
@@ -847,15 +847,15 @@ def _with_values(model: GeneratedModel, x: Array, text: str) -> Array:
     return x
 
 
-# The rough track of `srf simulate`: what the options ask for, and the records laid on it.
+# The random friction field along slip (--roughness), and records simulated with it.
 
-TABLES = (("mu", "slip"),)  # what is added to which part of the model, and what it is a function of
+TABLES = (("mu", "slip"),)  # a table over slip is added to the friction coefficient
 LENGTH = 10.0  # um, the correlation length where only a size is given
-LARGEST_ROUGHNESS = 0.5  # of mu0: a rougher track has places that pull
+LARGEST_ROUGHNESS = 0.5  # of mu0: above it the friction coefficient may become negative
 
 
 def read_track(given: Mapping[str, Any]) -> RoughTrack | None:
-    """Return the track that --roughness, --roughness-length and --seed ask for, None for a smooth one."""
+    """Return the random field that --roughness, --roughness-length and --seed describe; None without one."""
     if given["roughness"] is None:
         if given["roughness_length"] is not None:
             raise SrfError("--roughness-length is given and the track is smooth", "Give the size: --roughness 3e-4.")
@@ -913,7 +913,7 @@ def _reach(model: GeneratedModel, job: Job) -> float:
 
 
 def track_parameters(track: RoughTrack | None, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the two options as parameters are described: value, unit and origin; nothing for a smooth track."""
+    """Return the field's amplitude and correlation length as described parameters; nothing without a field."""
     if track is None:
         return {}
     origin = "default" if given["roughness_length"] is None else "flag"
@@ -924,7 +924,7 @@ def track_parameters(track: RoughTrack | None, given: Mapping[str, Any]) -> dict
 
 
 def track_notes(track: RoughTrack | None) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return the note on a track and its entry in a result's meta, as `srf fit` has them; nothing for a smooth one."""
+    """Return the note on the field and its entry in `meta`, as in the result of `srf fit`; nothing without a field."""
     if track is None:
         return (), {}
     note = f"track: mu0 wanders by {track.size:g} (standard deviation) over {track.length:g} um"

@@ -267,7 +267,8 @@ class DiagnosisResult(Result):
             _report(fresh, found, made_of, told, debug)
 
 
-def _notes(found: dict[str, Any], *, recorded: bool = True) -> list[str]:
+def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:
+    """Return notes on an answer; not `recorded`: it rests on critical loads alone."""
     notes = list(found["reasons"])
     for name, side in (("baseline", found["baseline"]), ("final model", found["augmented"])):
         held = side["holdout"]["rms_over_noise"]
@@ -290,7 +291,7 @@ def _notes(found: dict[str, Any], *, recorded: bool = True) -> list[str]:
 
 
 def _missing(missing: dict[str, Any]) -> list[str]:
-    """Return what is known of a force that no registered effect explains."""
+    """Return notes on a force that no registered effect explains."""
     if not missing:
         return []
     latent = missing["latent"]
@@ -306,6 +307,7 @@ def _missing(missing: dict[str, Any]) -> list[str]:
 
 
 def _places(location: Location) -> list[str]:
+    """Return notes on the phase, frequencies and quantity of state that the misfit goes with."""
     notes = []
     if location.forcing_phase is not None:
         notes.append(
@@ -320,7 +322,7 @@ def _places(location: Location) -> list[str]:
 
 
 def check_answer(folder: Path, *, force: bool) -> None:
-    """Raise SrfError now if a diagnosis could not be written to `folder` later."""
+    """Raise SrfError where a diagnosis could not be written to `folder`."""
     recover(folder)
     parent = Path(os.path.realpath(folder)).parent
     if not parent.is_dir():
@@ -350,7 +352,7 @@ def _is_diagnosis(folder: Path) -> bool:
 
 
 def _in_shown_units(made_of: dict[str, Any], diagnosis: Diagnosis) -> None:
-    """Put what the report shows into the units of the recordings, and add what the user stated and where the runs were made."""
+    """Convert the report's material to the units of the recordings; add stated stiffness, velocities and loads."""
     experiment = diagnosis.experiment
     runs = {run.name: run for run in experiment.runs}
     for shown in made_of["runs"]:
@@ -383,7 +385,7 @@ def _velocities(run: Run) -> list[tuple[float, float]]:
 
 
 def _proposed(fresh: Path, folder: Path, found: Mapping[str, Any], result: DiagnosisResult) -> list[str]:
-    """Write what each hypothesis foretells of the run that would part them, and return what the report says of it."""
+    """Write each hypothesis' prediction of the discriminating run, and return the report's sentences on it."""
     from srfcli.diagnosis.design import parting_files
 
     told = found["experiment"]

@@ -213,7 +213,7 @@ def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title
 # Figures of recordings: each run with what was observed and what was imposed, and the samples that are not compared.
 
 BINS = 1500  # columns in which a long record is drawn by its extremes
-STRETCH, CROSSES = 20, 100  # samples in a row that make a band; single ones that are crossed each
+STRETCH, CROSSES = 20, 100  # consecutive samples from which a band is drawn; most single ones that are marked with crosses
 DECADES = 30.0  # ratio of velocities from which their axis is logarithmic
 UNUSED = "#D55E00"
 
@@ -242,7 +242,7 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
 
 
 def _settle(figure: Figure) -> None:
-    """Lay the panels out once and for all, at rounded places: the solver's last digits differ from time to time."""
+    """Fix the layout at rounded positions: the last digits of the layout solver differ from run to run."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for axis in figure.axes:
@@ -276,7 +276,7 @@ def _panel(axes: list[Axes], run: Mapping[str, Any]) -> None:
 
 
 def _proposed(axis: Axes, t: Any, observed: Any, proposed: Any) -> None:
-    """Draw the record as proposed corrections would make it, where they change it: spikes ringed, a moved level dashed."""
+    """Draw the record as corrected, where proposed corrections change it: spikes as rings, a shifted level dashed."""
     import numpy as np
 
     from srfcli.data.clock import runs_of
@@ -296,7 +296,7 @@ def _proposed(axis: Axes, t: Any, observed: Any, proposed: Any) -> None:
 
 
 def _imposed(axis: Axes, values: Any, *, wide: bool) -> None:
-    """Give a constant an axis that its rounding does not fill, and velocities over decades a logarithmic one."""
+    """Set the scale of an imposed quantity: wide for a constant, logarithmic for velocities over decades."""
     import numpy as np
 
     size = float(np.abs(values).max())
@@ -340,7 +340,7 @@ def _mark_unused(axis: Axes, t: Any, x: Any, bad: Any) -> str:
 
 
 def _thinned(t: Any, x: Any) -> tuple[Any, Any]:
-    """Return the record, or where it is long, its smallest and largest value in each of many columns, in order of time."""
+    """Return the record; a long one reduced to the minimum and maximum of each of BINS bins, both at the bin's first time."""
     import numpy as np
 
     if t.size <= 4 * BINS:
@@ -460,9 +460,9 @@ def _line(
 
 
 def envelope(t: Any, y: Any, *, bins: int = BINS) -> tuple[Any, Any]:
-    """Return a curve (t, y) of few points that looks the same: the least and the largest value of each bin, in their order.
+    """Return a curve (t, y) reduced to the minimum and maximum of each bin, in their order; NaN gaps are kept.
 
-    Records of up to four points a bin stay as they are.
+    Records of up to four points a bin are returned unchanged.
     """
     import numpy as np
 

@@ -76,7 +76,7 @@ _METADATA: dict[str, dict[str, Any]] = {
 
 
 def check_plot(path: Path, *, force: bool) -> None:
-    """Raise SrfError now if a figure could not be saved at `path` later; matplotlib is looked for but not imported."""
+    """Raise SrfError where a figure could not be saved at `path`; matplotlib is looked for but not imported."""
     if path.suffix.lower() not in SUFFIXES:
         got = f"ends in {path.suffix!r}" if path.suffix else "has no ending"
         raise SrfError(f"--plot {path} {got}", f"End it in {', '.join(SUFFIXES)}: --plot {path.with_suffix('.svg')}")
@@ -90,7 +90,7 @@ def _missing() -> SrfError:
 
 
 def load_matplotlib() -> None:
-    """Import matplotlib from elsewhere than the current folder, whose `matplotlibrc` it would read: it may be a stranger's."""
+    """Import matplotlib from another folder than the current one, whose `matplotlibrc` it would read and which is not trusted."""
     if "matplotlib" in sys.modules:
         return
     try:

@@ -23,7 +23,6 @@ from srfcli.results.provenance import sidecar_path
 from srfcli.results.report_figures import (
     LEVEL,
     Trace,
-    atlas_figure,
     axis_text,
     diagram_figure,
     force_by_state,
@@ -34,6 +33,7 @@ from srfcli.results.report_figures import (
     parameters_figure,
     rms_over_noise,
     run_figure,
+    scan_figure,
     spots,
     trace,
 )
@@ -177,7 +177,7 @@ def places(matter: Matter) -> Markup:
     parts += [_run(matter, one) for one in matter.fitted[1:SHOWN]]
     if len(matter.fitted) > SHOWN:
         parts.append(tag("p", f"The other {len(matter.fitted) - SHOWN} runs are drawn in the folder figures."))
-    return section("where", "Where simulation and recording part", parts, critical_loads(matter), atlas(matter))
+    return section("where", "Where simulation and recording part", parts, critical_loads(matter), residual_scan(matter))
 
 
 def critical_loads(matter: Matter) -> list[Any]:
@@ -279,8 +279,8 @@ def _run(matter: Matter, one: Trace) -> Markup:
     return matter.figure(f"run {one.name}", alt, caption)
 
 
-def atlas(matter: Matter) -> Markup:
-    """Return with which phase, frequency and quantity of state the misfit goes."""
+def residual_scan(matter: Matter) -> Markup:
+    """Return the residual scan: phases, frequencies and quantities of state that the misfit goes with."""
     found = spots(matter.tables.get("atlas") or ())
     if not found:
         return Markup("")
@@ -730,7 +730,7 @@ def _drawings(traces: tuple[Trace, ...], material: Mapping[str, Any]) -> Iterato
         yield f"run {one.name}", partial(run_figure, one)
     for loads in material.get("thresholds", ()):
         yield f"loads {loads['name']}", partial(loads_figure, loads)
-    yield "atlas", partial(atlas_figure, plain_value(material.get("atlas") or ()))
+    yield "atlas", partial(scan_figure, plain_value(material.get("atlas") or ()))
     changed = any(t["chi2"][0] != t["chi2"][1] for t in material.get("thresholds", ()))
     if changed or not all(one.same for one in traces):
         yield "parameters", partial(parameters_figure, plain_value(material.get("parameters") or ()))

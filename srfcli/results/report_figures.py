@@ -1,4 +1,4 @@
-"""Figures of a diagnosis' report: runs and residuals, the scan of places, what was found."""
+"""Figures of a diagnosis' report: runs and residuals, the residual scan, what was found."""
 
 from __future__ import annotations
 
@@ -413,7 +413,7 @@ def _pieces(t: Array) -> list[tuple[int, int]]:
     return [(a, b) for a, b in itertools.pairwise(borders) if b > a]
 
 
-# The atlas of places at which a misfit was looked for: its rows in one form, a figure of them, the foremost in words.
+# The residual scan: its rows as `Spot`, the foremost of them, and a figure.
 
 BINS = 3  # of an axis, from which it has a panel of its own
 BARS = 12  # in a panel of names
@@ -458,7 +458,7 @@ class Spot:
 
     @property
     def sure(self) -> bool:
-        """True where noise does not do this, all that was looked at being allowed for."""
+        """True where the p-value, adjusted for the number of places, is below LEVEL."""
         return self.p_value is not None and self.p_value < LEVEL
 
     @property
@@ -476,7 +476,7 @@ class Spot:
 
 
 def spots(rows: Sequence[Mapping[str, Any]]) -> list[Spot]:
-    """Return the rows of the atlas, what stands out most first; a row has low and high, or `bin`: an interval or a name."""
+    """Return the rows of the residual scan, largest first; a row has low and high, or `bin`: an interval or a name."""
     found = []
     for row in rows:
         log_p, statistic, p = row.get("log_p"), row.get("statistic"), row.get("p_value")
@@ -499,7 +499,7 @@ def _place(value: Any) -> tuple[float, float, str]:
 
 
 def axis_text(axis: str) -> str:
-    """Return what an axis of the atlas is, in words."""
+    """Return the name of an axis of the residual scan in words."""
     return AXES.get(axis, (axis, ""))[0]
 
 
@@ -512,8 +512,8 @@ def foremost(found: Sequence[Spot], *, each: int = 2, most: int = 12) -> list[Sp
     return kept
 
 
-def atlas_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
-    """Return a panel for each axis of the atlas with several bins, but runs and windows in time; None where there is none."""
+def scan_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
+    """Return a panel for each axis of the residual scan with several bins, but runs and times; None where there is none."""
     by_axis: dict[str, list[Spot]] = {}
     for spot in spots(rows):
         if spot.axis not in APART and spot.kind != "shape":

@@ -39,9 +39,9 @@ from srfcli.validation.cases import (
 from srfcli.validation.gauge import Array, Gauge, white
 from srfcli.validation.slider import Physics, Plan
 
-# One answer held against the truth: what would have been right, and whether it was said.
+# The mark of one answer: which answers are accepted, and whether it is one of them.
 
-INVISIBLE = 5.0  # standard errors: an effect whose size even the best fit would know no better cannot be asked for
+INVISIBLE = 5.0  # standard errors: an effect whose size is smaller, in units of its error in the best fit, counts as invisible
 CONFIDENT = 0.9
 UNNAMED = ("none", "inconclusive", "ambiguous")  # right where what is concealed cannot be seen
 Accepted = frozenset[tuple[str, frozenset[str]]]
@@ -200,7 +200,7 @@ def _ratio(answer: Answer, sight: Sight, model: str) -> float | None:
     return float((ours / true) ** 0.5)
 
 
-# What there was to be seen in a case, from its truth: the error of a model that knows it, and how far each effect stands out.
+# Visibility, from the truth of a case: the error of the true model, and the size of each effect in standard errors.
 
 STEP = 2e-4  # relative, of a parameter's difference: in stick-slip a larger one shifts the phase by more than is linear
 
@@ -372,7 +372,7 @@ def deviation(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] |
     return None
 
 
-# Marks as tables: what was said for what, how often right, how sure, how well it predicts, and what it cost.
+# Marks as tables: confusion, rates, power, calibration, held-out errors, sizes and cost.
 
 SCHEMA = "srf.prove/1"
 STANDS_OUT = (0.0, INVISIBLE, 10.0, 20.0, 50.0, 200.0, float("inf"))
@@ -705,7 +705,7 @@ def quantile(values: Sequence[float], share: float) -> float | None:
     return float(np.quantile(values, share)) if values else None
 
 
-# What the gates are worth: the same searches, judged without them.
+# Ablations: the same searches, judged without some of the tests.
 
 Judge = Callable[[Answer], tuple[str, frozenset[str]]]
 
