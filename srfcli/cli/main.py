@@ -139,9 +139,7 @@ def cli() -> None:
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run `srf` with `argv`, or with the process's arguments, and exit."""
     os.environ.update(ONE_THREAD)
-    gc.set_threshold(
-        100_000, 10, 10
-    )  # to look for cycles among what is imported, and at the end, is a sixth of a short run
+    gc.set_threshold(100_000, 10, 10)  # collecting among imported modules, and at the end, takes a sixth of a short run
     atexit.register(gc.freeze)
     cli.main(argv)
 

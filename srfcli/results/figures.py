@@ -459,16 +459,16 @@ def _line(
         ax.ticklabel_format(axis="y", useOffset=False)
 
 
-def envelope(t: Any, y: Any, *, bins: int = BINS) -> tuple[Any, Any]:
+def envelope(t: Any, y: Any) -> tuple[Any, Any]:
     """Return a curve (t, y) reduced to the minimum and maximum of each bin, in their order; NaN gaps are kept.
 
     Records of up to four points a bin are returned unchanged.
     """
     import numpy as np
 
-    if t.size <= 4 * bins:
+    if t.size <= 4 * BINS:
         return t, y
-    edges = np.searchsorted(t, np.linspace(t[0], t[-1], bins + 1)[:-1])
+    edges = np.searchsorted(t, np.linspace(t[0], t[-1], BINS + 1)[:-1])
     keep = {0, t.size - 1}
     for a, b in zip(edges, [*edges[1:], t.size], strict=True):
         part = y[a:b]

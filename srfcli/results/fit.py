@@ -1,4 +1,4 @@
-"""Fits: parameters with errors and flags, how each run and table is fitted, the posterior; a campaign, a row an experiment."""
+"""Fits: of an experiment, of critical loads alone, and of a campaign of experiments, a row each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
 from srfcli.data.values import OBSERVABLES
-from srfcli.results.tables import Column, Result, Table, own_figure
+from srfcli.results.tables import STATUS, Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from srfcli.inference.fit import Fit, Problem, RunFit
     from srfcli.inference.posterior import Interval, Posterior
     from srfcli.inference.recordings import RecordingFit
-    from srfcli.inference.thresholds import Match
+    from srfcli.inference.thresholds import Match, MethodFit, ThresholdFit
 
 PARAMETERS = (
     Column("parameter", "", "name"),
@@ -398,6 +398,172 @@ def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float
     return notes
 
 
+# A fit of critical loads alone, as in the paper: each method beside the others, with its cost against evaluations.
+
+METHOD = Column("method", "", "powell, or least-squares with exact derivatives")
+ESTIMATES = (
+    METHOD,
+    Column("parameter", "", "name"),
+    Column("value", "", "estimate, in the unit beside it", ".7g"),
+    Column("stderr", "", "standard error from the given sigma, linearised", ".3g"),
+    Column("lower", "", "bound of the search"),
+    Column("upper", "", "bound of the search"),
+    Column("unit", "", "unit of all the columns before"),
+    Column("start", "", "where the fit began"),
+    Column("flag", "", "why an error is missing or means nothing"),
+)
+METHODS = (
+    METHOD,
+    Column("status", "", STATUS),
+    Column("chi2_start", "1", "sum of squared residuals in sigma at the start"),
+    Column("chi2", "1", "the same at the end"),
+    Column("freedom", "1", "critical loads less free parameters"),
+    Column("paper_cost_start", "N^2", "the paper's sum of squares at the start"),
+    Column("paper_cost", "N^2", "the same at the end"),
+    Column("evaluations", "1", "of the whole cost"),
+    Column("gradients", "1", "sets of exact derivatives that the method used"),
+    Column("surveys", "1", "lines searched in full"),
+)
+TRACE = (
+    METHOD,
+    Column("evaluation", "1", "of the whole cost, counted from 1"),
+    Column("chi2", "1", "lowest so far"),
+)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class ThresholdFitResult(Result):
+    """The fit of a model to a table of critical loads, by each method.
+
+    Attributes
+    ----------
+    found : ThresholdFit
+        The table, the free parameters, and what each method found.
+    laws : str
+        The title of the model.
+    held : mapping
+        The parameters and their origin, as a table describes them.
+    """
+
+    found: ThresholdFit = field(repr=False)
+    laws: str
+    held: Mapping[str, Mapping[str, Any]] = field(repr=False)
+
+    @property
+    def _freedom(self) -> int:
+        return len(self.found.table) - len(self.found.scale)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return the estimates of each method; `meta` has the methods, the traces, the loads and the information matrices."""
+        fit, rows = self.found, []
+        for m in fit.methods:
+            for i, q in enumerate(fit.scale):
+                numbers = (m.values[i], m.uncertainty.errors[i], q.lower, q.upper)
+                shown = [q.declared(float(x)) for x in numbers]
+                start, said = q.declared(float(q.start)), m.uncertainty.flags[i] or "ok"
+                rows.append((m.method, q.name, *shown, q.parameter.unit, start, said))
+        meta: dict[str, Any] = {
+            "methods": self.methods.records(),
+            "trace": self.trace.records(),
+            "loads": self.loads.records(),
+            "information": {m.method: self._information(m) for m in fit.methods},
+        }
+        notes = (*fit.table.notes, *self._remarks())
+        title = f"{fit.table.source}, {len(fit.table)} critical loads; {self.laws}"
+        return Table("srf.fit-thresholds/2", ESTIMATES, rows, title, notes, self.held, meta, fit.status.value)
+
+    def _information(self, m: MethodFit) -> dict[str, Any]:
+        """Return correlations and the information matrix's eigenvalues in the coordinates ln(value), or value/size."""
+        return {
+            "parameters": self.found.scale.names,
+            "coordinates": ["ln" if q.log else "linear" for q in self.found.scale],
+            "correlation": m.uncertainty.correlation,
+            "eigenvalues": m.uncertainty.eigenvalues,
+            "eigenvectors": m.uncertainty.combinations.T,
+        }
+
+    def _remarks(self) -> list[str]:
+        """Return notes: the least determined combination, whether the model describes the data, how data were matched."""
+        from srfcli.inference.critical_loads import IMPROBABLE, chance_of
+
+        notes = []
+        for m in self.found.methods:
+            if m.uncertainty.weakest:
+                notes.append(f"{m.method}: least determined is {m.uncertainty.weakest}")
+            chance = chance_of(m.cost, self._freedom)
+            if m.status.ok and chance < IMPROBABLE:
+                notes.append(
+                    f"{m.method}: chi2 {m.cost:.4g} on {self._freedom} degrees of freedom: chance {chance:.1g}; the model does"
+                    " not describe the data within sigma, and the errors do not allow for that"
+                )
+            notes += [f"{m.method}: {note}" for note in m.notes]
+        return notes
+
+    @cached_property
+    def methods(self) -> Table:
+        """Return how each method ended, and what it took."""
+        rows = [
+            (
+                m.method,
+                m.status.value,
+                m.start_cost,
+                m.cost,
+                self._freedom,
+                *m.paper_cost,
+                m.evaluations,
+                m.gradients,
+                m.surveys,
+            )
+            for m in self.found.methods
+        ]
+        return Table("srf.fit-thresholds.methods/1", METHODS, rows, "Methods")
+
+    @cached_property
+    def trace(self) -> Table:
+        """Return the lowest cost of each method against its evaluations."""
+        rows = [(m.method, i + 1, m.trace.best[i]) for m in self.found.methods for i in m.trace.milestones()]
+        return Table("srf.fit-thresholds.trace/1", TRACE, rows, "Cost against evaluations")
+
+    @cached_property
+    def loads(self) -> Table:
+        """Return each critical load, measured and computed, under the estimates of each method."""
+        rows = [(m.method, *row) for m in self.found.methods for row in load_rows(self.found.table, m.match)]
+        return Table("srf.fit-thresholds.loads/1", (METHOD, *LOADS), rows, "Critical loads")
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the measured critical loads beside those of the best fit over V, and the lowest chi2 against evaluations."""
+        import numpy as np
+
+        from srfcli.results import plots
+        from srfcli.results.figures import draw_loads
+
+        own_figure(ax, "a fit of critical loads")
+        table, best = self.found.table, min(self.found.methods, key=lambda m: m.cost)
+        loads = np.where(best.match.missing, np.nan, best.match.loads)
+        with plots.house_style():
+            figure = plots.bare_figure((6.0, 7.2))
+            above, below = figure.subplots(2, 1, height_ratios=(3, 2))
+            draw_loads(above, table, {"fit": loads})
+            for index, m in enumerate(self.found.methods):
+                look = {"color": ("#000000", "#777777")[index], "linestyle": plots.DASHES[index]}
+                count = range(1, len(m.trace) + 1)
+                below.step(count, m.trace.best, where="post", label=m.method, **look)
+                below.plot(count[-1:], m.trace.best[-1:], "o", color=look["color"])
+            if self._freedom:
+                below.axhline(self._freedom, color="#555555", linestyle=plots.DOTTED, label="degrees of freedom")
+            below.set(xscale="log", yscale="log", xlabel="evaluations of the whole cost", ylabel="lowest χ² so far")
+            found = ", ".join(
+                plots.valued(q.name, q.declared(float(best.values[i])), q.parameter.unit)
+                for i, q in enumerate(self.found.scale)
+            )
+            plots.heading(figure, f"{plots.name_text(str(table.source))}: {self.laws}\nfit: {found}")
+            plots.decade_ticks(below)
+            below.legend(loc="best", fontsize=plots.NAME, handlelength=2.8)
+            figure.align_ylabels([above, below])
+            return figure
+
+
 # A campaign: many experiments, a row each, as the table that a laboratory publishes.
 
 ROOM = 60  # letters of the experiments' names that stand upright below the figure
@@ -414,7 +580,9 @@ LEADING = (
     Column("load_unit", "", "N or MPa"),
     Column("segments", "", "of constant velocity, one slip length D0 or longer"),
     Column("steady", "", "of them, those that end in steady sliding"),
-    Column("final_slope", "1/mm", "largest change of friction with slip at the end of a segment, over its error 3 or more"),
+    Column(
+        "final_slope", "1/mm", "largest change of friction with slip at the end of a segment, over its error 3 or more"
+    ),
     Column("rms_over_noise", "", "1 where the model explains all but the noise"),
 )
 DERIVED = (

@@ -37,13 +37,8 @@ SYMBOLS = {
     "lambda": "λ", "alpha": "α", "phi": "φ",
 }  # fmt: skip
 HEADING, LINE, MARGIN = 9.0, 0.155, 0.012  # points and inches of a heading's line; its margin, of the figure's width
-NAME, NAME_ROW, NAME_WIDTH = (
-    9.0,
-    0.19,
-    0.075,
-)  # points of a curve's name below the axes, inches of a row and of a letter
-HANDLE = 0.65  # inches beside a name
-
+NAME = 9.0  # points of a curve's name below the axes
+NAME_ROW, NAME_WIDTH, HANDLE = 0.19, 0.075, 0.65  # inches of a row of names, of a letter, and of the line beside a name
 SCREEN = 90.0  # dots per inch in a notebook
 
 STYLE: dict[str, Any] = {
@@ -244,8 +239,6 @@ def stability_diagram(
     *,
     hopf: Mapping[str, Any] | None = None,
     title: str = "",
-    xlabel: str = "V  [µm/s]",
-    ylabel: str = "K/W$_0$  [1/µm]",
     ax: Axes | None = None,
 ) -> Figure:
     """Return the stability boundaries K/W0 (1/um) against V (um/s, logarithmic), drawn in `ax` if that is given.
@@ -260,7 +253,7 @@ def stability_diagram(
             ax.plot(hopf["V"], _gaps(hopf["K_over_W0"]), color="#555555", linestyle=DOTTED, label="ε = 0 (Hopf)")
         _draw_branches(ax, branches)
         amplitudes = {b["eps"] for b in branches}
-        ax.set(xlabel=xlabel, ylabel=ylabel)
+        ax.set(xlabel="V  [µm/s]", ylabel="K/W$_0$  [1/µm]")
         _frame_curves(ax)
         if len(amplitudes) == 1 or (hopf is not None and not branches):
             curves = [(b["V"], b["K_over_W0"]) for b in branches] or [(hopf["V"], hopf["K_over_W0"])]  # type: ignore[index]
@@ -410,7 +403,6 @@ def lines(
     ylabel: str,
     logx: bool = False,
     *,
-    logy: bool = False,
     title: str = "",
     ax: Axes | None = None,
 ) -> Figure:
@@ -423,8 +415,6 @@ def lines(
             ax.plot(_gaps(x), drawn, color=colour, linestyle=dash, label=label, marker=marker, markersize=4)
         if logx:
             ax.set_xscale("log")
-        if logy:
-            ax.set_yscale("log")
         ax.margins(x=0.0 if len(x) > 1 else 0.05)
         ax.set(xlabel=xlabel, ylabel=ylabel)
         decade_ticks(ax)
@@ -443,7 +433,7 @@ def orbit(
 ) -> Figure:
     """Return one forced period, panels over tau in periods: u (um), v (um/s, logarithmic), ages (s), mu and W (N)."""
     panels: list[tuple[str, Values, bool, str]] = [("u  [µm]", u, False, "u"), ("v  [µm/s]", v, True, "v")]
-    panels += [(f"{_greek(name)}  [s]", values, True, "state") for name, values in states.items()]
+    panels += [(f"{n.replace('phi', 'φ').replace('_', ' ')}  [s]", ages, True, "state") for n, ages in states.items()]
     panels += [("µ", mu, False, "mu"), ("W  [N]", W, False, "W")]
     with house_style():
         figure, axes = new_figure(len(panels), size=(6.0, 1.15 * len(panels) + 0.9))
@@ -462,10 +452,6 @@ def orbit(
         axes[-1].set_xlabel("time  [periods of the load]")
         figure.align_ylabels(axes)
         return figure
-
-
-def _greek(name: str) -> str:
-    return name.replace("phi", "φ").replace("_", " ")
 
 
 def decade_ticks(ax: Axes) -> None:

@@ -84,12 +84,9 @@ def from_line(line: str, *, where: str) -> Answer:
             raise ValueError("not the keys of an answer")
         if found["verdict"] not in VERDICTS:
             raise ValueError(f"verdict {found['verdict']!r}")
-    except (SrfError, ValueError) as error:
-        raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
-    try:
         equivalent = tuple(tuple(names) for names in found["equivalent"])
         lists = {name: tuple(found[name]) for name in ("effects", "not_identifiable")}
-    except TypeError as error:
+    except (SrfError, ValueError, TypeError) as error:
         raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
     return Answer(**{**found, **lists, "equivalent": equivalent})
 
