@@ -31,7 +31,6 @@ from srfcli.results.report_figures import (
     loads_figure,
     overview,
     parameters_figure,
-    rms_over_noise,
     run_figure,
     scan_figure,
     spots,
@@ -107,13 +106,6 @@ class Matter:
     def loads(self) -> list[Mapping[str, Any]]:
         """Return the tables of critical loads: name, held out or not, and chi2 under both models."""
         return list(self.tables.get("thresholds") or ())
-
-    def rms(self, one: Trace) -> tuple[float, float]:
-        """Return a run's residual over noise, whitened where the material has it so, before and after."""
-        given = next((r.get("rms") for r in self.tables["runs"] if r["name"] == one.name), None)
-        found = (given[0], given[1]) if given else (rms_over_noise(one.before), rms_over_noise(one.after))
-        before, after = (float("inf") if value is None else value for value in found)  # of a run that a model cannot follow
-        return before, after
 
     def figure(self, name: str, alt: str, caption: Any = "", *, small: bool = False) -> Markup:
         """Return a figure, or nothing where it was not drawn."""
@@ -202,7 +194,7 @@ def _run_table(matter: Matter) -> Markup:
     """Return the fitted runs with their residuals and, where any stands out, their parts of the misfit."""
     located, rows = {r["name"]: r for r in matter.located}, []
     for one in matter.fitted:
-        place, both = located.get(one.name, {}), matter.rms(one)
+        place, both = located.get(one.name, {}), one.rms
         row = [one.name, rms(both[0])] + ([] if matter.same else [rms(both[1])])
         if located:
             where = spans(merged(place.get("windows") or one.windows)) or "nowhere in particular"
@@ -269,7 +261,7 @@ def merged(windows: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
 
 
 def _run(matter: Matter, one: Trace) -> Markup:
-    before, after = matter.rms(one)
+    before, after = one.rms
     fell = f"{rms(before)}" if matter.same else f"{rms(before)} before, {rms(after)} after"
     where = f"; they part at the shaded times, furthest from {spans([one.worst])}" if one.worst else ""
     alt = f"Run {one.name}: recording, simulations and residuals over time{where}."
@@ -287,8 +279,7 @@ def residual_scan(matter: Matter) -> Markup:
     rows = [
         [axis_text(s.axis), s.place, s.run or "all", number(s.height), probability(s.p_value)] for s in foremost(found)
     ]
-    known = any(finite(r.get("log_p")) for r in matter.tables["atlas"])
-    heads = ["looked at by", "place", "run", "−log10 p" if known else "|statistic|", "p, adjusted"]
+    heads = ["looked at by", "place", "run", "−log10 p", "p, adjusted"]
     caption = "What stands out most; the last column allows for all that was looked at."
     figure = matter.figure(
         "atlas",
@@ -314,8 +305,7 @@ def left_out(matter: Matter) -> Markup:
     parting = matter.tables.get("parting")
     if parting:
         parts.append(tag("h3", "The experiment that would part them"))
-        told = [parting] if isinstance(parting, str) else [str(p) for p in parting]
-        parts += [commands([p.rstrip()]) if p.startswith("[[runs]]") else tag("p", p) for p in told]
+        parts += [commands([p.rstrip()]) if p.startswith("[[runs]]") else tag("p", p) for p in parting]
     return section("left-out", "What was left out", parts)
 
 
@@ -355,10 +345,8 @@ def scores(matter: Matter) -> Markup:
         return Markup("")
     rows = []
     for s in found:
-        unit = unit_text(s.get("unit"))
-        tail = f" {unit}" if unit else ""
         size, least = with_error(s.get("size"), s.get("stderr")), number(s.get("detectable"), 2)
-        rows.append([s["effect"], number(s.get("gain")), size + tail, percent(s.get("surviving")), least + tail])
+        rows.append([s["effect"], number(s.get("gain")), size, percent(s.get("surviving")), least])
     caption = (
         "At first order: the gain in log likelihood that each effect promises, the size it would have from its neutral value, "
         "the share of its signal that the baseline's own parameters cannot absorb, and the smallest size that this experiment "
@@ -403,7 +391,7 @@ def held_out(matter: Matter) -> Markup:
         return section("held-out", "Runs that the fit never saw", tag("p", text))
     rows = []
     for one in matter.held:
-        before, after = matter.rms(one)
+        before, after = one.rms
         word = "better" if after < 0.99 * before else "worse" if after > 1.01 * before else "alike"
         word = word if min(before, after) < float("inf") else "not at all"
         rows.append([one.name, rms(before)] + ([] if matter.same else [rms(after), word]))
@@ -453,7 +441,7 @@ def onward(matter: Matter) -> Markup:
     files = [p for pattern in FILES for p in sorted(matter.folder.glob(pattern)) if p.is_file()]
     names = [p.relative_to(matter.folder).as_posix() for p in files]
     items = [tag("li", tag("a", name, href=quote(name))) for name in names]
-    lines = matter.tables.get("commands") or command_lines(matter.answer, names)
+    lines = command_lines(matter.answer, names)
     parts = [tag("p", "Typed in the folder of this report:"), commands(lines)] if lines else []
     return section("onward", "The model, and how to go on", parts, tag("ul", items) if items else "")
 
@@ -651,15 +639,17 @@ Drawing = tuple[str, Callable[..., "Figure | None"]]
 def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str, Any]) -> tuple[Path, ...]:
     """Write report.html and figures/*.svg, *.png into `folder`, each whole or not at all, and return their places.
 
-    `answer` is the object of the format srf.diagnose/1. `material` has
-    runs: {name, holdout, t, observed, used, baseline, augmented, noise_level, V, W, windows} with arrays (n,), t in s, V in um/s,
-    W in N; optional: observable or label, rms (before, after);
-    atlas: {axis, run, statistic, p_value, log_p, and low, high or bin};
-    ranked: {name, evidence, rms_over_noise, p_value}; scores: {effect, gain, size, stderr, surviving, detectable, unit};
-    parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma}.
-    thresholds: {name, holdout, table, chi2 (before, after)}, with baseline and augmented, critical loads (n,) in N, if any.
-    Optional: title; about {effect: a phrase}; parting, paragraphs on a run that parts what is ambiguous; commands, lines to go
-    on with; force {run: {t, force, band, v, phi, W}, "form": text, "unit": text}; diagram {V, W0_baseline, W0_augmented, note}.
+    `answer` is the object of the format srf.diagnose/1. `material` is that of `srfcli.diagnosis.answer.material`:
+    title; about {effect: a phrase};
+    runs: {name, holdout, label, load_unit, t, observed, used, baseline, augmented, V, W, windows} with arrays (n,), t in s, V in
+    um/s, and of baseline and augmented model: white, rms, friction;
+    thresholds: {name, holdout, table, baseline, augmented, chi2 (of both models)}, critical loads (n,) in N;
+    atlas, the residual scan: {axis, run, kind, low, high, log_p, p_value};
+    ranked: {name, evidence, rms_over_noise, field, confidence, against};
+    scores: {effect, gain, size, stderr, surviving, detectable};
+    parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma};
+    and, where there are any, parting: paragraphs on the discriminating run; force {run: {t, force, band (2, n), v, phi, W},
+    "form": text}; diagram {V, note, and for baseline and augmented model: W0, V of these, W0_hopf}.
     Without matplotlib the page has all but the figures, and says so.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -681,12 +671,9 @@ def _tables(material: Mapping[str, Any]) -> dict[str, Any]:
         {"name": str(t["name"]), "holdout": bool(t["holdout"]), "chi2": plain_value(t["chi2"]), "size": len(t["table"])}
         for t in material.get("thresholds", ())
     ]
-    found["runs"] = [
-        {"name": str(r["name"]), "rms": plain_value(r.get("rms")), "holdout": bool(r.get("holdout"))}
-        for r in material.get("runs", ())
-    ]
+    found["runs"] = [{"name": str(r["name"]), "holdout": bool(r["holdout"])} for r in material.get("runs", ())]
     force, diagram = material.get("force") or {}, material.get("diagram") or {}
-    found["force"] = {k: force[k] for k in ("form", "unit") if force.get(k)} | ({"runs": True} if force else {})
+    found["force"] = {"form": force.get("form")} if force else {}
     found["diagram"] = {"note": diagram.get("note"), "marks": plain_value(diagram.get("marks") or ())}
     return found
 
@@ -735,12 +722,11 @@ def _drawings(traces: tuple[Trace, ...], material: Mapping[str, Any]) -> Iterato
     if changed or not all(one.same for one in traces):
         yield "parameters", partial(parameters_figure, plain_value(material.get("parameters") or ()))
     force = material.get("force") or {}
-    unit = str(force.get("unit", "N"))
     runs = {str(k): v for k, v in force.items() if isinstance(v, Mapping) and "t" in v}
     for name, one_force in runs.items():
-        yield f"force {name}", partial(force_figure, name, one_force, unit=unit)
+        yield f"force {name}", partial(force_figure, name, one_force)
     if runs:
-        yield "force-by-state", partial(force_by_state, runs, unit=unit)
+        yield "force-by-state", partial(force_by_state, runs)
     if material.get("diagram"):
         yield "diagram", partial(diagram_figure, material["diagram"])
 
