@@ -242,7 +242,12 @@ class DiagnosisResult(Result):
             for name, view in zip(prediction_names([v.run.name for v in views]), views, strict=True):
                 write_atomic(fresh / name, prediction_csv(view))
             augmented = augment(
-                self.registry, diagnosis.experiment, last.hypothesis, last.fit, folder=folder / "augmented", reader=self.reader
+                self.registry,
+                diagnosis.experiment,
+                last.hypothesis,
+                last.fit,
+                folder=folder / "augmented",
+                reader=self.reader,
             )
             (fresh / "augmented").mkdir()
             for name, content in augmented.files.items():
@@ -295,7 +300,9 @@ def _missing(missing: dict[str, Any]) -> list[str]:
     if not missing:
         return []
     latent = missing["latent"]
-    notes = [f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"]
+    notes = [
+        f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"
+    ]
     for name, share in list(latent["coordinates"].items())[:1]:
         notes[0] += f"; a function of {name} is {100 * share:.0f} % of it"
     if missing["form"] is None:
@@ -399,7 +406,9 @@ def _proposed(fresh: Path, folder: Path, found: Mapping[str, Any], result: Diagn
     return [*told["sentences"], told["run"]]
 
 
-def _report(folder: Path, found: dict[str, Any], made: dict[str, Any], told: Callable[[str], None], debug: bool) -> None:
+def _report(
+    folder: Path, found: dict[str, Any], made: dict[str, Any], told: Callable[[str], None], debug: bool
+) -> None:
     try:
         from srfcli.results.report import write_report
 

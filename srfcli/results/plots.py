@@ -180,7 +180,9 @@ def heading(figure: Figure, text: str) -> None:
     """
     if not text:
         return
-    lines = [broken for line in text.split("\n") for broken in _broken(line, figure, (1 - 2 * MARGIN) * figure.bbox.width)]
+    lines = [
+        broken for line in text.split("\n") for broken in _broken(line, figure, (1 - 2 * MARGIN) * figure.bbox.width)
+    ]
     figure.set_figheight(figure.get_figheight() + LINE * len(lines[1:]))
     figure.suptitle("\n".join(lines), x=MARGIN, ha="left", fontsize=HEADING, linespacing=1.3)
 
@@ -222,7 +224,9 @@ def one_panel(ax: Axes | None, *, title: str, size: tuple[float, float] | None =
     with house_style():
         if ax is not None:
             yield cast("Figure", ax.figure), ax
-            ax.set_title("\n".join(_broken(title.split("\n")[0], cast("Figure", ax.figure), ax.bbox.width)), fontsize=HEADING)
+            ax.set_title(
+                "\n".join(_broken(title.split("\n")[0], cast("Figure", ax.figure), ax.bbox.width)), fontsize=HEADING
+            )
             if len(ax.get_legend_handles_labels()[1]) > 1:
                 ax.legend(loc="best", handlelength=2.8, fontsize=NAME)
             return

@@ -327,8 +327,14 @@ def hypotheses(matter: Matter) -> Markup:
         label = "the baseline alone" if r["name"] == "none" else r["name"]
         sure = confidence.get("+".join(sorted(names)), r.get("confidence"))
         rows.append(
-            [label, number(r["evidence"] - top), rms(r["rms_over_noise"]), number(r.get("field") or 0.0, 2), percent(sure),
-             r.get("against") or ""]
+            [
+                label,
+                number(r["evidence"] - top),
+                rms(r["rms_over_noise"]),
+                number(r.get("field") or 0.0, 2),
+                percent(sure),
+                r.get("against") or "",
+            ]
         )
     caption = (
         "Everything that was fitted in full, best first: log evidence against the best, innovations over noise, the amplitude of "
@@ -821,7 +827,9 @@ def _headline(data: Mapping[str, Any]) -> str:
     """Return what was found, in a sentence."""
     notes, rows = [str(n) for n in data.get("notes") or ()], list(data.get("rows") or ())
     if _kind(data) in (KINDS["fit"], KINDS["fit-thresholds"]):
-        best = min((data.get("meta") or {}).get("methods") or [{}], key=lambda m: m.get("chi2", 0.0))  # of critical loads
+        best = min(
+            (data.get("meta") or {}).get("methods") or [{}], key=lambda m: m.get("chi2", 0.0)
+        )  # of critical loads
         told = []
         for row in rows:
             if row.get("method") == best.get("method"):

@@ -659,7 +659,9 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
     curves += [("W0_hopf_baseline", "baseline, constant load", BEFORE, DOTTED)]
     curves += [("W0_hopf_augmented", "augmented model, constant load", AFTER, DOTTED)]
     if all(_equal(diagram, key) for key in ("V", "W0", "W0_hopf")):  # nothing was added: one curve would hide the other
-        curves = [(key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]]
+        curves = [
+            (key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]
+        ]
     drawn = [c for c in curves if diagram.get(c[0]) is not None and np.isfinite(_gaps(diagram[c[0]])).any()]
     if not drawn or diagram.get("V") is None:
         return None
@@ -693,7 +695,10 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
 
 def _equal(diagram: Mapping[str, Any], quantity: str) -> bool:
     """Return whether the augmented model's curve is the baseline's."""
-    baseline, augmented = diagram.get(f"{quantity}_baseline", diagram.get(quantity)), diagram.get(f"{quantity}_augmented")
+    baseline, augmented = (
+        diagram.get(f"{quantity}_baseline", diagram.get(quantity)),
+        diagram.get(f"{quantity}_augmented"),
+    )
     if augmented is None:
         return quantity == "V" or baseline is None
     if baseline is None:

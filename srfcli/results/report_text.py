@@ -162,7 +162,10 @@ REMEDIES = {  # what is wrong, and what to do; {value} is the size with its erro
         "the stage's velocity ripples with its position: {value}",
         "measure the stage's own motion, and give it as load_point_displacement",
     ),
-    "slip-hardening": ("friction rises or falls with slip, and levels off: {value}", "slide further before the first step"),
+    "slip-hardening": (
+        "friction rises or falls with slip, and levels off: {value}",
+        "slide further before the first step",
+    ),
     "frictional-heating": (
         "friction changes with the heat that sliding makes: {value}",
         "slide slower, or use the augmented model, which has the heat",
@@ -188,7 +191,10 @@ REMEDIES = {  # what is wrong, and what to do; {value} is the size with its erro
         "the load follows its command late, and overshoots: {value}",
         "give the load that was measured, not its command",
     ),
-    "gauge-creep": ("the gauge creeps: {value}", "calibrate it over the times of the experiment, or use the augmented model"),
+    "gauge-creep": (
+        "the gauge creeps: {value}",
+        "calibrate it over the times of the experiment, or use the augmented model",
+    ),
     "pore-pressure": (
         "a pore pressure carries a part of the load: {value}",
         "record the pressure, and give the effective load",
@@ -276,7 +282,11 @@ def _wrong(effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) 
 def _filled(text: str, effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     """Return a text of REMEDIES with the sizes that an effect was found to have."""
     row = next(iter(_rows(effect, material)), {})
-    nameless = effect in ("stiffness-error", "inertia", "load-transmission")  # the sentence itself says what the size is of
+    nameless = effect in (
+        "stiffness-error",
+        "inertia",
+        "load-transmission",
+    )  # the sentence itself says what the size is of
     sizes = _size(row) if nameless else joined([f"{p['name']} = {_size(p)}" for p in _rows(effect, material)])
     plain = with_unit(number(row.get("augmented"), 4), row.get("unit"))
     return text.format(

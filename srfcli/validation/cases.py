@@ -285,7 +285,9 @@ def draw_wide(
     rig = str(rng.choice([name for name in RIGS if name.partition("-")[0] == setting.apparatus]))
     gauge = draw_gauge(rng, rig, physics, noise)
     only = str(rng.choice(_runs_of(forms[0], plans))) if kind == "one-run" else ""
-    return Recipe(forms, sizes, physics, without(physics, forms), plans, gauge, kind, rig, setting.protocol, noise, only)
+    return Recipe(
+        forms, sizes, physics, without(physics, forms), plans, gauge, kind, rig, setting.protocol, noise, only
+    )
 
 
 def wide_names(rng: np.random.Generator, kind: str) -> tuple[str, ...]:
@@ -323,7 +325,11 @@ def _sized(effect: Effect, sizes: tuple[float, float, Mapping[str, tuple[float, 
 def _may_be_odd(forms: Sequence[Effect], setting: Setting) -> bool:
     """Return whether a rigid or quasi-static baseline can be followed, and gives nothing away."""
     decided = any(e.name in USUAL_ONLY for e in forms)
-    return not decided and setting.protocol not in ("mixed", "stick-slip") and "nagata" not in (setting.ageing, setting.stated)
+    return (
+        not decided
+        and setting.protocol not in ("mixed", "stick-slip")
+        and "nagata" not in (setting.ageing, setting.stated)
+    )
 
 
 def _runs_of(effect: Effect, plans: Sequence[Plan]) -> list[str]:
@@ -434,7 +440,9 @@ DESCRIPTION = "experiment.toml"
 STARTS = PAPER.start(Physics())  # name -> value, lower, upper: the same for every case, as in the examples
 
 
-def description(baseline: Physics, plans: tuple[Plan, ...], *, title: str, rig: Rig = PAPER, spikes: bool = False) -> str:
+def description(
+    baseline: Physics, plans: tuple[Plan, ...], *, title: str, rig: Rig = PAPER, spikes: bool = False
+) -> str:
     """Return the text of experiment.toml: apparatus and model as the baseline has them, nothing of what is concealed."""
     mass = "" if baseline.massless else f'mass = "{baseline.M * 1e6:.3g} kg"\n'
     reference = [] if baseline.law == "dieterich-cutoff" else ["V0 = { value = 1.0, fixed = true }"]
@@ -471,7 +479,8 @@ def table(plan: Plan, observed: Array, rig: Rig = PAPER) -> str:
     V = velocities[np.minimum(np.searchsorted(ends, t + 1e-9, side="right"), velocities.size - 1)]
     W = [load(s)[0] / rig.factor for s in t.tolist()]
     rows = (
-        f"{s:.4f},{v:g},{w:.{rig.load_digits}f},{u:.{rig.digits}f}" for s, v, w, u in zip(t, V, W, observed, strict=True)
+        f"{s:.4f},{v:g},{w:.{rig.load_digits}f},{u:.{rig.digits}f}"
+        for s, v, w, u in zip(t, V, W, observed, strict=True)
     )
     header = f"time [s],load_point_velocity [um/s],{rig.load},{rig.heading}"
     return "\n".join([header, *rows]) + "\n"
@@ -627,8 +636,7 @@ def known_physics(truth: Mapping[str, Any], *, baseline: bool = False) -> Physic
 def known_plans(truth: Mapping[str, Any]) -> tuple[Plan, ...]:
     """Return the runs of a case from the truth about it."""
     return tuple(
-        Plan(**{**r, **{n: tuple(map(tuple, r.get(n, ()))) for n in ("drive", "steps", "gaps")}})
-        for r in truth["runs"]
+        Plan(**{**r, **{n: tuple(map(tuple, r.get(n, ()))) for n in ("drive", "steps", "gaps")}}) for r in truth["runs"]
     )
 
 
@@ -852,7 +860,9 @@ def check_kinds(kinds: Sequence[str], bank: str) -> None:
     every = WIDE_KINDS if bank == "wide" else KINDS
     strange = [k for k in kinds if k not in every]
     if strange and strange[0] in WIDE_KINDS:
-        raise SrfError(f"the bank of the paper has no cases of the kind '{strange[0]}'", "srf prove --bank wide has them.")
+        raise SrfError(
+            f"the bank of the paper has no cases of the kind '{strange[0]}'", "srf prove --bank wide has them."
+        )
     if strange:
         raise SrfError(f"unknown kind of case '{strange[0]}'", did_you_mean(strange[0], every))
 

@@ -41,7 +41,9 @@ from srfcli.validation.slider import Physics, Plan
 
 # The mark of one answer: which answers are accepted, and whether it is one of them.
 
-INVISIBLE = 5.0  # standard errors: an effect whose size is smaller, in units of its error in the best fit, counts as invisible
+INVISIBLE = (
+    5.0  # standard errors: an effect whose size is smaller, in units of its error in the best fit, counts as invisible
+)
 CONFIDENT = 0.9
 UNNAMED = ("none", "inconclusive", "ambiguous")  # right where what is concealed cannot be seen
 Accepted = frozenset[tuple[str, frozenset[str]]]
@@ -237,9 +239,7 @@ def see(task: Task) -> Sight:
             known[plan.name] = float(np.sqrt(np.mean((run.observed - made)[run.used] ** 2)))
     fitted = {plan: p for plan, p in sliders.items() if not plan.holdout}
     effects = concealed(truth)
-    stands = {
-        e.name: stands_out(e, [o for o in effects if o is not e], fitted, gauge=gauge, rig=rig) for e in effects
-    }
+    stands = {e.name: stands_out(e, [o for o in effects if o is not e], fitted, gauge=gauge, rig=rig) for e in effects}
     return Sight(folder.name, known, {n: s for n, (s, _) in stands.items()}, {n: r for n, (_, r) in stands.items()})
 
 
