@@ -163,7 +163,7 @@ def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, 
     try:
         outcomes = [outcome for one in _find(registry, name, kind) for outcome in check_law(one)]
     except SrfError as error:
-        if not _is_file(name):
+        if not (name.endswith((".toml", ".py")) and Path(name).is_file()):
             raise
         caret = error.caret() if isinstance(error, ExpressionError) else None
         text = "\n".join(part for part in (error.message, caret, f"Try: {error.hint}" if error.hint else None) if part)
@@ -172,10 +172,6 @@ def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, 
         click.echo(f"{outcome.verdict:7}  {outcome.check:13}  {outcome.text}")
     if any(outcome.verdict == "FAIL" for outcome in outcomes):
         ctx.exit(EXIT_USAGE)
-
-
-def _is_file(name: str) -> bool:
-    return name.endswith((".toml", ".py")) and Path(name).is_file()
 
 
 def _find(registry: Registry, name: str, kind: str | None) -> list[Law]:

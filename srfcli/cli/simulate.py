@@ -239,7 +239,10 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     recorded, begin, span, found = _recorded_load(system, given["load_file"], given["reader"])
     pieces = _drive_pieces(given, values["V"], span)
     f = values["f"] if values["eps"] else None
-    rates = _rates(given["rate"], pieces, f)
+    if given["rate"] is None:
+        rates = (usual_rate(sum(p.duration for p in pieces), f),) * len(pieces)
+    else:
+        rates = parse_rates(given["rate"], len(pieces))
     t = sample_times(pieces, rates, begin)
     drive = build_drive(pieces, begin)
     base = recorded or _base_load(given, values["W0"], begin)
@@ -247,7 +250,11 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     load.check(float(t[0]), float(t[-1]))
     start = start_state(model, p, given["start"], drive=drive, load=load.rest(begin), begin=begin)
     job, mover = Job(NAME, p, drive, load, t, start, observable, f, modulation, beside=tuple(beside)), model
-    if (track := _track(system, given)) is not None:
+    if (track := read_track(given)) is not None:
+        if system.loading.value != "vertical":
+            raise SrfError(
+                "a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined."
+            )
         mover = system.model(tables=TABLES)
         job = on_track(model, mover, job, track, start=given["start"])
     gauge, others = read_gauges(given, [observable, *beside])
@@ -307,15 +314,6 @@ def read_gauges(given: Mapping[str, Any], observables: Sequence[str]) -> tuple[G
     return gauges[0], dict(zip(observables[1:], gauges[1:], strict=True))
 
 
-def _track(system: SystemOptions, given: Mapping[str, Any]) -> RoughTrack | None:
-    track = read_track(given)
-    if track is not None and system.loading.value != "vertical":
-        raise SrfError(
-            "a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined."
-        )
-    return track
-
-
 def _drive_pieces(given: Mapping[str, Any], V: float, span: float | None) -> tuple[Piece, ...]:
     """Return the pieces of --drive, or one of constant velocity: as long as --for, the recorded load or --load, or 40 um."""
     if given["drive"] is not None:
@@ -347,12 +345,6 @@ def _recorded_load(
 
     load, t, notices = read_load(path, registry=system.registry(), format=reader)
     return load, float(t[0]), float(t[-1] - t[0]), tuple(map(str, notices))
-
-
-def _rates(text: str | None, pieces: Sequence[Piece], f: float | None) -> tuple[float, ...]:
-    if text is not None:
-        return parse_rates(text, len(pieces))
-    return (usual_rate(sum(p.duration for p in pieces), f),) * len(pieces)
 
 
 def _sampling_notes(

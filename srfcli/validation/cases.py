@@ -437,7 +437,6 @@ def draw_protocol(rng: np.random.Generator) -> tuple[Plan, ...]:
 # A case as a folder in the format srf-experiment/1: what the one who is to diagnose it gets to see.
 
 DESCRIPTION = "experiment.toml"
-STARTS = PAPER.start(Physics())  # name -> value, lower, upper: the same for every case, as in the examples
 
 
 def description(
