@@ -1,4 +1,4 @@
-"""`srf diagnose`: where recordings and their model differ, which physics is missing, and the model that has it."""
+"""`srf diagnose`: which physics a model of recordings lacks, and the model that has it; `srf report`: a page on results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
 from srfcli.cli.options import listed, open_registry, plugins_option, reader_option, vary_options
 from srfcli.core.errors import SrfError
 
-EXAMPLES = """
+DIAGNOSE = """
 srf diagnose EXPERIMENT                              a folder with experiment.toml, or that file
 srf diagnose EXPERIMENT --out found                  report, figures, predictions and the augmented model
 srf diagnose EXPERIMENT --json
@@ -20,7 +20,7 @@ srf fit found/augmented                              the augmented model is an e
 """
 
 
-@click.command("diagnose", cls=SrfCommand, epilog=EXAMPLES)
+@click.command("diagnose", cls=SrfCommand, epilog=DIAGNOSE)
 @click.argument("source", metavar="EXPERIMENT", type=click.Path(path_type=Path))
 @click.option(
     "--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable."
@@ -38,7 +38,7 @@ srf fit found/augmented                              the augmented model is an e
 @click.option("--json", "as_json", is_flag=True, help="Print one object, in full precision.")
 @click.option("--out", metavar="DIR", help="Write answer, report, predictions and augmented experiment to DIR.")
 @click.option("--force", is_flag=True, help="Replace a diagnosis that is in DIR already.")
-def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], **options: Any) -> None:
+def diagnose(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], **options: Any) -> None:
     """Say where recordings, or critical loads, and their model part, and which physics the model lacks.
 
     The baseline of the experiment is fitted with a random friction field and coloured gauge noise. Every registered effect is
@@ -48,7 +48,7 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
     from srfcli.cli.emit import Progress, finish, show
     from srfcli.results.diagnosis import check_answer
     from srfcli.results.tables import json_text
-    from srfcli.tasks.diagnose import diagnose
+    from srfcli.tasks import diagnose as tasks
 
     folder = None if options["out"] is None else Path(options["out"]).expanduser()
     if folder is not None:
@@ -61,7 +61,7 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
             session.detail(text)
 
         try:
-            found = diagnose(
+            found = tasks.diagnose(
                 source, effects=effects, trend=options["trend"], vary=listed(options["vary"]), by=options["by"],
                 reader=options["reader"], seed=options["seed"], registry=registry, progress=told,
             )  # fmt: skip
@@ -93,3 +93,35 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
         found.status,
         advice=f"the answer rests on what was fitted until then: {fitted}. Effects not among these were not tried.",
     )
+
+
+# `srf report`: one page on the results in a folder.
+
+REPORT = """
+srf fit EXPERIMENT --out results/fit.json --plot results/fit.svg
+srf map --eps 0.18 --out results/map.json --plot results/map.svg
+srf report results                                   writes results/report.html
+srf report results --title 'PMMA, May' --force
+"""
+
+
+@click.command("report", cls=SrfCommand, epilog=REPORT)
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--title", metavar="TEXT", help="Title of the page.  [default: the folder's name]")
+@click.option("--out", metavar="FILE.html", help="The page to write.  [default: report.html in the folder]")
+@click.option("--force", is_flag=True, help="Overwrite an existing page.")
+def report(folder: Path, title: str | None, out: str | None, force: bool) -> None:
+    """Write one page on the fits, maps, comparisons and other results of a folder.
+
+    Results are what `--out FILE.json` wrote; a figure of the same name beside one stands with it. A diagnosis has its own report,
+    which `srf diagnose --out` writes.
+    """
+    from srfcli.core.files import check_target, write_atomic
+    from srfcli.results.report import read_results, results_page
+
+    results = read_results(folder)
+    place = folder / "report.html" if out is None else Path(out).expanduser()
+    check_target(place, force=force)
+    write_atomic(place, results_page(folder, results, title=title or folder.resolve().name))
+    Session.current().say(f"{len(results)} result{'s' if len(results) != 1 else ''}")
+    click.echo(str(place))

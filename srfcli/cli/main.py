@@ -59,11 +59,11 @@ COMMANDS = {
         "Fit the model of an experiment to its recordings and critical loads, all together, by maximum likelihood.",
     ),
     "diagnose": (
-        "srfcli.cli.diagnose:command",
+        "srfcli.cli.diagnose:diagnose",
         "Say where recordings, or critical loads, and their model part, and which physics the model lacks.",
     ),
     "report": (
-        "srfcli.cli.report:command",
+        "srfcli.cli.diagnose:report",
         "Write one page on the fits, maps, comparisons and other results of a folder.",
     ),
     "simulate": (
