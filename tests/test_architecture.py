@@ -250,7 +250,7 @@ finally:
     print(sorted(own & set(sys.modules)), file=sys.stderr)
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
-    assert (done.returncode, done.stderr.strip()) == (0, "['srfcli.cli.linear']")
+    assert (done.returncode, done.stderr.strip()) == (0, "['srfcli.cli.stability']")
 
 
 def test_the_map_names_every_folder_and_only_files_that_are() -> None:

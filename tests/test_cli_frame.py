@@ -277,7 +277,7 @@ def test_no_color(monkeypatch: pytest.MonkeyPatch, variable: str, coloured: bool
         monkeypatch.setenv("NO_COLOR", variable)
     stream = Terminal()
     monkeypatch.setattr(sys, "stdout", stream)
-    emit_module._to_stdout(Table("s", (Column("x"),), [(1 / 3,)], title="t"), "text")
+    emit_module.show(Table("s", (Column("x"),), [(1 / 3,)], title="t"))
     assert "0.333333" in stream.getvalue() and "0.33333333" not in stream.getvalue()
     assert not any(f"\x1b[{code}" in stream.getvalue() for code in ("3", "9"))  # emphasis may stay, colours may not
     assert Console(file=Terminal()).no_color != coloured

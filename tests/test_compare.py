@@ -13,9 +13,8 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.codegen.model import open_model
+from srfcli.codegen.slider import system
 from srfcli.core.errors import SrfError, Status
-from srfcli.laws.registry import bundled_registry
 from srfcli.numerics import compare
 from srfcli.numerics.compare import (
     LawPart,
@@ -35,7 +34,7 @@ from srfcli.numerics.compare import (
 )
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
-from srfcli.results.map import compare_figure, highest_fold
+from srfcli.results.map import ComparisonResult, highest_fold
 
 LAWS = [
     {"law": "log-log"},
@@ -232,18 +231,19 @@ def test_highest_fold():
 @pytest.mark.parametrize("matched", [True, False])
 def test_a_figure_names_what_its_laws_were_given(matched):
     pytest.importorskip("matplotlib")
-    model = open_model(bundled_registry())
+    slider = system()
     lines = np.full((WINDOW.velocities().size, 1), 9.0)
     curve = np.array([[5.0, 10], [9, 12]])
     study = LawStudy(
         (lines, lines), ((), (curve,)), (0, 0), (0, 0), (np.nan, np.nan), (np.nan, np.nan), (Status.OK,) * 2
     )
-    p = model.vector()
-    matches = [Match(p, (), 0.0, Status.OK), Match(p, ("A", "D0") if matched else (), 0.0, Status.OK)]
-    described = {"K": {"value": 0.21, "unit": "N/um"}}
-    figure = compare_figure(["a", "b"], [model] * 2, matches, {0: study, 1: study}, (0.0, 0.1), WINDOW, described)
+    p = slider.vector()
+    matches = (Match(p, (), 0.0, Status.OK), Match(p, ("A", "D0") if matched else (), 0.0, Status.OK))
+    goal = observe(slider.model, p, 10.0)
+    studies = {0: study, 1: study}
+    figure = ComparisonResult(("a", "b"), (slider,) * 2, goal, matches, studies, (0.0, 0.1), (0.1,), WINDOW).plot()
     said = "matched at low velocity" if matched else "as given"
-    assert figure._suptitle.get_text() == f"2 laws, {said}, ε = 0.1; a with\nK = 0.21 N/µm"
+    assert figure._suptitle.get_text().startswith(f"2 laws, {said}, ε = 0.1; a with\nf = 120 Hz, K = 0.21 N/µm")
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names[1:] == ["a", "b, matched with A = 0.0126, D$_0$ = 0.402 µm" if matched else "b"]
 

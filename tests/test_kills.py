@@ -318,7 +318,7 @@ main()
     [
         ("click", signal.SIGINT, -signal.SIGINT, ""),
         ("srfcli.core.errors", signal.SIGINT, -signal.SIGINT, ""),
-        ("srfcli.cli.linear", signal.SIGINT, 130, "Error: interrupted"),
+        ("srfcli.cli.stability", signal.SIGINT, 130, "Error: interrupted"),
         ("srfcli.tasks.stability", signal.SIGINT, 130, "Error: interrupted"),
         ("click", signal.SIGTERM, -signal.SIGTERM, ""),
         ("srfcli.tasks.stability", signal.SIGTERM, -signal.SIGTERM, ""),

@@ -18,7 +18,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_target, write_atomic
 from srfcli.laws.values import Law
 from srfcli.results import plots
-from srfcli.results.provenance import Provenance, describe, sidecar_path, write_sidecar
+from srfcli.results.provenance import Provenance, describe, sidecar
 from srfcli.results.tables import Column, Table, print_terminal, to_csv, to_json, to_text
 
 COLUMNS = (Column("V", "um/s", "driving velocity", ".4g"), Column("W0", "N"), Column("type"), Column("status"))
@@ -150,10 +150,10 @@ def test_a_sidecar_is_stable_but_for_its_timings(tmp_path: Path) -> None:
     }
     first, second = (Provenance(**kept, timings={"solve": t}) for t in (0.1, 0.2))
     assert describe(first) == describe(second)
-    texts = [write_sidecar(place, b"abc", p).read_text() for p in (first, second)]
+    texts = [sidecar(place, b"abc", p) for p in (first, second)]
     assert texts[0] != texts[1]
     assert texts[0].split('"timings"')[0] == texts[1].split('"timings"')[0]
-    data = json.loads(sidecar_path(place).read_text())
+    data = json.loads(texts[1])
     assert list(data)[-1] == "timings" and data["seed"] == 3 and data["arguments"] == ["linear"]
     assert data["laws"][0]["sha256"] == data["inputs"][str(source)] is not None
     assert data["sha256"].startswith("ba7816bf") and {"srf", "python", "numpy"} <= set(data["versions"])

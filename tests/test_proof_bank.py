@@ -18,6 +18,7 @@ from srfcli.validation.apparatus import (
     APPARATUS,
     LAW_SHARES,
     NOISE_SHARES,
+    PAPER,
     PROTOCOLS,
     WRONG_AGEING,
     Setting,
@@ -30,7 +31,6 @@ from srfcli.validation.cases import (
     NAMES,
     OUTSIDE_NAMES,
     SEAL,
-    STARTS,
     WIDE_KINDS,
     acting,
     check_cases,
@@ -84,7 +84,8 @@ def test_every_case_reads_back_and_gives_nothing_away(quick, tmp_path, name):
         baseline.rigid, baseline.massless, baseline.bare,
     )  # fmt: skip
     fitted = {q.name for q in experiment.parameters if not q.fixed}
-    assert fitted == set(STARTS) - ({"lambda"} if baseline.rigid else set()) - ({"Vsat"} if baseline.bare else set())
+    lacking = ({"lambda"} if baseline.rigid else set()) | ({"Vsat"} if baseline.bare else set())
+    assert fitted == set(PAPER.start(Physics())) - lacking
     traces = known_traces(truth)
     for run, plan in zip(experiment.runs, known_plans(truth), strict=True):
         assert run.used.all()

@@ -71,9 +71,17 @@ def made_run(
     used[100:110] = False
     observed = true + NOISE * rng.normal(size=n)
     observed[100:110] = 1e9  # a placeholder that must not be drawn
-    return {"name": name, "holdout": holdout, "t": t, "observed": observed, "used": used, "baseline": true - missing,
-            "augmented": true, "noise_level": NOISE, "V": np.where(t < 2, 5.0, 50.0), "W": 7 * (1 + 0.1 * np.sin(30 * t)),
-            "slip": 5 * t, "windows": [list(w) for w in windows]}  # fmt: skip
+    return whole(
+        {"name": name, "holdout": holdout, "label": "elongation  [µm]", "load_unit": "N", "t": t, "observed": observed,
+         "used": used, "baseline": true - missing, "augmented": true, "V": np.where(t < 2, 5.0, 50.0),
+         "W": 7 * (1 + 0.1 * np.sin(30 * t)), "friction": [None, None], "windows": [list(w) for w in windows]}
+    )  # fmt: skip
+
+
+def whole(run: dict[str, Any]) -> dict[str, Any]:
+    """A run with the residuals of its models, in units of the noise."""
+    white = [(run["observed"] - run[model]) / NOISE for model in ("baseline", "augmented")]
+    return run | {"white": white, "rms": [float(np.sqrt(np.mean(z[run["used"]] ** 2))) for z in white]}
 
 
 def made_answer(verdict: str, name: str = "onset") -> dict[str, Any]:
@@ -101,8 +109,7 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
     if verdict == "identified":
         runs = [made_run("quiet", windows=()), *runs, made_run("later", holdout=True, seed=2, windows=())]
     if verdict in ("none", "inconclusive"):
-        for run in runs:
-            run["augmented"] = run["baseline"]
+        runs = [whole(run | {"augmented": run["baseline"]}) for run in runs]
     rows = [{"axis": "v", "run": "", "kind": "mean", "low": 10.0**k, "high": 10.0 ** (k + 1), "statistic": 3.0 * k, "z": 1.0,
              "freedom": 1.0, "log_p": -5.0 * k, "p_value": 10.0 ** (-2 * k)} for k in range(5)]  # fmt: skip
     material: dict[str, Any] = {
@@ -119,9 +126,10 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
     }  # fmt: skip
     if verdict == "unknown":
         t = runs[0]["t"]
-        force = {"t": t, "force": 0.01 * np.sin(t), "band": np.full(t.size, 0.002), "v": 5 + 40 * np.sin(t) ** 2,
-                 "phi": 0.1 + t, "W": runs[0]["W"]}  # fmt: skip
-        material["force"] = {"quiet": force, "form": "0.3*log(v/V0) < 1", "unit": "1", "terms": {"gain": 1}}
+        wave = 0.01 * np.sin(t)
+        force = {"t": t, "force": wave, "band": [wave - 0.002, wave + 0.002], "v": 5 + 40 * np.sin(t) ** 2, "phi": 0.1 + t,
+                 "W": runs[0]["W"]}  # fmt: skip
+        material["force"] = {"quiet": force, "form": "0.3*log(v/V0) < 1", "unit": "1"}
     if verdict == "identified":
         V = np.geomspace(1, 100, 30)
         material["diagram"] = {
@@ -131,7 +139,7 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
             "note": "at eps = 0.18",
         }
     if verdict == "ambiguous":
-        material["parting"] = "Step the load from 5 to 9 N."
+        material["parting"] = ["Step the load from 5 to 9 N."]
     return material
 
 
@@ -290,12 +298,12 @@ def test_the_run_with_most_of_the_misfit_comes_first(tmp_path: Path) -> None:
 
 def test_no_name_breaks_out_of_the_page(tmp_path: Path) -> None:
     answer, material = made_answer("ambiguous", HOSTILE), made_material("ambiguous", HOSTILE)
-    material |= {"title": HOSTILE, "commands": [HOSTILE], "about": {HOSTILE: HOSTILE}}
+    material |= {"title": HOSTILE, "parting": [HOSTILE], "about": {HOSTILE: HOSTILE}}
     answer |= {"effects": [HOSTILE], "model": HOSTILE, "confidence": {HOSTILE: 1.0}}
     answer["not_identifiable"] = [{"effect": HOSTILE, "reason": HOSTILE}]
     material["ranked"][0]["name"] = material["scores"][0]["effect"] = material["parameters"][0]["name"] = HOSTILE
-    material["atlas"] += [{"axis": HOSTILE, "run": HOSTILE, "bin": HOSTILE + str(k), "statistic": 3.0, "p_value": 0.1}
-                          for k in range(4)]  # fmt: skip
+    material["atlas"] += [{"axis": HOSTILE, "run": HOSTILE, "kind": "mean", "low": float(k), "high": k + 1.0, "log_p": -3.0,
+                           "p_value": 0.1} for k in range(4)]  # fmt: skip
     material["runs"][0]["name"] = answer["location"]["runs"][0]["name"] = "../../" + HOSTILE
     write_report(tmp_path / "out", answer, material)
     page = read(tmp_path / "out")
@@ -313,11 +321,12 @@ def test_two_runs_whose_names_make_one_file_name_keep_both_figures(
 ) -> None:
     monkeypatch.setattr(report, "figure_bytes", lambda figure, suffix: f"{figure}{suffix}".encode())
     monkeypatch.setattr(report, "overview", lambda traces, narrow=False: None)
-    monkeypatch.setattr(report, "atlas_figure", lambda rows, narrow=False: None)
+    monkeypatch.setattr(report, "scan_figure", lambda rows, narrow=False: None)
     monkeypatch.setattr(report, "run_figure", lambda one, narrow=False: one.name)
     material = made_material("none")
     empty = made_run("empty") | {"used": np.zeros(900, dtype=bool)}  # nothing to draw
-    material["runs"] = [run | {"baseline": run["augmented"]} for run in (made_run("a b"), made_run("A/b"), empty)]
+    runs = (made_run("a b"), made_run("A/b"), empty)
+    material["runs"] = [run | {"white": [run["white"][1]] * 2} for run in runs]
     write_report(tmp_path, made_answer("none"), material)
     found = {p.name: p.read_text() for p in (tmp_path / "figures").glob("*.svg")}
     assert found == {"run-a-b.svg": "a b.svg", "run-A-b-2.svg": "A/b.svg"}
@@ -357,7 +366,7 @@ def test_a_slower_sampling_rate_is_no_gap() -> None:
     t = run["t"]
     kept = (np.arange(t.size) % 10 == 0) | (t > 1.0)
     kept &= (t < 2.0) | (t > 2.5)
-    thin = {k: v[kept] if isinstance(v, np.ndarray) and v.size == t.size else v for k, v in run.items()}
+    thin = whole({k: v[kept] if isinstance(v, np.ndarray) and v.size == t.size else v for k, v in run.items()})
     (line,) = [q for q in run_figure(trace(thin)).axes[0].lines if q.get_label() == "recorded"][:1]
     x, y = (np.asarray(a, float) for a in (line.get_xdata(), line.get_ydata()))
     drawn = x[np.isfinite(y)]
@@ -383,18 +392,18 @@ def test_a_close_up_shows_where_and_how_fast_it_fails() -> None:
     seen = close_up(trace(burst))
     assert seen is None or seen.stop - seen.start < 0.6 * 6000
     t = burst["t"]
-    spike = burst | {"baseline": burst["augmented"] - 3.0 * np.exp(-(((t - 2.2) / 0.02) ** 2))}
+    spike = whole(burst | {"baseline": burst["augmented"] - 3.0 * np.exp(-(((t - 2.2) / 0.02) ** 2))})
     part = close_up(trace(spike))
     assert part is not None
     shown = trace(spike).t[part]
     assert shown[0] < 2.18 and shown[-1] > 2.22 and shown[-1] - shown[0] < 0.5
-    fast = burst | {"baseline": burst["augmented"] - 0.2 * np.sin(2 * np.pi * 120 * t), "windows": [[0.0, 3.0]]}
+    fast = whole(burst | {"baseline": burst["augmented"] - 0.2 * np.sin(2 * np.pi * 120 * t), "windows": [[0.0, 3.0]]})
     part = close_up(trace(fast))
     assert part is not None
     shown = trace(fast).t[part]
     assert 4 / 120 < shown[-1] - shown[0] < 12 / 120
-    assert close_up(trace(burst | {"baseline": burst["augmented"]})) is None  # noise alone
-    assert close_up(trace(burst | {"baseline": burst["augmented"] + 0.2})) is None  # the same everywhere
+    assert close_up(trace(whole(burst | {"baseline": burst["augmented"]}))) is None  # noise alone
+    assert close_up(trace(whole(burst | {"baseline": burst["augmented"] + 0.2}))) is None  # the same everywhere
 
 
 @pytest.mark.parametrize(
@@ -431,19 +440,16 @@ def test_windows_that_adjoin_are_one_in_words() -> None:
     assert merged([]) == []
 
 
-def test_the_atlas_is_read_in_both_forms() -> None:
-    rows = [{"axis": "v", "low": 1.0, "high": 2.0, "log_p": -230.2585, "statistic": 9.0, "p_value": 1e-90},
-            {"axis": "v", "low": 2.0, "high": 3.0, "log_p": -23.0, "statistic": 900.0, "p_value": 1e-3},
-            {"axis": "v", "low": 3.0, "high": 4.0, "log_p": -1.0, "statistic": 1.0, "p_value": 0.9},
-            {"axis": "run", "run": "steps", "bin": "steps", "statistic": None, "p_value": 0.5},
-            {"axis": "frequency", "bin": [119.5, 120.5], "log_p": -50.0, "p_value": 0.5}]  # fmt: skip
+def test_the_residual_scan_is_read_in_the_order_of_its_p_values() -> None:
+    rows = [{"axis": axis, "run": "", "kind": "mean", "low": low, "high": high, "log_p": log_p, "p_value": p}
+            for axis, low, high, log_p, p in (("v", 1.0, 2.0, -230.2585, 1e-90), ("v", 2.0, 3.0, -23.0, 1e-3),
+                                              ("v", 3.0, 4.0, -1.0, 0.9), ("frequency", 119.5, 120.5, -50.0, 0.5))]  # fmt: skip
     found = spots(rows)
     assert [round(s.height, 2) for s in found] == [100.0, 21.71, 9.99, 0.43]
     assert [s.place.replace("\u00a0", " ") for s in found[:2]] == ["1.00 to 2.00 µm/s", "120 Hz"]
     assert [s.sure for s in found] == [True, False, True, False]
     assert [s.axis for s in foremost(found, each=1)] == ["v", "frequency"]
-    assert [s.height for s in spots([{"axis": "a", "bin": "b", "statistic": -4.0}])] == [4.0]
-    (edge,) = spots([{"axis": "dlnW/dt", "low": -4.5e-15, "high": 35.8, "statistic": 1.0}])
+    (edge,) = spots([rows[0] | {"axis": "dlnW/dt", "low": -4.5e-15, "high": 35.8}])
     assert edge.place.startswith("0 to 35.8")  # an end that rounding alone keeps from zero
 
 

@@ -1,1 +1,1 @@
-"""The `srf` command: one short module per subcommand, light to import."""
+"""The `srf` command: modules that are light to import, each with the commands of one subject."""

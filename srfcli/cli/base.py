@@ -1,4 +1,4 @@
-"""What every `srf` command shares: the run's switches, classes for commands and groups, and how an error is told."""
+"""What every `srf` command shares: the switches of a run, classes for commands and groups, and the reporting of errors."""
 
 from __future__ import annotations
 
@@ -70,30 +70,29 @@ def switches() -> list[click.Option]:
     ]
 
 
-class SrfCommand(click.Command):
-    """A command with the switches, whose epilog, the examples, is printed as it is written."""
+class WithExamples(click.Command):
+    """A command or a group whose epilog, the examples, is printed as it is written: a wrapped command line cannot be copied."""
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog, its common indentation replaced by two spaces."""
+        if self.epilog:
+            import inspect  # only for help
+
+            formatter.write("\nExamples:\n")
+            for line in inspect.cleandoc(self.epilog).splitlines():
+                formatter.write(f"  {line}".rstrip() + "\n")
+
+
+class SrfCommand(WithExamples):
+    """A command with examples and the switches."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.params.extend(switches())
 
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the epilog verbatim: a wrapped command line cannot be copied."""
-        write_epilog(self.epilog, formatter)
 
-
-def write_epilog(epilog: str | None, formatter: click.HelpFormatter) -> None:
-    """Write `epilog` as it stands, its common indentation replaced by two spaces."""
-    if epilog:
-        import inspect  # only for help
-
-        formatter.write("\nExamples:\n")
-        for line in inspect.cleandoc(epilog).splitlines():
-            formatter.write(f"  {line}".rstrip() + "\n")
-
-
-class SrfGroup(click.Group):
-    """A group that lists its commands in the order of their registration and tells errors the way `srf` does."""
+class SrfGroup(WithExamples, click.Group):
+    """A group that lists its commands in the order of their registration and reports every error in the form of `srf`."""
 
     command_class = SrfCommand
 
@@ -101,7 +100,7 @@ class SrfGroup(click.Group):
         super().__init__(*args, **{"no_args_is_help": False, **kwargs})
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the commands in reading order rather than the alphabet's."""
+        """Return the commands in the order of their registration."""
         return list(self.commands)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -119,10 +118,6 @@ class SrfGroup(click.Group):
         if name in self.commands or name.startswith("-") or ctx.resilient_parsing:
             return super().resolve_command(ctx, args)
         raise SrfError(f"no such command {name!r} of {ctx.command_path}", did_you_mean(name, self.commands))
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the epilog verbatim."""
-        write_epilog(self.epilog, formatter)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the commands with their first sentence, all of it."""
@@ -142,10 +137,10 @@ class SrfGroup(click.Group):
 
 
 class Screen:
-    """A text stream on which nothing acts: whatever is written to it is made printable; `unescaped` is the stream below.
+    """A text stream that replaces control characters in whatever is written to it; `unescaped` is the stream below.
 
-    All of stdout and stderr goes through one, tracebacks and what libraries say too. It has no `buffer`, which would be a way
-    round.
+    All output to stdout and stderr passes through one, also tracebacks and the messages of libraries. It has no `buffer`: bytes
+    written to that would bypass it.
     """
 
     def __init__(self, stream: TextIO, name: str) -> None:
@@ -167,7 +162,7 @@ class Screen:
     def _named(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:  # of a full disk or the like: which file it was is otherwise not said
+        except OSError as error:  # a full disk, for example; the error itself does not name the stream
             error.filename = error.filename or self.called
             raise
 
@@ -193,7 +188,7 @@ def _screened() -> Iterator[None]:
 
 
 class _Told(logging.Handler):
-    """What the package warns of, as one line on stderr."""
+    """A log handler that writes each warning of the package as one line on stderr."""
 
     def __init__(self, session: Session) -> None:
         super().__init__(logging.WARNING)
@@ -214,9 +209,9 @@ def _telling(session: Session) -> Iterator[None]:
 
 
 def _open_streams() -> None:
-    """Lead standard streams that were closed (>&-) to nothing: the next file to be opened would take their place."""
+    """Open standard streams that were closed (>&-) on the null device: else the next file that is opened takes their number."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:  # the lowest number that is free is the one that was closed
+        if getattr(sys, name) is None:  # the lowest free number is that of the closed stream
             handle = os.open(os.devnull, os.O_RDWR)
             setattr(sys, name, os.fdopen(handle, mode, encoding="utf-8", closefd=False))
 
@@ -227,12 +222,12 @@ def _run(group: click.Group, arguments: list[str], session: Session, **extra: An
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for a Greek letter, it does not fail
     with _screened(), _telling(session), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # NumPy's, of an overflow on the way: rows and statuses tell
+        warnings.simplefilter("ignore", RuntimeWarning)  # NumPy warns of overflows; rows and statuses report them
         return _ended(group, arguments, session, **extra)
 
 
 def _ended(group: click.Group, arguments: list[str], session: Session, **extra: Any) -> int:
-    """Run the command and return its exit code, every error told."""
+    """Run the command, report any error on stderr, and return the exit code."""
     try:
         code = click.Group.main(group, arguments, standalone_mode=False, **extra)
         sys.stdout.flush()  # here, where a closed pipe can still be caught
@@ -274,7 +269,7 @@ def _end(
     message: str, hint: str | None, code: int, error: BaseException, session: Session, *, caret: str | None = None
 ) -> int:
     with contextlib.suppress(OSError):
-        sys.stdout.flush()  # what was found stands before the error
+        sys.stdout.flush()  # so that results stand before the error
     if session.debug:
         traceback.print_exception(error)
     lines = [f"Error: {' '.join(message.split())}", *([caret] if caret else []), *([f"Try: {hint}"] if hint else [])]
@@ -284,7 +279,7 @@ def _end(
 
 
 def _silence_stdout() -> None:
-    """Point stdout at nothing: the interpreter flushes it once more at exit, and would complain."""
+    """Point stdout at the null device: the interpreter flushes it once more at exit, which would fail."""
     with contextlib.suppress(OSError, ValueError):
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, sys.stdout.fileno())
@@ -292,7 +287,7 @@ def _silence_stdout() -> None:
 
 
 def _usage_text(error: click.ClickException, group: click.Group, arguments: Sequence[str]) -> tuple[str, str | None]:
-    """Return what click objects to, in a sentence like the others, and where to read on."""
+    """Return click's error as a message in the form of `srf`, and a hint."""
     path, command = _named_command(group, arguments)
     choices = getattr(getattr(getattr(error, "param", None), "type", None), "choices", None)
     if choices and (found := re.search(r"'([^']*)' is not one of", error.format_message())):
@@ -311,13 +306,13 @@ def _usage_text(error: click.ClickException, group: click.Group, arguments: Sequ
 
 
 def as_options(text: str, command: click.Command) -> str:
-    """Return `text` with the options of `command` for the parameters that the library names in backticks."""
+    """Return `text` with each parameter that the library names in backticks replaced by the option of `command`."""
     options = {p.name: next((o for o in p.opts if o.startswith("--")), None) for p in command.params}
     return re.sub(r"`(\w+)`", lambda m: options.get(m[1]) or m[0], text)
 
 
 def _named_command(group: click.Group, arguments: Sequence[str]) -> tuple[str, click.Command]:
-    """Return the command that `arguments` name, with its full name: an error from click's parser does not say."""
+    """Return the full name of the command that `arguments` name, and the command; click's parser errors do not have them."""
     path, command = "srf", cast(click.Command, group)
     for word in arguments:
         if isinstance(command, click.Group) and word in command.commands:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from srfcli.cli.base import SrfCommand
-from srfcli.cli.law import plugins_option
-from srfcli.cli.options import OutputOptions, output_options
-from srfcli.core.units import split_quantity
+from srfcli.cli.base import EXIT_CONDITION, EXIT_OK, SrfCommand
+from srfcli.cli.options import OutputOptions, open_registry, output_options, plugins_option
+from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.units import from_base, split_quantity
+from srfcli.results.report_text import joined
 from srfcli.results.tables import Column, Table
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from srfcli.data.values import Experiment, Run
     from srfcli.inference.cramer_rao import Forecast, Reach
     from srfcli.laws.registry import Registry
-
-# `srf check`: what is in the recordings of an experiment, what is wrong with them, and what they can tell.
 
 EXAMPLES = """
 srf check experiment/                              sampling, flaws, noise, drive and load of every run
@@ -80,9 +79,7 @@ def command(
     Every value of the description is checked against the laws and the data files. For each run: sampling, gaps, spikes, resets,
     quantisation, level and colour of the noise, drive and load as they are in the data, and what the load's variation can tell.
     """
-    from srfcli.cli.base import EXIT_CONDITION, EXIT_OK
     from srfcli.cli.emit import emit
-    from srfcli.cli.options import open_registry
     from srfcli.data.experiment import check_run, read_experiment
 
     _check_kinds(fail_on)
@@ -93,7 +90,7 @@ def command(
     forecast = _forecast(found, checks, registry) if simulate else None
     table, more = _table(found, checks, forecast), []
     if output.format == "text":
-        more = report(table.rows, checks, forecast, load_unit="MPa" if found.stress else "N")
+        more = report(table.records(), checks, forecast, load_unit="MPa" if found.stress else "N")
         more[-1] = dataclasses.replace(more[-1], notes=table.notes)
         title = f"{table.title}\n{_model_line(found)}"
         table = dataclasses.replace(table, columns=(), rows=(), notes=(), title=title)
@@ -107,7 +104,6 @@ def command(
 
 def _check_kinds(fail_on: Sequence[str]) -> None:
     """Raise SrfError for a kind that no notice is of."""
-    from srfcli.core.errors import SrfError, did_you_mean
     from srfcli.data.experiment import KINDS
 
     for kind in fail_on:
@@ -117,8 +113,6 @@ def _check_kinds(fail_on: Sequence[str]) -> None:
 
 def _chosen(experiment: Experiment, names: Sequence[str]) -> list[Run]:
     """Return the runs of these names, all where there are none; raises SrfError for a name that no run has."""
-    from srfcli.core.errors import SrfError, did_you_mean
-
     known = [run.name for run in experiment.runs]
     for name in names:
         if name not in known:
@@ -149,9 +143,7 @@ def _stiffness(experiment: Experiment) -> str:
 
 
 def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecast | None) -> Table:
-    from srfcli.core.units import from_base
     from srfcli.data.values import shown_unit
-    from srfcli.results.tables import Table
 
     told = [None] * len(checks) if forecast is None else forecast.runs
     notices = [str(n) for n in experiment.notices]
@@ -245,7 +237,6 @@ COLUMNS = (
     Column("lambda_peak", about="the same for a change of lambda by 10 %"),
     Column("n_peak", about="the same for a change of n by 0.1"),
 )
-Cells = Mapping[str, Any]
 CHANGE_HEADINGS = {"alpha": "0.2 makes", "lambda": "10 % makes", "n": "0.1 makes"}
 
 
@@ -274,26 +265,6 @@ def row(check: RunCheck, told: Reach | None) -> tuple[Any, ...]:
     return tuple(cells[column.name] for column in COLUMNS)
 
 
-def report(
-    rows: Sequence[Sequence[Any]], checks: Sequence[RunCheck], forecast: Forecast | None, *, load_unit: str = "N"
-) -> list[Table]:
-    """Return tables no wider than a page, rounded: samples, readings, noise, what was imposed, what the load can tell."""
-    cells = [{c.name: cell for c, cell in zip(COLUMNS, r, strict=True)} for r in rows]
-    shown = {
-        title: {heading.replace("[N]", f"[{load_unit}]"): of for heading, of in columns.items()}
-        for title, columns in SHOWN.items()
-    }
-    tables = [_shown(title, columns, cells) for title, columns in shown.items()]
-    tables.insert(2, _noise_table(checks))
-    return tables if forecast is None else [*tables, _told(forecast)]
-
-
-def _shown(title: str, columns: Mapping[str, Callable[[Cells], Any]], rows: Sequence[Cells]) -> Table:
-    return Table(
-        "srf.check.text/1", tuple(map(Column, columns)), [[of(r) for of in columns.values()] for r in rows], title
-    )
-
-
 def _noise_table(checks: Sequence[RunCheck]) -> Table:
     """Return what each run's noise consists of, at each of its sampling rates."""
     rows: list[list[Any]] = []
@@ -302,16 +273,75 @@ def _noise_table(checks: Sequence[RunCheck]) -> Table:
             parts = [p for p in noise.parts if p[0] != "rounding" or (p[1] / noise.total) ** 2 >= 0.005]
             for k, (part, sd, colour) in enumerate(parts):
                 own = [check.run.name, rounded(1 / dt, 4)] if k == 0 else ["", None]
-                time, frequency = (None, None) if not colour else (colour[0], None) if len(colour) == 2 else (None, colour[0])
+                time, frequency = (
+                    (None, None) if not colour else (colour[0], None) if len(colour) == 2 else (None, colour[0])
+                )
                 quality = colour[2] if len(colour) == 3 else None
                 share = f"{100 * (sd / noise.total) ** 2:.0f} %"
                 rows.append([*own, part, rounded(sd, 3), share, *(rounded(x, 3) for x in (time, frequency, quality))])
     headings = ["run", "rate [Hz]", "noise", "sd", "share", "over [s]", "about [Hz]", "quality"]
-    return Table("srf.check.text/1", tuple(map(Column, headings)), rows, "Noise")
+    return _text_table(headings, rows, "Noise")
 
 
-def _digits(name: str, digits: int) -> Callable[[Cells], Any]:
-    return lambda r: rounded(r[name], digits)
+# title: heading -> the column that is shown, or the two between whose values it lies, and its significant digits
+SHOWN: dict[str, dict[str, tuple[str, int] | tuple[str, str, int]]] = {
+    "Samples": {
+        "run": ("run", 0),
+        "role": ("role", 0),
+        "samples": ("samples", 0),
+        "used": ("used", 0),
+        "duration [s]": ("duration", 6),
+        "rate [Hz]": ("rate_min", "rate_max", 4),
+        "gaps": ("gaps", 0),
+        "spikes": ("spikes", 0),
+        "resets": ("resets", 0),
+    },
+    "Readings": {
+        "run": ("run", 0),
+        "observable": ("observable", 0),
+        "lowest": ("reading_min", 5),
+        "highest": ("reading_max", 5),
+        "noise": ("noise", 3),
+        "quantum": ("quantum", 3),
+    },
+    "Imposed": {
+        "run": ("run", 0),
+        "V [um/s]": ("V_min", "V_max", 5),
+        "W [N]": ("W_min", "W_max", 5),
+        "mean W [N]": ("W_mean", 5),
+        "W'/W [1/s]": ("W_rate", 3),
+        "f [Hz]": ("f", 6),
+        "eps": ("eps", 4),
+        "onset [s]": ("onset", 4),
+    },
+}
+
+
+def report(
+    rows: Sequence[dict[str, Any]], checks: Sequence[RunCheck], forecast: Forecast | None, *, load_unit: str = "N"
+) -> list[Table]:
+    """Return tables no wider than a page, rounded: samples, readings, noise, what was imposed, what the load can tell.
+
+    `rows` have a run's cells by the names of COLUMNS.
+    """
+    rows = [r | {"observable": r["observable"] + (f" [{r['unit']}]" if r["unit"] != "1" else "")} for r in rows]
+    tables = []
+    for title, columns in SHOWN.items():
+        headings = [heading.replace("[N]", f"[{load_unit}]") for heading in columns]
+        tables.append(_text_table(headings, [[_shown(r, *of) for of in columns.values()] for r in rows], title))
+    tables.insert(2, _noise_table(checks))
+    return tables if forecast is None else [*tables, _told(forecast)]
+
+
+def _text_table(headings: Sequence[str], rows: Sequence[Sequence[Any]], title: str) -> Table:
+    return Table("srf.check.text/1", tuple(map(Column, headings)), rows, title)
+
+
+def _shown(cells: dict[str, Any], *of: Any) -> Any:
+    """Return a cell, or the range between two, with so many digits; `of` is as in SHOWN."""
+    *names, digits = of
+    ends = list(dict.fromkeys(rounded(cells[name], digits) for name in names))
+    return ends[0] if len(ends) == 1 else f"{ends[0]} to {ends[1]}"
 
 
 def rounded(value: Any, digits: int) -> Any:
@@ -322,44 +352,6 @@ def rounded(value: Any, digits: int) -> Any:
     return int(short) if short.is_integer() and abs(short) < 1e15 else short
 
 
-def _range(low: float, high: float, digits: int) -> Any:
-    ends = [rounded(x, digits) for x in (low, high)]
-    return ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
-
-
-SHOWN: dict[str, dict[str, Callable[[Cells], Any]]] = {
-    "Samples": {
-        "run": lambda r: r["run"],
-        "role": lambda r: r["role"],
-        "samples": lambda r: r["samples"],
-        "used": lambda r: r["used"],
-        "duration [s]": _digits("duration", 6),
-        "rate [Hz]": lambda r: _range(r["rate_min"], r["rate_max"], 4),
-        "gaps": lambda r: r["gaps"],
-        "spikes": lambda r: r["spikes"],
-        "resets": lambda r: r["resets"],
-    },
-    "Readings": {
-        "run": lambda r: r["run"],
-        "observable": lambda r: r["observable"] + (f" [{r['unit']}]" if r["unit"] != "1" else ""),
-        "lowest": _digits("reading_min", 5),
-        "highest": _digits("reading_max", 5),
-        "noise": _digits("noise", 3),
-        "quantum": _digits("quantum", 3),
-    },
-    "Imposed": {
-        "run": lambda r: r["run"],
-        "V [um/s]": lambda r: _range(r["V_min"], r["V_max"], 5),
-        "W [N]": lambda r: _range(r["W_min"], r["W_max"], 5),
-        "mean W [N]": _digits("W_mean", 5),
-        "W'/W [1/s]": _digits("W_rate", 3),
-        "f [Hz]": _digits("f", 6),
-        "eps": _digits("eps", 4),
-        "onset [s]": _digits("onset", 4),
-    },
-}
-
-
 def _told(forecast: Forecast) -> Table:
     known = [name for name in CHANGE_HEADINGS if any(name in r.errors for r in forecast.runs)]
     told = [*forecast.runs, *([forecast.together] if forecast.together else [])]
@@ -368,7 +360,7 @@ def _told(forecast: Forecast) -> Table:
     ]
     headings = [heading for name in known for heading in (f"{name} error", CHANGE_HEADINGS[name])]
     title = "What the load can tell at best: errors, and what a change makes, over the noise of a sample"
-    return Table("srf.check.text/1", tuple(map(Column, ["run", "load varies", *headings])), cells, title)
+    return _text_table(["run", "load varies", *headings], cells, title)
 
 
 def _errors(told: Reach, name: str) -> tuple[str, str]:
@@ -414,7 +406,7 @@ def described(check: RunCheck, told: Reach | None) -> dict[str, Any]:
 
 
 def tells(told: Reach) -> dict[str, Any]:
-    """Return what one run or several can tell: errors that are infinite are null."""
+    """Return as plain data what one run, or all together, can identify."""
     simulation = {"status": told.status.value, "misfit": told.misfit, "believed": told.believed}
     return {
         "variation": told.variation,
@@ -435,13 +427,13 @@ def _noise(noise: GaugeNoise) -> dict[str, Any]:
 
 # What `srf check` says in words: what the loads of these recordings can and cannot identify, and how the noise was found.
 
-CONSTANT = 1e-5  # relative variation of a load that is none
-LIMITS = {
-    "alpha": (0.05, 0.5),
-    "lambda": (0.1, 1.0),
-    "n": (0.1, 1.0),
-}  # errors from which it can hardly, and cannot be known
-SEEN, HIDDEN = 3.0, 0.3  # times the noise of a sample: what stays below is hard to tell from drift, and cannot be told
+CONSTANT = 1e-5  # relative variation of a load below which it is constant
+# errors above which a parameter can hardly, and cannot, be identified
+LIMITS = {"alpha": (0.05, 0.5), "lambda": (0.1, 1.0), "n": (0.1, 1.0)}
+SEEN, HIDDEN = (
+    3.0,
+    0.3,
+)  # peaks over the noise of a sample, below which a parameter can hardly, and cannot, be identified
 CAN = "can be identified"
 CHANGES = {"alpha": "alpha = 0.2", "lambda": "a change by 10 %", "n": "a change by 0.1"}
 SUBJECTS = {
@@ -456,9 +448,9 @@ NOISE = (
 
 
 def sentences(forecast: Forecast) -> list[str]:
-    """Return what the loads tell: the runs whose load is constant, a sentence for each name asked for, and what that rests on."""
+    """Return sentences on what the loads can identify: runs of constant load, each parameter, and the assumptions."""
     constant = [r.name for r in forecast.runs if r.variation < CONSTANT]
-    told = [f"the load is constant in {_listed(constant)}"] if constant else []
+    told = [f"the load is constant in {joined(constant)}"] if constant else []
     told += [_not_believed(r) for r in forecast.runs if not r.believed or not r.status.ok]
     judge = forecast.together or next((r for r in forecast.runs if r.believed), None)
     if judge is None:
@@ -495,18 +487,14 @@ def _sentence(name: str, judge: Reach, forecast: Forecast) -> str:
         said += f", but {CHANGES[name]} makes {judge.peaks[name]:.2g} of a sample's noise, where drift and model errors hide"
     alone = [r.name for r in forecast.runs if r.believed and verdict_of(name, r) == CAN]
     if verdict == CAN and alone and len(forecast.runs) > 1:
-        said += f"; {f'each of {_listed(alone)}' if len(alone) > 1 else alone[0]} does so alone"
+        said += f"; {f'each of {joined(alone)}' if len(alone) > 1 else alone[0]} does so alone"
     return said
 
 
 def verdict_of(name: str, told: Reach) -> str:
-    """Return what error and peak mean: can, can hardly, or cannot be identified."""
+    """Return whether a parameter can, can hardly, or cannot be identified, from its error and peak."""
     clear, hardly = LIMITS[name]
     error, peak = told.errors[name], told.peaks[name]
     if error < clear and peak >= SEEN:
         return CAN
     return "can hardly be identified" if error < hardly and peak >= HIDDEN else "cannot be identified"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

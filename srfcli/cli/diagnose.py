@@ -1,18 +1,17 @@
-"""`srf diagnose`: where recordings and their model differ, which physics is missing, and the model that has it."""
+"""`srf diagnose`: which physics a model of recordings lacks, and the model that has it; `srf report`: a page on results."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
-from srfcli.cli.law import plugins_option
-from srfcli.cli.options import listed, vary_options
+from srfcli.cli.options import listed, open_registry, plugins_option, reader_option, vary_options
+from srfcli.core.errors import SrfError
 
-EXAMPLES = """
+DIAGNOSE = """
 srf diagnose EXPERIMENT                              a folder with experiment.toml, or that file
 srf diagnose EXPERIMENT --out found                  report, figures, predictions and the augmented model
 srf diagnose EXPERIMENT --json
@@ -21,13 +20,14 @@ srf fit found/augmented                              the augmented model is an e
 """
 
 
-@click.command("diagnose", cls=SrfCommand, epilog=EXAMPLES)
+@click.command("diagnose", cls=SrfCommand, epilog=DIAGNOSE)
 @click.argument("source", metavar="EXPERIMENT", type=click.Path(path_type=Path))
-@click.option("--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable.")
-@click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
+@click.option(
+    "--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable."
+)
 @vary_options
 @plugins_option
-@click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
+@reader_option
 @click.option(
     "--seed",
     type=int,
@@ -38,19 +38,17 @@ srf fit found/augmented                              the augmented model is an e
 @click.option("--json", "as_json", is_flag=True, help="Print one object, in full precision.")
 @click.option("--out", metavar="DIR", help="Write answer, report, predictions and augmented experiment to DIR.")
 @click.option("--force", is_flag=True, help="Replace a diagnosis that is in DIR already.")
-def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], **options: Any) -> None:
+def diagnose(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], **options: Any) -> None:
     """Find where recordings, or critical loads, differ from their model, and which physics the model lacks.
 
     The baseline of the experiment is fitted with a random friction field and coloured gauge noise. Every registered effect is
     scored for what it could explain beyond these, and those with the highest scores are fitted. Held-out runs are read when the
     models are final, and must be predicted. Verdicts are none, identified, ambiguous, unknown and inconclusive.
     """
-    from srfcli.cli.emit import Progress, finish
-    from srfcli.cli.options import open_registry
-    from srfcli.core.errors import SrfError
+    from srfcli.cli.emit import Progress, finish, show
     from srfcli.results.diagnosis import check_answer
-    from srfcli.results.tables import json_text, print_terminal, to_text
-    from srfcli.tasks.diagnose import diagnose
+    from srfcli.results.tables import json_text
+    from srfcli.tasks import diagnose as tasks
 
     folder = None if options["out"] is None else Path(options["out"]).expanduser()
     if folder is not None:
@@ -63,7 +61,7 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
             session.detail(text)
 
         try:
-            found = diagnose(
+            found = tasks.diagnose(
                 source, effects=effects, trend=options["trend"], vary=listed(options["vary"]), by=options["by"],
                 reader=options["reader"], seed=options["seed"], registry=registry, progress=told,
             )  # fmt: skip
@@ -74,23 +72,20 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
                 exit_code=EXIT_INTERRUPTED,
             ) from None
     if folder is not None:
-        found.write(
-            folder, force=options["force"], arguments=session.arguments, told=session.say, debug=session.debug
-        )
+        found.write(folder, force=options["force"], arguments=session.arguments, told=session.say, debug=session.debug)
         session.say(f"Wrote {folder}")
     if options["as_json"]:
         click.echo(json_text(found.answer, indent=2))
     else:
         click.echo(f"{found.sentence}\n")
         for table in (found.table, found.parameter_table, *(t for t in (found.run_table, found.load_table) if t.rows)):
-            if sys.stdout.isatty():
-                print_terminal(table, sys.stdout)
-            else:
-                click.echo(to_text(table), nl=False)
+            show(table)
             click.echo()
         if folder is not None:
             home = folder / "augmented"
-            laws = f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
+            laws = (
+                f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
+            )
             click.echo(f"The augmented model: srf fit {home}")
             click.echo(f"Its laws' diagram: srf linear {laws}")
     fitted = ", ".join(sorted(f.name for f in found.diagnosis.ranked))
@@ -98,3 +93,35 @@ def command(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], *
         found.status,
         advice=f"the answer rests on what was fitted until then: {fitted}. Effects not among these were not tried.",
     )
+
+
+# `srf report`: one page on the results in a folder.
+
+REPORT = """
+srf fit EXPERIMENT --out results/fit.json --plot results/fit.svg
+srf map --eps 0.18 --out results/map.json --plot results/map.svg
+srf report results                                   writes results/report.html
+srf report results --title 'PMMA, May' --force
+"""
+
+
+@click.command("report", cls=SrfCommand, epilog=REPORT)
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--title", metavar="TEXT", help="Title of the page.  [default: the folder's name]")
+@click.option("--out", metavar="FILE.html", help="The page to write.  [default: report.html in the folder]")
+@click.option("--force", is_flag=True, help="Overwrite an existing page.")
+def report(folder: Path, title: str | None, out: str | None, force: bool) -> None:
+    """Write one page on the fits, maps, comparisons and other results of a folder.
+
+    Results are what `--out FILE.json` wrote; a figure of the same name beside one stands with it. A diagnosis has its own report,
+    which `srf diagnose --out` writes.
+    """
+    from srfcli.core.files import check_target, write_atomic
+    from srfcli.results.report import read_results, results_page
+
+    results = read_results(folder)
+    place = folder / "report.html" if out is None else Path(out).expanduser()
+    check_target(place, force=force)
+    write_atomic(place, results_page(folder, results, title=title or folder.resolve().name))
+    Session.current().say(f"{len(results)} result{'s' if len(results) != 1 else ''}")
+    click.echo(str(place))

@@ -16,17 +16,13 @@ from srfcli.cli.options import OutputOptions
 from srfcli.core.errors import SrfError, Status, printable
 from srfcli.core.files import check_target, write_atomic
 from srfcli.laws.values import Law
-from srfcli.results import tables
-from srfcli.results import tables as records
 from srfcli.results.provenance import Provenance, write_result
-from srfcli.results.tables import Table
+from srfcli.results.tables import Table, print_terminal, to_csv, to_json, to_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# The way out of a command: a table to stdout or a file, a figure, their sidecars, progress and the exit code.
-
-PATIENCE, LITTLE = 2.0, 0.01  # s that nobody needs an estimate for; share of the work from which one can be made
+PATIENCE, LITTLE = 2.0, 0.01  # s before an estimate is shown; smallest share of the work from which one is made
 
 
 def emit(
@@ -60,12 +56,12 @@ def emit(
         for index, one in enumerate(shown):
             if index:
                 click.echo()
-            _to_stdout(one, options.format)
+            show(one, options.format)
     else:
         content = "\n".join(render(one, options.format) for one in shown).encode("utf-8")
         _write(options.out, content, provenance, options)
     if options.format == "csv" or options.out is not None:
-        for note in table.notes:  # CSV has no place for them, and a file is not looked at at once
+        for note in table.notes:  # CSV has no place for notes, and a file may not be read at once
             Session.current().say(f"Note: {note}")
     if options.plot is not None:
         if figure is None:
@@ -78,12 +74,13 @@ def emit(
 
 def render(table: Table, format: str) -> str:
     """Return the table as `format`: text (twelve digits), json or csv (full precision)."""
-    return {"text": tables.to_text, "json": records.to_json, "csv": records.to_csv}[format](table)
+    return {"text": to_text, "json": to_json, "csv": to_csv}[format](table)
 
 
-def _to_stdout(table: Table, format: str) -> None:
+def show(table: Table, format: str = "text") -> None:
+    """Print the table on stdout, formatted where that is a terminal and text is asked for."""
     if format == "text" and sys.stdout.isatty():
-        tables.print_terminal(table, sys.stdout)
+        print_terminal(table, sys.stdout)
     else:
         click.echo(render(table, format), nl=False)
 
@@ -117,10 +114,10 @@ def finish(status: Status, *, advice: str | None = None) -> None:
 
 
 class Progress:
-    """One line on stderr that says how far a long loop is and, after two seconds, how long the rest will take.
+    """One line on stderr with the progress of a long loop and, after two seconds, an estimate of the time that is left.
 
-    It is silent where stderr is no terminal, and under -q. The rest is estimated from the share that is done: of `total`, or as
-    `advance` is told; without either the line says how long it has been.
+    Nothing is written where stderr is no terminal, and under -q. The estimate uses the share that is done: of `total`, or as
+    given to `advance`. Without either the line shows the elapsed time.
 
     with Progress("boundary", total=60) as progress:
         for point in points:
@@ -141,11 +138,11 @@ class Progress:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._active and self._shown_at:
-            self._raw.write("\r\x1b[K")  # the line was for waiting; nothing of it stays
+            self._raw.write("\r\x1b[K")  # the line is removed when the loop ends
             self._stream.flush()
 
     def stage(self, label: str) -> None:
-        """Begin another stage of the same work, with a count and a time of its own, unless it is the one that runs."""
+        """Begin another stage of the work, with its own count and clock; does nothing where it is the current one."""
         if label != self.label:
             self.label, self.total, self.done, self._begun = label, None, 0, time.monotonic()
 
@@ -154,7 +151,7 @@ class Progress:
     ) -> None:
         """Count `steps` more and show it, at most ten times a second.
 
-        `share` of the work is done, from 0 to 1; `bound` is that share of the most work that there can be.
+        `share` of the work is done, from 0 to 1; `bound` is the share of the largest possible amount of work.
         """
         self.done += steps
         now = time.monotonic()
@@ -171,9 +168,9 @@ class Progress:
 
 
 def remaining(elapsed: float, share: float | None, *, most: bool = False) -> str:
-    """Return how long the rest will take after `elapsed` seconds for a share of the work; how long it has been for None.
+    """Return an estimate of the time that is left after `elapsed` seconds, or the elapsed time where `share` is None.
 
-    `most` says that it is a share of the most work that there can be.
+    With `most`, `share` is that of the largest possible amount of work, and the estimate is an upper bound.
     """
     if elapsed < PATIENCE or (share is not None and share >= 1.0):
         return ""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +12,14 @@ import click
 
 from srfcli.cli.base import Session, SrfCommand
 from srfcli.cli.options import (
+    CHOICES,
     OutputOptions,
     Spread,
     SystemOptions,
     listed,
     output_options,
     parse_over,
+    reader_option,
     stability_options,
     vary_options,
     worker_options,
@@ -24,17 +27,10 @@ from srfcli.cli.options import (
 from srfcli.core.errors import SrfError, Status
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from srfcli.core.settings import Parameter
-    from srfcli.inference.free_parameters import Scale
-    from srfcli.inference.thresholds import MethodFit, ThresholdFit, Trace
-    from srfcli.results.campaign import CampaignResult
-    from srfcli.results.tables import Table
+    from srfcli.inference.thresholds import Trace
+    from srfcli.results.fit import CampaignResult
 
-# `srf fit`: parameters from recordings, or from a table of critical loads.
-
-METHOD = "powell, or least-squares with exact derivatives"
 EXAMPLES = """
 srf fit EXPERIMENT                                  a folder with experiment.toml, or that file
 srf fit EXPERIMENT --profile --starts 5 --json
@@ -45,7 +41,7 @@ srf fit EXPERIMENT --track smooth                   no random friction field, wh
 srf fit A B C --table out.csv --workers 3           a campaign: each by itself, a row each
 srf fit THRESHOLDS.csv --free A,B,D0,Vsat,lambda    critical loads: V, eps, W0c, sigma
 """
-USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seven runs, 63 in the other
+USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 24 to 29, the other 63
 
 
 @click.command("fit", cls=SrfCommand, epilog=EXAMPLES)
@@ -65,7 +61,6 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
     "--starts", type=click.IntRange(1, 1000), default=1, show_default=True, help="Starting points to fit from."
 )
 @click.option("--profile", is_flag=True, help="Profile-likelihood intervals.")
-@click.option("--trend", type=click.Choice(["slip", "time"]), help="Let each run's observable drift with slip or time.")
 @vary_options
 @click.option(
     "--prior/--no-prior",
@@ -83,7 +78,7 @@ USUAL_STEPS = 30  # of a fit; 24 to 29 in five of six experiments of one to seve
 )
 @click.option("--draws", metavar="FILE.nc", help="Keep the draws of --sample as ArviZ's netCDF.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of further starts and of the sampler.")
-@click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
+@reader_option
 @click.option(
     "--bounds", multiple=True, metavar="NAME=LO:HI", help="Bounds of a parameter, for a table of critical loads."
 )
@@ -111,7 +106,7 @@ def command(
     """
     campaign, source = place is not None or len(sources) > 1, sources[0]
     if not campaign:
-        _refuse(options, ("workers", "cluster", "resume"), "several experiments")
+        _refuse(("workers", "cluster", "resume"), "several experiments")
     if source.suffix.lower() == ".csv" and not campaign:
         from srfcli.data.draft import looks_like_recording
 
@@ -121,14 +116,14 @@ def command(
                 f"`srf new {source}` writes the experiment.toml to fit.",
             )
         meant = ("starts", "profile", "trend", "vary", "by", "prior", "track", "sample", "draws", "reader")
-        _refuse(options, meant, "recordings")
+        _refuse(meant, "recordings")
         fit_thresholds(
             source, system=system, output=output, free=options["free"], bounds=options["bounds"],
             methods=options["method"], tol=options["tol"], max_evaluations=options["max_evaluations"],
         )  # fmt: skip
         return
-    _refuse(options, ("bounds", "method", "tol", "max_evaluations"), "critical loads")
-    for name in ("law", "ageing", "interface", "loading", "inertia"):
+    _refuse(("bounds", "method", "tol", "max_evaluations"), "critical loads")
+    for name in CHOICES:
         if getattr(system, name).origin == "flag":
             raise SrfError(f"--{name} is given, and an experiment names its own", "Change [model] in experiment.toml.")
     if system.effects:
@@ -139,12 +134,10 @@ def command(
     if campaign:
         _fit_campaign(sources, place, spread, system, output, **options)
         return
-    _fit_recordings(
-        source, system, output, **{k: v for k, v in options.items() if k not in ("bounds", "method", "tol")}
-    )
+    _fit_recordings(source, system, output, **options)
 
 
-def _refuse(options: dict[str, Any], names: tuple[str, ...], purpose: str) -> None:
+def _refuse(names: tuple[str, ...], purpose: str) -> None:
     """Raise where an option is given that has no meaning for this kind of source."""
     context = click.get_current_context()
     for name in names:
@@ -154,8 +147,6 @@ def _refuse(options: dict[str, Any], names: tuple[str, ...], purpose: str) -> No
 
 
 def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
-    import time
-
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.inference.posterior import to_arviz
     from srfcli.results.fit import ADVICE
@@ -203,13 +194,11 @@ def _fit_campaign(
     **options: Any,
 ) -> None:
     """Fit each experiment by itself, a row each; the table is written anew whenever one is done."""
-    import time
-
     from srfcli.cli.emit import Progress, emit, finish, render, warn_uncompiled
     from srfcli.core.files import check_target, write_atomic
     from srfcli.tasks.campaign import fit_campaign
 
-    _refuse(options, ("profile", "sample", "draws", "vary", "by", "prior"), "one experiment")
+    _refuse(("profile", "sample", "draws", "vary", "by", "prior"), "one experiment")
     target = None if place is None else Path(place).expanduser()
     if target is not None:
         if target.suffix.lower() != ".csv":
@@ -246,17 +235,16 @@ def _fit_campaign(
 
 
 class FitShare:
-    """The share of a fit that is done, from 0 to 1, by the steps that were told of each of its starts.
+    """Estimates the share of a fit that is done, from 0 to 1, from the steps that each start reports.
 
-    Most fits take some thirty steps, so that many are expected at first; one that takes more has, at any step, a quarter of its
-    own before it.
+    A start is expected to take USUAL_STEPS steps, or 4/3 of those it has made where that is more.
     """
 
     def __init__(self, starts: int = 1) -> None:
         self.starts, self.number, self.steps = starts, 1, 0
 
     def after(self, text: str) -> float:
-        """Return the share that is done once this step was told; `start 2 of 5: ...` begins the second."""
+        """Return the share that is done after this step; the text `start 2 of 5: ...` begins the second start."""
         told = re.match(r"start (\d+) of", text)
         if told and int(told[1]) != self.number:
             self.number, self.steps = int(told[1]), 0
@@ -265,7 +253,7 @@ class FitShare:
 
 
 def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> Path | None:
-    """Return where the draws go; raises SrfError now for what could not be written later."""
+    """Return the file of the draws; raises SrfError, before the fit, where it could not be written."""
     import importlib.util
 
     from srfcli.core.files import check_target
@@ -306,6 +294,7 @@ def fit_thresholds(
     from srfcli.data.thresholds import read_thresholds
     from srfcli.inference import thresholds as inference
     from srfcli.inference.free_parameters import GIVEN, free_parameters, with_transmission
+    from srfcli.results.fit import ThresholdFitResult
 
     table = read_thresholds(path)
     model = system.model()
@@ -337,18 +326,11 @@ def fit_thresholds(
             max_evaluations=max_evaluations or inference.MAX_EVALUATIONS,
             report=report,
         )
-    described = {k: v for k, v in resolved.described().items() if k not in GIVEN}
-    loads, trace = _loads(fit), _trace(fit)
-    summary = _summary(fit)
+    found = ThresholdFitResult(fit, model.title, {k: v for k, v in resolved.described().items() if k not in GIVEN})
     emit(
-        _parameters(fit, model.title, described, [summary, trace, loads]),
-        output,
-        more=[summary, trace, loads],
-        laws=model.laws,
-        inputs=[path],
-        timings={m.method: m.cpu for m in fit.methods},
-        figure=lambda: _threshold_figure(fit, model.title),
-    )
+        found.table, output, more=[found.methods, found.trace, found.loads], laws=model.laws, inputs=[path],
+        timings={m.method: m.cpu for m in fit.methods}, figure=found.plot,
+    )  # fmt: skip
     for m in fit.methods:
         Session.current().say(f"{m.method}: {m.evaluations} evaluations, {m.cpu:.1f} s of CPU")
     finish(fit.status)
@@ -366,148 +348,3 @@ def _bounds(text: str, parameters: Sequence[Parameter]) -> tuple[str, tuple[floa
         raise SrfError(f"--bounds {text!r} is not NAME=LOW:HIGH, low below high", "Write --bounds Vsat=100:1000.")
     fitted = found.fitted(parameters)
     return found.name, (to_base(fitted.lo, fitted.unit), to_base(fitted.hi, fitted.unit))
-
-
-def _parameters(fit: ThresholdFit, title: str, described: Mapping[str, Any], rest: Sequence[Table]) -> Table:
-    from srfcli.results.tables import Column, Table
-
-    columns = (
-        Column("method", "", METHOD),
-        Column("parameter", "", "name"),
-        Column("value", "", "estimate, in the unit beside it", ".7g"),
-        Column("stderr", "", "standard error from the given sigma, linearised", ".3g"),
-        Column("lower", "", "bound of the search"),
-        Column("upper", "", "bound of the search"),
-        Column("unit", "", "unit of all the columns before"),
-        Column("start", "", "where the fit began"),
-        Column("flag", "", "why an error is missing or means nothing"),
-    )
-    rows = []
-    for m in fit.methods:
-        for i, q in enumerate(fit.scale):
-            ends = [q.declared(v) for v in (q.lower, q.upper)]
-            start, value, error = (q.declared(float(v)) for v in (q.start, m.values[i], m.uncertainty.errors[i]))
-            rows.append(
-                (m.method, q.name, value, error, *ends, q.parameter.unit, start, m.uncertainty.flags[i] or "ok")
-            )
-    names = [[c.name for c in t.columns] for t in rest]
-    meta: dict[str, Any] = {
-        key: [dict(zip(n, row, strict=True)) for row in t.rows]
-        for key, t, n in zip(("methods", "trace", "loads"), rest, names, strict=True)
-    }
-    meta["information"] = {m.method: _information(fit.scale, m) for m in fit.methods}
-    notes = (*fit.table.notes, *_remarks(fit))
-    return Table(
-        "srf.fit-thresholds/2",
-        columns,
-        rows,
-        f"{fit.table.source}, {len(fit.table)} critical loads; {title}",
-        notes,
-        described,
-        meta,
-        fit.status.value,
-    )
-
-
-def _information(scale: Scale, m: MethodFit) -> dict[str, Any]:
-    """Return correlations and the information matrix's eigenvalues in the coordinates ln(value), or value/size."""
-    return {
-        "parameters": scale.names,
-        "coordinates": ["ln" if q.log else "linear" for q in scale],
-        "correlation": m.uncertainty.correlation,
-        "eigenvalues": m.uncertainty.eigenvalues,
-        "eigenvectors": m.uncertainty.combinations.T,
-    }
-
-
-def _remarks(fit: ThresholdFit) -> list[str]:
-    """Return what a reader of the parameters has to know: fit or no fit, what is least determined, how data were matched."""
-    from scipy.stats import chi2
-
-    notes, freedom = [], len(fit.table) - len(fit.scale)
-    for m in fit.methods:
-        if m.uncertainty.weakest:
-            notes.append(f"{m.method}: least determined is {m.uncertainty.weakest}")
-        chance = float(chi2.sf(m.cost, freedom)) if freedom else 1.0
-        if m.status.ok and chance < 1e-3:
-            notes.append(
-                f"{m.method}: chi2 {m.cost:.4g} on {freedom} degrees of freedom: chance {chance:.1g}; the model does not"
-                " describe the data within sigma, and the errors do not allow for that"
-            )
-        notes += [f"{m.method}: {note}" for note in m.notes]
-    return notes
-
-
-def _summary(fit: ThresholdFit) -> Table:
-    from srfcli.results.tables import STATUS, Column, Table
-
-    columns = (
-        Column("method", "", METHOD),
-        Column("status", "", STATUS),
-        Column("chi2_start", "1", "sum of squared residuals in sigma at the start"),
-        Column("chi2", "1", "the same at the end"),
-        Column("freedom", "1", "critical loads less free parameters"),
-        Column("paper_cost_start", "N^2", "the paper's sum of squares at the start"),
-        Column("paper_cost", "N^2", "the same at the end"),
-        Column("evaluations", "1", "of the whole cost"),
-        Column("gradients", "1", "sets of exact derivatives that the method used"),
-        Column("surveys", "1", "lines searched in full"),
-    )
-    freedom = len(fit.table) - len(fit.scale)
-    rows = [
-        (m.method, m.status.value, m.start_cost, m.cost, freedom, *m.paper_cost, m.evaluations, m.gradients, m.surveys)
-        for m in fit.methods
-    ]
-    return Table("srf.fit-thresholds.methods/1", columns, rows, "Methods")
-
-
-def _trace(fit: ThresholdFit) -> Table:
-    from srfcli.results.tables import Column, Table
-
-    columns = (
-        Column("method", "", METHOD),
-        Column("evaluation", "1", "of the whole cost, counted from 1"),
-        Column("chi2", "1", "lowest so far"),
-    )
-    rows = [(m.method, i + 1, m.trace.best[i]) for m in fit.methods for i in m.trace.milestones()]
-    return Table("srf.fit-thresholds.trace/1", columns, rows, "Cost against evaluations")
-
-
-def _loads(fit: ThresholdFit) -> Table:
-    from srfcli.results.fit import LOADS, load_rows
-    from srfcli.results.tables import Column, Table
-
-    rows = [(m.method, *row) for m in fit.methods for row in load_rows(fit.table, m.match)]
-    return Table("srf.fit-thresholds.loads/1", (Column("method", "", METHOD), *LOADS), rows, "Critical loads")
-
-
-def _threshold_figure(fit: ThresholdFit, title: str) -> Figure:
-    """Return the measured critical loads beside those of the best fit over V, and the lowest chi2 against evaluations."""
-    import numpy as np
-
-    from srfcli.results import plots
-    from srfcli.results.figures import draw_loads
-
-    table, best = fit.table, min(fit.methods, key=lambda m: m.cost)
-    loads = np.where(best.match.missing, np.nan, best.match.loads)
-    with plots.house_style():
-        figure = plots.bare_figure((6.0, 7.2))
-        above, below = figure.subplots(2, 1, height_ratios=(3, 2))
-        draw_loads(above, table, {"fit": loads})
-        for index, m in enumerate(fit.methods):
-            look = {"color": ("#000000", "#777777")[index], "linestyle": plots.DASHES[index]}
-            count = range(1, len(m.trace) + 1)
-            below.step(count, m.trace.best, where="post", label=m.method, **look)
-            below.plot(count[-1:], m.trace.best[-1:], "o", color=look["color"])
-        freedom = len(table) - len(fit.scale)
-        if freedom:
-            below.axhline(freedom, color="#555555", linestyle=plots.DOTTED, label="degrees of freedom")
-        below.set(xscale="log", yscale="log", xlabel="evaluations of the whole cost", ylabel="lowest χ² so far")
-        found = ", ".join(
-            plots.valued(q.name, q.declared(float(best.values[i])), q.parameter.unit) for i, q in enumerate(fit.scale)
-        )
-        plots.heading(figure, f"{plots.name_text(str(table.source))}: {title}\nfit: {found}")
-        plots.decade_ticks(below)
-        below.legend(loc="best", fontsize=plots.NAME, handlelength=2.8)
-        figure.align_ylabels([above, below])
-        return figure

@@ -5,13 +5,13 @@ from __future__ import annotations
 import difflib
 import json
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from srfcli.cli.base import EXIT_USAGE, SrfCommand, SrfGroup
+from srfcli.cli.options import open_registry, plugins_option
 from srfcli.core.errors import ExpressionError, SrfError
 
 if TYPE_CHECKING:
@@ -24,15 +24,6 @@ if TYPE_CHECKING:
 KINDS = ["friction", "ageing", "modifier", "interface", "effect"]
 KIND = click.Choice([*KINDS, "reader"])
 LAW_KIND = click.Choice(KINDS)
-
-plugins_option = click.option(
-    "--plugins",
-    "plugins",
-    multiple=True,
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Folder with law files of your own; may be given several times. Also SRF_PLUGINS.",
-)
 
 EPILOG = """
 srf laws                            every law, where it comes from and what it is
@@ -48,22 +39,15 @@ srf laws --json | jq .rows          for a program
 @plugins_option
 def laws(kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
     """List the laws that are found; none is imported for that."""
-    from srfcli.cli.options import open_registry
-    from srfcli.results.tables import print_terminal, to_json, to_text
+    from srfcli.cli.emit import show
 
     registry = open_registry(plugins)
-    table = laws_table(registry, kind)
-    if as_json:
-        click.echo(to_json(table).rstrip("\n"))
-    elif sys.stdout.isatty():
-        print_terminal(table, sys.stdout)
-    else:
-        click.echo(to_text(table).rstrip("\n"))
+    show(laws_table(registry, kind), "json" if as_json else "text")
     for problem in registry.problems:
         click.echo(f"Not listed ({problem.origin}): {problem.message}", err=True)
 
 
-def laws_table(registry: Registry, kind: str | None = None) -> Table:
+def laws_table(registry: Registry, kind: str | None) -> Table:
     """Return the listing as a table; a law that shares its name with another says so in the column `clash`."""
     from srfcli.results.tables import Column, Table
 
@@ -122,8 +106,6 @@ def law() -> None:
 @plugins_option
 def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
     """Show formula, parameters and references of a law; NAME may be a file."""
-    from srfcli.cli.options import open_registry
-
     found = _find(open_registry(plugins), name, kind)
     if as_json:
         documents = [_document(one) for one in found]
@@ -175,14 +157,13 @@ def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, 
 
     Of an effect: parses, units, a neutral value at which the model is the baseline, derivatives.
     """
-    from srfcli.cli.options import open_registry
     from srfcli.tasks.law_check import Outcome, check_law
 
     registry = open_registry(plugins)
     try:
         outcomes = [outcome for one in _find(registry, name, kind) for outcome in check_law(one)]
     except SrfError as error:
-        if not _is_file(name):
+        if not (name.endswith((".toml", ".py")) and Path(name).is_file()):
             raise
         caret = error.caret() if isinstance(error, ExpressionError) else None
         text = "\n".join(part for part in (error.message, caret, f"Try: {error.hint}" if error.hint else None) if part)
@@ -191,10 +172,6 @@ def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, 
         click.echo(f"{outcome.verdict:7}  {outcome.check:13}  {outcome.text}")
     if any(outcome.verdict == "FAIL" for outcome in outcomes):
         ctx.exit(EXIT_USAGE)
-
-
-def _is_file(name: str) -> bool:
-    return name.endswith((".toml", ".py")) and Path(name).is_file()
 
 
 def _find(registry: Registry, name: str, kind: str | None) -> list[Law]:

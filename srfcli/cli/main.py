@@ -19,31 +19,34 @@ COMMANDS = {
     "laws": ("srfcli.cli.law:laws", "List the laws that are found; none is imported for that."),
     "law": ("srfcli.cli.law:law", "Show, write and check laws."),
     "derive": (
-        "srfcli.cli.derive:command",
+        "srfcli.cli.system:derive",
         "Steady state, slopes, equations, dispersion relation and closed critical loads of a system, by algebra.",
     ),
     "code": (
-        "srfcli.cli.derive:code",
+        "srfcli.cli.system:code",
         "Print the generated NumPy module of a system: rates, Jacobians, derivatives by the parameters, "
         "characteristic polynomial.",
     ),
-    "linear": ("srfcli.cli.linear:command", "Critical load, K/W0 and frequency of steady sliding under constant load."),
-    "critical": ("srfcli.cli.critical:command", "Every critical load at the given velocities, numbered from low W0."),
+    "linear": (
+        "srfcli.cli.stability:linear",
+        "Critical load, K/W0 and frequency of steady sliding under constant load.",
+    ),
+    "critical": ("srfcli.cli.stability:critical", "Every critical load at the given velocities, numbered from low W0."),
     "continue": (
-        "srfcli.cli.continue_:command",
+        "srfcli.cli.stability:continue_",
         "The stability boundary of the forced sliding state in a plane of two parameters.",
     ),
     "floquet": (
-        "srfcli.cli.floquet:command",
+        "srfcli.cli.stability:floquet",
         "The forced periodic state at one V, W0 and eps: multipliers, mean friction, harmonics.",
     ),
-    "map": ("srfcli.cli.map:command", "The stability of the forced sliding state over a plane of two parameters."),
+    "map": ("srfcli.cli.map:map_", "The stability of the forced sliding state over a plane of two parameters."),
     "response": (
         "srfcli.cli.response:command",
         "How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t).",
     ),
     "compare": (
-        "srfcli.cli.compare:command",
+        "srfcli.cli.map:compare",
         "Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment tells them apart.",
     ),
     "new": (
@@ -56,11 +59,11 @@ COMMANDS = {
         "Fit the model of an experiment to its recordings and critical loads, all together, by maximum likelihood.",
     ),
     "diagnose": (
-        "srfcli.cli.diagnose:command",
+        "srfcli.cli.diagnose:diagnose",
         "Find where recordings, or critical loads, differ from their model, and which physics the model lacks.",
     ),
     "report": (
-        "srfcli.cli.report:command",
+        "srfcli.cli.diagnose:report",
         "Write one page on the fits, maps, comparisons and other results of a folder.",
     ),
     "simulate": (
@@ -68,7 +71,7 @@ COMMANDS = {
         "Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding.",
     ),
     "prove": ("srfcli.cli.prove:command", "Prove the diagnosis on experiments whose truth nobody has seen."),
-    "config": ("srfcli.cli.config:command", "Show which values are used, and who set them."),
+    "config": ("srfcli.cli.system:config", "Show which values are used, and who set them."),
 }
 
 EPILOG = """
@@ -136,9 +139,7 @@ def cli() -> None:
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run `srf` with `argv`, or with the process's arguments, and exit."""
     os.environ.update(ONE_THREAD)
-    gc.set_threshold(
-        100_000, 10, 10
-    )  # to look for cycles among what is imported, and at the end, is a sixth of a short run
+    gc.set_threshold(100_000, 10, 10)  # collecting among imported modules, and at the end, takes a sixth of a short run
     atexit.register(gc.freeze)
     cli.main(argv)
 

@@ -1,28 +1,54 @@
-"""`srf map`: the stability of the forced sliding state over a plane of two parameters, with every boundary on it."""
+"""`srf map` and `srf compare`: stability over a plane of two parameters, with every boundary on it; laws side by side."""
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
+    AMPLITUDE,
+    APPARATUS,
+    APPARATUS_OPTIONS,
+    DEFAULT_POINTS,
+    LOADINGS,
+    Options,
     OutputOptions,
     Range,
     Spread,
     SystemOptions,
+    add_options,
+    check_axes,
+    check_origins,
+    mesh_option,
+    open_registry,
     output_options,
     over_option,
     parse_over,
     read_output,
     stability_options,
+    step_option,
+    value_option,
+    values_option,
     worker_options,
 )
-from srfcli.core.errors import SrfError
+from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.settings import (
+    Resolved,
+    Setting,
+    TomlSettings,
+    choose,
+    find_toml,
+    load_toml,
+    parse_assignment,
+    resolve,
+)
+from srfcli.core.units import parse_quantity
 from srfcli.results.map import ratio_powers, unit_text
 
 if TYPE_CHECKING:
@@ -30,9 +56,9 @@ if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.plane import MapAxis, MapGrid
 
-# `srf map`: the stability of the forced sliding state over a plane of two parameters, with every boundary on it.
+# `srf map`: the stability of the forced sliding state over a plane of two parameters.
 
-EXAMPLES = """
+MAP = """
 srf map --eps 0.18 --over V=1:100:120 --over K/W0=0.005:0.03:200 --plot map.svg
 srf map --eps 0.18 --out map.csv --boundary boundary.csv
 srf map --V 7 --over eps=0.01:0.4:80 --over K/W0=0.005:0.03:100
@@ -40,11 +66,11 @@ srf map --eps 0.4 --workers 8 --resume parts --out map.csv
 """
 
 
-@click.command("map", cls=SrfCommand, epilog=EXAMPLES)
+@click.command("map", cls=SrfCommand, epilog=MAP)
 @stability_options
-@click.option("--eps", "eps", metavar="VALUE", help="Relative modulation amplitude, where it is not an axis.")
-@click.option("--V", "V", metavar="VALUE", help="Driving velocity in um/s, where it is not an axis.")
-@click.option("--W0", "W0", metavar="VALUE", help="Mean normal load in N, where it is not an axis.")
+@value_option("eps", "Relative modulation amplitude, where it is not an axis.")
+@value_option("V", "Driving velocity in um/s, where it is not an axis.")
+@value_option("W0", "Mean normal load in N, where it is not an axis.")
 @over_option(
     help="An axis, twice: NAME=LOW:HIGH:POINTS[:log|lin]; NAME may be a ratio, as K/W0, whose second part moves."
 )
@@ -70,14 +96,12 @@ srf map --eps 0.4 --workers 8 --resume parts --out map.csv
     show_default=True,
     help="What the map's mesh may shift a boundary by, relatively.",
 )
-@click.option("--step", type=float, default=0.035, show_default=True, help="Longest step, as a share of the window.")
+@step_option
 @click.option("--tol", type=float, help="Relative error of each boundary point; 1e-6 unless set.")
-@click.option(
-    "--max-mesh", type=click.IntRange(64, 8192), default=512, show_default=True, help="Intervals of the finest mesh."
-)
+@mesh_option(least=64)
 @worker_options
 @output_options
-def command(
+def map_(
     system: SystemOptions,
     eps: str | None,
     V: str | None,
@@ -101,7 +125,6 @@ def command(
     points; CSV and JSON hold the grid.
     """
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.core.errors import SrfError
     from srfcli.numerics.continuation import AtlasSettings, StepSettings
     from srfcli.numerics.plane import MapSettings
     from srfcli.tasks import map as task
@@ -113,7 +136,11 @@ def command(
     if boundary is not None and not boundaries:
         raise SrfError("--boundary needs the boundaries that --no-boundaries leaves out", "Drop one of the two.")
     place = None if boundary is None else _boundary_output(boundary, output)
-    slider, grid = _slider_grid(system, over, {"eps": eps, "V": V, "W0": W0})
+    given = {"eps": eps, "V": V, "W0": W0}
+    check_axes({name for r in over for name in r.name.split("/")}, given)
+    slider = system.slider(**given)
+    slider.model.check_changing_load(slider.vector())
+    grid = read_grid(slider.model, slider.vector(), over)
     settings = AtlasSettings(tol=system.tolerance(tol).value, max_mesh=max_mesh, steps=StepSettings(largest=step))
     warn_uncompiled("a map takes about three times as long")
     begun, mapped = time.perf_counter(), 0.0
@@ -142,27 +169,8 @@ def command(
     finish(found.status)
 
 
-def _slider_grid(
-    system: SystemOptions, over: tuple[Range, ...], given: dict[str, str | None]
-) -> tuple[SlidingSystem, MapGrid]:
-    """Return the system and the grid; raises SrfError where an axis has a value too."""
-    from srfcli.core.errors import SrfError
-
-    swept = {name for r in over for name in r.name.split("/")}
-    for name, value in given.items():
-        if value is not None and name in swept:
-            raise SrfError(
-                f"{name} is an axis and has a value too", f"Leave out --{name}, or take {name} out of --over."
-            )
-    slider = system.slider(**given)
-    slider.model.check_changing_load(slider.vector())
-    return slider, read_grid(slider.model, slider.model.vector(slider.resolved.values), over)
-
-
 def _boundary_output(boundary: str, output: OutputOptions) -> OutputOptions:
     """Return where the boundary's points go, checked now."""
-    from srfcli.core.errors import SrfError
-
     if boundary == "-" or Path(boundary).suffix.lower() not in (".csv", ".json"):
         raise SrfError(f"--boundary {boundary} ends in neither .csv nor .json", "--boundary boundary.csv")
     place = read_output(out=boundary, force=output.force, provenance=output.provenance)
@@ -171,7 +179,7 @@ def _boundary_output(boundary: str, output: OutputOptions) -> OutputOptions:
     return place
 
 
-# The axes of a map from the command line: parameters, or ratios of two such as K/W0.
+# The axes of a map: parameters, or ratios of two such as K/W0.
 
 COLUMNS, ROWS = 80, 120  # points of an axis for which none were given
 
@@ -248,3 +256,130 @@ def _load_axis(model: GeneratedModel, base: Array, x: MapAxis) -> MapAxis:
         return MapAxis("W0", lo, hi, ROWS)
     K = float(base[model.index("K")])
     return MapAxis("W0", K / hi, K / lo, ROWS, True, "K")
+
+
+# `srf compare`: the stability diagrams of several laws, each brought to the same observables at one low velocity.
+
+COMPARE = """
+srf compare --law srf-vsat --law log-log --law bowden-tabor --eps 0.18 --plot laws.svg
+srf compare --ageing dieterich --ageing ruina --ageing dieterich+linker-dieterich --eps 0.09,0.18
+srf compare --law srf-vsat --law log-log --eps 0.18 --workers 2 --json
+"""
+COMPARED_OPTIONS: Options = {  # those of `system_options`, but that several laws may be named
+    "laws": click.option("--law", "laws", multiple=True, metavar="NAME", help="A friction law; repeat for more."),
+    "ageings": click.option(
+        "--ageing", "ageings", multiple=True, metavar="NAME", help="An ageing law; repeat: all pairs count."
+    ),
+    "interface": click.option(
+        "--interface", metavar="NAME", help="Tangential compliance of the interface, the same for all laws."
+    ),
+    "loading": click.option("--loading", type=click.Choice(LOADINGS), help="How the normal load is applied."),
+    **APPARATUS_OPTIONS,
+    "assignments": click.option(
+        "--set", "assignments", multiple=True, metavar="NAME=VALUE", help="Set a parameter of every law that has it."
+    ),
+    "plugins": click.option(
+        "--plugins", multiple=True, type=click.Path(exists=True, path_type=Path), help="Take laws from here, too."
+    ),
+}
+
+
+@click.command("compare", cls=SrfCommand, epilog=COMPARE)
+@add_options(COMPARED_OPTIONS)
+@values_option(AMPLITUDE, default=(0.18,))
+@click.option(
+    "--at", default="10", show_default=True, metavar="V", help="Velocity (um/s) at which laws are brought together."
+)
+@click.option(
+    "--adjust", default="A,B,D0", show_default=True, help="The three parameters adjusted, with mu0 where there is one."
+)
+@click.option(
+    "--match/--no-match", "matched", default=True, show_default=True, help="Whether parameters are adjusted at all."
+)
+@over_option(help="The window: V=LOW:HIGH[:POINTS] and K/W0=LOW:HIGH[:POINTS], each of which may be left out.")
+@worker_options
+@output_options
+def compare(
+    laws: tuple[str, ...],
+    ageings: tuple[str, ...],
+    eps: tuple[float, ...],
+    at: str,
+    adjust: str,
+    matched: bool,
+    over: tuple[Range, ...],
+    spread: Spread,
+    output: OutputOptions,
+    **system: Any,
+) -> None:
+    """Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment tells them apart.
+
+    The first law is the reference. Every other one is brought to its friction, slope, critical load and critical period at one
+    low velocity, so that what differs is the law and not its calibration.
+    """
+    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
+    from srfcli.tasks import map as tasks
+
+    begun = time.perf_counter()
+    sliders = _sliders(laws, ageings, system)
+    window = _window(next(iter(sliders.values())).model, over)
+    warn_uncompiled("boundaries take about three times as long")
+    with Progress("compare") as progress:
+        found = tasks.compare(
+            sliders, eps=eps, at=parse_quantity(at, "um/s", name="--at"), adjust=adjust.split(","), matched=matched,
+            **window, run=spread.run, progress=lambda name, share: progress.advance(note=name, share=share),
+        )  # fmt: skip
+    every = dict.fromkeys(law for slider in sliders.values() for law in slider.model.laws)
+    emit(found.table, output, laws=every, timings={"all": time.perf_counter() - begun}, figure=found.plot)
+    finish(found.status)
+
+
+def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, Any]) -> dict[str, SlidingSystem]:
+    """Return a system for every pair of a friction and an ageing law, by a name that tells them apart."""
+    from srfcli.codegen.model import open_model
+    from srfcli.codegen.slider import SlidingSystem
+
+    toml = load_toml(find_toml())
+    chosen = {k: choose(k, system[k], toml=toml) for k in ("interface", "loading", "inertia")}
+    chosen |= {k: choose(k, None, toml=toml) for k, given in (("law", laws), ("ageing", ageings)) if not given}
+    check_origins(toml, chosen)
+    shared = {k: chosen[k].value for k in ("interface", "loading", "inertia")}
+    named = (*chosen.values(), *(Setting(name, "flag") for name in (*laws, *ageings)))
+    laws, ageings = laws or (chosen["law"].value,), ageings or (chosen["ageing"].value,)
+    pairs = list(dict.fromkeys(itertools.product(laws, ageings)))
+    if len(pairs) < 2:
+        raise SrfError("one law is nothing to compare", "Name more: --law srf-vsat --law log-log, or several --ageing.")
+    registry = open_registry(system["plugins"], named)
+    models = [open_model(registry, law=law, ageing=ageing, **shared) for law, ageing in pairs]
+    short = len(set(ageings)) == 1, len(set(laws)) == 1
+    names = [law if short[0] else ageing if short[1] else f"{law}/{ageing}" for law, ageing in pairs]
+    resolved = _resolved(models, system, toml)
+    return {n: SlidingSystem(m, r) for n, m, r in zip(names, models, resolved, strict=True)}
+
+
+def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSettings) -> list[Resolved]:
+    """Return every model's parameters; an assignment counts for the models that have its parameter, and one must."""
+    flags = {n: system[f"set_{n}"] for n in APPARATUS if system[f"set_{n}"] is not None}
+    for text in system["assignments"]:
+        name, value = parse_assignment(text)
+        flags[name] = value
+    known = {n for m in models for n in m.names}
+    for name in flags:
+        if name not in known:
+            raise SrfError(f"unknown parameter {name!r} in all of these laws", did_you_mean(name, known))
+    return [
+        resolve(m.parameters, {n: v for n, v in flags.items() if n in m.names}, toml=toml, where=m.title)
+        for m in models
+    ]
+
+
+def _window(model: GeneratedModel, over: tuple[Range, ...]) -> dict[str, Any]:
+    """Return the window that --over describes, and how many points it has, as the task takes them."""
+    parts: dict[str, Any] = {"points": {}}
+    for given in over:
+        axis = read_axis(model, given)
+        if axis.name not in ("V", "K/W0"):
+            raise SrfError(f"--over {axis.name} is not an axis of the comparison", "Its plane is V against K/W0.")
+        parts["V" if axis.name == "V" else "K_over_W0"] = (axis.lo, axis.hi)
+        if given.n != DEFAULT_POINTS:
+            parts["points"]["columns" if axis.name == "V" else "rows"] = given.n
+    return parts

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import Session, SrfCommand
-from srfcli.cli.law import plugins_option
+from srfcli.cli.options import plugins_option, reader_option
 from srfcli.core.errors import SrfError
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ KINDS = ("steps", "shs", "oscillation")
 @click.option("--interface", metavar="NAME", default="rigid", show_default=True, help="Elasticity of the interface.")
 @click.option("--holdout", multiple=True, metavar="RUN", help="Keep this run from every fit, to judge it.")
 @click.option("--title", default="", metavar="TEXT", help="Title of the experiment.")
-@click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")
+@reader_option
 @click.option(
     "--out", metavar="FILE", help="The file to write; - is stdout.  [default: experiment.toml in this folder]"
 )

@@ -13,14 +13,14 @@ import contextlib
 import functools
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from srfcli.cli.base import Session, SrfCommand, SrfGroup
+from srfcli.cli.base import Session
 from srfcli.core.errors import SrfError
 from srfcli.core.files import check_target, is_special
 from srfcli.core.settings import (
@@ -159,7 +159,7 @@ def parse_overs(texts: Sequence[str]) -> tuple[Range, ...]:
 
 
 def names_of(kind: str) -> Callable[[click.Context, click.Parameter, str], list[Any]]:
-    """Return what completes the name of a law of this kind where the tab key is pressed: the laws that are found."""
+    """Return a shell completion for the names of laws of this kind."""
 
     def complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[Any]:
         from click.shell_completion import CompletionItem
@@ -167,7 +167,9 @@ def names_of(kind: str) -> Callable[[click.Context, click.Parameter, str], list[
         from srfcli.laws.registry import load_registry
 
         with contextlib.suppress(SrfError):  # a folder that is gone; the command itself says so
-            return [CompletionItem(e.name, help=e.about) for e in load_registry().entries(kind) if e.name.startswith(begun)]
+            return [
+                CompletionItem(e.name, help=e.about) for e in load_registry().entries(kind) if e.name.startswith(begun)
+            ]
         return []
 
     return complete
@@ -188,7 +190,7 @@ def over_option(*, default: Sequence[str] = (), help: str = "") -> Callable[[Cal
 
 
 def values_option(
-    parameter: Parameter, *, default: Sequence[float] | None = None, about: str = ""
+    parameter: Parameter, *, default: tuple[float, ...] | None = None, about: str = ""
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add --NAME for a list of values, `--V 1,7,25` or repeated, with or without unit.
 
@@ -203,12 +205,8 @@ def values_option(
         multiple=True,
         metavar="VALUES",
         help=f"{meaning[:1].upper()}{meaning[1:]}{unit}; several as a,b,c.",
-        callback=lambda _context, _option, texts: parse_values(texts, parameter) if texts else _default(default),
+        callback=lambda _context, _option, texts: parse_values(texts, parameter) if texts else default,
     )
-
-
-def _default(default: Sequence[float] | None) -> tuple[float, ...] | None:
-    return None if default is None else tuple(default)
 
 
 def parse_values(texts: Sequence[str], parameter: Parameter) -> tuple[float, ...]:
@@ -226,24 +224,6 @@ def parse_values(texts: Sequence[str], parameter: Parameter) -> tuple[float, ...
 
 # Option decorators that commands share: which system, and where its results go.
 
-__all__ = [
-    "OutputOptions",
-    "Range",
-    "Session",
-    "SrfCommand",
-    "SrfGroup",
-    "SystemOptions",
-    "output_options",
-    "over_option",
-    "parse_over",
-    "parse_overs",
-    "parse_values",
-    "record_options",
-    "stability_options",
-    "system_options",
-    "values_option",
-]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 APPARATUS = {  # the flags that have their own option; every other parameter is set with --set
@@ -253,6 +233,8 @@ APPARATUS = {  # the flags that have their own option; every other parameter is 
     "angle": "Inclination of an inclined spring, in deg.",
 }
 LOADINGS = ("vertical", "inclined")
+CHOICES = ("law", "ageing", "interface", "loading", "inertia")
+AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation amplitudes")
 FORMATS = ("text", "json", "csv")
 SUFFIXES = ("", ".txt", ".json", ".csv")
 
@@ -278,7 +260,7 @@ class SystemOptions:
 
     def _chosen(self) -> dict[str, Any]:
         check_origins(self.toml, {"law": self.law, "ageing": self.ageing, "interface": self.interface})
-        return {key: getattr(self, key).value for key in ("law", "ageing", "interface", "loading", "inertia")}
+        return {key: getattr(self, key).value for key in CHOICES}
 
     def system(self) -> System:
         """Return the system that the options name."""
@@ -318,7 +300,7 @@ class SystemOptions:
         return SlidingSystem(model, self.resolve(model.parameters, **given))
 
     def say_defaults(self, resolved: Resolved, names: Iterable[str]) -> None:
-        """Say on stderr which of these parameters have a value that nobody chose."""
+        """Say on stderr which of these parameters have the default of their law."""
         taken = [p for p in resolved.parameters if p.name in set(names) and resolved.origins[p.name] == "law default"]
         if taken:
             values = ", ".join(f"{p.name} = {p.default:g}{'' if p.unit == '1' else f' {p.unit}'}" for p in taken)
@@ -327,9 +309,7 @@ class SystemOptions:
 
     def choices(self) -> dict[str, Setting]:
         """Return every setting of DEFAULTS by name, for listing."""
-        names = ("law", "ageing", "interface", "loading", "inertia", "tol")
-        settings = (self.law, self.ageing, self.interface, self.loading, self.inertia, self.tolerance())
-        return dict(zip(names, settings, strict=True))
+        return {key: getattr(self, key) for key in CHOICES} | {"tol": self.tolerance()}
 
     def tolerance(self, flag: float | None = None) -> Setting:
         """Return the tolerance, between 0 and 1: `flag` if given, else SRF_TOL, srf.toml or the default."""
@@ -350,6 +330,7 @@ def open_registry(plugins: Sequence[Path], settings: Sequence[Setting] = ()) -> 
 
 
 def _by_person(setting: Setting) -> bool:
+    """Return whether a flag or an environment variable set it, and no file."""
     return setting.origin == "flag" or setting.origin.startswith("environment ")
 
 
@@ -366,80 +347,136 @@ def check_origins(toml: TomlSettings, settings: Mapping[str, Setting]) -> None:
                 )
 
 
-def system_options(function: F) -> F:
-    """Add the options that choose a system; the command gets them as `system`, a SystemOptions."""
-    return _add_system(function, _system_click_options())
-
-
-def stability_options(function: F) -> F:
-    """Add what `system_options` adds, and --effect, for a command whose results are those of sliding at one velocity for ever."""
-    text = "Have this effect besides the laws, as `srf laws --kind effect` lists them; repeatable."
-    complete = names_of("effect")
-    effect = click.option("--effect", "effects", multiple=True, metavar="NAME", help=text, shell_complete=complete)
-    return _add_system(function, [*_system_click_options(), effect])
-
-
-def _add_system(function: F, options: Sequence[Callable[[Any], Any]]) -> F:
-    names = ("law", "ageing", "interface", "loading", "inertia", "plugins", "assignments", *_apparatus_keys().values())
-
-    @functools.wraps(function)
-    def wrapper(*args: Any, **kwargs: Any) -> Any:
-        taken = {name: kwargs.pop(name) for name in names} | {"effects": kwargs.pop("effects", ())}
-        return function(*args, system=_read_system(taken), **kwargs)
-
-    for option in reversed(options):
-        wrapper = option(wrapper)
-    return wrapper  # type: ignore[return-value]
-
-
-def _apparatus_keys() -> dict[str, str]:
-    return {name: f"set_{name}" for name in APPARATUS}
-
-
 def _about(key: str) -> str:
     default = DEFAULTS[key]
     return f"{default.about[:1].upper()}{default.about[1:]}.  [default: {default.value}]"
 
 
-def _system_click_options() -> list[Callable[[Any], Any]]:
-    chosen = [
-        click.option("--law", metavar="NAME", help=_about("law"), shell_complete=names_of("friction")),
-        click.option("--ageing", metavar="NAME", help=_about("ageing"), shell_complete=names_of("ageing")),
-        click.option("--interface", metavar="NAME", help=_about("interface"), shell_complete=names_of("interface")),
-        click.option("--loading", type=click.Choice(LOADINGS), help=_about("loading")),
-        click.option(
-            "--inertia/--no-inertia", default=None, help="Whether the slider's mass counts.  [default: it does]"
-        ),
-    ]
-    apparatus = [
-        click.option(f"--{name}", key, metavar="VALUE", help=APPARATUS[name]) for name, key in _apparatus_keys().items()
-    ]
-    text = "Set any parameter, with or without unit: --set Vsat=300 --set 'D0=0.5 um'."
-    return [
-        *chosen,
-        *apparatus,
-        click.option("--set", "assignments", multiple=True, metavar="NAME=VALUE", help=text),
-        click.option(
-            "--plugins",
-            multiple=True,
-            metavar="DIR",
-            type=click.Path(exists=True, path_type=Path),
-            help="Take laws from this folder, too.",
-        ),
-    ]
+Options = dict[str, Callable[[Any], Any]]  # decorators by the name of the argument that each of them adds
+APPARATUS_OPTIONS: Options = {
+    "inertia": click.option(
+        "--inertia/--no-inertia", default=None, help="Whether the slider's mass counts.  [default: it does]"
+    ),
+    **{f"set_{n}": click.option(f"--{n}", f"set_{n}", metavar="VALUE", help=about) for n, about in APPARATUS.items()},
+}
+SYSTEM_OPTIONS: Options = {
+    "law": click.option("--law", metavar="NAME", help=_about("law"), shell_complete=names_of("friction")),
+    "ageing": click.option("--ageing", metavar="NAME", help=_about("ageing"), shell_complete=names_of("ageing")),
+    "interface": click.option(
+        "--interface", metavar="NAME", help=_about("interface"), shell_complete=names_of("interface")
+    ),
+    "loading": click.option("--loading", type=click.Choice(LOADINGS), help=_about("loading")),
+    **APPARATUS_OPTIONS,
+    "assignments": click.option(
+        "--set",
+        "assignments",
+        multiple=True,
+        metavar="NAME=VALUE",
+        help="Set any parameter, with or without unit: --set Vsat=300 --set 'D0=0.5 um'.",
+    ),
+    "plugins": click.option(
+        "--plugins",
+        multiple=True,
+        metavar="DIR",
+        type=click.Path(exists=True, path_type=Path),
+        help="Take laws from this folder, too.",
+    ),
+}
+EFFECT_OPTION: Options = {
+    "effects": click.option(
+        "--effect",
+        "effects",
+        multiple=True,
+        metavar="NAME",
+        help="Have this effect besides the laws, as `srf laws --kind effect` lists them; repeatable.",
+        shell_complete=names_of("effect"),
+    )
+}
 
 
-def _read_system(taken: Mapping[str, Any]) -> SystemOptions:
+def add_options(options: Options) -> Callable[[F], F]:
+    """Return a decorator that adds options, which the help lists in this order."""
+
+    def decorate(function: F) -> F:
+        for option in reversed(options.values()):
+            function = option(function)
+        return function
+
+    return decorate
+
+
+def _as_one(function: F, name: str, read: Callable[..., Any], options: Options) -> F:
+    """Add options of which the command gets one argument, `name`: what `read` makes of their values."""
+
+    @functools.wraps(function)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        taken = {key: kwargs.pop(key) for key in options}
+        return function(*args, **{name: read(**taken)}, **kwargs)
+
+    return add_options(options)(wrapper)  # type: ignore[return-value]
+
+
+def system_options(function: F) -> F:
+    """Add the options that choose a system; the command gets them as `system`, a SystemOptions."""
+    return _as_one(function, "system", _read_system, SYSTEM_OPTIONS)
+
+
+def stability_options(function: F) -> F:
+    """Add what `system_options` adds, and --effect: for commands on the stability of sliding."""
+    return _as_one(function, "system", _read_system, SYSTEM_OPTIONS | EFFECT_OPTION)
+
+
+def _read_system(
+    *, assignments: Sequence[str], plugins: tuple[Path, ...], effects: tuple[str, ...] = (), **taken: Any
+) -> SystemOptions:
     toml = load_toml(find_toml())
-    chosen = {key: choose(key, taken[key], toml=toml) for key in ("law", "ageing", "interface", "loading", "inertia")}
-    flags: dict[str, str] = {n: taken[key] for n, key in _apparatus_keys().items() if taken[key] is not None}
-    for text in taken["assignments"]:
+    chosen = {key: choose(key, taken[key], toml=toml) for key in CHOICES}
+    flags: dict[str, str] = {n: taken[f"set_{n}"] for n in APPARATUS if taken[f"set_{n}"] is not None}
+    for text in assignments:
         name, value = parse_assignment(text)
         if name in flags and flags[name] != value:
             raise SrfError(f"{name} is set twice: {flags[name]} and {value}", "Give each parameter one value.")
         flags[name] = value
     folders = [Path(p) for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
-    return SystemOptions(**chosen, flags=flags, plugins=(*taken["plugins"], *folders), toml=toml, effects=taken["effects"])
+    return SystemOptions(**chosen, flags=flags, plugins=(*plugins, *folders), toml=toml, effects=effects)
+
+
+plugins_option = click.option(
+    "--plugins",
+    "plugins",
+    multiple=True,
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Folder with law files of your own; may be given several times. Also SRF_PLUGINS.",
+)
+
+
+def value_option(name: str, help: str) -> Callable[[F], F]:
+    """Add --NAME for one value of a parameter, as text with or without unit."""
+    return click.option(f"--{name}", name, metavar="VALUE", help=help)
+
+
+def mesh_option(*, least: int, most: int = 8192, default: int = 512) -> Callable[[F], F]:
+    """Add --max-mesh; the command gets `max_mesh`."""
+    kind = click.IntRange(least, most)
+    return click.option(
+        "--max-mesh", type=kind, default=default, show_default=True, help="Intervals of the finest mesh."
+    )
+
+
+def step_option(function: F) -> F:
+    """Add --step, the longest step of a continuation; the command gets `step`."""
+    text = "Longest step, as a share of the window."
+    return click.option("--step", type=float, default=0.035, show_default=True, help=text)(function)
+
+
+def check_axes(swept: Container[str], given: Mapping[str, str | None]) -> None:
+    """Raise SrfError for a parameter that is swept and has a value, too."""
+    for name, value in given.items():
+        if value is not None and name in swept:
+            raise SrfError(
+                f"{name} is an axis and has a value too", f"Leave out --{name}, or take {name} out of --over."
+            )
 
 
 @dataclass(frozen=True)
@@ -453,39 +490,26 @@ class OutputOptions:
     provenance: bool = True
 
 
+OUTPUT_OPTIONS: Options = {
+    "as_json": click.option("--json", "as_json", is_flag=True, help="Print JSON, in full precision."),
+    "as_csv": click.option("--csv", "as_csv", is_flag=True, help="Print CSV, in full precision."),
+    "out": click.option("--out", metavar="FILE", help="Write to FILE; .json and .csv choose the format, - is stdout."),
+    "plot": click.option("--plot", metavar="FILE", help="Draw a figure to FILE.png, .svg or .pdf."),
+    "force": click.option("--force", is_flag=True, help="Overwrite existing files."),
+    "provenance": click.option(
+        "--provenance/--no-provenance", default=True, help="Write FILE.provenance.json beside each file."
+    ),
+}
+
+
 def output_options(function: F) -> F:
     """Add --json, --csv, --out, --plot, --force and --no-provenance; the command gets `output`, already checked."""
-    return _add_output(function, plot=True)
+    return _as_one(function, "output", read_output, OUTPUT_OPTIONS)
 
 
 def record_options(function: F) -> F:
     """Add what `output_options` adds but --plot, for a command that has no figure."""
-    return _add_output(function, plot=False)
-
-
-def _add_output(function: F, *, plot: bool) -> F:
-    names = ("as_json", "as_csv", "out", "force", "provenance", *(["plot"] if plot else []))
-
-    @functools.wraps(function)
-    def wrapper(*args: Any, **kwargs: Any) -> Any:
-        taken = {name: kwargs.pop(name) for name in names}
-        return function(*args, output=read_output(**taken), **kwargs)
-
-    for option in reversed(_output_click_options(plot)):
-        wrapper = option(wrapper)
-    return wrapper  # type: ignore[return-value]
-
-
-def _output_click_options(plot: bool) -> list[Callable[[Any], Any]]:
-    figure = click.option("--plot", metavar="FILE", help="Draw a figure to FILE.png, .svg or .pdf.")
-    return [
-        click.option("--json", "as_json", is_flag=True, help="Print JSON, in full precision."),
-        click.option("--csv", "as_csv", is_flag=True, help="Print CSV, in full precision."),
-        click.option("--out", metavar="FILE", help="Write to FILE; .json and .csv choose the format, - is stdout."),
-        *([figure] if plot else []),
-        click.option("--force", is_flag=True, help="Overwrite existing files."),
-        click.option("--provenance/--no-provenance", default=True, help="Write FILE.provenance.json beside each file."),
-    ]
+    return _as_one(function, "output", read_output, {k: v for k, v in OUTPUT_OPTIONS.items() if k != "plot"})
 
 
 def read_output(
@@ -497,7 +521,7 @@ def read_output(
     force: bool = False,
     provenance: bool = True,
 ) -> OutputOptions:
-    """Return the output options; raises SrfError now for what could not be written once all is computed."""
+    """Return the output options; raises SrfError, before anything is computed, for files that could not be written."""
     if as_json and as_csv:
         raise SrfError("--json and --csv exclude each other", "Choose one; a second run with the other costs little.")
     if out == "" or plot == "":
@@ -557,30 +581,29 @@ class Spread:
             yield from run_here(function, tasks)
 
 
+WORKER_OPTIONS: Options = {
+    "workers": click.option(
+        "--workers", type=click.IntRange(0, 4096), help="Processes to use, 0 for all cores.  [default: this one only]"
+    ),
+    "cluster": click.option(
+        "--cluster", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster, tcp://host:port."
+    ),
+    "resume": click.option(
+        "--resume", metavar="DIR", help="Keep finished parts in DIR, and go on from those found there."
+    ),
+}
+
+
 def worker_options(function: F) -> F:
     """Add --workers, --cluster and --resume; the command gets them as `spread`, a Spread."""
+    return _as_one(function, "spread", _read_spread, WORKER_OPTIONS)
 
-    @functools.wraps(function)
-    def wrapper(*args: Any, **kwargs: Any) -> Any:
-        workers, cluster, resume = (kwargs.pop(name) for name in ("workers", "cluster", "resume"))
-        if workers is not None and cluster is not None:
-            raise SrfError("--workers and --cluster exclude each other", "A cluster has its own number of workers.")
-        count = workers if workers else os.cpu_count() or 1 if workers == 0 else 1
-        folder = None if resume is None else Path(resume).expanduser()
-        return function(*args, spread=Spread(count, cluster, folder), **kwargs)
 
-    options = (
-        click.option(
-            "--workers",
-            type=click.IntRange(0, 4096),
-            help="Processes to use, 0 for all cores.  [default: this one only]",
-        ),
-        click.option("--cluster", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster, tcp://host:port."),
-        click.option("--resume", metavar="DIR", help="Keep finished parts in DIR, and go on from those found there."),
-    )
-    for option in reversed(options):
-        wrapper = option(wrapper)
-    return wrapper  # type: ignore[return-value]
+def _read_spread(*, workers: int | None, cluster: str | None, resume: str | None) -> Spread:
+    if workers is not None and cluster is not None:
+        raise SrfError("--workers and --cluster exclude each other", "A cluster has its own number of workers.")
+    count = workers if workers else os.cpu_count() or 1 if workers == 0 else 1
+    return Spread(count, cluster, None if resume is None else Path(resume).expanduser())
 
 
 def listed(texts: Sequence[str]) -> list[str]:
@@ -588,12 +611,17 @@ def listed(texts: Sequence[str]) -> list[str]:
     return [name.strip() for text in texts for name in text.split(",") if name.strip()]
 
 
-def vary_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add --vary and --by, which fits of recordings have in common."""
-    by = click.option(
-        "--by", type=click.Choice(["run", "load", "segment", "direction"]), help="What --vary goes by; run if nothing says."
-    )
-    vary = click.option(
-        "--vary", multiple=True, metavar="NAMES", help="Parameters, or noise, with a value of their own in each run, or --by."
-    )
-    return vary(by(command))
+def vary_options(function: F) -> F:
+    """Add --trend, --vary and --by, which fits of recordings have in common."""
+    ways = ["run", "load", "segment", "direction"]
+    by = click.option("--by", type=click.Choice(ways), help="What --vary goes by; run if nothing says.")
+    text = "Parameters, or noise, with a value of their own in each run, or --by."
+    vary = click.option("--vary", multiple=True, metavar="NAMES", help=text)
+    text = "Let each run's observable drift with slip or time."
+    trend = click.option("--trend", type=click.Choice(["slip", "time"]), help=text)
+    return trend(vary(by(function)))
+
+
+def reader_option(function: F) -> F:
+    """Add --format, the reader of all data files; the command gets `reader`."""
+    return click.option("--format", "reader", metavar="READER", help="Read every data file by this reader.")(function)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from srfcli.cli.base import Session, SrfCommand
-from srfcli.cli.law import plugins_option
-from srfcli.cli.options import OutputOptions
+from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
+from srfcli.cli.options import OutputOptions, plugins_option
+from srfcli.core.errors import SrfError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -97,9 +98,6 @@ def command(
     every case from its folder alone. When all are answered it verifies the seal, reads the truths, and prints what was
     right, with intervals. Each answer is kept as it comes.
     """
-    import os
-
-    from srfcli.core.errors import SrfError
     from srfcli.validation.trials import Trial
 
     if as_json and as_csv:
@@ -110,62 +108,32 @@ def command(
         )
         raise SrfError(said, "srf prove --out DIR makes a trial, srf prove --report-only DIR reads one.")
     count = workers or os.cpu_count() or 1
-    if report is None:
-        assert out is not None
-        trial = _answered(out, cases, seed, kinds, bank, track, resume, unfinished, count, limit, plugins)
+    asked = {"cases": cases, "seed": seed, "kinds": kinds, "bank": bank, "track": track, "resume": resume}
+    if out is not None:
+        if unfinished:
+            raise SrfError("--unfinished ends a trial that was begun", f"srf prove --report-only {out} --unfinished")
+        trial = _answered(out, asked, count, limit, plugins)
     else:
-        given = {
-            "--cases": cases is not None,
-            "--seed": seed is not None,
-            "--kind": bool(kinds),
-            "--bank": bank is not None,
-            "--track": track is not None,
-            "--resume": resume,
-        }
-        for option in (name for name, present in given.items() if present):
-            raise SrfError(f"{option} has no meaning with --report-only", "Leave it out.")
+        assert report is not None
+        for name, value in asked.items():
+            if value is not None and value is not False and value != ():
+                raise SrfError(f"--{name.replace('kinds', 'kind')} has no meaning with --report-only", "Leave it out.")
         trial = Trial(report)
         trial.asked()
     _report(trial, count, unfinished, "json" if as_json else "csv" if as_csv else "text")
 
 
-def _answered(
-    folder: Path,
-    cases: int | None,
-    seed: int | None,
-    kinds: tuple[str, ...],
-    bank: str | None,
-    track: str | None,
-    resume: bool,
-    unfinished: bool,
-    workers: int,
-    limit: float,
-    plugins: tuple[Path, ...],
-) -> Trial:
+def _answered(folder: Path, asked: dict[str, Any], workers: int, limit: float, plugins: tuple[Path, ...]) -> Trial:
     """Return the trial with an answer to every case; Ctrl-C ends the command, and what was answered is kept."""
-    from srfcli.cli.base import EXIT_INTERRUPTED
     from srfcli.cli.emit import Progress
-    from srfcli.core.errors import SrfError
     from srfcli.laws.registry import load_registry
     from srfcli.validation.trials import answer_all, begin
 
-    if unfinished:
-        raise SrfError("--unfinished ends a trial that was begun", f"srf prove --report-only {folder} --unfinished")
     load_registry(plugins)  # a folder that is none must stop the command, not fail every case
     session = Session.current()
     try:
         with Progress("bank") as progress:
-            trial = begin(
-                folder,
-                cases=cases,
-                seed=seed,
-                kinds=kinds,
-                track=track,
-                bank=bank,
-                resume=resume,
-                workers=workers,
-                told=lambda k, n: progress.advance(),
-            )
+            trial = begin(folder, **asked, workers=workers, told=lambda k, n: progress.advance())
         waiting = trial.waiting()
         session.say(f"SHA-256 of the sealed truths: {trial.digest()}")
         with Progress("diagnosed", total=len(waiting)) as progress:

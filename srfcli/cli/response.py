@@ -3,46 +3,51 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
+    AMPLITUDE,
     OutputOptions,
     Range,
     SystemOptions,
     output_options,
     over_option,
     stability_options,
+    value_option,
     values_option,
 )
-from srfcli.core.errors import Status, worst
-from srfcli.core.settings import Parameter
+from srfcli.core.errors import SrfError, Status, worst
 from srfcli.results.plots import titled
+from srfcli.results.tables import STATUS, Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from srfcli.codegen.model import GeneratedModel
     from srfcli.core.settings import Resolved
-    from srfcli.numerics.response import LinearResponse
-    from srfcli.results.tables import Column, Table
 
 EXAMPLES = """
 srf response --V 10 --W0 6 --over f=1:1000:200 --plot response.svg
 srf response --V 10 --W0 6 --over f=1:1000:200 --csv
 srf response --V 10 --W0 6 --mean --eps 0.05,0.1,0.2 --over f=20:400:30
 """
-AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation amplitudes, for --mean")
-QUANTITIES = ("friction", "force", "position", "velocity")
+QUANTITIES = {  # whose response is found: unit of the gain, and what it is of
+    "friction": ("1", "of the friction coefficient"),
+    "force": ("1", "of the friction force over W0"),
+    "position": ("um", "of the slider's position"),
+    "velocity": ("1", "of the interface's slip velocity over V"),
+}
 
 
 @click.command("response", cls=SrfCommand, epilog=EXAMPLES)
 @stability_options
-@click.option("--V", "V", metavar="VALUE", help="Driving velocity in um/s.")
-@click.option("--W0", "W0", metavar="VALUE", help="Mean normal load in N.")
-@values_option(AMPLITUDE)
+@value_option("V", "Driving velocity in um/s.")
+@value_option("W0", "Mean normal load in N.")
+@values_option(AMPLITUDE, about="relative modulation amplitudes, for --mean")
 @over_option(
     default=("f=1:1000:200",), help="The frequencies (Hz), or another parameter: NAME=LOW:HIGH[:POINTS[:log|lin]]."
 )
@@ -67,7 +72,6 @@ def command(
     what the modulation takes off the mean friction force, at any amplitude.
     """
     from srfcli.cli.emit import emit, finish
-    from srfcli.core.errors import SrfError
 
     if len(over) != 1:
         raise SrfError(f"--over is given {len(over)} times", "One parameter is swept: --over f=1:1000:200.")
@@ -75,8 +79,7 @@ def command(
         raise SrfError("--mean needs amplitudes", "Give some: --mean --eps 0.05,0.1,0.2.")
     if eps and not mean:
         raise SrfError("--eps has no part in the linear response", "Leave it out, or ask for --mean.")
-    model = system.model()
-    swept = over[0]
+    model, swept = system.model(), over[0]
     if swept.name == "eps":
         raise SrfError("eps is not swept", "Give amplitudes: --mean --eps 0.05,0.1,0.2; the linear response has none.")
     resolved = system.resolve(model.parameters, V=V, W0=W0)
@@ -86,157 +89,116 @@ def command(
     system.say_defaults(resolved, {"V", "W0"} - {swept.name})
     model.check_changing_load(model.vector(resolved.values))
     begun = time.perf_counter()
-    tolerance = system.tolerance(tol).value
-    if mean:
-        table, figure, status = _mean(model, resolved, swept, eps or (), tolerance)
-    else:
-        table, figure, status = _linear(model, resolved, swept)
+    tolerance, sweep = system.tolerance(tol).value, Sweep(model, resolved, swept)
+    table, figure, status = _mean(sweep, eps or (), tolerance) if mean else _linear(sweep)
     emit(table, output, laws=model.laws, timings={"solve": time.perf_counter() - begun}, figure=figure)
     finish(status)
 
 
-def _described(resolved: Resolved, *swept: str) -> dict[str, Any]:
-    return {k: v for k, v in resolved.described().items() if k not in swept}
+class Sweep:
+    """A model over the values of one parameter: `values` in um, s, N and `shown` in its declared unit."""
+
+    def __init__(self, model: GeneratedModel, resolved: Resolved, swept: Range) -> None:
+        self.model, self.resolved, self.name = model, resolved, swept.name
+        self.values = swept.base_points(model.parameters, where=model.title)
+        self.shown = [model.declared(swept.name, v) for v in self.values]
+        self.log = swept.values is None and swept.spacing == "log"
+        self.unit = model.parameters[model.index(swept.name)].unit
+
+    def vectors(self, eps: float) -> Any:
+        """Return the parameters (n_parameters, n) at every value, for a modulation amplitude."""
+        import numpy as np
+
+        return self.model.vector({**self.resolved.values, "eps": eps, self.name: np.array(self.values)})
+
+    @property
+    def column(self) -> Column:
+        """Return the column of the values."""
+        return Column(self.name, self.unit, "", ".8g")
+
+    @property
+    def label(self) -> str:
+        """Return the label of the axis that the values lie on."""
+        return f"{self.name}  [{self.unit.replace('um', 'µm')}]"
+
+    def table(self, schema: str, columns: Sequence[Column], rows: list[tuple[Any, ...]], notes: Sequence[str]) -> Table:
+        """Return the table of what was found, with the parameters that are the same in all rows."""
+        described = {k: v for k, v in self.resolved.described().items() if k not in (self.name, "eps")}
+        return Table(schema, tuple(columns), rows, self.model.title, tuple(notes), described)
 
 
-def _linear(model: GeneratedModel, resolved: Resolved, swept: Range) -> tuple[Table, Any, Status]:
-    """Return the table of the transfer functions, its figure and its status."""
+Found = tuple[Table, Callable[[], "Figure"], Status]  # what was found, its figure, and whether it can be used
+
+
+def _linear(sweep: Sweep) -> Found:
+    """Return the transfer functions: gain and phase of each quantity, and where it resonates."""
     import numpy as np
 
     from srfcli.numerics.response import linear_response, resonance
-    from srfcli.results.tables import Table
 
-    values = np.array(swept.base_points(model.parameters, where=model.title))
-    shown = [model.declared(swept.name, v) for v in values]
-    found = linear_response(model, model.vector({**resolved.values, swept.name: values, "eps": 0.0}))
+    found = linear_response(sweep.model, sweep.vectors(0.0))
     parts = {name: getattr(found, name) for name in QUANTITIES}
-    cells = [f(parts[name]) for name in QUANTITIES for f in (np.abs, np.angle)]
-    rows = [(x, *(float(c[i]) for c in cells), _steady(found, i), found.status[i].value) for i, x in enumerate(shown)]
-    unit = model.parameters[model.index(swept.name)].unit
-    columns = _linear_columns(swept.name, unit)
+    cells = [f(values) for values in parts.values() for f in (np.abs, np.angle)]
+    steady = [("stable" if found.stable[i] else "unstable") if s.ok else None for i, s in enumerate(found.status)]
+    rows = [(x, *(float(c[i]) for c in cells), steady[i], found.status[i].value) for i, x in enumerate(sweep.shown)]
+    columns = [sweep.column]
+    for name, (unit, about) in QUANTITIES.items():
+        columns.append(Column(f"{name}_gain", unit, f"amplitude {about} for eps = 1, to first order"))
+        columns.append(Column(f"{name}_phase", "rad", "ahead of the load"))
+    columns += [Column("type", "", "stable or unstable: steady sliding"), Column("status")]
     notes = ["to first order in eps: amplitudes are eps times the gains"]
-    if swept.name == "f":
-        for name in QUANTITIES:
-            top = resonance(values, np.abs(parts[name]))
+    if sweep.name == "f":
+        for name, values in parts.items():
+            top = resonance(np.array(sweep.values), np.abs(values))
             where = "none inside the range" if top is None else f"{top[0]:.6g} Hz, gain {top[1]:.6g}"
             notes.append(f"resonance of {name}: {where}")
-    if any(_steady(found, i) == "unstable" for i in range(len(shown))):
+    if "unstable" in steady:
         notes.append("where steady sliding is unstable the response is not what would be seen")
-    table = Table("srf.response/2", columns, rows, model.title, tuple(notes), _described(resolved, swept.name, "eps"))
-    status = worst(found.status)
-    log = swept.values is None and swept.spacing == "log"
-    return (
-        table,
-        lambda: _bode(shown, parts, f"{swept.name}  [{unit}]", log, titled(model.title, table.parameters)),
-        status,
-    )
-
-
-def _steady(found: LinearResponse, i: int) -> str | None:
-    """Return whether steady sliding is stable at a point, None where it has no rates."""
-    return None if not found.status[i].ok else "stable" if found.stable[i] else "unstable"
-
-
-def _bode(x: list[float], parts: dict[str, Any], xlabel: str, log: bool, title: str) -> Figure:
-    from srfcli.results.figures import gains
-
-    labels = {"friction": "µ", "force": "µW/W$_0$", "position": "x  [µm]", "velocity": "v/V"}
-    return gains(x, {labels[k]: v for k, v in parts.items()}, xlabel=xlabel.replace("um", "µm"), logx=log, title=title)
-
-
-def _mean(
-    model: GeneratedModel, resolved: Resolved, swept: Range, amplitudes: tuple[float, ...], tol: float
-) -> tuple[Table, Any, Status]:
-    """Return the table of mean frictions, its figure and its status."""
-    import numpy as np
-
-    from srfcli.numerics.response import mean_friction
-    from srfcli.results.tables import Table
-
-    values = np.array(swept.base_points(model.parameters, where=model.title))
-    rows, statuses, curves = [], [], []
-    shown = [model.declared(swept.name, v) for v in values]
-    for eps in amplitudes:
-        found = mean_friction(model, model.vector({**resolved.values, "eps": eps, swept.name: values}), tol=tol)
-        statuses += list(found.status)
-        curves.append([float(d) for d in found.drop])
-        rows += [
-            (
-                eps,
-                x,
-                *(
-                    float(c[i])
-                    for c in (found.steady, found.force, found.drop, found.friction, found.growth, found.error)
-                ),
-                found.status[i].value,
-            )
-            for i, x in enumerate(shown)
-        ]
-    unit = model.parameters[model.index(swept.name)].unit
-    columns = _mean_columns(swept.name, unit)
-    notes = ("mean over a forcing period of the forced periodic state, stable or not",)
-    table = Table("srf.response.mean/2", columns, rows, model.title, notes, _described(resolved, swept.name, "eps"))
-    log = swept.values is None and swept.spacing == "log"
+    table = sweep.table("srf.response/2", columns, rows, notes)
 
     def figure() -> Figure:
-        from srfcli.results import plots
+        from srfcli.results.figures import gains
 
-        label = f"{swept.name}  [{unit.replace('um', 'µm')}]"
-        names = [f"ε = {eps:g}" for eps in amplitudes]
-        return plots.lines(
-            shown,
-            curves,
-            names,
-            label,
-            "drop of the mean friction force / W$_0$",
-            log,
-            title=titled(model.title, table.parameters),
-        )
+        labels = {"friction": "µ", "force": "µW/W$_0$", "position": "x  [µm]", "velocity": "v/V"}
+        title = titled(table.title, table.parameters)
+        drawn = {labels[name]: values for name, values in parts.items()}
+        return gains(sweep.shown, drawn, xlabel=sweep.label, logx=sweep.log, title=title)
 
-    return table, figure, worst(statuses)
+    return table, figure, worst(found.status)
 
 
-def _mean_columns(name: str, unit: str) -> tuple[Column, ...]:
-    """Return the columns of --mean."""
-    from srfcli.results.tables import STATUS, Column
+def _mean(sweep: Sweep, amplitudes: tuple[float, ...], tol: float) -> Found:
+    """Return the mean friction of the forced states at each amplitude."""
+    from srfcli.numerics.response import mean_friction
 
-    return (
+    rows, statuses, curves = [], [], []
+    for eps in amplitudes:
+        found = mean_friction(sweep.model, sweep.vectors(eps), tol=tol)
+        statuses += list(found.status)
+        curves.append([float(d) for d in found.drop])
+        cells = (found.steady, found.force, found.drop, found.friction, found.growth, found.error)
+        rows += [(eps, x, *(float(c[i]) for c in cells), found.status[i].value) for i, x in enumerate(sweep.shown)]
+    about = "ln of the leading multiplier's modulus; the forced state is stable where negative"
+    columns = (
         Column("eps", "1", "modulation amplitude"),
-        Column(name, unit, "", ".8g"),
+        sweep.column,
         Column("steady_force", "1", "friction force of steady sliding over W0"),
         Column("mean_force", "1", "mean friction force over W0"),
         Column("force_drop", "1", "what modulation takes off the mean friction force, over W0"),
         Column("mean_friction", "1", "mean friction coefficient"),
-        Column(
-            "growth_per_period",
-            "1",
-            "ln of the leading multiplier's modulus; the forced state is stable where negative",
-        ),
+        Column("growth_per_period", "1", about),
         Column("error", "1", "estimated error of the mesh", ".2g"),
         Column("status", "", STATUS),
     )
+    notes = ("mean over a forcing period of the forced periodic state, stable or not",)
+    table = sweep.table("srf.response.mean/2", columns, rows, notes)
 
+    def figure() -> Figure:
+        from srfcli.results import plots
 
-def _linear_columns(name: str, unit: str) -> tuple[Column, ...]:
-    """Return the columns of the transfer functions."""
-    from srfcli.results.tables import Column
+        names = [f"ε = {eps:g}" for eps in amplitudes]
+        ylabel = "drop of the mean friction force / W$_0$"
+        title = titled(table.title, table.parameters)
+        return plots.lines(sweep.shown, curves, names, sweep.label, ylabel, sweep.log, title=title)
 
-    about = {
-        "friction": ("1", "of the friction coefficient"),
-        "force": ("1", "of the friction force over W0"),
-        "position": ("um", "of the slider's position"),
-        "velocity": ("1", "of the interface's slip velocity over V"),
-    }
-    return (
-        Column(name, unit, "", ".8g"),
-        *(
-            column
-            for part in QUANTITIES
-            for column in (
-                Column(f"{part}_gain", about[part][0], f"amplitude {about[part][1]} for eps = 1, to first order"),
-                Column(f"{part}_phase", "rad", "ahead of the load"),
-            )
-        ),
-        Column("type", "", "stable or unstable: steady sliding"),
-        Column("status"),
-    )
+    return table, figure, worst(statuses)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import Session, SrfCommand
-from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options
+from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options, value_option
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.core.units import convert, parse_quantity, split_quantity
 from srfcli.laws.law_file import APPARATUS
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from srfcli.core.settings import Parameter, Resolved
     from srfcli.data.noise import RoughTrack
     from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
-    from srfcli.laws.registry import Registry
     from srfcli.motion.imposed import Drive, Load
 
     Array = NDArray
@@ -40,112 +39,82 @@ srf simulate EXPERIMENT --run onset --plot onset.svg
 srf simulate EXPERIMENT --set lambda=0.5 --out-dir predicted
 srf simulate EXPERIMENT --roughness 3e-4 --roughness-length 10 --seed 1 --out-dir rough
 """
-OWN_RECORD = {  # what describes a record of one's own: an experiment brings its own
+OWN_RECORD = {  # options that describe a new record; they exclude EXPERIMENT, which has its own
     "V": "--V", "W0": "--W0", "eps": "--eps", "drive": "--drive", "load": "--load", "load_file": "--load-file",
     "onset": "--onset", "duration": "--for", "rate": "--rate", "observable": "--observe", "free": "--free",
 }  # fmt: skip
 EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load_file"), ("load", "load_file"))
 
 
-def _options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of `srf simulate` that it shares with no other command."""
-    options = [
-        click.argument("experiment", required=False, type=click.Path(exists=True, path_type=Path)),
-        click.option("--V", "V", metavar="VALUE", help="Constant driving velocity, in um/s."),
-        click.option("--W0", "W0", metavar="VALUE", help="Constant normal load, in N."),
-        click.option(
-            "--eps", "eps", metavar="VALUE", help="Relative amplitude of a modulation at --f, on top of any load."
-        ),
-        click.option(
-            "--for", "duration", metavar="TIME", help="Length of the record, in s.  [default: 40 um of driving]"
-        ),
-        click.option(
-            "--drive",
-            metavar="PIECES",
-            help="Driving velocity as DURATION:VELOCITY, ... in s and um/s; 0 is a hold, 5->20 a ramp.",
-        ),
-        click.option("--load", metavar="PIECES", help="Normal load as DURATION:LOAD, ... in s and N; 5->7 is a ramp."),
-        click.option(
-            "--load-rise",
-            metavar="TIME",
-            default=f"{RISE:g} s",
-            show_default=True,
-            help="Time over which steps and corners of --load are rounded.",
-        ),
-        click.option(
-            "--load-file",
-            type=click.Path(exists=True, dir_okay=False, path_type=Path),
-            help="A recorded load: a file with columns time and normal_load.",
-        ),
-        click.option(
-            "--format", "reader", metavar="READER", help="Read --load-file, or the runs' files, by this reader."
-        ),
-        click.option(
-            "--onset", metavar="TIME", help="When the modulation begins to rise.  [default: at the first sample]"
-        ),
-        click.option("--rate", metavar="HZ", help="Samples per second, or one rate for each piece of --drive."),
-        click.option(
-            "--start",
-            metavar="STATE",
-            default="steady",
-            show_default=True,
-            help="Steady sliding at the first velocity, at another (--start 10), or values: --start 'v=1e-3, phi=100 s'.",
-        ),
-        click.option(
-            "--rtol", type=float, default=1e-8, show_default=True, help="Local relative error of integration."
-        ),
-        click.option(
-            "--run", "runs", multiple=True, metavar="NAME", help="Only this run of EXPERIMENT; may be repeated."
-        ),
-        click.option(
-            "--observe",
-            "observable",
-            metavar="NAMES",
-            help="What the apparatus records: elongation, force or friction, and besides it another, slip or contact_area, "
-            "as force,slip.  [default: elongation]",
-        ),
-        click.option(
-            "--noise",
-            metavar="SIZE",
-            help="Standard deviation of the gauge's noise, in the observable's unit; of several one for each, as 0.01,0.2.",
-        ),
-        click.option("--lag1", type=float, default=0.0, help="Correlation of the noise from sample to sample, as 0.8."),
-        click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded."),
-        click.option(
-            "--roughness", metavar="SIZE", help="Standard deviation of a random friction field along slip, as 3e-4."
-        ),
-        click.option(
-            "--roughness-length", metavar="UM", help="Correlation length of that field, in um.  [default: 10 um]"
-        ),
-        click.option(
-            "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is random."
-        ),
-        click.option(
-            "--out-dir",
-            "--experiment",
-            "folder",
-            type=click.Path(path_type=Path),
-            metavar="DIR",
-            help="Write the records as an experiment folder, whole or not at all.",
-        ),
-        click.option(
-            "--start-values",
-            default="true",
-            show_default=True,
-            metavar="true|perturb:10%",
-            help="Start values written to DIR: the true ones, or off by up to so much.",
-        ),
-        click.option(
-            "--free", metavar="NAMES", help="Parameters that DIR leaves to a fit.  [default: the law's, not V0]"
-        ),
-    ]
-    for option in reversed(options):
-        function = option(function)
-    return function
-
-
 @click.command("simulate", cls=SrfCommand, epilog=EXAMPLES)
-@_options
+@click.argument("experiment", required=False, type=click.Path(exists=True, path_type=Path))
+@value_option("V", "Constant driving velocity, in um/s.")
+@value_option("W0", "Constant normal load, in N.")
+@value_option("eps", "Relative amplitude of a modulation at --f, on top of any load.")
+@click.option("--for", "duration", metavar="TIME", help="Length of the record, in s.  [default: 40 um of driving]")
+@click.option(
+    "--drive",
+    metavar="PIECES",
+    help="Driving velocity as DURATION:VELOCITY, ... in s and um/s; 0 is a hold, 5->20 a ramp.",
+)
+@click.option("--load", metavar="PIECES", help="Normal load as DURATION:LOAD, ... in s and N; 5->7 is a ramp.")
+@click.option(
+    "--load-rise",
+    metavar="TIME",
+    default=f"{RISE:g} s",
+    show_default=True,
+    help="Time over which steps and corners of --load are rounded.",
+)
+@click.option(
+    "--load-file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="A recorded load: a file with columns time and normal_load.",
+)
+@click.option("--format", "reader", metavar="READER", help="Read --load-file, or the runs' files, by this reader.")
+@click.option("--onset", metavar="TIME", help="When the modulation begins to rise.  [default: at the first sample]")
+@click.option("--rate", metavar="HZ", help="Samples per second, or one rate for each piece of --drive.")
+@click.option(
+    "--start",
+    metavar="STATE",
+    default="steady",
+    show_default=True,
+    help="Steady sliding at the first velocity, at another (--start 10), or values: --start 'v=1e-3, phi=100 s'.",
+)
+@click.option("--rtol", type=float, default=1e-8, show_default=True, help="Local relative error of integration.")
+@click.option("--run", "runs", multiple=True, metavar="NAME", help="Only this run of EXPERIMENT; may be repeated.")
+@click.option(
+    "--observe",
+    "observable",
+    metavar="NAMES",
+    help="What the apparatus records: elongation, force or friction, and besides it another, slip or contact_area, "
+    "as force,slip.  [default: elongation]",
+)
+@click.option(
+    "--noise",
+    metavar="SIZE",
+    help="Standard deviation of the gauge's noise, in the observable's unit; of several one for each, as 0.01,0.2.",
+)
+@click.option("--lag1", type=float, default=0.0, help="Correlation of the noise from sample to sample, as 0.8.")
+@click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded.")
+@click.option("--roughness", metavar="SIZE", help="Standard deviation of a random friction field along slip, as 3e-4.")
+@click.option("--roughness-length", metavar="UM", help="Correlation length of that field, in um.  [default: 10 um]")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is random.")
+@click.option(
+    "--out-dir",
+    "--experiment",
+    "folder",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Write the records as an experiment folder, whole or not at all.",
+)
+@click.option(
+    "--start-values",
+    default="true",
+    show_default=True,
+    metavar="true|perturb:10%",
+    help="Start values written to DIR: the true ones, or off by up to so much.",
+)
+@click.option("--free", metavar="NAMES", help="Parameters that DIR leaves to a fit.  [default: the law's, not V0]")
 @system_options
 @output_options
 def command(system: SystemOptions, experiment: Path | None, output: OutputOptions, **given: Any) -> None:
@@ -159,7 +128,7 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
 
     _check(given, experiment, output)
     warn_uncompiled("a simulation takes up to 34 times as long")
-    work = _own(system, given) if experiment is None else _repeated(system, experiment, given)
+    work = own_record(system, given) if experiment is None else repeated_runs(system, experiment, given)
     begun = time.perf_counter()
     with Progress("simulate", total=len(work.jobs)) as progress:
         found = simulate_work(
@@ -181,16 +150,6 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
     if folder is not None:
         _write(work, found.records, found.status, folder, given, output, timings)
     finish(found.status)
-
-
-def _own(system: SystemOptions, given: dict[str, Any]) -> Work:
-
-    return own_record(system, given)
-
-
-def _repeated(system: SystemOptions, experiment: Path, given: dict[str, Any]) -> Work:
-
-    return repeated_runs(system, experiment, given)
 
 
 def _check(given: dict[str, Any], experiment: Path | None, output: OutputOptions) -> None:
@@ -263,11 +222,10 @@ def _write(
     session.say(f"Wrote {folder} ({len(files) - 1} run{'s' if len(files) != 2 else ''})")
 
 
-# A record of one's own for `srf simulate`: drive, load and sampling from the options.
+# A new record: drive, load and sampling from the options.
 
-DRIVE_EXAMPLE, LOAD_EXAMPLE = "0.5:12, 4:8", "2:5, 0.2:5->7, 4:7"
-REFERENCE = ("V0",)  # a velocity that mu0 refers to: no record tells the two apart
-FACTOR = 5.0  # bounds of a fit lie so far from a value
+REFERENCE = ("V0",)  # the velocity that mu0 refers to: not identifiable beside mu0
+FACTOR = 5.0  # ratio of the bounds of a fit to the value
 NAME = "simulated"
 
 
@@ -281,7 +239,10 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     recorded, begin, span, found = _recorded_load(system, given["load_file"], given["reader"])
     pieces = _drive_pieces(given, values["V"], span)
     f = values["f"] if values["eps"] else None
-    rates = _rates(given["rate"], pieces, f)
+    if given["rate"] is None:
+        rates = (usual_rate(sum(p.duration for p in pieces), f),) * len(pieces)
+    else:
+        rates = parse_rates(given["rate"], len(pieces))
     t = sample_times(pieces, rates, begin)
     drive = build_drive(pieces, begin)
     base = recorded or _base_load(given, values["W0"], begin)
@@ -289,7 +250,11 @@ def own_record(system: SystemOptions, given: Mapping[str, Any]) -> Work:
     load.check(float(t[0]), float(t[-1]))
     start = start_state(model, p, given["start"], drive=drive, load=load.rest(begin), begin=begin)
     job, mover = Job(NAME, p, drive, load, t, start, observable, f, modulation, beside=tuple(beside)), model
-    if (track := _track(system, given)) is not None:
+    if (track := read_track(given)) is not None:
+        if system.loading.value != "vertical":
+            raise SrfError(
+                "a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined."
+            )
         mover = system.model(tables=TABLES)
         job = on_track(model, mover, job, track, start=given["start"])
     gauge, others = read_gauges(given, [observable, *beside])
@@ -341,26 +306,18 @@ def read_gauges(given: Mapping[str, Any], observables: Sequence[str]) -> tuple[G
         sizes[name] = [parse_quantity(text, unit, name=f"--{name}") for text, unit in zip(texts, units, strict=True)]
     silent = any(sizes["noise"])  # a gauge without noise beside others; of none, a colour is told
     gauges = [
-        Gauge(n, given["lag1"] if n or not silent else 0.0, q, given["seed"]) for n, q in zip(*sizes.values(), strict=True)
+        Gauge(n, given["lag1"] if n or not silent else 0.0, q, given["seed"])
+        for n, q in zip(*sizes.values(), strict=True)
     ]
     for gauge in gauges:
         check_gauge(noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed)
     return gauges[0], dict(zip(observables[1:], gauges[1:], strict=True))
 
 
-def _track(system: SystemOptions, given: Mapping[str, Any]) -> RoughTrack | None:
-    track = read_track(given)
-    if track is not None and system.loading.value != "vertical":
-        raise SrfError(
-            "a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined."
-        )
-    return track
-
-
 def _drive_pieces(given: Mapping[str, Any], V: float, span: float | None) -> tuple[Piece, ...]:
     """Return the pieces of --drive, or one of constant velocity: as long as --for, the recorded load or --load, or 40 um."""
     if given["drive"] is not None:
-        return parse_pieces(given["drive"], "um/s", option="--drive", example=DRIVE_EXAMPLE)
+        return parse_pieces(given["drive"], "um/s", option="--drive", example="0.5:12, 4:8")
     if given["duration"] is not None:
         duration = parse_quantity(given["duration"], "s", name="--for")
         if not 0 < duration <= LONGEST:
@@ -368,11 +325,14 @@ def _drive_pieces(given: Mapping[str, Any], V: float, span: float | None) -> tup
     elif span is not None:
         duration = span
     elif given["load"] is not None:
-        pieces = parse_pieces(given["load"], "N", option="--load", example=LOAD_EXAMPLE)
-        duration = edges_of(pieces, 0.0)[-1]
+        duration = edges_of(_load_pieces(given), 0.0)[-1]
     else:
         duration = float(f"{TRAVEL / V:.3g}")
     return (Piece(duration, V, V),)
+
+
+def _load_pieces(given: Mapping[str, Any]) -> tuple[Piece, ...]:
+    return parse_pieces(given["load"], "N", option="--load", example="2:5, 0.2:5->7, 4:7")
 
 
 def _recorded_load(
@@ -387,12 +347,6 @@ def _recorded_load(
     return load, float(t[0]), float(t[-1] - t[0]), tuple(map(str, notices))
 
 
-def _rates(text: str | None, pieces: Sequence[Piece], f: float | None) -> tuple[float, ...]:
-    if text is not None:
-        return parse_rates(text, len(pieces))
-    return (usual_rate(sum(p.duration for p in pieces), f),) * len(pieces)
-
-
 def _sampling_notes(
     rates: Sequence[float], f: float | None, given: Mapping[str, Any], pieces: Sequence[Piece]
 ) -> tuple[str, ...]:
@@ -402,8 +356,7 @@ def _sampling_notes(
             f"sampled {min(rates) / f:.2g} times a period of the modulation: from fewer than 8 the load is not read back"
         )
     if given["load"] is not None:
-        length = edges_of(parse_pieces(given["load"], "N", option="--load", example=LOAD_EXAMPLE), 0.0)[-1]
-        total = edges_of(pieces, 0.0)[-1]
+        length, total = (edges_of(made, 0.0)[-1] for made in (_load_pieces(given), pieces))
         if length < total * (1 - 1e-9):
             notes.append(f"--load ends at {length:g} s of {total:g} s; its last value holds on")
         elif length > total * (1 + 1e-9):
@@ -416,7 +369,7 @@ def _base_load(given: Mapping[str, Any], W0: float, begin: float) -> Load:
 
     if given["load"] is None:
         return ConstantLoad(W0)
-    pieces = parse_pieces(given["load"], "N", option="--load", example=LOAD_EXAMPLE)
+    pieces = _load_pieces(given)
     rise = parse_quantity(given["load_rise"], "s", name="--load-rise")
     return LoadSteps.sequence([(p.duration, p.first, p.last) for p in pieces], start=begin, rise=rise)
 
@@ -479,8 +432,6 @@ def fit_parameters(model: GeneratedModel, values: Mapping[str, float], free: set
 
 def bounds(parameter: Parameter, value: float) -> tuple[float, float]:
     """Return the bounds of a fit around `value` (um, s, N), within the parameter's own."""
-    import math
-
     from srfcli.core.units import to_base
 
     lower, upper = (to_base(b, parameter.unit) for b in (parameter.lower, parameter.upper))
@@ -506,8 +457,6 @@ def parse_spread(text: str) -> float:
 
 def perturbed(parameters: Sequence[FitParameter], spread: float, seed: int) -> tuple[FitParameter, ...]:
     """Return the free parameters off by a factor drawn evenly from 1 - spread to 1 + spread, within their bounds."""
-    import dataclasses
-
     from srfcli.data.noise import generator
 
     rng = generator(seed, "start values")
@@ -542,20 +491,21 @@ def _experiment(
     )
 
 
-# The runs of an experiment for `srf simulate`: as they were driven, loaded and sampled, with any parameters and laws.
+# The runs of an experiment: as they were driven, loaded and sampled, with any parameters and laws.
 
 IMPOSED = ("V", "W0", "eps", "f")
 
 
 def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -> Work:
     """Return the runs of the experiment at `path`, to be simulated with its own values but for what flags set."""
+    from srfcli.codegen.model import open_model
     from srfcli.data.experiment import read_experiment
 
     registry = system.registry()
     experiment = read_experiment(path, registry=registry, format=given["reader"])
     experiment.check_recorded("to simulate")
     choice = _choice(system, experiment.choice)
-    model = _open(registry, choice)
+    model = open_model(registry, **dataclasses.asdict(choice))
     flags = _flags(system, model)
     runs = _chosen(experiment, given["runs"])
     observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in runs))
@@ -568,7 +518,7 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
     spread = parse_spread(given["start_values"])
     jobs, mover = tuple(_job(model, experiment, run, flags, given["start"]) for run in runs), model
     if (track := read_track(given)) is not None:
-        mover = _open(registry, choice, tables=TABLES)
+        mover = open_model(registry, **dataclasses.asdict(choice), tables=TABLES)
         jobs = tuple(on_track(model, mover, job, track, start=given["start"]) for job in jobs)
 
     def made(records: Sequence[Record]) -> Experiment:
@@ -579,7 +529,7 @@ def repeated_runs(system: SystemOptions, path: Path, given: Mapping[str, Any]) -
 
     described = _run_parameters(model, experiment, flags) | track_parameters(track, given)
     noted, told = track_notes(track)
-    inputs = (_description_file(path), *(run.file for run in runs))
+    inputs = (path / "experiment.toml" if path.is_dir() else path, *(run.file for run in runs))
     free = [run.name for run in runs if run.initial == "free"]
     notes = (f"initial state of {', '.join(free)} not known: begun in steady sliding",) if free else ()
     meta = {"title": experiment.title, "rtol": given["rtol"], **told}
@@ -592,20 +542,6 @@ def _choice(system: SystemOptions, choice: ModelChoice) -> ModelChoice:
         raise SrfError("the runs of an experiment are loaded from above", "Leave out --loading inclined.")
     named = {key: getattr(system, key) for key in ("law", "ageing", "interface", "inertia")}
     return dataclasses.replace(choice, **{k: s.value for k, s in named.items() if s.origin == "flag"})
-
-
-def _open(registry: Registry, choice: ModelChoice, *, tables: Sequence[tuple[str, str]] = ()) -> GeneratedModel:
-    from srfcli.codegen.model import open_model
-
-    return open_model(
-        registry,
-        law=choice.law,
-        ageing=choice.ageing,
-        interface=choice.interface,
-        inertia=choice.inertia,
-        effects=choice.effects,
-        tables=tables,
-    )
 
 
 def _flags(system: SystemOptions, model: GeneratedModel) -> dict[str, float]:
@@ -642,7 +578,9 @@ def _job(model: GeneratedModel, experiment: Experiment, run: Run, flags: Mapping
         raise SrfError(f"run {run.name!r}: {error.message}", error.hint) from error
     ripple = run.modulation[0] if run.modulation else None
     beside = tuple(signal.observable for signal in run.others)
-    return Job(run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run, beside=beside)
+    return Job(
+        run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run, beside=beside
+    )
 
 
 def _asked_by_effects(model: GeneratedModel, run: Run) -> dict[str, float]:
@@ -724,15 +662,11 @@ def _moved(p: FitParameter, value: float | None) -> FitParameter:
     return dataclasses.replace(p, value=value, lower=min(p.lower, value), upper=max(p.upper, value), unit=unit)
 
 
-def _description_file(path: Path) -> Path:
-    return path / "experiment.toml" if path.is_dir() else path
-
-
-# What `srf simulate` is told in words: pieces of drive and load, sampling rates, the state to start from.
+# Reading of options: pieces of drive and load, sampling rates, the initial state.
 
 MOST_SAMPLES = 10_000_000
-FEW_SAMPLES, MANY_SAMPLES, USUAL_RATE = 1000, 100_000, 1000.0  # what --rate is without being given
-TRAVEL = 40.0  # um of driving where nothing says how long
+FEW_SAMPLES, MANY_SAMPLES, USUAL_RATE = 1000, 100_000, 1000.0  # of the default of --rate: see `usual_rate`
+TRAVEL = 40.0  # um of driving where no duration is given
 LARGEST_VELOCITY = 1e9  # um/s
 LONGEST = 1e12  # s
 
@@ -763,18 +697,13 @@ def _parse_piece(part: str, number: int, unit: str, option: str, example: str) -
     ends = [end.strip() for end in values_text.split("->")]
     if not colon or not duration_text.strip() or not all(ends) or len(ends) > 2:
         raise SrfError(f"{where} is not DURATION:VALUE or DURATION:FROM->TO", f"Write {option} '{example}'.")
-    duration = _number(duration_text, "s", f"{option}: the duration of piece {number}")
+    duration = parse_quantity(duration_text, "s", name=f"{option}: the duration of piece {number}")
     if not 0 < duration <= LONGEST:
         raise SrfError(f"{where} lasts {duration:g} s", f"Give each piece a duration above 0, up to {LONGEST:g} s.")
     split = [split_quantity(end, name=f"{option}: the value of piece {number}", example=f"5 {unit}") for end in ends]
     written = next((u for _, u in reversed(split) if u), unit)
     values = [convert(v, u or written, unit, name=f"{option}: piece {number}") for v, u in split]
     return Piece(duration, values[0], values[-1])
-
-
-def _number(text: str, unit: str, name: str) -> float:
-    value, written = split_quantity(text, name=name, example=f"0.5 {unit}")
-    return convert(value, written or unit, unit, name=name)
 
 
 def edges_of(pieces: Sequence[Piece], start: float) -> list[float]:
@@ -801,7 +730,7 @@ def build_drive(pieces: Sequence[Piece], start: float) -> Drive:
 
 def parse_rates(text: str, pieces: int) -> tuple[float, ...]:
     """Return the samples per second in each of so many pieces: one for all, or one for each."""
-    rates = tuple(_number(part, "Hz", "--rate") for part in text.split(","))
+    rates = tuple(parse_quantity(part, "Hz", name="--rate") for part in text.split(","))
     if not all(0 < rate <= 1e9 for rate in rates):
         raise SrfError(f"--rate {text}: a rate lies between 0 and 1e9 Hz", "Write --rate 1000.")
     if len(rates) not in (1, pieces):
@@ -886,7 +815,7 @@ def start_state(model: GeneratedModel, p: Array, text: str, *, drive: Drive, loa
 
 def _start_velocity(text: str) -> float:
     try:
-        V = _number(text, "um/s", "--start")
+        V = parse_quantity(text, "um/s", name="--start")
     except SrfError as error:
         raise SrfError(f"--start {text!r} is neither steady, nor a velocity, nor values", error.hint) from error
     if not 1e-12 <= V <= LARGEST_VELOCITY:
@@ -903,22 +832,22 @@ def _with_values(model: GeneratedModel, x: Array, text: str) -> Array:
         if name not in plain:
             raise SrfError(f"--start: {name!r} is no state of {model.title}", did_you_mean(name, plain))
         unit = {"u": "um", "z": "um/s", "v": "um/s"}.get(name, "s")
-        number, i = _number(value, unit, f"--start: {name}"), plain.index(name)
+        number, i = parse_quantity(value, unit, name=f"--start: {name}"), plain.index(name)
         if model.logarithmic[i] and not number > 0:
             raise SrfError(f"--start: {name} = {number:g} {unit} is not above 0", f"Write --start {name}=1e-6.")
         x[i] = math.log(number) if model.logarithmic[i] else number
     return x
 
 
-# The rough track of `srf simulate`: what the options ask for, and the records laid on it.
+# The random friction field along slip (--roughness), and records simulated with it.
 
-TABLES = (("mu", "slip"),)  # what is added to which part of the model, and what it is a function of
+TABLES = (("mu", "slip"),)  # a table over slip is added to the friction coefficient
 LENGTH = 10.0  # um, the correlation length where only a size is given
-LARGEST_ROUGHNESS = 0.5  # of mu0: a rougher track has places that pull
+LARGEST_ROUGHNESS = 0.5  # of mu0: above it the friction coefficient may become negative
 
 
 def read_track(given: Mapping[str, Any]) -> RoughTrack | None:
-    """Return the track that --roughness, --roughness-length and --seed ask for, None for a smooth one."""
+    """Return the random field that --roughness, --roughness-length and --seed describe; None without one."""
     if given["roughness"] is None:
         if given["roughness_length"] is not None:
             raise SrfError("--roughness-length is given and the track is smooth", "Give the size: --roughness 3e-4.")
@@ -976,7 +905,7 @@ def _reach(model: GeneratedModel, job: Job) -> float:
 
 
 def track_parameters(track: RoughTrack | None, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the two options as parameters are described: value, unit and origin; nothing for a smooth track."""
+    """Return the field's amplitude and correlation length as described parameters; nothing without a field."""
     if track is None:
         return {}
     origin = "default" if given["roughness_length"] is None else "flag"
@@ -987,7 +916,7 @@ def track_parameters(track: RoughTrack | None, given: Mapping[str, Any]) -> dict
 
 
 def track_notes(track: RoughTrack | None) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return the note on a track and its entry in a result's meta, as `srf fit` has them; nothing for a smooth one."""
+    """Return the note on the field and its entry in `meta`, as in the result of `srf fit`; nothing without a field."""
     if track is None:
         return (), {}
     note = f"track: mu0 wanders by {track.size:g} (standard deviation) over {track.length:g} um"

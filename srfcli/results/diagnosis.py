@@ -229,23 +229,27 @@ class DiagnosisResult(Result):
         from srfcli.diagnosis.answer import material, run_views
         from srfcli.diagnosis.augment import augment
         from srfcli.diagnosis.diagram import stability
-        from srfcli.results.provenance import Provenance, write_sidecar
+        from srfcli.results.provenance import Provenance, write_result
 
         folder, diagnosis, last, found = Path(folder), self.diagnosis, self.diagnosis.final, self.answer
         with whole_folder(folder, lambda: check_answer(folder, force=force)) as fresh:  # an hour may have passed
             text = (json_text(found, indent=2) + "\n").encode("utf-8")
-            write_atomic(fresh / ANSWER, text)
             made = Provenance(
                 arguments=tuple(arguments), laws=last.fit.likelihood.problem.model.laws,
                 inputs=(diagnosis.experiment.path, *diagnosis.experiment.files), seed=self.seed,
                 timings={"diagnose": self.seconds},
             )  # fmt: skip
-            write_sidecar(fresh / ANSWER, text, made)
+            write_result(fresh / ANSWER, text, made)
             views = run_views(diagnosis)
             for name, view in zip(prediction_names([v.run.name for v in views]), views, strict=True):
                 write_atomic(fresh / name, prediction_csv(view))
             augmented = augment(
-                self.registry, diagnosis.experiment, last.hypothesis, last.fit, folder=folder / "augmented", reader=self.reader
+                self.registry,
+                diagnosis.experiment,
+                last.hypothesis,
+                last.fit,
+                folder=folder / "augmented",
+                reader=self.reader,
             )
             (fresh / "augmented").mkdir()
             for name, content in augmented.files.items():
@@ -270,7 +274,8 @@ class DiagnosisResult(Result):
             _report(fresh, found, made_of, told, debug)
 
 
-def _notes(found: dict[str, Any], *, recorded: bool = True) -> list[str]:
+def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:
+    """Return notes on an answer; not `recorded`: it rests on critical loads alone."""
     notes = list(found["reasons"])
     for name, side in (("baseline", found["baseline"]), ("final model", found["augmented"])):
         held = side["holdout"]["rms_over_noise"]
@@ -293,11 +298,13 @@ def _notes(found: dict[str, Any], *, recorded: bool = True) -> list[str]:
 
 
 def _missing(missing: dict[str, Any]) -> list[str]:
-    """Return what is known of a force that no registered effect explains."""
+    """Return notes on a force that no registered effect explains."""
     if not missing:
         return []
     latent = missing["latent"]
-    notes = [f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"]
+    notes = [
+        f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"
+    ]
     for name, share in list(latent["coordinates"].items())[:1]:
         notes[0] += f"; a function of {name} is {100 * share:.0f} % of it"
     if missing["form"] is None:
@@ -309,6 +316,7 @@ def _missing(missing: dict[str, Any]) -> list[str]:
 
 
 def _places(location: Location) -> list[str]:
+    """Return notes on the phase, frequencies and quantity of state that the misfit goes with."""
     notes = []
     if location.forcing_phase is not None:
         notes.append(
@@ -323,7 +331,7 @@ def _places(location: Location) -> list[str]:
 
 
 def check_answer(folder: Path, *, force: bool) -> None:
-    """Raise SrfError now if a diagnosis could not be written to `folder` later."""
+    """Raise SrfError where a diagnosis could not be written to `folder`."""
     recover(folder)
     parent = Path(os.path.realpath(folder)).parent
     if not parent.is_dir():
@@ -353,7 +361,7 @@ def _is_diagnosis(folder: Path) -> bool:
 
 
 def _in_shown_units(made_of: dict[str, Any], diagnosis: Diagnosis) -> None:
-    """Put what the report shows into the units of the recordings, and add what the user stated and where the runs were made."""
+    """Convert the report's material to the units of the recordings; add stated stiffness, velocities and loads."""
     experiment = diagnosis.experiment
     runs = {run.name: run for run in experiment.runs}
     for shown in made_of["runs"]:
@@ -386,7 +394,7 @@ def _velocities(run: Run) -> list[tuple[float, float]]:
 
 
 def _proposed(fresh: Path, folder: Path, found: Mapping[str, Any], result: DiagnosisResult) -> list[str]:
-    """Write what each hypothesis foretells of the run that would part them, and return what the report says of it."""
+    """Write each hypothesis' prediction of the discriminating run, and return the report's sentences on it."""
     from srfcli.diagnosis.design import parting_files
 
     told = found["experiment"]
@@ -400,7 +408,9 @@ def _proposed(fresh: Path, folder: Path, found: Mapping[str, Any], result: Diagn
     return [*told["sentences"], told["run"]]
 
 
-def _report(folder: Path, found: dict[str, Any], made: dict[str, Any], told: Callable[[str], None], debug: bool) -> None:
+def _report(
+    folder: Path, found: dict[str, Any], made: dict[str, Any], told: Callable[[str], None], debug: bool
+) -> None:
     try:
         from srfcli.results.report import write_report
 

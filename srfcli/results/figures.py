@@ -16,7 +16,6 @@ from srfcli.results.plots import (
     decade_ticks,
     heading,
     house_style,
-    load_matplotlib,
     name_text,
     names_below,
     new_figure,
@@ -214,7 +213,10 @@ def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title
 # Figures of recordings: each run with what was observed and what was imposed, and the samples that are not compared.
 
 BINS = 1500  # columns in which a long record is drawn by its extremes
-STRETCH, CROSSES = 20, 100  # samples in a row that make a band; single ones that are crossed each
+STRETCH, CROSSES = (
+    20,
+    100,
+)  # consecutive samples from which a band is drawn; most single ones that are marked with crosses
 DECADES = 30.0  # ratio of velocities from which their axis is logarithmic
 UNUSED = "#D55E00"
 
@@ -225,7 +227,6 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
     A run is {name, t, observed, label, used, V, W, holdout, gaps}: arrays (n,), `label` the observable with its unit, `gaps`
     pairs of times. Samples that are not used are marked, gaps are shaded.
     """
-    load_matplotlib()
     columns = 1 if len(runs) < 4 else 2
     rows = math.ceil(len(runs) / columns)
     with house_style():
@@ -244,7 +245,7 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
 
 
 def _settle(figure: Figure) -> None:
-    """Lay the panels out once and for all, at rounded places: the solver's last digits differ from time to time."""
+    """Fix the layout at rounded positions: the last digits of the layout solver differ from run to run."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for axis in figure.axes:
@@ -278,7 +279,7 @@ def _panel(axes: list[Axes], run: Mapping[str, Any]) -> None:
 
 
 def _proposed(axis: Axes, t: Any, observed: Any, proposed: Any) -> None:
-    """Draw the record as proposed corrections would make it, where they change it: spikes ringed, a moved level dashed."""
+    """Draw the record as corrected, where proposed corrections change it: spikes as rings, a shifted level dashed."""
     import numpy as np
 
     from srfcli.data.clock import runs_of
@@ -298,7 +299,7 @@ def _proposed(axis: Axes, t: Any, observed: Any, proposed: Any) -> None:
 
 
 def _imposed(axis: Axes, values: Any, *, wide: bool) -> None:
-    """Give a constant an axis that its rounding does not fill, and velocities over decades a logarithmic one."""
+    """Set the scale of an imposed quantity: wide for a constant, logarithmic for velocities over decades."""
     import numpy as np
 
     size = float(np.abs(values).max())
@@ -342,7 +343,7 @@ def _mark_unused(axis: Axes, t: Any, x: Any, bad: Any) -> str:
 
 
 def _thinned(t: Any, x: Any) -> tuple[Any, Any]:
-    """Return the record, or where it is long, its smallest and largest value in each of many columns, in order of time."""
+    """Return the record; a long one reduced to the minimum and maximum of each of BINS bins, both at the bin's first time."""
     import numpy as np
 
     if t.size <= 4 * BINS:
@@ -412,7 +413,6 @@ def _names(figure: Figure, axes: Sequence[Axes]) -> None:
 
 
 def _grid(rows: int, columns: int, *, size: tuple[float, float]) -> tuple[Figure, list[list[Axes]]]:
-    load_matplotlib()
     figure = bare_figure(size)
     made = figure.subplots(rows, columns, sharex=("row" if columns > 1 else "col"), squeeze=False)
     return figure, [list(row) for row in made]
@@ -462,16 +462,16 @@ def _line(
         ax.ticklabel_format(axis="y", useOffset=False)
 
 
-def envelope(t: Any, y: Any, *, bins: int = BINS) -> tuple[Any, Any]:
-    """Return a curve (t, y) of few points that looks the same: the least and the largest value of each bin, in their order.
+def envelope(t: Any, y: Any) -> tuple[Any, Any]:
+    """Return a curve (t, y) reduced to the minimum and maximum of each bin, in their order; NaN gaps are kept.
 
-    Records of up to four points a bin stay as they are.
+    Records of up to four points a bin are returned unchanged.
     """
     import numpy as np
 
-    if t.size <= 4 * bins:
+    if t.size <= 4 * BINS:
         return t, y
-    edges = np.searchsorted(t, np.linspace(t[0], t[-1], bins + 1)[:-1])
+    edges = np.searchsorted(t, np.linspace(t[0], t[-1], BINS + 1)[:-1])
     keep = {0, t.size - 1}
     for a, b in zip(edges, [*edges[1:], t.size], strict=True):
         part = y[a:b]

@@ -1,18 +1,19 @@
-"""A fit of an experiment: parameters with errors and flags, how each run and table is fitted, the posterior if it was drawn."""
+"""Fits: of an experiment, of critical loads alone, and of a campaign of experiments, a row each."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from srfcli.core.errors import Status
+from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
 from srfcli.data.values import OBSERVABLES
-from srfcli.results.tables import Column, Result, Table, own_figure
+from srfcli.results.tables import STATUS, Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from srfcli.inference.fit import Fit, Problem, RunFit
     from srfcli.inference.posterior import Interval, Posterior
     from srfcli.inference.recordings import RecordingFit
-    from srfcli.inference.thresholds import Match
+    from srfcli.inference.thresholds import Match, MethodFit, ThresholdFit
 
 PARAMETERS = (
     Column("parameter", "", "name"),
@@ -134,10 +135,34 @@ class FitResult(Result):
         """Return name -> standard error, in um, s, N."""
         return dict(self.found.fit.stderr)
 
+    def _shown(self, name: str, *values: float | None) -> tuple[str, list[Any]]:
+        """Return the unit in which a parameter is shown, and its values (um, s, N) in that unit."""
+        declared = unit_of(self.found.problem, name)
+        unit, factor = self.experiment.shown(declared)
+        return unit, [None if x is None else from_base(x, declared) * factor for x in values]
+
+    @property
+    def _observables(self) -> list[RunFit]:
+        """Return how each observable is fitted, run by run."""
+        fit = self.found.fit
+        return [f for first in fit.runs for f in (first, *(g for g in fit.others if g.name == first.name))]
+
     @cached_property
     def runs(self) -> Table | None:
         """Return a row for each run, fitted or held out: residual, noise, and what is left of them; None without runs."""
-        return run_table(self.found.fit, self.experiment) if self.experiment.runs else None
+        from srfcli.inference.noise import lag_one
+
+        rows, runs = [], {run.name: run for run in self.experiment.runs}
+        for f in self._observables:
+            observable = f.observable or runs[f.name].observable
+            size = sum(b - a for a, b in f.parts)
+            ratio = f.rms / f.white if f.white else None
+            unit = runs[f.name].unit_of(observable)
+            rows.append(
+                (f.name, observable, "held out" if f.holdout else "fit", size, f.rms, f.white, unit, ratio,
+                 lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
+            )  # fmt: skip
+        return Table("srf.fit.runs/1", RUNS, rows, "runs") if runs else None
 
     @cached_property
     def tables(self) -> Table | None:
@@ -158,39 +183,87 @@ class FitResult(Result):
 
     @cached_property
     def varied(self) -> Table | None:
-        """Return a row for each parameter that varies between runs or loads, None where none does."""
-        return varied_table(self.found)
+        """Return mean and scatter of each parameter that varies between runs or loads; None where none does."""
+        rows: list[tuple[Any, ...]] = []
+        for name, scatter in self.found.scatter.items():
+            if scatter is None:
+                rows.append(
+                    (name, None, None, None, self._shown(name)[0], None)
+                )  # one is at its bound: its error is not known
+                continue
+            unit, shown = self._shown(name, scatter.mean, scatter.stderr, scatter.scatter)
+            rows.append((name, *shown, unit, scatter.p_value))
+        return Table("srf.fit.varied/1", VARIED, rows, "what varies") if rows else None
 
     @cached_property
     def draws(self) -> Table | None:
-        """Return mean, spread and quantiles of the posterior draws, None where none were asked for."""
-        return None if self.posterior is None else posterior_table(self.found.problem, self.posterior)
+        """Return mean, spread and quantiles of the posterior draws, and what they are worth; None where none were asked for."""
+        import numpy as np
+
+        if self.posterior is None:
+            return None
+        rows = []
+        for k, name in enumerate(self.posterior.names):
+            draws = self.posterior.draws[:, k]
+            numbers = (draws.mean(), draws.std(ddof=1), *np.quantile(draws, (0.025, 0.5, 0.975)))
+            unit, shown = self._shown(name, *map(float, numbers))
+            rows.append((name, *shown, unit, float(self.posterior.effective[k]), float(self.posterior.r_hat[k])))
+        return Table("srf.fit.posterior/1", POSTERIOR, rows, "posterior")
 
     @cached_property
     def table(self) -> Table:
-        """Return a row for each parameter: estimate, standard error, interval, unit, and what is to be known of it."""
-        found = self.found
-        made = parameter_table(
-            found.problem, found.fit, self.intervals, found.starts, self.posterior, self.runs, self.worst
-        )
+        """Return a row for each parameter: estimate, standard error, interval, unit, and what is to be known of it.
+
+        `meta` has the runs, the correlations and all that has no column.
+        """
+        found, fit = self.found, self.found.fit
+        profiled = {i.name: i for i in self.intervals}
+        rows = []
+        for k, name in enumerate(fit.names):
+            value, error, interval = fit.values[name], fit.stderr[name], profiled.get(name)
+            ends = (value - 1.96 * error, value + 1.96 * error) if interval is None else (interval.low, interval.high)
+            unit, (*shown, start) = self._shown(name, value, error, *ends, float(found.problem.start[k]))
+            rows.append((name, *shown, unit, start, flag(fit, k)))
+        meta: dict[str, Any] = {
+            "runs": [] if self.runs is None else self.runs.records(),
+            "correlation": fit.correlation,
+            "log_likelihood": fit.log_likelihood,
+            "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
+            "evaluations": fit.evaluations,
+            "noise": {
+                f.name: {"innovation": f.noise.innovation, "coefficients": f.noise.coefficients, "colours": f.colours}
+                for f in fit.runs
+            },
+            "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in found.starts],
+            "posterior": None if self.posterior is None else _described(self.posterior),
+        }
         if self.tables is not None and self.loads is not None:
-            parts = {"tables": as_records(self.tables), "loads": as_records(self.loads)}
-            made = replace(made, notes=(*made.notes, *load_notes(found.fit)), meta={**made.meta, **parts})
+            meta |= {"tables": self.tables.records(), "loads": self.loads.records()}
+        if found.track is not None:
+            meta["track"] = asdict(found.track)
+        title = self.experiment.title
+        return Table("srf.fit/2", PARAMETERS, rows, title, tuple(self._notes()), {}, meta, status=self.worst.value)
+
+    def _notes(self) -> list[str]:
+        """Return what is to be known beside the numbers, in sentences."""
+        found = self.found
+        notes = _notes(found.fit, self.intervals, found.starts)
+        notes += filter(None, [self.experiment.rescaled()])
+        notes += [] if self.posterior is None else _posterior_notes(self.posterior)
+        notes += load_notes(found.fit) if found.fit.tables else []
         if found.track is not None:
             from srfcli.inference.state_space import typical_friction
 
-            told = [str(found.track)]
+            notes.append(str(found.track))
             share = found.track.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
             if share > BROAD:
-                told.append(
+                notes.append(
                     f"that field is {100 * share:.1g} % of the friction, more than a track has: it may stand in for physics that "
                     "the model lacks. Try another ageing law or friction law, or `srf diagnose`."
                 )
-            made = replace(made, notes=(*made.notes, *told), meta={**made.meta, "track": asdict(found.track)})
         if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
-            note = f"interrupted: {len(found.starts)} of {self.asked} starts were done"
-            made = replace(made, notes=(*made.notes, note))
-        return made
+            notes.append(f"interrupted: {len(found.starts)} of {self.asked} starts were done")
+        return notes
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return each run's recording and prediction above its residual, and each table's measured and computed loads."""
@@ -198,76 +271,27 @@ class FitResult(Result):
 
         from srfcli.results.figures import fit_figure
         from srfcli.results.plots import symbol_text
-        from srfcli.results.report_text import NO_BREAK, bracketed, unit_text
+        from srfcli.results.report_text import bracketed, with_unit
 
         own_figure(ax, "a fit")
-        problem, fit, experiment = self.found.problem, self.found.fit, self.experiment
+        fit, experiment = self.found.fit, self.experiment
         runs = {r.name: r for r in experiment.runs}
         tables = [
-            (t.loads.name, t.loads.holdout, t.loads.table, np.where(t.match.missing, np.nan, t.match.loads)) for t in fit.tables
+            (t.loads.name, t.loads.holdout, t.loads.table, np.where(t.match.missing, np.nan, t.match.loads))
+            for t in fit.tables
         ]
         rows, told = [], []
-        for f in every_observable(fit):
+        for f in self._observables:
             run, what = runs[f.name], f.observable or runs[f.name].observable
             unit, signal = run.unit_of(what), next(s for s in run.signals if s.observable == what)
             label = run.quantity_of(what) + ("" if unit == "1" else f"\n[{unit.replace('um', 'µm')}]")
             rows.append((f.name, f.holdout, label, run.t, signal.observed, f.prediction.y, f.white))
         for name in fit.names:
-            declared = unit_of(problem, name)
-            unit, factor = experiment.shown(declared)
-            value, error = (from_base(x, declared) * factor for x in (fit.values[name], fit.stderr[name]))
-            shown = "" if unit == "1" else f"{NO_BREAK}{unit_text(unit)}"
-            told.append(f"{symbol_text(name)} = {bracketed(value, error)}{shown}")
+            unit, (value, error) = self._shown(name, fit.values[name], fit.stderr[name])
+            told.append(f"{symbol_text(name)} = {with_unit(bracketed(value, error), unit)}")
         choice = experiment.choice
         title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
         return fit_figure(rows, title=title, found=", ".join(told), tables=tables)
-
-
-def parameter_table(
-    problem: Problem,
-    fit: Fit,
-    intervals: Sequence[Interval],
-    starts: Sequence[tuple[float, bool]],
-    posterior: Posterior | None,
-    runs: Table | None,
-    status: Status,
-) -> Table:
-    """Return the estimates as a table whose `meta` has the runs, the correlations and all that has no column."""
-    by_name = {i.name: i for i in intervals}
-    rows = []
-    for k, name in enumerate(fit.names):
-        declared = unit_of(problem, name)
-        unit, factor = problem.experiment.shown(declared)
-        value, error = fit.values[name], fit.stderr[name]
-        found = by_name.get(name)
-        ends = (value - 1.96 * error, value + 1.96 * error) if found is None else (found.low, found.high)
-        cells = [value, error, *ends]
-        *shown, start = [
-            None if c is None else from_base(c, declared) * factor for c in (*cells, float(problem.start[k]))
-        ]
-        rows.append((name, *shown, unit, start, flag(fit, k)))
-    notes = _notes(fit, intervals, starts)
-    notes += filter(None, [problem.experiment.rescaled()])
-    notes += [] if posterior is None else _posterior_notes(posterior)
-    meta = {
-        "runs": [] if runs is None else as_records(runs),
-        "correlation": fit.correlation,
-        "log_likelihood": fit.log_likelihood,
-        "rms_over_noise": {"fit": fit.rms_over_noise(), "holdout": fit.rms_over_noise(holdout=True)},
-        "evaluations": fit.evaluations,
-        "noise": {
-            f.name: {"innovation": f.noise.innovation, "coefficients": f.noise.coefficients, "colours": f.colours}
-            for f in fit.runs
-        },
-        "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in starts],
-        "posterior": None if posterior is None else _described(posterior),
-    }
-    return Table("srf.fit/2", PARAMETERS, rows, problem.experiment.title, tuple(notes), {}, meta, status=status.value)
-
-
-def as_records(table: Table) -> list[dict[str, Any]]:
-    """Return the rows of a table by the names of its columns."""
-    return [dict(zip((c.name for c in table.columns), row, strict=True)) for row in table.rows]
 
 
 def load_rows(table: Thresholds, match: Match) -> list[tuple[Any, ...]]:
@@ -297,20 +321,6 @@ def load_notes(fit: Fit) -> list[str]:
     return notes
 
 
-def posterior_table(problem: Problem, posterior: Posterior) -> Table:
-    """Return mean, spread and quantiles of each parameter, and what its draws are worth."""
-    import numpy as np
-
-    rows, draws = [], posterior.draws
-    for k, name in enumerate(posterior.names):
-        declared = unit_of(problem, name)
-        unit, factor = problem.experiment.shown(declared)
-        shown = [from_base(float(x), declared) * factor for x in (draws[:, k].mean(), draws[:, k].std(ddof=1),
-                 *np.quantile(draws[:, k], (0.025, 0.5, 0.975)))]  # fmt: skip
-        rows.append((name, *shown, unit, float(posterior.effective[k]), float(posterior.r_hat[k])))
-    return Table("srf.fit.posterior/1", POSTERIOR, rows, "posterior")
-
-
 def _described(posterior: Posterior) -> dict[str, Any]:
     return {
         "names": posterior.names, "draws": posterior.draws, "burn_in": posterior.burn_in, "accepted": posterior.accepted,
@@ -336,42 +346,6 @@ def _posterior_notes(posterior: Posterior) -> list[str]:
             f"posterior: intervals should rest on {ENOUGH:.0f} independent draws with R-hat up to {MIXED}: --sample {more}"
         )
     return notes
-
-
-def every_observable(fit: Fit) -> list[RunFit]:
-    """Return how each observable is fitted, run by run."""
-    return [f for first in fit.runs for f in (first, *(g for g in fit.others if g.name == first.name))]
-
-
-def run_table(fit: Fit, experiment: Experiment) -> Table:
-    """Return one row for each run, fitted or held out."""
-    from srfcli.inference.noise import lag_one
-
-    rows, runs = [], {run.name: run for run in experiment.runs}
-    for f in every_observable(fit):
-        observable = f.observable or runs[f.name].observable
-        size = sum(b - a for a, b in f.parts)
-        ratio = f.rms / f.white if f.white else None
-        unit = runs[f.name].unit_of(observable)
-        rows.append(
-            (f.name, observable, "held out" if f.holdout else "fit", size, f.rms, f.white, unit, ratio,
-             lag_one(f.residual, f.parts), len(f.colours) or f.noise.order)
-        )  # fmt: skip
-    return Table("srf.fit.runs/1", RUNS, rows, "runs")
-
-
-def varied_table(found: RecordingFit) -> Table | None:
-    """Return mean and scatter of what varies between groups of runs, and how likely that scatter is by chance."""
-    rows: list[tuple[Any, ...]] = []
-    for name, scatter in found.scatter.items():
-        declared = unit_of(found.problem, name)
-        unit, factor = found.problem.experiment.shown(declared)
-        if scatter is None:
-            rows.append((name, None, None, None, unit, None))  # one is at its bound: its error is not known
-            continue
-        shown = [from_base(x, declared) * factor for x in (scatter.mean, scatter.stderr, scatter.scatter)]
-        rows.append((name, *shown, unit, scatter.p_value))
-    return Table("srf.fit.varied/1", VARIED, rows, "what varies") if rows else None
 
 
 def unit_of(problem: Problem, name: str) -> str:
@@ -422,3 +396,287 @@ def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float
             f"residuals are coloured in {', '.join(coloured)}: noise of that colour, or physics that is missing"
         )
     return notes
+
+
+# A fit of critical loads alone, as in the paper: each method beside the others, with its cost against evaluations.
+
+METHOD = Column("method", "", "powell, or least-squares with exact derivatives")
+ESTIMATES = (
+    METHOD,
+    Column("parameter", "", "name"),
+    Column("value", "", "estimate, in the unit beside it", ".7g"),
+    Column("stderr", "", "standard error from the given sigma, linearised", ".3g"),
+    Column("lower", "", "bound of the search"),
+    Column("upper", "", "bound of the search"),
+    Column("unit", "", "unit of all the columns before"),
+    Column("start", "", "where the fit began"),
+    Column("flag", "", "why an error is missing or means nothing"),
+)
+METHODS = (
+    METHOD,
+    Column("status", "", STATUS),
+    Column("chi2_start", "1", "sum of squared residuals in sigma at the start"),
+    Column("chi2", "1", "the same at the end"),
+    Column("freedom", "1", "critical loads less free parameters"),
+    Column("paper_cost_start", "N^2", "the paper's sum of squares at the start"),
+    Column("paper_cost", "N^2", "the same at the end"),
+    Column("evaluations", "1", "of the whole cost"),
+    Column("gradients", "1", "sets of exact derivatives that the method used"),
+    Column("surveys", "1", "lines searched in full"),
+)
+TRACE = (
+    METHOD,
+    Column("evaluation", "1", "of the whole cost, counted from 1"),
+    Column("chi2", "1", "lowest so far"),
+)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class ThresholdFitResult(Result):
+    """The fit of a model to a table of critical loads, by each method.
+
+    Attributes
+    ----------
+    found : ThresholdFit
+        The table, the free parameters, and what each method found.
+    laws : str
+        The title of the model.
+    held : mapping
+        The parameters and their origin, as a table describes them.
+    """
+
+    found: ThresholdFit = field(repr=False)
+    laws: str
+    held: Mapping[str, Mapping[str, Any]] = field(repr=False)
+
+    @property
+    def _freedom(self) -> int:
+        return len(self.found.table) - len(self.found.scale)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return the estimates of each method; `meta` has the methods, the traces, the loads and the information matrices."""
+        fit, rows = self.found, []
+        for m in fit.methods:
+            for i, q in enumerate(fit.scale):
+                numbers = (m.values[i], m.uncertainty.errors[i], q.lower, q.upper)
+                shown = [q.declared(float(x)) for x in numbers]
+                start, said = q.declared(float(q.start)), m.uncertainty.flags[i] or "ok"
+                rows.append((m.method, q.name, *shown, q.parameter.unit, start, said))
+        meta: dict[str, Any] = {
+            "methods": self.methods.records(),
+            "trace": self.trace.records(),
+            "loads": self.loads.records(),
+            "information": {m.method: self._information(m) for m in fit.methods},
+        }
+        notes = (*fit.table.notes, *self._remarks())
+        title = f"{fit.table.source}, {len(fit.table)} critical loads; {self.laws}"
+        return Table("srf.fit-thresholds/2", ESTIMATES, rows, title, notes, self.held, meta, fit.status.value)
+
+    def _information(self, m: MethodFit) -> dict[str, Any]:
+        """Return correlations and the information matrix's eigenvalues in the coordinates ln(value), or value/size."""
+        return {
+            "parameters": self.found.scale.names,
+            "coordinates": ["ln" if q.log else "linear" for q in self.found.scale],
+            "correlation": m.uncertainty.correlation,
+            "eigenvalues": m.uncertainty.eigenvalues,
+            "eigenvectors": m.uncertainty.combinations.T,
+        }
+
+    def _remarks(self) -> list[str]:
+        """Return notes: the least determined combination, whether the model describes the data, how data were matched."""
+        from srfcli.inference.critical_loads import IMPROBABLE, chance_of
+
+        notes = []
+        for m in self.found.methods:
+            if m.uncertainty.weakest:
+                notes.append(f"{m.method}: least determined is {m.uncertainty.weakest}")
+            chance = chance_of(m.cost, self._freedom)
+            if m.status.ok and chance < IMPROBABLE:
+                notes.append(
+                    f"{m.method}: chi2 {m.cost:.4g} on {self._freedom} degrees of freedom: chance {chance:.1g}; the model does"
+                    " not describe the data within sigma, and the errors do not allow for that"
+                )
+            notes += [f"{m.method}: {note}" for note in m.notes]
+        return notes
+
+    @cached_property
+    def methods(self) -> Table:
+        """Return how each method ended, and what it took."""
+        rows = [
+            (
+                m.method,
+                m.status.value,
+                m.start_cost,
+                m.cost,
+                self._freedom,
+                *m.paper_cost,
+                m.evaluations,
+                m.gradients,
+                m.surveys,
+            )
+            for m in self.found.methods
+        ]
+        return Table("srf.fit-thresholds.methods/1", METHODS, rows, "Methods")
+
+    @cached_property
+    def trace(self) -> Table:
+        """Return the lowest cost of each method against its evaluations."""
+        rows = [(m.method, i + 1, m.trace.best[i]) for m in self.found.methods for i in m.trace.milestones()]
+        return Table("srf.fit-thresholds.trace/1", TRACE, rows, "Cost against evaluations")
+
+    @cached_property
+    def loads(self) -> Table:
+        """Return each critical load, measured and computed, under the estimates of each method."""
+        rows = [(m.method, *row) for m in self.found.methods for row in load_rows(self.found.table, m.match)]
+        return Table("srf.fit-thresholds.loads/1", (METHOD, *LOADS), rows, "Critical loads")
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the measured critical loads beside those of the best fit over V, and the lowest chi2 against evaluations."""
+        import numpy as np
+
+        from srfcli.results import plots
+        from srfcli.results.figures import draw_loads
+
+        own_figure(ax, "a fit of critical loads")
+        table, best = self.found.table, min(self.found.methods, key=lambda m: m.cost)
+        loads = np.where(best.match.missing, np.nan, best.match.loads)
+        with plots.house_style():
+            figure = plots.bare_figure((6.0, 7.2))
+            above, below = figure.subplots(2, 1, height_ratios=(3, 2))
+            draw_loads(above, table, {"fit": loads})
+            for index, m in enumerate(self.found.methods):
+                look = {"color": ("#000000", "#777777")[index], "linestyle": plots.DASHES[index]}
+                count = range(1, len(m.trace) + 1)
+                below.step(count, m.trace.best, where="post", label=m.method, **look)
+                below.plot(count[-1:], m.trace.best[-1:], "o", color=look["color"])
+            if self._freedom:
+                below.axhline(self._freedom, color="#555555", linestyle=plots.DOTTED, label="degrees of freedom")
+            below.set(xscale="log", yscale="log", xlabel="evaluations of the whole cost", ylabel="lowest χ² so far")
+            found = ", ".join(
+                plots.valued(q.name, q.declared(float(best.values[i])), q.parameter.unit)
+                for i, q in enumerate(self.found.scale)
+            )
+            plots.heading(figure, f"{plots.name_text(str(table.source))}: {self.laws}\nfit: {found}")
+            plots.decade_ticks(below)
+            below.legend(loc="best", fontsize=plots.NAME, handlelength=2.8)
+            figure.align_ylabels([above, below])
+            return figure
+
+
+# A campaign: many experiments, a row each, as the table that a laboratory publishes.
+
+ROOM = 60  # letters of the experiments' names that stand upright below the figure
+PAIRS = (("A", "B"), ("A", "D0"), ("B", "D0"))  # whose covariances a fit of a velocity step is quoted with
+LEADING = (
+    Column("experiment", "", "folder or file"),
+    Column("status", "", "of the fit; failed where there is none"),
+    Column("law", "", "friction and ageing law"),
+    Column("runs", "", "that were fitted"),
+    Column("samples", "", "compared in them"),
+    Column("V_min", "um/s", "lowest velocity of the drive"),
+    Column("V_max", "um/s", "highest velocity of the drive"),
+    Column("load", "", "mean of the fitted runs, in the unit beside it"),
+    Column("load_unit", "", "N or MPa"),
+    Column("segments", "", "of constant velocity, one slip length D0 or longer"),
+    Column("steady", "", "of them, those that end in steady sliding"),
+    Column(
+        "final_slope", "1/mm", "largest change of friction with slip at the end of a segment, over its error 3 or more"
+    ),
+    Column("rms_over_noise", "", "1 where the model explains all but the noise"),
+)
+DERIVED = (
+    Column("A_minus_B", "1", "A - B: above 0, friction rises with velocity"),
+    Column("A_minus_B_stderr", "1", "with the covariance of the two"),
+)
+STATED = (
+    Column("k", "", "stiffness, stated or fitted, in the unit beside it"),
+    Column("k_stderr", "", "empty where the stiffness is the stated one"),
+    Column("k_unit", "", "as the experiment states it"),
+)
+TRAILING = (
+    Column("flags", "", "what is to be known before the row is used"),
+    Column("reason", "", "why there is no fit"),
+)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class CampaignResult(Result):
+    """The fits of many experiments.
+
+    Attributes
+    ----------
+    rows : sequence of dict
+        What each experiment's fit gave, by the name of its column, and `parameters`, name -> [value, standard error, unit].
+    worst : Status
+        INTERRUPTED where not all were done.
+    """
+
+    rows: Sequence[Mapping[str, Any]]
+    asked: int
+    worst: Status = Status.OK
+
+    @property
+    def failed(self) -> int:
+        """Return how many experiments have no fit."""
+        return sum(row["status"] == "failed" for row in self.rows)
+
+    @property
+    def table(self) -> Table:
+        """Return a row for each experiment; a parameter that an experiment does not fit is empty in its row."""
+        names = list(dict.fromkeys(name for row in self.rows for name in row.get("parameters", {}) if name != "K"))
+        columns = [*LEADING]
+        for name in names:
+            units = dict.fromkeys(row["parameters"][name][2] for row in self.rows if name in row.get("parameters", {}))
+            unit = next(iter(units)) if len(units) == 1 else ""
+            columns += [Column(name, unit, "estimate"), Column(f"{name}_stderr", unit, "standard error", ".3g")]
+        both = {"A", "B"} <= set(names)
+        covariances = [Column(f"cov_{a}_{b}", "", "covariance") for a, b in PAIRS if {a, b} <= set(names)]
+        columns += [*(DERIVED if both else ()), *STATED, *covariances, *TRAILING]
+        cells = []
+        for row in self.rows:
+            found = {**row, **row.get("covariances", {})}
+            for name, (value, error, _) in row.get("parameters", {}).items():
+                found |= {name: value, f"{name}_stderr": error}
+            cells.append([found.get(column.name) for column in columns])
+        notes = []
+        if self.failed:
+            notes.append(f"{self.failed} of {len(self.rows)} experiments have no fit: their rows say why")
+        if len(self.rows) < self.asked:
+            notes.append(f"interrupted: {len(self.rows)} of {self.asked} experiments were done")
+        title = f"{len(self.rows)} experiment" + ("s" if len(self.rows) != 1 else "")
+        worst = Status.INTERRUPTED if len(self.rows) < self.asked else self.worst
+        return Table("srf.campaign/1", tuple(columns), cells, title, tuple(notes), status=worst.value)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return A - B with its error over the velocity of each experiment, those that have no fit left out."""
+        from srfcli.results import plots
+
+        own_figure(ax, "a campaign")
+        known = [row for row in self.rows if row.get("A_minus_B") is not None]
+        if not known:
+            raise SrfError("no experiment of the campaign has A and B: there is nothing to draw", "Leave --plot out.")
+        laws = list(dict.fromkeys(str(row["law"]) for row in known))
+        title = plots.name_text("; ".join(laws), wide=True)
+        with plots.one_panel(None, title=title, size=(max(6.0, 1.0 + 0.3 * len(known)), 4.2)) as (figure, axes):
+            place = range(len(known))
+            values, errors = ([row[key] for row in known] for key in ("A_minus_B", "A_minus_B_stderr"))
+            errors = [e if e is not None and math.isfinite(e) else 0.0 for e in errors]
+            axes.errorbar(place, values, yerr=[1.96 * e for e in errors], fmt="o", capsize=3, color=plots.COLOURS[0])
+            axes.axhline(0.0, color="#555555", linestyle=plots.DOTTED)
+            axes.set(xticks=list(place), ylabel="A − B, and 95 % intervals", xlabel="experiment")
+            names = _short_names([str(row["experiment"]) for row in known])
+            turn: dict[str, Any] = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"}
+            upright = sum(map(len, names)) <= ROOM and len(known) < 10
+            axes.set_xticklabels([plots.name_text(name) for name in names], **({} if upright else turn))
+            axes.margins(x=0.5 / len(known) if len(known) > 1 else 0.5)
+        return figure
+
+
+def _short_names(places: Sequence[str]) -> list[str]:
+    """Return the names of folders or files, those of their folders where all are called alike, whole where two are the same."""
+    named = [
+        Path(place).parent.name or place if Path(place).name == "experiment.toml" else Path(place).name
+        for place in places
+    ]
+    return [name if named.count(name) == 1 else place for name, place in zip(named, places, strict=True)]

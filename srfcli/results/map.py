@@ -6,7 +6,7 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -64,34 +64,187 @@ class MapResult(Result):
     followed: bool = True
 
     @cached_property
-    def _common(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return what all tables share, and what JSON holds beside the rows."""
-        grid, model = self.found.grid, self.system.model
-        notes, meta, status = _summary(model, self.found, self.atlas, list(self.special), self.followed)
-        described = self.system.described(without=(grid.x.moved, grid.y.moved))
-        return {"title": model.title, "notes": notes, "parameters": described, "status": status.value}, meta
+    def _summary(self) -> tuple[tuple[str, ...], dict[str, Any], Status]:
+        """Return the notes, what JSON holds beside the rows, and the status of the whole."""
+        from srfcli.numerics.map import KINDS
+        from srfcli.numerics.map_boundaries import map_notes, unexplained
+        from srfcli.numerics.special_points import crossings_at
+
+        model, found, atlas = self.system.model, self.found, self.atlas
+        count = found.kind.size
+        share = {name: float((found.kind == k).sum() / count) for k, name in enumerate(KINDS)}
+        meta: dict[str, Any] = {
+            "share": share,
+            "suspect_cells": len(found.suspect),
+            "points_added": len(found.extra_at),
+        }
+        status = Status.NO_CONVERGENCE if found.lost else Status.OK
+        if not found.finished:
+            left = "interrupted: what was not reached is unresolved, and no boundary was followed"
+            return (left, *map_notes(found)), meta, Status.INTERRUPTED
+        without = int((~model.has_rates(found.points(model))).sum()) if found.lost else 0
+        reason = [f"{Status.NO_VALUE.value} at {without} points: {Status.NO_VALUE.advice}"] if without else []
+        if not self.followed:
+            return (*reason, *map_notes(found)), meta, status
+        values = found.points(model)[model.index(found.grid.x.moved), :, 0]
+        met = [len(crossings) for crossings in crossings_at(model, atlas.plane, atlas.branches, values)]
+        odd = unexplained(model, found, atlas)
+        meta |= {"crossings": met, "unexplained_points": len(odd)}
+        number = len(atlas.branches)
+        lines = ", ".join(f"{n} on {lines}" for n, lines in sorted(Counter(met).items()))
+        notes = [
+            f"{number} component{'' if number == 1 else 's'}; stable at {share['stable']:.1%} of the points",
+            f"boundaries met by the {len(met)} lines of constant {found.grid.x.name}: {lines}",
+        ]
+        if len(odd):
+            notes.append(
+                f"the curves do not account for the stability of {len(odd)} of {count} points: one is missing there"
+            )
+            status = Status.NO_CONVERGENCE
+        else:
+            notes.append(f"the curves account for the stability of all {count} points")
+        bad = sum(not s.status.ok for marks in self.special for s in marks)
+        if bad:
+            notes.append(f"{bad} special points could not be located; their rows say so")
+        stopped = atlas.status is Status.INTERRUPTED  # counts before what else went wrong
+        return (*notes, *reason, *atlas.notes), meta, atlas.status if stopped or status.ok else status
+
+    @cached_property
+    def _common(self) -> dict[str, Any]:
+        """Return what the tables of the map and of its boundaries share."""
+        notes, _, status = self._summary
+        described = self.system.described(without=(self.found.grid.x.moved, self.found.grid.y.moved))
+        return {"title": self.system.model.title, "notes": notes, "parameters": described, "status": status.value}
+
+    @property
+    def _names(self) -> list[tuple[str, str]]:
+        """Return each axis as the name of a column, and its unit."""
+        grid = self.found.grid
+        return [(column_name(a), axis_unit(self.system.model, a)) for a in (grid.x, grid.y)]
+
+    def _coordinates(self, p: Array) -> list[float]:
+        """Return where parameters (n_parameters,) lie on the two axes, in the units that are shown."""
+        model, grid = self.system.model, self.found.grid
+        return [shown(model, a, float(a.quantity(model, p))) for a in (grid.x, grid.y)]
 
     @cached_property
     def table(self) -> Table:
         """Return a row for each point of the grid; `meta` has components and special points."""
-        common, meta = self._common
-        tables = {"components": _plain(self.components), "special": _plain(self.special_points)}
-        return replace(grid_table(self.system.model, self.found, **common), meta={**meta, **tables})
+        import numpy as np
+
+        from srfcli.numerics.map import KINDS, per_slip
+
+        model, found, grid = self.system.model, self.found, self.found.grid
+        p, declared, shape = found.points(model), {q.name: q for q in model.parameters}, found.kind.shape
+        place = {n: np.broadcast_to(p[model.index(n)], shape) for n in ("eps", "V", "W0")}
+        place["K_over_W0"] = np.broadcast_to(p[model.index("K")] / p[model.index("W0")], shape)
+        for axis, along in ((grid.x, np.s_[:, None]), (grid.y, np.s_[None, :])):
+            values = np.array([shown(model, axis, v) for v in axis.samples()])
+            place[column_name(axis)] = np.broadcast_to(values[along], shape)
+        extra = [a for a in (grid.x, grid.y) if column_name(a) not in PLACE]
+        growth = "growth_per_slip" if "D0" in model.names else "growth_rate"
+        kinds = "stable; ns, pd, fold: unstable by a multiplier off the real axis, negative, positive; unresolved"
+        columns = (
+            Column("eps", "1", "modulation amplitude"),
+            Column("type", "", kinds),
+            Column("V", "um/s", "driving velocity"),
+            Column("K_over_W0", "1/um", "stiffness over mean load", ".10g"),
+            Column("W0", "N", "mean load", ".10g"),
+            *(
+                Column(column_name(a), axis_unit(model, a), "" if a.held else declared[a.moved].about, ".10g")
+                for a in extra
+            ),
+            Column("theta", "rad", "angle of the leading multiplier over one forcing period"),
+            Column(growth, *GROWTH[growth]),
+            Column("growth_per_period", "1", "ln of the leading multiplier's modulus over one forcing period"),
+            Column("intervals", "1", "of the mesh"),
+        )
+        cells = place | {
+            "type": np.array(KINDS)[found.kind],
+            "theta": np.abs(np.angle(found.leading)),
+            "intervals": found.mesh,
+        }
+        cells |= {growth: found.growth * per_slip(model, p), "growth_per_period": found.growth}
+        rows = list(zip(*(cells[c.name].ravel().tolist() for c in columns), strict=True))
+        meta = self._summary[1] | {"components": self.components.records(), "special": self.special_points.records()}
+        return Table("srf.map/2", columns, rows, meta=meta, **self._common)
 
     @cached_property
     def components(self) -> Table:
         """Return a row for each connected boundary."""
-        return components_table(self.system.model, self.found, self.atlas, list(self.special), **self._common[0])
+        import numpy as np
+
+        model, grid, rows = self.system.model, self.found.grid, []
+        for k, (branch, marks) in enumerate(zip(self.atlas.branches, self.special, strict=True), 1):
+            p = np.stack([pt.p for pt in branch.points], axis=1)
+            spans = [
+                shown(model, axis, f(axis.quantity(model, p))) for axis in (grid.x, grid.y) for f in (np.min, np.max)
+            ]
+            kinds = "+".join(sorted({pt.kind for pt in branch.points}))
+            folds = Counter(s.axis for s in marks if s.what == "fold")
+            others = ", ".join(sorted({s.what for s in marks} - {"fold"})) or None
+            worst = max(pt.error for pt in branch.points)
+            turned = [folds.get(axis.moved, 0) for axis in (grid.x, grid.y)]
+            rows.append(
+                (k, len(branch.points), kinds, *spans, *turned, others, branch.start.value, branch.end.value, worst)
+            )
+        columns = (
+            Column("component", "1", "number of the connected curve"),
+            Column("points", "1", "on the curve"),
+            Column("type", "", "ns, pd or fold: a multiplier off the real axis, at -1, at +1"),
+            *(Column(f"{n}_{end}", u) for n, u in self._names for end in ("min", "max")),
+            *(Column(f"folds_{n}", "1", f"how often {n} turns round along the curve") for n, _ in self._names),
+            Column("special_points", "", "resonances and other special points on it, folds aside"),
+            Column("start", "", "why the curve begins where it does"),
+            Column("end", "", "why it ends; closed: an island"),
+            Column("error", "1", "largest estimated relative error of its points", ".2g"),
+        )
+        return Table("srf.map.components/1", columns, rows, **self._common)
 
     @cached_property
     def special_points(self) -> Table:
         """Return a row for each fold, resonance and other special point."""
-        return special_table(self.system.model, self.found, list(self.special))
+        axes = {a.moved: column_name(a) for a in (self.found.grid.y, self.found.grid.x)}
+        rows = [
+            (
+                k,
+                f"fold in {axes[s.axis]}" if s.what == "fold" else s.what,
+                *self._coordinates(s.p),
+                s.theta,
+                s.error,
+                s.status.value,
+            )
+            for k, marks in enumerate(self.special, 1)
+            for s in marks
+        ]
+        columns = (
+            Column("component", "1", "number of the connected curve"),
+            Column("point", "", "fold: a parameter turns round; 1:k: resonance"),
+            *(Column(n, u, "", ".10g") for n, u in self._names),
+            Column("theta", "rad", "angle of the critical multiplier over one forcing period"),
+            Column("error", "1", "estimated relative error", ".2g"),
+            Column("status", "", STATUS),
+        )
+        return Table("srf.map.special/1", columns, rows, "special points")
 
     @cached_property
     def boundary(self) -> Table:
         """Return a row for each polished point of the boundaries, with the cubic coefficient of the normal form."""
-        return _points_table(self.system.model, self.atlas, list(self.cubic), self._common[0])
+        from srfcli.numerics.continuation import crossing_numbers
+
+        model, atlas = self.system.model, self.atlas
+        extra = tuple(a.name for a in (atlas.plane.x, atlas.plane.y) if a.name not in ("V", "W0", "eps"))
+        branches = zip(atlas.branches, crossing_numbers(model, atlas), self.cubic, strict=True)
+        rows = [
+            (*boundary_row(model, q, k, number, extra), float(d))
+            for k, (branch, numbers, cubic) in enumerate(branches, 1)
+            for q, number, d in zip(branch.points, numbers, cubic, strict=True)
+        ]
+        about = (
+            "cubic coefficient of the normal form, a period; supercritical where negative, subcritical where positive"
+        )
+        columns = (*boundary_columns(model, extra), Column("cubic", "1", about))
+        return Table("srf.map.boundary/1", columns, rows, **{**self._common, "notes": ()})
 
     def to_xarray(self) -> Any:
         """Return growth and type of stability over the grid as an xarray.Dataset of two dimensions, named as the axes.
@@ -105,7 +258,9 @@ class MapResult(Result):
 
         xarray, grid, table = load_xarray(), self.found.grid, self.table
         cells = zip(*table.rows, strict=True)
-        fields = {c.name: np.array(v).reshape(grid.x.count, grid.y.count) for c, v in zip(table.columns, cells, strict=True)}
+        fields = {
+            c.name: np.array(v).reshape(grid.x.count, grid.y.count) for c, v in zip(table.columns, cells, strict=True)
+        }
         x, y = column_name(grid.x), column_name(grid.y)
         coords = {x: fields.pop(x)[:, 0], y: fields.pop(y)[0]}
         made = xarray.Dataset({name: ((x, y), values) for name, values in fields.items()}, coords=coords)
@@ -129,7 +284,7 @@ class MapResult(Result):
         growth = np.where(np.isfinite(found.leading), found.growth * per_slip(model, p), np.nan)
         lost = np.argwhere(~np.isfinite(found.leading))
         marks = [
-            {"what": s.what, **dict(zip("xy", _coordinates(model, grid, s.p), strict=True))}
+            {"what": s.what, **dict(zip("xy", self._coordinates(s.p), strict=True))}
             for points in self.special
             for s in points
             if s.status.ok
@@ -138,7 +293,7 @@ class MapResult(Result):
             xs,
             ys,
             growth,
-            branches=[_curve(model, grid, b, d) for b, d in zip(self.atlas.branches, self.cubic, strict=True)],
+            branches=[self._curve(b, d) for b, d in zip(self.atlas.branches, self.cubic, strict=True)],
             special=marks,
             unresolved=([xs[i] for i, _ in lost], [ys[j] for _, j in lost]),
             xlabel=label(model, grid.x),
@@ -150,188 +305,17 @@ class MapResult(Result):
             ax=ax,
         )
 
-
-def _summary(
-    model: GeneratedModel, found: StabilityMap, atlas: Atlas, special: list[list[SpecialPoint]], wanted: bool
-) -> tuple[tuple[str, ...], dict[str, Any], Status]:
-    """Return the notes, what JSON holds beside the rows, and the status of the whole."""
-    from srfcli.numerics.map import KINDS
-    from srfcli.numerics.map_boundaries import map_notes, unexplained
-    from srfcli.numerics.special_points import crossings_at
-
-    count = found.kind.size
-    share = {name: float((found.kind == k).sum() / count) for k, name in enumerate(KINDS)}
-    meta: dict[str, Any] = {"share": share, "suspect_cells": len(found.suspect), "points_added": len(found.extra_at)}
-    status = Status.NO_CONVERGENCE if found.lost else Status.OK
-    if not found.finished:
-        left = "interrupted: what was not reached is unresolved, and no boundary was followed"
-        return (left, *map_notes(found)), meta, Status.INTERRUPTED
-    without = int((~model.has_rates(found.points(model))).sum()) if found.lost else 0
-    reason = [f"{Status.NO_VALUE.value} at {without} points: {Status.NO_VALUE.advice}"] if without else []
-    if not wanted:
-        return (*reason, *map_notes(found)), meta, status
-    values = found.points(model)[model.index(found.grid.x.moved), :, 0]
-    met = crossings_at(model, atlas.plane, atlas.branches, values)
-    odd = unexplained(model, found, atlas)
-    meta |= {"crossings": [len(c) for c in met], "unexplained_points": len(odd)}
-    number = len(atlas.branches)
-    notes = [f"{number} component{'' if number == 1 else 's'}; stable at {share['stable']:.1%} of the points"]
-    notes.append(crossing_notes([len(c) for c in met], found.grid.x.name))
-    if len(odd):
-        notes.append(
-            f"the curves do not account for the stability of {len(odd)} of {count} points: one is missing there"
-        )
-        status = Status.NO_CONVERGENCE
-    else:
-        notes.append(f"the curves account for the stability of all {count} points")
-    bad = sum(not s.status.ok for marks in special for s in marks)
-    if bad:
-        notes.append(f"{bad} special points could not be located; their rows say so")
-    stopped = atlas.status is Status.INTERRUPTED  # counts before what else went wrong
-    return (*notes, *reason, *atlas.notes), meta, atlas.status if stopped or status.ok else status
-
-
-def _plain(table: Table) -> list[dict[str, Any]]:
-    names = [c.name for c in table.columns]
-    return [dict(zip(names, row, strict=True)) for row in table.rows]
-
-
-def _points_table(model: GeneratedModel, atlas: Atlas, cubic: list[Array], common: dict[str, Any]) -> Table:
-    """Return the polished points of all components, as `srf continue` lists them, with the cubic coefficient."""
-    from srfcli.numerics.continuation import crossing_numbers
-
-    extra = tuple(a.name for a in (atlas.plane.x, atlas.plane.y) if a.name not in ("V", "W0", "eps"))
-    rows = [
-        (*boundary_row(model, q, k, number, extra), float(d))
-        for k, (branch, numbers) in enumerate(zip(atlas.branches, crossing_numbers(model, atlas), strict=True), 1)
-        for q, number, d in zip(branch.points, numbers, cubic[k - 1], strict=True)
-    ]
-    about = "cubic coefficient of the normal form, a period; supercritical where negative, subcritical where positive"
-    columns = (*boundary_columns(model, extra), Column("cubic", "1", about))
-    return Table("srf.map.boundary/1", columns, rows, **{**common, "notes": ()})
-
-
-def grid_table(model: GeneratedModel, found: StabilityMap, **common: Any) -> Table:
-    """Return the map as one row for each grid point."""
-    import numpy as np
-
-    from srfcli.numerics.map import KINDS, per_slip
-
-    grid, p, declared = found.grid, found.points(model), {q.name: q for q in model.parameters}
-    shape = found.kind.shape
-    place = {n: np.broadcast_to(p[model.index(n)], shape) for n in ("eps", "V", "W0")}
-    place["K_over_W0"] = np.broadcast_to(p[model.index("K")] / p[model.index("W0")], shape)
-    for axis, along in ((grid.x, np.s_[:, None]), (grid.y, np.s_[None, :])):
-        values = np.array([shown(model, axis, v) for v in axis.samples()])
-        place[column_name(axis)] = np.broadcast_to(values[along], shape)
-    extra = [a for a in (grid.x, grid.y) if column_name(a) not in PLACE]
-    growth = "growth_per_slip" if "D0" in model.names else "growth_rate"
-    columns = (
-        Column("eps", "1", "modulation amplitude"),
-        Column("type", "", "stable; ns, pd, fold: unstable by a multiplier off the real axis, negative, positive; unresolved"),
-        Column("V", "um/s", "driving velocity"),
-        Column("K_over_W0", "1/um", "stiffness over mean load", ".10g"),
-        Column("W0", "N", "mean load", ".10g"),
-        *(Column(column_name(a), axis_unit(model, a), declared[a.moved].about if not a.held else "", ".10g") for a in extra),
-        Column("theta", "rad", "angle of the leading multiplier over one forcing period"),
-        Column(growth, *GROWTH[growth]),
-        Column("growth_per_period", "1", "ln of the leading multiplier's modulus over one forcing period"),
-        Column("intervals", "1", "of the mesh"),
-    )
-    cells = place | {"type": np.array(KINDS)[found.kind], "theta": np.abs(np.angle(found.leading)), "intervals": found.mesh}
-    cells |= {growth: found.growth * per_slip(model, p), "growth_per_period": found.growth}
-    rows = list(zip(*(cells[c.name].ravel().tolist() for c in columns), strict=True))
-    return Table("srf.map/2", columns, rows, **common)
-
-
-def components_table(
-    model: GeneratedModel, found: StabilityMap, atlas: Atlas, special: list[list[SpecialPoint]], **common: Any
-) -> Table:
-    """Return one row for each boundary component."""
-    import numpy as np
-
-    grid = found.grid
-    rows = []
-    for k, (branch, marks) in enumerate(zip(atlas.branches, special, strict=True), 1):
-        p = np.stack([pt.p for pt in branch.points], axis=1)
-        spans = [shown(model, axis, f(axis.quantity(model, p))) for axis in (grid.x, grid.y) for f in (np.min, np.max)]
-        kinds = "+".join(sorted({pt.kind for pt in branch.points}))
-        folds = Counter(s.axis for s in marks if s.what == "fold")
-        others = ", ".join(sorted({s.what for s in marks} - {"fold"})) or None
-        worst = max(pt.error for pt in branch.points)
-        turned = [folds.get(axis.moved, 0) for axis in (grid.x, grid.y)]
-        rows.append(
-            (k, len(branch.points), kinds, *spans, *turned, others, branch.start.value, branch.end.value, worst)
-        )
-    names = [(column_name(a), axis_unit(model, a)) for a in (grid.x, grid.y)]
-    columns = (
-        Column("component", "1", "number of the connected curve"),
-        Column("points", "1", "on the curve"),
-        Column("type", "", "ns, pd or fold: a multiplier off the real axis, at -1, at +1"),
-        *(Column(f"{n}_{end}", u) for n, u in names for end in ("min", "max")),
-        *(Column(f"folds_{n}", "1", f"how often {n} turns round along the curve") for n, _ in names),
-        Column("special_points", "", "resonances and other special points on it, folds aside"),
-        Column("start", "", "why the curve begins where it does"),
-        Column("end", "", "why it ends; closed: an island"),
-        Column("error", "1", "largest estimated relative error of its points", ".2g"),
-    )
-    return Table("srf.map.components/1", columns, rows, **common)
-
-
-def special_table(model: GeneratedModel, found: StabilityMap, special: list[list[SpecialPoint]]) -> Table:
-    """Return one row for each fold, resonance and other special point."""
-    grid = found.grid
-    names = [(column_name(a), axis_unit(model, a)) for a in (grid.x, grid.y)]
-    rows = [
-        (
-            k,
-            f"fold in {_axis_name(grid, s.axis)}" if s.what == "fold" else s.what,
-            *(shown(model, a, float(a.quantity(model, s.p))) for a in (grid.x, grid.y)),
-            s.theta,
-            s.error,
-            s.status.value,
-        )
-        for k, marks in enumerate(special, 1)
-        for s in marks
-    ]
-    columns = (
-        Column("component", "1", "number of the connected curve"),
-        Column("point", "", "fold: a parameter turns round; 1:k: resonance"),
-        *(Column(n, u, "", ".10g") for n, u in names),
-        Column("theta", "rad", "angle of the critical multiplier over one forcing period"),
-        Column("error", "1", "estimated relative error", ".2g"),
-        Column("status", "", STATUS),
-    )
-    return Table("srf.map.special/1", columns, rows, "special points")
-
-
-def _axis_name(grid: Any, moved: str) -> str:
-    return next(column_name(a) for a in (grid.x, grid.y) if a.moved == moved)
-
-
-def crossing_notes(counts: list[int], name: str) -> str:
-    """Return how many boundaries vertical lines meet, as a sentence."""
-    seen = sorted(Counter(counts).items())
-    said = ", ".join(f"{n} on {lines}" for n, lines in seen)
-    return f"boundaries met by the {len(counts)} lines of constant {name}: {said}"
-
-
-def _coordinates(model: GeneratedModel, grid: Any, p: Array) -> list[float]:
-    return [shown(model, a, float(a.quantity(model, p))) for a in (grid.x, grid.y)]
-
-
-def _curve(
-    model: GeneratedModel, grid: Any, branch: Branch, cubic: Array
-) -> tuple[list[float], list[float], list[str]]:
-    """Return a branch's coordinates and what it is at each; a closed one ends where it begins."""
-    points = [_coordinates(model, grid, pt.p) for pt in branch.points]
-    if branch.end is Status.CLOSED:
-        points.append(points[0])
-    looks = [
-        "fold" if pt.kind == "fold" else "subcritical" if d > 0 else ""
-        for pt, d in zip(branch.points, cubic, strict=True)
-    ]
-    return [q[0] for q in points], [q[1] for q in points], looks + looks[: len(points) - len(looks)]
+    def _curve(self, branch: Branch, cubic: Array) -> tuple[list[float], list[float], list[str]]:
+        """Return a branch's coordinates and what it is at each; a closed one ends where it begins."""
+        points = [self._coordinates(pt.p) for pt in branch.points]
+        looks = [
+            "fold" if pt.kind == "fold" else "subcritical" if d > 0 else ""
+            for pt, d in zip(branch.points, cubic, strict=True)
+        ]
+        if branch.end is Status.CLOSED:
+            points.append(points[0])
+            looks.append(looks[0])
+        return [q[0] for q in points], [q[1] for q in points], looks
 
 
 def ratio_powers(model: GeneratedModel, held: str, moved: str) -> tuple[int, ...]:
@@ -443,91 +427,113 @@ class ComparisonResult(Result):
     wanted: tuple[float, ...]
     window: Window = field(repr=False)
 
+    @property
+    def _models(self) -> list[GeneratedModel]:
+        return [s.model for s in self.systems]
+
+    def _adjusted(self, k: int) -> dict[str, float]:
+        """Return the parameters that were adjusted of law `k`, in their declared units."""
+        model, m = self._models[k], self.matches[k]
+        return {n: model.declared(n, float(m.p[model.index(n)])) for n in m.adjusted}
+
     @cached_property
     def table(self) -> Table:
         """Return a row for each law and amplitude; the notes say what was matched, and where an experiment tells laws apart."""
-        names, models, matches = list(self.names), [s.model for s in self.systems], list(self.matches)
-        studies = dict(self.studies)
-        pairs, said = sentences(names, models, matches, studies, self.amplitudes, self.window)
-        rows, worst = law_rows(names, matches, studies, self.amplitudes, list(self.wanted), self.window)
-        notes = (*law_notes(names, models, matches, self.goal, self.window), *said)
-        meta = law_meta(names, models, matches, self.goal, pairs)
-        described = self.systems[0].described(without=("V", "W0", "eps"))
-        return Table(
-            "srf.compare/2", COMPARISON_COLUMNS, rows, f"{len(names)} laws", notes, described, meta, worst.value
+        goal, window = self.goal, self.window
+        rows, worst = self._rows()
+        pairs, said = self._contrasts()
+        notes = (
+            f"reference {self.names[0]} at {goal.V:g} um/s: friction {goal.friction:.6g}, slope -d mu/d ln V {goal.slope:.6g}, "
+            f"critical load {goal.W0:.6g} N, period {2 * math.pi / goal.Omega:.6g} s",
+            *(self._matched(k) for k, m in enumerate(self.matches) if m.adjusted),
+            f"looked at V from {window.V[0]:g} to {window.V[1]:g} um/s and W0 from {window.W0[0]:.4g} to {window.W0[1]:.4g} N, "
+            f"{window.columns} x {window.rows} points a map",
+            *said,
         )
+        observed = {"V": goal.V, "friction": goal.friction, "slope": goal.slope, "W0": goal.W0, "Omega": goal.Omega}
+        adjusted = {name: self._adjusted(k) for k, name in enumerate(self.names)}
+        meta = {"pairs": pairs, "adjusted": adjusted, "observables": observed}
+        described = self.systems[0].described(without=("V", "W0", "eps"))
+        title = f"{len(self.names)} laws"
+        return Table("srf.compare/2", COMPARISON_COLUMNS, rows, title, notes, described, meta, worst.value)
+
+    def _rows(self) -> tuple[list[tuple[Any, ...]], Status]:
+        """Return a row under COMPARISON_COLUMNS for each law and wanted amplitude, and the first status that is not ok."""
+        from srfcli.numerics.compare import changed_areas
+
+        rows: list[tuple[Any, ...]] = []
+        statuses = []
+        for k, (name, m) in enumerate(zip(self.names, self.matches, strict=True)):
+            if k not in self.studies:
+                rows.append((name, None, *(None,) * 7, m.miss, m.status.value))
+                statuses.append(m.status)
+                continue
+            study = self.studies[k]
+            begins, ends = (b[1] if math.isfinite(b[1]) else None for b in (study.onset, study.end))
+            for eps in self.wanted:
+                i = self.amplitudes.index(eps)
+                shape = (study.folds[i], len(study.curves[i]), highest_fold(study, i))
+                areas = changed_areas(study.crossings[: i + 1], self.window)
+                rows.append((name, eps, begins, ends, *areas, *shape, m.miss, study.status[i].value))
+                statuses.append(study.status[i])
+        return rows, next((s for s in statuses if not s.ok), Status.OK)
+
+    def _matched(self, k: int) -> str:
+        """Return how well law `k` was matched, and with which parameters."""
+        name, m = self.names[k], self.matches[k]
+        values = ", ".join(f"{n} = {value:.6g}" for n, value in self._adjusted(k).items())
+        if m.status.ok:
+            return f"{name} matched with {values}"
+        return f"{name} could not be matched: {m.miss:.2g} is left with {values}"
+
+    def _contrasts(self) -> tuple[list[dict[str, Any]], list[str]]:
+        """Return for each pair of laws where their critical loads differ most, as data and as a sentence."""
+        from srfcli.numerics.compare import EXPERIMENT, contrast
+
+        pairs, said = [], []
+        for a, b in itertools.combinations(sorted(self.studies), 2):
+            laws = [self.names[a], self.names[b]]
+            best = contrast(self.studies[a], self.studies[b], self.amplitudes, self.window)
+            if best is None:
+                said.append(f"{' and '.join(laws)}: no velocity at which both have a critical load in the window")
+                continue
+            K = [float(self.matches[k].p[self._models[k].index("K")]) for k in (a, b)]
+            ratios = [k / w for k, w in zip(K, best.W0, strict=True)]
+            times = best.difference / EXPERIMENT
+            told = (
+                f"{times:.1f} times the {EXPERIMENT:.0%} of the paper's critical loads"
+                if best.seen
+                else f"not to be told apart by an experiment good to {EXPERIMENT:.0%}"
+            )
+            apart = f"a factor of {1 + best.difference:.3g}" if best.difference > 1 else f"{best.difference:.1%}"
+            said.append(
+                f"{' and '.join(laws)} differ most at V = {best.V:.3g} um/s, eps = {best.eps:.3g}: W0c = {best.W0[0]:.4g} "
+                f"and {best.W0[1]:.4g} N (K/W0 = {ratios[0]:.4g} and {ratios[1]:.4g} /um), {apart}, {told}"
+            )
+            where = {"eps": best.eps, "V": best.V, "W0": list(best.W0), "K_over_W0": ratios}
+            pairs.append({"laws": laws, **where, "difference": best.difference, "seen": bool(best.seen)})
+        return pairs, said
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the boundaries at the largest amplitude over each other, each law named with its matched parameters."""
-        return compare_figure(
-            list(self.names), [s.model for s in self.systems], list(self.matches), dict(self.studies), self.amplitudes,
-            self.window, self.table.parameters, ax,
-        )  # fmt: skip
+        from srfcli.results import plots
 
-
-def law_rows(
-    names: list[str],
-    matches: list[Match],
-    studies: dict[int, LawStudy],
-    amplitudes: tuple[float, ...],
-    wanted: list[float],
-    window: Window,
-) -> tuple[list[tuple[Any, ...]], Status]:
-    """Return a row under COMPARISON_COLUMNS for each law and wanted amplitude, and the worst status among them."""
-    from srfcli.numerics.compare import changed_areas
-
-    rows: list[tuple[Any, ...]] = []
-    statuses = []
-    for k, name in enumerate(names):
-        if k not in studies:
-            rows.append((name, None, *(None,) * 7, matches[k].miss, matches[k].status.value))
-            statuses.append(matches[k].status)
-            continue
-        study, miss = studies[k], matches[k].miss
-        begins, ends = (b[1] if math.isfinite(b[1]) else None for b in (study.onset, study.end))
-        for eps in wanted:
-            i = amplitudes.index(eps)
-            shape = (study.folds[i], len(study.curves[i]), highest_fold(study, i))
-            areas = changed_areas(study.crossings[: i + 1], window)
-            rows.append((name, eps, begins, ends, *areas, *shape, miss, study.status[i].value))
-            statuses.append(study.status[i])
-    return rows, next((s for s in statuses if not s.ok), Status.OK)
-
-
-def law_notes(
-    names: list[str], models: list[GeneratedModel], matches: list[Match], goal: Observables, window: Window
-) -> list[str]:
-    """Return what laws were brought to, with which parameters, and where was looked."""
-    return [
-        f"reference {names[0]} at {goal.V:g} um/s: friction {goal.friction:.6g}, slope -d mu/d ln V {goal.slope:.6g}, "
-        f"critical load {goal.W0:.6g} N, period {2 * math.pi / goal.Omega:.6g} s",
-        *(_said(names[k], models[k], m) for k, m in enumerate(matches) if m.adjusted),
-        f"looked at V from {window.V[0]:g} to {window.V[1]:g} um/s and W0 from {window.W0[0]:.4g} to {window.W0[1]:.4g} N, "
-        f"{window.columns} x {window.rows} points a map",
-    ]
-
-
-def law_meta(
-    names: list[str],
-    models: list[GeneratedModel],
-    matches: list[Match],
-    goal: Observables,
-    pairs: list[dict[str, Any]],
-) -> dict[str, Any]:
-    """Return what JSON holds beside the rows."""
-    fitted = {
-        names[k]: {n: models[k].declared(n, float(m.p[models[k].index(n)])) for n in m.adjusted}
-        for k, m in enumerate(matches)
-    }
-    observed = {"V": goal.V, "friction": goal.friction, "slope": goal.slope, "W0": goal.W0, "Omega": goal.Omega}
-    return {"pairs": pairs, "adjusted": fitted, "observables": observed}
-
-
-def _said(name: str, model: GeneratedModel, m: Match) -> str:
-    values = ", ".join(f"{n} = {model.declared(n, float(m.p[model.index(n)])):.6g}" for n in m.adjusted)
-    if m.status.ok:
-        return f"{name} matched with {values}"
-    return f"{name} could not be matched: {m.miss:.2g} is left with {values}"
+        models, studies = self._models, self.studies
+        first, K = studies[min(studies)].crossings[0][:, 0], float(self.matches[0].p[models[0].index("K")])
+        labels = []
+        for k, (name, model) in enumerate(zip(self.names, models, strict=True)):
+            units = {q.name: q.unit for q in model.parameters}
+            told = ", ".join(plots.valued(n, value, units[n]) for n, value in self._adjusted(k).items())
+            labels.append(f"{plots.name_text(name)}, matched with {told}" if told else plots.name_text(name))
+        branches = [
+            {"eps": k, "label": labels[k], "V": curve[:, 0].tolist(), "K_over_W0": (K / curve[:, 1]).tolist()}
+            for k, study in sorted(studies.items())
+            for curve in study.curves[-1]
+        ]
+        hopf = {"V": self.window.velocities().tolist(), "K_over_W0": (K / first).tolist()}
+        how = "matched at low velocity" if any(m.adjusted for m in self.matches) else "as given"
+        title = f"{len(self.names)} laws, {how}, ε = {self.amplitudes[-1]:g}; {self.names[0]} with"
+        return plots.stability_diagram(branches, hopf=hopf, title=plots.titled(title, self.table.parameters), ax=ax)
 
 
 def highest_fold(study: LawStudy, i: int) -> float | None:
@@ -539,79 +545,3 @@ def highest_fold(study: LawStudy, i: int) -> float | None:
         if before < v > after
     ]
     return max(tops, default=None)
-
-
-def sentences(
-    names: list[str],
-    models: list[GeneratedModel],
-    matches: list[Match],
-    studies: dict[int, LawStudy],
-    amplitudes: tuple[float, ...],
-    window: Window,
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return for each pair of laws where their critical loads differ most, as data and as a sentence."""
-    from srfcli.numerics.compare import EXPERIMENT, contrast
-
-    pairs, said = [], []
-    for a, b in itertools.combinations(sorted(studies), 2):
-        best = contrast(studies[a], studies[b], amplitudes, window)
-        if best is None:
-            said.append(f"{names[a]} and {names[b]}: no velocity at which both have a critical load in the window")
-            continue
-        K = [float(matches[k].p[models[k].index("K")]) for k in (a, b)]
-        ratios = [k / w for k, w in zip(K, best.W0, strict=True)]
-        times = best.difference / EXPERIMENT
-        told = (
-            f"{times:.1f} times the {EXPERIMENT:.0%} of the paper's critical loads"
-            if best.seen
-            else f"not to be told apart by an experiment good to {EXPERIMENT:.0%}"
-        )
-        apart = f"a factor of {1 + best.difference:.3g}" if best.difference > 1 else f"{best.difference:.1%}"
-        said.append(
-            f"{names[a]} and {names[b]} differ most at V = {best.V:.3g} um/s, eps = {best.eps:.3g}: W0c = {best.W0[0]:.4g} "
-            f"and {best.W0[1]:.4g} N (K/W0 = {ratios[0]:.4g} and {ratios[1]:.4g} /um), {apart}, {told}"
-        )
-        pairs.append(
-            {
-                "laws": [names[a], names[b]],
-                "eps": best.eps,
-                "V": best.V,
-                "W0": list(best.W0),
-                "K_over_W0": ratios,
-                "difference": best.difference,
-                "seen": bool(best.seen),
-            }
-        )
-    return pairs, said
-
-
-def compare_figure(
-    names: list[str],
-    models: list[GeneratedModel],
-    matches: list[Match],
-    studies: dict[int, LawStudy],
-    amplitudes: tuple[float, ...],
-    window: Window,
-    described: Mapping[str, Mapping[str, Any]],
-    ax: Axes | None = None,
-) -> Figure:
-    """Return the laws' boundaries at the largest amplitude over each other, each named with the parameters it was given."""
-    from srfcli.results import plots
-
-    first, K = studies[min(studies)].crossings[0][:, 0], float(matches[0].p[models[0].index("K")])
-    labels = []
-    for name, model, m in zip(names, models, matches, strict=True):
-        values = {n: model.declared(n, float(m.p[model.index(n)])) for n in m.adjusted}
-        units = {q.name: q.unit for q in model.parameters}
-        told = ", ".join(plots.valued(n, value, units[n]) for n, value in values.items())
-        labels.append(f"{plots.name_text(name)}, matched with {told}" if told else plots.name_text(name))
-    branches = [
-        {"eps": k, "label": labels[k], "V": curve[:, 0].tolist(), "K_over_W0": (K / curve[:, 1]).tolist()}
-        for k, study in sorted(studies.items())
-        for curve in study.curves[-1]
-    ]
-    hopf = {"V": window.velocities().tolist(), "K_over_W0": (K / first).tolist()}
-    matched = any(m.adjusted for m in matches)
-    title = f"{len(names)} laws, {'matched at low velocity' if matched else 'as given'}, ε = {amplitudes[-1]:g}"
-    title = plots.titled(f"{title}; {names[0]} with", described)
-    return plots.stability_diagram(branches, hopf=hopf, title=title, ax=ax)

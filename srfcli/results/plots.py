@@ -37,13 +37,8 @@ SYMBOLS = {
     "lambda": "λ", "alpha": "α", "phi": "φ",
 }  # fmt: skip
 HEADING, LINE, MARGIN = 9.0, 0.155, 0.012  # points and inches of a heading's line; its margin, of the figure's width
-NAME, NAME_ROW, NAME_WIDTH = (
-    9.0,
-    0.19,
-    0.075,
-)  # points of a curve's name below the axes, inches of a row and of a letter
-HANDLE = 0.65  # inches beside a name
-
+NAME = 9.0  # points of a curve's name below the axes
+NAME_ROW, NAME_WIDTH, HANDLE = 0.19, 0.075, 0.65  # inches of a row of names, of a letter, and of the line beside a name
 SCREEN = 90.0  # dots per inch in a notebook
 
 STYLE: dict[str, Any] = {
@@ -76,7 +71,7 @@ _METADATA: dict[str, dict[str, Any]] = {
 
 
 def check_plot(path: Path, *, force: bool) -> None:
-    """Raise SrfError now if a figure could not be saved at `path` later; matplotlib is looked for but not imported."""
+    """Raise SrfError where a figure could not be saved at `path`; matplotlib is looked for but not imported."""
     if path.suffix.lower() not in SUFFIXES:
         got = f"ends in {path.suffix!r}" if path.suffix else "has no ending"
         raise SrfError(f"--plot {path} {got}", f"End it in {', '.join(SUFFIXES)}: --plot {path.with_suffix('.svg')}")
@@ -90,7 +85,7 @@ def _missing() -> SrfError:
 
 
 def load_matplotlib() -> None:
-    """Import matplotlib from elsewhere than the current folder, whose `matplotlibrc` it would read: it may be a stranger's."""
+    """Import matplotlib from another folder than the current one, whose `matplotlibrc` it would read and which is not trusted."""
     if "matplotlib" in sys.modules:
         return
     try:
@@ -185,7 +180,9 @@ def heading(figure: Figure, text: str) -> None:
     """
     if not text:
         return
-    lines = [broken for line in text.split("\n") for broken in _broken(line, figure, (1 - 2 * MARGIN) * figure.bbox.width)]
+    lines = [
+        broken for line in text.split("\n") for broken in _broken(line, figure, (1 - 2 * MARGIN) * figure.bbox.width)
+    ]
     figure.set_figheight(figure.get_figheight() + LINE * len(lines[1:]))
     figure.suptitle("\n".join(lines), x=MARGIN, ha="left", fontsize=HEADING, linespacing=1.3)
 
@@ -227,7 +224,9 @@ def one_panel(ax: Axes | None, *, title: str, size: tuple[float, float] | None =
     with house_style():
         if ax is not None:
             yield cast("Figure", ax.figure), ax
-            ax.set_title("\n".join(_broken(title.split("\n")[0], cast("Figure", ax.figure), ax.bbox.width)), fontsize=HEADING)
+            ax.set_title(
+                "\n".join(_broken(title.split("\n")[0], cast("Figure", ax.figure), ax.bbox.width)), fontsize=HEADING
+            )
             if len(ax.get_legend_handles_labels()[1]) > 1:
                 ax.legend(loc="best", handlelength=2.8, fontsize=NAME)
             return
@@ -244,8 +243,6 @@ def stability_diagram(
     *,
     hopf: Mapping[str, Any] | None = None,
     title: str = "",
-    xlabel: str = "V  [µm/s]",
-    ylabel: str = "K/W$_0$  [1/µm]",
     ax: Axes | None = None,
 ) -> Figure:
     """Return the stability boundaries K/W0 (1/um) against V (um/s, logarithmic), drawn in `ax` if that is given.
@@ -260,7 +257,7 @@ def stability_diagram(
             ax.plot(hopf["V"], _gaps(hopf["K_over_W0"]), color="#555555", linestyle=DOTTED, label="ε = 0 (Hopf)")
         _draw_branches(ax, branches)
         amplitudes = {b["eps"] for b in branches}
-        ax.set(xlabel=xlabel, ylabel=ylabel)
+        ax.set(xlabel="V  [µm/s]", ylabel="K/W$_0$  [1/µm]")
         _frame_curves(ax)
         if len(amplitudes) == 1 or (hopf is not None and not branches):
             curves = [(b["V"], b["K_over_W0"]) for b in branches] or [(hopf["V"], hopf["K_over_W0"])]  # type: ignore[index]
@@ -410,7 +407,6 @@ def lines(
     ylabel: str,
     logx: bool = False,
     *,
-    logy: bool = False,
     title: str = "",
     ax: Axes | None = None,
 ) -> Figure:
@@ -423,8 +419,6 @@ def lines(
             ax.plot(_gaps(x), drawn, color=colour, linestyle=dash, label=label, marker=marker, markersize=4)
         if logx:
             ax.set_xscale("log")
-        if logy:
-            ax.set_yscale("log")
         ax.margins(x=0.0 if len(x) > 1 else 0.05)
         ax.set(xlabel=xlabel, ylabel=ylabel)
         decade_ticks(ax)
@@ -443,7 +437,7 @@ def orbit(
 ) -> Figure:
     """Return one forced period, panels over tau in periods: u (um), v (um/s, logarithmic), ages (s), mu and W (N)."""
     panels: list[tuple[str, Values, bool, str]] = [("u  [µm]", u, False, "u"), ("v  [µm/s]", v, True, "v")]
-    panels += [(f"{_greek(name)}  [s]", values, True, "state") for name, values in states.items()]
+    panels += [(f"{n.replace('phi', 'φ').replace('_', ' ')}  [s]", ages, True, "state") for n, ages in states.items()]
     panels += [("µ", mu, False, "mu"), ("W  [N]", W, False, "W")]
     with house_style():
         figure, axes = new_figure(len(panels), size=(6.0, 1.15 * len(panels) + 0.9))
@@ -462,10 +456,6 @@ def orbit(
         axes[-1].set_xlabel("time  [periods of the load]")
         figure.align_ylabels(axes)
         return figure
-
-
-def _greek(name: str) -> str:
-    return name.replace("phi", "φ").replace("_", " ")
 
 
 def decade_ticks(ax: Axes) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from srfcli.laws.values import Law
 from srfcli.results.tables import json_text, plain_value
 
 SCHEMA = "srf.provenance/1"
-_LIBRARIES = ("click", "matplotlib", "numpy", "pint", "scipy", "sympy")
+LIBRARIES = ("click", "matplotlib", "numpy", "pint", "scipy", "sympy")
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,6 @@ def write_result(path: Path, content: bytes, provenance: Provenance | None) -> P
     return sidecar_path(path)
 
 
-def write_sidecar(path: Path, content: bytes, provenance: Provenance) -> Path:
-    """Write the sidecar of the result `content` at `path` and return its place."""
-    write_atomic(sidecar_path(path), sidecar(path, content, provenance))
-    return sidecar_path(path)
-
-
 def sidecar(path: Path, content: bytes, provenance: Provenance) -> str:
     """Return the text of the sidecar of the result `content` at `path`; the timings are its last key."""
     data = {"schema": SCHEMA, "file": path.name, "sha256": hashlib.sha256(content).hexdigest(), **describe(provenance)}
@@ -93,12 +87,12 @@ def file_hash(path: Path) -> str | None:
         return None
 
 
-def versions(libraries: Iterable[str] = _LIBRARIES) -> dict[str, str]:
+def versions() -> dict[str, str]:
     """Return the versions of srf, Python and the installed libraries, without importing any."""
     from importlib import metadata  # costs a sixth of the start, and only sidecars need it
 
     found = {"srf": __version__, "python": platform.python_version()}
-    for name in libraries:
+    for name in LIBRARIES:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

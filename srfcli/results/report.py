@@ -23,7 +23,6 @@ from srfcli.results.provenance import sidecar_path
 from srfcli.results.report_figures import (
     LEVEL,
     Trace,
-    atlas_figure,
     axis_text,
     diagram_figure,
     force_by_state,
@@ -32,8 +31,8 @@ from srfcli.results.report_figures import (
     loads_figure,
     overview,
     parameters_figure,
-    rms_over_noise,
     run_figure,
+    scan_figure,
     spots,
     trace,
 )
@@ -53,13 +52,12 @@ from srfcli.results.report_text import (
     unit_text,
     verdict_sentence,
     with_error,
+    with_unit,
 )
 from srfcli.results.tables import plain_value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-# What stands in the report of a diagnosis, section by section, from the answer, its material and finished pictures.
 
 # What stands in the report of a diagnosis, section by section, from the answer, its material and finished pictures.
 
@@ -108,13 +106,6 @@ class Matter:
     def loads(self) -> list[Mapping[str, Any]]:
         """Return the tables of critical loads: name, held out or not, and chi2 under both models."""
         return list(self.tables.get("thresholds") or ())
-
-    def rms(self, one: Trace) -> tuple[float, float]:
-        """Return a run's residual over noise, whitened where the material has it so, before and after."""
-        given = next((r.get("rms") for r in self.tables["runs"] if r["name"] == one.name), None)
-        found = (given[0], given[1]) if given else (rms_over_noise(one.before), rms_over_noise(one.after))
-        before, after = (float("inf") if value is None else value for value in found)  # of a run that a model cannot follow
-        return before, after
 
     def figure(self, name: str, alt: str, caption: Any = "", *, small: bool = False) -> Markup:
         """Return a figure, or nothing where it was not drawn."""
@@ -178,7 +169,7 @@ def places(matter: Matter) -> Markup:
     parts += [_run(matter, one) for one in matter.fitted[1:SHOWN]]
     if len(matter.fitted) > SHOWN:
         parts.append(tag("p", f"The other {len(matter.fitted) - SHOWN} runs are drawn in the folder figures."))
-    return section("where", "Where simulation and recording part", parts, critical_loads(matter), atlas(matter))
+    return section("where", "Where simulation and recording part", parts, critical_loads(matter), residual_scan(matter))
 
 
 def critical_loads(matter: Matter) -> list[Any]:
@@ -203,7 +194,7 @@ def _run_table(matter: Matter) -> Markup:
     """Return the fitted runs with their residuals and, where any stands out, their parts of the misfit."""
     located, rows = {r["name"]: r for r in matter.located}, []
     for one in matter.fitted:
-        place, both = located.get(one.name, {}), matter.rms(one)
+        place, both = located.get(one.name, {}), one.rms
         row = [one.name, rms(both[0])] + ([] if matter.same else [rms(both[1])])
         if located:
             where = spans(merged(place.get("windows") or one.windows)) or "nowhere in particular"
@@ -270,7 +261,7 @@ def merged(windows: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
 
 
 def _run(matter: Matter, one: Trace) -> Markup:
-    before, after = matter.rms(one)
+    before, after = one.rms
     fell = f"{rms(before)}" if matter.same else f"{rms(before)} before, {rms(after)} after"
     where = f"; they part at the shaded times, furthest from {spans([one.worst])}" if one.worst else ""
     alt = f"Run {one.name}: recording, simulations and residuals over time{where}."
@@ -280,16 +271,15 @@ def _run(matter: Matter, one: Trace) -> Markup:
     return matter.figure(f"run {one.name}", alt, caption)
 
 
-def atlas(matter: Matter) -> Markup:
-    """Return with which phase, frequency and quantity of state the misfit goes."""
+def residual_scan(matter: Matter) -> Markup:
+    """Return the residual scan: phases, frequencies and quantities of state that the misfit goes with."""
     found = spots(matter.tables.get("atlas") or ())
     if not found:
         return Markup("")
     rows = [
         [axis_text(s.axis), s.place, s.run or "all", number(s.height), probability(s.p_value)] for s in foremost(found)
     ]
-    known = any(finite(r.get("log_p")) for r in matter.tables["atlas"])
-    heads = ["looked at by", "place", "run", "−log10 p" if known else "|statistic|", "p, adjusted"]
+    heads = ["looked at by", "place", "run", "−log10 p", "p, adjusted"]
     caption = "What stands out most; the last column allows for all that was looked at."
     figure = matter.figure(
         "atlas",
@@ -315,8 +305,7 @@ def left_out(matter: Matter) -> Markup:
     parting = matter.tables.get("parting")
     if parting:
         parts.append(tag("h3", "The experiment that would part them"))
-        told = [parting] if isinstance(parting, str) else [str(p) for p in parting]
-        parts += [commands([p.rstrip()]) if p.startswith("[[runs]]") else tag("p", p) for p in told]
+        parts += [commands([p.rstrip()]) if p.startswith("[[runs]]") else tag("p", p) for p in parting]
     return section("left-out", "What was left out", parts)
 
 
@@ -338,8 +327,14 @@ def hypotheses(matter: Matter) -> Markup:
         label = "the baseline alone" if r["name"] == "none" else r["name"]
         sure = confidence.get("+".join(sorted(names)), r.get("confidence"))
         rows.append(
-            [label, number(r["evidence"] - top), rms(r["rms_over_noise"]), number(r.get("field") or 0.0, 2), percent(sure),
-             r.get("against") or ""]
+            [
+                label,
+                number(r["evidence"] - top),
+                rms(r["rms_over_noise"]),
+                number(r.get("field") or 0.0, 2),
+                percent(sure),
+                r.get("against") or "",
+            ]
         )
     caption = (
         "Everything that was fitted in full, best first: log evidence against the best, innovations over noise, the amplitude of "
@@ -356,10 +351,8 @@ def scores(matter: Matter) -> Markup:
         return Markup("")
     rows = []
     for s in found:
-        unit = unit_text(s.get("unit"))
-        tail = f" {unit}" if unit else ""
         size, least = with_error(s.get("size"), s.get("stderr")), number(s.get("detectable"), 2)
-        rows.append([s["effect"], number(s.get("gain")), size + tail, percent(s.get("surviving")), least + tail])
+        rows.append([s["effect"], number(s.get("gain")), size, percent(s.get("surviving")), least])
     caption = (
         "At first order: the gain in log likelihood that each effect promises, the size it would have from its neutral value, "
         "the share of its signal that the baseline's own parameters cannot absorb, and the smallest size that this experiment "
@@ -404,7 +397,7 @@ def held_out(matter: Matter) -> Markup:
         return section("held-out", "Runs that the fit never saw", tag("p", text))
     rows = []
     for one in matter.held:
-        before, after = matter.rms(one)
+        before, after = one.rms
         word = "better" if after < 0.99 * before else "worse" if after > 1.01 * before else "alike"
         word = word if min(before, after) < float("inf") else "not at all"
         rows.append([one.name, rms(before)] + ([] if matter.same else [rms(after), word]))
@@ -412,13 +405,8 @@ def held_out(matter: Matter) -> Markup:
     text = "These were opened only after the model was final."
     shown = [_run(matter, one) for one in matter.held[:SHOWN]]
     caption = "Residual over noise."
-    return section(
-        "held-out",
-        "Runs that the fit never saw",
-        tag("p", text),
-        table(heads, rows, caption=caption, numeric=(1, 2)),
-        shown,
-    )
+    found = table(heads, rows, caption=caption, numeric=(1, 2))
+    return section("held-out", "Runs that the fit never saw", tag("p", text), found, shown)
 
 
 def missing_force(matter: Matter) -> Markup:
@@ -459,7 +447,7 @@ def onward(matter: Matter) -> Markup:
     files = [p for pattern in FILES for p in sorted(matter.folder.glob(pattern)) if p.is_file()]
     names = [p.relative_to(matter.folder).as_posix() for p in files]
     items = [tag("li", tag("a", name, href=quote(name))) for name in names]
-    lines = matter.tables.get("commands") or command_lines(matter.answer, names)
+    lines = command_lines(matter.answer, names)
     parts = [tag("p", "Typed in the folder of this report:"), commands(lines)] if lines else []
     return section("onward", "The model, and how to go on", parts, tag("ul", items) if items else "")
 
@@ -657,15 +645,17 @@ Drawing = tuple[str, Callable[..., "Figure | None"]]
 def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str, Any]) -> tuple[Path, ...]:
     """Write report.html and figures/*.svg, *.png into `folder`, each whole or not at all, and return their places.
 
-    `answer` is the object of the format srf.diagnose/1. `material` has
-    runs: {name, holdout, t, observed, used, baseline, augmented, noise_level, V, W, windows} with arrays (n,), t in s, V in um/s,
-    W in N; optional: observable or label, rms (before, after);
-    atlas: {axis, run, statistic, p_value, log_p, and low, high or bin};
-    ranked: {name, evidence, rms_over_noise, p_value}; scores: {effect, gain, size, stderr, surviving, detectable, unit};
-    parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma}.
-    thresholds: {name, holdout, table, chi2 (before, after)}, with baseline and augmented, critical loads (n,) in N, if any.
-    Optional: title; about {effect: a phrase}; parting, paragraphs on a run that parts what is ambiguous; commands, lines to go
-    on with; force {run: {t, force, band, v, phi, W}, "form": text, "unit": text}; diagram {V, W0_baseline, W0_augmented, note}.
+    `answer` is the object of the format srf.diagnose/1. `material` is that of `srfcli.diagnosis.answer.material`:
+    title; about {effect: a phrase};
+    runs: {name, holdout, label, load_unit, t, observed, used, baseline, augmented, V, W, windows} with arrays (n,), t in s, V in
+    um/s, and of baseline and augmented model: white, rms, friction;
+    thresholds: {name, holdout, table, baseline, augmented, chi2 (of both models)}, critical loads (n,) in N;
+    atlas, the residual scan: {axis, run, kind, low, high, log_p, p_value};
+    ranked: {name, evidence, rms_over_noise, field, confidence, against};
+    scores: {effect, gain, size, stderr, surviving, detectable};
+    parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma};
+    and, where there are any, parting: paragraphs on the discriminating run; force {run: {t, force, band (2, n), v, phi, W},
+    "form": text}; diagram {V, note, and for baseline and augmented model: W0, V of these, W0_hopf}.
     Without matplotlib the page has all but the figures, and says so.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -674,8 +664,7 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     written: list[Path] = []
     pictures: dict[str, bytes] = {}
     if importlib.util.find_spec("matplotlib") is not None:
-        for name, content in _drawn(folder / FIGURES, traces, material, written):
-            pictures[name] = content
+        pictures = dict(_drawn(folder / FIGURES, traces, material, written))
     matter = Matter(plain_value(answer), tables, traces, pictures, folder)
     write_atomic(folder / PAGE, _page(matter))
     return (*written, folder / PAGE)
@@ -688,12 +677,9 @@ def _tables(material: Mapping[str, Any]) -> dict[str, Any]:
         {"name": str(t["name"]), "holdout": bool(t["holdout"]), "chi2": plain_value(t["chi2"]), "size": len(t["table"])}
         for t in material.get("thresholds", ())
     ]
-    found["runs"] = [
-        {"name": str(r["name"]), "rms": plain_value(r.get("rms")), "holdout": bool(r.get("holdout"))}
-        for r in material.get("runs", ())
-    ]
+    found["runs"] = [{"name": str(r["name"]), "holdout": bool(r["holdout"])} for r in material.get("runs", ())]
     force, diagram = material.get("force") or {}, material.get("diagram") or {}
-    found["force"] = {k: force[k] for k in ("form", "unit") if force.get(k)} | ({"runs": True} if force else {})
+    found["force"] = {"form": force.get("form")} if force else {}
     found["diagram"] = {"note": diagram.get("note"), "marks": plain_value(diagram.get("marks") or ())}
     return found
 
@@ -737,19 +723,16 @@ def _drawings(traces: tuple[Trace, ...], material: Mapping[str, Any]) -> Iterato
         yield f"run {one.name}", partial(run_figure, one)
     for loads in material.get("thresholds", ()):
         yield f"loads {loads['name']}", partial(loads_figure, loads)
-    yield "atlas", partial(atlas_figure, plain_value(material.get("atlas") or ()))
+    yield "atlas", partial(scan_figure, plain_value(material.get("atlas") or ()))
     changed = any(t["chi2"][0] != t["chi2"][1] for t in material.get("thresholds", ()))
     if changed or not all(one.same for one in traces):
         yield "parameters", partial(parameters_figure, plain_value(material.get("parameters") or ()))
     force = material.get("force") or {}
-    unit, runs = (
-        str(force.get("unit", "N")),
-        {str(k): v for k, v in force.items() if isinstance(v, Mapping) and "t" in v},
-    )
+    runs = {str(k): v for k, v in force.items() if isinstance(v, Mapping) and "t" in v}
     for name, one_force in runs.items():
-        yield f"force {name}", partial(force_figure, name, one_force, unit=unit)
+        yield f"force {name}", partial(force_figure, name, one_force)
     if runs:
-        yield "force-by-state", partial(force_by_state, runs, unit=unit)
+        yield "force-by-state", partial(force_by_state, runs)
     if material.get("diagram"):
         yield "diagram", partial(diagram_figure, material["diagram"])
 
@@ -758,16 +741,8 @@ def _page(matter: Matter) -> str:
     sentence = verdict_sentence(matter.answer, matter.tables)
     verdict = str(matter.answer.get("verdict"))
     title = str(matter.tables.get("title") or "Diagnosis")
-    parts = [
-        places(matter),
-        left_out(matter),
-        missing_force(matter),
-        parameters(matter),
-        held_out(matter),
-        diagram(matter),
-        onward(matter),
-    ]
-    shown = [p for p in parts if p]
+    sections = (places, left_out, missing_force, parameters, held_out, diagram, onward)
+    shown = [made for made in (one(matter) for one in sections) if made]
     links = [
         tag("a", Markup(m[2]), href=f"#{m[1]}")
         for p in shown
@@ -852,23 +827,21 @@ def _headline(data: Mapping[str, Any]) -> str:
     """Return what was found, in a sentence."""
     notes, rows = [str(n) for n in data.get("notes") or ()], list(data.get("rows") or ())
     if _kind(data) in (KINDS["fit"], KINDS["fit-thresholds"]):
-        best = min((data.get("meta") or {}).get("methods") or [{}], key=lambda m: m.get("chi2", 0.0))  # of critical loads
+        best = min(
+            (data.get("meta") or {}).get("methods") or [{}], key=lambda m: m.get("chi2", 0.0)
+        )  # of critical loads
         told = []
         for row in rows:
             if row.get("method") == best.get("method"):
-                unit = unit_text(row.get("unit"))
-                value = bracketed(row.get("value"), row.get("stderr"))
-                told.append(f"{row['parameter']} = {value}" + (f"{NO_BREAK}{unit}" if unit else ""))
+                value = with_unit(bracketed(row.get("value"), row.get("stderr")), row.get("unit"))
+                told.append(f"{row['parameter']} = {value}")
         ratio = ((data.get("meta") or {}).get("rms_over_noise") or {}).get("fit")
         tail = f"; residuals are {number(ratio)} times the noise" if finite(ratio) else ""
         if finite(best.get("chi2")):
             tail = f"; χ² is {number(best['chi2'])} on {best.get('freedom')} degrees of freedom"
         return ", ".join(told) + tail + _state(data)
-    return (
-        f"{notes[0][:1].upper()}{notes[0][1:]}{_state(data)}"
-        if notes
-        else f"{_kind(data)}: {len(rows)} rows{_state(data)}"
-    )
+    found = f"{notes[0][:1].upper()}{notes[0][1:]}" if notes else f"{_kind(data)}: {len(rows)} rows"
+    return found + _state(data)
 
 
 def _state(data: Mapping[str, Any]) -> str:
@@ -888,22 +861,13 @@ def _result(folder: Path, path: Path, data: Mapping[str, Any]) -> Markup:
     parts.append(_table(data))
     flagged = [r for r in data.get("rows") or () if r.get("flag") not in (None, "", "ok")]
     if flagged:
-        parts.append(
-            tag(
-                "p",
-                "To be known before the values are used: "
-                + "; ".join(f"{r['parameter']}: {r['flag']}" for r in flagged)
-                + ".",
-            )
-        )
+        told = "; ".join(f"{r['parameter']}: {r['flag']}" for r in flagged)
+        parts.append(tag("p", f"To be known before the values are used: {told}."))
     runs = (data.get("meta") or {}).get("runs")
     if isinstance(runs, list) and runs and isinstance(runs[0], dict) and "rms_over_noise" in runs[0]:
         rows = [[r["run"], r["role"], r.get("used", r.get("samples")), number(r["rms_over_noise"])] for r in runs]
-        parts.append(
-            table(
-                ["run", "role", "samples", "residual / noise"], rows, caption="How each run is fitted.", numeric=(2, 3)
-            )
-        )
+        heads = ["run", "role", "samples", "residual / noise"]
+        parts.append(table(heads, rows, caption="How each run is fitted.", numeric=(2, 3)))
     notes = [str(n) for n in data.get("notes") or ()]
     if notes:
         parts.append(tag("ul", [tag("li", n) for n in notes]))

@@ -1,11 +1,11 @@
-"""Figures of a diagnosis' report: runs and residuals, the scan of places, what was found."""
+"""Figures of a diagnosis' report: runs and residuals, the residual scan, what was found."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,13 +17,13 @@ from srfcli.results.plots import (
     DASHES,
     DOTTED,
     _gaps,
+    bare_figure,
     decade_ticks,
     house_style,
-    load_matplotlib,
     name_text,
     new_figure,
 )
-from srfcli.results.report_text import NO_BREAK, finite, number
+from srfcli.results.report_text import finite, number, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,7 +43,6 @@ PEAK = 0.3  # of a residual's power in one line, from which it has a period
 FAINT = 2.0  # of the noise's variance: less than that needs no close-up
 ZOOM = 0.3  # of a run: a close-up of more would show nothing new
 VARIES = 1e-3  # relative variation of a load from which it is worth a panel
-LABELS = {"elongation": "elongation  [µm]", "force": "force  [N]", "friction": "friction coefficient"}
 NARROW_FIGURE = 4.3  # inches: a figure for a small screen, whose text keeps its size there
 GAP = 5.0  # usual steps in time after which a record has a gap
 BESIDE = 5  # steps before it, and after, that tell the usual one: a record may change its sampling rate
@@ -52,35 +51,28 @@ SAME = 1e-9  # of the noise: predictions that differ by less are one
 
 @dataclass(frozen=True)
 class Trace:
-    """One run as it is drawn: arrays (n,) of the samples that are compared, residuals `before`, `after` over the noise.
+    """One run as it is drawn: arrays (n,) of the samples that are compared, in the units of the recording.
 
-    `white` has these two where each sample has a noise of its own, `unexplained` the friction that each model leaves to chance.
+    `before` and `after` are the innovations of baseline and augmented model over their standard deviations, `rms` their root
+    mean squares, infinite for a run that a model cannot follow. `unexplained` is the friction that each model leaves to its
+    random field.
     """
 
     name: str
     holdout: bool
     label: str
+    load_unit: str
     t: Array = field(repr=False)
     observed: Array = field(repr=False)
     baseline: Array = field(repr=False)
     augmented: Array = field(repr=False)
-    noise: float
+    before: Array = field(repr=False)
+    after: Array = field(repr=False)
     V: Array = field(repr=False)
     W: Array = field(repr=False)
     windows: tuple[tuple[float, float], ...]
-    load_unit: str = "N"
-    white: tuple[Array, Array] | None = field(default=None, repr=False)
+    rms: tuple[float, float]
     unexplained: tuple[Array, Array] | None = field(default=None, repr=False)
-
-    @property
-    def before(self) -> Array:
-        """Return the baseline's residual over the noise."""
-        return self.white[0] if self.white else np.asarray((self.observed - self.baseline) / self.noise)
-
-    @property
-    def after(self) -> Array:
-        """Return the augmented model's residual over the noise."""
-        return self.white[1] if self.white else np.asarray((self.observed - self.augmented) / self.noise)
 
     @property
     def same(self) -> bool:
@@ -105,31 +97,18 @@ class Trace:
 def trace(run: Mapping[str, Any]) -> Trace:
     """Return a run of the material, without the samples that are not compared or at which a model has no value."""
     arrays = {k: np.asarray(run[k], dtype=float) for k in ("t", "observed", "baseline", "augmented", "V", "W")}
-    t = arrays["t"]
-    good = np.asarray(run.get("used", np.ones(t.shape, dtype=bool)), dtype=bool).copy()
-    for values in arrays.values():
+    arrays |= {k: np.asarray(z, dtype=float) for k, z in zip(("before", "after"), run["white"], strict=True)}
+    field = [np.asarray(x, dtype=float) for x in run["friction"] if x is not None]
+    good = np.asarray(run["used"], dtype=bool).copy()
+    for values in (*arrays.values(), *field):
         good &= np.isfinite(values)
-    pairs: dict[str, tuple[Array, Array] | None] = {"white": None, "friction": None}
-    for key in pairs:
-        if run.get(key) is not None and all(x is not None for x in run[key]):
-            first, second = (np.asarray(x, dtype=float) for x in run[key])
-            good &= np.isfinite(first) & np.isfinite(second)
-            pairs[key] = first, second
-    windows = tuple((float(a), float(b)) for a, b in run.get("windows", ()))
-    noise = float(run.get("noise_level") or 0.0)
-    kept = {k: values[good] for k, values in arrays.items()}
-    white, unexplained = (None if pair is None else (pair[0][good], pair[1][good]) for pair in pairs.values())
+    before, after = (float(x) if np.isfinite(x) else math.inf for x in run["rms"])
     return Trace(
-        str(run["name"]),
-        bool(run.get("holdout")),
-        str(run.get("label") or LABELS.get(str(run.get("observable")), "observed  [µm]")),
-        **kept,
-        noise=noise if noise > 0 else max(float(np.std(kept["observed"])) * 1e-3, 1e-12) if kept["t"].size else 1.0,
-        windows=windows,
-        load_unit=str(run.get("load_unit") or "N"),
-        white=white,
-        unexplained=unexplained if unexplained is not None and any(np.any(x) for x in unexplained) else None,
-    )
+        str(run["name"]), bool(run["holdout"]), str(run["label"]), str(run["load_unit"]),
+        **{k: values[good] for k, values in arrays.items()},
+        windows=tuple((float(a), float(b)) for a, b in run["windows"]), rms=(before, after),
+        unexplained=(field[0][good], field[1][good]) if len(field) == 2 and any(np.any(x[good]) for x in field) else None,
+    )  # fmt: skip
 
 
 def rms_over_noise(z: Array) -> float:
@@ -149,19 +128,15 @@ def overview(traces: Sequence[Trace], *, narrow: bool = False) -> Figure:
 
     `narrow` sets the two models below each other, for a small screen.
     """
-    load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
-
     both = not all(x.same for x in traces)
     local = [(x, local_rms(x.t, x.before), local_rms(x.t, x.after)) for x in traces if x.t.size > 1]
     top = max((float(np.max(r)) for _, *two in local for _, r in two), default=1.0)
     with house_style():
+        from matplotlib.colors import LogNorm
+
         count = 2 if both else 1
         lines = count if narrow else 1
-        figure = Figure(figsize=(NARROW_FIGURE if narrow else 9.6, lines * (0.36 * len(local) + 0.7) + 0.8))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((NARROW_FIGURE if narrow else 9.6, lines * (0.36 * len(local) + 0.7) + 0.8))
         axes = figure.subplots(lines, count // lines, sharex=True, sharey=True, squeeze=False).ravel()
         for k, (axis, title) in enumerate(zip(axes, ("baseline", "augmented model"), strict=False)):
             for row, (one, *found) in enumerate(local):
@@ -208,17 +183,12 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
 
     `narrow` leaves the close-up out and gives the legend a row of its own, for a small screen.
     """
-    load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     imposed = [k for k in ("V", "W") if np.ptp(getattr(one, k)) > VARIES * float(np.abs(getattr(one, k)).max())]
     piece = None if narrow else close_up(one)
     friction = one.unexplained is not None
     heights = [3.0, 2.2, 1.1, *[1.3] * friction, *[0.75] * len(imposed)]
     with house_style():
-        figure = Figure(figsize=(NARROW_FIGURE if narrow else 10.4 if piece else 9.0, 0.72 * sum(heights) + 1.1))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((NARROW_FIGURE if narrow else 10.4 if piece else 9.0, 0.72 * sum(heights) + 1.1))
         widths = (1.75, 1.0) if piece else (1.0,)
         grid = figure.add_gridspec(len(heights), len(widths), height_ratios=heights, width_ratios=widths)
         axes = _column(figure, grid, 0, [slice(i, i + 1) for i in range(len(heights))])
@@ -422,10 +392,9 @@ def _pieces(t: Array) -> list[tuple[int, int]]:
     return [(a, b) for a, b in itertools.pairwise(borders) if b > a]
 
 
-# The atlas of places at which a misfit was looked for: its rows in one form, a figure of them, the foremost in words.
+# The residual scan: its rows as `Spot`, the foremost of them, and a figure.
 
 BINS = 3  # of an axis, from which it has a panel of its own
-BARS = 12  # in a panel of names
 FINEST = 240  # columns in which a spectrum is drawn by its maxima
 LEVEL = 0.01  # of the p-value adjusted for all that was looked at
 WIDE_AXIS = 100.0  # ratio from which an axis is logarithmic
@@ -451,9 +420,9 @@ ROUNDING = 1e-9  # of an interval's other end: an end below is zero
 
 @dataclass(frozen=True)
 class Spot:
-    """One place: an interval `low` to `high` of an axis or, where these are NaN, a `name`; `height` is how far it stands out.
+    """One place of the scan: an interval `low` to `high` of an axis, in a run or in all; `height` is -log10 of the p-value.
 
-    `height` is minus the decimal logarithm of the unadjusted p-value where that is known, else the size of the statistic.
+    `p_value` is adjusted for the number of places, `height` is not.
     """
 
     axis: str
@@ -461,54 +430,37 @@ class Spot:
     kind: str
     low: float
     high: float
-    name: str
     height: float
     p_value: float | None
 
     @property
     def sure(self) -> bool:
-        """True where noise does not do this, all that was looked at being allowed for."""
+        """True where the p-value, adjusted for the number of places, is below LEVEL."""
         return self.p_value is not None and self.p_value < LEVEL
 
     @property
     def place(self) -> str:
         """Return the place in words, with its unit."""
-        if self.name:
-            return self.name
         unit = AXES.get(self.axis, ("", ""))[1]
-        tail = f"{NO_BREAK}{unit}" if unit else ""
         if self.axis == "frequency" or self.low == self.high:
-            return f"{number(0.5 * (self.low + self.high))}{tail}"
+            return with_unit(number(0.5 * (self.low + self.high)), unit)
         least = ROUNDING * max(abs(self.low), abs(self.high))
         low, high = (0.0 if abs(end) < least else end for end in (self.low, self.high))
-        return f"{number(low)} to {number(high)}{tail}"
+        return with_unit(f"{number(low)} to {number(high)}", unit)
 
 
 def spots(rows: Sequence[Mapping[str, Any]]) -> list[Spot]:
-    """Return the rows of the atlas, what stands out most first; a row has low and high, or `bin`: an interval or a name."""
-    found = []
-    for row in rows:
-        log_p, statistic, p = row.get("log_p"), row.get("statistic"), row.get("p_value")
-        if not finite(log_p) and not finite(statistic):
-            continue
-        height = -float(log_p) / math.log(10) if finite(log_p) else abs(float(statistic or 0.0))
-        place = row.get("bin") if "low" not in row else [row["low"], row["high"]]
-        low, high, name = _place(place)
-        found.append(
-            Spot(str(row.get("axis", "")), str(row.get("run") or ""), str(row.get("kind", "")), low, high, name, height,
-                 float(p) if p is not None and finite(p) else None)
-        )  # fmt: skip
+    """Return the rows of the residual scan, the least probable first."""
+    found = [
+        Spot(str(r["axis"]), str(r["run"] or ""), str(r["kind"]), float(r["low"]), float(r["high"]),
+             -float(r["log_p"]) / math.log(10), r["p_value"])
+        for r in rows if all(finite(r[k]) for k in ("low", "high", "log_p"))
+    ]  # fmt: skip
     return sorted(found, key=lambda s: -s.height)
 
 
-def _place(value: Any) -> tuple[float, float, str]:
-    if isinstance(value, list | tuple) and len(value) == 2 and all(finite(v) for v in value):
-        return float(value[0]), float(value[1]), ""
-    return (float(value), float(value), "") if finite(value) else (math.nan, math.nan, str(value))
-
-
 def axis_text(axis: str) -> str:
-    """Return what an axis of the atlas is, in words."""
+    """Return the name of an axis of the residual scan in words."""
     return AXES.get(axis, (axis, ""))[0]
 
 
@@ -521,35 +473,25 @@ def foremost(found: Sequence[Spot], *, each: int = 2, most: int = 12) -> list[Sp
     return kept
 
 
-def atlas_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
-    """Return a panel for each axis of the atlas with several bins, but runs and windows in time; None where there is none."""
-    load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+def scan_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
+    """Return a panel for each axis of the residual scan with several bins, but runs and times; None where there is none."""
     by_axis: dict[str, list[Spot]] = {}
     for spot in spots(rows):
         if spot.axis not in APART and spot.kind != "shape":
             by_axis.setdefault(spot.axis, []).append(spot)
-    shown = {k: v for k, v in by_axis.items() if len({(s.low, s.high, s.name) for s in v}) >= BINS}
+    shown = {k: v for k, v in by_axis.items() if len({(s.low, s.high) for s in v}) >= BINS}
     if not shown:
         return None
     columns = 1 if narrow else min(3, len(shown))
     lines = math.ceil(len(shown) / columns)
-    label = "−log$_{10}$ p" if any(finite(r.get("log_p")) for r in rows) else "|statistic|"
     with house_style():
-        figure = Figure(figsize=(NARROW_FIGURE if narrow else 3.5 * columns + 0.2, 2.3 * lines + 0.2))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((NARROW_FIGURE if narrow else 3.5 * columns + 0.2, 2.3 * lines + 0.2))
         panels = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
         for k, (axis, (name, found)) in enumerate(zip(panels, shown.items(), strict=False)):
             about, unit = AXES.get(name, (name_text(name, narrow=narrow), ""))
             axis.set_title(about + (f"  [{unit}]" if unit else ""), fontsize=9.5)
-            if math.isfinite(found[0].low):
-                _bins(axis, found)
-                axis.set_ylabel(label if k % columns == 0 else "")
-            else:
-                _names(axis, found, narrow=narrow)
-                axis.set_xlabel(label)
+            _bins(axis, found)
+            axis.set_ylabel("−log$_{10}$ p" if k % columns == 0 else "")
         for axis in panels[len(shown) :]:
             axis.set_axis_off()
         _settle(figure)
@@ -587,20 +529,7 @@ def _columns(bins: Sequence[Spot], log: bool) -> list[Spot]:
     for spot in bins:
         k = int(np.clip(np.searchsorted(edges, 0.5 * (spot.low + spot.high), side="right") - 1, 0, FINEST - 1))
         highest.setdefault(k, spot)
-    return [
-        Spot(s.axis, s.run, s.kind, float(edges[k]), float(edges[k + 1]), s.name, s.height, s.p_value)
-        for k, s in highest.items()
-    ]
-
-
-def _names(axis: Axes, found: Sequence[Spot], *, narrow: bool) -> None:
-    highest: dict[str, Spot] = {}
-    for spot in found:
-        highest.setdefault(name_text(spot.name, narrow=narrow), spot)
-    shown = list(highest.items())[:BARS][::-1]
-    colours = [BEFORE if s.sure else "#AAAAAA" for _, s in shown]
-    axis.barh([k for k, _ in shown], [s.height for _, s in shown], color=colours)
-    axis.tick_params(axis="y", labelsize=8.5)
+    return [replace(s, low=float(edges[k]), high=float(edges[k + 1])) for k, s in highest.items()]
 
 
 # Figures of what was found: how far parameters had been bent, a missing force, a stability diagram.
@@ -640,21 +569,20 @@ def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool =
         return figure
 
 
-def force_figure(name: str, force: Mapping[str, Any], *, unit: str = "N", narrow: bool = False) -> Figure:
-    """Return a run's missing force (n,) over time with its band, above the load and the slip velocity where they are known."""
+def force_figure(name: str, force: Mapping[str, Any], *, narrow: bool = False) -> Figure:
+    """Return a run's missing friction (n,) over time with its band (2, n), above slip velocity and load."""
     t = np.asarray(force["t"], dtype=float)
-    imposed = [(k, label) for k, label in (("v", "v\n[µm/s]"), ("W", "W\n[N]")) if force.get(k) is not None]
+    imposed = (("v", "v\n[µm/s]"), ("W", "W\n[N]"))
     with house_style():
         figure, axes = new_figure(1 + len(imposed), size=(NARROW_FIGURE if narrow else 9.0, 2.6 + 1.0 * len(imposed)))
-        values, band = np.asarray(force["force"], dtype=float), force.get("band")
-        if band is not None:
-            low, high = _limits(values, np.asarray(band, dtype=float))
-            axes[0].fill_between(t, low, high, color=AFTER, alpha=0.22, linewidth=0, label="95 % band")
+        low, high = np.asarray(force["band"], dtype=float)
+        axes[0].fill_between(t, low, high, color=AFTER, alpha=0.22, linewidth=0, label="95 % band")
+        values = np.asarray(force["force"], dtype=float)
         axes[0].plot(*_thinned(t, values), color=AFTER, linewidth=1.2, label="missing force")
         axes[0].axhline(0, color="#777777", linewidth=0.8)
         axes[0].set_title(name_text(name, narrow=narrow), pad=22 if narrow else None)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=2, fontsize=8.5, borderaxespad=0.0)
-        axes[0].set_ylabel(f"missing force\n[{unit}]" if unit != "1" else "missing friction\ncoefficient")
+        axes[0].set_ylabel("missing friction\ncoefficient")
         for axis, (key, label) in zip(axes[1:], imposed, strict=True):
             known = np.asarray(force[key], dtype=float)
             axis.plot(*_thinned(t, known), color="#555555", linewidth=0.8)
@@ -669,41 +597,28 @@ def force_figure(name: str, force: Mapping[str, Any], *, unit: str = "N", narrow
         return figure
 
 
-def _limits(values: Any, band: Any) -> tuple[Any, Any]:
-    """Return lower and upper limit from a band given as a half width (n,), or as limits (2, n) or (n, 2)."""
-    if band.ndim < 2:
-        return values - band, values + band
-    return (band[0], band[1]) if band.shape[0] == 2 else (band[:, 0], band[:, 1])
-
-
-def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, unit: str = "N", narrow: bool = False) -> Figure | None:
-    """Return the missing force of all runs against slip velocity, age and load, averaged in pieces; None without a state."""
-    load_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    shown = [s for s in STATES if any(f.get(s[0]) is not None and np.ptp(f[s[0]]) > 0 for f in forces.values())]
+def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
+    """Return the missing friction of all runs against slip velocity, age and load, averaged in pieces; None if none varies."""
+    shown = [s for s in STATES if any(np.ptp(f[s[0]]) > 0 for f in forces.values())]
     if not shown:
         return None
     with house_style():
         lines = len(shown) if narrow else 1
-        figure = Figure(figsize=(NARROW_FIGURE if narrow else 3.2 * len(shown) + 0.4, 0.5 + 2.6 * lines))
-        FigureCanvasAgg(figure)
+        figure = bare_figure((NARROW_FIGURE if narrow else 3.2 * len(shown) + 0.4, 0.5 + 2.6 * lines))
         axes = figure.subplots(lines, len(shown) // lines, sharey=True, squeeze=False).ravel()
         for axis, (key, label, wide) in zip(axes, shown, strict=True):
-            spans = [np.asarray(f[key], dtype=float) for f in forces.values() if f.get(key) is not None]
+            spans = [np.asarray(f[key], dtype=float) for f in forces.values()]
             low, high = min(float(s.min()) for s in spans), max(float(s.max()) for s in spans)
             log = wide and low > 0 and high > WIDE_QUANTITY * low
             for index, (name, force) in enumerate(forces.items()):
-                if force.get(key) is not None:
-                    _by_state(axis, np.asarray(force[key], dtype=float), np.asarray(force["force"], dtype=float), log,
-                              name_text(name, narrow=narrow), index)  # fmt: skip
+                x, y = (np.asarray(force[k], dtype=float) for k in (key, "force"))
+                _by_state(axis, x, y, log, name_text(name, narrow=narrow), index)
             axis.axhline(0, color="#777777", linewidth=0.8)
             axis.set_xlabel(label)
             if log:
                 axis.set_xscale("log")
                 decade_ticks(axis)
-        axes[0].set_ylabel(f"missing force  [{unit}]" if unit != "1" else "missing friction coefficient")
+        axes[0].set_ylabel("missing friction coefficient")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
         _settle(figure)
         return figure
@@ -744,7 +659,9 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
     curves += [("W0_hopf_baseline", "baseline, constant load", BEFORE, DOTTED)]
     curves += [("W0_hopf_augmented", "augmented model, constant load", AFTER, DOTTED)]
     if all(_equal(diagram, key) for key in ("V", "W0", "W0_hopf")):  # nothing was added: one curve would hide the other
-        curves = [(key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]]
+        curves = [
+            (key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]
+        ]
     drawn = [c for c in curves if diagram.get(c[0]) is not None and np.isfinite(_gaps(diagram[c[0]])).any()]
     if not drawn or diagram.get("V") is None:
         return None
@@ -778,7 +695,10 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
 
 def _equal(diagram: Mapping[str, Any], quantity: str) -> bool:
     """Return whether the augmented model's curve is the baseline's."""
-    baseline, augmented = diagram.get(f"{quantity}_baseline", diagram.get(quantity)), diagram.get(f"{quantity}_augmented")
+    baseline, augmented = (
+        diagram.get(f"{quantity}_baseline", diagram.get(quantity)),
+        diagram.get(f"{quantity}_augmented"),
+    )
     if augmented is None:
         return quantity == "V" or baseline is None
     if baseline is None:

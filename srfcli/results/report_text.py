@@ -80,6 +80,12 @@ def unit_text(unit: Any) -> str:
     return "" if unit in (None, "", "1") else str(unit).replace("um", "µm")
 
 
+def with_unit(text: str, unit: Any) -> str:
+    """Return a number's text with its unit, from which no line break parts it; as it is for the unit 1."""
+    shown = unit_text(unit)
+    return f"{text}{NO_BREAK}{shown}" if shown else text
+
+
 def spans(windows: Sequence[Sequence[float]], most: int = 4) -> str:
     """Return intervals of time in words, the first `most` of them."""
     shown = [f"{number(a)} to {number(b)}{NO_BREAK}s" for a, b in windows[:most]]
@@ -156,7 +162,10 @@ REMEDIES = {  # what is wrong, and what to do; {value} is the size with its erro
         "the stage's velocity ripples with its position: {value}",
         "measure the stage's own motion, and give it as load_point_displacement",
     ),
-    "slip-hardening": ("friction rises or falls with slip, and levels off: {value}", "slide further before the first step"),
+    "slip-hardening": (
+        "friction rises or falls with slip, and levels off: {value}",
+        "slide further before the first step",
+    ),
     "frictional-heating": (
         "friction changes with the heat that sliding makes: {value}",
         "slide slower, or use the augmented model, which has the heat",
@@ -182,7 +191,10 @@ REMEDIES = {  # what is wrong, and what to do; {value} is the size with its erro
         "the load follows its command late, and overshoots: {value}",
         "give the load that was measured, not its command",
     ),
-    "gauge-creep": ("the gauge creeps: {value}", "calibrate it over the times of the experiment, or use the augmented model"),
+    "gauge-creep": (
+        "the gauge creeps: {value}",
+        "calibrate it over the times of the experiment, or use the augmented model",
+    ),
     "pore-pressure": (
         "a pore pressure carries a part of the load: {value}",
         "record the pressure, and give the effective load",
@@ -264,25 +276,29 @@ def gain_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str
 def _wrong(effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     if effect in REMEDIES:
         return _filled(REMEDIES[effect][0], effect, answer, material)
-    sizes = _sizes(effect, material)
+    sizes = joined([f"{p['name']} = {_size(p)}" for p in _rows(effect, material)])
     about = _about(effect, material)
     return f"the model lacks {effect}{f' ({about})' if about else ''}" + (f": {sizes}" if sizes else "")
 
 
 def _filled(text: str, effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
+    """Return a text of REMEDIES with the sizes that an effect was found to have."""
     row = next(iter(_rows(effect, material)), {})
-    unit = unit_text(row.get("unit"))
-    value = bracketed(row.get("augmented"), row.get("augmented_stderr"))
-    tail = f"{NO_BREAK}{unit}" if unit else ""
-    sizes = (
-        _sizes(effect, material)
-        if effect not in ("stiffness-error", "inertia", "load-transmission")
-        else f"{value}{tail}"
-    )
-    plain = f"{number(row.get('augmented'), 4)}{tail}"
+    nameless = effect in (
+        "stiffness-error",
+        "inertia",
+        "load-transmission",
+    )  # the sentence itself says what the size is of
+    sizes = _size(row) if nameless else joined([f"{p['name']} = {_size(p)}" for p in _rows(effect, material)])
+    plain = with_unit(number(row.get("augmented"), 4), row.get("unit"))
     return text.format(
         value=sizes or "its size is below", number=plain, stated=material.get("stated", {}).get("stiffness", "–")
     )
+
+
+def _size(row: Mapping[str, Any]) -> str:
+    """Return a parameter's value in the augmented model, with its error and unit."""
+    return with_unit(bracketed(row.get("augmented"), row.get("augmented_stderr")), row.get("unit"))
 
 
 def _rows(effect: str, material: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -292,17 +308,6 @@ def _rows(effect: str, material: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return rows or [
         p for p in material.get("parameters", ()) if p.get("baseline") is None and finite(p.get("augmented"))
     ]
-
-
-def _sizes(effect: str, material: Mapping[str, Any]) -> str:
-    told = []
-    for p in _rows(effect, material):
-        unit = unit_text(p.get("unit"))
-        told.append(
-            f"{p['name']} = {bracketed(p.get('augmented'), p.get('augmented_stderr'))}"
-            + (f"{NO_BREAK}{unit}" if unit else "")
-        )
-    return joined(told)
 
 
 def bracketed(value: Any, error: Any) -> str:

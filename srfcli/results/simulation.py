@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -127,7 +127,11 @@ def measure(gauge: Gauge, job: Job, observed: Array, observable: str = "") -> Ar
     if not (gauge.noise or gauge.quantum):
         return None
     return measured(
-        observed, noise=gauge.noise, lag1=gauge.lag1, quantum=gauge.quantum, seed=gauge.seed,
+        observed,
+        noise=gauge.noise,
+        lag1=gauge.lag1,
+        quantum=gauge.quantum,
+        seed=gauge.seed,
         stream=" ".join(filter(None, (job.name, observable))),
     )
 
@@ -170,16 +174,56 @@ class SimulationResult(Result):
 
     @cached_property
     def table(self) -> Table:
-        """Return the records one below the other, a row for each sample."""
-        return record_table(self.work, self.records, status=self.worst)
+        """Return the records one below the other, a row for each sample: what was imposed, how it slid, what was recorded."""
+        from srfcli.data.values import OBSERVABLES
+
+        model, jobs = self.work.model, self.work.jobs
+        named = any(job.run is not None for job in jobs)
+        gauge = any(r.measured is not None for r in self.records)
+        ages = [name for name in model.states if name.startswith("ln_") and name != "ln_v"]
+        units = {OBSERVABLES[job.observable] for job in jobs}
+        unit = units.pop() if len(units) == 1 else "um, N or 1"
+        beside = [column for column in OTHERS if any(column.name in job.beside for job in jobs)]
+        columns = (
+            *([Column("run", "1", "name of the run")] if named else []),
+            Column("t", "s", "time"),
+            Column("V", "um/s", "driving velocity"),
+            Column("W", "N", "imposed normal load"),
+            Column("u", "um", "elongation of the spring"),
+            Column("v", "um/s", "slip velocity"),
+            *(Column(name[3:], "s", "age of the contacts") for name in ages),
+            Column("mu", "1", "friction coefficient"),
+            Column("tau", "N", "friction force W mu"),
+            *([Column("recorded", unit, "what the run's file holds")] if named else []),
+            *([Column("measured", unit, "the simulated observable through the gauge")] if gauge else []),
+            *beside,
+        )
+        blocks = [_block(r, ages, [c.name for c in beside], named=named, gauge=gauge) for r in self.records]
+        notes = (*self.work.notes, *(note for r in self.records for note in summary(r, named=named)))
+        meta = {"samples": {r.job.name: r.done for r in self.records}, **self.work.meta}
+        return Table(
+            "srf.simulate/1", columns, Rows(blocks), model.title, notes, self.work.parameters, meta, self.worst.value
+        )
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the records over time: observable, friction, velocities and load, a panel for each."""
+        import numpy as np
+
         from srfcli.results.figures import traces
         from srfcli.results.plots import titled
 
         own_figure(ax, "a simulation")
-        return traces(curves(self.records), title=titled(self.work.model.title, self.work.parameters))
+        drawn = []
+        for r in self.records:
+            n, trace = r.done, r.trace
+            record = {"name": r.job.name, "t": trace.t[:n], "observable": r.job.observable, "mu": trace.mu[:n]}
+            record |= {"observed": r.observed[:n], "v": trace.v[:n], "V": trace.V[:n], "W": trace.W[:n]}
+            if r.job.run is not None:
+                record["recorded"] = np.where(r.job.run.used, r.job.run.observed, np.nan)[:n]
+            elif r.measured is not None:
+                record["measured"] = r.measured[:n]
+            drawn.append(record)
+        return traces(drawn, title=titled(self.work.model.title, self.work.parameters))
 
 
 class Rows(Sequence[tuple[Any, ...]]):
@@ -208,40 +252,10 @@ class Rows(Sequence[tuple[Any, ...]]):
         raise IndexError(index)
 
 
-def record_table(work: Work, records: Sequence[Record], *, status: Status) -> Table:
-    """Return the records one below the other: t, V, W, u, v, the ages, mu, tau, and what was recorded or measured."""
-    from srfcli.data.values import OBSERVABLES
-
-    model, named = work.model, any(job.run is not None for job in work.jobs)
-    gauge = any(r.measured is not None for r in records)
-    ages = [name for name in model.states if name.startswith("ln_") and name != "ln_v"]
-    columns = [Column("run", "1", "name of the run")] if named else []
-    columns += [
-        Column("t", "s", "time"),
-        Column("V", "um/s", "driving velocity"),
-        Column("W", "N", "imposed normal load"),
-        Column("u", "um", "elongation of the spring"),
-        Column("v", "um/s", "slip velocity"),
-        *(Column(name[3:], "s", "age of the contacts") for name in ages),
-        Column("mu", "1", "friction coefficient"),
-        Column("tau", "N", "friction force W mu"),
-    ]
-    units = {OBSERVABLES[job.observable] for job in work.jobs}
-    unit = units.pop() if len(units) == 1 else "um, N or 1"
-    columns += [Column("recorded", unit, "what the run's file holds")] if named else []
-    columns += [Column("measured", unit, "the simulated observable through the gauge")] if gauge else []
-    beside = list(dict.fromkeys(name for job in work.jobs for name in job.beside))
-    columns += [column for column in OTHERS if column.name in beside]
-    beside = [column.name for column in columns[-len(beside) :]] if beside else []
-    blocks = [_block(r, ages, beside, named=named, gauge=gauge) for r in records]
-    notes = (*work.notes, *(note for r in records for note in summary(r, named=named)))
-    meta = {"samples": {r.job.name: r.done for r in records}, **work.meta}
-    return Table(
-        "srf.simulate/1", tuple(columns), Rows(blocks), model.title, notes, work.parameters, meta, status.value
-    )
-
-
-def _block(r: Record, ages: list[str], beside: list[str], *, named: bool, gauge: bool) -> tuple[tuple[Any, ...], Sequence[Array]]:
+def _block(
+    r: Record, ages: list[str], beside: list[str], *, named: bool, gauge: bool
+) -> tuple[tuple[Any, ...], Sequence[Array]]:
+    """Return the cells that lead each row of a record, and the columns that follow."""
     import numpy as np
 
     n, trace = r.done, r.trace
@@ -317,27 +331,8 @@ def _stretches(job: Job, t: Array) -> Iterator[tuple[int, int, float]]:
             yield a, b, V
 
 
-def curves(records: Sequence[Record]) -> list[dict[str, Any]]:
-    """Return the records as `output.traces` draws them."""
-    import numpy as np
-
-    drawn = []
-    for r in records:
-        n, trace = r.done, r.trace
-        record = {"name": r.job.name, "t": trace.t[:n], "observable": r.job.observable, "mu": trace.mu[:n]}
-        record |= {"observed": r.observed[:n], "v": trace.v[:n], "V": trace.V[:n], "W": trace.W[:n]}
-        if r.job.run is not None:
-            record["recorded"] = np.where(r.job.run.used, r.job.run.observed, np.nan)[:n]
-        elif r.measured is not None:
-            record["measured"] = r.measured[:n]
-        drawn.append(record)
-    return drawn
-
-
 def simulated_run(model: GeneratedModel, r: Record, gauge: Gauge, others: Mapping[str, Gauge]) -> Run:
     """Return the run as a recording of the simulation; what the repeated run says beside the observable is kept."""
-    import dataclasses
-
     import numpy as np
 
     from srfcli.data.values import Run, Signal
@@ -348,7 +343,7 @@ def simulated_run(model: GeneratedModel, r: Record, gauge: Gauge, others: Mappin
     initial = "steady" if job.start is None else "free"  # the form has no other word for a state of one's own
     K = float(job.p[model.index("K")])
     if job.run is not None:
-        return dataclasses.replace(
+        return replace(
             job.run, observed=observed, used=used, quantum=gauge.quantum, notices=(), stiffness=K, initial=initial,
             others=beside,
         )  # fmt: skip

@@ -299,8 +299,7 @@ class CriticalResult(Result):
         """Return the critical K/W0 (1/um) against V (um/s), a mark for each crossing."""
         from srfcli.results import plots
 
-        names = [c.name for c in BOUNDARY_COLUMNS]
-        points = [dict(zip(names, row, strict=True)) for row in self.table.rows]
+        points = self.table.records()
         return plots.critical_points(points, title=plots.titled(self.table.title, self.table.parameters), ax=ax)
 
 

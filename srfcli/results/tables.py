@@ -66,6 +66,11 @@ class Table:
             if len(row) != len(self.columns):
                 raise ValueError(f"a row of {len(row)} cells under {len(self.columns)} columns in {self.schema}")
 
+    def records(self) -> list[dict[str, Any]]:
+        """Return each row as column name -> cell."""
+        names = [c.name for c in self.columns]
+        return [dict(zip(names, row, strict=True)) for row in self.rows]
+
 
 def plain_value(value: Any) -> Any:
     """Return `value` as Python's own numbers, text, lists and dicts; NaN and infinities become None."""
@@ -139,7 +144,7 @@ def print_terminal(table: Table, stream: TextIO) -> None:
     from rich.text import Text
 
     text = to_text(table, full=False)
-    stream = getattr(stream, "unescaped", stream)  # rich's own colours are meant; every text is made printable before
+    stream = getattr(stream, "unescaped", stream)  # colours must not be escaped; text is made printable before
     console = Console(file=stream, highlight=False, soft_wrap=True)
     rule = 3 * len(table.columns)
     body = text.splitlines()[: len(table.rows) + 2]
@@ -176,7 +181,7 @@ def to_csv(table: Table) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([printable(c.name) for c in table.columns])
-    text = cache(_csv_cell)  # words recur in long tables, whose other cells are finite numbers, which csv writes in full
+    text = cache(_csv_cell)  # words recur in long tables; csv itself writes finite numbers in full
     for row in table.rows:
         writer.writerow(
             [
@@ -201,7 +206,7 @@ def _csv_cell(value: Any) -> str:
 
 
 def json_text(data: Any, *, indent: int | None = None) -> str:
-    """Return plain data as JSON that a terminal shows as it is: what it would act on is spelt \\u001b."""
+    """Return plain data as JSON; control characters, on which a terminal would act, are written as \\u001b."""
     text = json.dumps(data, indent=indent, ensure_ascii=False, allow_nan=False)
     if printable(text) == text:
         return text

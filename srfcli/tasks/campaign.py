@@ -18,8 +18,7 @@ from srfcli.core.units import from_base
 from srfcli.data.values import Run
 from srfcli.inference.noise import lag_one
 from srfcli.laws.registry import load_registry
-from srfcli.results.campaign import PAIRS, CampaignResult
-from srfcli.results.fit import FitResult, unit_of
+from srfcli.results.fit import PAIRS, CampaignResult, FitResult, unit_of
 from srfcli.tasks.recordings import fit, read_experiment
 
 TAIL = 1 / 3  # of a segment, at its end, that is checked for steady sliding

@@ -1,4 +1,4 @@
-"""The diagnosis of one case by somebody who has its folder and nothing else, and its answer."""
+"""Blind diagnosis of one case: it is given the case's folder and nothing else, and returns an answer."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.laws.registry import Registry
 
-# What a diagnosis said of one case: a line of a file that grows while a trial runs, and from which it resumes.
+# Answers: one line each of a file that grows while a trial runs, and from which it resumes.
 
 LARGEST = 64 * 2**20  # bytes of all answers
 
@@ -85,12 +85,9 @@ def from_line(line: str, *, where: str) -> Answer:
             raise ValueError("not the keys of an answer")
         if found["verdict"] not in VERDICTS:
             raise ValueError(f"verdict {found['verdict']!r}")
-    except (SrfError, ValueError) as error:
-        raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
-    try:
         equivalent = tuple(tuple(names) for names in found["equivalent"])
         lists = {name: tuple(found[name]) for name in ("effects", "not_identifiable")}
-    except TypeError as error:
+    except (SrfError, ValueError, TypeError) as error:
         raise SrfError(f"{where}: no answer: {error}", "Delete the line, and go on with --resume.") from None
     return Answer(**{**found, **lists, "equivalent": equivalent})
 
@@ -116,7 +113,7 @@ def write_answers(path: Path, answers: Iterable[Answer]) -> None:
     write_atomic(path, "".join(lines))
 
 
-# The diagnosis of one case, by somebody who has its folder and nothing else. Nothing here can reach a truth.
+# The diagnosis of one case. Nothing here can reach a truth.
 
 Diagnose = Callable[[Path, tuple[Path, ...]], Answer]  # folder of a case, folders of plugins
 ELSEWHERE = ("cli", "results", "validation")  # parts of the package that no answer depends on
@@ -132,7 +129,7 @@ class Task:
     limit: float
 
 
-class _TooLong(BaseException):  # no Exception: a diagnosis that copes with everything must not cope with this
+class _TooLong(BaseException):  # not an Exception, so that no handler inside the diagnosis catches it
     pass
 
 

@@ -23,6 +23,7 @@ from srfcli.validation.apparatus import (
     PAPER,
     RIGS,
     SIZES,
+    TURN,
     Rig,
     Setting,
     disturbed,
@@ -36,8 +37,6 @@ from srfcli.validation.gauge import REDDEST, Array, Gauge, play, read_gauge
 from srfcli.validation.slider import SMOOTH, Physics, Plan, Trace, Track, move
 
 # What can be concealed: each effect, how strong it is drawn, and what the baseline is that lacks it.
-
-TURN = (0.0, 2 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -286,7 +285,9 @@ def draw_wide(
     rig = str(rng.choice([name for name in RIGS if name.partition("-")[0] == setting.apparatus]))
     gauge = draw_gauge(rng, rig, physics, noise)
     only = str(rng.choice(_runs_of(forms[0], plans))) if kind == "one-run" else ""
-    return Recipe(forms, sizes, physics, without(physics, forms), plans, gauge, kind, rig, setting.protocol, noise, only)
+    return Recipe(
+        forms, sizes, physics, without(physics, forms), plans, gauge, kind, rig, setting.protocol, noise, only
+    )
 
 
 def wide_names(rng: np.random.Generator, kind: str) -> tuple[str, ...]:
@@ -324,7 +325,11 @@ def _sized(effect: Effect, sizes: tuple[float, float, Mapping[str, tuple[float, 
 def _may_be_odd(forms: Sequence[Effect], setting: Setting) -> bool:
     """Return whether a rigid or quasi-static baseline can be followed, and gives nothing away."""
     decided = any(e.name in USUAL_ONLY for e in forms)
-    return not decided and setting.protocol not in ("mixed", "stick-slip") and "nagata" not in (setting.ageing, setting.stated)
+    return (
+        not decided
+        and setting.protocol not in ("mixed", "stick-slip")
+        and "nagata" not in (setting.ageing, setting.stated)
+    )
 
 
 def _runs_of(effect: Effect, plans: Sequence[Plan]) -> list[str]:
@@ -432,10 +437,11 @@ def draw_protocol(rng: np.random.Generator) -> tuple[Plan, ...]:
 # A case as a folder in the format srf-experiment/1: what the one who is to diagnose it gets to see.
 
 DESCRIPTION = "experiment.toml"
-STARTS = PAPER.start(Physics())  # name -> value, lower, upper: the same for every case, as in the examples
 
 
-def description(baseline: Physics, plans: tuple[Plan, ...], *, title: str, rig: Rig = PAPER, spikes: bool = False) -> str:
+def description(
+    baseline: Physics, plans: tuple[Plan, ...], *, title: str, rig: Rig = PAPER, spikes: bool = False
+) -> str:
     """Return the text of experiment.toml: apparatus and model as the baseline has them, nothing of what is concealed."""
     mass = "" if baseline.massless else f'mass = "{baseline.M * 1e6:.3g} kg"\n'
     reference = [] if baseline.law == "dieterich-cutoff" else ["V0 = { value = 1.0, fixed = true }"]
@@ -472,7 +478,8 @@ def table(plan: Plan, observed: Array, rig: Rig = PAPER) -> str:
     V = velocities[np.minimum(np.searchsorted(ends, t + 1e-9, side="right"), velocities.size - 1)]
     W = [load(s)[0] / rig.factor for s in t.tolist()]
     rows = (
-        f"{s:.4f},{v:g},{w:.{rig.load_digits}f},{u:.{rig.digits}f}" for s, v, w, u in zip(t, V, W, observed, strict=True)
+        f"{s:.4f},{v:g},{w:.{rig.load_digits}f},{u:.{rig.digits}f}"
+        for s, v, w, u in zip(t, V, W, observed, strict=True)
     )
     header = f"time [s],load_point_velocity [um/s],{rig.load},{rig.heading}"
     return "\n".join([header, *rows]) + "\n"
@@ -602,7 +609,7 @@ def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
         "noise": recipe.noise,
         "resembles": sorted({r for e in recipe.effects for r in e.resembles}),
         "sizes": dict(zip(names, recipe.sizes, strict=True)),
-        "truth": {n: v for n, v in _changed(recipe.physics, recipe.baseline).items()},
+        "truth": _changed(recipe.physics, recipe.baseline),
         "physics": asdict(recipe.physics),
         "baseline": asdict(recipe.baseline),
         "rough": recipe.physics.track.size,
@@ -615,9 +622,8 @@ def _truth(recipe: Recipe, attempt: int, seed: int | Sequence[int]) -> Truth:
 
 
 def _changed(p: Physics, baseline: Physics) -> dict[str, Any]:
-    """Return the fields in which the truth departs from its baseline, or from neutral values."""
-    usual = baseline
-    return {f.name: getattr(p, f.name) for f in fields(p) if getattr(p, f.name) != getattr(usual, f.name)}
+    """Return the fields in which the truth departs from its baseline."""
+    return {f.name: getattr(p, f.name) for f in fields(p) if getattr(p, f.name) != getattr(baseline, f.name)}
 
 
 def known_physics(truth: Mapping[str, Any], *, baseline: bool = False) -> Physics:
@@ -629,8 +635,7 @@ def known_physics(truth: Mapping[str, Any], *, baseline: bool = False) -> Physic
 def known_plans(truth: Mapping[str, Any]) -> tuple[Plan, ...]:
     """Return the runs of a case from the truth about it."""
     return tuple(
-        Plan(**{**r, **{n: tuple(map(tuple, r.get(n, ()))) for n in ("drive", "steps", "gaps")}})
-        for r in truth["runs"]
+        Plan(**{**r, **{n: tuple(map(tuple, r.get(n, ()))) for n in ("drive", "steps", "gaps")}}) for r in truth["runs"]
     )
 
 
@@ -800,8 +805,10 @@ def make_bank(
         raise SrfError(f"{apart} exists already", "Truths are never overwritten; name another file.")
     plan = plan_wide(n, seed, kinds=kinds) if bank == "wide" else [(None, p) for p in plan_bank(n, seed, kinds=kinds)]
     folder.mkdir(parents=True)
+    rough, own = TRACKS[track] if track else (None, None)
+    shared: dict[str, Any] = {"rough": rough, "own": own, "strengths": strengths, "bank": bank}
     tasks = [
-        (folder / f"case-{i:03d}", (seed, i), kind, names, track, strengths, bank)
+        {"folder": folder / f"case-{i:03d}", "seed": (seed, i), "kind": kind, "effects": names, **shared}
         for i, (kind, names) in enumerate(plan)
     ]
     truths: dict[str, Truth] = {}
@@ -852,7 +859,9 @@ def check_kinds(kinds: Sequence[str], bank: str) -> None:
     every = WIDE_KINDS if bank == "wide" else KINDS
     strange = [k for k in kinds if k not in every]
     if strange and strange[0] in WIDE_KINDS:
-        raise SrfError(f"the bank of the paper has no cases of the kind '{strange[0]}'", "srf prove --bank wide has them.")
+        raise SrfError(
+            f"the bank of the paper has no cases of the kind '{strange[0]}'", "srf prove --bank wide has them."
+        )
     if strange:
         raise SrfError(f"unknown kind of case '{strange[0]}'", did_you_mean(strange[0], every))
 
@@ -865,11 +874,5 @@ def _counts(n: int, kinds: Sequence[str], every: Sequence[str], usual: Sequence[
     return counts
 
 
-Task = tuple[Path, tuple[int, int], str | None, tuple[str, ...], str | None, bool, str]
-
-
-def _make(task: Task) -> tuple[str, Truth]:
-    folder, seed, kind, names, track, strengths, bank = task
-    rough, own = TRACKS[track] if track else (None, None)
-    made = make_case(folder, seed, kind=kind, effects=names, rough=rough, own=own, strengths=strengths, bank=bank)
-    return folder.name, made
+def _make(task: Mapping[str, Any]) -> tuple[str, Truth]:
+    return task["folder"].name, make_case(**task)

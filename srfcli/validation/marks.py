@@ -39,9 +39,11 @@ from srfcli.validation.cases import (
 from srfcli.validation.gauge import Array, Gauge, white
 from srfcli.validation.slider import Physics, Plan
 
-# One answer held against the truth: what would have been right, and whether it was said.
+# The mark of one answer: which answers are accepted, and whether it is one of them.
 
-INVISIBLE = 5.0  # standard errors: an effect whose size even the best fit would know no better cannot be asked for
+INVISIBLE = (
+    5.0  # standard errors: an effect whose size is smaller, in units of its error in the best fit, counts as invisible
+)
 CONFIDENT = 0.9
 UNNAMED = ("none", "inconclusive", "ambiguous")  # right where what is concealed cannot be seen
 Accepted = frozenset[tuple[str, frozenset[str]]]
@@ -106,10 +108,9 @@ def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
     hidden = tuple(truth["effects"])
     invisible = tuple(n for n in hidden if (s := sight.sigmas.get(n)) is not None and s < INVISIBLE)
     allowed = accepted(truth, invisible)
-    said = (answer.verdict, frozenset(answer.effects) if answer.verdict == "identified" else frozenset())
-    right = answer.verdict != FAILED and said in allowed
-    shares = {**answer.confidence}
-    top = max(shares, key=lambda name: shares[name]) if shares else ""
+    right = answer.verdict != FAILED and as_it_is(answer) in allowed
+    shares = answer.confidence
+    top = max(shares, key=lambda name: shares[name], default="")
     known = [s for n in hidden if (s := sight.sigmas.get(n)) is not None]
     return Mark(
         answer.case,
@@ -201,7 +202,7 @@ def _ratio(answer: Answer, sight: Sight, model: str) -> float | None:
     return float((ours / true) ** 0.5)
 
 
-# What there was to be seen in a case, from its truth: the error of a model that knows it, and how far each effect stands out.
+# Visibility, from the truth of a case: the error of the true model, and the size of each effect in standard errors.
 
 STEP = 2e-4  # relative, of a parameter's difference: in stick-slip a larger one shifts the phase by more than is linear
 
@@ -238,9 +239,7 @@ def see(task: Task) -> Sight:
             known[plan.name] = float(np.sqrt(np.mean((run.observed - made)[run.used] ** 2)))
     fitted = {plan: p for plan, p in sliders.items() if not plan.holdout}
     effects = concealed(truth)
-    stands = {
-        e.name: stands_out(e, [o for o in effects if o is not e], fitted, gauge=gauge, rig=rig) for e in effects
-    }
+    stands = {e.name: stands_out(e, [o for o in effects if o is not e], fitted, gauge=gauge, rig=rig) for e in effects}
     return Sight(folder.name, known, {n: s for n, (s, _) in stands.items()}, {n: r for n, (_, r) in stands.items()})
 
 
@@ -373,12 +372,12 @@ def deviation(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] |
     return None
 
 
-# Marks as tables: what was said for what, how often right, how sure, how well it predicts, and what it cost.
+# Marks as tables: confusion, rates, power, calibration, held-out errors, sizes and cost.
 
 SCHEMA = "srf.prove/1"
 STANDS_OUT = (0.0, INVISIBLE, 10.0, 20.0, 50.0, 200.0, float("inf"))
 STRONG = (0.0, 1 / 3, 2 / 3, 1.0)
-MINUTES = 300.0  # s of CPU a case should not take
+SHORT = 300.0  # s of CPU: a case should take less
 WITHIN = 1.1  # of the true model's error
 SHARE = (
     Column("share", "1", "of the cases", ".3f"),
@@ -390,19 +389,8 @@ COUNTED = (Column("hits", "1", "for how many cases it holds"), Column("cases", "
 
 def tables(marks: Sequence[Mark], *, digest: str, seed: int, of: int) -> tuple[Table, list[Table]]:
     """Return the confusion table, whose `meta` holds everything, and the tables that text shows below it."""
-    more = [
-        rates(marks),
-        by_effect(marks),
-        by_outside(marks),
-        by_setting(marks),
-        by_strength(marks),
-        calibrated(marks),
-        held(marks),
-        sizes(marks),
-        cost(marks),
-        ablated(marks),
-    ]
-    more = [t for t in more if t.rows]
+    made = (rates, by_effect, by_outside, by_setting, by_strength, calibrated, held, sizes, cost, ablated)
+    more = [t for t in (make(marks) for make in made) if t.rows]
     meta: dict[str, Any] = {
         "digest": digest,
         "seed": seed,
@@ -410,7 +398,7 @@ def tables(marks: Sequence[Mark], *, digest: str, seed: int, of: int) -> tuple[T
         "answered": len(marks),
         "code": sorted({m.answer.code for m in marks}),
         "calibration_error": calibration_of(marks)[1],
-        **{t.schema.split("/")[0].split(".")[-1]: rows_of(t) for t in more},
+        **{t.schema.split("/")[0].split(".")[-1]: t.records() for t in more},
         "marks": [row_of(m) for m in marks],
     }
     first = confusion(marks)
@@ -419,12 +407,7 @@ def tables(marks: Sequence[Mark], *, digest: str, seed: int, of: int) -> tuple[T
         notes.append(f"{of - len(marks)} further cases were given up without an answer")
     if len(meta["code"]) > 1:
         notes.append(f"answered by {len(meta['code'])} different states of the program: {', '.join(meta['code'])}")
-    return Table(first.schema, first.columns, first.rows, first.title, tuple(notes), meta=meta), more
-
-
-def rows_of(table: Table) -> list[dict[str, Any]]:
-    """Return a table's rows as name -> value."""
-    return [dict(zip([c.name for c in table.columns], row, strict=True)) for row in table.rows]
+    return replace(first, notes=tuple(notes), meta=meta), more
 
 
 def _cells(found: Rate) -> tuple[Any, ...]:
@@ -628,7 +611,7 @@ def cost(marks: Sequence[Mark]) -> Table:
     times = [m.answer.cpu for m in marks]
     rows = []
     if times:
-        short = sum(t < MINUTES for t in times) / len(times)
+        short = sum(t < SHORT for t in times) / len(times)
         rows = [(len(times), quantile(times, 0.5), quantile(times, 0.9), max(times), short, sum(times) / 3600)]
     return Table("srf.prove.cost/1", columns, rows, "CPU of a diagnosis")
 
@@ -717,17 +700,12 @@ def calibration(stated: Sequence[float], hits: Sequence[bool]) -> tuple[tuple[Bi
     return tuple(bins), error
 
 
-def quantile(values: Iterable[float], share: float) -> float | None:
+def quantile(values: Sequence[float], share: float) -> float | None:
     """Return the value that `share` of them do not exceed, by linear interpolation; None of none."""
-    ordered = sorted(values)
-    if not ordered:
-        return None
-    at = share * (len(ordered) - 1)
-    k = min(int(at), len(ordered) - 2) if len(ordered) > 1 else 0
-    return ordered[0] if len(ordered) == 1 else ordered[k] + (at - k) * (ordered[k + 1] - ordered[k])
+    return float(np.quantile(values, share)) if values else None
 
 
-# What the gates are worth: the same searches, judged without them.
+# Ablations: the same searches, judged without some of the tests.
 
 Judge = Callable[[Answer], tuple[str, frozenset[str]]]
 

@@ -1,4 +1,4 @@
-"""A trial on its way: a folder with a sealed bank, the answers that have come in, and, last of all, the truths."""
+"""A trial: a folder with a sealed bank of cases, the answers so far and, when all are answered, the truths."""
 
 from __future__ import annotations
 

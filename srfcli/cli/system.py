@@ -1,4 +1,4 @@
-"""`srf derive` and `srf code`: what follows from a law by algebra, and the NumPy module that computes with it."""
+"""`srf config`, `srf derive` and `srf code`: a system's values, what follows from it by algebra, and its NumPy module."""
 
 from __future__ import annotations
 
@@ -8,14 +8,69 @@ from pathlib import Path
 
 import click
 
-from srfcli.cli.base import SrfCommand
-from srfcli.cli.emit import out_option, put
-from srfcli.cli.options import SystemOptions, system_options
+from srfcli.cli.base import SrfCommand, SrfGroup
+from srfcli.cli.emit import emit, out_option, put
+from srfcli.cli.options import OutputOptions, SystemOptions, record_options, system_options
 from srfcli.core.errors import SrfError
+from srfcli.core.settings import DEFAULTS
+from srfcli.results.tables import Column, Table
+
+# `srf config`: which values a command would use, and who set them.
+
+COLUMNS = (
+    Column("name", about="choice or parameter"),
+    Column("value", about="in its declared unit", format=".12g"),
+    Column("unit", about="declared unit"),
+    Column("origin", about="flag, environment variable, srf.toml or default"),
+    Column("about", about="meaning"),
+)
+
+
+@click.group("config", cls=SrfGroup)
+def config() -> None:
+    """Show which values are used, and who set them."""
+
+
+@config.command(
+    "show",
+    epilog="""
+    srf config show
+    srf config show --law dieterich-cutoff --set B=0.03
+    SRF_K='210 N/mm' srf config show --json
+    """,
+)
+@system_options
+@record_options
+def show(system: SystemOptions, output: OutputOptions) -> None:
+    """Print every choice and parameter with its value and origin.
+
+    srf.toml is looked for in this directory and above it, up to the repository's root or the home directory:
+
+    \b
+        [defaults]
+        law = "srf-vsat"
+        [parameters]
+        K = "210 N/mm"
+        Vsat = 300
+    """
+    built = system.system()
+    resolved = system.resolve(built.parameters)
+    rows: list[tuple[object, ...]] = [
+        (key, s.value, None, s.origin, DEFAULTS[key].about) for key, s in system.choices().items()
+    ]
+    for p in built.parameters:
+        rows.append((p.name, resolved.declared[p.name], p.unit, resolved.origins[p.name], p.about or None))
+    notes = (f"settings file: {system.toml.path}",) if system.toml.path else ()
+    emit(
+        Table("srf.config/1", COLUMNS, rows, title=built.title, notes=notes, parameters=resolved.described()),
+        output,
+        laws=built.laws,
+    )
+
 
 # `srf derive`: what follows from a law by algebra, and the paper's equations held against it.
 
-EPILOG = """
+DERIVE = """
 srf derive                                       the paper's model
 srf derive --law log-log --ageing ruina --with all
 srf derive --law two-state --format latex --out two-state.tex
@@ -26,7 +81,7 @@ FORMATS = ("text", "json", "latex", "python")
 EXTRAS = {"jacobian": ("jacobian",), "parameters": ("parameters",), "all": ("jacobian", "parameters")}
 
 
-@click.command("derive", cls=SrfCommand, epilog=EPILOG)
+@click.command("derive", cls=SrfCommand, epilog=DERIVE)
 @system_options
 @click.option("--format", "form", type=click.Choice(FORMATS), default="text", show_default=True, help="What to write.")
 @click.option(
@@ -36,7 +91,7 @@ EXTRAS = {"jacobian": ("jacobian",), "parameters": ("parameters",), "all": ("jac
     "--check-paper", is_flag=True, help="Compare the paper's printed equations and claims with its own model."
 )
 @out_option
-def command(
+def derive(
     system: SystemOptions, form: str, extra: tuple[str, ...], check_paper: bool, out: Path | None, force: bool
 ) -> None:
     """Steady state, slopes, equations, dispersion relation and closed critical loads of a system, by algebra.
@@ -49,13 +104,12 @@ def command(
 
 def _derive(system: SystemOptions, form: str, extra: tuple[str, ...], *, plain: bool) -> str:
     from srfcli.symbolic import derivation as render
-    from srfcli.symbolic.derivation import derivation
 
     chosen = system.system()
     if form == "python":
         return render.to_python(chosen)
     wanted = EXTRAS["all"] if form == "json" else [part for name in extra for part in EXTRAS[name]]
-    sections = derivation(chosen, wanted)
+    sections = render.derivation(chosen, wanted)
     if form == "json":
         return json.dumps(render.to_document(chosen, sections), indent=2, allow_nan=False) + "\n"
     if form == "latex":
@@ -77,13 +131,13 @@ def _paper(form: str) -> str:
 
 # `srf code`: the NumPy module that computes everything numerical about a system.
 
-CODE_EPILOG = """
+CODE = """
 srf code                                  the paper's model
 srf code --law log-log --out log_log.py   a module to import: needs NumPy alone
 """
 
 
-@click.command("code", cls=SrfCommand, epilog=CODE_EPILOG)
+@click.command("code", cls=SrfCommand, epilog=CODE)
 @system_options
 @out_option
 def code(system: SystemOptions, out: Path | None, force: bool) -> None:

@@ -1,0 +1,295 @@
+"""`srf linear`, `critical`, `floquet` and `continue`: the stability of sliding under a constant and under a modulated load."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import click
+
+from srfcli.cli.base import EXIT_CONDITION, EXIT_OK, SrfCommand
+from srfcli.cli.options import (
+    AMPLITUDE,
+    OutputOptions,
+    Range,
+    SystemOptions,
+    check_axes,
+    mesh_option,
+    output_options,
+    over_option,
+    parse_over,
+    stability_options,
+    step_option,
+    value_option,
+    values_option,
+)
+from srfcli.core.errors import SrfError
+from srfcli.core.settings import Parameter
+
+if TYPE_CHECKING:
+    from srfcli.codegen.model import GeneratedModel
+
+# `srf linear`: steady sliding under constant load.
+
+LINEAR = """
+srf linear                                             V from 1 to 100 um/s
+srf linear --over V=1:300:40 --plot hopf.svg
+srf linear --law log-log --over D0=0.2:2:20 --set V=10
+srf linear --over V=1,10,100 --csv
+srf linear --loading inclined --ageing dieterich+linker-dieterich --over angle=-30:30:13:lin
+"""
+
+
+@click.command("linear", cls=SrfCommand, epilog=LINEAR)
+@stability_options
+@over_option(help="Values to run over, V=1:100:60 unless given; repeat for a grid of two parameters.")
+@click.option(
+    "--all-roots", is_flag=True, help="List every Hopf point, also where stability returns or other roots are unstable."
+)
+@output_options
+def linear(system: SystemOptions, over: tuple[Range, ...], all_roots: bool, output: OutputOptions) -> None:
+    """Critical load, K/W0 and frequency of steady sliding under constant load.
+
+    From the exact characteristic polynomial: all its Hopf points, with the direction of crossing checked and the first
+    Lyapunov coefficient (direct: stick-slip grows from nothing; inverted: it starts with a jump). Beside them stand the
+    closed forms for a rigid interface, and for a rigid interface without inertia.
+    """
+    from srfcli.cli.emit import emit
+    from srfcli.tasks import stability
+
+    slider = system.slider()
+    ranges = [r.fitted(slider.model.parameters, where=slider.model.title) for r in over or (parse_over("V=1:100:60"),)]
+    found = stability.linear(slider, over={r.name: r.points() for r in ranges}, all_roots=all_roots)
+    emit(found.table, output, laws=slider.model.laws, figure=found.plot)
+
+
+# `srf critical`: every critical load at given velocities and modulation amplitudes.
+
+CRITICAL = """
+srf critical --eps 0.13 --V 1,7,25
+srf critical --eps 0,0.045,0.09 --V 1,2,5,10,20,50 --csv
+srf critical --eps 0.4 --V 40 --window 4:500
+"""
+VELOCITY = Parameter("V", 10.0, "um/s", 1e-12, 1e9, "driving velocities")
+
+
+@click.command("critical", cls=SrfCommand, epilog=CRITICAL)
+@stability_options
+@values_option(VELOCITY)
+@values_option(AMPLITUDE)
+@click.option(
+    "--window",
+    metavar="LOW:HIGH",
+    help="Loads to look between, in N; else all at which a crossing can be.",
+)
+@click.option("--tol", type=float, help="Relative error of a critical load.", default=1e-8, show_default=True)
+@click.option(
+    "--samples",
+    type=click.IntRange(8, 100_000),
+    default=192,
+    show_default=True,
+    help="Loads looked at first, on each line.",
+)
+@click.option(
+    "--resolution",
+    type=float,
+    default=1e-3,
+    show_default=True,
+    help="Finest spacing in ln W0 where a pair of crossings could hide.",
+)
+@mesh_option(least=32)
+@output_options
+def critical(
+    system: SystemOptions,
+    V: tuple[float, ...] | None,
+    eps: tuple[float, ...] | None,
+    window: str | None,
+    tol: float,
+    samples: int,
+    resolution: float,
+    max_mesh: int,
+    output: OutputOptions,
+) -> None:
+    """Every critical load at the given velocities, numbered from low W0.
+
+    The growth rate is sampled along W0, refined where a pair of crossings could hide, and each sign change is polished on
+    meshes that are doubled until the error is met. Odd crossings lose stability as W0 rises, even ones regain it.
+    """
+    from srfcli.cli.emit import Progress, emit, finish
+    from srfcli.tasks import stability
+
+    slider = system.slider()
+    limits = None if window is None else _window(window).fitted(slider.model.parameters, where=slider.model.title)
+    begun = time.perf_counter()
+    with Progress("critical", total=len(V or (None,)) * len(eps or (None,))) as progress:
+        found = stability.critical(
+            slider, V=V, eps=eps, window=None if limits is None else (limits.lo, limits.hi), tol=tol, samples=samples,
+            resolution=resolution, max_mesh=max_mesh, progress=lambda place: progress.advance(note=place),
+        )  # fmt: skip
+    timings = {"solve": time.perf_counter() - begun}
+    emit(found.table, output, laws=slider.model.laws, timings=timings, figure=found.plot)
+    finish(found.status)
+
+
+def _window(text: str) -> Range:
+    """Return the loads that LOW:HIGH spans, with or without a unit; raises SrfError that shows the form."""
+    try:
+        found = parse_over(f"W0={text}") if text.count(":") == 1 else None
+    except SrfError:
+        found = None
+    if found is None or not found.lo > 0:
+        raise SrfError(f"--window {text!r} is not LOW:HIGH, two rising loads above 0", "Write --window 4:500.")
+    return found
+
+
+# `srf floquet`: one forced periodic state in full.
+
+FLOQUET = """
+srf floquet --V 8 --W0 9 --eps 0.09
+srf floquet --V 50 --W0 15 --eps 0.18 --plot orbit.svg
+srf floquet --V 8 --W0 9 --eps 0.09 --json --tol 1e-9
+"""
+
+
+@click.command("floquet", cls=SrfCommand, epilog=FLOQUET)
+@stability_options
+@value_option("V", "Driving velocity, in um/s.")
+@value_option("W0", "Mean normal load, in N.")
+@value_option("eps", "Relative amplitude of the load modulation.")
+@click.option("--tol", type=float, help="Error of the multipliers; 1e-6 unless set.")
+@mesh_option(least=32, most=65536, default=1024)
+@click.option(
+    "--harmonics", type=click.IntRange(1, 200), default=5, show_default=True, help="Harmonics of u and mu to list."
+)
+@click.option("--fail-on", type=click.Choice(["unstable", "stable"]), help="Exit with 4 when the state is so.")
+@output_options
+def floquet(
+    system: SystemOptions,
+    V: str | None,
+    W0: str | None,
+    eps: str | None,
+    tol: float | None,
+    max_mesh: int,
+    harmonics: int,
+    fail_on: str | None,
+    output: OutputOptions,
+) -> int:
+    """The forced periodic state at one V, W0 and eps: multipliers, mean friction, harmonics.
+
+    The mesh is doubled until the estimated error of the multipliers is below --tol. The state is stable where all
+    multipliers lie inside the unit circle; the mean friction is set beside that of steady sliding at eps = 0.
+    """
+    from srfcli.cli.emit import emit, finish
+    from srfcli.tasks import stability
+
+    slider = system.slider(V=V, W0=W0, eps=eps)
+    system.say_defaults(slider.resolved, ("V", "W0", "eps"))
+    tolerance, begun = system.tolerance(tol).value, time.perf_counter()
+    found = stability.floquet(slider, tol=tolerance, max_mesh=max_mesh, harmonics=harmonics)
+    timings = {"solve": time.perf_counter() - begun}
+    emit(found.table, output, laws=slider.model.laws, timings=timings, figure=found.plot)
+    if not found.status.ok:
+        finish(found.status)
+    return EXIT_CONDITION if fail_on == ("stable" if found.stable else "unstable") else EXIT_OK
+
+
+# `srf continue`: stability boundaries under modulation, followed through folds, all components in a window.
+
+CONTINUE = """
+srf continue --eps 0.18 --plot boundary.svg
+srf continue --eps 0.18 --eps 0.13 --over V=1:100 --csv
+srf continue --V 7 --over eps=0.01:0.4 --over W0=4:100
+srf continue --eps 0.09 --law log-log --ageing dieterich+linker-dieterich
+"""
+
+
+@click.command("continue", cls=SrfCommand, epilog=CONTINUE)
+@stability_options
+@values_option(AMPLITUDE, about="relative modulation amplitudes, a boundary for each")
+@value_option("V", "Driving velocity in um/s, where it is not an axis.")
+@value_option("W0", "Mean normal load in N, where it is not an axis.")
+@over_option(help="The plane: NAME=LOW:HIGH once (against W0) or twice; V=1:100 unless given.")
+@click.option(
+    "--scan-lines",
+    type=click.IntRange(2, 10_000),
+    default=10,
+    show_default=True,
+    help="Lines on which components are looked for.",
+)
+@click.option(
+    "--samples",
+    type=click.IntRange(8, 100_000),
+    default=64,
+    show_default=True,
+    help="Points looked at first, on each line.",
+)
+@step_option
+@click.option(
+    "--max-steps", type=click.IntRange(1, 1_000_000), default=3000, show_default=True, help="Longest curve, each way."
+)
+@click.option("--tol", type=float, help="Relative error of each point; 1e-6 unless set.")
+@mesh_option(least=64)
+@output_options
+def continue_(
+    system: SystemOptions,
+    eps: tuple[float, ...] | None,
+    V: str | None,
+    W0: str | None,
+    over: tuple[Range, ...],
+    scan_lines: int,
+    samples: int,
+    step: float,
+    max_steps: int,
+    tol: float | None,
+    max_mesh: int,
+    output: OutputOptions,
+) -> None:
+    """The stability boundary of the forced sliding state in a plane of two parameters.
+
+    Components are looked for on lines across the window, each is followed by pseudo-arclength continuation through its
+    folds, and every point is polished until its error is met. Ctrl-C keeps what is done.
+    """
+    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
+    from srfcli.numerics.continuation import AtlasSettings, StepSettings
+    from srfcli.tasks.stability import continue_boundary
+
+    if not 1e-4 <= step <= 0.5:
+        raise SrfError(
+            f"--step {step:g} is not a share of the window", "Choose it between 0.0001 and 0.5; 0.035 is usual."
+        )
+    spanned = {r.name for r in over} or {"V"}
+    if len(spanned) < 2:
+        spanned.add("W0")
+    check_axes(spanned, {"V": V, "W0": W0})
+    slider = system.slider(V=V, W0=W0)
+    model = slider.model
+    settings = AtlasSettings(
+        scan_lines, samples, tol=system.tolerance(tol).value, max_mesh=max_mesh,
+        steps=StepSettings(largest=step, max_steps=max_steps),
+    )  # fmt: skip
+    if len(over) > 2:
+        raise SrfError(f"--over is given {len(over)} times", "A plane has two axes: --over V=1:100 --over W0=4:400.")
+    ranges = [_axis(model, r) for r in over or (parse_over("V=1:100"),)]
+    with Progress("continue") as progress:
+        growing = continue_boundary(
+            slider, eps=eps, over={r.name: (r.lo, r.hi) for r in ranges},
+            log=[r.name for r in ranges if r.spacing == "log"], settings=settings,
+            progress=lambda said: progress.advance(0, note=said),
+        )  # fmt: skip
+        warn_uncompiled("boundaries take about three times as long")
+        system.say_defaults(slider.resolved, {"V", "W0"} - spanned)
+        begun = time.perf_counter()
+        *_, found = growing
+    timings = {"solve": time.perf_counter() - begun}
+    emit(found.table, output, laws=model.laws, timings=timings, figure=found.plot)
+    finish(found.status)
+
+
+def _axis(model: GeneratedModel, given: Range) -> Range:
+    """Return a range as an axis, in declared units; raises SrfError for a list of values."""
+    fitted = given.fitted(model.parameters, where=model.title)
+    if fitted.values:
+        raise SrfError(
+            f"--over {given.name} lists values", f"An axis runs from a low to a high end: --over {given.name}=1:100."
+        )
+    return fitted
