@@ -240,15 +240,17 @@ class ModelSearch:
         base = self._record(self.fit(None))
         base = self._expand(base)
         self._search()
-        for further in (self._recolour, self._together, self._swap, self._swap):  # dearer, or less likely
+        for further in (self._recolour, self._together, self._swap):  # dearer, or less likely
             best = self.best()
             wanting = best is not self.baseline or not self.baseline.fine
             imitated = further == self._swap and wanting  # an effect may pass for another ageing law
             if (imitated or not best.fine) and not self.spent:
                 further(self.baseline)
                 self._search()
-            if further == self._swap and not self.best().hypothesis.ageing:
-                break
+        if self.best().hypothesis.ageing and not self.spent:  # another law is much like it; its noise may have been misjudged
+            for again in (self._swap, self._recolour):
+                again(self.baseline)
+                self._search()
         self.cut_short = self.spent and bool(self.queue)
         self._eliminate()
         if self.experiment.runs is not self.whole.runs:
