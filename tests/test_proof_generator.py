@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+import srfcli as srf
 from srfcli.data.experiment import read_experiment
 from srfcli.inference.prediction import predict
 from srfcli.laws.registry import load_registry
@@ -28,6 +29,7 @@ from srfcli.validation.slider import (
     Track,
     ageing,
     at_unit_velocity,
+    critical_load,
     example_protocol,
     friction,
     log_velocity,
@@ -473,3 +475,25 @@ def test_it_shares_nothing_with_what_it_proves():
         names |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
         own = {n for n in names if n.startswith("srfcli")} - {f"srfcli.validation.{name}" for name in GENERATOR}
         assert own <= {"srfcli.core.errors", "srfcli.core.files", "srfcli.core.parallel"}, path
+
+
+@pytest.mark.parametrize(
+    ("change", "laws"),
+    [
+        ({}, {}),
+        ({"rigid": True, "massless": True}, {"interface": "rigid", "inertia": False}),
+        ({"ageing": "ruina", "bare": True}, {"ageing": "ruina", "law": "dieterich-ruina"}),
+        ({"Wa": 0.4}, {"effects": ["adhesion-offset"], "Wa": 0.4}),
+    ],
+    ids=["usual", "rigid-massless", "ruina", "adhesion"],
+)
+def test_critical_loads_are_those_of_the_characteristic_polynomial(change, laws):
+    """Eigenvalues of differences of the generator's rates, against the polynomial that the tool derives."""
+    p = Physics(**change)
+    own = {"mu0": p.mu0, "A": p.A, "B": p.B, "D0": p.D0, "K": p.K}
+    own |= {} if p.bare else {"Vsat": p.Vsat}
+    own |= {} if p.rigid else {"lambda": p.lam}
+    own |= {} if p.massless else {"M": p.M * 1e6}
+    rows = srf.linear(srf.system(**laws, **own), over={"V": [1.0, 30.0]}).table.records()
+    found = [row["W0"] for row in rows]
+    assert [critical_load(p, V, 0.1, 100.0) for V in (1.0, 30.0)] == pytest.approx(found, rel=1e-4)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.errors import SrfError
 from srfcli.data.values import Experiment
+from srfcli.diagnosis.search import Fitted
 from srfcli.inference.prediction import stiffness_share
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
@@ -71,6 +72,16 @@ def stability(
     if apart:
         notes.append(f"{', '.join(apart)}: critical loads do not depend on that.")
     return found | {"note": " ".join(notes)}
+
+
+def critical_loads(registry: Registry, fitted: Fitted, V: Array) -> Array:
+    """Return the critical load (N) of a fitted model under constant load at each velocity (um/s), NaN for none.
+
+    What acts in one run alone is left out.
+    """
+    hypothesis, problem = fitted.hypothesis, fitted.fit.likelihood.problem
+    choice = problem.experiment.choice.plus(e.name for e in hypothesis.effects if not e.run)
+    return _loads(*_model(registry, replace(problem.experiment, choice=choice), fitted.fit.values), V)
 
 
 def _model(registry: Registry, experiment: Experiment, values: Mapping[str, float]) -> tuple[GeneratedModel, Array]:

@@ -43,8 +43,8 @@ class Answer:
 
     `fit` holds the fitted runs' rms over noise, `held` each held-out run's rms in um and over noise, by `baseline` and
     `augmented`; `parameters` are those that the effects brought, in declared units; `tried` has what was fitted, `ungated` the
-    verdict without a say of held-out runs; `run` is where most of the baseline's excess misfit is, if one run has more than half;
-    `cpu` and `wall` are in s; `code` tells programs apart.
+    verdict without a say of held-out runs; `run` is the one in which alone an effect acts; `loads` are the critical loads of both
+    models at velocities `V` (um/s) beyond those of the recordings; `cpu` and `wall` are in s; `code` tells programs apart.
     """
 
     case: str
@@ -63,6 +63,7 @@ class Answer:
     code: str = ""
     failure: str = ""
     run: str = ""
+    loads: Mapping[str, Sequence[float | None]] = field(default_factory=dict)
 
     @property
     def said(self) -> str:
@@ -81,7 +82,7 @@ def from_line(line: str, *, where: str) -> Answer:
     """Return the answer of a line; SrfError, naming `where`, for one that is no answer."""
     try:
         found = parse_json(line, "the line")
-        if not isinstance(found, dict) or {"run", *found} != {f.name for f in fields(Answer)}:  # older ones have no run
+        if not isinstance(found, dict) or {"run", "loads", *found} != {f.name for f in fields(Answer)}:  # older ones lack these
             raise ValueError("not the keys of an answer")
         if found["verdict"] not in VERDICTS:
             raise ValueError(f"verdict {found['verdict']!r}")
@@ -165,10 +166,13 @@ def diagnose_case(folder: Path, plugins: tuple[Path, ...], *, by: type[ModelSear
     registry = _registry(plugins)
     search = (by or ModelSearch)(registry, read_experiment(folder, registry=registry, holdout=False))
     search.run()
-    return told(conclude(search, read_experiment(folder, registry=registry)), case=folder.name)
+    return told(conclude(search, read_experiment(folder, registry=registry)), registry, case=folder.name)
 
 
-def told(diagnosis: Diagnosis, *, case: str) -> Answer:
+BEYOND = (0.1, 1 / 3, 3.0, 10.0)  # times the slowest, the fastest drive: where critical loads are asked for
+
+
+def told(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
     """Return a diagnosis as an answer."""
     from srfcli.diagnosis.answer import run_views
     from srfcli.diagnosis.verdict import brought
@@ -192,7 +196,23 @@ def told(diagnosis: Diagnosis, *, case: str) -> Answer:
         {_plain(f.name): _evidence(f) for f in reversed(diagnosis.ranked)},
         diagnosis.ungated,
         run=next(iter(diagnosis.acts_in.values()), ""),
+        loads=_critical_loads(diagnosis, registry),
     )
+
+
+def _critical_loads(diagnosis: Diagnosis, registry: Registry) -> Mapping[str, Sequence[float | None]]:
+    """Return the critical loads of both models beyond the recordings' velocities; nothing where a model has no such loads."""
+    from srfcli.diagnosis.diagram import critical_loads
+
+    driven = np.concatenate([np.abs(run.drive.velocities) for run in diagnosis.experiment.runs])
+    slowest, fastest = driven[driven > 0].min(), driven.max()
+    V = np.array([x * (slowest if x < 1 else fastest) for x in BEYOND])
+    try:
+        found = {name: critical_loads(registry, f, V) for name, f in
+                 (("baseline", diagnosis.baseline), ("augmented", diagnosis.final))}  # fmt: skip
+    except SrfError:
+        return {}
+    return {name: [_finite(x) for x in values.tolist()] for name, values in {"V": V, **found}.items()}
 
 
 def _plain(name: str) -> str:

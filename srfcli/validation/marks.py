@@ -35,9 +35,10 @@ from srfcli.validation.cases import (
     known_plans,
     known_rig,
     shown,
+    without,
 )
 from srfcli.validation.gauge import Array, Gauge, white
-from srfcli.validation.slider import Physics, Plan
+from srfcli.validation.slider import Physics, Plan, critical_load
 
 # The mark of one answer: which answers are accepted, and whether it is one of them.
 
@@ -55,7 +56,8 @@ class Mark:
 
     `class_right`: right, or ambiguous with the truth among what is listed or equivalent to it. `alarm`: something is said to be
     missing. `top` is the hypothesis with most confidence, `stated` that confidence, `hit` whether it is the truth; `error` the
-    held-out rms of the final model over that of the true one, `baseline_error` that of the baseline; `deviation` is the
+    held-out rms of the final model over that of the true one, `baseline_error` that of the baseline, `loads` how far the critical
+    loads of both are off (rms of the logarithm), beyond the recordings' velocities; `deviation` is the
     distance of an effect's size from the true one, where it was named rightly and alone: in standard errors, and relative.
     `own_track`: each run has a rough track of its own. `set_in` says in which apparatus, protocol, law, noise and field it was
     concealed. `located`: of an effect in one run, whether it is named and most of the misfit is placed in that run.
@@ -81,6 +83,7 @@ class Mark:
     own_track: bool = False
     set_in: Mapping[str, str] = field(default_factory=dict)
     located: bool = False
+    loads: tuple[float, float] | None = None
 
     @property
     def visible(self) -> bool:
@@ -133,6 +136,7 @@ def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
         truth.get("own_track", False),
         setting_of(truth),
         answer.verdict == "identified" and answer.effects == hidden and answer.run == truth.get("only", "") != "",
+        load_errors(truth, answer),
     )
 
 
@@ -372,6 +376,24 @@ def deviation(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] |
     return None
 
 
+def load_errors(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] | None:
+    """Return how far critical loads are off those of the true equations, final model and baseline: rms of ln W0c/W0c.
+
+    At the velocities at which all three have one; None where there are none.
+    """
+    if not answer.loads:
+        return None
+    p, plans = known_physics(truth), known_plans(truth)
+    p = without(p, concealed(truth)) if truth.get("only") else p  # elsewhere it is no part of the system
+    V, ours, base = (np.array(answer.loads[name], dtype=float) for name in ("V", "augmented", "baseline"))
+    true = np.array([critical_load(p, v, 1e-3 * plans[0].W0, 1e3 * plans[0].W0) for v in V.tolist()])
+    there = np.isfinite(true) & np.isfinite(ours) & np.isfinite(base)
+    if not there.any():
+        return None
+    off, before = (float(np.sqrt(np.mean(np.log(x[there] / true[there]) ** 2))) for x in (ours, base))
+    return off, before
+
+
 # Marks as tables: confusion, rates, power, calibration, held-out errors, sizes and cost.
 
 SCHEMA = "srf.prove/1"
@@ -389,7 +411,7 @@ COUNTED = (Column("hits", "1", "for how many cases it holds"), Column("cases", "
 
 def tables(marks: Sequence[Mark], *, digest: str, seed: int, of: int) -> tuple[Table, list[Table]]:
     """Return the confusion table, whose `meta` holds everything, and the tables that text shows below it."""
-    made = (rates, by_effect, by_outside, by_setting, by_strength, calibrated, held, sizes, cost, ablated)
+    made = (rates, by_effect, by_outside, by_setting, by_strength, calibrated, held, critical, sizes, cost, ablated)
     more = [t for t in (make(marks) for make in made) if t.rows]
     meta: dict[str, Any] = {
         "digest": digest,
@@ -557,6 +579,15 @@ def calibrated(marks: Sequence[Mark]) -> Table:
     return Table("srf.prove.calibration/1", columns, rows, "Stated confidence of the likeliest hypothesis", notes)
 
 
+GROUPS: tuple[tuple[str, Callable[[Mark], bool]], ...] = (
+    ("named rightly", lambda m: m.right and m.answer.verdict == "identified"),
+    ("named wrongly", lambda m: m.wrong_name),
+    ("ambiguous", lambda m: m.answer.verdict == "ambiguous"),
+    ("unknown", lambda m: m.answer.verdict == "unknown"),
+    ("none or inconclusive", lambda m: m.answer.verdict in ("none", "inconclusive")),
+)
+
+
 def held(marks: Sequence[Mark]) -> Table:
     """Return the held-out error over that of the model that knows the truth."""
     columns = (
@@ -564,25 +595,34 @@ def held(marks: Sequence[Mark]) -> Table:
         Column("within", about=f"at most {WITHIN}", format=".3f"), Column("baseline_median", format=".3f"),
     )  # fmt: skip
     rows = []
-    groups: list[tuple[str, Callable[[Mark], bool]]] = [
-        ("named rightly", lambda m: m.right and m.answer.verdict == "identified"),
-        ("named wrongly", lambda m: m.wrong_name),
-        ("ambiguous", lambda m: m.answer.verdict == "ambiguous"),
-        ("unknown", lambda m: m.answer.verdict == "unknown"),
-        ("none or inconclusive", lambda m: m.answer.verdict in ("none", "inconclusive")),
-    ]
-    for name, chosen in groups:
-        for rough in (False, True):
-            errors = [
-                (m.error, m.baseline_error) for m in marks if m.rough == rough and chosen(m) and m.error is not None
-            ]
-            if errors:
-                ours, base = [e for e, _ in errors], [b for _, b in errors if b is not None]
-                within = sum(e <= WITHIN for e in ours) / len(ours)
-                title = f"{name}, rough tracks" if rough else name
-                rows.append((title, len(ours), quantile(ours, 0.5), quantile(ours, 0.9), within, quantile(base, 0.5)))
+    for (name, chosen), rough in product(GROUPS, (False, True)):
+        errors = [(m.error, m.baseline_error) for m in marks if m.rough == rough and chosen(m) and m.error is not None]
+        if errors:
+            ours, base = [e for e, _ in errors], [b for _, b in errors if b is not None]
+            within = sum(e <= WITHIN for e in ours) / len(ours)
+            title = f"{name}, rough tracks" if rough else name
+            rows.append((title, len(ours), quantile(ours, 0.5), quantile(ours, 0.9), within, quantile(base, 0.5)))
     note = "rms of held-out runs, over that of the model that knows the truth and the track; `within` 1.1 of it"
     return Table("srf.prove.held/1", columns, rows, "Held-out error", (note,) if rows else ())
+
+
+def critical(marks: Sequence[Mark]) -> Table:
+    """Return how far the critical loads of the models are off those of the truth, beyond the velocities of the recordings."""
+    columns = (
+        Column("answers"), Column("cases"), Column("median", format=".3g"), Column("q90", format=".3g"),
+        Column("baseline_median", format=".3g"), Column("baseline_q90", format=".3g"), Column("nearer", format=".3f"),
+    )  # fmt: skip
+    rows = []
+    for name, chosen in GROUPS:
+        errors = [m.loads for m in marks if chosen(m) and m.loads is not None]
+        if errors:
+            ours, base = ([e[k] for e in errors] for k in (0, 1))
+            nearer = sum(a <= b for a, b in errors) / len(errors)
+            spread = [quantile(x, q) for x in (ours, base) for q in (0.5, 0.9)]
+            rows.append((name, len(errors), *spread, nearer))
+    note = ("relative error of critical loads at a tenth, a third, 3 and 10 times the velocities driven, by the truth's "
+            "equations; nearer: as the baseline's, or less")  # fmt: skip
+    return Table("srf.prove.loads/1", columns, rows, "Critical loads off the recordings", (note,) if rows else ())
 
 
 def sizes(marks: Sequence[Mark]) -> Table:

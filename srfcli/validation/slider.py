@@ -11,10 +11,12 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
+from typing import Any
 from zlib import crc32
 
 import numpy as np
 from scipy.integrate import ode
+from scipy.optimize import brentq
 
 # Rough tracks: a friction coefficient that wanders with position, the same for all runs of a case.
 
@@ -722,3 +724,37 @@ def _through(slider: Slider, solver: ode, trace: Trace, end: float) -> Array | N
     except OverflowError:  # a state ran away
         return None
     return y if solver.successful() and np.isfinite(y).all() else None
+
+
+# Stability of steady sliding by the slider's own equations: differences of its rates, and their eigenvalues.
+
+UNSTEADY: dict[str, Any] = {
+    "track": Track(), "topo": 0.0, "bump": 0.0, "drift_t": 0.0, "drift_x": 0.0, "ripple": 0.0, "drive_tau": 0.0,
+}  # fmt: skip
+UNFELT: dict[str, Any] = {"lag": 0.0, "creep": 0.0, "servo": 0.0}  # of gauge and servo: steady sliding does not feel them
+LOADS = 60  # that are tried, evenly in their logarithm
+DIFFERENCE = 1e-4  # relative, of a state: a critical load is 2e-5 off; the friction law is inverted to some 1e-10
+
+
+def critical_load(p: Physics, V: float, low: float, high: float) -> float:
+    """Return the least load from `low` to `high` above which steady sliding at V (um/s) is unstable; NaN if there is none.
+
+    What depends on place or time has no steady sliding, and is left out.
+    """
+    p = replace(p, **UNSTEADY, **UNFELT)
+
+    def growth(ln_W: float) -> float:
+        slider = Slider(p, Plan("steady", ((1.0, V),), math.exp(ln_W), 0.1))
+        y, kept = np.array(slider.steady()), [i for i, name in enumerate(slider.names) if name != "s"]
+        J = np.empty((len(kept), len(kept)))
+        for column, i in enumerate(kept):
+            step = np.zeros(y.size)
+            step[i] = DIFFERENCE * max(abs(y[i]), DIFFERENCE)
+            above, below = (np.array(slider.rates(0.5, y + side * step, V))[kept] for side in (1, -1))
+            J[:, column] = (above - below) / (2 * step[i])
+        return float(np.linalg.eigvals(J).real.max()) if np.isfinite(J).all() else math.nan
+
+    grid = np.linspace(math.log(low), math.log(high), LOADS)
+    found = np.array([growth(x) for x in grid])
+    lost = np.flatnonzero((found[:-1] < 0) & (found[1:] >= 0))
+    return math.exp(brentq(growth, grid[lost[0]], grid[lost[0] + 1], xtol=1e-9)) if lost.size else math.nan
