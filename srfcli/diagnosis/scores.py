@@ -325,11 +325,14 @@ class Scores:
         return found
 
     def alone(self) -> list[Score]:
-        """Return the scores of effects that act in one run alone, where that gains more than to act in all; largest first.
+        """Return the scores of effects that act in one run alone, largest first, where that gains more than to act in all.
+
+        By more than the choice of the run costs.
 
         Laws are the same in all runs; what belongs to the apparatus may befall one.
         """
-        every, best, end = {s.effect.reported: s.gain for s in self.singles}, dict[str, Score](), 0
+        choice, best, end = float(np.log(max(len(self.remainder.runs), 1))), dict[str, Score](), 0
+        every = {s.effect.reported: s.gain + choice for s in self.singles}
         apparatus = [c for c in self.raw if not (c.effect.constitutive or c.effect.frees or c.effect.settings)]
         for f in self.remainder.runs:
             rows = slice(end, end := end + 2 * f.white.size)

@@ -155,7 +155,7 @@ def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted
 
     That is its evidence on the runs fitted and its likelihood of the runs held out, for those that pass; the others are given
     the same likelihood as the best of these. Of two that come close one that holds the other gives way, and one that
-    became the other.
+    became the other; of an effect in all runs or in one, that which is worse.
     """
     least = -np.inf if ranked[0].fine else ranked[0].evidence - CLOSE
     passed = [f for f in ranked if f.fine and f.evidence > least]
@@ -167,8 +167,11 @@ def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted
     joint = {f.name: f.evidence + told.get(f.name, rest) for f in ranked}
     close = [f for f in passed if joint[passed[0].name] - joint[f.name] < CLOSE]
     names = [set(f.hypothesis.reported) for f in close]
-    close = [f for f in close if not any(n < set(f.hypothesis.reported) for n in names)]
-    return tuple(f for f in close if not any(_is_that_law(f, other, joint) for other in close)), joint
+    close = [f for f, own in zip(close, names, strict=True) if not any(n < own for n in names)]
+    best: dict[frozenset[str], Fitted] = {}
+    for f in close:
+        best.setdefault(frozenset(f.hypothesis.reported), f)
+    return tuple(f for f in best.values() if not any(_is_that_law(f, other, joint) for other in close)), joint
 
 
 def foretold(fitted: Fitted, whole: Experiment) -> float:
