@@ -13,6 +13,9 @@ from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiler
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.hypotheses import Hypothesis
+from srfcli.diagnosis.search import COARSE, ModelSearch
+from srfcli.inference.state_space import Likelihood, StateSpaceFit, maximise
 from srfcli.laws.registry import bundled_registry
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
@@ -110,3 +113,29 @@ def test_what_is_wrong_with_it_is_said(entry, said, tmp_path):
     with pytest.raises(SrfError, match=said) as found:
         read_experiment(path, registry=SHIPPED)
     assert "experiment.toml" in str(found.value)
+
+
+class Stuck(ModelSearch):
+    """A search whose first fit of the baseline ends elsewhere: with another D0, beside a field that takes up the rest."""
+
+    def fit(self, move):
+        found = super().fit(move)
+        if move is not None:
+            return found
+        self.right = found.evidence
+        problem = self._problem(Hypothesis(), {})
+        likelihood = Likelihood(problem, processes=found.fit.likelihood.processes, rtol=COARSE)
+        x = likelihood.coordinates({**found.fit.values, "D0": 0.25, "field_amplitude": 2e-3, "field_length": 0.3})
+        maximum = maximise(likelihood, x, held=["D0"], steps=8)
+        return self._judged(Hypothesis(), StateSpaceFit(likelihood, maximum, 1))
+
+
+@needs_compiler
+def test_a_baseline_in_a_false_maximum_is_fitted_again_from_a_better_model(tmp_path):
+    """Else what is nothing would have the name of the effect whose fit found the way out."""
+    experiment = read_experiment(written(tmp_path, ()), registry=SHIPPED)
+    search = Stuck(SHIPPED, experiment.fitted(), effects=["slip-evolution", "viscous-drag", "second-state"])
+    best = search.run()
+    assert best.name == "none" and best.fine
+    assert best.evidence == pytest.approx(search.right, abs=1.0)
+    assert len(search.fitted) > 1

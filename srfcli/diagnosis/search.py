@@ -252,6 +252,7 @@ class ModelSearch:
                 again(self.baseline)
                 self._search()
         self.cut_short = self.spent and bool(self.queue)
+        self._rebase()
         self._eliminate()
         if self.experiment.runs is not self.whole.runs:
             self._fit_all()
@@ -509,6 +510,23 @@ class ModelSearch:
             self.count += 1
             expected = promise - node.fit.log_likelihood + node.evidence
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
+
+    def _rebase(self) -> None:
+        """Fit the baseline anew from the best model's parameters where it is likelier than it was: it had a false maximum."""
+        best, base = self.best(), self.baseline
+        if best is base or not self.experiment.runs:
+            return
+        values, processes = best.fit.values, best.fit.likelihood.processes
+        own = Likelihood(self._problem(Hypothesis(), values), smooth=best.fit.smooth, processes=processes, rtol=COARSE)
+        if not own.at(own.coordinates(values), slopes=False).log_likelihood > base.fit.log_likelihood + NEEDED:
+            return
+        try:
+            found = self._record(self.fit(_Move(0.0, 0, Hypothesis(), dict(values), ())))
+        except SrfError:  # it stays as it was
+            return
+        if found is not base:
+            self._expand(found)
+            self._search()
 
     def _eliminate(self) -> None:
         """Refit the parts of the best model, and of those that come close, alone from its parameters (backward elimination)."""
