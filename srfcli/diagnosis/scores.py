@@ -329,11 +329,12 @@ class Scores:
 
         By more than the choice of the run costs.
 
-        Laws are the same in all runs; what belongs to the apparatus may befall one.
+        Laws are the same in all runs, and so is what the rig's elasticity makes of the load; other faults of the apparatus may
+        befall one.
         """
         choice, best, end = float(np.log(max(len(self.remainder.runs), 1))), dict[str, Score](), 0
         every = {s.effect.reported: s.gain + choice for s in self.singles}
-        apparatus = [c for c in self.raw if not (c.effect.constitutive or c.effect.frees or c.effect.settings)]
+        apparatus = [c for c in self.raw if _may_befall_one_run(c.effect)]
         for f in self.remainder.runs:
             rows = slice(end, end := end + 2 * f.white.size)
             for first in range(0, len(apparatus), TOGETHER):
@@ -450,6 +451,15 @@ class Scores:
             values = (self._expected(a, size[:cut]), self._expected(b, size[cut:]))
             found.append(PairScore((a.effect, b.effect), gain, values))
         return sorted(found, key=lambda p: -p.gain)[:most]
+
+
+def _may_befall_one_run(effect: Effect) -> bool:
+    """Return whether an effect is a fault of the apparatus, and no law of the contact, the spring or the frame under load."""
+    elastic = any(
+        slot == "K" or (slot == "V" and {"W", "W_dot"} & {str(s) for s in formula.free_symbols})
+        for slot, formula in effect.changes
+    )
+    return not (effect.constitutive or effect.frees or effect.settings or elastic)
 
 
 def _stacked(innovations: Array, variances: Array) -> Array:

@@ -252,6 +252,7 @@ class ModelSearch:
                 again(self.baseline)
                 self._search()
         self.cut_short = self.spent and bool(self.queue)
+        self._in_all_runs()
         self._rebase()
         self._eliminate()
         if self.experiment.runs is not self.whole.runs:
@@ -510,6 +511,19 @@ class ModelSearch:
             self.count += 1
             expected = promise - node.fit.log_likelihood + node.evidence
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
+
+    def _in_all_runs(self) -> None:
+        """Fit the best model in all runs where an effect acts in one: another that was missing may have misled its score."""
+        best = self.best()
+        effects = tuple(replace(e, run="") for e in best.hypothesis.effects)
+        whole = Hypothesis(effects, best.hypothesis.ageing)
+        if whole.name in self.fitted:
+            return
+        try:
+            self._record(self.fit(_Move(0.0, 0, whole, dict(best.fit.values), self._sizes(best))))
+        except SrfError as error:
+            self.excluded.append(Excluded(whole.name, error.message))
+        self._search()
 
     def _rebase(self) -> None:
         """Fit the baseline anew from the best model's parameters where it is likelier than it was: it had a false maximum."""
