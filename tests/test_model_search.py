@@ -148,7 +148,8 @@ def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
     first = float(column.columns[:, 0] @ scores.remainder.rest)
     spread = np.sqrt(column.whole / column.columns.shape[1])  # standard deviation of the slope, the others' share in it
     assert abs(slope - first) < 0.15 * spread
-    moved = values | {n: fitted.values[n] + size * d for n, d in zip(fitted.likelihood.names, column.fitted[:, 0], strict=True)}
+    along = scores.remainder.shifts(column.taken[:, 0])
+    moved = values | {n: fitted.values[n] + size * d for n, d in zip(fitted.likelihood.names, along, strict=True)}
     x = likelihood.coordinates(moved | {longs[column.name]: size})
     x[likelihood.names.index(longs[column.name])] = size
     spared = likelihood.at(x, slopes=False).log_likelihood - gained[0]  # where the other parameters go along

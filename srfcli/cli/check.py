@@ -430,10 +430,8 @@ def _noise(noise: GaugeNoise) -> dict[str, Any]:
 CONSTANT = 1e-5  # relative variation of a load below which it is constant
 # errors above which a parameter can hardly, and cannot, be identified
 LIMITS = {"alpha": (0.05, 0.5), "lambda": (0.1, 1.0), "n": (0.1, 1.0)}
-SEEN, HIDDEN = (
-    3.0,
-    0.3,
-)  # peaks over the noise of a sample, below which a parameter can hardly, and cannot, be identified
+# peaks over the noise of a sample, below which a parameter can hardly, and cannot, be identified
+SEEN, HIDDEN = 3.0, 0.3
 CAN = "can be identified"
 CHANGES = {"alpha": "alpha = 0.2", "lambda": "a change by 10 %", "n": "a change by 0.1"}
 SUBJECTS = {

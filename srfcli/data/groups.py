@@ -59,9 +59,8 @@ def step(run: Run) -> str:
 
 def levels(run: Run) -> list[tuple[float, float]]:
     """Return when each velocity of a run begins (s), and what it is (um/s); ramps lie between them."""
-    starts = [float(run.t[0]), *(b for b in run.drive.breaks if run.t[0] < b < run.t[-1])]
     found: list[tuple[float, float]] = []
-    for begin, end in zip(starts, [*starts[1:], float(run.t[-1])], strict=True):
+    for begin, end in pairwise(run.edges):
         V, rate, since = run.drive.piece(begin)
         ends = np.maximum([V + rate * (begin - since), V + rate * (end - since)], STILL)
         if np.ptp(np.log(ends)) > np.log(STEP):

@@ -73,8 +73,8 @@ class PairScore:
 class _Column:
     """Columns (2 m, q) of an effect by the size called `name`, at given inner values; names are the effect's own.
 
-    Projected, they are free of what was fitted, `whole` is their square before that, and `along` (r, q) what they have of the
-    field that all runs share; `fitted` (p, q) is what a size of 1 does to the parameters that were fitted.
+    Projected, they are free of what was fitted, of whose directions they had `taken` (p, q); `whole` is their square before that,
+    and `along` (r, q) what they have of the field that all runs share.
     """
 
     effect: Effect
@@ -82,7 +82,7 @@ class _Column:
     inner: dict[str, float]
     columns: Array
     whole: float = 0.0
-    fitted: Array | None = None
+    taken: Array | None = None
     along: Array | None = None
 
 
@@ -137,9 +137,9 @@ class Remainder:
         """Return columns (2 m, k) projected off what was fitted."""
         return np.asarray(columns - self.base @ (self.base.T @ columns))
 
-    def shifts(self, columns: Array) -> Array:
-        """Return by how much the parameters that were fitted change (p, k) where what columns (2 m, k) say is added."""
-        return np.asarray(-self._back @ (self.base.T @ columns))
+    def shifts(self, taken: Array) -> Array:
+        """Return by how much the parameters that were fitted change where something is added that has `taken` (p,) of `base`."""
+        return np.asarray(-self._back @ taken)
 
     @cached_property
     def runs(self) -> tuple[Filtered, ...]:
@@ -186,8 +186,7 @@ class Scores:
         self.remainder, self.fitted = remainder, remainder.fitted
         self.excluded: list[Excluded] = []
         self.shared = self.remainder.shared
-        self.raw = self._all(candidates)
-        self.columns = self._projected(self.raw)
+        self.columns = self._projected(self._all(candidates))
         self.singles = self._best_of(self.columns)
 
     def _all(self, candidates: Sequence[Effect]) -> list[_Column]:
@@ -327,27 +326,29 @@ class Scores:
     def alone(self) -> list[Score]:
         """Return the scores of effects that act in one run alone, largest first, where that gains more than to act in all.
 
-        By more than the choice of the run costs.
-
-        Laws are the same in all runs, and so is what the rig's elasticity makes of the load; other faults of the apparatus may
-        befall one.
+        By more than the choice of the run costs. Laws are the same in all runs, and so is what the rig's elasticity makes of the
+        load; other faults of the apparatus may befall one.
         """
-        choice, best, end = float(np.log(max(len(self.remainder.runs), 1))), dict[str, Score](), 0
-        every = {s.effect.reported: s.gain + choice for s in self.singles}
-        apparatus = [c for c in self.raw if _may_befall_one_run(c.effect)]
-        for f in self.remainder.runs:
+        runs, base, found, end = self.remainder.fitted.maximum.point.runs, self.remainder.base, [], 0
+        if len(runs) < 2:
+            return []
+        every = {s.effect.reported: s.gain + float(np.log(len(runs))) for s in self.singles}
+        apparatus = [c for c in self.columns if _may_befall_one_run(c.effect)]
+        for f in runs:
             rows = slice(end, end := end + 2 * f.white.size)
+            best: list[Score] = []
             for first in range(0, len(apparatus), TOGETHER):
                 parts = []
                 for c in apparatus[first : first + TOGETHER]:
                     columns = np.zeros_like(c.columns)
-                    columns[rows] = c.columns[rows]
+                    columns[rows] = c.columns[rows] + base[rows] @ c.taken
                     parts.append(replace(c, effect=replace(c.effect, run=f.run.name), columns=columns))
-                for score in self._best_of(self._projected(parts)):
-                    label = score.effect.label
-                    if score.gain > max(every.get(score.effect.reported, 0.0), best[label].gain if label in best else 0.0):
-                        best[label] = score
-        return sorted(best.values(), key=lambda s: -s.gain) if len(self.remainder.runs) > 1 else []
+                best += self._best_of(self._projected(parts))
+            foremost: dict[str, Score] = {}
+            for score in sorted(best, key=lambda s: -s.gain):
+                foremost.setdefault(score.effect.reported, score)
+            found += [s for name, s in foremost.items() if s.gain > every[name]]
+        return sorted(found, key=lambda s: -s.gain)
 
     def _projected(self, columns: Sequence[_Column]) -> list[_Column]:
         """Return the columns that do something here, projected off what was fitted, many at a time."""
@@ -362,13 +363,14 @@ class Scores:
             if not some:
                 continue
             whole_columns = np.concatenate([c.columns for c in some], axis=1)
-            free, fitted = self.remainder.free(whole_columns), self.remainder.shifts(whole_columns)
+            taken = self.remainder.base.T @ whole_columns
+            free = whole_columns - self.remainder.base @ taken
             along = self.shared.u.T @ free if self.shared.gain else None
             at = 0
             for c in some:
                 part = slice(at, at := at + c.columns.shape[1])
                 beside = None if along is None else along[:, part]
-                found.append(replace(c, columns=free[:, part], along=beside, fitted=fitted[:, part]))
+                found.append(replace(c, columns=free[:, part], along=beside, taken=taken[:, part]))
         return found
 
     def _judge(self, *several: _Column) -> tuple[float, Array, Array]:
@@ -407,7 +409,7 @@ class Scores:
             values = self._expected(column, size)
             direction = column.columns @ size
             norm = float(np.linalg.norm(direction))
-            shifts = np.zeros(0) if column.fitted is None else column.fitted @ size
+            shifts = np.zeros(0) if column.taken is None else self.remainder.shifts(column.taken @ size)
             best[effect.reported] = Score(
                 effect, gain, values, float(size[0]), error, error * np.sqrt(24.0), free,
                 direction / norm if norm > 0 else direction,

@@ -350,7 +350,6 @@ class ModelSearch:
         if node.fine and not node.hypothesis.reported and (not node.fit.smooth or node.fit.likelihood.processes):
             least = HINT
         alone = scores.alone() if not node.fine or any(s.gain > least for s in scores.singles) else []
-        scores.raw = []  # of much memory
         promised = [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in alone]
         promised = sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])
         for gain, score in promised[:SINGLES]:
@@ -517,13 +516,16 @@ class ModelSearch:
         best = self.best()
         effects = tuple(replace(e, run="") for e in best.hypothesis.effects)
         whole = Hypothesis(effects, best.hypothesis.ageing)
-        if whole.name in self.fitted:
-            return
+        if whole.name not in self.fitted:
+            self._fit_from(best, whole, self._sizes(best))
+            self._search()
+
+    def _fit_from(self, node: Fitted, hypothesis: Hypothesis, sizes: tuple[dict[str, float], ...]) -> None:
+        """Fit a model from the parameters of another that was fitted; what cannot be fitted is left out, with the reason."""
         try:
-            self._record(self.fit(_Move(0.0, 0, whole, dict(best.fit.values), self._sizes(best))))
+            self._record(self.fit(_Move(0.0, 0, hypothesis, dict(node.fit.values), sizes)))
         except SrfError as error:
-            self.excluded.append(Excluded(whole.name, error.message))
-        self._search()
+            self.excluded.append(Excluded(hypothesis.name, error.message))
 
     def _rebase(self) -> None:
         """Fit the baseline anew from the best model's parameters where it is likelier than it was: it had a false maximum."""
@@ -554,10 +556,7 @@ class ModelSearch:
                     continue
                 if any(n not in self._stated for n in effect.needs):
                     continue  # it is nothing without the other
-                try:
-                    self._record(self.fit(_Move(0.0, 0, part, dict(node.fit.values), (own,))))
-                except SrfError as error:
-                    self.excluded.append(Excluded(part.name, error.message))
+                self._fit_from(node, part, (own,))
 
     @cached_property
     def _stated(self) -> frozenset[str]:

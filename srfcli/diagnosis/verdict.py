@@ -216,10 +216,10 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
     found = []
     for run in (run for run in whole.runs if run.holdout):
         first, last, seen = (f.fit.likelihood.held_out(run, f.fit.values) for f in models)
-        before, loud, own = baseline.fit.foretold(run), "", best.fit.likelihood
-        if own.noisy_alone(run):
-            loud = next((text for size, text in loudness(*own.alone(run, best.fit.values)) if size > 1.0), "")
-        found.append(Held(first, last, seen, (before, before if best is baseline else best.fit.foretold(run)), loud))
+        before, after, loud = baseline.fit.foretold(run), best.fit.foretold(run), ""
+        if best.fit.likelihood.noisy_alone(run):
+            loud = next((text for size, text in loudness(*after.alone) if size > 1.0), "")
+        found.append(Held(first, last, seen, (before, after), loud))
     return tuple(found)
 
 

@@ -55,13 +55,12 @@ def own_start(
 
 def first_friction(run: Run) -> float:
     """Return the friction coefficient in the first readings of a run, by the stated stiffness."""
-    first, W = float(np.median(run.observed[run.used][:5])), run.load.rest(float(run.t[0]))
-    return {"elongation": first * run.stiffness / W, "force": first / W, "friction": first}[run.observable]
+    return float(np.median(run.observed[run.used][:5]) * run.friction_factor(run.first_load))
 
 
 def first_elongation(run: Run) -> float:
     """Return the spring's elongation (um) in the first readings of a run, by the stated stiffness."""
-    return first_friction(run) * run.load.rest(float(run.t[0])) / run.stiffness
+    return first_friction(run) * run.first_load / run.stiffness
 
 
 def _gauge_start(run: Run, kind: str) -> tuple[float, float, float]:

@@ -80,7 +80,7 @@ FLAT = 1e-8  # of the scaled information: a direction that is flatter has a scor
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
-ALIKE = 0.25  # in the logarithm of the sampling interval, within which a gauge's noise is the same
+SAME_RATE = 0.25  # in the logarithm of the sampling interval, within which a gauge's noise is the same
 COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
 PERIODOGRAM = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
@@ -541,7 +541,7 @@ class Likelihood:
     def noisy_alone(self, run: Run) -> bool:
         """Return whether no run that was fitted has this one's gauge noise: none of its group, or none sampled about as often."""
         return not all(
-            any(known[::2] == kind[::2] and abs(np.log(known[1] / kind[1])) < ALIKE for known in self.kinds)
+            any(known[::2] == kind[::2] and abs(np.log(known[1] / kind[1])) < SAME_RATE for known in self.kinds)
             for kind in self.kinds_of(run)
         )
 
@@ -830,10 +830,14 @@ def _curvature_beyond(last: Point, point: Point) -> Array:
 
 @dataclass(frozen=True)
 class Foretold:
-    """Log marginal likelihood of a run under a fit to others, and the rms of its innovations with what parameters may move."""
+    """Log marginal likelihood of a run under a fit to others, and the rms of its innovations with what parameters may move.
+
+    `alone` is the likelihood by what belongs to the run alone, at the fit's values of the rest, and its maximum.
+    """
 
     log_likelihood: float
     rms: float
+    alone: tuple[Likelihood, Point] = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -843,6 +847,7 @@ class StateSpaceFit:
     likelihood: Likelihood
     maximum: Maximum
     evaluations: int
+    _told: dict[str, tuple[Run, Foretold]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def smooth(self) -> bool:
@@ -868,9 +873,16 @@ class StateSpaceFit:
     def foretold(self, run: Run) -> Foretold:
         """Return how well a run that was not fitted is predicted, with the parameters as uncertain as they are.
 
-        Laplace's method: the fit is the prior of the parameters that the run shares with others.
+        Laplace's method: the fit is the prior of the parameters that the run shares with others. Each run is predicted once.
         """
+        known = self._told.get(run.name)
+        if known is None or known[0] is not run:
+            known = self._told[run.name] = (run, self._foretold(run))
+        return known[1]
+
+    def _foretold(self, run: Run) -> Foretold:
         own, (alone, point) = self.likelihood, self.likelihood.alone(run, self.values)
+        by_itself = (alone, point)
         problem, like = alone.problem, dict(zip(own.names, range(len(own.names)), strict=True))
         if own.noisy_alone(run):
             like = {n: place for n, place in like.items() if n not in alone.names or n in FIELD}
@@ -889,7 +901,7 @@ class StateSpaceFit:
         wide = Likelihood(both, smooth=own.smooth, processes=own.processes, rtol=own.base_rtol)
         point = wide.at(wide.coordinates(point.values))
         if not np.isfinite(point.log_likelihood):
-            return Foretold(-np.inf, np.inf)
+            return Foretold(-np.inf, np.inf, by_itself)
         covariance = np.diag((wide.upper - wide.lower) ** 2)  # of what belongs to the run alone
         known = [i for i, n in enumerate(wide.names) if n in like]
         there = [like[wide.names[i]] for i in known]
@@ -907,7 +919,8 @@ class StateSpaceFit:
                 best, chi2 = moved.log_likelihood - cost / 2, float(moved.runs[0].white @ moved.runs[0].white) + cost
                 break
         size = moved.runs[0].white.size
-        return Foretold(best - 0.5 * float(np.linalg.slogdet(bent)[1]), float(np.sqrt(chi2 / size)))
+        evidence = best - 0.5 * float(np.linalg.slogdet(bent)[1])
+        return Foretold(evidence, float(np.sqrt(chi2 / size)), by_itself)
 
     @property
     def criterion(self) -> float:

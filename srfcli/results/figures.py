@@ -213,10 +213,8 @@ def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title
 # Figures of recordings: each run with what was observed and what was imposed, and the samples that are not compared.
 
 BINS = 1500  # columns in which a long record is drawn by its extremes
-STRETCH, CROSSES = (
-    20,
-    100,
-)  # consecutive samples from which a band is drawn; most single ones that are marked with crosses
+# consecutive samples from which a band is drawn; most single ones that are marked with crosses
+STRETCH, CROSSES = 20, 100
 DECADES = 30.0  # ratio of velocities from which their axis is logarithmic
 UNUSED = "#D55E00"
 

@@ -187,9 +187,8 @@ class FitResult(Result):
         rows: list[tuple[Any, ...]] = []
         for name, scatter in self.found.scatter.items():
             if scatter is None:
-                rows.append(
-                    (name, None, None, None, self._shown(name)[0], None)
-                )  # one is at its bound: its error is not known
+                # one is at its bound: its error is not known
+                rows.append((name, None, None, None, self._shown(name)[0], None))
                 continue
             unit, shown = self._shown(name, scatter.mean, scatter.stderr, scatter.scatter)
             rows.append((name, *shown, unit, scatter.p_value))

@@ -827,9 +827,8 @@ def _headline(data: Mapping[str, Any]) -> str:
     """Return what was found, in a sentence."""
     notes, rows = [str(n) for n in data.get("notes") or ()], list(data.get("rows") or ())
     if _kind(data) in (KINDS["fit"], KINDS["fit-thresholds"]):
-        best = min(
-            (data.get("meta") or {}).get("methods") or [{}], key=lambda m: m.get("chi2", 0.0)
-        )  # of critical loads
+        # the methods are those of critical loads
+        best = min((data.get("meta") or {}).get("methods") or [{}], key=lambda m: m.get("chi2", 0.0))
         told = []
         for row in rows:
             if row.get("method") == best.get("method"):

@@ -284,11 +284,8 @@ def _wrong(effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) 
 def _filled(text: str, effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     """Return a text of REMEDIES with the sizes that an effect was found to have."""
     row = next(iter(_rows(effect, material)), {})
-    nameless = effect in (
-        "stiffness-error",
-        "inertia",
-        "load-transmission",
-    )  # the sentence itself says what the size is of
+    # the sentence itself says what the size is of
+    nameless = effect in ("stiffness-error", "inertia", "load-transmission")
     sizes = _size(row) if nameless else joined([f"{p['name']} = {_size(p)}" for p in _rows(effect, material)])
     plain = with_unit(number(row.get("augmented"), 4), row.get("unit"))
     return text.format(

@@ -15,11 +15,7 @@ from srfcli.validation.slider import AGEING_LAWS, BARE, LAWS, Physics, Plan, ste
 # How an apparatus records, and what its experimenter writes into a description: the same for every case of it.
 
 Start = tuple[float, float, float]  # value, lower, upper
-PARAMETERS = {
-    "Vsat": "Vsat",
-    "lam": "lambda",
-    "nagata": "c",
-}  # field of Physics -> name in a law's file, where they differ
+PARAMETERS = {"Vsat": "Vsat", "lam": "lambda", "nagata": "c"}  # field of Physics -> name in a law's file, where they differ
 OF_LAW = {  # the fields of Physics that each friction law has
     "srf-vsat": ("mu0", "A", "B", "D0", "Vsat"),
     "dieterich-ruina": ("mu0", "A", "B", "D0"),
@@ -153,9 +149,7 @@ def settings(*, wrong_ageing: bool = False) -> list[Setting]:
     with mass has.
     """
     ageing = list(WRONG_AGEING) if wrong_ageing else [(name, name) for name in AGEING_LAWS]
-    made = [
-        Setting(a, p, law, true, stated) for a, p, law, (true, stated) in product(APPARATUS, PROTOCOLS, LAWS, ageing)
-    ]
+    made = [Setting(a, p, law, true, stated) for a, p, law, (true, stated) in product(APPARATUS, PROTOCOLS, LAWS, ageing)]
     return [
         s
         for s in made
@@ -230,26 +224,13 @@ BY_LOAD = {  # nothing happens without a load that changes, or what does is a ch
 }  # fmt: skip
 BY_MODULATION = {"rho", "distortion"}
 OF_AGE = {"alpha", "slip_share", "p_age", "D_power", "age_rate"}  # of the one age; two have none of their own
-BESIDE_NAGATA = {
-    "Wa",
-    "cross",
-    "K_power",
-    "n_kappa",
-    "eta",
-    "lam",
-}  # the rate of the friction force does not follow then
+BESIDE_NAGATA = {"Wa", "cross", "K_power", "n_kappa", "eta", "lam"}  # the rate of the friction force does not follow then
 ONE_RUN = ("rho", "distortion", "cross", "drift_t", "drift_x", "ripple", "lag", "topo")  # what may befall one run alone
 
 
 def possible(varies: str, setting: Setting) -> bool:
     """Return whether the effect that varies a field of Physics makes sense in a setting."""
-    apparatus, protocol, law, ageing, _ = (
-        setting.apparatus,
-        setting.protocol,
-        setting.law,
-        setting.ageing,
-        setting.stated,
-    )
+    apparatus, protocol, law, ageing, _ = setting.apparatus, setting.protocol, setting.law, setting.ageing, setting.stated
     rules = (
         apparatus == "paper" or varies in SIZES[apparatus],
         varies not in BY_LOAD or protocol in LOADED,
@@ -269,11 +250,7 @@ def possible(varies: str, setting: Setting) -> bool:
 # A slider and its runs, drawn together: whether it sticks depends on both.
 
 TRIES = 400
-STABLE = {
-    "paper": 1.2,
-    "rock": 2.5,
-    "micro": 1.5,
-}  # spring over the critical one: a quasi-static slider must be far from it
+STABLE = {"paper": 1.2, "rock": 2.5, "micro": 1.5}  # spring over the critical one: a quasi-static slider must be far from it
 UNSTABLE = 0.8
 
 
@@ -312,9 +289,7 @@ def _slider(rng: np.random.Generator, setting: Setting) -> tuple[Physics, float]
     """Return a slider without effects, and the load under which it is used."""
     if setting.apparatus == "paper":
         usual = Physics()
-        around = {
-            n: getattr(usual, n) * float(np.exp(0.05 * rng.standard_normal())) for n in ("A", "B", "D0", "lam", "Vsat")
-        }
+        around = {n: getattr(usual, n) * float(np.exp(0.05 * rng.standard_normal())) for n in ("A", "B", "D0", "lam", "Vsat")}
         mu, load = 0.464 * float(np.exp(0.01 * rng.standard_normal())), 7.0 if setting.protocol == "mixed" else 5.0
         p = replace(usual, **around)
     elif setting.apparatus == "rock":

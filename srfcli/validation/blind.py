@@ -169,7 +169,7 @@ def diagnose_case(folder: Path, plugins: tuple[Path, ...], *, by: type[ModelSear
     return told(conclude(search, read_experiment(folder, registry=registry)), registry, case=folder.name)
 
 
-BEYOND = (0.1, 1 / 3, 3.0, 10.0)  # times the slowest, the fastest drive: where critical loads are asked for
+OFF_RANGE = (0.1, 1 / 3, 3.0, 10.0)  # times the slowest, the fastest drive: where critical loads are asked for
 
 
 def told(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
@@ -206,7 +206,7 @@ def _critical_loads(diagnosis: Diagnosis, registry: Registry) -> Mapping[str, Se
 
     driven = np.concatenate([np.abs(run.drive.velocities) for run in diagnosis.experiment.runs])
     slowest, fastest = driven[driven > 0].min(), driven.max()
-    V = np.array([x * (slowest if x < 1 else fastest) for x in BEYOND])
+    V = np.array([x * (slowest if x < 1 else fastest) for x in OFF_RANGE])
     try:
         found = {name: critical_loads(registry, f, V) for name, f in
                  (("baseline", diagnosis.baseline), ("augmented", diagnosis.final))}  # fmt: skip

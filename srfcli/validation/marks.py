@@ -42,9 +42,8 @@ from srfcli.validation.slider import Physics, Plan, critical_load
 
 # The mark of one answer: which answers are accepted, and whether it is one of them.
 
-INVISIBLE = (
-    5.0  # standard errors: an effect whose size is smaller, in units of its error in the best fit, counts as invisible
-)
+# standard errors: an effect whose size is smaller, in units of its error in the best fit, counts as invisible
+INVISIBLE = 5.0
 CONFIDENT = 0.9
 UNNAMED = ("none", "inconclusive", "ambiguous")  # right where what is concealed cannot be seen
 Accepted = frozenset[tuple[str, frozenset[str]]]
@@ -399,7 +398,7 @@ def load_errors(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float]
 SCHEMA = "srf.prove/1"
 STANDS_OUT = (0.0, INVISIBLE, 10.0, 20.0, 50.0, 200.0, float("inf"))
 STRONG = (0.0, 1 / 3, 2 / 3, 1.0)
-SHORT = 300.0  # s of CPU: a case should take less
+LONGEST_CPU = 300.0  # s of CPU: a case should take less
 WITHIN = 1.1  # of the true model's error
 SHARE = (
     Column("share", "1", "of the cases", ".3f"),
@@ -651,7 +650,7 @@ def cost(marks: Sequence[Mark]) -> Table:
     times = [m.answer.cpu for m in marks]
     rows = []
     if times:
-        short = sum(t < SHORT for t in times) / len(times)
+        short = sum(t < LONGEST_CPU for t in times) / len(times)
         rows = [(len(times), quantile(times, 0.5), quantile(times, 0.9), max(times), short, sum(times) / 3600)]
     return Table("srf.prove.cost/1", columns, rows, "CPU of a diagnosis")
 

@@ -153,9 +153,8 @@ class Physics:
     eta: float = 0.0  # N s/um, a dashpot beside kappa
     drive_tau: float = 0.0  # s, the stage follows its nominal velocity with this lag
     backlash: float = 0.0  # um, half the gauge's dead band
-    servo: float = (
-        0.0  # share of the load that a servo of second order controls, W'' = w^2 (command - W) - 2 damping w W'
-    )
+    # share of the load that a servo of second order controls, W'' = w^2 (command - W) - 2 damping w W'
+    servo: float = 0.0
     servo_f: float = 5.0  # Hz, w/(2 pi)
     servo_damping: float = 0.5
     pore: float = 0.0  # N, carried by a fluid: the asperities feel W - pore
@@ -309,9 +308,8 @@ def felt_load(p: Physics, plan: Plan) -> Callable[[float], Felt]:
     def felt(t: float) -> Felt:
         W, rate = imposed(t)
         if not plan.eps:
-            return Felt(
-                W - p.pore, rate, W - W0, W, rate
-            )  # a slow step of the load is no modulation: it arrives in full
+            # a slow step of the load is no modulation: it arrives in full
+            return Felt(W - p.pore, rate, W - W0, W, rate)
         s, s_dot = switched(t)
         angle = omega * t + p.distortion_phase
         here = W0 + p.rho * (W - W0) + height * s * math.cos(angle)
@@ -475,12 +473,10 @@ def stiffness(p: Physics) -> Callable[[float], float]:
 # Where friction force, slip velocity and spring elongation come from: three kinds of slider.
 
 Sliding = tuple[float, float, float]  # slip velocity um/s, elongation of the spring um, friction force N
-Slide = Callable[
-    [list[float], float, float, float, float, float], Sliding
-]  # of states, m, a, load, force along, spring's K
-Push = Callable[
-    [list[float], Sliding, float, float, float], list[float]
-]  # of states, the above, stage velocity, force, K
+# of states, m, a, load, force along, spring's K
+Slide = Callable[[list[float], float, float, float, float, float], Sliding]
+# of states, the above, stage velocity, force, K
+Push = Callable[[list[float], Sliding, float, float, float], list[float]]
 Pull = Callable[[list[float], list[float], float, float], float]  # of states, their rates, load and its rate: F'
 
 
