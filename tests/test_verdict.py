@@ -103,11 +103,12 @@ def test_nothing_is_missing_only_where_it_could_have_been_seen(concluded, sizes,
     [
         ([held(1.0)], "identified"),
         ([held(1.0), held(1.5 * HELD)], "unknown"),
-        ([held(1.0, gain=-3.0)], "unknown"),
-        ([held(1.0, gain=-3.0), held(1.0, gain=5.0)], "identified"),
+        ([held(1.0, gain=-5.0)], "identified"),
+        ([held(1.0, gain=-7.0)], "unknown"),
+        ([held(1.0, gain=-7.0), held(1.0, gain=5.0)], "identified"),
         ([held(1.0, whole=False)], "unknown"),
     ],
-    ids=["predicted", "not predicted", "worse than by the baseline", "better in all", "not followed"],
+    ids=["predicted", "not predicted", "as well as by the baseline", "worse than by it", "well enough in all", "not followed"],
 )
 def test_held_out_runs_refuse(concluded, runs, verdict):
     found = concluded(fitted("viscous-drag", evidence=100.0), LOST, held=runs)

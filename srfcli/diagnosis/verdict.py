@@ -252,13 +252,17 @@ def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score]) -> tup
 
 
 def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequence[HeldLoads] = ()) -> str:
-    """Return why held-out runs and critical loads refuse the best model; nothing where they do not."""
+    """Return why held-out runs and critical loads refuse the best model; nothing where they do not.
+
+    Were a model true, another one would predict new data better by CLOSE in log likelihood in at most exp(-CLOSE) of cases, as
+    the ratio of their likelihoods is one on average.
+    """
     for table in loads:
         if table.excess > 1.0:
             name, chi2 = table.augmented.loads.name, table.augmented.match.cost
             return f"held-out critical loads are not predicted: {name} has chi2 {chi2:.1f}"
     more = sum(h.gain for h in held) + sum(h.gain for h in loads)
-    if loads and best is not baseline and more < 0:
+    if loads and best is not baseline and more < -CLOSE:
         return f"what is held out is predicted worse than by the baseline: log likelihood {more:+.1f}"
     if not held:
         return ""
@@ -271,7 +275,7 @@ def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequenc
     if not rms < HELD:
         return f"held-out runs are not predicted: innovations have an rms of {rms:.3f} with the parameters moved as they may"
     gain = sum(h.gain for h in held)
-    if best is not baseline and gain < 0:
+    if best is not baseline and gain < -CLOSE:
         return f"held-out runs are predicted worse than by the baseline: log likelihood {gain:+.1f}"
     return ""
 
