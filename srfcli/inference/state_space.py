@@ -942,19 +942,24 @@ class StateSpaceFit:
         covariance[np.ix_(known, known)] = (self.maximum.covariance + self.maximum.spread)[np.ix_(there, there)]
         free = np.nonzero(np.diag(covariance) > 0)[0]
         away = root(covariance[np.ix_(free, free)])
-        bent = np.eye(free.size) + away.T @ point.information[np.ix_(free, free)] @ away
-        step = np.linalg.solve(bent, away.T @ point.score[free])
-        best, chi2 = point.log_likelihood, float(point.runs[0].white @ point.runs[0].white)
-        for share in (1.0, 0.5, 0.25):
+        z, best, damping = np.zeros(free.size), point, 0.0  # z are the coordinates by the prior's standard errors
+        for _ in range(STEPS // 2):
+            bent = np.eye(z.size) + away.T @ best.information[np.ix_(free, free)] @ away
+            steep = away.T @ best.score[free] - z
+            step = np.linalg.solve(bent + damping * np.diag(np.diag(bent)), steep)
             x = point.x.copy()
-            x[free] += share * away @ step
-            moved, cost = wide.at(np.clip(x, wide.lower, wide.upper), slopes=False, like=point), share**2 * float(step @ step)
-            if moved.log_likelihood - cost / 2 > best:
-                best, chi2 = moved.log_likelihood - cost / 2, float(moved.runs[0].white @ moved.runs[0].white) + cost
+            x[free] += away @ (z + step)
+            moved = wide.at(np.clip(x, wide.lower, wide.upper), like=point)
+            better = moved.log_likelihood - 0.5 * float((z + step) @ (z + step)) > best.log_likelihood - 0.5 * float(z @ z)
+            if better:
+                z, best = z + step, moved
+            damping = 0.1 * damping if better else max(10 * damping, 0.01)
+            if step @ steep < CONVERGED**2:
                 break
-        size = moved.runs[0].white.size
-        evidence = best - 0.5 * float(np.linalg.slogdet(bent)[1])
-        return Foretold(evidence, float(np.sqrt(chi2 / size)), by_itself)
+        bent = np.eye(z.size) + away.T @ best.information[np.ix_(free, free)] @ away
+        white, cost = best.runs[0].white, float(z @ z)
+        evidence = best.log_likelihood - 0.5 * (cost + float(np.linalg.slogdet(bent)[1]))
+        return Foretold(evidence, float(np.sqrt((white @ white + cost) / white.size)), by_itself)
 
     @property
     def criterion(self) -> float:
