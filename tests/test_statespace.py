@@ -401,12 +401,11 @@ def test_a_fit_from_values_30_percent_off_finds_parameters_and_field(make_model,
         assert found.values["field_amplitude"] == pytest.approx(amplitude, rel=0.5)
 
 
-@pytest.mark.parametrize("off", [{"Va": 4000.0, "mu0": 0.418, "Vb": 244.0, "lambda": 0.47}, {"Va": 50_000.0, "mu0": 0.445}], ids=["below", "above"])
-def test_a_fit_follows_a_ridge_that_bends(make_model, off):
+def test_a_fit_follows_a_ridge_that_bends(make_model):
     """In stick-slip mu0, Va, Vb and lambda make up for each other along a curve, which straight steps cross to and fro."""
     true = {"mu0": 0.43, "A": 0.0128, "B": 0.0263, "D0": 0.38, "Va": 14_700.0, "Vb": 260.0, "lambda": 0.55}
     names = {"law": "dieterich-cutoff", "ageing": "dieterich", "interface": "elastic", "inertia": True}
-    drive, t = Drive.steps([(0.0, 13.0), (0.5, 7.6)]), np.linspace(0, 5.5, 1376)
+    drive, t = Drive.steps([(0.0, 13.0), (0.5, 7.6)]), np.linspace(0, 3.0, 751)
     run = recording(t, "elongation", drive, ConstantLoad(9.9), stiffness=0.21)
     listed = tuple(FitParameter(n, v, v / 5, v * 5, False, "1") for n, v in true.items())
     choice = ModelChoice("dieterich-cutoff", "dieterich", "elastic", True)
@@ -414,10 +413,9 @@ def test_a_fit_follows_a_ridge_that_bends(make_model, off):
     y = predict(make_model(**names), experiment, run, true).y
     run = replace(run, observed=y + 0.05 * np.random.default_rng(3).standard_normal(t.size))
     problem = fit_problem(make_model(**names, random_field=True), replace(experiment, runs=(run,)))
-    likelihood = Likelihood(problem, smooth=True)
-    start = likelihood.coordinates({**true, **off, "gauge_white": 0.05})
-    found = maximise(likelihood, start, close=0.5)
-    assert found.away < 1.0
+    likelihood = Likelihood(problem, smooth=True, rtol=1e-3)
+    off = {"mu0": 0.418, "Va": 4000.0, "Vb": 244.0, "lambda": 0.47, "gauge_white": 0.05}
+    assert maximise(likelihood, likelihood.coordinates({**true, **off}), close=0.5).away < 0.5
 
 
 def test_threads_change_nothing(make_model, monkeypatch):
