@@ -14,7 +14,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -708,6 +708,13 @@ class Drive:
         """Return a velocity that jumps to V at t, for each (t, V); the first holds before its time too."""
         times, velocities = zip(*changes, strict=True)
         return cls(tuple(map(float, times)), tuple(map(float, velocities)), (0.0,) * len(times))
+
+    @classmethod
+    def sequence(cls, pieces: Sequence[tuple[float, float, float]], *, start: float = 0.0) -> Drive:
+        """Return the drive of pieces (duration in s, first and last velocity in um/s), one after another from `start` on."""
+        times = tuple(accumulate((duration for duration, _, _ in pieces[:-1]), initial=start))
+        rates = tuple((last - first) / duration for duration, first, last in pieces)
+        return cls(times, tuple(first for _, first, _ in pieces), rates)
 
     @classmethod
     def ramps(cls, points: Sequence[tuple[float, float]]) -> Drive:
