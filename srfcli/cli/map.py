@@ -49,7 +49,7 @@ from srfcli.core.settings import (
     resolve,
 )
 from srfcli.core.units import parse_quantity
-from srfcli.results.map import ratio_powers, unit_text
+from srfcli.results.map import ratio_powers
 
 if TYPE_CHECKING:
     from srfcli.codegen.model import Array, GeneratedModel
@@ -224,7 +224,7 @@ def read_axis(model: GeneratedModel, given: Range) -> MapAxis:
 
 def _ratio_factor(model: GeneratedModel, given: Range, held: str, moved: str) -> float:
     """Return what a ratio's numbers are multiplied with: they are in um, s, N unless a unit is written."""
-    from srfcli.core.units import find_unit
+    from srfcli.core.units import describe, find_unit
 
     powers = ratio_powers(model, held, moved)
     if not given.unit:
@@ -233,7 +233,7 @@ def _ratio_factor(model: GeneratedModel, given: Range, held: str, moved: str) ->
     if unit.powers != powers:
         raise SrfError(
             f"--over {given.name}: {given.unit!r} is the wrong unit",
-            f"Write it in {unit_text(powers)}, or leave it out.",
+            f"Write it in {describe(powers)}, or leave it out.",
         )
     return unit.factor
 

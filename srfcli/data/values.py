@@ -22,6 +22,11 @@ BESIDE = {"slip": "um", "contact_area": "1"}  # what may be observed besides one
 AREA_GROWTH = 0.05  # of a contact area by e-fold of its age: 0.02 to 0.1 for rock, glass and polymers
 
 
+def per_elongation(observable: str, K: float, W: Array | float) -> Array | float:
+    """Return what an observable is for each um of the spring's elongation, under the stiffness K (N/um) and the load W (N)."""
+    return {"elongation": 1.0, "force": K, "friction": K / W}[observable]
+
+
 @dataclass(frozen=True)
 class ModelChoice:
     """The names that `open_model` takes: friction law, ageing law with modifiers, interface, whether mass counts, effects."""

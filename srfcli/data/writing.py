@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from srfcli.core.errors import SrfError
-from srfcli.core.files import SIDECAR, clear, parse_toml, read_text, recover, toml_lines, whole_folder
+from srfcli.core.files import SIDECAR, clear, parse_toml, read_text, recover, toml_lines, unused_name, whole_folder
 from srfcli.core.units import find_unit
 from srfcli.data.description import LARGEST
 from srfcli.data.thresholds import thresholds_csv
@@ -207,8 +207,5 @@ def _file_names(runs: list[str]) -> list[str]:
     names: list[str] = []
     for run in runs:
         stem = re.sub(r"[^\w.-]+", "-", run, flags=re.ASCII).strip("-.") or "run"
-        name, number = f"{stem}.csv", 2
-        while name.lower() in (other.lower() for other in names):
-            name, number = f"{stem}-{number}.csv", number + 1
-        names.append(name)
+        names.append(unused_name(stem, ".csv", names))
     return names

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.data.values import CriticalLoads, Run
+from srfcli.data.values import CriticalLoads, Run, per_elongation
 from srfcli.diagnosis.design import Parting, described
 from srfcli.diagnosis.discrepancy import RunForce, unexplained_friction
 from srfcli.diagnosis.residual_scan import Location, Row
@@ -69,12 +69,7 @@ def slip_of(run: Run, predicted: Array) -> Array:
     """Return the slider's place on the track (n,) in um: what the stage moved less what the spring was stretched."""
     V = run.drive(run.t)
     moved = np.concatenate([[0.0], np.cumsum(0.5 * (V[1:] + V[:-1]) * np.diff(run.t))])
-    u = (
-        predicted
-        * {"elongation": 1.0, "force": 1 / run.stiffness, "friction": run.load(run.t)[0] / run.stiffness}[
-            run.observable
-        ]
-    )
+    u = predicted / per_elongation(run.observable, run.stiffness, run.load(run.t)[0])
     return np.asarray(run.start + moved - (u - u[0]))
 
 

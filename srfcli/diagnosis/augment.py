@@ -18,7 +18,7 @@ import numpy as np
 import sympy as sp
 
 from srfcli.core.errors import SrfError
-from srfcli.core.files import toml_lines
+from srfcli.core.files import toml_lines, unused_name
 from srfcli.core.settings import Parameter
 from srfcli.core.units import find_unit, from_base, split_quantity
 from srfcli.data.description import GEOMETRY, open_node
@@ -152,12 +152,8 @@ def _parts(
         if not small:
             names[path] = os.path.relpath(path, folder.resolve())
         elif path not in names:
-            stem, suffix, number = re.sub(r"[^\w.-]+", "-", path.stem) or "run", path.suffix, 1
-            name = f"{stem}{suffix}"
-            while name.lower() in taken:
-                number += 1
-                name = f"{stem}-{number}{suffix}"
-            taken.add(name.lower())
+            name = unused_name(re.sub(r"[^\w.-]+", "-", path.stem) or "run", path.suffix, taken)
+            taken.add(name)
             names[path], copies[name] = name, path
         runs.append({**run, "file": names[path]})
     return runs, copies

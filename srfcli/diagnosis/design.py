@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.data.values import Experiment, Run
+from srfcli.data.values import OBSERVABLES, Experiment, Run, per_elongation
 from srfcli.data.writing import DESCRIPTION, experiment_files, run_csv
 from srfcli.diagnosis.augment import augment
 from srfcli.diagnosis.search import Fitted
@@ -46,7 +46,6 @@ CONFIRMED = 3  # of the best, how many with the motion itself
 ROUNDS = 10  # of Gauss and Newton
 GROWS = 0.1  # e-foldings in a run that leave sliding as steady as it was
 REPEATS = 100  # of a run that nobody will go beyond
-UNITS = {"elongation": "um", "force": "N", "friction": "1"}
 PARTS = 60  # of a run, in which it is found how much of it suffices
 
 
@@ -296,11 +295,11 @@ class Design:
         first, second = sorted((true_name, wrong_name), key=names.index)
         left = losses[true_name, wrong_name].left * (1.0 if true_name == first else -1.0)
         at = int(np.argmax(np.abs(left)))
-        scale = {"elongation": 1.0, "force": 1 / run.stiffness, "friction": run.load(run.t)[0][at] / run.stiffness}
+        factor = float(per_elongation(run.observable, run.stiffness, run.load(run.t)[0][at]))
         return Parting(
             names, trial.proposal, run, worth[true_name, wrong_name],
             {a: min(g for (true, _), g in worth.items() if true == a) for a in names}, seconds, repeats, (first, second),
-            float(run.t[at]), float(left[at]), abs(float(left[at] * scale[run.observable])), UNITS[run.observable],
+            float(run.t[at]), float(left[at]), abs(float(left[at])) / factor, OBSERVABLES[run.observable],
             wrongs[wrong_name], trial.y,
         )  # fmt: skip
 

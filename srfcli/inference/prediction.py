@@ -17,7 +17,7 @@ from srfcli.codegen.splines import Spline, appended
 from srfcli.core.errors import Status
 from srfcli.core.units import split_quantity
 from srfcli.data.imposed import find_modulation
-from srfcli.data.values import AREA_GROWTH, Experiment, Run
+from srfcli.data.values import AREA_GROWTH, Experiment, Run, per_elongation
 from srfcli.motion.imposed import Load
 from srfcli.motion.integrators import integrate
 
@@ -313,7 +313,7 @@ def _observe(
     """Return the recorded quantity and its derivatives: elongation u, spring force K u, or friction K u/W."""
     V, (W, W_dot) = run.drive(t), run.load(t)
     K = p[model.index("K")]
-    factor = {"elongation": np.ones_like(W), "force": np.full_like(W, K), "friction": K / W}[run.observable]
+    factor = np.broadcast_to(per_elongation(run.observable, K, W), W.shape)
     J = np.zeros((t.size, len(places)))
     recorded = model.namespace.get("OBSERVED", "u")
     if recorded in model.states:

@@ -248,7 +248,9 @@ class SampledLoad(Load):
             raise SrfError("a sampled load needs finite loads at rising times", "drop gaps and repeated times first")
         if values.min() <= 0:
             raise SrfError(
-                f"the load is {values.min():g} N at t = {t[values.argmin()]:g} s", "the slider must stay in contact"
+                f"the load is {values.min():g} N at t = {t[values.argmin()]:g} s",
+                "the slider must stay in contact",
+                kind="no contact",
             )
         self.times, self.W, self.noise = t, values, float(noise)
         self.knots, self.coefficients, self.breaks = _build(t, values, self.noise)
@@ -305,18 +307,9 @@ class SampledLoad(Load):
         first = min(max(bisect_right(self._knots, start) - 1, 0), len(self._rows) - 1)
         last = int(np.searchsorted(self.knots, end, side="left"))
         knots, rows = self.knots[first : last + 1].copy(), self.coefficients[first:last].copy()
-        rows[0] = shift_polynomial(rows[0], start - knots[0])
+        rows[0] = _shifted(rows[0], start - knots[0])
         knots[0], knots[-1] = start, end
         return knots, rows
-
-
-def shift_polynomial(row: Array, by: float) -> Array:
-    """Return the coefficients, lowest power first, of p(x + by)."""
-    out = row.copy()
-    for k in range(row.size - 1):  # Horner's scheme, once per power
-        for j in range(row.size - 2, k - 1, -1):
-            out[j] += by * out[j + 1]
-    return out
 
 
 def _build(t: Array, W: Array, noise: float) -> tuple[Array, Array, tuple[float, ...]]:
@@ -354,7 +347,7 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
     else:
         even, change = np.abs(longer) < allowed, np.abs(np.diff(np.log(steps))) > allowed  # between two rates
     found = []
-    for a, b in _runs(even):
+    for a, b in runs_of(even):
         cuts = [a, *(a + 1 + np.flatnonzero(change[a:b])).tolist(), b + 1]
         found += [(c, d) for c, d in pairwise(cuts) if d - c >= SHORTEST - 1]
     total = float(np.ptp(W))
@@ -364,7 +357,7 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
         if rough.mean() > MOSTLY:
             rough[:] = False
         calm = ~(rough[1:] | rough[:-1])  # intervals between two samples that their neighbours foretell
-        smooth += [(a + c, a + d + 1) for c, d in _runs(calm) if d - c >= SHORTEST - 2]
+        smooth += [(a + c, a + d + 1) for c, d in runs_of(calm) if d - c >= SHORTEST - 2]
     return smooth
 
 
@@ -393,7 +386,8 @@ def _rough(t: Array, W: Array, total: float, noise: float) -> NDArray[np.bool_]:
     return rough
 
 
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last index of every unbroken run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
@@ -674,9 +668,7 @@ def _shifted(coefficients: Array, by: Array | float) -> Array:
     return out
 
 
-# What the experimenter imposes: the driving velocity V(t) and the normal load W(t), piece by smooth piece; um, s, N.
-
-__all__ = ["ConstantLoad", "Drive", "Load", "LoadPiece", "Modulation", "SampledLoad", "unforetold"]
+# The imposed driving velocity; um, s.
 
 
 @dataclass(frozen=True)

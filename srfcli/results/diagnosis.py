@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.core.errors import SrfError, Status
-from srfcli.core.files import parse_json, read_plain, recover, whole_folder, write_atomic
+from srfcli.core.files import parse_json, read_plain, recover, unused_name, whole_folder, write_atomic
 from srfcli.core.units import split_quantity
 from srfcli.results.report_text import unit_text
 from srfcli.results.tables import Column, Result, Table, json_text, own_figure, plain_value
@@ -428,10 +428,7 @@ def prediction_names(runs: list[str], word: str = "prediction") -> list[str]:
     names: list[str] = []
     for run in runs:
         stem = re.sub(r"[^\w .-]+", "-", run).strip(" .") or "run"
-        name, number = f"{word}-{stem}.csv", 2
-        while name.lower() in (other.lower() for other in names):
-            name, number = f"{word}-{stem}-{number}.csv", number + 1
-        names.append(name)
+        names.append(unused_name(f"{word}-{stem}", ".csv", names))
     return names
 
 

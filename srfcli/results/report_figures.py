@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.results.figures import _imposed, _settle, _thinned, draw_loads
+from srfcli.results.figures import _imposed, _settle, draw_loads, envelope
 from srfcli.results.plots import (
     COLOURS,
     DASHES,
@@ -273,14 +273,14 @@ def _models(axis: Axes, one: Trace, part: slice) -> None:
         if few:
             axis.plot(t[a:b], one.observed[part][a:b], ".", color=OBSERVED, markersize=2.6, label=mark)
         else:
-            axis.plot(*_thinned(t[a:b], one.observed[part][a:b]), color=OBSERVED, linewidth=0.9, alpha=0.75, label=mark)
+            axis.plot(*envelope(t[a:b], one.observed[part][a:b]), color=OBSERVED, linewidth=0.9, alpha=0.75, label=mark)
     drawn = [(one.baseline, BEFORE, "baseline", "-"), (one.augmented, AFTER, "augmented model", (0, (4, 1.2)))]
     if one.same:
         drawn = [(one.baseline, AFTER, "baseline", "-")]
     for values, colour, label, dash in drawn:
         for a, b in _pieces(t):
             shown = label if a == 0 else None
-            axis.plot(*_thinned(t[a:b], values[part][a:b]), color=colour, linewidth=1.1, linestyle=dash, label=shown)
+            axis.plot(*envelope(t[a:b], values[part][a:b]), color=colour, linewidth=1.1, linestyle=dash, label=shown)
     axis.set_ylabel(name_text(one.label))
     axis.ticklabel_format(axis="y", useOffset=False)
     axis.margins(y=0.14)
@@ -308,7 +308,7 @@ def _unexplained(axis: Axes, one: Trace) -> None:
     sets = [(before, BEFORE, "-"), (after, AFTER, (0, (4, 1.2)))]
     for values, colour, dash in [(before, AFTER, "-")] if one.same else sets:
         for a, b in _pieces(one.t):
-            axis.plot(*_thinned(one.t[a:b], 1e3 * values[a:b]), color=colour, linewidth=1.1, linestyle=dash)
+            axis.plot(*envelope(one.t[a:b], 1e3 * values[a:b]), color=colour, linewidth=1.1, linestyle=dash)
     axis.axhline(0.0, color="#777777", linewidth=0.8)
     axis.set_ylabel("random\nfriction\n[10$^{-3}$]")
     axis.margins(y=0.1)
@@ -321,7 +321,7 @@ def _noise_band(axis: Axes) -> None:
 
 
 def _imposed_panel(axis: Axes, one: Trace, key: str, part: slice) -> None:
-    axis.plot(*_thinned(one.t[part], getattr(one, key)[part]), color="#555555", linewidth=0.8)
+    axis.plot(*envelope(one.t[part], getattr(one, key)[part]), color="#555555", linewidth=0.8)
     _imposed(axis, getattr(one, key)[part], wide=key == "V")
     if axis.get_yscale() == "log":  # decades would fall outside so low a panel
         ends = sorted({float(f"{x:.3g}") for x in (getattr(one, key)[part].min(), getattr(one, key)[part].max())})
@@ -578,14 +578,14 @@ def force_figure(name: str, force: Mapping[str, Any], *, narrow: bool = False) -
         low, high = np.asarray(force["band"], dtype=float)
         axes[0].fill_between(t, low, high, color=AFTER, alpha=0.22, linewidth=0, label="95 % band")
         values = np.asarray(force["force"], dtype=float)
-        axes[0].plot(*_thinned(t, values), color=AFTER, linewidth=1.2, label="missing force")
+        axes[0].plot(*envelope(t, values), color=AFTER, linewidth=1.2, label="missing force")
         axes[0].axhline(0, color="#777777", linewidth=0.8)
         axes[0].set_title(name_text(name, narrow=narrow), pad=22 if narrow else None)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=2, fontsize=8.5, borderaxespad=0.0)
         axes[0].set_ylabel("missing friction\ncoefficient")
         for axis, (key, label) in zip(axes[1:], imposed, strict=True):
             known = np.asarray(force[key], dtype=float)
-            axis.plot(*_thinned(t, known), color="#555555", linewidth=0.8)
+            axis.plot(*envelope(t, known), color="#555555", linewidth=0.8)
             axis.set_ylabel(label)
             if key == "v" and known.min() > 0 and known.max() > WIDE_QUANTITY * known.min():
                 axis.set_yscale("log")
