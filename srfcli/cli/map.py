@@ -16,7 +16,7 @@ from srfcli.cli.options import (
     APPARATUS,
     APPARATUS_OPTIONS,
     DEFAULT_POINTS,
-    LOADINGS,
+    SYSTEM_OPTIONS,
     Options,
     OutputOptions,
     Range,
@@ -270,17 +270,13 @@ COMPARED_OPTIONS: Options = {  # those of `system_options`, but that several law
     "ageings": click.option(
         "--ageing", "ageings", multiple=True, metavar="NAME", help="An ageing law; repeat: all pairs count."
     ),
-    "interface": click.option(
-        "--interface", metavar="NAME", help="Tangential compliance of the interface, the same for all laws."
-    ),
-    "loading": click.option("--loading", type=click.Choice(LOADINGS), help="How the normal load is applied."),
+    "interface": SYSTEM_OPTIONS["interface"],
+    "loading": SYSTEM_OPTIONS["loading"],
     **APPARATUS_OPTIONS,
     "assignments": click.option(
         "--set", "assignments", multiple=True, metavar="NAME=VALUE", help="Set a parameter of every law that has it."
     ),
-    "plugins": click.option(
-        "--plugins", multiple=True, type=click.Path(exists=True, path_type=Path), help="Take laws from here, too."
-    ),
+    "plugins": SYSTEM_OPTIONS["plugins"],
 }
 
 

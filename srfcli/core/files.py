@@ -389,6 +389,19 @@ def check_target(path: Path, *, force: bool, what: str = "--out") -> None:
         )
 
 
+def check_folder_place(folder: Path, *, what: str = "") -> bool:
+    """Return whether there is a folder already; raises SrfError now if none could be written there later."""
+    recover(folder)
+    shown, parent = f"{what} {folder}".strip(), Path(os.path.realpath(folder)).parent
+    if not parent.is_dir():
+        raise SrfError(f"{shown}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
+    if not os.access(parent, os.W_OK):
+        raise SrfError(f"{shown}: the directory {parent} is not writable", "Name a folder elsewhere.", exit_code=1)
+    if os.path.lexists(folder) and (not folder.is_dir() or folder.is_symlink()):
+        raise SrfError(f"{shown} exists and is not a folder", "Name another folder.")
+    return folder.is_dir()
+
+
 def is_special(path: Path) -> bool:
     """Return whether `path` is a device or a pipe, which is written through and must never be replaced."""
     try:

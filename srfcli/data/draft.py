@@ -573,7 +573,7 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
     base, modifiers = registry.ageing(sketch.ageing)
     surface = registry.get("interface", wish.interface)
     listed: list[Parameter] = [p for each in (law, base, *modifiers, surface) for p in each.parameters]
-    V = float(np.median([abs(run.drive(run.t[:1])[0]) or 1.0 for run in runs]))
+    V = float(np.median([abs(run.drive.at(float(run.t[0]))) or 1.0 for run in runs]))
     friction = [(run.observed * run.friction_factor(run.load(run.t)[0]))[run.used] for run in runs]
     mu = float(np.median(np.concatenate(friction)))
     lines = []

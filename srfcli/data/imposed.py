@@ -48,8 +48,8 @@ class StartsAtRest(SrfError):
 
 def check_start(run: RunDescription, drive: Drive, begin: float) -> None:
     """Raise StartsAtRest where a run that is to begin in steady sliding is not driven forward at first."""
-    V, rate, since = drive.piece(begin)
-    if run.initial == "steady" and not V + rate * (begin - since) > 0:
+    V = drive.at(begin)
+    if run.initial == "steady" and not V > 0:
         where = run.node.child("drive").where if run.drive is not None else run.node.where
         error = StartsAtRest(
             f"{where}: the drive begins with {V:g} um/s, so that there is no steady sliding to begin with",

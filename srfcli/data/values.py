@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import Notice, SrfError
+from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.units import factor_between, find_unit, split_quantity, to_base
 from srfcli.data.clock import Sampling, find_sampling
 from srfcli.data.thresholds import Thresholds
@@ -205,6 +205,14 @@ class Experiment:
             raise SrfError(
                 f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`."
             )
+
+    def named(self, names: Sequence[str]) -> tuple[Run, ...]:
+        """Return the runs of these names, all where none is given; raises SrfError for a name that no run has."""
+        known = [run.name for run in self.runs]
+        for name in names:
+            if name not in known:
+                raise SrfError(f"`runs`: no run {name!r} in {self.path}", did_you_mean(name, known))
+        return tuple(run for run in self.runs if not names or run.name in names)
 
     def elsewhere(self, run: Run) -> dict[str, float]:
         """Return the parameters that act in other runs alone, at what they are in this one."""

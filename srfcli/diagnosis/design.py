@@ -127,7 +127,7 @@ class Side:
         """Return whether the sliding with which a run begins is stable: no apparatus begins with any other."""
         model = self.problem.model
         p = run_parameters(model, self.problem.experiment, run, {**self.values(), "field_amplitude": 0.0})
-        V, W = float(run.drive(run.t[:1])[0]), run.load.rest(float(run.t[0]))
+        V, W = run.drive.at(float(run.t[0])), run.first_load
         J = np.asarray(model.rates_jacobian(np.asarray(model.steady(p)), V, W, 0.0, p), dtype=float)
         return bool(np.linalg.eigvals(J).real.max() * float(np.ptp(run.t)) < GROWS)
 
@@ -465,7 +465,7 @@ def reach_of(experiment: Experiment) -> Reach:
     late = [b for b in begun if 0 < b < 1]
     return Reach(
         _velocities(experiment.runs),
-        tuple(r.load.rest(float(r.t[0])) for r in experiment.runs),
+        tuple(r.first_load for r in experiment.runs),
         tuple(_digits(w["eps"]) for w in shown), tuple(_digits(w["f"]) for w in shown), tuple(map(_digits, jumps)),
         float(np.median(late)) if late else 0.25,
         _digits(float(np.median([w["rise0"] for w in shown]))) if shown else 0.02,

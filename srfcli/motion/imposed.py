@@ -728,13 +728,17 @@ class Drive:
         i = max(bisect_right(self.times, t) - 1, 0)
         return self.velocities[i], self.accelerations[i], self.times[i]
 
+    def at(self, t: float) -> float:
+        """Return V at one time (s)."""
+        V, rate, since = self.piece(t)
+        return V + rate * (t - since) if rate else V
+
     def displacement(self, t: Array) -> Array:
         """Return the displacement since t[0] at the rising times `t` (n,), exactly: V is linear between the breaks."""
         inside = [b for b in self.breaks if t[0] < b < t[-1]]
         edges = np.array([t[0], *inside, t[-1]])
-        starts = [self.piece(float(a)) for a in edges[:-1]]
-        V = np.array([v + rate * (a - since) for (v, rate, since), a in zip(starts, edges[:-1], strict=True)])
-        rates = np.array([rate for _, rate, _ in starts])
+        V = np.array([self.at(a) for a in edges[:-1].tolist()])
+        rates = np.array([self.piece(a)[1] for a in edges[:-1].tolist()])
         widths = np.diff(edges)
         reached = np.concatenate(([0.0], np.cumsum(V * widths + 0.5 * rates * widths**2)))
         i = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(V) - 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.core.errors import SrfError, Status
-from srfcli.core.files import parse_json, read_plain, recover, unused_name, whole_folder, write_atomic
+from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
 from srfcli.core.units import split_quantity
 from srfcli.results.report_text import unit_text
 from srfcli.results.tables import Column, Result, Table, json_text, own_figure, plain_value
@@ -332,19 +331,7 @@ def _places(location: Location) -> list[str]:
 
 def check_answer(folder: Path, *, force: bool) -> None:
     """Raise SrfError where a diagnosis could not be written to `folder`."""
-    recover(folder)
-    parent = Path(os.path.realpath(folder)).parent
-    if not parent.is_dir():
-        raise SrfError(f"--out {folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
-    if not os.access(parent, os.W_OK):
-        raise SrfError(
-            f"--out {folder}: the directory {parent} is not writable", "Name a folder elsewhere.", exit_code=1
-        )
-    if not os.path.lexists(folder):
-        return
-    if not folder.is_dir() or folder.is_symlink():
-        raise SrfError(f"--out {folder} exists and is not a folder", "Name another folder.")
-    if not any(folder.iterdir()):
+    if not check_folder_place(folder, what="--out") or not any(folder.iterdir()):
         return
     if not _is_diagnosis(folder):
         raise SrfError(f"--out {folder} holds something else than a diagnosis", "It is never replaced; name another.")

@@ -221,7 +221,7 @@ def start_state(
     """
     q = np.array(p, dtype=float)
     q[model.index("W0")] = load
-    first = float(drive(np.array([begin]))[0])
+    first = drive.at(begin)
     if start is None or (isinstance(start, str) and start.strip().lower() == "steady"):
         if first <= 0:
             moving = next((v for v in drive.velocities if v > 0), 10.0)
@@ -415,7 +415,7 @@ def runs_again(
     choice = replace(experiment.choice, **laws)
     model = mover = open_model(registry, **asdict(choice))
     values = _values(model, parameters)
-    runs = _chosen(experiment, names)
+    runs = experiment.named(names)
     observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in runs))
     if len(observables) > 1 and (noise or quantum):
         raise SrfError(
@@ -448,14 +448,6 @@ def _values(model: GeneratedModel, parameters: Mapping[str, str]) -> dict[str, f
         parameter = require_parameter(name, model.parameters, where=model.title)
         values[name] = to_base(check_value(parameter, text), parameter.unit)
     return values
-
-
-def _chosen(experiment: Experiment, names: Sequence[str]) -> tuple[Run, ...]:
-    known = [run.name for run in experiment.runs]
-    for name in names:
-        if name not in known:
-            raise SrfError(f"`runs`: no run {name!r} in {experiment.path}", did_you_mean(name, known))
-    return tuple(run for run in experiment.runs if not names or run.name in names)
 
 
 def _of_the_laws(experiment: Experiment) -> dict[str, float]:
