@@ -14,7 +14,7 @@ import click
 from srfcli.cli.base import EXIT_CONDITION, EXIT_OK, SrfCommand
 from srfcli.cli.options import OutputOptions, open_registry, output_options, plugins_option
 from srfcli.core.errors import SrfError, did_you_mean
-from srfcli.core.units import from_base, split_quantity
+from srfcli.core.units import from_base
 from srfcli.results.report_text import joined
 from srfcli.results.tables import Column, Table
 
@@ -124,13 +124,8 @@ def _model_line(experiment: Experiment) -> str:
     mass = "" if experiment.mass is None else f", mass {experiment.mass * 1e6:.6g} kg"
     inertia = "on" if choice.inertia else "off"
     laws = ", ".join([choice.law, choice.ageing, choice.interface, f"inertia {inertia}", *choice.effects])
-    return f"{laws}; stiffness {_stiffness(experiment)}{mass}"
-
-
-def _stiffness(experiment: Experiment) -> str:
-    number, base = split_quantity(experiment.stiffness_text, name="stiffness")
-    unit, factor = experiment.shown(base) if base in ("N/um", "1/um") else (base, 1.0)
-    return f"{number * factor:.6g} {unit}"
+    stiffness, unit = experiment.shown_stiffness
+    return f"{laws}; stiffness {stiffness:.6g} {unit}{mass}"
 
 
 def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecast | None) -> Table:

@@ -223,16 +223,27 @@ class Experiment:
         runs = tuple(run for run in self.runs if not run.holdout)
         return replace(self, runs=runs, thresholds=tuple(table for table in self.thresholds if not table.holdout))
 
+    @cached_property
+    def stated_stiffness(self) -> tuple[float, str]:
+        """Return number and unit of the stiffness, as they are stated."""
+        return split_quantity(self.stiffness_text, name="stiffness")
+
+    @property
+    def shown_stiffness(self) -> tuple[float, str]:
+        """Return number and unit of the stiffness, as they are shown."""
+        number, stated = self.stated_stiffness
+        unit, factor = self.shown(stated) if stated in ("N/um", "1/um") else (stated, 1.0)
+        return number * factor, unit
+
     @property
     def stiffness(self) -> float:
         """Return the stated stiffness in N/um, or in 1/um where it is friction per micron."""
-        number, unit = split_quantity(self.stiffness_text, name="stiffness")
-        return to_base(number, unit)
+        return to_base(*self.stated_stiffness)
 
-    @property
+    @cached_property
     def per_load(self) -> bool:
         """Return whether the stiffness is stated in 1/um, as friction per micron."""
-        return not find_unit(split_quantity(self.stiffness_text, name="stiffness")[1]).powers[2]
+        return not find_unit(self.stated_stiffness[1]).powers[2]
 
     @property
     def stress(self) -> bool:
@@ -243,7 +254,7 @@ class Experiment:
         """Return a sentence on what a stiffness stated in 1/um is under each run's load; "" for any other stiffness."""
         if not self.per_load:
             return ""
-        number, unit = split_quantity(self.stiffness_text, name="stiffness")
+        number, unit = self.stated_stiffness
         under: dict[str, str] = {}
         for run in self.runs:
             W = run.first_load

@@ -20,7 +20,7 @@ import sympy as sp
 from srfcli.core.errors import SrfError
 from srfcli.core.files import toml_lines, unused_name
 from srfcli.core.settings import Parameter
-from srfcli.core.units import find_unit, from_base, split_quantity
+from srfcli.core.units import from_base
 from srfcli.data.description import GEOMETRY, open_node
 from srfcli.data.values import Experiment, ModelChoice
 from srfcli.data.writing import DESCRIPTION, KILOGRAM, parameter_table, shortest
@@ -78,9 +78,8 @@ def augment(
         for q in fitted.likelihood.problem.experiment.parameters
     ]
     values = {q.name: q.value for q in listed}
-    stiffness, unit = split_quantity(experiment.stiffness_text, name="stiffness")
-    base = "1/um" if "N" not in unit else "N/um"
-    K = values.get("K", stiffness * find_unit(unit).factor)
+    base = "1/um" if experiment.per_load else "N/um"
+    K = values.get("K", experiment.stiffness)
     settings = dict(s for e in hypothesis.effects for s in e.settings)
     inertia = bool(settings.get("inertia", experiment.choice.inertia))
     mass = values.get("M", experiment.mass) if inertia else experiment.mass

@@ -15,7 +15,6 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.codegen.splines import Spline, appended
 from srfcli.core.errors import Status
-from srfcli.core.units import split_quantity
 from srfcli.data.imposed import find_modulation
 from srfcli.data.values import AREA_GROWTH, Experiment, Run, per_elongation
 from srfcli.motion.imposed import Load
@@ -255,8 +254,7 @@ _MODULATIONS: dict[int, tuple[Load, dict[str, float]]] = {}  # it is asked for a
 
 def stiffness_share(experiment: Experiment, run: Run) -> float:
     """Return a run's stiffness in N/um for each unit of the stated one: its first load where that is friction per um, else 1."""
-    unit = split_quantity(experiment.stiffness_text, name="stiffness")[1]
-    return run.first_load if "N" not in unit else 1.0
+    return run.first_load if experiment.per_load else 1.0
 
 
 def predict(

@@ -14,7 +14,6 @@ import numpy as np
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
-from srfcli.core.units import split_quantity
 from srfcli.results.report_text import unit_text
 from srfcli.results.tables import Column, Result, Table, json_text, own_figure, plain_value
 
@@ -359,9 +358,8 @@ def _in_shown_units(made_of: dict[str, Any], diagnosis: Diagnosis) -> None:
         row["unit"], factor = experiment.shown(str(row["unit"]))
         for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
             row[key] = row[key] and row[key] * factor
-    number, unit = split_quantity(experiment.stiffness_text, name="stiffness")
-    shown_unit, factor = experiment.shown(unit) if unit in ("N/um", "1/um") else (unit, 1.0)
-    made_of["stated"] = {"stiffness": f"{number * factor:.4g} {unit_text(shown_unit)}"}
+    stiffness, unit = experiment.shown_stiffness
+    made_of["stated"] = {"stiffness": f"{stiffness:.4g} {unit_text(unit)}"}
     made_of["own"] = {
         effect.reported: [*(p.name for p in effect.parameters), *effect.frees]
         for ranked in diagnosis.ranked for effect in ranked.hypothesis.effects
