@@ -158,6 +158,13 @@ def parse_overs(texts: Sequence[str]) -> tuple[Range, ...]:
     return ranges
 
 
+def parse_ends(name: str, text: str) -> Range | None:
+    """Return the range of a parameter that LOW:HIGH spans, with or without a unit; None where the text is none."""
+    with contextlib.suppress(SrfError):
+        return parse_over(f"{name}={text}") if text.count(":") == 1 else None
+    return None
+
+
 def names_of(kind: str) -> Callable[[click.Context, click.Parameter, str], list[Any]]:
     """Return a shell completion for the names of laws of this kind."""
 

@@ -21,7 +21,7 @@ from srfcli.cli.options import (
     values_option,
 )
 from srfcli.core.errors import SrfError, Status, worst
-from srfcli.results.plots import titled
+from srfcli.results.plots import axis_label, titled
 from srfcli.results.tables import STATUS, Column, Table
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ class Sweep:
     @property
     def label(self) -> str:
         """Return the label of the axis that the values lie on."""
-        return f"{self.name}  [{self.unit.replace('um', 'µm')}]"
+        return axis_label(self.name, self.unit)
 
     def table(self, schema: str, columns: Sequence[Column], rows: list[tuple[Any, ...]], notes: Sequence[str]) -> Table:
         """Return the table of what was found, with the parameters that are the same in all rows."""

@@ -17,6 +17,7 @@ from srfcli.cli.options import (
     mesh_option,
     output_options,
     over_option,
+    parse_ends,
     parse_over,
     stability_options,
     step_option,
@@ -133,10 +134,7 @@ def critical(
 
 def _window(text: str) -> Range:
     """Return the loads that LOW:HIGH spans, with or without a unit; raises SrfError that shows the form."""
-    try:
-        found = parse_over(f"W0={text}") if text.count(":") == 1 else None
-    except SrfError:
-        found = None
+    found = parse_ends("W0", text)
     if found is None or not found.lo > 0:
         raise SrfError(f"--window {text!r} is not LOW:HIGH, two rising loads above 0", "Write --window 4:500.")
     return found

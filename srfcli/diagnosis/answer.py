@@ -62,8 +62,7 @@ def _view(before: Filtered, after: Filtered, holdout: bool) -> RunView:
     others = tuple((s.observed - before.of(i).nu, s.observed - after.of(i).nu) for i, s in enumerate(run.others, 1))
     slip = slip_from(run, y[1] / per_elongation(run.observable, run.stiffness, run.load(run.t)[0]))
     return RunView(
-        replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), noise, slip, (white[0], white[1]),
-        others,
+        replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), noise, slip, (white[0], white[1]), others
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from srfcli.results.plots import (
     QUANTITY,
     Values,
     bare_figure,
+    curve_style,
     decade_ticks,
     heading,
     house_style,
@@ -186,7 +187,7 @@ def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title
         figure, axes = new_figure(2 + len(measured), size=(6.0, 5.2 + 1.5 * len(measured)))
         above, below, own = axes[0], axes[-1], dict(zip(measured, axes[1:], strict=False))
         for k, (label, values) in enumerate(parts.items()):
-            look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[k % len(DASHES)]}
+            look = curve_style(k)
             own.get(label, above).plot(list(x), np.abs(values), label=label, **look)
             below.plot(list(x), np.degrees(np.unwrap(np.angle(values))), label=label.partition("  [")[0], **look)
         for label, axis in own.items():
@@ -483,13 +484,13 @@ def draw_loads(ax: Axes, table: Thresholds, computed: Mapping[str, Values]) -> N
 
     mark: dict[str, Any] = {"fmt": "o", "markersize": 5, "markerfacecolor": "none"}
     for index, eps in enumerate(np.unique(table.eps)):
-        colour, dash = COLOURS[index % len(COLOURS)], DASHES[index % len(DASHES)]
+        style = curve_style(index)
         here = np.flatnonzero(table.eps == eps)
         here = here[np.argsort(table.V[here], kind="stable")]
-        ax.errorbar(table.V[here], table.W0c[here], yerr=table.sigma[here], color=colour, **mark)
+        ax.errorbar(table.V[here], table.W0c[here], yerr=table.sigma[here], color=style["color"], **mark)
         for number, (name, loads) in enumerate(computed.items()):
-            style: dict[str, Any] = {"color": colour, "linestyle": dash} | ({"linewidth": 0.6} if number else {})
-            ax.plot(table.V[here], np.asarray(loads)[here], label=f"{name}, ε = {eps:g}", **style)
+            thin: dict[str, Any] = {"linewidth": 0.6} if number else {}
+            ax.plot(table.V[here], np.asarray(loads)[here], label=f"{name}, ε = {eps:g}", **style, **thin)
     ax.errorbar([], [], yerr=[], color="#555555", label="measured, ± σ", **mark)
     ax.set(xscale="log", yscale="log", xlabel="V  [µm/s]", ylabel="critical W$_0$  [N]")
     decade_ticks(ax)

@@ -345,13 +345,9 @@ def column_name(axis: MapAxis) -> str:
 
 def label(model: GeneratedModel, axis: MapAxis) -> str:
     """Return an axis' label with its unit."""
-    from srfcli.results.plots import axis_label, symbol_text
+    from srfcli.results.plots import axis_label
 
-    if not axis.held:
-        return axis_label(axis.moved, axis_unit(model, axis))
-    ratio = f"{symbol_text(axis.held)}/{symbol_text(axis.moved)}"
-    unit = axis_unit(model, axis)
-    return ratio if unit in ("", "1") else f"{ratio}  [{unit.replace('um', 'µm')}]"
+    return axis_label(axis.name, axis_unit(model, axis))
 
 
 # Laws side by side: a row for each law and amplitude, a sentence for each pair, their boundaries over each other.

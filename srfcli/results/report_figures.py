@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from srfcli.results.figures import _imposed, _settle, draw_loads, envelope
 from srfcli.results.plots import (
-    COLOURS,
-    DASHES,
     DOTTED,
     _gaps,
     bare_figure,
+    curve_style,
     decade_ticks,
     house_style,
     name_text,
@@ -78,6 +77,12 @@ class Trace:
     def same(self) -> bool:
         """True where the augmented model is the baseline."""
         return bool(np.allclose(self.before, self.after, rtol=0.0, atol=SAME))
+
+    def sides(self, before: Array, after: Array) -> list[tuple[Array, str, Any]]:
+        """Return values of baseline and augmented model, the baseline's alone where they are the same, with colour and dashes."""
+        if self.same:
+            return [(before, AFTER, "-")]
+        return [(before, BEFORE, "-"), (after, AFTER, (0, (4, 1.2)))]
 
     def heights(self) -> tuple[float, ...]:
         """Return for each window how far its residual is above noise, from 0 to 1 for the worst."""
@@ -250,8 +255,7 @@ def _whole(axes: Sequence[Axes], one: Trace, *, narrow: bool = False) -> None:
         handlelength=1.4 if narrow else 2.4, borderaxespad=0.0, columnspacing=1.0,
     )  # fmt: skip
     _residual(below, one)
-    sets = [(one.before, BEFORE, "-"), (one.after, AFTER, (0, (4, 1.2)))]
-    for z, colour, dash in [(one.before, AFTER, "-")] if one.same else sets:
+    for z, colour, dash in one.sides(one.before, one.after):
         borders, values = local_rms(one.t, z)
         local.stairs(values, borders, baseline=None, color=colour, linestyle=dash, linewidth=1.4)
     local.axhline(1.0, color="#777777", linewidth=0.8)
@@ -274,10 +278,8 @@ def _models(axis: Axes, one: Trace, part: slice) -> None:
             axis.plot(t[a:b], one.observed[part][a:b], ".", color=OBSERVED, markersize=2.6, label=mark)
         else:
             axis.plot(*envelope(t[a:b], one.observed[part][a:b]), color=OBSERVED, linewidth=0.9, alpha=0.75, label=mark)
-    drawn = [(one.baseline, BEFORE, "baseline", "-"), (one.augmented, AFTER, "augmented model", (0, (4, 1.2)))]
-    if one.same:
-        drawn = [(one.baseline, AFTER, "baseline", "-")]
-    for values, colour, label, dash in drawn:
+    names = ("baseline", "augmented model")
+    for label, (values, colour, dash) in zip(names, one.sides(one.baseline, one.augmented), strict=False):
         for a, b in _pieces(t):
             shown = label if a == 0 else None
             axis.plot(*envelope(t[a:b], values[part][a:b]), color=colour, linewidth=1.1, linestyle=dash, label=shown)
@@ -288,8 +290,8 @@ def _models(axis: Axes, one: Trace, part: slice) -> None:
 
 def _residual(axis: Axes, one: Trace) -> None:
     """Draw both residuals over the whole run as bands between their extremes, and where noise would stay."""
-    sets = [(one.before, BEFORE, 0.55), (one.after, AFTER, 0.75)]
-    for z, colour, alpha in [(one.before, AFTER, 0.75)] if one.same else sets:
+    for z, colour, _ in one.sides(one.before, one.after):
+        alpha = 0.75 if colour == AFTER else 0.55
         for a, b in _pieces(one.t):
             if b - a < 4 * COLUMNS:
                 axis.plot(one.t[a:b], z[a:b], color=colour, linewidth=0.6, alpha=alpha)
@@ -304,9 +306,7 @@ def _residual(axis: Axes, one: Trace) -> None:
 def _unexplained(axis: Axes, one: Trace) -> None:
     """Draw the friction that each model leaves to its random field, in thousandths."""
     assert one.unexplained is not None
-    before, after = one.unexplained
-    sets = [(before, BEFORE, "-"), (after, AFTER, (0, (4, 1.2)))]
-    for values, colour, dash in [(before, AFTER, "-")] if one.same else sets:
+    for values, colour, dash in one.sides(*one.unexplained):
         for a, b in _pieces(one.t):
             axis.plot(*envelope(one.t[a:b], 1e3 * values[a:b]), color=colour, linewidth=1.1, linestyle=dash)
     axis.axhline(0.0, color="#777777", linewidth=0.8)
@@ -626,9 +626,9 @@ def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, narrow: bool = Fa
 
 def _by_state(axis: Axes, x: Any, y: Any, log: bool, label: str, index: int) -> None:
     """Draw samples faintly and their averages along the quantity of state."""
-    colour = COLOURS[index % len(COLOURS)]
+    style = curve_style(index)
     every = max(x.size // 1500, 1)
-    axis.plot(x[::every], y[::every], ".", color=colour, markersize=1.2, alpha=0.25, rasterized=True)
+    axis.plot(x[::every], y[::every], ".", color=style["color"], markersize=1.2, alpha=0.25, rasterized=True)
     scale = np.log(x) if log else x
     edges = np.linspace(scale.min(), scale.max(), PIECES + 1)
     place = np.clip(np.digitize(scale, edges) - 1, 0, PIECES - 1)
@@ -636,7 +636,7 @@ def _by_state(axis: Axes, x: Any, y: Any, log: bool, label: str, index: int) -> 
     kept = count >= max(3, x.size // 2000)
     middle = 0.5 * (edges[1:] + edges[:-1])[kept]
     mean = np.bincount(place, weights=y, minlength=PIECES)[kept] / count[kept]
-    axis.plot(np.exp(middle) if log else middle, mean, color=colour, linestyle=DASHES[index % len(DASHES)], label=label)
+    axis.plot(np.exp(middle) if log else middle, mean, **style, label=label)
 
 
 def loads_figure(one: Mapping[str, Any], *, narrow: bool = False) -> Figure:
