@@ -13,7 +13,6 @@ import click
 from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
     AMPLITUDE,
-    APPARATUS,
     APPARATUS_OPTIONS,
     DEFAULT_POINTS,
     SYSTEM_OPTIONS,
@@ -30,6 +29,7 @@ from srfcli.cli.options import (
     output_options,
     over_option,
     parse_over,
+    read_flags,
     read_output,
     stability_options,
     step_option,
@@ -45,7 +45,6 @@ from srfcli.core.settings import (
     choose,
     find_toml,
     load_toml,
-    parse_assignment,
     resolve,
 )
 from srfcli.core.units import parse_quantity
@@ -209,9 +208,7 @@ def read_axis(model: GeneratedModel, given: Range) -> MapAxis:
     from srfcli.core.units import to_base
     from srfcli.numerics.plane import MapAxis
 
-    if given.values is not None:
-        hint = f"An axis runs from a low to a high end: --over {given.name}=1:100:60."
-        raise SrfError(f"--over {given.name} lists values", hint)
+    given.check_ends()
     log = given.spacing == "log"
     if "/" not in given.name:
         fitted = given.fitted(model.parameters, where=model.title)
@@ -354,10 +351,7 @@ def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, 
 
 def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSettings) -> list[Resolved]:
     """Return every model's parameters; an assignment counts for the models that have its parameter, and one must."""
-    flags = {n: system[f"set_{n}"] for n in APPARATUS if system[f"set_{n}"] is not None}
-    for text in system["assignments"]:
-        name, value = parse_assignment(text)
-        flags[name] = value
+    flags = read_flags(system, system["assignments"])
     known = {n for m in models for n in m.names}
     for name in flags:
         if name not in known:

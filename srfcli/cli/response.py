@@ -14,6 +14,7 @@ from srfcli.cli.options import (
     OutputOptions,
     Range,
     SystemOptions,
+    check_axes,
     output_options,
     over_option,
     stability_options,
@@ -83,9 +84,7 @@ def command(
     if swept.name == "eps":
         raise SrfError("eps is not swept", "Give amplitudes: --mean --eps 0.05,0.1,0.2; the linear response has none.")
     resolved = system.resolve(model.parameters, V=V, W0=W0)
-    for name, value in (("V", V), ("W0", W0)):
-        if value is not None and name == swept.name:
-            raise SrfError(f"{name} is swept and has a value too", f"Leave out --{name}, or sweep another parameter.")
+    check_axes({swept.name}, {"V": V, "W0": W0})
     system.say_defaults(resolved, {"V", "W0"} - {swept.name})
     model.check_changing_load(model.vector(resolved.values))
     begun = time.perf_counter()
