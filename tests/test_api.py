@@ -17,6 +17,7 @@ from click.testing import CliRunner
 
 import srfcli as srf
 from srfcli.cli.main import cli
+from srfcli.inference.prediction import run_parameters
 
 FUNCTIONS = [name for name in srf.__all__ if inspect.isfunction(getattr(srf, name))]
 TASKS = sorted({inspect.getmodule(getattr(srf, name)).__name__ for name in FUNCTIONS})
@@ -101,7 +102,7 @@ def test_a_simulation_under_modulation_ends_in_the_periodic_state(slider: srf.Sl
     assert last.mean() == pytest.approx(srf.floquet(moving).state.mean_friction, rel=2e-4)
     with pytest.raises(srf.SrfError, match="rising"):
         srf.simulate(slider, t=[1, 0])
-    with pytest.raises(srf.SrfError, match="at rest"):
+    with pytest.raises(srf.SrfError, match="no steady sliding"):
         srf.simulate(slider, t=[0, 1], drive=[(0, 0)])
 
 
@@ -205,3 +206,21 @@ def test_the_page_on_python_is_true(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     exec(text.partition("```python\n")[2].partition("```")[0], space)
     assert len(space["frame"]) == 3 and space["figure"].axes
     assert all(f"srf.{name}(" in text for name in FUNCTIONS)
+
+
+def test_a_stiffness_in_another_unit_of_force_is_no_friction_per_micron(tmp_path: Path) -> None:
+    """A fitted stiffness in kgf/mm is the machine's under every load, as one in N/um is."""
+    rows = [f"{0.1 * i:.1f},3,3.0,7.0" for i in range(60)]
+    head = "time [s],load_point_velocity [um/s],force,normal_load"
+    (tmp_path / "run.csv").write_text("\n".join([head, *rows]))
+    (tmp_path / "experiment.toml").write_text("""
+format = "srf-experiment/1"
+apparatus = { stiffness = "21 kgf/mm" }
+model = { law = "dieterich-ruina", ageing = "ruina", interface = "rigid", inertia = false }
+parameters = { K = { value = "21 kgf/mm", lower = "10 kgf/mm", upper = "40 kgf/mm" } }
+runs = [{ name = "run", file = "run.csv" }]
+""")
+    experiment = srf.read_experiment(tmp_path)
+    model = srf.system("dieterich-ruina", ageing="ruina", interface="rigid", inertia=False).model
+    p = run_parameters(model, experiment, experiment.runs[0], {})
+    assert p[model.index("K")] == pytest.approx(21 * 9.80665e-3)

@@ -97,7 +97,7 @@ def test_one_run_without_simulation(small: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message", "hint"),
     [
-        (("--run", "tow"), "--run tow: ", "Did you mean 'two'?"),
+        (("--run", "tow"), "--run: no run 'tow'", "Did you mean 'two'?"),
         (("--fail-on", "gaps"), "--fail-on gaps: no such kind of notice", "Did you mean 'gap'?"),
         (("--format", "cvs"), "unknown reader 'cvs'", "Did you mean 'csv'?"),
     ],

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
-from srfcli.results.map import unit_text
+from srfcli.core.units import describe
 
 SMALL = ("map", "--eps", "0.18", "--over", "V=10:40:8", "--over", "K/W0=0.01:0.025:12")
 
@@ -117,7 +117,7 @@ def test_a_ratio_takes_a_unit():
 
 @pytest.mark.parametrize(
     ("powers", "text"),
-    [((-1, 0, 0, 0), "1/um"), ((0, 0, 0, 0), "1"), ((1, -1, 0, 0), "um/s"), ((-2, 2, 1, 0), "s^2 N/um^2")],
+    [((-1, 0, 0, 0), "1/um"), ((0, 0, 0, 0), "1"), ((1, -1, 0, 0), "um/s"), ((-2, 2, 1, 0), "s^2*N/um^2")],
 )
 def test_units_of_ratios(powers, text):
-    assert unit_text(powers) == text
+    assert describe(powers) == text

@@ -14,7 +14,7 @@ import click
 from srfcli.cli.base import EXIT_CONDITION, EXIT_OK, SrfCommand
 from srfcli.cli.options import OutputOptions, open_registry, output_options, plugins_option
 from srfcli.core.errors import SrfError, did_you_mean
-from srfcli.core.units import from_base, split_quantity
+from srfcli.core.units import from_base
 from srfcli.results.report_text import joined
 from srfcli.results.tables import Column, Table
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from srfcli.data.experiment import RunCheck
     from srfcli.data.gauge import GaugeNoise
-    from srfcli.data.values import Experiment, Run
+    from srfcli.data.values import Experiment
     from srfcli.inference.cramer_rao import Forecast, Reach
     from srfcli.laws.registry import Registry
 
@@ -38,7 +38,7 @@ srf check experiment/ --json | jq .meta.runs       all that was found
 
 @click.command("check", cls=SrfCommand, epilog=EXAMPLES)
 @click.argument("experiment", type=click.Path(path_type=Path))
-@click.option("--run", "names", multiple=True, metavar="NAME", help="Report this run only; may be given several times.")
+@click.option("--run", "runs", multiple=True, metavar="NAME", help="Report this run only; may be given several times.")
 @click.option("--format", "format", metavar="NAME", help="Reader of all data files; srf laws --kind reader lists them.")
 @click.option(
     "--fail-on",
@@ -66,7 +66,7 @@ srf check experiment/ --json | jq .meta.runs       all that was found
 @output_options
 def command(
     experiment: Path,
-    names: tuple[str, ...],
+    runs: tuple[str, ...],
     format: str | None,
     fail_on: tuple[str, ...],
     limit: float,
@@ -86,7 +86,7 @@ def command(
     begun, registry = time.perf_counter(), open_registry(plugins)
     found = read_experiment(experiment, registry=registry, format=format, limit=int(limit * 2**20))
     found.check_recorded("to check")
-    checks = [check_run(run) for run in _chosen(found, names)]
+    checks = [check_run(run) for run in found.named(runs)]
     forecast = _forecast(found, checks, registry) if simulate else None
     table, more = _table(found, checks, forecast), []
     if output.format == "text":
@@ -111,15 +111,6 @@ def _check_kinds(fail_on: Sequence[str]) -> None:
             raise SrfError(f"--fail-on {kind}: no such kind of notice", did_you_mean(kind, (*KINDS, "notice")))
 
 
-def _chosen(experiment: Experiment, names: Sequence[str]) -> list[Run]:
-    """Return the runs of these names, all where there are none; raises SrfError for a name that no run has."""
-    known = [run.name for run in experiment.runs]
-    for name in names:
-        if name not in known:
-            raise SrfError(f"--run {name}: {experiment.path} has no such run", did_you_mean(name, known))
-    return [run for run in experiment.runs if not names or run.name in names]
-
-
 def _forecast(experiment: Experiment, checks: Sequence[RunCheck], registry: Registry) -> Forecast:
     from srfcli.cli.emit import Progress
     from srfcli.inference.cramer_rao import forecast
@@ -133,13 +124,8 @@ def _model_line(experiment: Experiment) -> str:
     mass = "" if experiment.mass is None else f", mass {experiment.mass * 1e6:.6g} kg"
     inertia = "on" if choice.inertia else "off"
     laws = ", ".join([choice.law, choice.ageing, choice.interface, f"inertia {inertia}", *choice.effects])
-    return f"{laws}; stiffness {_stiffness(experiment)}{mass}"
-
-
-def _stiffness(experiment: Experiment) -> str:
-    number, base = split_quantity(experiment.stiffness_text, name="stiffness")
-    unit, factor = experiment.shown(base) if base in ("N/um", "1/um") else (base, 1.0)
-    return f"{number * factor:.6g} {unit}"
+    stiffness, unit = experiment.shown_stiffness
+    return f"{laws}; stiffness {stiffness:.6g} {unit}{mass}"
 
 
 def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecast | None) -> Table:
@@ -159,7 +145,7 @@ def _table(experiment: Experiment, checks: Sequence[RunCheck], forecast: Forecas
     meta = {
         "experiment": str(experiment.path),
         "model": dataclasses.asdict(choice),
-        "notices": [{"kind": n.kind, "where": n.where, "what": n.what} for n in experiment.notices],
+        "notices": list(map(dataclasses.asdict, experiment.notices)),
         "runs": [described(check, one) for check, one in zip(checks, told, strict=True)],
         "together": together and tells(together),
     }
@@ -401,7 +387,7 @@ def described(check: RunCheck, told: Reach | None) -> dict[str, Any]:
         },
         "declared_modulation": run.modulation,
         "tells": None if told is None else tells(told),
-        "notices": [{"kind": n.kind, "where": n.where, "what": n.what} for n in run.notices],
+        "notices": list(map(dataclasses.asdict, run.notices)),
     }
 
 

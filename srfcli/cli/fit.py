@@ -18,7 +18,7 @@ from srfcli.cli.options import (
     SystemOptions,
     listed,
     output_options,
-    parse_over,
+    parse_ends,
     reader_option,
     stability_options,
     vary_options,
@@ -340,10 +340,8 @@ def _bounds(text: str, parameters: Sequence[Parameter]) -> tuple[str, tuple[floa
     """Return name and bounds in base units that NAME=LOW:HIGH states; raises SrfError that shows the form."""
     from srfcli.core.units import to_base
 
-    try:
-        found = parse_over(text) if text.count(":") == 1 else None
-    except SrfError:
-        found = None
+    name, _, ends = text.partition("=")
+    found = parse_ends(name, ends)
     if found is None:
         raise SrfError(f"--bounds {text!r} is not NAME=LOW:HIGH, low below high", "Write --bounds Vsat=100:1000.")
     fitted = found.fitted(parameters)

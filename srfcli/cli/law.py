@@ -13,6 +13,7 @@ import click
 from srfcli.cli.base import EXIT_USAGE, SrfCommand, SrfGroup
 from srfcli.cli.options import open_registry, plugins_option
 from srfcli.core.errors import ExpressionError, SrfError
+from srfcli.laws.law_file import PLUGIN_KINDS
 
 if TYPE_CHECKING:
     from srfcli.laws.registry import Registry
@@ -21,9 +22,8 @@ if TYPE_CHECKING:
 
 # `srf laws`: what laws there are.
 
-KINDS = ["friction", "ageing", "modifier", "interface", "effect"]
-KIND = click.Choice([*KINDS, "reader"])
-LAW_KIND = click.Choice(KINDS)
+KIND = click.Choice(PLUGIN_KINDS)
+LAW_KIND = click.Choice(PLUGIN_KINDS[:-1])  # a reader is no law
 
 EPILOG = """
 srf laws                            every law, where it comes from and what it is

@@ -13,10 +13,9 @@ import click
 from srfcli.cli.base import SrfCommand
 from srfcli.cli.options import (
     AMPLITUDE,
-    APPARATUS,
     APPARATUS_OPTIONS,
     DEFAULT_POINTS,
-    LOADINGS,
+    SYSTEM_OPTIONS,
     Options,
     OutputOptions,
     Range,
@@ -30,6 +29,7 @@ from srfcli.cli.options import (
     output_options,
     over_option,
     parse_over,
+    read_flags,
     read_output,
     stability_options,
     step_option,
@@ -45,11 +45,10 @@ from srfcli.core.settings import (
     choose,
     find_toml,
     load_toml,
-    parse_assignment,
     resolve,
 )
 from srfcli.core.units import parse_quantity
-from srfcli.results.map import ratio_powers, unit_text
+from srfcli.results.map import ratio_powers
 
 if TYPE_CHECKING:
     from srfcli.codegen.model import Array, GeneratedModel
@@ -209,9 +208,7 @@ def read_axis(model: GeneratedModel, given: Range) -> MapAxis:
     from srfcli.core.units import to_base
     from srfcli.numerics.plane import MapAxis
 
-    if given.values is not None:
-        hint = f"An axis runs from a low to a high end: --over {given.name}=1:100:60."
-        raise SrfError(f"--over {given.name} lists values", hint)
+    given.check_ends()
     log = given.spacing == "log"
     if "/" not in given.name:
         fitted = given.fitted(model.parameters, where=model.title)
@@ -224,7 +221,7 @@ def read_axis(model: GeneratedModel, given: Range) -> MapAxis:
 
 def _ratio_factor(model: GeneratedModel, given: Range, held: str, moved: str) -> float:
     """Return what a ratio's numbers are multiplied with: they are in um, s, N unless a unit is written."""
-    from srfcli.core.units import find_unit
+    from srfcli.core.units import describe, find_unit
 
     powers = ratio_powers(model, held, moved)
     if not given.unit:
@@ -233,7 +230,7 @@ def _ratio_factor(model: GeneratedModel, given: Range, held: str, moved: str) ->
     if unit.powers != powers:
         raise SrfError(
             f"--over {given.name}: {given.unit!r} is the wrong unit",
-            f"Write it in {unit_text(powers)}, or leave it out.",
+            f"Write it in {describe(powers)}, or leave it out.",
         )
     return unit.factor
 
@@ -270,17 +267,13 @@ COMPARED_OPTIONS: Options = {  # those of `system_options`, but that several law
     "ageings": click.option(
         "--ageing", "ageings", multiple=True, metavar="NAME", help="An ageing law; repeat: all pairs count."
     ),
-    "interface": click.option(
-        "--interface", metavar="NAME", help="Tangential compliance of the interface, the same for all laws."
-    ),
-    "loading": click.option("--loading", type=click.Choice(LOADINGS), help="How the normal load is applied."),
+    "interface": SYSTEM_OPTIONS["interface"],
+    "loading": SYSTEM_OPTIONS["loading"],
     **APPARATUS_OPTIONS,
     "assignments": click.option(
         "--set", "assignments", multiple=True, metavar="NAME=VALUE", help="Set a parameter of every law that has it."
     ),
-    "plugins": click.option(
-        "--plugins", multiple=True, type=click.Path(exists=True, path_type=Path), help="Take laws from here, too."
-    ),
+    "plugins": SYSTEM_OPTIONS["plugins"],
 }
 
 
@@ -358,10 +351,7 @@ def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, 
 
 def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSettings) -> list[Resolved]:
     """Return every model's parameters; an assignment counts for the models that have its parameter, and one must."""
-    flags = {n: system[f"set_{n}"] for n in APPARATUS if system[f"set_{n}"] is not None}
-    for text in system["assignments"]:
-        name, value = parse_assignment(text)
-        flags[name] = value
+    flags = read_flags(system, system["assignments"])
     known = {n for m in models for n in m.names}
     for name in flags:
         if name not in known:

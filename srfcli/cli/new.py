@@ -132,7 +132,7 @@ def _asked(
 ) -> tuple[str | None, str | None, str]:
     """Ask for what neither the first file nor the options say; answers for columns go into `columns`."""
     from srfcli.data.columns import open_source
-    from srfcli.data.draft import Wish, missing, name_columns
+    from srfcli.data.draft import OBSERVABLES, Wish, missing, name_columns
 
     drive, load, stiffness = options["drive"], options["load"], options["stiffness"]
     headings = open_source(path, registry=registry, format=options["reader"]).headings
@@ -145,7 +145,7 @@ def _asked(
         if option.startswith("--column time"):
             columns["time"] = click.prompt(f"{sentence}. Time", err=True)
         elif option.startswith("--column"):
-            role = click.prompt(f"{sentence}.\nWhat was observed", err=True, type=click.Choice(OBSERVED))
+            role = click.prompt(f"{sentence}.\nWhat was observed", err=True, type=click.Choice(OBSERVABLES[::-1]))
             columns[role] = click.prompt("In the column", err=True)
         elif option.startswith("--drive"):
             drive = click.prompt(f"{sentence}. Velocity in um/s, or duration:velocity, ...", err=True)
@@ -154,9 +154,6 @@ def _asked(
     if stiffness is None:
         stiffness = click.prompt("Stiffness of the machine, as 5.4e-3 1/um, 55 MPa/mm or 0.21 N/um", err=True)
     return drive, load, stiffness
-
-
-OBSERVED = ("friction", "shear_stress", "force", "elongation")
 
 
 def _column(text: str) -> tuple[str, str]:

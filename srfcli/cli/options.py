@@ -92,6 +92,12 @@ class Range:
             return replace(self, values=tuple(map(fit, self.values)), unit=parameter.unit)
         return replace(self, lo=fit(self.lo), hi=fit(self.hi), unit=parameter.unit)
 
+    def check_ends(self) -> None:
+        """Raise SrfError for a list of values where an axis is asked for."""
+        if self.values is not None:
+            hint = f"An axis runs from a low to a high end: --over {self.name}=1:100."
+            raise SrfError(f"--over {self.name} lists values", hint)
+
     def base_points(self, parameters: Sequence[Parameter], *, where: str = "this system") -> list[float]:
         """Return every value in um, s, N and radians."""
         fitted = self.fitted(parameters, where=where)
@@ -156,6 +162,13 @@ def parse_overs(texts: Sequence[str]) -> tuple[Range, ...]:
             hint = "Give one range for each parameter, or list values: V=1,2,5."
             raise SrfError(f"--over {made.name} is given twice", hint)
     return ranges
+
+
+def parse_ends(name: str, text: str) -> Range | None:
+    """Return the range of a parameter that LOW:HIGH spans, with or without a unit; None where the text is none."""
+    with contextlib.suppress(SrfError):
+        return parse_over(f"{name}={text}") if text.count(":") == 1 else None
+    return None
 
 
 def names_of(kind: str) -> Callable[[click.Context, click.Parameter, str], list[Any]]:
@@ -431,14 +444,20 @@ def _read_system(
 ) -> SystemOptions:
     toml = load_toml(find_toml())
     chosen = {key: choose(key, taken[key], toml=toml) for key in CHOICES}
+    flags = read_flags(taken, assignments)
+    folders = [Path(p) for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
+    return SystemOptions(**chosen, flags=flags, plugins=(*plugins, *folders), toml=toml, effects=effects)
+
+
+def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, str]:
+    """Return what APPARATUS_OPTIONS, among the values `taken`, and --set say, by parameter; raises SrfError for two values."""
     flags: dict[str, str] = {n: taken[f"set_{n}"] for n in APPARATUS if taken[f"set_{n}"] is not None}
     for text in assignments:
         name, value = parse_assignment(text)
         if name in flags and flags[name] != value:
             raise SrfError(f"{name} is set twice: {flags[name]} and {value}", "Give each parameter one value.")
         flags[name] = value
-    folders = [Path(p) for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
-    return SystemOptions(**chosen, flags=flags, plugins=(*plugins, *folders), toml=toml, effects=effects)
+    return flags
 
 
 plugins_option = click.option(

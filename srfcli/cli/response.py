@@ -14,6 +14,7 @@ from srfcli.cli.options import (
     OutputOptions,
     Range,
     SystemOptions,
+    check_axes,
     output_options,
     over_option,
     stability_options,
@@ -21,7 +22,7 @@ from srfcli.cli.options import (
     values_option,
 )
 from srfcli.core.errors import SrfError, Status, worst
-from srfcli.results.plots import titled
+from srfcli.results.plots import axis_label, titled
 from srfcli.results.tables import STATUS, Column, Table
 
 if TYPE_CHECKING:
@@ -83,9 +84,7 @@ def command(
     if swept.name == "eps":
         raise SrfError("eps is not swept", "Give amplitudes: --mean --eps 0.05,0.1,0.2; the linear response has none.")
     resolved = system.resolve(model.parameters, V=V, W0=W0)
-    for name, value in (("V", V), ("W0", W0)):
-        if value is not None and name == swept.name:
-            raise SrfError(f"{name} is swept and has a value too", f"Leave out --{name}, or sweep another parameter.")
+    check_axes({swept.name}, {"V": V, "W0": W0})
     system.say_defaults(resolved, {"V", "W0"} - {swept.name})
     model.check_changing_load(model.vector(resolved.values))
     begun = time.perf_counter()
@@ -119,7 +118,7 @@ class Sweep:
     @property
     def label(self) -> str:
         """Return the label of the axis that the values lie on."""
-        return f"{self.name}  [{self.unit.replace('um', 'µm')}]"
+        return axis_label(self.name, self.unit)
 
     def table(self, schema: str, columns: Sequence[Column], rows: list[tuple[Any, ...]], notes: Sequence[str]) -> Table:
         """Return the table of what was found, with the parameters that are the same in all rows."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 import click
 
@@ -17,6 +16,7 @@ from srfcli.cli.options import (
     mesh_option,
     output_options,
     over_option,
+    parse_ends,
     parse_over,
     stability_options,
     step_option,
@@ -25,9 +25,6 @@ from srfcli.cli.options import (
 )
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
-
-if TYPE_CHECKING:
-    from srfcli.codegen.model import GeneratedModel
 
 # `srf linear`: steady sliding under constant load.
 
@@ -133,10 +130,7 @@ def critical(
 
 def _window(text: str) -> Range:
     """Return the loads that LOW:HIGH spans, with or without a unit; raises SrfError that shows the form."""
-    try:
-        found = parse_over(f"W0={text}") if text.count(":") == 1 else None
-    except SrfError:
-        found = None
+    found = parse_ends("W0", text)
     if found is None or not found.lo > 0:
         raise SrfError(f"--window {text!r} is not LOW:HIGH, two rising loads above 0", "Write --window 4:500.")
     return found
@@ -269,7 +263,9 @@ def continue_(
     )  # fmt: skip
     if len(over) > 2:
         raise SrfError(f"--over is given {len(over)} times", "A plane has two axes: --over V=1:100 --over W0=4:400.")
-    ranges = [_axis(model, r) for r in over or (parse_over("V=1:100"),)]
+    for given in over:
+        given.check_ends()
+    ranges = [r.fitted(model.parameters, where=model.title) for r in over or (parse_over("V=1:100"),)]
     with Progress("continue") as progress:
         growing = continue_boundary(
             slider, eps=eps, over={r.name: (r.lo, r.hi) for r in ranges},
@@ -283,13 +279,3 @@ def continue_(
     timings = {"solve": time.perf_counter() - begun}
     emit(found.table, output, laws=model.laws, timings=timings, figure=found.plot)
     finish(found.status)
-
-
-def _axis(model: GeneratedModel, given: Range) -> Range:
-    """Return a range as an axis, in declared units; raises SrfError for a list of values."""
-    fitted = given.fitted(model.parameters, where=model.title)
-    if fitted.values:
-        raise SrfError(
-            f"--over {given.name} lists values", f"An axis runs from a low to a high end: --over {given.name}=1:100."
-        )
-    return fitted

@@ -47,16 +47,20 @@ def shown(value: object) -> str:
 class SrfError(Exception):
     """Misuse that stops a command: `message` says what and where, `hint` what to do instead.
 
-    `exit_code` is 2 for usage, laws and recordings; 1 for I/O.
+    `exit_code` is 2 for usage, laws and recordings; 1 for I/O. `kind` names an error that some caller treats by itself:
+    "no file", "unknown name", "no contact".
     """
 
     exit_code = 2
 
-    def __init__(self, message: str, hint: str | None = None, *, exit_code: int | None = None) -> None:
+    def __init__(
+        self, message: str, hint: str | None = None, *, exit_code: int | None = None, kind: str = ""
+    ) -> None:
         message, hint = printable(shortened(message)), hint and printable(shortened(hint))
         super().__init__(message)
         self.message = message
         self.hint = hint
+        self.kind = kind
         if exit_code is not None:
             self.exit_code = exit_code
 

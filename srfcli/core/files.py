@@ -18,7 +18,7 @@ import signal
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -52,11 +52,13 @@ def check_plain(path: Path) -> os.stat_result:
     if not stat.S_ISREG(found.st_mode):
         kind = next((name for is_kind, name in _KINDS if is_kind(found.st_mode)), "no regular file")
         hint = "Name a file in it." if kind == "a folder" else "Name a file; save first what comes through a pipe."
-        raise SrfError(f"no file {path}, but {kind}", hint)
+        raise SrfError(f"no file {path}, but {kind}", hint, kind="no file")
     # said to be files; reading may wait or fail
     if path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix":
         raise SrfError(
-            f"no file {path}, but a part of the running system", "Name a file; copy what is meant to one first."
+            f"no file {path}, but a part of the running system",
+            "Name a file; copy what is meant to one first.",
+            kind="no file",
         )
     return found
 
@@ -67,7 +69,7 @@ def open_plain(path: Path) -> io.BufferedReader:
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0))
     if not stat.S_ISREG(os.fstat(handle).st_mode):  # another one was put there meanwhile
         os.close(handle)
-        raise SrfError(f"no file {path}, but something else by now", "Name a file.")
+        raise SrfError(f"no file {path}, but something else by now", "Name a file.", kind="no file")
     return os.fdopen(handle, "rb")
 
 
@@ -387,12 +389,37 @@ def check_target(path: Path, *, force: bool, what: str = "--out") -> None:
         )
 
 
+def check_folder_place(folder: Path, *, what: str = "") -> bool:
+    """Return whether there is a folder already; raises SrfError now if none could be written there later."""
+    recover(folder)
+    shown, parent = f"{what} {folder}".strip(), Path(os.path.realpath(folder)).parent
+    if not parent.is_dir():
+        raise SrfError(f"{shown}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
+    if not os.access(parent, os.W_OK):
+        raise SrfError(f"{shown}: the directory {parent} is not writable", "Name a folder elsewhere.", exit_code=1)
+    if os.path.lexists(folder) and (not folder.is_dir() or folder.is_symlink()):
+        raise SrfError(f"{shown} exists and is not a folder", "Name another folder.")
+    return folder.is_dir()
+
+
 def is_special(path: Path) -> bool:
     """Return whether `path` is a device or a pipe, which is written through and must never be replaced."""
     try:
         return not stat.S_ISREG(path.stat().st_mode)
     except OSError:
         return False
+
+
+def unused_name(stem: str, suffix: str, taken: Iterable[str]) -> str:
+    """Return a file name that is not taken: stem and suffix, and if need be a number from 2 on in between.
+
+    Names that differ in capitals alone are the same, as some file systems do not tell them apart.
+    """
+    lowered = {other.lower() for other in taken}
+    name, number = f"{stem}{suffix}", 2
+    while name.lower() in lowered:
+        name, number = f"{stem}-{number}{suffix}", number + 1
+    return name
 
 
 def write_atomic(path: Path, content: str | bytes) -> None:

@@ -27,7 +27,7 @@ class Parameter:
 
 
 FILE_NAME = "srf.toml"
-SMALLEST = 1e-30  # of a parameter that is not zero, in its own unit: powers and products of it are numbers, too
+SMALLEST = 1e-30  # of a number that is not zero, in its own unit: powers and products of it are numbers, too
 
 
 @dataclass(frozen=True)

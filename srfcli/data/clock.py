@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError
+from srfcli.motion.imposed import runs_of
 
 Mask = NDArray[np.bool_]
 
@@ -69,12 +70,6 @@ class Sampling:
         count = [r.last - r.first for r in self.rates]
         count[-1] += 1
         return np.repeat(near, count).astype(np.intc)
-
-
-def runs_of(mask: Mask) -> list[tuple[int, int]]:
-    """Return first and last index of every unbroken run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
 
 @dataclass(frozen=True)

@@ -52,10 +52,11 @@ def _head(path: Path) -> bytes:
         with open_plain(path) as stream:
             head = stream.read(SNIFFED)
     except FileNotFoundError:
-        if not path.parent.is_dir():
-            raise SrfError(f"no file {path}", f"There is no folder {path.parent}.") from None
         names = [p.name for p in path.parent.glob("*")]
-        raise SrfError(f"no file {path}", did_you_mean(path.name, names) if names else "Its folder is empty.") from None
+        hint = did_you_mean(path.name, names) if names else "Its folder is empty."
+        if not path.parent.is_dir():
+            hint = f"There is no folder {path.parent}."
+        raise SrfError(f"no file {path}", hint, kind="no file") from None
     except OSError as error:
         raise _unreadable(path, error) from None
     if not head:

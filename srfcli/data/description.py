@@ -17,6 +17,7 @@ from typing import Any, NoReturn, TypeVar
 
 from srfcli.core.errors import SrfError, did_you_mean, printable, shown
 from srfcli.core.files import check_plain, parse_toml, read_text, recover
+from srfcli.core.settings import SMALLEST
 from srfcli.core.units import (
     GEOMETRY_UNITS,
     NO_GEOMETRY,
@@ -404,7 +405,6 @@ def _modulation(node: Node) -> tuple[float, float, float]:
 
 # A value in a TOML file that knows where it stands: every breach is told with file, line, key, finding and expectation.
 
-SMALLEST = 1e-30  # of a number that is not zero: powers and products of it are numbers, too
 LARGEST = 16 * 2**20  # bytes of a description
 Value = TypeVar("Value")
 Other = TypeVar("Other")

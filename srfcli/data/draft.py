@@ -28,7 +28,7 @@ from srfcli.core.units import (
 from srfcli.data.columns import open_source, read_columns
 from srfcli.data.description import ROLES, check_unit, read_description
 from srfcli.data.experiment import read_choice, read_experiment, read_parameters
-from srfcli.data.imposed import Stroke, find_modulation, strokes
+from srfcli.data.imposed import StartsAtRest, Stroke, find_modulation, strokes
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
 
@@ -514,15 +514,10 @@ def _read(sketch: _Sketch, registry: Registry) -> tuple[list[Run], tuple[str, ..
         with _as_file(replace(sketch, free=free).text((), absolute=True)) as file:
             try:
                 return list(read_experiment(file, registry=registry).runs), free
+            except StartsAtRest as error:
+                free = (*free, error.run)
             except SrfError as error:
-                still = [n for n in sketch.names if n not in free]
-                if "the drive begins with" in error.message and still:
-                    index = re.search(r"runs\[(\d+)\]", error.message)
-                    name = sketch.names[int(index[1])] if index else still[0]
-                    if name not in free:
-                        free = (*free, name)
-                        continue
-                apart = "no contact" in error.message or "the load is" in error.message
+                apart = error.kind == "no contact"
                 hint = "Take the part in contact: --window FROM,TO in seconds." if apart else error.hint
                 raise SrfError(re.sub(rf"{re.escape(str(file))}(, line \d+)?: ", "", error.message), hint) from None
 
@@ -578,7 +573,7 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
     base, modifiers = registry.ageing(sketch.ageing)
     surface = registry.get("interface", wish.interface)
     listed: list[Parameter] = [p for each in (law, base, *modifiers, surface) for p in each.parameters]
-    V = float(np.median([abs(run.drive(run.t[:1])[0]) or 1.0 for run in runs]))
+    V = float(np.median([abs(run.drive.at(float(run.t[0]))) or 1.0 for run in runs]))
     friction = [(run.observed * run.friction_factor(run.load(run.t)[0]))[run.used] for run in runs]
     mu = float(np.median(np.concatenate(friction)))
     lines = []

@@ -62,6 +62,7 @@ from srfcli.data.values import (
     ModelChoice,
     Run,
     Signal,
+    per_elongation,
 )
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
@@ -337,9 +338,9 @@ def read_run(
     try:
         source = open_source(run.file, registry=registry, format=format or run.format)
     except SrfError as error:
-        if error.message.startswith("no file"):
+        if error.kind == "no file":
             run.node.child("file").fail(error.message, error.hint)
-        if error.message.startswith("unknown reader") and not format:
+        if error.kind == "unknown name" and not format:
             run.node.child("format").fail(error.message, error.hint)
         raise
     columns = read_columns(run, source, specs, limit=limit, geometry=apparatus.geometry)
@@ -359,7 +360,7 @@ def read_run(
     role, *beside = [c.role for c in columns.channels.values() if c.role in OBSERVABLES | BESIDE]
     at_start = load.rest(float(t[0]))
     stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
-    rise = np.abs(drive(t)) * {"elongation": 1.0, "force": stiffness, "friction": stiffness / at_start}[role]
+    rise = np.abs(drive(t)) * per_elongation(role, stiffness, at_start)
     units = _units(run, columns, apparatus)
     if len(set(units.values())) > 1:
         named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())

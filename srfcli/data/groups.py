@@ -39,7 +39,7 @@ def grouped(experiment: Experiment, vary: Sequence[str] = (), by: str | None = N
 def labels(experiment: Experiment) -> dict[str, str]:
     """Return the group of each run, by its name."""
     if experiment.by == "load":
-        return {run.name: f"{run.load.rest(float(run.t[0])):.3g} {run.load_unit}" for run in experiment.runs}
+        return {run.name: f"{run.first_load:.3g} {run.load_unit}" for run in experiment.runs}
     if experiment.by == "direction":
         strokes = any(run.backward for run in experiment.runs)
         return {run.name: stroke(run) if strokes else step(run) for run in experiment.runs}

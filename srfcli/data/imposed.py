@@ -40,15 +40,23 @@ def declared_drive(run: RunDescription, columns: Columns) -> Drive:
     return Drive.steps(list(zip(starts, (v for _, v in run.drive), strict=True)))
 
 
+class StartsAtRest(SrfError):
+    """A run that is to begin in steady sliding is not driven forward at first; `run` is its name."""
+
+    run = ""
+
+
 def check_start(run: RunDescription, drive: Drive, begin: float) -> None:
-    """Raise SrfError where a run that is to begin in steady sliding is not driven forward at first."""
-    V, rate, since = drive.piece(begin)
-    if run.initial == "steady" and not V + rate * (begin - since) > 0:
+    """Raise StartsAtRest where a run that is to begin in steady sliding is not driven forward at first."""
+    V = drive.at(begin)
+    if run.initial == "steady" and not V > 0:
         where = run.node.child("drive").where if run.drive is not None else run.node.where
-        raise SrfError(
+        error = StartsAtRest(
             f"{where}: the drive begins with {V:g} um/s, so that there is no steady sliding to begin with",
             'Write initial = "free": the initial state is then estimated. Or take a window that begins in sliding.',
         )
+        error.run = run.name
+        raise error
 
 
 def drive_differs(drive: Drive, t: Array, V: Array, where: str) -> list[Notice]:
@@ -587,6 +595,7 @@ def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
         raise SrfError(
             f"{place.span(at, at)}, column '{place.heading}': the load is {filled[at]:.6g} N",
             "The slider must stay in contact: zero the gauge ([columns] offset), or take a window without this part.",
+            kind="no contact",
         )
     load, told = _smooth(place, filled)
     return load, [*notices, *told]

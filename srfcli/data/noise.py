@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from srfcli.codegen.model import Array
 from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError
-from srfcli.data.clock import Mask, runs_of
-from srfcli.motion.imposed import unforetold
+from srfcli.data.clock import Mask
+from srfcli.motion.imposed import runs_of, unforetold
 
 SEGMENT = 256  # samples of a periodogram
 NEIGHBOURS = 16  # from which a sample is interpolated: to 1e-4 for sines of five samples a period or more

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
-from srfcli.core.errors import Notice, SrfError
+from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.units import factor_between, find_unit, split_quantity, to_base
 from srfcli.data.clock import Sampling, find_sampling
 from srfcli.data.thresholds import Thresholds
@@ -20,6 +20,11 @@ from srfcli.motion.imposed import Drive, Load
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
 BESIDE = {"slip": "um", "contact_area": "1"}  # what may be observed besides one of these
 AREA_GROWTH = 0.05  # of a contact area by e-fold of its age: 0.02 to 0.1 for rock, glass and polymers
+
+
+def per_elongation(observable: str, K: float, W: Array | float) -> Array | float:
+    """Return what an observable is for each um of the spring's elongation, under the stiffness K (N/um) and the load W (N)."""
+    return {"elongation": 1.0, "force": K, "friction": K / W}[observable]
 
 
 @dataclass(frozen=True)
@@ -201,6 +206,14 @@ class Experiment:
                 f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`."
             )
 
+    def named(self, names: Sequence[str]) -> tuple[Run, ...]:
+        """Return the runs of these names, all where none is given; raises SrfError for a name that no run has."""
+        known = [run.name for run in self.runs]
+        for name in names:
+            if name not in known:
+                raise SrfError(f"`runs`: no run {name!r} in {self.path}", did_you_mean(name, known))
+        return tuple(run for run in self.runs if not names or run.name in names)
+
     def elsewhere(self, run: Run) -> dict[str, float]:
         """Return the parameters that act in other runs alone, at what they are in this one."""
         return {q.name: q.elsewhere for q in self.parameters if q.runs and run.name not in q.runs}
@@ -210,16 +223,27 @@ class Experiment:
         runs = tuple(run for run in self.runs if not run.holdout)
         return replace(self, runs=runs, thresholds=tuple(table for table in self.thresholds if not table.holdout))
 
+    @cached_property
+    def stated_stiffness(self) -> tuple[float, str]:
+        """Return number and unit of the stiffness, as they are stated."""
+        return split_quantity(self.stiffness_text, name="stiffness")
+
+    @property
+    def shown_stiffness(self) -> tuple[float, str]:
+        """Return number and unit of the stiffness, as they are shown."""
+        number, stated = self.stated_stiffness
+        unit, factor = self.shown(stated) if stated in ("N/um", "1/um") else (stated, 1.0)
+        return number * factor, unit
+
     @property
     def stiffness(self) -> float:
         """Return the stated stiffness in N/um, or in 1/um where it is friction per micron."""
-        number, unit = split_quantity(self.stiffness_text, name="stiffness")
-        return to_base(number, unit)
+        return to_base(*self.stated_stiffness)
 
-    @property
+    @cached_property
     def per_load(self) -> bool:
         """Return whether the stiffness is stated in 1/um, as friction per micron."""
-        return not find_unit(split_quantity(self.stiffness_text, name="stiffness")[1]).powers[2]
+        return not find_unit(self.stated_stiffness[1]).powers[2]
 
     @property
     def stress(self) -> bool:
@@ -230,7 +254,7 @@ class Experiment:
         """Return a sentence on what a stiffness stated in 1/um is under each run's load; "" for any other stiffness."""
         if not self.per_load:
             return ""
-        number, unit = split_quantity(self.stiffness_text, name="stiffness")
+        number, unit = self.stated_stiffness
         under: dict[str, str] = {}
         for run in self.runs:
             W = run.first_load

@@ -11,7 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from srfcli.core.errors import SrfError
-from srfcli.core.files import SIDECAR, clear, parse_toml, read_text, recover, toml_lines, whole_folder
+from srfcli.core.files import (
+    SIDECAR,
+    check_folder_place,
+    clear,
+    parse_toml,
+    read_text,
+    toml_lines,
+    unused_name,
+    whole_folder,
+)
 from srfcli.core.units import find_unit
 from srfcli.data.description import LARGEST
 from srfcli.data.thresholds import thresholds_csv
@@ -49,16 +58,8 @@ def experiment_files(experiment: Experiment) -> dict[str, str]:
 
 def check_folder(folder: Path, *, force: bool) -> None:
     """Raise SrfError now if an experiment could not be written to `folder` later."""
-    recover(folder)
-    parent = Path(os.path.realpath(folder)).parent
-    if not parent.is_dir():
-        raise SrfError(f"{folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
-    if not os.access(parent, os.W_OK):
-        raise SrfError(f"{folder}: the directory {parent} is not writable", "Name a folder elsewhere.", exit_code=1)
-    if not os.path.lexists(folder):
+    if not check_folder_place(folder):
         return
-    if not folder.is_dir() or folder.is_symlink():
-        raise SrfError(f"{folder} exists and is not a folder", "Name another folder.")
     clear(folder)
     strangers = sorted(p.name for p in folder.iterdir() if p.name not in _own_files(folder))
     if strangers:
@@ -207,8 +208,5 @@ def _file_names(runs: list[str]) -> list[str]:
     names: list[str] = []
     for run in runs:
         stem = re.sub(r"[^\w.-]+", "-", run, flags=re.ASCII).strip("-.") or "run"
-        name, number = f"{stem}.csv", 2
-        while name.lower() in (other.lower() for other in names):
-            name, number = f"{stem}-{number}.csv", number + 1
-        names.append(name)
+        names.append(unused_name(stem, ".csv", names))
     return names

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.data.values import CriticalLoads, Run
+from srfcli.data.values import CriticalLoads, Run, per_elongation
 from srfcli.diagnosis.design import Parting, described
 from srfcli.diagnosis.discrepancy import RunForce, unexplained_friction
 from srfcli.diagnosis.residual_scan import Location, Row
 from srfcli.diagnosis.verdict import Diagnosis, parameters_of
 from srfcli.inference.prediction import of_run
+from srfcli.inference.recordings import slip_from
 from srfcli.inference.state_space import Filtered
 
 SCHEMA = "srf.diagnose/1"
@@ -59,23 +60,10 @@ def _view(before: Filtered, after: Filtered, holdout: bool) -> RunView:
     rms = [float(np.sqrt(np.mean(w[run.used] ** 2))) for w in white]
     noise = float(np.median(np.sqrt(after.found.S[run.used])))
     others = tuple((s.observed - before.of(i).nu, s.observed - after.of(i).nu) for i, s in enumerate(run.others, 1))
+    slip = slip_from(run, y[1] / per_elongation(run.observable, run.stiffness, run.load(run.t)[0]))
     return RunView(
-        replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), noise, slip_of(run, y[1]), (white[0], white[1]),
-        others,
+        replace(run, holdout=holdout), holdout, y[0], y[1], (rms[0], rms[1]), noise, slip, (white[0], white[1]), others
     )  # fmt: skip
-
-
-def slip_of(run: Run, predicted: Array) -> Array:
-    """Return the slider's place on the track (n,) in um: what the stage moved less what the spring was stretched."""
-    V = run.drive(run.t)
-    moved = np.concatenate([[0.0], np.cumsum(0.5 * (V[1:] + V[:-1]) * np.diff(run.t))])
-    u = (
-        predicted
-        * {"elongation": 1.0, "force": 1 / run.stiffness, "friction": run.load(run.t)[0] / run.stiffness}[
-            run.observable
-        ]
-    )
-    return np.asarray(run.start + moved - (u - u[0]))
 
 
 def answer(

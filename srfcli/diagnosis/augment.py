@@ -18,9 +18,9 @@ import numpy as np
 import sympy as sp
 
 from srfcli.core.errors import SrfError
-from srfcli.core.files import toml_lines
+from srfcli.core.files import toml_lines, unused_name
 from srfcli.core.settings import Parameter
-from srfcli.core.units import find_unit, from_base, split_quantity
+from srfcli.core.units import from_base
 from srfcli.data.description import GEOMETRY, open_node
 from srfcli.data.values import Experiment, ModelChoice
 from srfcli.data.writing import DESCRIPTION, KILOGRAM, parameter_table, shortest
@@ -78,9 +78,8 @@ def augment(
         for q in fitted.likelihood.problem.experiment.parameters
     ]
     values = {q.name: q.value for q in listed}
-    stiffness, unit = split_quantity(experiment.stiffness_text, name="stiffness")
-    base = "1/um" if "N" not in unit else "N/um"
-    K = values.get("K", stiffness * find_unit(unit).factor)
+    base = "1/um" if experiment.per_load else "N/um"
+    K = values.get("K", experiment.stiffness)
     settings = dict(s for e in hypothesis.effects for s in e.settings)
     inertia = bool(settings.get("inertia", experiment.choice.inertia))
     mass = values.get("M", experiment.mass) if inertia else experiment.mass
@@ -152,12 +151,8 @@ def _parts(
         if not small:
             names[path] = os.path.relpath(path, folder.resolve())
         elif path not in names:
-            stem, suffix, number = re.sub(r"[^\w.-]+", "-", path.stem) or "run", path.suffix, 1
-            name = f"{stem}{suffix}"
-            while name.lower() in taken:
-                number += 1
-                name = f"{stem}-{number}{suffix}"
-            taken.add(name.lower())
+            name = unused_name(re.sub(r"[^\w.-]+", "-", path.stem) or "run", path.suffix, taken)
+            taken.add(name)
             names[path], copies[name] = name, path
         runs.append({**run, "file": names[path]})
     return runs, copies

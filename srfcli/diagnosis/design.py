@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.data.values import Experiment, Run
+from srfcli.data.values import OBSERVABLES, Experiment, Run, per_elongation
 from srfcli.data.writing import DESCRIPTION, experiment_files, run_csv
 from srfcli.diagnosis.augment import augment
 from srfcli.diagnosis.search import Fitted
@@ -46,7 +46,6 @@ CONFIRMED = 3  # of the best, how many with the motion itself
 ROUNDS = 10  # of Gauss and Newton
 GROWS = 0.1  # e-foldings in a run that leave sliding as steady as it was
 REPEATS = 100  # of a run that nobody will go beyond
-UNITS = {"elongation": "um", "force": "N", "friction": "1"}
 PARTS = 60  # of a run, in which it is found how much of it suffices
 
 
@@ -128,7 +127,7 @@ class Side:
         """Return whether the sliding with which a run begins is stable: no apparatus begins with any other."""
         model = self.problem.model
         p = run_parameters(model, self.problem.experiment, run, {**self.values(), "field_amplitude": 0.0})
-        V, W = float(run.drive(run.t[:1])[0]), run.load.rest(float(run.t[0]))
+        V, W = run.drive.at(float(run.t[0])), run.first_load
         J = np.asarray(model.rates_jacobian(np.asarray(model.steady(p)), V, W, 0.0, p), dtype=float)
         return bool(np.linalg.eigvals(J).real.max() * float(np.ptp(run.t)) < GROWS)
 
@@ -296,11 +295,11 @@ class Design:
         first, second = sorted((true_name, wrong_name), key=names.index)
         left = losses[true_name, wrong_name].left * (1.0 if true_name == first else -1.0)
         at = int(np.argmax(np.abs(left)))
-        scale = {"elongation": 1.0, "force": 1 / run.stiffness, "friction": run.load(run.t)[0][at] / run.stiffness}
+        factor = float(per_elongation(run.observable, run.stiffness, run.load(run.t)[0][at]))
         return Parting(
             names, trial.proposal, run, worth[true_name, wrong_name],
             {a: min(g for (true, _), g in worth.items() if true == a) for a in names}, seconds, repeats, (first, second),
-            float(run.t[at]), float(left[at]), abs(float(left[at] * scale[run.observable])), UNITS[run.observable],
+            float(run.t[at]), float(left[at]), abs(float(left[at])) / factor, OBSERVABLES[run.observable],
             wrongs[wrong_name], trial.y,
         )  # fmt: skip
 
@@ -466,7 +465,7 @@ def reach_of(experiment: Experiment) -> Reach:
     late = [b for b in begun if 0 < b < 1]
     return Reach(
         _velocities(experiment.runs),
-        tuple(r.load.rest(float(r.t[0])) for r in experiment.runs),
+        tuple(r.first_load for r in experiment.runs),
         tuple(_digits(w["eps"]) for w in shown), tuple(_digits(w["f"]) for w in shown), tuple(map(_digits, jumps)),
         float(np.median(late)) if late else 0.25,
         _digits(float(np.median([w["rise0"] for w in shown]))) if shown else 0.02,

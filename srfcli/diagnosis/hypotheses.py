@@ -11,7 +11,7 @@ import sympy as sp
 
 from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.settings import Parameter
-from srfcli.core.units import split_quantity, to_base
+from srfcli.core.units import to_base
 from srfcli.data.scales import at_scale, scales_of
 from srfcli.data.values import Experiment, FitParameter
 from srfcli.inference.fit import Problem, fit_problem
@@ -206,9 +206,8 @@ def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment
         found.append(FitParameter(name, value, low, high, p.name in effect.fixed, p.unit, runs, value if runs else 0.0))
     for name in effect.frees:
         if name == "K":
-            size, unit = split_quantity(experiment.stiffness_text, name="stiffness")
-            value = to_base(size, unit)
-            found.append(FitParameter("K", value, 0.2 * value, 5 * value, False, unit))
+            value = experiment.stiffness
+            found.append(FitParameter("K", value, 0.2 * value, 5 * value, False, experiment.stated_stiffness[1]))
         elif name == "M":
             found.append(FitParameter("M", 1e-6, 1e-9, 1e-4, False, "kg"))
     return found

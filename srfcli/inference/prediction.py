@@ -15,9 +15,8 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.codegen.splines import Spline, appended
 from srfcli.core.errors import Status
-from srfcli.core.units import split_quantity
 from srfcli.data.imposed import find_modulation
-from srfcli.data.values import AREA_GROWTH, Experiment, Run
+from srfcli.data.values import AREA_GROWTH, Experiment, Run, per_elongation
 from srfcli.motion.imposed import Load
 from srfcli.motion.integrators import integrate
 
@@ -110,8 +109,8 @@ def start_state(
 def _balanced(
     model: GeneratedModel, run: Run, p: Array, values: Mapping[str, float], by: Sequence[str], places: Mapping[str, int]
 ) -> tuple[Array, Array]:
-    states, t0 = list(model.states), float(run.t[0])
-    V, W = float(run.drive(run.t[:1])[0]), run.load.rest(t0)
+    states = list(model.states)
+    V, W = run.drive.at(float(run.t[0])), run.first_load
     ages, iv = _ages(model), states.index("ln_v")
     mu = values[f"{run.name}.mu"]
     x = np.asarray(model.steady(p)).astype(complex)
@@ -200,11 +199,9 @@ def run_parameters(model: GeneratedModel, experiment: Experiment, run: Run, valu
     base |= {name: value for name, value in listed.items() if name in model.names}
     if "K" in listed:
         base["K"] = listed["K"] * stiffness_share(experiment, run)
-    first = float(run.t[0])
-    V, rate, since = run.drive.piece(first)
     if "begin" in model.names:
         base |= of_run(run)
-    return model.vector({**base, "V": V + rate * (first - since) if rate else V, "W0": run.load.rest(first)})
+    return model.vector({**base, "V": run.drive.at(float(run.t[0])), "W0": run.first_load})
 
 
 def of_run(run: Run) -> dict[str, float]:
@@ -257,8 +254,7 @@ _MODULATIONS: dict[int, tuple[Load, dict[str, float]]] = {}  # it is asked for a
 
 def stiffness_share(experiment: Experiment, run: Run) -> float:
     """Return a run's stiffness in N/um for each unit of the stated one: its first load where that is friction per um, else 1."""
-    unit = split_quantity(experiment.stiffness_text, name="stiffness")[1]
-    return run.load.rest(float(run.t[0])) if "N" not in unit else 1.0
+    return run.first_load if experiment.per_load else 1.0
 
 
 def predict(
@@ -313,7 +309,7 @@ def _observe(
     """Return the recorded quantity and its derivatives: elongation u, spring force K u, or friction K u/W."""
     V, (W, W_dot) = run.drive(t), run.load(t)
     K = p[model.index("K")]
-    factor = {"elongation": np.ones_like(W), "force": np.full_like(W, K), "friction": K / W}[run.observable]
+    factor = np.broadcast_to(per_elongation(run.observable, K, W), W.shape)
     J = np.zeros((t.size, len(places)))
     recorded = model.namespace.get("OBSERVED", "u")
     if recorded in model.states:

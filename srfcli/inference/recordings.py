@@ -8,6 +8,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from srfcli.codegen.c_source import GET_COMPILER, compiler
 from srfcli.codegen.model import Array, open_model
@@ -321,12 +322,14 @@ def shared_field(found: StateSpaceFit) -> float:
 
 def slip_along(run: Run, x: Array, states: tuple[str, ...]) -> Array:
     """Return the slip (n,) in um along smoothed states, from the run's start on."""
-    v = np.exp(x[:, states.index("ln_v")])
-    moved = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(run.t))])
     if "u" in states:  # exact, where stick-slip is faster than the samples
-        V, u = run.drive(run.t), x[:, states.index("u")]
-        moved = np.concatenate([[0.0], np.cumsum(0.5 * (V[1:] + V[:-1]) * np.diff(run.t))]) - (u - u[0])
-    return np.asarray(run.start + moved)
+        return slip_from(run, x[:, states.index("u")])
+    return np.asarray(run.start + cumulative_trapezoid(np.exp(x[:, states.index("ln_v")]), run.t, initial=0.0))
+
+
+def slip_from(run: Run, u: Array) -> Array:
+    """Return the slip (n,) in um from the run's start on: what the stage moved less what the spring was stretched, u (n,)."""
+    return np.asarray(run.start + (cumulative_trapezoid(run.drive(run.t), run.t, initial=0.0) - (u - u[0])))
 
 
 def _judged(problem: Problem, found: LatentFit, name: str) -> RunFit:

@@ -99,7 +99,7 @@ class Registry:
         others = [e.kind for e in self._entries if e.name == name]
         known = did_you_mean(name, (e.name for e in self.entries(kind)))
         hint = f"'{name}' is of kind {others[0]}. Known: {known.rpartition('Known: ')[2]}" if others else known
-        raise SrfError(f"unknown {what} '{name}'", hint)
+        raise SrfError(f"unknown {what} '{name}'", hint, kind="unknown name")
 
     def get(self, kind: str, name: str) -> Law:
         """Return the law of that kind and name, or in the file of that name where it ends in .toml or .py."""

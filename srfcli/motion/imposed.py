@@ -14,7 +14,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -248,7 +248,9 @@ class SampledLoad(Load):
             raise SrfError("a sampled load needs finite loads at rising times", "drop gaps and repeated times first")
         if values.min() <= 0:
             raise SrfError(
-                f"the load is {values.min():g} N at t = {t[values.argmin()]:g} s", "the slider must stay in contact"
+                f"the load is {values.min():g} N at t = {t[values.argmin()]:g} s",
+                "the slider must stay in contact",
+                kind="no contact",
             )
         self.times, self.W, self.noise = t, values, float(noise)
         self.knots, self.coefficients, self.breaks = _build(t, values, self.noise)
@@ -305,18 +307,9 @@ class SampledLoad(Load):
         first = min(max(bisect_right(self._knots, start) - 1, 0), len(self._rows) - 1)
         last = int(np.searchsorted(self.knots, end, side="left"))
         knots, rows = self.knots[first : last + 1].copy(), self.coefficients[first:last].copy()
-        rows[0] = shift_polynomial(rows[0], start - knots[0])
+        rows[0] = _shifted(rows[0], start - knots[0])
         knots[0], knots[-1] = start, end
         return knots, rows
-
-
-def shift_polynomial(row: Array, by: float) -> Array:
-    """Return the coefficients, lowest power first, of p(x + by)."""
-    out = row.copy()
-    for k in range(row.size - 1):  # Horner's scheme, once per power
-        for j in range(row.size - 2, k - 1, -1):
-            out[j] += by * out[j + 1]
-    return out
 
 
 def _build(t: Array, W: Array, noise: float) -> tuple[Array, Array, tuple[float, ...]]:
@@ -354,7 +347,7 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
     else:
         even, change = np.abs(longer) < allowed, np.abs(np.diff(np.log(steps))) > allowed  # between two rates
     found = []
-    for a, b in _runs(even):
+    for a, b in runs_of(even):
         cuts = [a, *(a + 1 + np.flatnonzero(change[a:b])).tolist(), b + 1]
         found += [(c, d) for c, d in pairwise(cuts) if d - c >= SHORTEST - 1]
     total = float(np.ptp(W))
@@ -364,7 +357,7 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
         if rough.mean() > MOSTLY:
             rough[:] = False
         calm = ~(rough[1:] | rough[:-1])  # intervals between two samples that their neighbours foretell
-        smooth += [(a + c, a + d + 1) for c, d in _runs(calm) if d - c >= SHORTEST - 2]
+        smooth += [(a + c, a + d + 1) for c, d in runs_of(calm) if d - c >= SHORTEST - 2]
     return smooth
 
 
@@ -393,7 +386,8 @@ def _rough(t: Array, W: Array, total: float, noise: float) -> NDArray[np.bool_]:
     return rough
 
 
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def runs_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last index of every unbroken run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
@@ -674,9 +668,7 @@ def _shifted(coefficients: Array, by: Array | float) -> Array:
     return out
 
 
-# What the experimenter imposes: the driving velocity V(t) and the normal load W(t), piece by smooth piece; um, s, N.
-
-__all__ = ["ConstantLoad", "Drive", "Load", "LoadPiece", "Modulation", "SampledLoad", "unforetold"]
+# The imposed driving velocity; um, s.
 
 
 @dataclass(frozen=True)
@@ -710,6 +702,13 @@ class Drive:
         return cls(tuple(map(float, times)), tuple(map(float, velocities)), (0.0,) * len(times))
 
     @classmethod
+    def sequence(cls, pieces: Sequence[tuple[float, float, float]], *, start: float = 0.0) -> Drive:
+        """Return the drive of pieces (duration in s, first and last velocity in um/s), one after another from `start` on."""
+        times = tuple(accumulate((duration for duration, _, _ in pieces[:-1]), initial=start))
+        rates = tuple((last - first) / duration for duration, first, last in pieces)
+        return cls(times, tuple(first for _, first, _ in pieces), rates)
+
+    @classmethod
     def ramps(cls, points: Sequence[tuple[float, float]]) -> Drive:
         """Return straight lines through (t, V), constant before the first point and after the last."""
         t, V = (np.array(column, dtype=float) for column in zip(*points, strict=True))
@@ -729,13 +728,17 @@ class Drive:
         i = max(bisect_right(self.times, t) - 1, 0)
         return self.velocities[i], self.accelerations[i], self.times[i]
 
+    def at(self, t: float) -> float:
+        """Return V at one time (s)."""
+        V, rate, since = self.piece(t)
+        return V + rate * (t - since) if rate else V
+
     def displacement(self, t: Array) -> Array:
         """Return the displacement since t[0] at the rising times `t` (n,), exactly: V is linear between the breaks."""
         inside = [b for b in self.breaks if t[0] < b < t[-1]]
         edges = np.array([t[0], *inside, t[-1]])
-        starts = [self.piece(float(a)) for a in edges[:-1]]
-        V = np.array([v + rate * (a - since) for (v, rate, since), a in zip(starts, edges[:-1], strict=True)])
-        rates = np.array([rate for _, rate, _ in starts])
+        V = np.array([self.at(a) for a in edges[:-1].tolist()])
+        rates = np.array([self.piece(a)[1] for a in edges[:-1].tolist()])
         widths = np.diff(edges)
         reached = np.concatenate(([0.0], np.cumsum(V * widths + 0.5 * rates * widths**2)))
         i = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(V) - 1)

@@ -83,8 +83,7 @@ def _parameters(model: GeneratedModel, p: Array, drive: Drive, load: Load, t: Ar
         raise SrfError(
             f"one set of {len(model.names)} parameters is needed, not an array of shape {q.shape}", "model.vector()"
         )
-    V, rate, since = drive.piece(float(t[0]))
-    q[model.index("V")] = V + rate * (float(t[0]) - since) if rate else V
+    q[model.index("V")] = drive.at(float(t[0]))
     q[model.index("W0")] = load.rest(float(t[0]))
     return q
 

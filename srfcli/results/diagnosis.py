@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -14,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.core.errors import SrfError, Status
-from srfcli.core.files import parse_json, read_plain, recover, whole_folder, write_atomic
-from srfcli.core.units import split_quantity
+from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
 from srfcli.results.report_text import unit_text
 from srfcli.results.tables import Column, Result, Table, json_text, own_figure, plain_value
 
@@ -332,19 +330,7 @@ def _places(location: Location) -> list[str]:
 
 def check_answer(folder: Path, *, force: bool) -> None:
     """Raise SrfError where a diagnosis could not be written to `folder`."""
-    recover(folder)
-    parent = Path(os.path.realpath(folder)).parent
-    if not parent.is_dir():
-        raise SrfError(f"--out {folder}: the directory {parent} does not exist", f"Create it: mkdir -p {parent}")
-    if not os.access(parent, os.W_OK):
-        raise SrfError(
-            f"--out {folder}: the directory {parent} is not writable", "Name a folder elsewhere.", exit_code=1
-        )
-    if not os.path.lexists(folder):
-        return
-    if not folder.is_dir() or folder.is_symlink():
-        raise SrfError(f"--out {folder} exists and is not a folder", "Name another folder.")
-    if not any(folder.iterdir()):
+    if not check_folder_place(folder, what="--out") or not any(folder.iterdir()):
         return
     if not _is_diagnosis(folder):
         raise SrfError(f"--out {folder} holds something else than a diagnosis", "It is never replaced; name another.")
@@ -372,9 +358,8 @@ def _in_shown_units(made_of: dict[str, Any], diagnosis: Diagnosis) -> None:
         row["unit"], factor = experiment.shown(str(row["unit"]))
         for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
             row[key] = row[key] and row[key] * factor
-    number, unit = split_quantity(experiment.stiffness_text, name="stiffness")
-    shown_unit, factor = experiment.shown(unit) if unit in ("N/um", "1/um") else (unit, 1.0)
-    made_of["stated"] = {"stiffness": f"{number * factor:.4g} {unit_text(shown_unit)}"}
+    stiffness, unit = experiment.shown_stiffness
+    made_of["stated"] = {"stiffness": f"{stiffness:.4g} {unit_text(unit)}"}
     made_of["own"] = {
         effect.reported: [*(p.name for p in effect.parameters), *effect.frees]
         for ranked in diagnosis.ranked for effect in ranked.hypothesis.effects
@@ -428,10 +413,7 @@ def prediction_names(runs: list[str], word: str = "prediction") -> list[str]:
     names: list[str] = []
     for run in runs:
         stem = re.sub(r"[^\w .-]+", "-", run).strip(" .") or "run"
-        name, number = f"{word}-{stem}.csv", 2
-        while name.lower() in (other.lower() for other in names):
-            name, number = f"{word}-{stem}-{number}.csv", number + 1
-        names.append(name)
+        names.append(unused_name(f"{word}-{stem}", ".csv", names))
     return names
 
 

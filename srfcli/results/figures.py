@@ -13,6 +13,7 @@ from srfcli.results.plots import (
     QUANTITY,
     Values,
     bare_figure,
+    curve_style,
     decade_ticks,
     heading,
     house_style,
@@ -186,7 +187,7 @@ def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title
         figure, axes = new_figure(2 + len(measured), size=(6.0, 5.2 + 1.5 * len(measured)))
         above, below, own = axes[0], axes[-1], dict(zip(measured, axes[1:], strict=False))
         for k, (label, values) in enumerate(parts.items()):
-            look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": DASHES[k % len(DASHES)]}
+            look = curve_style(k)
             own.get(label, above).plot(list(x), np.abs(values), label=label, **look)
             below.plot(list(x), np.degrees(np.unwrap(np.angle(values))), label=label.partition("  [")[0], **look)
         for label, axis in own.items():
@@ -257,7 +258,7 @@ def _panel(axes: list[Axes], run: Mapping[str, Any]) -> None:
     t = np.asarray(run["t"])
     labels = (run["label"], "V\n[µm/s]", f"W\n[{run.get('load_unit', 'N')}]")
     for axis, key, label, quantity in zip(axes, ("observed", "V", "W"), labels, "uvW", strict=True):
-        axis.plot(*_thinned(t, np.asarray(run[key])), color=QUANTITY[quantity], linewidth=0.8)
+        axis.plot(*envelope(t, np.asarray(run[key])), color=QUANTITY[quantity], linewidth=0.8)
         axis.set_ylabel(label)
         axis.margins(x=0.01, y=0.08)
         for begin, end in run.get("gaps", ()):
@@ -280,8 +281,8 @@ def _proposed(axis: Axes, t: Any, observed: Any, proposed: Any) -> None:
     """Draw the record as corrected, where proposed corrections change it: spikes as rings, a shifted level dashed."""
     import numpy as np
 
-    from srfcli.data.clock import runs_of
     from srfcli.data.noise import WIDEST_SPIKE
+    from srfcli.motion.imposed import runs_of
 
     lone, moved = np.zeros(t.size, bool), np.zeros(t.size, bool)
     for first, last in runs_of(proposed != observed):
@@ -291,7 +292,7 @@ def _proposed(axis: Axes, t: Any, observed: Any, proposed: Any) -> None:
         axis.plot(t[lone], observed[lone], "o", markersize=5, markerfacecolor="none", label="spike, proposed", **style)
     if moved.any():
         axis.plot(
-            *_thinned(t[moved], proposed[moved]), "--", linewidth=0.8, label="level moved back, proposed", **style
+            *envelope(t[moved], proposed[moved]), "--", linewidth=0.8, label="level moved back, proposed", **style
         )
     axis.legend(loc="best", fontsize="small")
 
@@ -322,13 +323,15 @@ def _mark_unused(axis: Axes, t: Any, x: Any, bad: Any) -> str:
     """Mark what is not compared: stretches as bands, single samples as crosses, many of these as ticks below; say how many."""
     import numpy as np
 
+    from srfcli.motion.imposed import runs_of
+
     if not bad.any():
         return ""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8))).reshape(-1, 2)
-    long = edges[:, 1] - edges[:, 0] >= STRETCH
-    for a, b in edges[long].tolist():
-        axis.axvspan(t[a], t[b - 1], color=UNUSED, alpha=0.25, linewidth=0)
-        bad[a:b] = False
+    total = int(bad.sum())
+    for first, last in runs_of(bad):
+        if last - first + 1 >= STRETCH:
+            axis.axvspan(t[first], t[last], color=UNUSED, alpha=0.25, linewidth=0)
+            bad[first : last + 1] = False
     single = np.flatnonzero(bad)
     if single.size > CROSSES:
         axis.plot(
@@ -336,19 +339,7 @@ def _mark_unused(axis: Axes, t: Any, x: Any, bad: Any) -> str:
         )
     else:
         axis.plot(t[single], x[single], "x", color=UNUSED, markersize=5, linestyle="none")
-    total = int((edges[:, 1] - edges[:, 0]).sum())
     return f": {total} sample{'s' if total > 1 else ''} not compared"
-
-
-def _thinned(t: Any, x: Any) -> tuple[Any, Any]:
-    """Return the record; a long one reduced to the minimum and maximum of each of BINS bins, both at the bin's first time."""
-    import numpy as np
-
-    if t.size <= 4 * BINS:
-        return t, x
-    edges = np.unique(np.searchsorted(t, np.linspace(t[0], t[-1], BINS + 1)[:-1]))
-    low, high = np.minimum.reduceat(x, edges), np.maximum.reduceat(x, edges)
-    return np.repeat(t[edges], 2), np.column_stack([low, high]).ravel()
 
 
 # Figures of records over time: friction, elongation, velocities and load, simulated and recorded.
@@ -493,13 +484,13 @@ def draw_loads(ax: Axes, table: Thresholds, computed: Mapping[str, Values]) -> N
 
     mark: dict[str, Any] = {"fmt": "o", "markersize": 5, "markerfacecolor": "none"}
     for index, eps in enumerate(np.unique(table.eps)):
-        colour, dash = COLOURS[index % len(COLOURS)], DASHES[index % len(DASHES)]
+        style = curve_style(index)
         here = np.flatnonzero(table.eps == eps)
         here = here[np.argsort(table.V[here], kind="stable")]
-        ax.errorbar(table.V[here], table.W0c[here], yerr=table.sigma[here], color=colour, **mark)
+        ax.errorbar(table.V[here], table.W0c[here], yerr=table.sigma[here], color=style["color"], **mark)
         for number, (name, loads) in enumerate(computed.items()):
-            style: dict[str, Any] = {"color": colour, "linestyle": dash} | ({"linewidth": 0.6} if number else {})
-            ax.plot(table.V[here], np.asarray(loads)[here], label=f"{name}, ε = {eps:g}", **style)
+            thin: dict[str, Any] = {"linewidth": 0.6} if number else {}
+            ax.plot(table.V[here], np.asarray(loads)[here], label=f"{name}, ε = {eps:g}", **style, **thin)
     ax.errorbar([], [], yerr=[], color="#555555", label="measured, ± σ", **mark)
     ax.set(xscale="log", yscale="log", xlabel="V  [µm/s]", ylabel="critical W$_0$  [N]")
     decade_ticks(ax)

@@ -270,7 +270,7 @@ class FitResult(Result):
 
         from srfcli.results.figures import fit_figure
         from srfcli.results.plots import symbol_text
-        from srfcli.results.report_text import bracketed, with_unit
+        from srfcli.results.report_text import bracketed, unit_text, with_unit
 
         own_figure(ax, "a fit")
         fit, experiment = self.found.fit, self.experiment
@@ -283,7 +283,7 @@ class FitResult(Result):
         for f in self._observables:
             run, what = runs[f.name], f.observable or runs[f.name].observable
             unit, signal = run.unit_of(what), next(s for s in run.signals if s.observable == what)
-            label = run.quantity_of(what) + ("" if unit == "1" else f"\n[{unit.replace('um', 'µm')}]")
+            label = run.quantity_of(what) + ("" if unit == "1" else f"\n[{unit_text(unit)}]")
             rows.append((f.name, f.holdout, label, run.t, signal.observed, f.prediction.y, f.white))
         for name in fit.names:
             unit, (value, error) = self._shown(name, fit.values[name], fit.stderr[name])

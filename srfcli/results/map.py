@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from srfcli.core.errors import Status
+from srfcli.core.units import describe, find_unit
 from srfcli.results.stability import boundary_columns, boundary_row
 from srfcli.results.tables import STATUS, Column, Result, Table, load_xarray
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from srfcli.numerics.plane import MapAxis
     from srfcli.numerics.special_points import SpecialPoint
 
-BASE_UNITS = ("um", "s", "N", "rad")
 
 
 PLACE = ("eps", "V", "K_over_W0", "W0")  # where a point lies; parameters along other axes stand after these
@@ -320,31 +320,14 @@ class MapResult(Result):
 
 def ratio_powers(model: GeneratedModel, held: str, moved: str) -> tuple[int, ...]:
     """Return the powers of (um, s, N, rad) of the ratio of two parameters."""
-    from srfcli.core.units import find_unit
-
     top, bottom = (find_unit(model.parameters[model.index(n)].unit).powers for n in (held, moved))
     return tuple(a - b for a, b in zip(top, bottom, strict=True))
-
-
-def unit_text(powers: tuple[int, ...]) -> str:
-    """Return powers of the base units as a unit: 1/um, N s/um^2, 1."""
-
-    def side(sign: int) -> str:
-        parts = [
-            name if abs(p) == 1 else f"{name}^{abs(p)}"
-            for name, p in zip(BASE_UNITS, powers, strict=True)
-            if p * sign > 0
-        ]
-        return " ".join(parts)
-
-    top, bottom = side(1), side(-1)
-    return f"{top or '1'}/{bottom}" if bottom else top or "1"
 
 
 def axis_unit(model: GeneratedModel, axis: MapAxis) -> str:
     """Return the unit in which an axis is shown: the parameter's declared one, um, s, N for a ratio."""
     return (
-        unit_text(ratio_powers(model, axis.held, axis.moved))
+        describe(ratio_powers(model, axis.held, axis.moved))
         if axis.held
         else model.parameters[model.index(axis.moved)].unit
     )
@@ -362,13 +345,9 @@ def column_name(axis: MapAxis) -> str:
 
 def label(model: GeneratedModel, axis: MapAxis) -> str:
     """Return an axis' label with its unit."""
-    from srfcli.results.plots import axis_label, symbol_text
+    from srfcli.results.plots import axis_label
 
-    if not axis.held:
-        return axis_label(axis.moved, axis_unit(model, axis))
-    ratio = f"{symbol_text(axis.held)}/{symbol_text(axis.moved)}"
-    unit = axis_unit(model, axis)
-    return ratio if unit in ("", "1") else f"{ratio}  [{unit.replace('um', 'µm')}]"
+    return axis_label(axis.name, axis_unit(model, axis))
 
 
 # Laws side by side: a row for each law and amplitude, a sentence for each pair, their boundaries over each other.

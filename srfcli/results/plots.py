@@ -153,8 +153,14 @@ def symbol_text(name: str) -> str:
 
 
 def axis_label(name: str, unit: str) -> str:
-    """Return a parameter as the label of an axis, with its unit unless that is 1."""
-    return symbol_text(name) if unit in ("", "1") else f"{symbol_text(name)}  [{unit.replace('um', 'µm')}]"
+    """Return a parameter, or a ratio as K/W0, as the label of an axis, with its unit unless that is 1."""
+    text = "/".join(map(symbol_text, name.split("/")))
+    return text if unit in ("", "1") else f"{text}  [{unit.replace('um', 'µm')}]"
+
+
+def curve_style(index: int) -> dict[str, Any]:
+    """Return colour and line style of a figure's curve number `index`."""
+    return {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index % len(DASHES)]}
 
 
 def titled(title: str, described: Mapping[str, Mapping[str, Any]]) -> str:
@@ -281,16 +287,15 @@ def critical_points(points: Sequence[Mapping[str, Any]], *, title: str = "", ax:
         for eps, crossing in sorted({(p["eps"], p["crossing"]) for p in points}):
             mine = sorted((p for p in points if (p["eps"], p["crossing"]) == (eps, crossing)), key=lambda p: p["V"])
             index, lost = order.index(eps), crossing % 2 == 1
-            colour = COLOURS[index % len(COLOURS)]
+            style = curve_style(index)
             ax.plot(
                 [p["V"] for p in mine],
                 [p["K_over_W0"] for p in mine],
-                color=colour,
+                **style,
                 linewidth=0.7,
-                linestyle=DASHES[index % len(DASHES)],
                 marker="os^Dv<>"[index % 7],
                 markersize=5.5,
-                markerfacecolor=colour if lost else "white",
+                markerfacecolor=style["color"] if lost else "white",
                 label=f"ε = {eps:g}: stability is {'lost' if lost else 'regained'} as W$_0$ rises"
                 if crossing < 3
                 else None,
@@ -329,13 +334,11 @@ def _draw_branches(ax: Axes, branches: Sequence[Mapping[str, Any]]) -> None:
     order = list(dict.fromkeys(b["eps"] for b in branches))
     named: set[str] = set()
     for branch in branches:
-        index = order.index(branch["eps"])
         label = branch.get("label") or f"ε = {branch['eps']:g}"
         ax.plot(
             branch["V"],
             _gaps(branch["K_over_W0"]),
-            color=COLOURS[index % len(COLOURS)],
-            linestyle=DASHES[index % len(DASHES)],
+            **curve_style(order.index(branch["eps"])),
             label=label if label not in named else None,
             marker="o" if len(branch["V"]) == 1 else None,
         )
@@ -415,8 +418,7 @@ def lines(
         for index, (y, label) in enumerate(zip(ys, labels, strict=True)):
             drawn = _gaps(y)
             marker = "o" if len(drawn) == 1 else None
-            colour, dash = COLOURS[index % len(COLOURS)], DASHES[index % len(DASHES)]
-            ax.plot(_gaps(x), drawn, color=colour, linestyle=dash, label=label, marker=marker, markersize=4)
+            ax.plot(_gaps(x), drawn, **curve_style(index), label=label, marker=marker, markersize=4)
         if logx:
             ax.set_xscale("log")
         ax.margins(x=0.0 if len(x) > 1 else 0.05)

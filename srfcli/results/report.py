@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from srfcli.core import __version__
 from srfcli.core.errors import SrfError
-from srfcli.core.files import write_atomic
+from srfcli.core.files import unused_name, write_atomic
 from srfcli.results.plots import figure_bytes
 from srfcli.results.provenance import sidecar_path
 from srfcli.results.report_figures import (
@@ -694,25 +694,15 @@ def _drawn(
         if figure is None:
             continue
         content = {suffix: figure_bytes(figure, suffix) for suffix in (".svg", ".png")}
+        stem = (re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "figure")[:80]
         for suffix, data in content.items():
-            place = _free(folder, name, suffix, written)
+            place = folder / unused_name(stem, suffix, [p.name for p in written])
             write_atomic(place, data)
             written.append(place)
         yield name, content[".svg"]
         small = draw(narrow=True)
         if small is not None:
             yield narrow_name(name), figure_bytes(small, ".svg")
-
-
-def _free(folder: Path, name: str, suffix: str, written: list[Path]) -> Path:
-    """Return a file name made of a figure's: letters, digits, dots and dashes, told apart from those that there are."""
-    stem = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "figure"
-    stem = stem[:80]
-    place, k = folder / f"{stem}{suffix}", 2
-    taken = {p.name.lower() for p in written}  # some file systems do not tell capitals apart
-    while place.name.lower() in taken:
-        place, k = folder / f"{stem}-{k}{suffix}", k + 1
-    return place
 
 
 def _drawings(traces: tuple[Trace, ...], material: Mapping[str, Any]) -> Iterator[Drawing]:

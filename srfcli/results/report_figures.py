@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.results.figures import _imposed, _settle, _thinned, draw_loads
+from srfcli.results.figures import _imposed, _settle, draw_loads, envelope
 from srfcli.results.plots import (
-    COLOURS,
-    DASHES,
     DOTTED,
     _gaps,
     bare_figure,
+    curve_style,
     decade_ticks,
     house_style,
     name_text,
@@ -78,6 +77,12 @@ class Trace:
     def same(self) -> bool:
         """True where the augmented model is the baseline."""
         return bool(np.allclose(self.before, self.after, rtol=0.0, atol=SAME))
+
+    def sides(self, before: Array, after: Array) -> list[tuple[Array, str, Any]]:
+        """Return values of baseline and augmented model, the baseline's alone where they are the same, with colour and dashes."""
+        if self.same:
+            return [(before, AFTER, "-")]
+        return [(before, BEFORE, "-"), (after, AFTER, (0, (4, 1.2)))]
 
     def heights(self) -> tuple[float, ...]:
         """Return for each window how far its residual is above noise, from 0 to 1 for the worst."""
@@ -250,8 +255,7 @@ def _whole(axes: Sequence[Axes], one: Trace, *, narrow: bool = False) -> None:
         handlelength=1.4 if narrow else 2.4, borderaxespad=0.0, columnspacing=1.0,
     )  # fmt: skip
     _residual(below, one)
-    sets = [(one.before, BEFORE, "-"), (one.after, AFTER, (0, (4, 1.2)))]
-    for z, colour, dash in [(one.before, AFTER, "-")] if one.same else sets:
+    for z, colour, dash in one.sides(one.before, one.after):
         borders, values = local_rms(one.t, z)
         local.stairs(values, borders, baseline=None, color=colour, linestyle=dash, linewidth=1.4)
     local.axhline(1.0, color="#777777", linewidth=0.8)
@@ -273,14 +277,12 @@ def _models(axis: Axes, one: Trace, part: slice) -> None:
         if few:
             axis.plot(t[a:b], one.observed[part][a:b], ".", color=OBSERVED, markersize=2.6, label=mark)
         else:
-            axis.plot(*_thinned(t[a:b], one.observed[part][a:b]), color=OBSERVED, linewidth=0.9, alpha=0.75, label=mark)
-    drawn = [(one.baseline, BEFORE, "baseline", "-"), (one.augmented, AFTER, "augmented model", (0, (4, 1.2)))]
-    if one.same:
-        drawn = [(one.baseline, AFTER, "baseline", "-")]
-    for values, colour, label, dash in drawn:
+            axis.plot(*envelope(t[a:b], one.observed[part][a:b]), color=OBSERVED, linewidth=0.9, alpha=0.75, label=mark)
+    names = ("baseline", "augmented model")
+    for label, (values, colour, dash) in zip(names, one.sides(one.baseline, one.augmented), strict=False):
         for a, b in _pieces(t):
             shown = label if a == 0 else None
-            axis.plot(*_thinned(t[a:b], values[part][a:b]), color=colour, linewidth=1.1, linestyle=dash, label=shown)
+            axis.plot(*envelope(t[a:b], values[part][a:b]), color=colour, linewidth=1.1, linestyle=dash, label=shown)
     axis.set_ylabel(name_text(one.label))
     axis.ticklabel_format(axis="y", useOffset=False)
     axis.margins(y=0.14)
@@ -288,8 +290,8 @@ def _models(axis: Axes, one: Trace, part: slice) -> None:
 
 def _residual(axis: Axes, one: Trace) -> None:
     """Draw both residuals over the whole run as bands between their extremes, and where noise would stay."""
-    sets = [(one.before, BEFORE, 0.55), (one.after, AFTER, 0.75)]
-    for z, colour, alpha in [(one.before, AFTER, 0.75)] if one.same else sets:
+    for z, colour, _ in one.sides(one.before, one.after):
+        alpha = 0.75 if colour == AFTER else 0.55
         for a, b in _pieces(one.t):
             if b - a < 4 * COLUMNS:
                 axis.plot(one.t[a:b], z[a:b], color=colour, linewidth=0.6, alpha=alpha)
@@ -304,11 +306,9 @@ def _residual(axis: Axes, one: Trace) -> None:
 def _unexplained(axis: Axes, one: Trace) -> None:
     """Draw the friction that each model leaves to its random field, in thousandths."""
     assert one.unexplained is not None
-    before, after = one.unexplained
-    sets = [(before, BEFORE, "-"), (after, AFTER, (0, (4, 1.2)))]
-    for values, colour, dash in [(before, AFTER, "-")] if one.same else sets:
+    for values, colour, dash in one.sides(*one.unexplained):
         for a, b in _pieces(one.t):
-            axis.plot(*_thinned(one.t[a:b], 1e3 * values[a:b]), color=colour, linewidth=1.1, linestyle=dash)
+            axis.plot(*envelope(one.t[a:b], 1e3 * values[a:b]), color=colour, linewidth=1.1, linestyle=dash)
     axis.axhline(0.0, color="#777777", linewidth=0.8)
     axis.set_ylabel("random\nfriction\n[10$^{-3}$]")
     axis.margins(y=0.1)
@@ -321,7 +321,7 @@ def _noise_band(axis: Axes) -> None:
 
 
 def _imposed_panel(axis: Axes, one: Trace, key: str, part: slice) -> None:
-    axis.plot(*_thinned(one.t[part], getattr(one, key)[part]), color="#555555", linewidth=0.8)
+    axis.plot(*envelope(one.t[part], getattr(one, key)[part]), color="#555555", linewidth=0.8)
     _imposed(axis, getattr(one, key)[part], wide=key == "V")
     if axis.get_yscale() == "log":  # decades would fall outside so low a panel
         ends = sorted({float(f"{x:.3g}") for x in (getattr(one, key)[part].min(), getattr(one, key)[part].max())})
@@ -578,14 +578,14 @@ def force_figure(name: str, force: Mapping[str, Any], *, narrow: bool = False) -
         low, high = np.asarray(force["band"], dtype=float)
         axes[0].fill_between(t, low, high, color=AFTER, alpha=0.22, linewidth=0, label="95 % band")
         values = np.asarray(force["force"], dtype=float)
-        axes[0].plot(*_thinned(t, values), color=AFTER, linewidth=1.2, label="missing force")
+        axes[0].plot(*envelope(t, values), color=AFTER, linewidth=1.2, label="missing force")
         axes[0].axhline(0, color="#777777", linewidth=0.8)
         axes[0].set_title(name_text(name, narrow=narrow), pad=22 if narrow else None)
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=2, fontsize=8.5, borderaxespad=0.0)
         axes[0].set_ylabel("missing friction\ncoefficient")
         for axis, (key, label) in zip(axes[1:], imposed, strict=True):
             known = np.asarray(force[key], dtype=float)
-            axis.plot(*_thinned(t, known), color="#555555", linewidth=0.8)
+            axis.plot(*envelope(t, known), color="#555555", linewidth=0.8)
             axis.set_ylabel(label)
             if key == "v" and known.min() > 0 and known.max() > WIDE_QUANTITY * known.min():
                 axis.set_yscale("log")
@@ -626,9 +626,9 @@ def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, narrow: bool = Fa
 
 def _by_state(axis: Axes, x: Any, y: Any, log: bool, label: str, index: int) -> None:
     """Draw samples faintly and their averages along the quantity of state."""
-    colour = COLOURS[index % len(COLOURS)]
+    style = curve_style(index)
     every = max(x.size // 1500, 1)
-    axis.plot(x[::every], y[::every], ".", color=colour, markersize=1.2, alpha=0.25, rasterized=True)
+    axis.plot(x[::every], y[::every], ".", color=style["color"], markersize=1.2, alpha=0.25, rasterized=True)
     scale = np.log(x) if log else x
     edges = np.linspace(scale.min(), scale.max(), PIECES + 1)
     place = np.clip(np.digitize(scale, edges) - 1, 0, PIECES - 1)
@@ -636,7 +636,7 @@ def _by_state(axis: Axes, x: Any, y: Any, log: bool, label: str, index: int) -> 
     kept = count >= max(3, x.size // 2000)
     middle = 0.5 * (edges[1:] + edges[:-1])[kept]
     mean = np.bincount(place, weights=y, minlength=PIECES)[kept] / count[kept]
-    axis.plot(np.exp(middle) if log else middle, mean, color=colour, linestyle=DASHES[index % len(DASHES)], label=label)
+    axis.plot(np.exp(middle) if log else middle, mean, **style, label=label)
 
 
 def loads_figure(one: Mapping[str, Any], *, narrow: bool = False) -> Figure:

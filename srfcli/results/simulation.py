@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from srfcli.core.errors import Status
+from srfcli.core.errors import SrfError, Status
 from srfcli.results.tables import Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
@@ -120,38 +120,34 @@ class Gauge:
     seed: int = 0
 
 
-def measure(gauge: Gauge, job: Job, observed: Array, observable: str = "") -> Array | None:
-    """Return an observable through its gauge, None where it reads exactly; each run and `observable` besides has its noise."""
-    from srfcli.data.noise import measured
-
-    if not (gauge.noise or gauge.quantum):
-        return None
-    return measured(
-        observed,
-        noise=gauge.noise,
-        lag1=gauge.lag1,
-        quantum=gauge.quantum,
-        seed=gauge.seed,
-        stream=" ".join(filter(None, (job.name, observable))),
-    )
-
-
 @dataclass(frozen=True)
 class Work:
-    """What is to be simulated, and what is needed to tell and to write it: `experiment` makes one of the records.
+    """What is to be simulated, and what is needed to tell and to write it.
 
-    `others` are the gauges of what is observed besides.
+    `gauges` are those of the observables, by name; one that is not named reads exactly. `experiment` is what the records are
+    written as, without its runs, None where they are not; `remarks` are to be made when it is written.
     """
 
     model: GeneratedModel
     jobs: tuple[Job, ...]
-    gauge: Gauge
     parameters: Mapping[str, Mapping[str, Any]]
-    experiment: Callable[[Sequence[Record]], Experiment]
+    gauges: Mapping[str, Gauge] = field(default_factory=dict)
+    experiment: Experiment | None = None
+    remarks: tuple[str, ...] = ()
     inputs: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
     meta: Mapping[str, Any] = field(default_factory=dict)
-    others: Mapping[str, Gauge] = field(default_factory=dict)
+
+
+def measure(work: Work, job: Job, observed: Array, observable: str) -> Array | None:
+    """Return an observable through its gauge, None where it reads exactly; each run and each observable has its own noise."""
+    from srfcli.data.noise import measured
+
+    gauge = work.gauges.get(observable, Gauge())
+    if not (gauge.noise or gauge.quantum):
+        return None
+    stream = job.name if observable == job.observable else f"{job.name} {observable}"
+    return measured(observed, **asdict(gauge), stream=stream)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -171,6 +167,13 @@ class SimulationResult(Result):
     work: Work = field(repr=False)
     records: tuple[Record, ...] = field(repr=False)
     worst: Status = Status.OK
+
+    @property
+    def experiment(self) -> Experiment:
+        """Return the experiment that the records are written as; raises SrfError where nothing says what it is of."""
+        if self.work.experiment is None:
+            raise SrfError("the records have no experiment to be written as", "`srf simulate --out-dir DIR` writes one.")
+        return replace(self.work.experiment, runs=tuple(_simulated_run(self.work, r) for r in self.records))
 
     @cached_property
     def table(self) -> Table:
@@ -331,7 +334,7 @@ def _stretches(job: Job, t: Array) -> Iterator[tuple[int, int, float]]:
             yield a, b, V
 
 
-def simulated_run(model: GeneratedModel, r: Record, gauge: Gauge, others: Mapping[str, Gauge]) -> Run:
+def _simulated_run(work: Work, r: Record) -> Run:
     """Return the run as a recording of the simulation; what the repeated run says beside the observable is kept."""
     import numpy as np
 
@@ -339,15 +342,16 @@ def simulated_run(model: GeneratedModel, r: Record, gauge: Gauge, others: Mappin
 
     observed = r.observed if r.measured is None else r.measured
     job, used = r.job, np.ones(observed.size, bool)
-    beside = tuple(Signal(name, y, used, others[name].quantum) for name, y in zip(job.beside, r.others, strict=True))
+    quantum = {name: work.gauges.get(name, Gauge()).quantum for name in (job.observable, *job.beside)}
+    others = tuple(Signal(name, y, used, quantum[name]) for name, y in zip(job.beside, r.others, strict=True))
     initial = "steady" if job.start is None else "free"  # the form has no other word for a state of one's own
-    K = float(job.p[model.index("K")])
+    K = float(job.p[work.model.index("K")])
     if job.run is not None:
         return replace(
-            job.run, observed=observed, used=used, quantum=gauge.quantum, notices=(), stiffness=K, initial=initial,
-            others=beside,
+            job.run, observed=observed, used=used, quantum=quantum[job.observable], notices=(), stiffness=K,
+            initial=initial, others=others,
         )  # fmt: skip
     return Run(
         job.name, Path(f"{job.name}.csv"), False, 0.0, initial, job.t, observed, job.observable, used, job.drive,
-        job.load, K, job.modulation, gauge.quantum, (), others=beside,
+        job.load, K, job.modulation, quantum[job.observable], (), others=others,
     )  # fmt: skip

@@ -1,15 +1,28 @@
-"""`simulate`: records of one slider over time."""
+"""`simulate`: records of one slider over time, under a drive and a load of one's own or as the runs of an experiment."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from srfcli.codegen.model import Array, GeneratedModel, open_model
+from srfcli.codegen.splines import appended
 from srfcli.core.errors import SrfError, Status, did_you_mean, worst
+from srfcli.core.settings import Parameter, check_value, require_parameter
+from srfcli.core.units import from_base, parse_quantity, tidy, to_base
 from srfcli.data.description import MOST_OBSERVABLES
-from srfcli.data.values import BESIDE, OBSERVABLES
+from srfcli.data.noise import RoughTrack, check_gauge, generator
+from srfcli.data.values import BESIDE, OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
+from srfcli.data.writing import stiffness_text
+from srfcli.inference.prediction import of_run
+from srfcli.laws.law_file import APPARATUS
+from srfcli.laws.registry import Registry
 from srfcli.motion import simulate as integrate
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, ModulatedLoad, Modulation
 from srfcli.results.simulation import RISE, Gauge, Job, Record, SimulationResult, Work, measure, observe
@@ -18,8 +31,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from srfcli.codegen.slider import SlidingSystem
-    from srfcli.data.values import Experiment
 
+LARGEST_VELOCITY = 1e9  # um/s
 
 
 def simulate(
@@ -29,7 +42,7 @@ def simulate(
     drive: Drive | Sequence[tuple[float, float]] | None = None,
     load: Load | Sequence[tuple[float, float]] | None = None,
     onset: float | None = None,
-    start: ArrayLike | None = None,
+    start: ArrayLike | str = "steady",
     observable: str | Sequence[str] = "elongation",
     rtol: float = 1e-8,
 ) -> SimulationResult:
@@ -47,8 +60,9 @@ def simulate(
         Normal load in N for each duration (s), steps rounded over 0.02 s; the system's W0 if left out.
     onset : float, optional
         When the modulation begins to rise, in s; at the first sample if left out.
-    start : array (n_states,), optional
-        State at the first sample, as the model orders it; steady sliding at the first velocity if left out.
+    start : array (n_states,) or str
+        State at the first sample, as the model orders it; 'steady' for steady sliding at the first velocity, '10' for steady
+        sliding at 10 um/s, or values such as 'v=1e-3, phi=100 s' in place of those of steady sliding.
     observable : {'elongation', 'force', 'friction'} or sequence of str
         What the apparatus records, in um, N or 1; of several, others or 'slip' (um) and 'contact_area' (1) after the first.
     rtol : float
@@ -79,37 +93,38 @@ def simulate(
     times = np.asarray(t, float)
     if times.ndim != 1 or times.size < 2 or not (np.diff(times) > 0).all():
         raise SrfError("t is no rising list of times", "Like numpy.linspace(0, 4, 4001), in s.")
-    first, *beside = check_observables([observable] if isinstance(observable, str) else list(observable))
+    observables = check_observables([observable] if isinstance(observable, str) else list(observable))
     if not 1e-13 <= rtol <= 1e-2:
         raise SrfError(f"rtol = {rtol:g} is out of range", "Choose it between 1e-13 and 1e-2, as 1e-8.")
-    system.model.check_changing_load(system.vector())
-    values, begin, end = system.resolved.values, float(times[0]), float(times[-1])
-    moved = Drive.constant(values["V"]) if drive is None else drive if isinstance(drive, Drive) else Drive.steps(drive)
-    if start is None and not float(moved(times[:1])[0]) > 0:
-        raise SrfError(
-            "the drive begins at rest: there is no steady sliding to start from", "Give start, or move first."
-        )
-    pressed: Load
-    if isinstance(load, Load):
-        pressed = load
-    elif load is None:
-        pressed = ConstantLoad(values["W0"])
-    else:
-        pressed = LoadSteps.sequence([(length, W, W) for length, W in load], start=begin, rise=RISE)
-    f, eps = (values["f"] if values["eps"] else None), values["eps"]
-    since = begin if onset is None else onset
-    if f is not None:
-        plain = isinstance(pressed, ConstantLoad)
-        wave = Modulation(pressed.W0 if isinstance(pressed, ConstantLoad) else 1.0, eps, f, onset=since)
-        pressed = wave if plain else ModulatedLoad(pressed, wave)
-    pressed.check(begin, end)
-    model = system.model
-    job = Job(
-        "simulated", model.vector(values), moved, pressed, times, None if start is None else np.asarray(start, float),
-        first, f, None if f is None else (f, eps, since), beside=tuple(beside),
-    )  # fmt: skip
-    replaced = [*(["V"] if drive is not None else []), *(["W0"] if load is not None else [])]
-    return simulate_work(Work(model, (job,), Gauge(), system.described(without=replaced), _none), rtol=rtol)
+    if drive is None:
+        drive = Drive.constant(system.resolved.values["V"])
+    elif not isinstance(drive, Drive):
+        drive = Drive.steps(drive)
+    if load is not None and not isinstance(load, Load):
+        load = LoadSteps.sequence([(length, W, W) for length, W in load], start=float(times[0]), rise=RISE)
+    work = record_of(system, t=times, drive=drive, load=load, onset=onset, start=start, observables=observables)
+    return simulate_work(work, rtol=rtol)
+
+
+def simulate_work(
+    work: Work, *, rtol: float = 1e-8, progress: Callable[[str, bool], None] = lambda name, done: None
+) -> SimulationResult:
+    """Return the records of prepared work; `progress` is told the name of each, before and after it was simulated."""
+    records: list[Record] = []
+    try:
+        for job in work.jobs:
+            progress(job.name, False)
+            trace = integrate.simulate(
+                work.model, job.p, drive=job.drive, load=job.load, t=job.t, start=job.start, tables=job.tables, rtol=rtol
+            )
+            shown = {name: observe(work.model, job, trace, name) for name in (job.observable, *job.beside)}
+            read = {name: measure(work, job, values, name) for name, values in shown.items()}
+            others = tuple(values if (y := read[name]) is None else y for name, values in shown.items())[1:]
+            records.append(Record(job, trace, shown[job.observable], read[job.observable], others))
+            progress(job.name, True)
+    except KeyboardInterrupt:
+        return SimulationResult(work, tuple(records), Status.INTERRUPTED)
+    return SimulationResult(work, tuple(records), worst([r.trace.status for r in records]))
 
 
 def check_observables(names: Sequence[str]) -> list[str]:
@@ -126,38 +141,439 @@ def check_observables(names: Sequence[str]) -> list[str]:
     return list(names)
 
 
-def _none(records: Sequence[Record]) -> Experiment:
-    raise SrfError(
-        "a simulation from Python is not written as an experiment", "`srf simulate --out-dir DIR` writes one."
+def read_gauges(
+    observables: Sequence[str], *, noise: str | None, lag1: float, quantum: str | None, seed: int
+) -> dict[str, Gauge]:
+    """Return the gauge of each observable; sizes are text as '0.01,0.2', in the observables' units unless one is written.
+
+    Raises SrfError for what no gauge does.
+    """
+    sizes = []
+    for name, text in (("noise", noise), ("quantum", quantum)):
+        texts = ["0"] * len(observables) if text is None else text.split(",")
+        if len(texts) != len(observables):
+            raise SrfError(
+                f"`{name}` {text}: found {len(texts)}, expected one for each of {', '.join(observables)}",
+                f"Write `{name}` {','.join(['0.01'] * len(observables))}.",
+            )
+        units = [(OBSERVABLES | BESIDE)[observable] for observable in observables]
+        sizes.append([parse_quantity(text, unit, name=f"`{name}`") for text, unit in zip(texts, units, strict=True)])
+    silent = any(sizes[0])  # a gauge without noise beside others; of none, a colour is told
+    gauges = [Gauge(n, lag1 if n or not silent else 0.0, q, seed) for n, q in zip(*sizes, strict=True)]
+    for gauge in gauges:
+        check_gauge(**asdict(gauge))
+    return dict(zip(observables, gauges, strict=True))
+
+
+# A new record: one slider under a drive and a load.
+
+REFERENCE = ("V0",)  # the velocity that mu0 refers to: not identifiable beside mu0
+FACTOR = 5.0  # ratio of the bounds of a fit to the value
+
+
+def record_of(
+    system: SlidingSystem,
+    *,
+    t: Array,
+    drive: Drive | None = None,
+    load: Load | None = None,
+    onset: float | None = None,
+    start: ArrayLike | str | None = "steady",
+    observables: Sequence[str] = ("elongation",),
+    rough: tuple[GeneratedModel, RoughTrack] | None = None,
+) -> Work:
+    """Return one record of a slider, to be simulated; arguments are those of `simulate`.
+
+    `rough` is the model with TABLES and the random field that it slides on.
+    """
+    model, values, p, begin = system.model, system.resolved.values, system.vector(), float(t[0])
+    model.check_changing_load(p)
+    replaced = [name for name, given in (("V", drive), ("W0", load)) if given is not None]
+    drive, load = drive or Drive.constant(values["V"]), load or ConstantLoad(values["W0"])
+    modulation = (values["f"], values["eps"], begin if onset is None else onset) if values["eps"] else None
+    if modulation is not None:
+        load = _modulated(load, *modulation)
+    load.check(begin, float(t[-1]))
+    state = start_state(model, p, start, drive=drive, load=load.rest(begin), begin=begin)
+    job = Job(
+        "simulated", p, drive, load, t, state, observables[0], modulation and modulation[0], modulation,
+        beside=tuple(observables[1:]),
+    )  # fmt: skip
+    described = system.described(without=replaced)
+    if rough is None:
+        return Work(model, (job,), described)
+    notes, meta = _track_told(rough[1])
+    return Work(rough[0], (on_track(model, *rough, job, start=start),), described, notes=notes, meta=meta)
+
+
+def _modulated(base: Load, f: float, eps: float, onset: float) -> Load:
+    if isinstance(base, ConstantLoad):
+        return Modulation(base.W0, eps, f, onset=onset)
+    return ModulatedLoad(base, Modulation(1.0, eps, f, onset=onset))
+
+
+def start_state(
+    model: GeneratedModel, p: Array, start: ArrayLike | str | None, *, drive: Drive, load: float, begin: float
+) -> Array | None:
+    """Return the state (n,) that `start` of `simulate` means, None for steady sliding at the drive's first velocity.
+
+    `load` (N) is the load at rest at the time `begin` (s). Raises SrfError where the drive does not move at first.
+    """
+    q = np.array(p, dtype=float)
+    q[model.index("W0")] = load
+    first = drive.at(begin)
+    if start is None or (isinstance(start, str) and start.strip().lower() == "steady"):
+        if first <= 0:
+            moving = next((v for v in drive.velocities if v > 0), 10.0)
+            raise SrfError(
+                f"the drive begins at {first:g} um/s: there is no steady sliding to start from",
+                f"Say what went before: `start` {moving:g} for steady sliding at {moving:g} um/s, "
+                "or begin `drive` with a piece that moves.",
+            )
+        return None
+    if not isinstance(start, str):
+        return np.asarray(start, float)
+    if "=" not in start:
+        q[model.index("V")] = _start_velocity(start)
+        return np.asarray(model.steady(q), dtype=float)
+    q[model.index("V")] = next((v for v in (first, *drive.velocities) if v > 0), 10.0)
+    return _with_values(model, np.array(model.steady(q), dtype=float), start)
+
+
+def _start_velocity(text: str) -> float:
+    try:
+        V = parse_quantity(text, "um/s", name="`start`")
+    except SrfError as error:
+        raise SrfError(f"`start` {text!r} is neither steady, nor a velocity, nor values", error.hint) from error
+    if not 1e-12 <= V <= LARGEST_VELOCITY:
+        raise SrfError(
+            f"`start` {text}: sliding is steady from 1e-12 to {LARGEST_VELOCITY:g} um/s", "Write `start` 10."
+        )
+    return V
+
+
+def _with_values(model: GeneratedModel, x: Array, text: str) -> Array:
+    plain = [name.removeprefix("ln_") for name in model.states]
+    for part in text.split(","):
+        name, _, value = (word.strip() for word in part.partition("="))
+        if name not in plain:
+            raise SrfError(f"`start`: {name!r} is no state of {model.title}", did_you_mean(name, plain))
+        unit = {"u": "um", "z": "um/s", "v": "um/s"}.get(name, "s")
+        number, i = parse_quantity(value, unit, name=f"`start`: {name}"), plain.index(name)
+        if model.logarithmic[i] and not number > 0:
+            raise SrfError(f"`start`: {name} = {number:g} {unit} is not above 0", f"Write `start` {name}=1e-6.")
+        x[i] = math.log(number) if model.logarithmic[i] else number
+    return x
+
+
+def new_experiment(
+    system: SlidingSystem, choice: ModelChoice, folder: Path, *, free: str | None, spread: float, seed: int
+) -> Experiment:
+    """Return the experiment that a record of this slider is written as, the record still to come.
+
+    `free` names the parameters that a fit is to find, the law's but V0 if left out; `spread` is as in `perturbed`.
+    """
+    model, values = system.model, system.resolved.values
+    chosen = free_names(model, free)
+    parameters = [
+        FitParameter(p.name, values[p.name], *bounds(p, values[p.name]), fixed=p.name not in chosen, unit=p.unit)
+        for p in model.parameters
+        if p.name not in APPARATUS or p.name in chosen
+    ]
+    mass = values.get("M") if choice.inertia else None
+    listed = perturbed(parameters, spread, seed)
+    return Experiment(
+        folder, f"simulated with {model.title}", choice, mass, stiffness_text(values["K"]), listed, (), ()
     )
 
 
-def simulate_work(
-    work: Work, *, rtol: float = 1e-8, progress: Callable[[str, bool], None] = lambda name, done: None
-) -> SimulationResult:
-    """Return the records of prepared work; `progress` is told the name of each, before and after it was simulated."""
-    records: list[Record] = []
+def free_names(model: GeneratedModel, names: str | None) -> set[str]:
+    """Return which parameters a fit of the written experiment is to find."""
+    laws = [p.name for p in model.parameters if p.name not in APPARATUS]
+    if names is None:
+        return {name for name in laws if name not in REFERENCE}
+    chosen = [name.strip() for name in names.split(",") if name.strip()]
+    known = [*laws, *(name for name in ("K", "M") if name in model.names)]
+    for name in chosen:
+        if name not in known:
+            raise SrfError(f"`free`: {name!r} is no parameter of {model.title}", did_you_mean(name, known))
+    return set(chosen)
+
+
+def bounds(parameter: Parameter, value: float) -> tuple[float, float]:
+    """Return the bounds of a fit around `value` (um, s, N): a factor of five, within the parameter's own."""
+    lower, upper = (to_base(b, parameter.unit) for b in (parameter.lower, parameter.upper))
+    if value > 0:
+        return max(lower, float(f"{value / FACTOR:.3g}")), min(upper, float(f"{value * FACTOR:.3g}"))
+    reach = FACTOR * max(abs(value), 1.0)
+    return (lower if math.isfinite(lower) else value - reach), (upper if math.isfinite(upper) else value + reach)
+
+
+def perturbed(parameters: Sequence[FitParameter], spread: float, seed: int) -> tuple[FitParameter, ...]:
+    """Return the free parameters off by a factor drawn evenly from 1 - spread to 1 + spread, within their bounds."""
+    rng = generator(seed, "start values")
+    moved = []
+    for p in parameters:
+        factor = 1.0 + spread * rng.uniform(-1.0, 1.0)  # drawn for fixed ones, too: what is free changes no other value
+        value = p.value if p.fixed or not spread else min(max(p.value * factor, p.lower), p.upper)
+        moved.append(replace(p, value=value))
+    return tuple(moved)
+
+
+# How a new record is sampled, where no times are given.
+
+MOST_SAMPLES = 10_000_000
+FEW_SAMPLES, MANY_SAMPLES, USUAL_RATE = 1000, 100_000, 1000.0  # see `usual_rate`
+
+
+def usual_rate(duration: float, frequency: float | None) -> float:
+    """Return the sampling rate where none is given: 1, 2 or 5 times a power of ten, in Hz.
+
+    1000 Hz, more for a record below a second and to see the modulation ten times a period, less beyond 100,000 samples.
+    """
+    wanted = max(USUAL_RATE, FEW_SAMPLES / duration, 10 * frequency if frequency else 0.0)
+    if wanted * duration > MANY_SAMPLES:
+        return _round_rate(MANY_SAMPLES / duration, up=False)
+    return _round_rate(wanted, up=True)
+
+
+def _round_rate(rate: float, *, up: bool) -> float:
+    power = math.floor(math.log10(rate))
+    steps = [float(f"{m}e{power}") for m in (1, 2, 5, 10)]
+    if up:
+        return next((s for s in steps if s >= rate * (1 - 1e-12)), steps[-1])
+    return next((s for s in reversed(steps) if s <= rate * (1 + 1e-12)), steps[0])
+
+
+def sample_times(durations: Sequence[float], rates: Sequence[float], start: float) -> Array:
+    """Return the times (s) of the samples, the first at `start`, the last at or just before the end of the last piece.
+
+    Each piece lasts its duration (s) and has its rate (Hz). Raises SrfError where samples are fewer than two or more than ten
+    million.
+    """
+    total = sum(duration * rate for duration, rate in zip(durations, rates, strict=True))
+    if total > MOST_SAMPLES:
+        size = f"{total:.3g} samples, {total * 64 / 1e9:.2g} GB"
+        raise SrfError(f"`rate` asks for {size}; {MOST_SAMPLES:.0e} is the limit", "Lower `rate`, or split the record.")
+    if total < 1:
+        raise SrfError(
+            f"`rate` gives only one sample in {sum(durations):g} s",
+            f"Raise it: `rate` {_round_rate(10 / sum(durations), up=True):g}.",
+        )
+    edges = list(accumulate(durations, initial=start))
+    blocks = []
+    for (a, b), rate in zip(pairwise(edges), rates, strict=True):
+        steps = np.arange(math.floor((b - a) * rate * (1 + 1e-12)) + 1)
+        times = a + steps / rate
+        blocks.append(times[times < b - 1e-9 / rate] if b != edges[-1] else np.minimum(times, b))
+    digits = 15 - math.ceil(math.log10(max(abs(edges[0]), abs(edges[-1]))))  # 0.507, not 0.5070000000000001
+    return np.unique(np.round(np.concatenate(blocks), min(12, max(digits, 0))))
+
+
+# The runs of an experiment: as they were driven, loaded and sampled, with any parameters and laws.
+
+IMPOSED = ("V", "W0", "eps", "f")
+OF_THE_APPARATUS = ("K", "M")
+
+
+def runs_again(
+    experiment: Experiment,
+    registry: Registry,
+    *,
+    laws: Mapping[str, Any],
+    parameters: Mapping[str, str],
+    names: Sequence[str] = (),
+    start: str = "steady",
+    noise: str | None = None,
+    lag1: float = 0.0,
+    quantum: str | None = None,
+    seed: int = 0,
+    track: RoughTrack | None = None,
+    folder: Path | None = None,
+    spread: float = 0.0,
+) -> Work:
+    """Return the runs of an experiment, to be simulated with its own laws and values but for those given.
+
+    Parameters
+    ----------
+    laws, parameters : mapping
+        Fields of its ModelChoice, and values as text with or without unit, to take in place of its own.
+    names : sequence of str
+        Of the runs; all if left out.
+    start : str
+        As in `simulate`.
+    noise, lag1, quantum
+        Of the gauges, as in `read_gauges`.
+    seed : int
+        Of the noise and of start values that are off.
+    track : RoughTrack, optional
+        Random field that the runs slide on.
+    folder, spread
+        Where the records are written as an experiment, if they are, and by how much its start values are off.
+    """
+    experiment.check_recorded("to simulate")
+    choice = replace(experiment.choice, **laws)
+    model = mover = open_model(registry, **asdict(choice))
+    values = _values(model, parameters)
+    runs = experiment.named(names)
+    observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in runs))
+    if len(observables) > 1 and (noise or quantum):
+        raise SrfError(
+            f"the runs record {' and '.join(map(', '.join, sorted(observables)))}: one `noise` has no unit for all",
+            "Choose runs that record the same, with `runs`.",
+        )
+    gauges = read_gauges(observables[0], noise=noise, lag1=lag1, quantum=quantum, seed=seed)
+    jobs = tuple(_job(model, experiment, run, values, start) for run in runs)
+    unknown = [run.name for run in runs if run.initial == "free"]
+    notes = (f"initial state of {', '.join(unknown)} not known: begun in steady sliding",) if unknown else ()
+    meta: dict[str, Any] = {"title": experiment.title}
+    if track is not None:
+        mover = open_model(registry, **asdict(choice), tables=TABLES)
+        jobs = tuple(on_track(model, mover, track, job, start=start) for job in jobs)
+        told, entry = _track_told(track)
+        notes, meta = (*notes, *told), meta | entry
+    inputs = (experiment.path, *(run.file for run in runs))
+    made = None if folder is None else _experiment_again(experiment, model, choice, values, folder, spread, seed)
+    dropped = [p.name for p in experiment.parameters if p.name not in model.names]
+    remarks = (f"not written, as {choice.law} has no such parameter: {', '.join(dropped)}",) if dropped else ()
+    return Work(mover, jobs, _described(model, experiment, values), gauges, made, remarks, inputs, notes, meta)
+
+
+def _values(model: GeneratedModel, parameters: Mapping[str, str]) -> dict[str, float]:
+    """Return the parameters that are set, in um, s, N."""
+    values = {}
+    for name, text in parameters.items():
+        if name in IMPOSED:
+            raise SrfError(f"{name} is what the runs impose", "An experiment says itself how it is driven and loaded.")
+        parameter = require_parameter(name, model.parameters, where=model.title)
+        values[name] = to_base(check_value(parameter, text), parameter.unit)
+    return values
+
+
+def _of_the_laws(experiment: Experiment) -> dict[str, float]:
+    """Return the values of [parameters]; stiffness and mass are the apparatus', whatever a fit starts from."""
+    return {p.name: p.value for p in experiment.parameters if p.name not in OF_THE_APPARATUS}
+
+
+def _job(
+    model: GeneratedModel, experiment: Experiment, run: Run, values: Mapping[str, float], start: ArrayLike | str
+) -> Job:
+    begin = float(run.t[0])
+    listed = {**_of_the_laws(experiment), "K": run.stiffness}
+    if experiment.mass:
+        listed["M"] = experiment.mass
+    asked = of_run(run) if "begin" in model.names else {}  # by effects
+    found = listed | asked | dict(values) | experiment.elsewhere(run)
+    p = model.vector({name: value for name, value in found.items() if name in model.names})
+    model.check_changing_load(p)
     try:
-        for job in work.jobs:
-            progress(job.name, False)
-            trace = integrate.simulate(
-                work.model,
-                job.p,
-                drive=job.drive,
-                load=job.load,
-                t=job.t,
-                start=job.start,
-                tables=job.tables,
-                rtol=rtol,
-            )
-            observed = observe(work.model, job, trace, job.observable)
-            others = []
-            for name in job.beside:
-                shown = observe(work.model, job, trace, name)
-                read = measure(work.others[name], job, shown, name) if name in work.others else None
-                others.append(shown if read is None else read)
-            records.append(Record(job, trace, observed, measure(work.gauge, job, observed), tuple(others)))
-            progress(job.name, True)
-    except KeyboardInterrupt:
-        return SimulationResult(work, tuple(records), Status.INTERRUPTED)
-    return SimulationResult(work, tuple(records), worst([r.trace.status for r in records]))
+        state = start_state(model, p, start, drive=run.drive, load=run.first_load, begin=begin)
+    except SrfError as error:
+        raise SrfError(f"run {run.name!r}: {error.message}", error.hint) from error
+    ripple = run.modulation[0] if run.modulation else None
+    beside = tuple(signal.observable for signal in run.others)
+    return Job(
+        run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run, beside=beside
+    )
+
+
+def _described(
+    model: GeneratedModel, experiment: Experiment, values: Mapping[str, float]
+) -> dict[str, dict[str, Any]]:
+    """Return name -> {value, unit, origin} of what does not change from run to run."""
+    listed, described = _of_the_laws(experiment), {}
+    if experiment.mass:
+        listed["M"] = experiment.mass
+    for p in model.parameters:
+        if p.name in IMPOSED:
+            continue
+        origin = "flag" if p.name in values else "experiment" if p.name in listed else "law default"
+        value = values.get(p.name, listed.get(p.name))
+        shown: Any = p.default if value is None else tidy(from_base(value, p.unit))
+        if p.name == "K" and origin != "flag":
+            shown, origin = experiment.stiffness_text, "experiment"
+        described[p.name] = {"value": shown, "unit": p.unit, "origin": origin}
+    return described
+
+
+def _experiment_again(
+    experiment: Experiment,
+    model: GeneratedModel,
+    choice: ModelChoice,
+    values: Mapping[str, float],
+    folder: Path,
+    spread: float,
+    seed: int,
+) -> Experiment:
+    """Return the experiment as it is written, its start values those of the simulation, or off them; its runs are to come."""
+    listed = [_moved(p, values.get(p.name)) for p in experiment.parameters if p.name in model.names]
+    known = {*(p.name for p in listed), *OF_THE_APPARATUS}
+    for p in model.parameters:
+        if p.name in values and p.name not in known:
+            value = values[p.name]
+            listed.append(FitParameter(p.name, value, *bounds(p, value), fixed=True, unit=p.unit))
+    return replace(
+        experiment,
+        path=folder,
+        title=f"{experiment.title} (simulated)".strip(),
+        choice=choice,
+        mass=(values.get("M", experiment.mass) if choice.inertia else None),
+        stiffness_text=stiffness_text(values["K"]) if "K" in values else experiment.stiffness_text,
+        parameters=perturbed(listed, spread, seed),
+        runs=(),
+        notices=(),
+    )
+
+
+def _moved(p: FitParameter, value: float | None) -> FitParameter:
+    if value is None:
+        return p
+    unit = "N/um" if p.name == "K" else p.unit  # the unit of the stiffness that is written, too
+    return replace(p, value=value, lower=min(p.lower, value), upper=max(p.upper, value), unit=unit)
+
+
+# The random friction field along slip, and records simulated with it.
+
+TABLES = (("mu", "slip"),)  # a table over slip is added to the friction coefficient
+LARGEST_ROUGHNESS = 0.5  # of mu0: above it the friction coefficient may become negative
+
+
+def on_track(
+    plain: GeneratedModel, rough: GeneratedModel, track: RoughTrack, job: Job, *, start: ArrayLike | str | None
+) -> Job:
+    """Return the job of the model `plain` as one of `rough`, the same with TABLES, on the part of the track that it covers.
+
+    Positions are slip from where the run begins; runs that begin at the same place find the same track there. `start` is as in
+    `simulate`. Raises SrfError for a roughness that the friction coefficient does not allow.
+    """
+    begin = float(job.t[0])
+    place = job.run.start if job.run is not None else 0.0
+    p = rough.vector(dict(zip(plain.names, job.p.tolist(), strict=True)) | {"start": place, "begin": begin})
+    mu0 = p[rough.index("mu0")] if "mu0" in rough.names else math.inf
+    if not track.size <= LARGEST_ROUGHNESS * mu0:
+        raise SrfError(
+            f"`roughness` {track.size:g} is more than half of mu0 = {mu0:g}",
+            "It is the standard deviation of mu0 along the track, such as 3e-4.",
+        )
+    table = track.spline(place, place + _reach(plain, job))
+    state = start_state(rough, appended(p, [table]), start, drive=job.drive, load=job.load.rest(begin), begin=begin)
+    return replace(job, p=p, start=state, tables=(table,))
+
+
+def _reach(model: GeneratedModel, job: Job) -> float:
+    """Return how far (um) the slider may slip: what is driven, what the spring holds at first, and what it swings beyond."""
+    begin, end = float(job.t[0]), float(job.t[-1])
+    times = np.unique([*job.t.tolist(), *(b for b in job.drive.breaks if begin < b < end)])
+    driven = np.cumsum(job.drive(0.5 * (times[1:] + times[:-1])) * np.diff(times))  # V is linear in between
+    held = 0.0
+    if job.start is not None and "u" in model.states:
+        held = abs(float(job.start[model.states.index("u")]))
+    # a spring that friction holds is drawn by less than 1.5 W/K, and swings back by less than it was drawn
+    drawn = 3.0 * float(job.load(job.t)[0].max()) / float(job.p[model.index("K")])
+    return max(float(driven.max()), 0.0) + 2 * held + drawn
+
+
+def _track_told(track: RoughTrack) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return the note on the field and its entry in `meta`, as in the result of `srf fit`."""
+    note = f"track: mu0 wanders by {track.size:g} (standard deviation) over {track.length:g} um"
+    return (note,), {"track": {"amplitude": track.size, "length_um": track.length}}
