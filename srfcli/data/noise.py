@@ -348,7 +348,9 @@ class RoughTrack:
                 "shorten the record, or give a longer roughness length",
             )
         first, last = math.floor(low / h), math.ceil(high / h)
+        first -= first * h > low  # as the quotient is rounded, and the spline's end
         last = max(last, first + 1)
+        last += first * h + h * (last - first) < high
         values = self._values(first - 1 - ECHO, last + 1 + ECHO)
         count = last - first + 3
         # the coefficients whose weighted means 1/6, 4/6, 1/6 are the values; summed so that no bit depends on the window
