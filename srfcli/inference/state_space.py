@@ -77,7 +77,7 @@ DOWN = 10.0  # in log likelihood, by how much less a stride may find than the be
 FINE = (16, 64)  # steps of two standard errors to either side, at least and at most, in which maxima next to one are looked for
 HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
-SHORT_OF, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
+BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
@@ -791,15 +791,11 @@ def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -
     without end, and no say, so that its jump is no barrier. Orear, Am. J. Phys. 50 (1982).
     """
     k, own = len(likelihood.names), free & np.isin(likelihood.names, likelihood.problem.names)
-    unit = likelihood.unit(point.x)
-    runs = []
-    for f in point.runs:
-        at = [likelihood.names.index(n) for n in f.names]
-        a, b = (slope * unit[at] for slope in f.slopes)
-        runs.append((at, a, b, 0.5 * (f.white**2 - 1)[:, None] * b - f.white[:, None] * a))
-    for t in point.tables:
-        a = t.slopes * unit
-        runs.append(([*range(k)], a, np.zeros_like(a), -t.white[:, None] * a))
+    whites = [f.white for f in point.runs] + [t.white for t in point.tables]
+    runs = [
+        (at, a, b, 0.5 * (white**2 - 1)[:, None] * b - white[:, None] * a)
+        for (at, a, b), white in zip(_slopes(likelihood, point), whites, strict=True)
+    ]
     widest = np.where(own, width * np.where(likelihood.logarithmic, 1.0, np.abs(point.x)), 0.0)
     uncertain = widest
     for _ in range(ROUNDS):
@@ -822,22 +818,36 @@ def _pull(likelihood: Likelihood, point: Point, moving: Array, move: Array) -> A
     By one likelihood without derivatives. Half of the step that this makes, added, follows a ridge that bends, which straight
     steps cross to and fro: geodesic acceleration, Transtrum and Sethna, arXiv:1201.5885 (2012).
     """
-    along = np.zeros(len(likelihood.names))
+    total, along = np.zeros((2, len(likelihood.names)))
     along[moving] = move
-    probe = likelihood.at(point.x + SHORT_OF * along, slopes=False, like=point)
-    total, unit = np.zeros(along.size), likelihood.unit(point.x)
+    probe = likelihood.at(point.x + BEND_AT * along, slopes=False, like=point)
     if not np.isfinite(probe.log_likelihood):
         return total[moving]
+    moved: list[tuple[Array, Array | float]] = []
     for f, g in zip(point.runs, probe.runs, strict=True):
-        at, S = [likelihood.names.index(n) for n in f.names], f.every.S[f.used]
-        moved = (g.every.nu - f.every.nu)[f.used] / np.sqrt(S), np.log(g.every.S[f.used] / S)
-        for m, slope, weight in zip(moved, f.slopes, (1.0, 0.5), strict=True):  # as in the information
-            slope = slope * unit[at]
-            total[at] -= weight * (2 / SHORT_OF * (m / SHORT_OF - slope @ along[at])) @ slope
-    for t, u in zip(point.tables, probe.tables, strict=True):
-        slope = t.slopes * unit
-        total -= (2 / SHORT_OF * ((u.white - t.white) / SHORT_OF - slope @ along)) @ slope
-    return np.asarray(total[moving])
+        S = f.every.S[f.used]
+        moved.append(((g.every.nu - f.every.nu)[f.used] / np.sqrt(S), np.log(g.every.S[f.used] / S)))
+    moved += [(u.white - t.white, 0.0) for t, u in zip(point.tables, probe.tables, strict=True)]
+    for (at, a, b), (first, second) in zip(_slopes(likelihood, point), moved, strict=True):
+        bends = [2 / BEND_AT * (m / BEND_AT - slope @ along[at]) for m, slope in ((first, a), (second, b))]
+        total[at] -= bends[0] @ a + 0.5 * bends[1] @ b  # weights as in the information
+    return total[moving]
+
+
+def _slopes(likelihood: Likelihood, point: Point) -> list[tuple[list[int], Array, Array]]:
+    """Return for each run and each table the places of its parameters (k,), and derivatives (m, k) by these coordinates.
+
+    Those of innovations over their standard deviations, or of residuals, and of the logarithms of variances.
+    """
+    unit, found = likelihood.unit(point.x), []
+    for f in point.runs:
+        at = [likelihood.names.index(n) for n in f.names]
+        a, b = (slope * unit[at] for slope in f.slopes)
+        found.append((at, a, b))
+    for t in point.tables:
+        a = t.slopes * unit
+        found.append(([*range(unit.size)], a, np.zeros_like(a)))
+    return found
 
 
 def _gain(trial: Point, point: Point, weights: Sequence[Array]) -> float:
