@@ -5,11 +5,13 @@ Import this before NumPy: it fixes the number of threads.
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -51,6 +53,42 @@ class Report:
             self.say("  ".join(cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(cells)))
             if number == 0:
                 self.say("  ".join("-" * w for w in widths))
+
+
+class Kept:
+    """Repeats of a benchmark, one line of JSON each in `results/NAME.jsonl`, told apart by the entries named in `key`."""
+
+    def __init__(self, name: str, key: Sequence[str]) -> None:
+        self.path, self.key = RESULTS / f"{name}.jsonl", tuple(key)
+
+    def rows(self) -> dict[tuple[Any, ...], dict[str, Any]]:
+        """Return the repeats of earlier runs; a last line that was cut short counts as not done."""
+        done = {}
+        for line in self.path.read_text(encoding="utf-8").splitlines() if self.path.exists() else ():
+            try:
+                row = json.loads(line)
+            except ValueError:
+                continue
+            done[tuple(row[name] for name in self.key)] = row
+        return done
+
+    def add(self, one: Callable[[Any], dict[str, Any]], tasks: Sequence[tuple[Any, ...]], workers: int) -> None:
+        """Do the tasks that are not kept yet, in their order, and keep each as soon as it is done."""
+        done = self.rows()
+        tasks = [task for task in tasks if task not in done]
+        self.path.parent.mkdir(exist_ok=True)
+        with self.path.open("a", encoding="utf-8") as file, ProcessPoolExecutor(workers) as pool:
+            if file.tell() and not self.path.read_bytes().endswith(b"\n"):
+                file.write("\n")
+            waiting = [pool.submit(one, task) for task in tasks]
+            try:
+                for number, future in enumerate(as_completed(waiting), start=1):
+                    file.write(json.dumps(future.result()) + "\n")
+                    file.flush()
+                    print(f"{number} of {len(tasks)}", flush=True)
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
 
 
 def processor() -> str:

@@ -12,15 +12,13 @@ repeats adds to what is there. `--only-print` tells what is there and fits nothi
 from __future__ import annotations
 
 import argparse
-import json
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
-from common import RESULTS, Report
+from common import Kept, Report
 
 from srfcli.codegen.model import open_model
 from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
@@ -40,7 +38,7 @@ BOUNDS = {
 }
 NOISE, QUANTUM = 0.02, 0.005
 LAGS = (0.0, 0.85)
-KEPT = RESULTS / "coverage.jsonl"
+KEPT = Kept("coverage", ("seed", "lag"))
 RUNS = [
     ("steps", Drive.steps([(0, 5.0), (1, 20.0), (2, 5.0), (3.5, 50.0), (4.2, 10.0)]), ConstantLoad(5.0), 6.0, 250),
     ("stickslip", Drive.steps([(0, 12.0), (0.5, 8.0)]), ConstantLoad(9.0), 4.0, 250),
@@ -97,37 +95,6 @@ def one(task: tuple[int, float]) -> dict[str, Any]:
     }
 
 
-def kept() -> dict[tuple[int, float], dict[str, Any]]:
-    """Return the repeats of earlier runs; a last line that was cut short counts as not done."""
-    done = {}
-    for line in KEPT.read_text(encoding="utf-8").splitlines() if KEPT.exists() else ():
-        try:
-            row = json.loads(line)
-        except ValueError:
-            continue
-        done[row["seed"], row["lag"]] = row
-    return done
-
-
-def fit_missing(repeats: int, workers: int) -> None:
-    """Fit what is not kept yet, both kinds of noise in turn, so that what was done by an interruption serves both."""
-    done = kept()
-    tasks = [(seed, lag) for seed in range(repeats) for lag in LAGS if (seed, lag) not in done]
-    KEPT.parent.mkdir(exist_ok=True)
-    with KEPT.open("a", encoding="utf-8") as file, ProcessPoolExecutor(workers) as pool:
-        if file.tell() and not KEPT.read_bytes().endswith(b"\n"):
-            file.write("\n")
-        waiting = [pool.submit(one, task) for task in tasks]
-        try:
-            for number, future in enumerate(as_completed(waiting), start=1):
-                file.write(json.dumps(future.result()) + "\n")
-                file.flush()
-                print(f"{number} of {len(tasks)}", flush=True)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
 def tell(report: Report, lag: float, rows: list[dict[str, Any]]) -> None:
     """Say how well the intervals cover in the repeats with noise of this lag-1 correlation."""
     z = np.array([row["z"] for row in rows])
@@ -165,10 +132,10 @@ def main() -> None:
     parser.add_argument("--only-print", action="store_true")
     chosen = parser.parse_args()
     if not chosen.only_print:
-        fit_missing(chosen.repeats, chosen.workers)
+        KEPT.add(one, [(seed, lag) for seed in range(chosen.repeats) for lag in LAGS], chosen.workers)
     report = Report("coverage", __doc__ or "")
     for lag in LAGS:
-        rows = [row for (seed, of), row in sorted(kept().items()) if of == lag and seed < chosen.repeats]
+        rows = [row for (seed, of), row in sorted(KEPT.rows().items()) if of == lag and seed < chosen.repeats]
         if rows:
             tell(report, lag, rows)
 

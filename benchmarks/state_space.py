@@ -1,29 +1,33 @@
 """The state-space fit on recordings of another code: coverage of its intervals, and whether it is found from values 30 % off.
 
-usage: state_space.py [--repeats N] [--workers N] [--without ridges|weights|faint]      N of each kind of track, 50 if left out
+usage: state_space.py [--repeats N] [--workers N] [--without ridges|weights|faint] [--only-print]
+
+N repeats of each kind of track are made, 50 if that is left out.
 
 The recordings are those of the sealed trials' generator, which shares no equation and no integrator with the fit: four runs
 (steps of velocity, stick-slip, a load step, slides and holds), gauge noise of 0.02 um quantised at 0.005 um. Parameters are drawn
 anew in each repeat, start values are the truth times 0.7 or 1.3, each, within the bounds of the file (mu0: 0.9 or 1.1). A fit
 has found its maximum where one from the true parameters is not likelier by more than 1. `--without` leaves a part of the search
 out: that along ridges, the weights with which a fit begins, so that all readings count alike from the start, or what fields
-too faint to be told add to the errors.
+too faint to be told add to the errors. Each repeat is kept in `results/state_space.jsonl` as soon as it is done: an interrupted
+run goes on where it stopped. `--only-print` tells what is there and fits nothing.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import common
 import numpy as np
 
-AMPLITUDES, LENGTH = (0.0, 1e-4, 3e-4), 6.0
+KINDS = ((0.0, False), (1e-4, False), (1e-4, True), (3e-4, False), (3e-4, True))  # amplitude of the field; one for all runs
+LENGTH = 6.0
+KEPT = common.Kept("state_space", ("seed", "amplitude", "shared", "without"))
 NAMES = {"mu0": "mu0", "A": "A", "B": "B", "D0": "D0", "Vsat": "Vsat", "lambda": "lam"}
 
 
@@ -38,7 +42,7 @@ def plans():
     )
 
 
-def one(task: tuple[float, bool, int, str]) -> dict[str, object]:
+def one(task: tuple[int, float, bool, str]) -> dict[str, object]:
     """Return what one repeat says: errors in standard errors, log likelihoods from far and from the truth, CPU."""
     from srfcli.codegen.model import open_model
     from srfcli.data.experiment import read_experiment
@@ -50,7 +54,7 @@ def one(task: tuple[float, bool, int, str]) -> dict[str, object]:
     from srfcli.validation.gauge import Gauge, read_gauge
     from srfcli.validation.slider import SMOOTH, Physics, Track, move
 
-    amplitude, shared, seed, without = task
+    seed, amplitude, shared, without = task
     rng = np.random.default_rng([seed, int(1e6 * amplitude), shared])
     usual = Physics()
     base = replace(usual, **{n: getattr(usual, n) * float(np.exp(s * rng.standard_normal())) for n, s in SPREAD.items()})
@@ -85,7 +89,8 @@ def one(task: tuple[float, bool, int, str]) -> dict[str, object]:
     errors = np.sqrt(np.diag(found.covariance))
     off = {n: (found.values[n] - truth[n]) / errors[found.likelihood.names.index(n)] for n in truth}
     return {
-        "amplitude": amplitude, "shared": shared, "seed": seed, "off": off, "missed": near.log_likelihood - found.log_likelihood,
+        "seed": seed, "amplitude": amplitude, "shared": shared, "without": without, "off": off,
+        "missed": near.log_likelihood - found.log_likelihood,
         "status": found.maximum.status.value, "smooth": found.smooth, "field": found.values["field_amplitude"], "cpu": used,
     }  # fmt: skip
 
@@ -95,31 +100,38 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--without", choices=("ridges", "weights", "faint"), default="")
+    parser.add_argument("--only-print", action="store_true")
     asked = parser.parse_args()
+    if not asked.only_print:
+        tasks = [(seed, *kind, asked.without) for seed in range(asked.repeats) for kind in KINDS]
+        KEPT.add(one, tasks, asked.workers)
     report = common.Report("state_space", __doc__ or "")
-    kinds = [(a, shared) for a in AMPLITUDES for shared in ((False, True) if a else (False,))]
-    if asked.without:
-        report.say(f"# without {asked.without}")
-    report.say(f"# {asked.repeats} repeats of each kind of track, correlated by (1 + d/l) exp(-d/l), l = {LENGTH:g} um")
-    rows = []
-    with ProcessPoolExecutor(asked.workers) as pool:
-        for amplitude, shared in kinds:
-            answers = list(pool.map(one, [(amplitude, shared, seed, asked.without) for seed in range(asked.repeats)]))
-            off = np.array([list(a["off"].values()) for a in answers])
-            inside = [f"{100 * np.mean(np.abs(column) < 1.96):.0f}" for column in off.T]
-            missed = sum(a["missed"] > 1.0 for a in answers)
-            rows.append(
-                (f"{amplitude:.0e}" if amplitude else "0", "one" if shared else "each its own", *inside,
-                 f"{100 * np.mean(np.abs(off) < 1.96):.1f} %", f"{off.std():.2f}", f"{asked.repeats - missed} of {asked.repeats}",
-                 sum(a["status"] == "ok" for a in answers), sum(bool(a["smooth"]) for a in answers),
-                 f"{np.median([a['cpu'] for a in answers]):.1f} s")
-            )  # fmt: skip
-            lost = [(a["seed"], round(a["missed"], 1)) for a in answers if a["missed"] > 1]
-            print(rows[-1], lost, file=sys.stderr, flush=True)
-    report.table(
-        ("field", "track", *NAMES, "all", "sd/stderr", "maximum found", "status ok", "no field", "CPU, median"),
-        rows,
-    )
+    report.say(f"# tracks correlated by (1 + d/l) exp(-d/l), l = {LENGTH:g} um")
+    rows = KEPT.rows()
+    for without in sorted({key[-1] for key in rows}):
+        report.say("#" + (f" without {without}" if without else ""))
+        report.table(
+            ("field", "track", "repeats", *NAMES, "all", "sd/stderr", "maximum found", "status ok", "no field", "CPU, median"),
+            [
+                told(kind, own)
+                for kind in KINDS
+                if (own := [r for r in rows.values() if (r["amplitude"], r["shared"], r["without"]) == (*kind, without)])
+            ],
+        )
+
+
+def told(kind: tuple[float, bool], answers: list[dict[str, Any]]) -> tuple[object, ...]:
+    """Return the line of the table for one kind of track."""
+    amplitude, shared = kind
+    off = np.array([list(a["off"].values()) for a in answers])
+    inside = [f"{100 * np.mean(np.abs(column) < 1.96):.0f}" for column in off.T]
+    found = sum(a["missed"] <= 1.0 for a in answers)
+    return (
+        f"{amplitude:.0e}" if amplitude else "0", "one" if shared else "each its own", len(answers), *inside,
+        f"{100 * np.mean(np.abs(off) < 1.96):.1f} %", f"{off.std():.2f}", f"{found} of {len(answers)}",
+        sum(a["status"] == "ok" for a in answers), sum(bool(a["smooth"]) for a in answers),
+        f"{np.median([a['cpu'] for a in answers]):.1f} s",
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -64,12 +64,17 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
                 tests.append((off / DEVIATION, f"the field is of another amplitude in {f.run.name}"))
     tests += _of_loads(found)
     tests.append((correlated(point) / DEVIATION, "innovations are correlated"))
-    if not found.smooth:
-        friction = max(float(np.median([typical_friction(f.run) for f in point.runs])), 1e-6)
-        share = values["field_amplitude"] / friction / PLAUSIBLE
-        tests.append((share, f"the field's amplitude is {values['field_amplitude']:.2g}"))
+    tests.append((field_share(found), f"the field's amplitude is {values.get('field_amplitude', 0.0):.2g}"))
     tests += loudness(found.likelihood, point)
     return [text for size, text in sorted(tests, reverse=True) if size > 1.0]
+
+
+def field_share(found: StateSpaceFit) -> float:
+    """Return the amplitude of a fit's random friction field over the largest that a track may have; 0 without a field."""
+    if found.smooth:
+        return 0.0
+    friction = max(float(np.median([typical_friction(f.run) for f in found.maximum.point.runs])), 1e-6)
+    return found.values["field_amplitude"] / friction / PLAUSIBLE
 
 
 def loudness(likelihood: Likelihood, point: Point) -> list[tuple[float, str]]:

@@ -21,7 +21,7 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment
-from srfcli.diagnosis.goodness_of_fit import DEVIATION, log_evidence, shortcomings
+from srfcli.diagnosis.goodness_of_fit import DEVIATION, field_share, log_evidence, shortcomings
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
 from srfcli.diagnosis.scores import Remainder, Score, Scores
 from srfcli.inference.fit import Problem
@@ -47,7 +47,8 @@ ALIKE = 0.9  # likeness of two effects at first order from which what one gains 
 SINGLES, PAIRS = 5, 3  # promises of each model that are followed
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 COARSE = 1e-3  # tolerance of the integration: 0.02 in log likelihood
-BUDGET = 150.0  # s of CPU
+BUDGET = 150.0  # s of CPU, at least
+BASELINES = 5.0  # times what the baseline took, at least: two effects, each fitted twice, and what they leave to be scored
 SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 ASTRAY = 1000.0  # in log likelihood below its parent, from where a model is not fitted: its score knows nothing of the maximum
 FARTHEST = 10.0  # in the logarithm of a parameter, that a score can move it: beyond any bounds
@@ -121,15 +122,13 @@ class ModelSearch:
         progress: Callable[[str], None] = lambda text: None,
         effects: Sequence[str] | None = None,
         trend: str | None = None,
-        *,
-        budget: float = BUDGET,
     ) -> None:
         self.registry, self.whole, self.progress = registry, experiment, progress
         self.trend = trend  # of every fit
         self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs))
         self.candidates, self.excluded = applicable(registry, experiment, effects)
         self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]
-        self.budget, self.begun, self.cut_short = budget, time.process_time(), False
+        self.budget, self.begun, self.cut_short = BUDGET, time.process_time(), False
         self.fitted: dict[str, Fitted] = {}
         self.queue: list[_Move] = []
         self.count = 0
@@ -238,7 +237,10 @@ class ModelSearch:
         """Return the best model; `ranked` has all that were fitted."""
         self.progress("baseline")
         base = self._record(self.fit(None))
+        self.budget = max(BUDGET, BASELINES * (time.process_time() - self.begun))
         base = self._expand(base)
+        if not base.fine:
+            self._swap(base)
         self._search()
         for further in (self._recolour, self._together, self._swap):  # dearer, or less likely
             best = self.best()
@@ -413,7 +415,7 @@ class ModelSearch:
         for size in np.geomspace(max(low, 1e-3 * high), high, BUILT):
             y = x.copy()
             y[place] = np.log(size) if likelihood.logarithmic[place] else size
-            trials.append((likelihood.at(y, slopes=False).log_likelihood, y))
+            trials.append((likelihood.at(y, slopes=False, like=node.fit.maximum.point).log_likelihood, y))
         best, x = max(trials, key=lambda t: t[0])
         if np.isfinite(best):
             found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
@@ -424,29 +426,34 @@ class ModelSearch:
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
 
     def _again(self, node: Fitted) -> _Move | None:
-        """Return a model that fails a test from another size of what is built in, where that is likelier: a false maximum.
+        """Return a model that fails a test, to be fitted anew where its fit may have ended in a false maximum.
 
-        So with the first of several inner parameters of an effect with states, as a frequency beside a damping.
+        Of what is built in, from another size where that is likelier; so with the first of several inner parameters of an effect
+        with states, as a frequency beside a damping. Else from where it stands, under a wider field, if a part of the recordings
+        is off that neither the field nor coloured noise has taken up.
         """
+        values, gain = dict(node.fit.values), 0.0
         built = [n for e in node.hypothesis.effects if e.settings for n in (*(p.name for p in e.parameters), *e.frees)]
         built += [e.scans[0][0] for e in node.hypothesis.effects if e.states and len(e.scans) > 1]
         likelihood = node.fit.likelihood
         name = next((n for n in likelihood.problem.names if n in built), None)
-        if name is None:
-            return None
-        trials = []
-        for ratio in np.geomspace(1 / FAR, FAR, AGAIN):
-            values = _followable(node.fit.values, likelihood.problem)
-            y = likelihood.coordinates({**values, name: values[name] * ratio})
-            trials.append(maximise(likelihood, y, held=[name], steps=12, close=1.0, widths=(), progress=self.progress))
-        likeliest = max(trials, key=lambda f: f.point.log_likelihood)
-        found = maximise(likelihood, likeliest.point.x, steps=12, close=1.0, widths=(), progress=self.progress)
-        gain = found.point.log_likelihood - node.fit.log_likelihood
-        if gain < NEEDED:
+        if name is not None:
+            trials = []
+            start = _followable(values, likelihood.problem)
+            for ratio in np.geomspace(1 / FAR, FAR, AGAIN):
+                y = likelihood.coordinates({**start, name: start[name] * ratio})
+                trials.append(
+                    maximise(likelihood, y, held=[name], steps=12, close=1.0, widths=(), progress=self.progress)
+                )
+            likeliest = max(trials, key=lambda f: f.point.log_likelihood)
+            found = maximise(likelihood, likeliest.point.x, steps=12, close=1.0, widths=(), progress=self.progress)
+            gain = found.point.log_likelihood - node.fit.log_likelihood
+            values = dict(found.point.values) if gain > NEEDED else values
+        apart = correlated(node.fit.maximum.point) < DEVIATION and field_share(node.fit) < 1 and node.fit.maximum.away < LOST
+        if gain < NEEDED and not apart:
             return None
         self.count += 1
-        values = dict(found.point.values)
-        expected = node.evidence + gain + WORTH
+        expected = node.evidence + max(gain, 0.0) + WORTH
         return _Move(-expected, self.count, node.hypothesis, values, self._sizes(node, values), again=True)
 
     def _recolour(self, base: Fitted) -> None:

@@ -136,7 +136,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
         reasons.append("held-out runs are not judged, as no run was fitted that would tell the gauge's noise")
     reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]
     if search.cut_short:
-        reasons.append(f"the search ended at its budget of {search.budget:g} s of CPU, with models left to fit")
+        reasons.append(f"the search ended at its budget of {search.budget:.0f} s of CPU, with models left to fit")
     absorbed = [
         Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.surviving):.2f} % of it")
         for s in scores

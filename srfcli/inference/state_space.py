@@ -27,7 +27,8 @@ from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, QUALITY
-from srfcli.data.values import CriticalLoads, Experiment, Run
+from srfcli.data.noise import white_level
+from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse, root
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
@@ -660,15 +661,23 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
         "field_length": (length, length / 100, 10 * length),
     }
     for what in {s.observable for r in runs for s in r.signals}:
-        level = float(np.median([first_level(r.t, s) for r in runs for s in r.signals if s.observable == what]))
+        own = [(r.t, s) for r in runs for s in r.signals if s.observable == what]
+        level = float(np.median([first_level(*each) for each in own]))
+        quiet = min([level, *(max(_floor(*each), 1e-3 * level) for each in own)])
         found |= {
-            ("gauge_white", what): (level, level / 30, 100 * level),
-            ("gauge_colour", what): (level, level / 100, 100 * level),
+            ("gauge_white", what): (level, quiet / 30, 100 * level),
+            ("gauge_colour", what): (level, quiet / 100, 100 * level),
             ("gauge_time", what): (10 * spacing, spacing, longest),
             ("gauge_frequency", what): (0.1 / spacing, 1 / longest, FASTEST / spacing),
             ("gauge_quality", what): (0.5, *QUALITY),
         }
     return found
+
+
+def _floor(t: Array, signal: Signal) -> float:
+    """Return the white noise of a signal at the times t (n,), which corners and jumps do not raise, and its rounding."""
+    a, b = max(stretches(t, signal.used), key=lambda part: part[1] - part[0])
+    return float(np.hypot(white_level(signal.observed[a:b]), signal.quantum / np.sqrt(12)))
 
 
 def _spacings(run: Run) -> list[float]:
