@@ -33,8 +33,7 @@ def white_level(x: Array, t: Array | None = None) -> float:
         return float(np.median(missed / unit) / 0.6745)
     length = min(SEGMENT, 2 ** int(np.log2(max(x.size, 1))))
     if length < 16:
-        third = np.diff(x, 3) if x.size > 3 else np.zeros(1)
-        return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
+        return calm_level(x)
     starts = np.unique(np.linspace(0, x.size - length, min(2 * x.size // length, 400)).astype(int))
     pieces = np.stack([x[a : a + length] for a in starts.tolist()])
     place = np.linspace(-1.0, 1.0, length)
@@ -45,6 +44,15 @@ def white_level(x: Array, t: Array | None = None) -> float:
     power = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2 / (window @ window)
     upper = power[:, length // 4 : length // 2]
     return float(np.sqrt(np.median(np.median(upper, axis=1)) / np.log(2)))
+
+
+def calm_level(x: Array) -> float:
+    """Return the standard deviation of white noise that the median of third differences of x (n,) shows.
+
+    Corners and jumps count as so many samples each, however large they are; coloured noise counts in part.
+    """
+    third = np.diff(x, 3) if x.size > 3 else np.zeros(1)
+    return float(np.median(np.abs(third)) / 0.6745 / np.sqrt(20.0))
 
 
 # Flaws of a channel: spikes, level jumps of a transducer, saturation, and the step of its quantisation.

@@ -27,7 +27,7 @@ from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, QUALITY
-from srfcli.data.noise import white_level
+from srfcli.data.noise import calm_level
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse, root
@@ -675,9 +675,9 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
 
 
 def _floor(t: Array, signal: Signal) -> float:
-    """Return the white noise of a signal at the times t (n,), which corners and jumps do not raise, and its rounding."""
+    """Return the white noise of a signal at the times t (n,), however large its corners and jumps are, and its rounding."""
     a, b = max(stretches(t, signal.used), key=lambda part: part[1] - part[0])
-    return float(np.hypot(white_level(signal.observed[a:b]), signal.quantum / np.sqrt(12)))
+    return float(np.hypot(calm_level(signal.observed[a:b]), signal.quantum / np.sqrt(12)))
 
 
 def _spacings(run: Run) -> list[float]:
