@@ -299,7 +299,7 @@ def test_what_a_held_out_run_adds_to_the_evidence_is_what_is_foretold_of_it(loud
 
 def test_noise_that_is_far_below_the_corners_of_a_recording_is_found(tmp_path):
     """Sampled coarsely, the drive's starts and stops look like loud white noise; the gauge's is coloured and faint."""
-    plan, base, rng = Plan("holds", ((3, 20), (3, 0.2)) * 4, 5.0, 0.05), Physics(), np.random.default_rng(3)
+    plan, base, rng = Plan("holds", ((1.5, 20), (1.5, 0.2)) * 2, 5.0, 0.05), Physics(), np.random.default_rng(3)
     readings = {plan: read_gauge(move(base, plan).u, Gauge(sigma=0.004, quantum=0.0005, lag1=0.8), rng)}
     for name, text in case_files("holds", base, readings).items():
         (tmp_path / name).write_text(text)
