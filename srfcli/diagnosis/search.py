@@ -30,6 +30,7 @@ from srfcli.inference.state_space import (
     NEEDED,
     Likelihood,
     Maximum,
+    Point,
     StateSpaceFit,
     correlated,
     fit_state_space,
@@ -47,8 +48,8 @@ ALIKE = 0.9  # likeness of two effects at first order from which what one gains 
 SINGLES, PAIRS = 5, 3  # promises of each model that are followed
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 COARSE = 1e-3  # tolerance of the integration: 0.02 in log likelihood
-BUDGET = 150.0  # s of CPU, at least
-BASELINES = 5.0  # times what the baseline took, at least: two effects, each fitted twice, and what they leave to be scored
+BUDGET = 150.0  # s of CPU, or more
+BASELINES = 5.0  # times what the baseline took, if that is more: two effects, each fitted twice, and what they leave to be scored
 SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 ASTRAY = 1000.0  # in log likelihood below its parent, from where a model is not fitted: its score knows nothing of the maximum
 FARTHEST = 10.0  # in the logarithm of a parameter, that a score can move it: beyond any bounds
@@ -415,7 +416,7 @@ class ModelSearch:
         for size in np.geomspace(max(low, 1e-3 * high), high, BUILT):
             y = x.copy()
             y[place] = np.log(size) if likelihood.logarithmic[place] else size
-            trials.append((likelihood.at(y, slopes=False, like=node.fit.maximum.point).log_likelihood, y))
+            trials.append((likelihood.at(y, slopes=False).log_likelihood, y))
         best, x = max(trials, key=lambda t: t[0])
         if np.isfinite(best):
             found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
@@ -428,33 +429,39 @@ class ModelSearch:
     def _again(self, node: Fitted) -> _Move | None:
         """Return a model that fails a test, to be fitted anew where its fit may have ended in a false maximum.
 
-        Of what is built in, from another size where that is likelier; so with the first of several inner parameters of an effect
-        with states, as a frequency beside a damping. Else from where it stands, under a wider field, if a part of the recordings
-        is off that neither the field nor coloured noise has taken up.
+        From another size of what is built in where that is likelier, else from where it stands, under a wider field, if a part of
+        the recordings is off that neither the field nor coloured noise has taken up.
         """
-        values, gain = dict(node.fit.values), 0.0
+        best, found = node.fit.maximum, self._resized(node)
+        gain = found.log_likelihood - node.fit.log_likelihood if found else 0.0
+        if not gain > NEEDED:
+            if correlated(best.point) > DEVIATION or field_share(node.fit) > 1 or best.away > LOST:
+                return None
+            found, gain = best.point, 0.0
+        assert found is not None
+        self.count += 1
+        values = dict(found.values)
+        return _Move(
+            -(node.evidence + gain + WORTH), self.count, node.hypothesis, values, self._sizes(node, values), again=True
+        )
+
+    def _resized(self, node: Fitted) -> Point | None:
+        """Return the likeliest point from other sizes of what is built in, the other parameters fitted under each.
+
+        So with the first of several inner parameters of an effect with states, as a frequency beside a damping; else None.
+        """
         built = [n for e in node.hypothesis.effects if e.settings for n in (*(p.name for p in e.parameters), *e.frees)]
         built += [e.scans[0][0] for e in node.hypothesis.effects if e.states and len(e.scans) > 1]
         likelihood = node.fit.likelihood
         name = next((n for n in likelihood.problem.names if n in built), None)
-        if name is not None:
-            trials = []
-            start = _followable(values, likelihood.problem)
-            for ratio in np.geomspace(1 / FAR, FAR, AGAIN):
-                y = likelihood.coordinates({**start, name: start[name] * ratio})
-                trials.append(
-                    maximise(likelihood, y, held=[name], steps=12, close=1.0, widths=(), progress=self.progress)
-                )
-            likeliest = max(trials, key=lambda f: f.point.log_likelihood)
-            found = maximise(likelihood, likeliest.point.x, steps=12, close=1.0, widths=(), progress=self.progress)
-            gain = found.point.log_likelihood - node.fit.log_likelihood
-            values = dict(found.point.values) if gain > NEEDED else values
-        apart = correlated(node.fit.maximum.point) < DEVIATION and field_share(node.fit) < 1 and node.fit.maximum.away < LOST
-        if gain < NEEDED and not apart:
+        if name is None:
             return None
-        self.count += 1
-        expected = node.evidence + max(gain, 0.0) + WORTH
-        return _Move(-expected, self.count, node.hypothesis, values, self._sizes(node, values), again=True)
+        trials, values = [], _followable(node.fit.values, likelihood.problem)
+        for ratio in np.geomspace(1 / FAR, FAR, AGAIN):
+            y = likelihood.coordinates({**values, name: values[name] * ratio})
+            trials.append(maximise(likelihood, y, held=[name], steps=12, close=1.0, widths=(), progress=self.progress))
+        likeliest = max(trials, key=lambda f: f.point.log_likelihood)
+        return maximise(likelihood, likeliest.point.x, steps=12, close=1.0, widths=(), progress=self.progress).point
 
     def _recolour(self, base: Fitted) -> None:
         """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""
