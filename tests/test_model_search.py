@@ -6,17 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import simpson
 
 from srfcli.codegen.c_source import compiler
 from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import grouped
-from srfcli.diagnosis.goodness_of_fit import log_evidence
+from srfcli.data.values import FitParameter
+from srfcli.diagnosis.goodness_of_fit import log_evidence, mass_at_bounds
 from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.scores import Remainder, Scores
 from srfcli.diagnosis.search import CLOSE, ModelSearch
 from srfcli.diagnosis.verdict import conclude
 from srfcli.inference import state_space
-from srfcli.inference.state_space import COLOUR, Likelihood, correlated, fit_state_space
+from srfcli.inference.state_space import COLOUR, Likelihood, StateSpaceFit, correlated, fit_state_space, maximise
 from srfcli.laws.registry import bundled_registry
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
@@ -190,3 +192,35 @@ def test_evidence_charges_for_what_is_free(tmp_path):
     problem = Hypothesis().problem(SHIPPED, experiment)
     fitted = fit_state_space(problem, processes=())
     assert log_evidence(fitted) < fitted.log_likelihood - 10.0
+
+
+def test_the_evidence_is_the_likelihood_averaged_over_the_priors(tmp_path):
+    """By numerical integration: of a drag that is kept out of its maximum by some standard errors, and the level of the noise."""
+    experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
+    drag = FitParameter("c", 0.0, -0.01, 0.01, False, "1")
+    held = tuple(replace(q, fixed=True) for q in experiment.parameters)
+    choice = experiment.choice.plus(["viscous-drag"])
+    problem = Hypothesis().problem(
+        SHIPPED, replace(experiment, runs=experiment.runs[:1], parameters=(*held, drag), choice=choice)
+    )
+
+    def maximum(problem):
+        likelihood = Likelihood(problem, smooth=True)
+        return StateSpaceFit(likelihood, maximise(likelihood, likelihood.start), 0)
+
+    free = maximum(problem)
+    best, error, widths = free.maximum.point.x, np.sqrt(np.diag(free.maximum.covariance)), np.arange(-7, 6.1, 0.25)
+    c, level = best[0] + widths * error[0], best[1] + np.linspace(-5, 5, 9) * error[1]
+    heights = [[free.likelihood.at(np.array([a, b]), slopes=False).log_likelihood for b in level] for a in c]
+    over_level = simpson(np.exp(np.array(heights) - free.log_likelihood), x=level, axis=1)
+    range_of_level = free.likelihood.upper[1] - free.likelihood.lower[1]
+    for beyond in (-6.0, -1.0, 0.5, 4.0):
+        below = widths <= -beyond
+        upper = problem.upper if beyond == -6.0 else c[below][-1:]
+        found = maximum(replace(problem, upper=upper))
+        for sizes in ({}, {"c": (0.0, 2e-3)}):
+            prior = 1 / (np.pi * 2e-3 * (1 + (c / 2e-3) ** 2)) if sizes else np.full(c.size, 1 / (upper - problem.lower)[0])
+            mass = simpson((over_level * prior)[below], x=c[below]) / range_of_level
+            expected = free.log_likelihood + np.log(mass)
+            assert log_evidence(found, sizes) == pytest.approx(expected, abs=0.15)  # the information is that expected of noise
+            assert (mass_at_bounds(found, sizes) < 0) == (beyond > 0)

@@ -2,14 +2,17 @@
 
 Under the right model the standardised innovations are white noise of variance 1 in every run and every stretch, the random
 friction field has one amplitude in all runs, and one that a track may have, and the gauge is not louder than differences of its
-readings. Laplace's method: Kass and Raftery, JASA 90 (1995); innovations: Durbin and Koopman 2012.
+readings. Laplace's method: Kass and Raftery, JASA 90 (1995); Cauchy priors: Jeffreys, Theory of Probability, 1961, 5.2;
+innovations: Durbin and Koopman 2012.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import product
 
 import numpy as np
+from scipy.special import erfcx
 
 from srfcli.codegen.model import Array
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
@@ -34,17 +37,42 @@ LOUD = 1.15  # gauge noise over that which differences of the recording show, be
 THIRD = 1.16  # relative variance, times n, of a level that third differences of n samples tell: (1 + 2 sum rho^2) / 2
 
 
-def log_evidence(found: StateSpaceFit) -> float:
-    """Return the log marginal likelihood by Laplace's method, priors flat within the bounds."""
-    likelihood, covariance = found.likelihood, found.maximum.covariance
-    free = np.diag(covariance) > 0
-    if not free.any() or not np.isfinite(found.log_likelihood):
+def log_evidence(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None = None) -> float:
+    """Return the log marginal likelihood by Laplace's method; `mass_at_bounds` is a part of it.
+
+    Priors are flat within the bounds, in the likelihood's coordinates; that of a parameter in `sizes`, by name, is a Cauchy
+    distribution (centre, scale).
+    """
+    if not np.isfinite(found.log_likelihood):
         return found.log_likelihood
-    width = (likelihood.upper - likelihood.lower)[free]
+    covariance = found.maximum.covariance
+    free = np.diag(covariance) > 0
     d = np.sqrt(np.diag(covariance)[free])
     _, logdet = np.linalg.slogdet(covariance[np.ix_(free, free)] / np.outer(d, d))
-    occam = np.minimum(0.5 * np.log(2 * np.pi) + np.log(d / width), 0.0)  # a prior is never narrower than the posterior
-    return float(found.log_likelihood + 0.5 * logdet + np.sum(occam))
+    occam = np.log(np.sqrt(2 * np.pi) * d) + _log_prior(found, sizes)[free]  # a prior is never narrower than the posterior
+    return float(found.log_likelihood + 0.5 * logdet + np.sum(np.minimum(occam, 0.0)) + mass_at_bounds(found, sizes))
+
+
+def mass_at_bounds(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None = None) -> float:
+    """Return what parameters at a bound add to the log evidence: each a one-sided integral, along which the others follow it."""
+    likelihood, maximum, total = found.likelihood, found.maximum, 0.0
+    x, score, I = maximum.point.x, maximum.point.score, maximum.point.information
+    free, prior = np.diag(maximum.covariance) > 0, _log_prior(found, sizes)
+    for j in np.flatnonzero(~free & ((x <= likelihood.lower) | (x >= likelihood.upper))):
+        bent = float(I[j, j] - I[j, free] @ maximum.covariance[np.ix_(free, free)] @ I[free, j])
+        d = 1 / np.sqrt(max(bent, (1e-3 * score[j]) ** 2, 1e-300))
+        total += min(float(np.log(np.sqrt(np.pi / 2) * d * erfcx(abs(score[j]) * d / np.sqrt(2))) + prior[j]), 0.0)
+    return total
+
+
+def _log_prior(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None) -> Array:
+    """Return the log prior density (k,) of each coordinate at the maximum."""
+    likelihood, density = found.likelihood, -np.log(found.likelihood.upper - found.likelihood.lower)
+    for name, (centre, scale) in (sizes or {}).items():
+        j = likelihood.names.index(name) if name in likelihood.names else -1  # it may be held
+        if j >= 0 and not likelihood.logarithmic[j] and scale > 0:
+            density[j] = -np.log(np.pi * scale * (1 + ((found.values[name] - centre) / scale) ** 2))
+    return np.asarray(density)
 
 
 def shortcomings(found: StateSpaceFit) -> list[str]:

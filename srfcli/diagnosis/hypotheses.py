@@ -152,6 +152,15 @@ class Hypothesis:
         choice = self.experiment(experiment).choice.plus(e.name for e in self.effects)
         return open_model(registry, **asdict(choice), stability=True)
 
+    def priors(self, model: GeneratedModel) -> dict[str, tuple[float, float]]:
+        """Return the neutral and the typical size of each effect's parameters in a model, by their names there, in um, s, N."""
+        found: dict[str, tuple[float, float]] = {}
+        for effect in self.effects:
+            neutral, typical = neutral_values(effect), typical_sizes(effect)
+            longs = {p.name: long for long, p in own_parameters(effect, model).items()}
+            found |= {longs[name]: (neutral[name], size) for name, size in typical.items()}
+        return found
+
     def problem(
         self,
         registry: Registry,
@@ -191,6 +200,12 @@ def neutral_values(effect: Effect) -> dict[str, float]:
     """Return the values at which an effect's sizes change nothing, in um, s, N."""
     units = {p.name: p.unit for p in effect.parameters}
     return {name: to_base(value, units[name]) for name, value in effect.neutral}
+
+
+def typical_sizes(effect: Effect) -> dict[str, float]:
+    """Return the distance of an effect's sizes from their neutral values in its file's defaults, in um, s, N."""
+    neutral = neutral_values(effect)
+    return {p.name: abs(to_base(p.default, p.unit) - neutral[p.name]) for p in effect.parameters if p.name in neutral}
 
 
 def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment) -> list[FitParameter]:

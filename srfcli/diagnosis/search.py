@@ -2,8 +2,9 @@
 
 A model is the baseline with a set of effects, or with another ageing law. Each model that was fitted says, at first order, what
 each effect could still explain; the model that promises most is fitted next. The score of a model is its log marginal likelihood
-by Laplace's method, with flat priors within the bounds of its parameters and a prior on the number of effects. The search ends
-when the best model passes its tests and nothing that is left promises to come close, or when the budget is spent.
+by Laplace's method, with flat priors within the bounds of its parameters, Cauchy priors about the typical sizes of its effects,
+and a prior on their number. The search ends when the best model passes its tests and nothing that is left promises to come close,
+or when the budget is spent.
 Best-first search: Pearl, Heuristics, 1984; Laplace's method: Kass and Raftery, JASA 90 (1995).
 """
 
@@ -21,7 +22,7 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment
-from srfcli.diagnosis.goodness_of_fit import DEVIATION, field_share, log_evidence, shortcomings
+from srfcli.diagnosis.goodness_of_fit import DEVIATION, field_share, log_evidence, mass_at_bounds, shortcomings
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
 from srfcli.diagnosis.scores import Remainder, Score, Scores
 from srfcli.inference.fit import Problem
@@ -64,12 +65,14 @@ FOLLOWED = 0.3  # least amplitude of the field from which an extended model is f
 class Fitted:
     """A model fitted: log evidence, what speaks against it (nothing where it passes), what it leaves, what effects promise.
 
-    The evidence holds what a field that all runs share gains beyond CLOSE, unless an effect says what all runs share along slip.
+    Of the evidence, `at_bounds` comes from parameters at a bound. It holds what a field that all runs share gains beyond CLOSE,
+    unless an effect says what all runs share along slip.
     """
 
     hypothesis: Hypothesis
     fit: StateSpaceFit
     evidence: float
+    at_bounds: float
     against: tuple[str, ...]
     remainder: Remainder = field(repr=False)
     scores: Scores | None = field(default=None, repr=False)
@@ -83,6 +86,11 @@ class Fitted:
     def fine(self) -> bool:
         """Return whether the model passes every test of what a fit leaves."""
         return not self.against
+
+    @property
+    def attainable(self) -> float:
+        """Return the evidence without what parameters at a bound cost: with an effect more they need not stand there."""
+        return self.evidence - self.at_bounds
 
     @property
     def promised(self) -> Sequence[Score]:
@@ -213,11 +221,12 @@ class ModelSearch:
                 "Give start values, or bounds, between which it slides as the recordings do.",
             )
         remainder = self.remainder(found)
-        evidence = log_evidence(found) + self._prior(hypothesis)
+        sizes = hypothesis.priors(found.likelihood.problem.model)
+        evidence = log_evidence(found, sizes) + self._prior(hypothesis)
         by_slip = any((shape := along_table(e)) and shape.argument == "slip" for e in hypothesis.effects)
         if not by_slip and found.maximum.away < LOST:  # a track is a function of slip or a random one
             evidence += max(remainder.shared.gain - CLOSE, 0.0)  # at first order, about a maximum
-        return Fitted(hypothesis, found, evidence, tuple(shortcomings(found)), remainder)
+        return Fitted(hypothesis, found, evidence, mass_at_bounds(found, sizes), tuple(shortcomings(found)), remainder)
 
     def _prior(self, hypothesis: Hypothesis) -> float:
         """Return the log prior of a model: each effect is one of those that there are, and halves its share.
@@ -359,7 +368,7 @@ class ModelSearch:
             hypothesis = Hypothesis((*present, score.effect), node.hypothesis.ageing)
             sizes = (*self._sizes(node), score.values)
             own = {n: score.shifts[n] for n in node.fit.likelihood.problem.names if score.shifts.get(n)}
-            self._push(node.evidence + gain + one, hypothesis, node, sizes, direction=score.direction, shifts=own)
+            self._push(node.attainable + gain + one, hypothesis, node, sizes, direction=score.direction, shifts=own)
         if not node.fine:
             for effect in (e for e in joining if e.settings or e.observed):
                 self._build(node, effect, one)
@@ -422,7 +431,7 @@ class ModelSearch:
             found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
             values = found.point.values
             self.count += 1
-            expected = found.point.log_likelihood - node.fit.log_likelihood + node.evidence + one
+            expected = found.point.log_likelihood - node.fit.log_likelihood + node.attainable + one
             sizes = (*self._sizes(node), {own[0]: values[own[0]]})
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
 
@@ -493,7 +502,7 @@ class ModelSearch:
         one = -float(np.log(2 * len(self.candidates))) - 3.0
         for pair in node.scores.pairs(PAIRS):
             if pair.gain > node.promised[0].gain + WORTH:
-                self._push(node.evidence + pair.gain + 2 * one, Hypothesis(pair.effects), node, pair.values)
+                self._push(node.attainable + pair.gain + 2 * one, Hypothesis(pair.effects), node, pair.values)
 
     def _swap(self, node: Fitted) -> None:
         """Push the other ageing laws, each after a few steps from where the model or the best one stands, with what it promises.
@@ -522,7 +531,7 @@ class ModelSearch:
                 found = maximise(likelihood, found.point.x, steps=9, close=1.0, widths=(), progress=self.progress)
                 promise = found.point.log_likelihood + 0.5 * found.away**2
             self.count += 1
-            expected = promise - node.fit.log_likelihood + node.evidence
+            expected = promise - node.fit.log_likelihood + node.attainable
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
 
     def _in_all_runs(self) -> None:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from srfcli.core.errors import Status
-from srfcli.core.units import from_base, to_base
+from srfcli.core.units import from_base
 from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import improbability, loudness
-from srfcli.diagnosis.hypotheses import Excluded, neutral_values
+from srfcli.diagnosis.hypotheses import Excluded, typical_sizes
 from srfcli.diagnosis.scores import Score
 from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
@@ -284,8 +284,7 @@ def interesting(score: Score) -> float:
     """Return the size of an effect that matters, in um, s, N: what its plugin gives as default, from its neutral value."""
     if not score.effect.sizes:
         return float("inf") if "K" not in score.effect.frees else 0.1 * abs(score.values["K"])
-    p = next(p for p in score.effect.parameters if p.name == score.effect.sizes[0])
-    return abs(to_base(p.default, p.unit) - neutral_values(score.effect)[p.name])
+    return typical_sizes(score.effect)[score.effect.sizes[0]]
 
 
 def at_bounds(fitted: Fitted) -> list[str]:
