@@ -11,6 +11,11 @@ from typing import Any
 
 import pytest
 
+from srfcli.core import ONE_THREAD
+
+for name, one in ONE_THREAD.items():  # as the command line does: two workers of several threads each hinder each other
+    os.environ.setdefault(name, one)
+
 # a shell that begins the suite in the background has SIGINT ignored, in all programs that it starts too
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -328,6 +328,7 @@ class ModelSearch:
                 found = self._record(self.fit(move))
             except SrfError as error:
                 self.excluded.append(Excluded(name, error.message))
+                self._expect_elsewhere(move)
                 continue
             self._revise(move, found)
             if found is self.best() and not found.fine and not move.again:
@@ -344,6 +345,13 @@ class ModelSearch:
             own = other.direction
             if own is not None and own.size == move.direction.size and abs(float(own @ move.direction)) > ALIKE:
                 other.expected -= surprise
+        heapq.heapify(self.queue)
+
+    def _expect_elsewhere(self, move: _Move) -> None:
+        """Expect of an effect that cannot be fitted from where one model stands as much beside the others that it was scored for."""
+        for other in self.queue:
+            if move.hypothesis.effects and other.hypothesis.effects[-1:] == move.hypothesis.effects[-1:]:
+                other.expected = min(other.expected, move.expected)
         heapq.heapify(self.queue)
 
     def _expand(self, node: Fitted) -> Fitted:
