@@ -78,6 +78,7 @@ DOWN = 10.0  # in log likelihood, by how much less a stride may find than the be
 FINE = (16, 64)  # steps of two standard errors to either side, at least and at most, in which maxima next to one are looked for
 HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
+FARTHEST_STEP = 1.5  # in the logarithm of a parameter
 BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
@@ -760,7 +761,7 @@ def maximise(
                 turn = 2 * float(np.linalg.norm(bend * d) / np.linalg.norm(move * d))
                 winding, part = turn > STRAIGHT, min(TURN / max(turn, TURN), 1.0)
                 move = part * move + part**2 * bend / 2
-            move = np.where(likelihood.logarithmic[moving], np.clip(move, -1.5, 1.5), move)
+            move = np.where(likelihood.logarithmic[moving], np.clip(move, -FARTHEST_STEP, FARTHEST_STEP), move)
             x[moving] += move
             trial = likelihood.at(np.clip(x, likelihood.lower, likelihood.upper), slopes=sure, like=point)
             gain = _gain(trial, point, weights)
@@ -829,6 +830,8 @@ def _pull(likelihood: Likelihood, point: Point, moving: Array, move: Array) -> A
     """
     total, along = np.zeros((2, len(likelihood.names)))
     along[moving] = move
+    if np.any(BEND_AT * np.abs(along[likelihood.logarithmic]) > FARTHEST_STEP):
+        return total[moving]
     probe = likelihood.at(point.x + BEND_AT * along, slopes=False, like=point)
     if not np.isfinite(probe.log_likelihood):
         return total[moving]
