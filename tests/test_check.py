@@ -184,6 +184,7 @@ def test_errors_are_those_of_a_fit(made: Path) -> None:
         assert found.together.errors[name] < min(r.errors[name] for r in found.runs)
 
 
+@pytest.mark.slow
 def test_stiffness_and_trends_are_unknown_too_and_cost_what_they_cost_a_fit(made: Path) -> None:
     """What is said of alpha is what a fit finds that knows neither the machine's stiffness nor a run's trend."""
     experiment = read_experiment(made, registry=REGISTRY)

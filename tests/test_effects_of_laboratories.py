@@ -286,6 +286,7 @@ def test_faults_of_a_spring_s_effect_are_told(old: str, new: str, said: str, tmp
 
 
 @pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
+@pytest.mark.slow
 def test_a_fit_of_a_load_cell_under_three_loads_finds_how_the_spring_stiffens(tmp_path: Path) -> None:
     """Recorded by the generator of concealed cases, whose equations are its own: the force is that of the stiffer spring."""
     slider = Physics(

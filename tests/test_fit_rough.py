@@ -184,6 +184,7 @@ def test_segments_that_do_not_rise_are_refused(ladder, tmp_path):
     assert done.exit_code == 2 and "segments: the times do not rise" in done.stderr
 
 
+@pytest.mark.slow
 def test_values_of_many_groups_are_drawn_to_their_mean(ladder):
     """Where D0 scatters by chance, its six values come together; the maximum is that of likelihood times prior."""
     pieces = grouped(srf.read_experiment(ladder), ["mu0", "D0"], "segment")
@@ -219,6 +220,7 @@ def test_values_of_groups_are_summed_up_as_random_effects():
     assert together.scatter == 0.0 and together.stderr == pytest.approx(np.sqrt(0.5 + 1 / 5)) and together.p_value > 0.9
 
 
+@pytest.mark.slow
 def test_the_likeliest_of_many_maxima_is_found(tmp_path):
     """The contact rings faster than it is sampled: next to the start values is a maximum 54 less likely, 229 errors off."""
     rng = np.random.default_rng([13, 100, False])

@@ -102,6 +102,7 @@ def test_a_fold_is_an_extremum_of_eps_along_the_response(model, atlas, cusp, whi
     assert fit(turn) == pytest.approx(eps, rel=2e-6)
 
 
+@pytest.mark.slow
 def test_at_the_cusp_two_extrema_of_eps_along_the_response_meet(model, atlas, cusp):
     (branch,) = atlas.branches
     point = branch.points[round(cusp.place)]

@@ -42,9 +42,9 @@ def written(example: ModuleType, folder: Path, **truth: float) -> Path:
 @pytest.mark.parametrize(
     ("truth", "name", "parameter", "value"),
     [
-        ({"alpha": 0.1}, "linker-dieterich", "alpha", 0.1),
+        pytest.param({"alpha": 0.1}, "linker-dieterich", "alpha", 0.1, marks=pytest.mark.slow),
         ({"alpha": 0.3}, "linker-dieterich", "alpha", 0.3),
-        ({"alpha": 0.5}, "linker-dieterich", "alpha", 0.5),
+        pytest.param({"alpha": 0.5}, "linker-dieterich", "alpha", 0.5, marks=pytest.mark.slow),
         ({"nagata": 1.0}, "nagata", "c", 1.0),
         ({"rho": 0.8}, "load-transmission", "rho", 0.8),
     ],

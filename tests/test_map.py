@@ -111,7 +111,7 @@ def test_folds_lie_where_crossings_appear(model, atlas):
     assert counts == [2, 0]
 
 
-@pytest.mark.parametrize(("eps", "count"), [(0.18, 2), (0.4, 4)])
+@pytest.mark.parametrize(("eps", "count"), [(0.18, 2), pytest.param(0.4, 4, marks=pytest.mark.slow)])
 def test_a_second_method_finds_the_same_components(model, eps, count):
     """A map, and curves from lines on a finer mesh with other seeds and shorter steps."""
     grid = window(model, eps, 30, 40, ratio=(0.21 / 200, 0.21 / 8))

@@ -175,6 +175,7 @@ def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, shared):
         assert gain == pytest.approx(found.gain, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_coloured_gauge_noise_is_not_taken_for_a_fine_field(tmp_path):
     """From the file's start values the fit is as likely as from the field that was drawn."""
     folder = recorded(tmp_path, Physics(), gauge=Gauge(lag1=0.7))

@@ -46,7 +46,7 @@ def written(folder, only):
 
 
 @needs_compiler
-@pytest.mark.parametrize("only", [("down",), ("up", "down", "again")], ids=["one", "all"])
+@pytest.mark.parametrize("only", [("down",), pytest.param(("up", "down", "again"), marks=pytest.mark.slow)], ids=["one", "all"])
 def test_a_diagnosis_names_the_run_in_which_alone_an_effect_acts(only, tmp_path):
     folder = written(tmp_path, only)
     done = srf("diagnose", str(folder), "--effect", NAME, "--json", "--out", str(tmp_path / "found"))
@@ -131,6 +131,7 @@ class Stuck(ModelSearch):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_a_baseline_in_a_false_maximum_is_fitted_again_from_a_better_model(tmp_path):
     """Else what is nothing would have the name of the effect whose fit found the way out."""
     experiment = read_experiment(written(tmp_path, ()), registry=SHIPPED)

@@ -16,6 +16,7 @@ from srfcli.diagnosis.discrepancy import (
     FOLDER,
     ClosedForm,
     FittedTerm,
+    best_form,
     coordinates_of,
     explain_unknown,
     unexplained_friction,
@@ -69,7 +70,7 @@ def age(tmp_path_factory):
     """The folder that `srf diagnose` writes where contacts age by another power, which no effect that is named describes."""
     folder = tmp_path_factory.mktemp("age")
     out = folder / "found"
-    arguments = ["diagnose", str(recorded(folder, replace(Physics(), p_age=1.7))), "--effect", "viscous-drag"]
+    arguments = ["diagnose", str(recorded(folder, replace(Physics(), p_age=1.7))), "--effect", "sensor-lag"]
     result = CliRunner().invoke(cli, [*arguments, "--out", str(out), "--json"])
     assert result.exit_code == 0, result.output
     return out
@@ -204,3 +205,11 @@ def test_terms_together_are_one_effect(tmp_path):
 )
 def test_values_carry_two_digits_of_their_error(value, error, text):
     assert with_error(value, error) == text
+
+
+@pytest.mark.slow
+def test_a_form_that_cannot_be_fitted_beside_an_effect_is_tried_without_it(tmp_path):
+    """A drag takes up a part of what ages differently; from where it stands the right term does not follow the recordings."""
+    search, diagnosis = searched(recorded(tmp_path, replace(Physics(), p_age=1.7)))
+    found = best_form(search, diagnosis)
+    assert found is not None and [t.effect.name for t in found.terms] == ["age-power"] and not found.beside
