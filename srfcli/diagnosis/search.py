@@ -348,7 +348,7 @@ class ModelSearch:
         heapq.heapify(self.queue)
 
     def _expect_elsewhere(self, move: _Move) -> None:
-        """Expect of an effect that cannot be fitted from where one model stands as much beside the others that it was scored for."""
+        """Expect of an effect that cannot be fitted beside one model as much beside the others that it was scored for."""
         for other in self.queue:
             if move.hypothesis.effects and other.hypothesis.effects[-1:] == move.hypothesis.effects[-1:]:
                 other.expected = min(other.expected, move.expected)
