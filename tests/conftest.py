@@ -13,8 +13,7 @@ import pytest
 
 from srfcli.core import ONE_THREAD
 
-for name, one in ONE_THREAD.items():  # as the command line does: two workers of several threads each hinder each other
-    os.environ.setdefault(name, one)
+os.environ.update(ONE_THREAD)  # as the command line does: two workers of several threads each hinder each other
 
 # a shell that begins the suite in the background has SIGINT ignored, in all programs that it starts too
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and threading.current_thread() is threading.main_thread():

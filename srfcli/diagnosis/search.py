@@ -65,14 +65,14 @@ FOLLOWED = 0.3  # least amplitude of the field from which an extended model is f
 class Fitted:
     """A model fitted: log evidence, what speaks against it (nothing where it passes), what it leaves, what effects promise.
 
-    Of the evidence, `at_bounds` comes from parameters at a bound. It holds what a field that all runs share gains beyond CLOSE,
-    unless an effect says what all runs share along slip.
+    Of the evidence, `mass_at_bounds` comes from parameters at a bound. It holds too what a field that all runs share gains beyond
+    CLOSE, unless an effect says what all runs share along slip.
     """
 
     hypothesis: Hypothesis
     fit: StateSpaceFit
     evidence: float
-    at_bounds: float
+    mass_at_bounds: float
     against: tuple[str, ...]
     remainder: Remainder = field(repr=False)
     scores: Scores | None = field(default=None, repr=False)
@@ -90,7 +90,7 @@ class Fitted:
     @property
     def attainable(self) -> float:
         """Return the evidence without what parameters at a bound cost: with an effect more they need not stand there."""
-        return self.evidence - self.at_bounds
+        return self.evidence - self.mass_at_bounds
 
     @property
     def promised(self) -> Sequence[Score]:
@@ -349,8 +349,9 @@ class ModelSearch:
 
     def _expect_elsewhere(self, move: _Move) -> None:
         """Expect of an effect that cannot be fitted beside one model as much beside the others that it was scored for."""
+        added = move.hypothesis.effects[-1:]
         for other in self.queue:
-            if move.hypothesis.effects and other.hypothesis.effects[-1:] == move.hypothesis.effects[-1:]:
+            if added and other.hypothesis.effects[-1:] == added:
                 other.expected = min(other.expected, move.expected)
         heapq.heapify(self.queue)
 
