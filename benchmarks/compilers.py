@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from srfcli.codegen.c_source import _build, c_source
+from srfcli.codegen.c_source import _build, filter_source, integrator_source
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.laws.registry import load_registry
 
@@ -55,12 +55,13 @@ def with_numba(model: GeneratedModel) -> float:
 
 def main() -> None:
     registry = load_registry()
-    models = {"integrator": open_model(registry), "with filter": open_model(registry, random_field=True)}
+    model = open_model(registry, random_field=True)
+    texts = {"integrator": integrator_source(model), "filter": filter_source(model)}
     print("compiler      text         lines   CPU s, twice     bytes")
     with tempfile.TemporaryDirectory() as folder:
         for name, command in commands().items():
-            for kind, model in models.items():
-                text, taken = c_source(model), []
+            for kind, text in texts.items():
+                taken = []
                 for _ in range(2):
                     before = children()
                     path = _build(command, text, Path(folder) / "model.so")
@@ -68,7 +69,7 @@ def main() -> None:
                 size = path.stat().st_size
                 print(f"{name:12}  {kind:11} {len(text.splitlines()):6}   {taken[0]:.2f} {taken[1]:.2f} {size:12}")
     if importlib.util.find_spec("numba"):
-        print(f"numba         three functions      {with_numba(models['integrator']):.2f}")
+        print(f"numba         three functions      {with_numba(model):.2f}")
 
 
 if __name__ == "__main__":

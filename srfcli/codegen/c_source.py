@@ -107,7 +107,7 @@ def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str
     kinds = {a: "const dual *" if dual else "const double *" for a in _POINTERS}
     declared = ", ".join(f"{kinds.get(a, 'const double ')}{_safe(a)}" for a in arguments)
     body = "\n".join(f"    {line}" for line in lines)
-    return f"static void {label}({declared}, {'dual' if dual else 'double'} *out) {{\n   {unused}\n{body}\n}}\n"
+    return f"static NOINLINE void {label}({declared}, {'dual' if dual else 'double'} *out) {{\n   {unused}\n{body}\n}}\n"
 
 
 @lru_cache(maxsize=4)
@@ -229,9 +229,20 @@ def _own(name: str) -> str:
     return (files("srfcli") / "codegen" / name).read_text(encoding="utf-8")
 
 
-def c_source(model: GeneratedModel) -> str:
-    """Return the C text of the integrator for this model, and of the filter where it has a random friction field."""
-    text = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n"
+def _head(model: GeneratedModel) -> str:
+    """Return what C texts begin with; a function that is not inlined takes as long to run and half of the time to compile."""
+    text = "#include <math.h>\n#define NOINLINE __attribute__((noinline))\n"
+    return text + f"#define NX {len(model.states)}\n#define NP {len(model.names)}\n"
+
+
+def integrator_source(model: GeneratedModel) -> str:
+    """Return the C text of the integrator for this model."""
+    return _step_source(model) + _own("integrate.c") + _own("dop853.c")
+
+
+def _step_source(model: GeneratedModel) -> str:
+    """Return the C text of a model's rates and of one step of Radau IIA."""
+    text = _head(model)
     tables, functions = model.namespace.get("TABLES", ()), FUNCTIONS
     if tables:
         text += f"#define NT {len(tables)}\n"
@@ -239,14 +250,13 @@ def c_source(model: GeneratedModel) -> str:
     text += _own("lambertw.c") if "lambertw(" in model.source else ""
     text += _own("tables.c") if tables else ""
     text += "\n".join(c_function(model.source, name, label=label) for name, label in functions.items())
-    text += _own("radau.c") + _own("dop853.c")
-    return text + (_filter_source(model) if "field_gain" in model.namespace else "")
+    return text + _own("radau.c")
 
 
 def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_step: float) -> str:
     """Return the C text of Newton's equations of periodic orbits; `scheme` holds the arrays of the collocation."""
     stages = len(scheme["STEP"])
-    text = f"#include <math.h>\n#define NX {len(model.states)}\n#define NP {len(model.names)}\n#define MS {stages}\n"
+    text = f"{_head(model)}#define MS {stages}\n"
     text += f"#define LOG_STEP {log_step!r}\n"
     text += f"static const int LOGS[NX] = {{{', '.join(str(int(v)) for v in model.logarithmic)}}};\n"
     for name, array in scheme.items():
@@ -275,10 +285,11 @@ def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_
     return text + _own("orbit.c")
 
 
-def _filter_source(model: GeneratedModel) -> str:
-    """Return the C text of the filter, which follows that of the integrator."""
+def filter_source(model: GeneratedModel) -> str:
+    """Return the C text of the filter for a model with a random friction field."""
     sizes = {"LANES": LANES, "GAUGE_PROCESSES": GAUGE_PROCESSES, "SIGNALS": SIGNALS}
-    text = "".join(f"#define {name} {size}\n" for name, size in sizes.items()) + dual_arithmetic(model.source)
+    text = _step_source(model) + "".join(f"#define {name} {size}\n" for name, size in sizes.items())
+    text += dual_arithmetic(model.source)
     text += c_function(model.source, "field_gain", label="srf_gain")
     for name, label in DUAL_FUNCTIONS.items():
         if name in model.namespace:
@@ -323,15 +334,14 @@ def flags() -> tuple[str, ...]:
 
 
 @cache
-def compiled(model: GeneratedModel) -> ctypes.CDLL | None:
-    """Return the compiled integrator of this model, or None where there is no compiler; SrfError where it fails on the text."""
+def compiled(model: GeneratedModel, part: str = "integrator") -> ctypes.CDLL | None:
+    """Return a model's compiled integrator, or its filter: None without a compiler, SrfError where it fails on the text."""
     if compiler() is None:
         return None
+    write, entry = {"integrator": (integrator_source, "srf_integrate"), "filter": (filter_source, "srf_filter")}[part]
     with _ONE:
-        library = library_of(lambda: c_source(model), ["motion", model.source])
-    library.srf_integrate.restype = ctypes.c_int
-    if hasattr(library, "srf_filter"):
-        library.srf_filter.restype = ctypes.c_int
+        library = library_of(lambda: write(model), [part, model.source])
+    getattr(library, entry).restype = ctypes.c_int
     return library
 
 

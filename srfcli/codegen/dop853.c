@@ -1,7 +1,7 @@
 /* The explicit Runge-Kutta method of order 8 of Dormand and Prince with its dense output of order 7 (Hairer, Norsett and Wanner, Solving
    Ordinary Differential Equations I, II.5 and II.6: DOP853), for stretches of a smooth segment that are not stiff.
 
-   Compiled after radau.c, whose types and functions it uses. Sensitivities are carried through the same stages, which differentiates
+   Compiled after integrate.c, whose types and functions it uses. Sensitivities are carried through the same stages, which differentiates
    each step exactly. At first, ever more seldom later, and where its steps are as long as stability allows, the method asks for some
    time how long a step of Radau IIA would be; where these would cost less it hands over until the next segment. */
 

@@ -77,7 +77,7 @@ static int nonzero(const lanes *d) {
 
 /* Covariance and tangents across one step whose stages are solved; the mean is moved too. Returns the error of the covariance
    over what is allowed, by the share that the last polynomial has in the variances; nothing is changed unless it is below 1. */
-static double moments(Imposed *force, Course *course, Belief *b, double t, double h, const double *Z) {
+static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double t, double h, const double *Z) {
     int m = NC + (course->slopes ? LANES : 0), na = course->na, pivot[NZ];
     double J[3][NX * NX], V[3], W[3], W_dot[3], x[NX], gain[NX], matrix[NZ * NZ];
     double G[NZ * (NC + LANES)] __attribute__((aligned(64))), B[NZ * (NC + LANES)] __attribute__((aligned(64)));
@@ -205,7 +205,7 @@ static double moments(Imposed *force, Course *course, Belief *b, double t, doubl
 }
 
 /* carries the belief from a to b, between which all that is imposed is smooth; returns 0 where it stops early */
-static int advance(Imposed *force, Course *course, Belief *belief, double a, double b) {
+static NOINLINE int advance(Imposed *force, Course *course, Belief *belief, double a, double b) {
     double V, W, W_dot, Z[NZ], Z0[NZ], J[3][NX * NX], J0[NX * NX], f0[NX], carry = 0.0;
     int rejected = 0, unseen = 0, first = course->first;
     Node now;

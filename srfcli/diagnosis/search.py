@@ -65,22 +65,30 @@ FOLLOWED = 0.3  # least amplitude of the field from which an extended model is f
 class Fitted:
     """A model fitted: log evidence, what speaks against it (nothing where it passes), what it leaves, what effects promise.
 
-    Of the evidence, `mass_at_bounds` comes from parameters at a bound. It holds too what a field that all runs share gains beyond
-    CLOSE, unless an effect says what all runs share along slip.
+    `separate` is the log evidence where each run has a field of its own; of it `mass_at_bounds` comes from parameters at a bound.
+    `shared` is what a field that all runs share gains beyond CLOSE at first order, None where an effect says what all runs share
+    along slip; `granted` is what is granted of that.
     """
 
     hypothesis: Hypothesis
     fit: StateSpaceFit
-    evidence: float
+    separate: float
     mass_at_bounds: float
     against: tuple[str, ...]
     remainder: Remainder = field(repr=False)
+    shared: float | None = None
+    granted: float = 0.0
     scores: Scores | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
         """Return the hypothesis' name."""
         return self.hypothesis.name
+
+    @property
+    def evidence(self) -> float:
+        """Return the log evidence, with what a field that all runs share is granted."""
+        return self.separate + self.granted
 
     @property
     def fine(self) -> bool:
@@ -222,11 +230,12 @@ class ModelSearch:
             )
         remainder = self.remainder(found)
         sizes = hypothesis.priors(found.likelihood.problem.model)
-        evidence = log_evidence(found, sizes) + self._prior(hypothesis)
         by_slip = any((shape := along_table(e)) and shape.argument == "slip" for e in hypothesis.effects)
-        if not by_slip and found.maximum.away < LOST:  # a track is a function of slip or a random one
-            evidence += max(remainder.shared.gain - CLOSE, 0.0)  # at first order, about a maximum
-        return Fitted(hypothesis, found, evidence, mass_at_bounds(found, sizes), tuple(shortcomings(found)), remainder)
+        random = not by_slip and found.maximum.away < LOST  # a track is a function of slip or a random one
+        return Fitted(
+            hypothesis, found, log_evidence(found, sizes) + self._prior(hypothesis), mass_at_bounds(found, sizes),
+            tuple(shortcomings(found)), remainder, max(remainder.shared.gain - CLOSE, 0.0) if random else None,
+        )  # fmt: skip
 
     def _prior(self, hypothesis: Hypothesis) -> float:
         """Return the log prior of a model: each effect is one of those that there are, and halves its share.
@@ -286,6 +295,7 @@ class ModelSearch:
             fitted[node.name] = replace(self._judged(node.hypothesis, found), scores=node.scores)
             options["processes"] = self.processes = found.likelihood.processes
         self.fitted = fitted
+        self._grant()
 
     def extend(self, nodes: Sequence[Fitted]) -> None:
         """Search on from models that another search has fitted."""
@@ -572,7 +582,7 @@ class ModelSearch:
             found = self._record(self.fit(_Move(0.0, 0, Hypothesis(), dict(values), ())))
         except SrfError:  # it stays as it was
             return
-        if found is not base:
+        if found.fit is not base.fit:
             self._expand(found)
             self._search()
 
@@ -598,11 +608,19 @@ class ModelSearch:
     def _record(self, found: Fitted, *, anew: bool = False) -> Fitted:
         name = found.name
         known = self.fitted.get(name)
-        text = f"log evidence {found.evidence:.1f}" + (f", but {found.against[0]}" if found.against else "")
+        text = f"log evidence {found.separate:.1f}" + (f", but {found.against[0]}" if found.against else "")
         self.progress(f"{name}: {text}")
-        if known is None or anew or found.evidence > known.evidence:
+        if known is None or anew or found.separate > known.separate:
             self.fitted[name] = found
+            self._grant()
         return self.fitted[name]
+
+    def _grant(self) -> None:
+        """Grant all models what the likeliest gains by a field that all runs share: first-order gains do not decide."""
+        under = {f.name: f for f in self.fitted.values() if f.shared is not None}
+        if under:
+            gain = max(under.values(), key=lambda f: f.separate).shared or 0.0
+            self.fitted.update({name: replace(f, granted=gain) for name, f in under.items() if f.granted != gain})
 
     def ranked(self) -> list[Fitted]:
         """Return everything that was fitted, best evidence first."""

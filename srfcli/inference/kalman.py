@@ -128,11 +128,11 @@ def kalman_filter(
     numbers in the same k directions. After `most` steps, 50 a sample if left out, the rest is NaN. Raises SrfError without a
     compiler, or for a model without a random friction field.
     """
-    library = compiled(model)
+    if "field_gain" not in model.namespace:
+        raise SrfError(f"{model.title} has no random friction field", "open_model(..., random_field=True)")
+    library = compiled(model, "filter")
     if library is None:
         raise SrfError("the Kalman filter needs a C compiler", "Install one, or the package ziglang.")
-    if not hasattr(library, "srf_filter"):
-        raise SrfError(f"{model.title} has no random friction field", "open_model(..., random_field=True)")
     n, k, states = t.size, p.d.shape[-1], len(model.states)
     signals = signals or Signals.one(n, len(order))
     if len(order) > GAUGE_PROCESSES * SIGNALS or signals.number.max() >= SIGNALS:
