@@ -22,8 +22,9 @@ from common import Kept, Report
 
 from srfcli.codegen.model import open_model
 from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
-from srfcli.inference.fit import fit, fit_problem
+from srfcli.inference.fit import fit_problem
 from srfcli.inference.prediction import predict
+from srfcli.inference.state_space import as_fit, fit_state_space
 from srfcli.laws.registry import load_registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Modulation
 
@@ -80,9 +81,9 @@ def coloured(rng: np.random.Generator, n: int, lag: float) -> np.ndarray:
 def one(task: tuple[int, float]) -> dict[str, Any]:
     """Return what is kept of one repeat: the errors in standard errors, the CPU time, rms over noise and how it ended."""
     seed, lag = task
-    problem = fit_problem(open_model(load_registry()), experiment(seed, lag))
+    problem = fit_problem(open_model(load_registry(), random_field=True), experiment(seed, lag))
     begun = time.process_time()
-    found = fit(problem)
+    found = as_fit(fit_state_space(problem))
     spent = time.process_time() - begun
     z = [float((found.values[n] - TRUE[n]) / found.stderr[n]) for n in TRUE]
     return {

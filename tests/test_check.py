@@ -22,8 +22,9 @@ from srfcli.data.experiment import check_run, read_experiment
 from srfcli.data.values import Experiment, FitParameter
 from srfcli.inference import cramer_rao as reach
 from srfcli.inference.cramer_rao import Forecast, Reach, forecast
-from srfcli.inference.fit import fit, fit_problem
+from srfcli.inference.fit import fit_problem
 from srfcli.inference.prediction import predict
+from srfcli.inference.state_space import as_fit, fit_state_space
 from srfcli.laws.registry import load_registry
 
 REGISTRY = load_registry(user=False, entry_points=False)
@@ -174,8 +175,8 @@ def test_errors_are_those_of_a_fit(made: Path) -> None:
     """The standard errors of a fit that starts from the true values are what was forecast, alpha and lambda among them."""
     experiment = read_experiment(made, registry=REGISTRY)
     found = told(experiment)
-    problem = fit_problem(open_model(REGISTRY, **asdict(experiment.choice)), experiment)
-    errors = fit(problem).stderr
+    problem = fit_problem(open_model(REGISTRY, **asdict(experiment.choice), random_field=True), experiment)
+    errors = as_fit(fit_state_space(problem, smooth=True)).stderr
     lam = next(p.value for p in experiment.parameters if p.name == "lambda")
     assert found.together is not None and len(found.runs) == 2
     assert found.together.errors["alpha"] == pytest.approx(errors["alpha"], rel=0.15)
@@ -195,8 +196,8 @@ def test_stiffness_and_trends_are_unknown_too_and_cost_what_they_cost_a_fit(made
         experiment,
         parameters=(*experiment.parameters, FitParameter("K", stated, stated / 2, 2 * stated, False, "N/um")),
     )
-    problem = fit_problem(open_model(REGISTRY, **asdict(experiment.choice)), free, trend="slip")
-    errors = fit(problem).stderr
+    problem = fit_problem(open_model(REGISTRY, **asdict(experiment.choice), random_field=True), free, trend="slip")
+    errors = as_fit(fit_state_space(problem, smooth=True)).stderr
     lam = next(p.value for p in experiment.parameters if p.name == "lambda")
     assert found.together is not None and known.together is not None
     assert found.together.errors["alpha"] == pytest.approx(errors["alpha"], rel=0.15)

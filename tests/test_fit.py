@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +10,15 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+import srfcli as srf
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
-from srfcli.inference.fit import Interrupted, fit, fit_problem, held_fit
+from srfcli.inference.fit import fit_problem
 from srfcli.inference.noise import Noise, estimate_noise, lag_one, log_determinant, stretches, white_level, whiten
 from srfcli.inference.posterior import profile
 from srfcli.inference.prediction import basis, own_names, own_start, predict
 from srfcli.inference.recordings import fit_from_several
+from srfcli.inference.state_space import as_fit, fit_state_space
 from srfcli.motion.imposed import ConstantLoad, Drive, Modulation
 
 ROCK = ModelChoice("dieterich-ruina", "ruina", "rigid", False)
@@ -53,7 +56,19 @@ def rock(model, *, seed=1, lag=0.0, sd=5e-4, observable="friction", start=1.2, r
 
 @pytest.fixture(scope="module")
 def rock_model(make_model):
-    return make_model(law="dieterich-ruina", ageing="ruina", interface="rigid", inertia=False)
+    return make_model(law="dieterich-ruina", ageing="ruina", interface="rigid", inertia=False, random_field=True)
+
+
+def fit(problem, smooth=True):
+    return as_fit(fit_state_space(problem, smooth=smooth))
+
+
+def fitter(problem):
+    def one(start, progress):
+        found = fit_state_space(replace(problem, start=start), smooth=True, progress=progress)
+        return as_fit(found), found
+
+    return one
 
 
 @pytest.mark.parametrize("coefficients", [(), (0.85,), (1.2, -0.5), (0.5, 0.2, 0.1)])
@@ -140,7 +155,7 @@ def test_recovery(rock_model, lag):
     for name, value in ROCK_TRUE.items():
         assert abs(found.values[name] - value) < 4 * found.stderr[name], name
         assert found.stderr[name] < 0.2 * value
-    assert all((f.noise.order > 0) == (lag > 0) for f in found.runs)
+    assert all(bool(f.colours) == (lag > 0) for f in found.runs)
 
 
 def test_coloured_noise_widens_the_errors(rock_model):
@@ -149,7 +164,7 @@ def test_coloured_noise_widens_the_errors(rock_model):
 
 
 def test_errors_are_those_of_repeats(rock_model):
-    found = [fit(fit_problem(rock_model, rock(rock_model, seed=s, lag=0.6, runs=1))) for s in range(24)]
+    found = [fit(fit_problem(rock_model, rock(rock_model, seed=s, lag=0.6, runs=1))) for s in range(10)]
     z = np.array([[(f.values[n] - v) / f.stderr[n] for n, v in ROCK_TRUE.items()] for f in found])
     assert 0.7 < np.sqrt(np.mean(z**2)) < 1.4
     assert np.mean(np.abs(z) < 1.96) > 0.85
@@ -157,9 +172,9 @@ def test_errors_are_those_of_repeats(rock_model):
 
 def test_profile_of_a_nearly_linear_parameter(rock_model):
     problem = fit_problem(rock_model, rock(rock_model))
-    found = fit(problem)
-    interval = profile(problem, found, "mu0")
-    half = 1.96 * found.stderr["mu0"]
+    found = fit_state_space(problem, smooth=True)
+    interval = profile(found, "mu0")
+    half = 1.96 * as_fit(found).stderr["mu0"]
     assert interval.high - found.values["mu0"] == pytest.approx(half, rel=0.05)
     assert found.values["mu0"] - interval.low == pytest.approx(half, rel=0.05)
 
@@ -193,8 +208,8 @@ def test_a_run_may_begin_without_any_friction(rock_model, first):
 
 
 def test_stick_slip_from_afar(make_model):
-    """A start at which sliding is steady looks linear for ever; the first horizon must not be believed."""
-    model = make_model()
+    """A start at which sliding is steady, whatever the recording does."""
+    model = make_model(random_field=True)
     t = np.arange(900) / 300
     parameters = tuple(FitParameter(n, v, v / 3, v * 3, False, "1") for n, v in PMMA_TRUE.items())
     base = Experiment(Path(), "", PMMA, 2.37e-6, "0.21 N/um", parameters, (), ())
@@ -211,7 +226,7 @@ def test_stick_slip_from_afar(make_model):
         runs.append(replace(run, observed=y))
     off = {"mu0": 1.03, "A": 1.13, "B": 0.89, "D0": 1.13}
     moved = tuple(replace(q, value=q.value * off[q.name]) for q in parameters)
-    found = fit(fit_problem(model, replace(base, parameters=moved, runs=tuple(runs))))
+    found = fit(fit_problem(model, replace(base, parameters=moved, runs=tuple(runs))), smooth=None)
     assert found.rms_over_noise() == pytest.approx(1.0, abs=0.05)
     for name, value in PMMA_TRUE.items():
         assert abs(found.values[name] - value) < 4 * found.stderr[name], name
@@ -219,9 +234,9 @@ def test_stick_slip_from_afar(make_model):
 
 def test_several_starts_agree_and_are_seeded(rock_model):
     problem = fit_problem(rock_model, rock(rock_model, runs=1))
-    found = fit_from_several(problem, count=3, seed=4)
-    assert len(found.rows) == 3 and all(same for _, same in found.rows) and not found.interrupted
-    assert fit_from_several(problem, count=3, seed=4).best.values == found.best.values
+    found = fit_from_several(problem, fitter(problem), count=2, seed=4)
+    assert len(found.rows) == 2 and all(same for _, same in found.rows) and not found.interrupted
+    assert fit_from_several(problem, fitter(problem), count=2, seed=4).best.values == found.best.values
 
 
 def test_starts_that_were_not_done_are_not_passed_over(rock_model):
@@ -232,24 +247,8 @@ def test_starts_that_were_not_done_are_not_passed_over(rock_model):
         if text.startswith("start 2 of 3"):
             raise KeyboardInterrupt
 
-    found = fit_from_several(problem, count=3, seed=4, progress=stop)
+    found = fit_from_several(problem, fitter(problem), count=3, seed=4, progress=stop)
     assert found.interrupted and len(found.rows) == 1
-
-
-def test_interruption_keeps_the_best(rock_model):
-    problem = fit_problem(rock_model, rock(rock_model))
-    calls = []
-
-    def stop(text):
-        calls.append(text)
-        if len(calls) == 2 or "stage 2" in text:
-            raise KeyboardInterrupt
-
-    with pytest.raises(Interrupted) as caught:
-        fit(problem, progress=lambda text: (_ for _ in ()).throw(KeyboardInterrupt))
-    assert set(caught.value.values) == set(ROCK_TRUE)
-    kept = held_fit(problem, ROCK_TRUE)
-    assert kept.status is Status.INTERRUPTED and kept.stderr["D0"] > 0
 
 
 @pytest.mark.parametrize(
@@ -269,16 +268,8 @@ def test_held_out_runs_are_judged_only(rock_model):
 
 
 def test_open_case_with_nothing_concealed(shared):
-    from dataclasses import asdict
-
-    from srfcli.codegen.model import open_model
-    from srfcli.data.experiment import read_experiment
-    from srfcli.laws.registry import load_registry
-
-    truth = __import__("json").loads((shared / "cases" / "truth.json").read_text())["open-01"]["parameters"]
-    registry = load_registry()
-    experiment = read_experiment(shared / "cases" / "open-01", registry=registry)
-    found = fit(fit_problem(open_model(registry, **asdict(experiment.choice)), experiment))
+    truth = json.loads((shared / "cases" / "truth.json").read_text())["open-01"]["parameters"]
+    found = srf.fit(shared / "cases" / "open-01").found.fit
     assert found.status.ok and found.rms_over_noise() == pytest.approx(1.0, abs=0.01)
     for name in found.names:
         assert abs(found.values[name] - truth["lam" if name == "lambda" else name]) < 3 * found.stderr[name], name

@@ -49,10 +49,7 @@ def test_a_fit_and_a_diagnosis_say_it(tmp_path: Path) -> None:
     folder = tmp_path / "steps"
     srf("simulate", *STEPS, "--free", "A", "--out-dir", str(folder), compiler=False, tmp_path=tmp_path)
     fit = srf("fit", str(folder), compiler=False, tmp_path=tmp_path)
-    assert fit.returncode == 0, fit.stderr
-    assert fit.stderr.count("Warning: no C compiler was found: the fit has no random friction field") == 1
-    rough = srf("fit", str(folder), "--track", "rough", compiler=False, tmp_path=tmp_path)
-    assert rough.returncode == 2 and "needs a C compiler" in rough.stderr
+    assert fit.returncode == 2 and "Try: pip install ziglang, or install cc, gcc or clang" in fit.stderr
     diagnosis = srf("diagnose", str(folder), compiler=False, tmp_path=tmp_path)
     assert diagnosis.returncode == 2 and "Try: pip install ziglang, or install cc, gcc or clang" in diagnosis.stderr
 

@@ -147,7 +147,7 @@ def _refuse(names: tuple[str, ...], purpose: str) -> None:
 
 
 def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
-    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
+    from srfcli.cli.emit import Progress, emit, finish
     from srfcli.inference.posterior import to_arviz
     from srfcli.results.fit import ADVICE
     from srfcli.tasks.recordings import fit, read_experiment
@@ -156,8 +156,6 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
     experiment = read_experiment(source, format=options["reader"], registry=registry)
     free = listed(options["free"]) or None
     kept = _draws_file(options["draws"], options["sample"], output)
-    if experiment.runs:
-        warn_uncompiled("the fit has no random friction field, and takes up to 34 times as long")
     begun, done = time.perf_counter(), FitShare(options["starts"])
     with Progress("fit") as progress:
 
@@ -194,7 +192,7 @@ def _fit_campaign(
     **options: Any,
 ) -> None:
     """Fit each experiment by itself, a row each; the table is written anew whenever one is done."""
-    from srfcli.cli.emit import Progress, emit, finish, render, warn_uncompiled
+    from srfcli.cli.emit import Progress, emit, finish, render
     from srfcli.core.files import check_target, write_atomic
     from srfcli.tasks.campaign import fit_campaign
 
@@ -204,7 +202,6 @@ def _fit_campaign(
         if target.suffix.lower() != ".csv":
             raise SrfError(f"--table {place} is no .csv file", f"End it in .csv: --table {target.with_suffix('.csv')}")
         check_target(target, force=output.force or spread.resume is not None, what="--table")
-    warn_uncompiled("the fits have no random friction field, and take up to 34 times as long")
     free = listed(options["free"]) or None
     begun = time.perf_counter()
     with Progress("fit", total=len(sources)) as progress:

@@ -1,13 +1,8 @@
-"""Maximum likelihood over all runs of an experiment together: whitened residuals, exact gradients, growing horizons.
-
-Stick-slip makes a least-squares surface full of false minima: a cycle too early fits as well as any. So a sample takes part only
-once the parameters are known well enough for the prediction there to be linear in what is still unknown of them; the horizon of
-each run grows from fit to fit until it covers the run.
-"""
+"""What is fitted to what, and what a fit is: free parameters with their bounds, runs and critical loads; estimates and errors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -16,12 +11,10 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.groups import NOISE, labels
-from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
+from srfcli.data.values import CriticalLoads, Experiment, Run
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
-from srfcli.inference.prediction import RTOL, Prediction, own_names, own_start, predict, run_parameters
-
-# Covariances from information matrices that may be nearly singular.
+from srfcli.inference.noise import Noise
+from srfcli.inference.prediction import Prediction, own_names, own_start, run_parameters
 
 
 def inverse(information: Array) -> Array:
@@ -37,18 +30,6 @@ def root(covariance: Array) -> Array:
     d = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(d, d))
     return np.asarray((d[:, None] * vectors) * np.sqrt(np.maximum(values, 0.0)))
-
-
-# Maximum likelihood over all runs of an experiment together: whitened residuals, exact gradients, growing horizons.
-
-LINEAR = 0.25  # of a run's amplitude: a prediction that bends by more is not used yet
-STAGES = 12
-GROWN = 3.0  # standard deviations of the last fit over which the next stage wants linearity
-SHORTER = (1.0, 0.5, 0.25, 0.12)  # of the first horizons
-POOR = 4.0  # reduced chi-squared of a first stage that is not believed before shorter ones were tried
-CONVERGED = 0.1  # standard errors: how far the minimum may still be, by the gradient
-BAD = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
-HUGE = 1e100  # a slope that is no slope any more: its square would overflow
 
 
 @dataclass(frozen=True)
@@ -92,7 +73,6 @@ class Fit:
     log_likelihood: float
     status: Status
     evaluations: int
-    trail: tuple[tuple[float, str], ...] = ()
     others: tuple[RunFit, ...] = ()
     tables: tuple[Matched, ...] = ()
 
@@ -143,7 +123,6 @@ class Problem:
     upper: Array
     trend: str | None = None
     held: Mapping[str, float] = field(default_factory=dict)
-    rtol: float = RTOL
     priors: tuple[tuple[tuple[str, ...], float], ...] = ()  # names, and the scatter of their values about an unknown mean
     tables: tuple[CriticalLoads, ...] = ()
     stability: GeneratedModel | None = None
@@ -187,20 +166,6 @@ class Problem:
     def local(self, run: Run, values: Mapping[str, float]) -> dict[str, float]:
         """Return parameters by name with those that vary under their own names, at what they are in this run."""
         return {**values, **{n: values[name] for n, name in self.varied(run).items() if name in values}}
-
-    def predicted(self, run: Run, theta: Array, *, until: float = np.inf, slopes: bool = True) -> Prediction:
-        """Return the prediction of a run, with derivatives by the free parameters."""
-        by = self.names if slopes else ()
-        return predict(
-            self.model,
-            self.experiment,
-            run,
-            self.named(theta),
-            by=by,
-            until=until,
-            trend=None if run.holdout else self.trend,
-            rtol=self.rtol,
-        )
 
 
 def fit_problem(
@@ -299,222 +264,3 @@ def scatter_of(fit: Fit, names: Sequence[str]) -> BetweenGroups | None:
     places = [fit.names.index(n) for n in names]
     covariance = np.asarray(fit.covariance)[np.ix_(places, places)]
     return between_groups(np.array([fit.values[n] for n in names]), covariance) if (np.diag(covariance) > 0).all() else None
-
-
-def fit(
-    problem: Problem,
-    *,
-    start: Array | None = None,
-    noises: Mapping[str, Noise] | None = None,
-    progress: Callable[[str], None] = lambda text: None,
-    refinements: int = 3,
-) -> Fit:
-    """Return the maximum-likelihood fit from `start` (k,), the problem's own start values if left out.
-
-    First with white noise of the level that the recordings' differences show and growing horizons, then with the noise that the
-    residuals show, until the two agree. KeyboardInterrupt becomes `Interrupted`, with the best parameters so far.
-    """
-    search = Search(problem, progress)
-    theta = np.clip(problem.start if start is None else start, problem.lower, problem.upper)
-    noise = {r.name: Noise(first_level(r.t, r.signals[0])) for r in problem.runs} if noises is None else dict(noises)
-    try:
-        theta, status = search.grow(theta, noise)
-        for _ in range(refinements if noises is None else 0):
-            before = theta
-            noise = search.noise(theta)
-            theta, status = search.minimise(theta, noise, {})
-            if np.all(np.abs(theta - before) <= 1e-2 * np.sqrt(np.diag(search.covariance))):
-                break
-    except KeyboardInterrupt as error:
-        raise Interrupted(problem.named(search.best)) from error
-    return search.result(theta, noise, status)
-
-
-def first_level(t: Array, signal: Signal) -> float:
-    """Return the standard deviation of white noise that the readings of a signal at the times t (n,) show themselves."""
-    level = white_level(signal.observed, stretches(t, signal.used))
-    return max(level, signal.quantum / np.sqrt(12), 1e-9 * float(np.ptp(signal.observed)), 1e-300)
-
-
-def unreached(difference: Array, J: Array, noise: Noise) -> Array:
-    """Return which samples (n,) have no residual or no slopes (n, k) to speak of: the integration did not reach them."""
-    return ~((np.abs(difference) < BAD * noise.innovation) & (np.abs(J) < HUGE).all(axis=1))
-
-
-class Search:
-    """One minimisation: counts evaluations, keeps the best, and knows the covariance of the last."""
-
-    def __init__(self, problem: Problem, progress: Callable[[str], None]) -> None:
-        self.problem, self.progress = problem, progress
-        self.evaluations = 0
-        self.reduced = 1.0  # chi-squared for each degree of freedom
-        self.best, self.covariance = problem.start, np.zeros((problem.start.size,) * 2)
-        self.trail: list[tuple[float, str]] = []
-        self.scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
-
-    def grow(self, theta: Array, noise: Mapping[str, Noise]) -> tuple[Array, Status]:
-        """Return the minimum over all samples, reached by horizons that grow."""
-        width = np.minimum((self.problem.upper - self.problem.lower) / 6, 0.15 * self.scale)
-        theta, status, horizons = self.first_stage(theta, noise, np.diag(width))
-        covered = self.covered(horizons)
-        for stage in range(2, STAGES + 1):
-            if covered >= 1.0:
-                break
-            directions = GROWN * root(self.covariance) * np.sqrt(max(self.reduced, 1.0))
-            linear = {r.name: self.horizon(r, theta, directions) for r in self.problem.runs}
-            horizons = {name: max(linear[name], horizons[name]) for name in linear}
-            share = self.covered(horizons)
-            if share <= covered or stage == STAGES:  # no horizon has grown: the rest is tried all the same
-                horizons, share = {}, 1.0
-            self.progress(f"stage {stage}: {100 * share:.0f} % of the samples")
-            theta, status = self.minimise(theta, noise, horizons)
-            covered = share
-        return theta, status
-
-    def first_stage(
-        self, start: Array, noise: Mapping[str, Noise], directions: Array
-    ) -> tuple[Array, Status, dict[str, float]]:
-        """Return the first minimum and its horizons: shorter ones where they fit far better.
-
-        Start values under which sliding is steady look linear for ever, whatever the recording does.
-        """
-        linear = {r.name: self.horizon(r, start, directions) for r in self.problem.runs}
-        found: tuple[Array, Status, dict[str, float]] | None = None
-        best = state = None
-        for share in SHORTER:
-            begins = {r.name: float(r.t[0]) for r in self.problem.runs}
-            horizons = {n: begins[n] + share * (h - begins[n]) for n, h in linear.items()}
-            self.progress(f"stage 1: {100 * self.covered(horizons):.0f} % of the samples")
-            theta, status = self.minimise(start, noise, horizons)
-            if best is None or self.reduced < best / 4:
-                best, found, state = self.reduced, (theta, status, horizons), (self.best, self.covariance, self.reduced)
-            if best < POOR:
-                break
-        assert found is not None and state is not None
-        self.best, self.covariance, self.reduced = state
-        return found
-
-    def covered(self, horizons: Mapping[str, float]) -> float:
-        """Return the share of all samples within the horizons."""
-        inside = sum(int(np.sum(r.t <= horizons[r.name])) for r in self.problem.runs)
-        return inside / sum(r.t.size for r in self.problem.runs)
-
-    def horizon(self, run: Run, theta: Array, directions: Array) -> float:
-        """Return the time up to which the prediction is linear over these directions (k, k), its columns."""
-        problem = self.problem
-        base = problem.predicted(run, theta)
-        self.evaluations += 1
-        amplitude = max(float(np.std(run.observed)), 10 * first_level(run.t, run.signals[0]))
-        limit = float(run.t[-1])
-        for d in directions.T:
-            moved = np.clip(theta + d, problem.lower, problem.upper)
-            bent = problem.predicted(run, moved, until=limit, slopes=False)
-            n = bent.y.size
-            with np.errstate(invalid="ignore"):
-                bend = np.abs(bent.y - base.y[:n] - base.J[:n] @ (moved - theta))
-            off = np.nonzero(~(bend <= LINEAR * amplitude))[0]
-            if off.size:
-                limit = float(run.t[max(off[0] - 1, 1)])
-        return limit
-
-    def minimise(self, theta: Array, noise: Mapping[str, Noise], horizons: Mapping[str, float]) -> tuple[Array, Status]:
-        """Return the minimum of the whitened residuals up to the horizons, and how the minimiser ended."""
-        return self.descend(theta, noise, horizons, tolerance=1e-9, most=60)
-
-    def descend(
-        self, theta: Array, noise: Mapping[str, Noise], horizons: Mapping[str, float], *, tolerance: float, most: int
-    ) -> tuple[Array, Status]:
-        """Return where at most so many evaluations lead, and how the minimiser ended."""
-        from scipy.optimize import least_squares
-
-        problem = self.problem
-        cache: dict[bytes, tuple[Array, Array]] = {}
-
-        def both(x: Array) -> tuple[Array, Array]:
-            key = x.tobytes()
-            if key not in cache:
-                cache.clear()
-                cache[key] = self.residuals(x * self.scale, noise, horizons)
-            return cache[key]
-
-        low, high = problem.lower / self.scale, problem.upper / self.scale
-        inside = np.clip(theta / self.scale, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
-        found = least_squares(
-            lambda x: both(x)[0], inside, jac=lambda x: both(x)[1], bounds=(low, high), x_scale="jac",
-            ftol=tolerance, xtol=1e-9, gtol=1e-12, max_nfev=most,
-        )  # fmt: skip
-        self.best = found.x * self.scale
-        information = found.jac.T @ found.jac
-        self.covariance = inverse(information) * np.outer(self.scale, self.scale)
-        free = found.active_mask == 0
-        gradient = (found.jac.T @ found.fun)[free]
-        away = float(np.sqrt(max(gradient @ inverse(information[np.ix_(free, free)]) @ gradient, 0.0)))
-        self.reduced = 2 * found.cost / max(found.fun.size - theta.size, 1)
-        self.trail.append(
-            (2 * float(found.cost), f"{found.nfev} evaluations, {away:.1e} standard errors from the minimum")
-        )
-        return self.best, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE
-
-    def residuals(self, theta: Array, noise: Mapping[str, Noise], horizons: Mapping[str, float]) -> tuple[Array, Array]:
-        """Return the whitened residuals and their derivatives by the scaled parameters."""
-        values, slopes = [], []
-        self.evaluations += 1
-        for run in self.problem.runs:
-            until = horizons.get(run.name, float("inf"))
-            found = self.problem.predicted(run, theta, until=until)
-            n = found.y.size
-            used = run.used[:n]
-            parts = stretches(run.t[:n], used)
-            own = noise[run.name]
-            difference = found.y - run.observed[:n]
-            bad = unreached(difference, found.J, own)
-            difference = np.where(bad, BAD * own.innovation, difference)
-            J = np.where(bad[:, None], 0.0, found.J) * self.scale
-            values.append(whiten(own, difference, parts))
-            slopes.append(whiten(own, J, parts))
-        return np.concatenate(values), np.concatenate(slopes)
-
-    def noise(self, theta: Array) -> dict[str, Noise]:
-        """Return the noise of each run's residuals."""
-        return {f.name: f.noise for f in judge(self.problem, theta, self.problem.runs)}
-
-    def result(self, theta: Array, noise: Mapping[str, Noise], status: Status) -> Fit:
-        problem = self.problem
-        runs = [replace(f, noise=noise[f.name]) for f in judge(problem, theta, problem.runs)]
-        total = 0.0
-        for f in runs:
-            white = whiten(f.noise, f.residual, f.parts)
-            total -= (
-                0.5 * float(white @ white) + log_determinant(f.noise, f.parts) + 0.5 * white.size * np.log(2 * np.pi)
-            )
-        held = judge(problem, theta, [r for r in problem.experiment.runs if r.holdout])
-        return Fit(
-            problem.names, problem.named(theta), self.covariance, problem.lower, problem.upper, (*runs, *held), total,
-            status, self.evaluations, tuple(self.trail),
-        )  # fmt: skip
-
-
-def judge(problem: Problem, theta: Array, runs: Sequence[Run]) -> list[RunFit]:
-    """Return how these runs, fitted or held out, agree with the parameters."""
-    found = []
-    for run in runs:
-        prediction = problem.predicted(run, theta)
-        residual = run.observed - prediction.y
-        parts = stretches(run.t, run.used & np.isfinite(residual))
-        found.append(
-            RunFit(
-                run.name, run.holdout, prediction, residual, parts, estimate_noise(residual, parts),
-                white_level(residual, parts),
-            )
-        )  # fmt: skip
-    return found
-
-
-def held_fit(problem: Problem, values: Mapping[str, float]) -> Fit:
-    """Return the state of a fit that was stopped: its parameters, with errors as if they were the minimum."""
-    theta = np.array([values[n] for n in problem.names])
-    search = Search(problem, lambda text: None)
-    noise = search.noise(theta)
-    _, slopes = search.residuals(theta, noise, {})
-    search.covariance = inverse(slopes.T @ slopes) * np.outer(search.scale, search.scale)
-    return search.result(theta, noise, Status.INTERRUPTED)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,17 +12,13 @@ from numpy.typing import NDArray
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError
-from srfcli.inference.fit import Fit, Problem, Search, root
-from srfcli.inference.noise import whiten
+from srfcli.inference.fit import root
 from srfcli.inference.state_space import CLOSER, StateSpaceFit, maximise
 
 # Profile likelihood: each parameter held at a value, the others refitted; the interval ends where the fit is worse by 3.84.
 
 LEVEL = 3.841458820694124  # of chi-squared with one degree of freedom, 95 %
 FARTHEST = 8.0  # standard errors: an interval that has not ended there is open
-
-Held = Callable[[int, float, Array], tuple[Array, float, int]]
-
 
 @dataclass(frozen=True)
 class Interval:
@@ -34,117 +30,43 @@ class Interval:
     evaluations: int
 
 
-@dataclass(frozen=True)
-class _Valley:
-    """Where a likelihood is largest: `best` (k,), its covariance and bounds, and what it costs to hold one coordinate.
-
-    `held(k, value, start)` returns the others' best values, minus twice the log likelihood there, and how often it was asked.
-    Coordinates that are `logarithmic` are those of a parameter's logarithm.
-    """
-
-    best: Array
-    base: float
-    covariance: Array
-    lower: Array
-    upper: Array
-    held: Held
-    logarithmic: NDArray[np.bool_]
-
-
-def profile(
-    problem: Problem,
-    fit: Fit,
-    name: str,
-    *,
-    rough: StateSpaceFit | None = None,
-    progress: Callable[[str], None] = lambda text: None,
-) -> Interval:
-    """Return the profile-likelihood interval of one parameter.
-
-    Of the state-space likelihood `rough`, field and gauge noise refitted too; without it the noise is held at what the fit
-    found.
-    """
-    k = problem.names.index(name)
-    valley = _of_residuals(problem, fit) if rough is None else _of_state_space(rough)
-    ends, count = [], 0
+def profile(found: StateSpaceFit, name: str, *, progress: Callable[[str], None] = lambda text: None) -> Interval:
+    """Return the profile-likelihood interval of one parameter, the others with field and gauge noise refitted."""
+    before, ends = found.likelihood.evaluations, []
     for side in (-1.0, 1.0):
-        end, used = _end(valley, k, side)
+        ends.append(_end(found, name, side))
         progress(f"{name}: {'upper' if side > 0 else 'lower'} end")
-        ends.append(float(np.exp(end)) if end is not None and valley.logarithmic[k] else end)
-        count += used
-    return Interval(name, ends[0], ends[1], count)
+    return Interval(name, ends[0], ends[1], found.likelihood.evaluations - before)
 
 
-def _end(valley: _Valley, k: int, side: float) -> tuple[float | None, int]:
-    """Return where the profile crosses LEVEL on one side, by secant on its root, which is nearly linear in the parameter."""
-    best, covariance = valley.best, valley.covariance
+def _end(found: StateSpaceFit, name: str, side: float) -> float | None:
+    """Return where the profile crosses LEVEL on one side, by secant on its root, which is nearly linear in the coordinate."""
+    likelihood, best, covariance = found.likelihood, found.maximum.point.x, found.maximum.covariance
+    k = likelihood.names.index(name)
     error = float(np.sqrt(covariance[k, k]))
     if not error > 0:
-        return None, 0
+        return None
     along = covariance[:, k] / covariance[k, k]
-    limit = valley.upper[k] if side > 0 else valley.lower[k]
-    used, theta = 0, best
+    limit = likelihood.upper[k] if side > 0 else likelihood.lower[k]
+    x = best
     points = [(0.0, -np.sqrt(LEVEL))]
     step = np.sqrt(LEVEL) * error
     for _ in range(8):
         value = best[k] + side * step
         if (value - limit) * side > 0 or step > FARTHEST * error * np.sqrt(LEVEL):
-            return None, used
-        start = np.clip(theta + along * (value - theta[k]), valley.lower, valley.upper)
+            return None
+        start = np.clip(x + along * (value - x[k]), likelihood.lower, likelihood.upper)
         start[k] = value
-        theta, cost, n = valley.held(k, value, start)
-        used += n
-        height = np.sign(cost - valley.base) * np.sqrt(abs(cost - valley.base)) - np.sqrt(LEVEL)
-        points.append((step, height))
-        if abs(height) < 0.01:
-            return float(value), used
+        point = maximise(likelihood, start, held=(name,), close=CLOSER).point
+        x, cost = point.x, 2 * (found.log_likelihood - point.log_likelihood)
+        points.append((step, np.sign(cost) * np.sqrt(abs(cost)) - np.sqrt(LEVEL)))
+        if abs(points[-1][1]) < 0.01:
+            break
         (a, fa), (b, fb) = points[-2:]
         step = max(b - fb * (b - a) / (fb - fa), 0.2 * b) if fb != fa else 1.5 * b
-    return float(best[k] + side * step), used
-
-
-def _of_state_space(found: StateSpaceFit) -> _Valley:
-    likelihood, maximum = found.likelihood, found.maximum
-
-    def held(k: int, value: float, start: Array) -> tuple[Array, float, int]:
-        before = likelihood.evaluations
-        others = maximise(likelihood, start, held=(likelihood.names[k],), close=CLOSER)
-        return others.point.x, -2 * others.point.log_likelihood, likelihood.evaluations - before
-
-    return _Valley(
-        maximum.point.x, -2 * found.log_likelihood, maximum.covariance, likelihood.lower, likelihood.upper, held,
-        likelihood.logarithmic,
-    )  # fmt: skip
-
-
-def _of_residuals(problem: Problem, fit: Fit) -> _Valley:
-    noise = {r.name: r.noise for r in fit.runs}
-
-    def cost(theta: Array) -> float:
-        residual, _ = Search(problem, lambda text: None).residuals(theta, noise, {})
-        return float(residual @ residual)
-
-    def held(k: int, value: float, start: Array) -> tuple[Array, float, int]:
-        others = [i for i in range(len(problem.names)) if i != k]
-        if not others:
-            theta = np.array([value])
-            return theta, cost(theta), 1
-        fewer = replace(
-            problem,
-            names=tuple(problem.names[i] for i in others),
-            start=start[others],
-            lower=problem.lower[others],
-            upper=problem.upper[others],
-            held={**problem.held, problem.names[k]: value},
-        )
-        search = Search(fewer, lambda text: None)
-        found, _ = search.minimise(start[others], noise, {})
-        return np.insert(found, k, value), search.trail[-1][0], search.evaluations
-
-    best = np.array([fit.values[n] for n in problem.names])
-    return _Valley(
-        best, cost(best), fit.covariance, problem.lower, problem.upper, held, np.zeros(best.size, dtype=bool)
-    )
+    else:
+        value = best[k] + side * step
+    return float(np.exp(value) if likelihood.logarithmic[k] else value)
 
 
 # Draws from the posterior by Markov chains, under flat priors within the bounds, and what they are worth.
@@ -226,23 +148,27 @@ def effective_size(chains: Array) -> Array:
 
 
 def sample(
-    problem: Problem,
-    fit: Fit,
+    found: StateSpaceFit,
     count: int,
     *,
-    rough: StateSpaceFit | None = None,
     seed: int = 0,
     progress: Callable[[str, float], None] = lambda text, share: None,
 ) -> Posterior:
-    """Return at least `count` draws of the parameters in problem.names, as `draw` makes them.
+    """Return at least `count` draws of the problem's parameters, as `draw` makes them; field and gauge noise are held."""
+    problem = found.likelihood.problem
+    lower, upper, k = problem.lower, problem.upper, len(problem.names)
 
-    Field and gauge noise are held at what the fit found: those of the state-space likelihood `rough`, without it the residuals'.
-    """
-    best = np.array([fit.values[n] for n in problem.names])
+    def log_posterior(theta: Array) -> float:
+        if (theta <= lower).any() or (theta >= upper).any():
+            return -np.inf
+        x = found.likelihood.coordinates({**found.values, **dict(zip(problem.names, theta.tolist(), strict=True))})
+        here = found.likelihood.at(x, slopes=False).log_likelihood
+        return here if np.isfinite(here) else -np.inf
+
+    best = np.array([found.values[n] for n in problem.names])
     return draw(
-        _log_posterior(problem, fit, rough), problem.names, best, fit.covariance, (problem.lower, problem.upper), count,
-        seed=seed, progress=progress,
-    )  # fmt: skip
+        log_posterior, problem.names, best, found.covariance[:k, :k], (lower, upper), count, seed=seed, progress=progress
+    )
 
 
 def draw(
@@ -432,30 +358,6 @@ class _Ridge:
         normal, scale = random.standard_normal(x.shape), random.chisquare(HEAVY, size=(x.shape[0], 1)) / HEAVY
         moved = self.back(normal / np.sqrt(scale))
         return moved, self.log_density(x) - self.log_density(moved)
-
-
-def _log_posterior(problem: Problem, fit: Fit, rough: StateSpaceFit | None) -> Callable[[Array], float]:
-    """Return the logarithm of the posterior density, up to a constant."""
-    noise = {f.name: f.noise for f in fit.runs}
-    parts = {f.name: f.parts for f in fit.runs}
-
-    def log_posterior(theta: Array) -> float:
-        if (theta <= problem.lower).any() or (theta >= problem.upper).any():
-            return -np.inf
-        if rough is not None:
-            x = rough.likelihood.coordinates({**rough.values, **dict(zip(problem.names, theta.tolist(), strict=True))})
-            found = rough.likelihood.at(x, slopes=False).log_likelihood
-            return found if np.isfinite(found) else -np.inf
-        total = 0.0
-        for run in problem.runs:
-            difference = problem.predicted(run, theta, slopes=False).y - run.observed
-            if not np.isfinite(difference).all():
-                return -np.inf
-            white = whiten(noise[run.name], difference, parts[run.name])
-            total += float(white @ white)
-        return -0.5 * total
-
-    return log_posterior
 
 
 def to_arviz(posterior: Posterior) -> Any:

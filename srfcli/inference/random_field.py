@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from srfcli.codegen.model import Array
 from srfcli.codegen.splines import Spline
 from srfcli.data.values import Run
-from srfcli.inference.fit import BAD, Problem, unreached
+from srfcli.inference.fit import Problem
 from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, whiten
 from srfcli.inference.prediction import Prediction, predict
 
@@ -140,6 +140,15 @@ class Point:
         )
 
 
+BAD = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
+HUGE = 1e100  # a slope that is no slope any more: its square would overflow
+
+
+def unreached(difference: Array, J: Array, noise: Noise) -> Array:
+    """Return which samples (n,) have no residual or no slopes (n, k) to speak of: the integration did not reach them."""
+    return ~((np.abs(difference) < BAD * noise.innovation) & (np.abs(J) < HUGE).all(axis=1))
+
+
 class Latent:
     """The likelihood of a problem whose model has the track as its first table, or none."""
 
@@ -157,7 +166,6 @@ class Latent:
             problem.model, problem.experiment, run, problem.named(theta), by=problem.names if slopes else (),
             trend=None if run.holdout else problem.trend, tables=(tracks.spline(run),) if self.rough else (),
             by_tables=(0,) if slopes and self.rough and run.name in tracks.of else (),
-            rtol=problem.rtol,
         )  # fmt: skip
 
     def at(self, theta: Array, tracks: Tracks, noise: Mapping[str, Noise], roughness: Roughness) -> Point:

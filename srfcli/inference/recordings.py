@@ -21,9 +21,7 @@ from srfcli.inference.fit import (
     Interrupted,
     Problem,
     RunFit,
-    fit,
     fit_problem,
-    held_fit,
     scatter_of,
 )
 from srfcli.inference.noise import Noise, estimate_noise, stretches, white_level
@@ -109,18 +107,19 @@ def fit_recordings(
 
     Parameters that `vary` have a value for each group of runs. `track` is "smooth" for no random friction field, "rough" for one
     in each run, "shared" for one that all runs share; left out, the recordings decide, whether it is shared only with
-    `ask_shared` and without critical loads. With `prior` the values of five groups or more are drawn towards their mean. Without
-    a C compiler there is no field, and noise is autoregressive. A fit stopped by Ctrl-C is a status; SrfError is raised for what
-    cannot be fitted.
+    `ask_shared` and without critical loads. With `prior` the values of five groups or more are drawn towards their mean. A fit
+    stopped by Ctrl-C is a status; SrfError is raised for what cannot be fitted, and for recordings without a C compiler.
     """
     beside = next((run.name for run in experiment.runs if run.others), "")
-    if beside and (track == "shared" or compiler() is None):
-        why = "needs a C compiler" if compiler() is None else "does not go with `track` shared"
-        raise SrfError(f"to fit several observables, as run '{beside}' has, {why}", "Leave `observables` out.")
+    if experiment.runs and compiler() is None:
+        raise SrfError("a fit of recordings needs a C compiler: the filter is compiled", GET_COMPILER)
+    if beside and track == "shared":
+        raise SrfError(
+            f"to fit several observables, as run '{beside}' has, does not go with `track` shared", "Leave `observables` out."
+        )
     experiment = grouped(experiment, vary, by)
-    if experiment.vary and (track == "shared" or compiler() is None):
-        why = "needs a C compiler" if compiler() is None else "does not go with `track` shared"
-        raise SrfError(f"`vary` {why}", "Leave it out.")
+    if experiment.vary and track == "shared":
+        raise SrfError("`vary` does not go with `track` shared", "Leave it out.")
     stability = open_model(registry, **asdict(experiment.choice), stability=True) if experiment.thresholds else None
     if not experiment.runs:
         if vary or trend or track:
@@ -128,10 +127,6 @@ def fit_recordings(
             raise SrfError(f"`{named}` is for recordings, and {experiment.path} has none", "Leave it out.")
         assert stability is not None
         model = stability
-    elif compiler() is None:
-        if stability is not None:
-            raise SrfError("critical loads beside recordings need a C compiler", GET_COMPILER)
-        return _without_compiler(registry, experiment, free, trend, track, starts, seed, progress)
     else:
         model = open_model(registry, **asdict(experiment.choice), random_field=True)
     if stability is not None and track == "shared":
@@ -145,7 +140,7 @@ def fit_recordings(
         return as_fit(found), found
 
     try:
-        several = fit_from_several(problem, fitter=one, count=starts, seed=seed, progress=progress)
+        several = fit_from_several(problem, one, count=starts, seed=seed, progress=progress)
     except Interrupted as error:
         found = stopped(problem, error.values)
         return RecordingFit(problem, as_fit(found), found, _track(found), (), Status.INTERRUPTED)
@@ -177,29 +172,6 @@ def _track(found: StateSpaceFit) -> Track | None:
 def _shared(found: SharedFit) -> Track:
     roughness = found.roughness
     return Track(roughness.amplitude, roughness.length, True) if roughness.amplitude else Track()
-
-
-def _without_compiler(
-    registry: Registry,
-    experiment: Experiment,
-    free: Sequence[str] | None,
-    trend: str | None,
-    track: str | None,
-    starts: int,
-    seed: int,
-    progress: Callable[[str], None],
-) -> RecordingFit:
-    """Return the fit of the free-running model, with autoregressive noise."""
-    if track in ("rough", "shared"):
-        raise SrfError(f"`track` {track} needs a C compiler", "Install one, or the package ziglang.")
-    model = open_model(registry, **asdict(experiment.choice))
-    problem = fit_problem(model, experiment, free=free, trend=trend)
-    try:
-        several = fit_from_several(problem, count=starts, seed=seed, progress=progress)
-    except Interrupted as error:
-        return RecordingFit(problem, held_fit(problem, error.values), None, None, (), Status.INTERRUPTED)
-    status = Status.INTERRUPTED if several.interrupted else several.best.status
-    return RecordingFit(problem, several.best, None, None, tuple(several.rows), status)
 
 
 # Several starts: the file's own, and others drawn over the bounds, so that a false minimum is found out.
@@ -236,13 +208,13 @@ class Several:
 
 def fit_from_several(
     problem: Problem,
+    fitter: Fitter,
     *,
-    fitter: Fitter | None = None,
     count: int = 1,
     seed: int = 0,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Several:
-    """Return the best fit over the starts, each by `fitter(start, progress)`, plain least squares if left out.
+    """Return the best fit over the starts, each by `fitter(start, progress)`.
 
     Ctrl-C ends them where one is done, and is `Interrupted` where none is.
     """
@@ -255,7 +227,7 @@ def fit_from_several(
             progress(prefix + text)
 
         try:
-            fits.append((fit(problem, start=start, progress=report), None) if fitter is None else fitter(start, report))
+            fits.append(fitter(start, report))
         except (Interrupted, KeyboardInterrupt):
             if not fits:
                 raise

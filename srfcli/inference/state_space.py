@@ -30,9 +30,9 @@ from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, 
 from srfcli.data.noise import calm_level
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
-from srfcli.inference.fit import CONVERGED, Fit, Interrupted, Problem, RunFit, first_level, inverse, root
+from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, inverse, root
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
-from srfcli.inference.noise import Noise, stretches
+from srfcli.inference.noise import Noise, stretches, white_level
 from srfcli.inference.prediction import (
     TINY,
     Prediction,
@@ -80,6 +80,7 @@ HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
 BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
+CONVERGED = 0.1  # standard errors: how far the maximum may still be, by the gradient
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
@@ -684,6 +685,12 @@ def _floor(t: Array, signal: Signal) -> float:
 def _spacings(run: Run) -> list[float]:
     """Return the spacings (s) at which a run was sampled, to two digits: runs that agree in them share a gauge noise."""
     return [float(f"{dt:.2g}") for dt in run.sampling.spacings]
+
+
+def first_level(t: Array, signal: Signal) -> float:
+    """Return the standard deviation of white noise that the readings of a signal at the times t (n,) show themselves."""
+    level = white_level(signal.observed, stretches(t, signal.used))
+    return max(level, signal.quantum / np.sqrt(12), 1e-9 * float(np.ptp(signal.observed)), 1e-300)
 
 
 def typical_friction(run: Run) -> float:

@@ -183,21 +183,18 @@ def fit(
     intervals: list[Interval] = []
     posterior: Posterior | None = None
     try:
-        if profile and status is not Status.INTERRUPTED:
+        if profile and found.state_space and status is not Status.INTERRUPTED:
             names = found.problem.names
             for k, name in enumerate(names):
 
                 def told(text: str, done: float = k / len(names)) -> None:
                     progress("profile", text, done)
 
-                intervals.append(
-                    posteriors.profile(found.problem, found.fit, name, rough=found.state_space, progress=told)
-                )
-        if sample and status is not Status.INTERRUPTED:
+                intervals.append(posteriors.profile(found.state_space, name, progress=told))
+        if sample and found.state_space and status is not Status.INTERRUPTED:
             posterior = posteriors.sample(
-                found.problem, found.fit, sample, rough=found.state_space, seed=seed,
-                progress=lambda text, share: progress("sample", text, share),
-            )  # fmt: skip
+                found.state_space, sample, seed=seed, progress=lambda text, share: progress("sample", text, share)
+            )
             status = Status.INTERRUPTED if posterior.interrupted else status
     except KeyboardInterrupt:
         status = Status.INTERRUPTED
