@@ -10,8 +10,8 @@ import pytest
 
 from srfcli.codegen.splines import Spline
 from srfcli.data.experiment import read_experiment
-from srfcli.inference.random_field import AMPLITUDES, LENGTHS, Roughness, Tracks, marginal
 from srfcli.inference.recordings import fit_recordings
+from srfcli.inference.shared_field import AMPLITUDES, LENGTHS, Roughness, marginal
 from srfcli.laws.registry import load_registry
 
 
@@ -22,22 +22,19 @@ def test_prior_is_the_matern_covariance() -> None:
     np.testing.assert_allclose(L @ L.T, 9e-8 * (1 + d) * np.exp(-d), rtol=1e-6, atol=1e-14)
 
 
-def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tracks]:
-    """A linear problem r = J theta + C c + noise of variance 1 on two tracks; returns r, J, C and the tracks."""
+def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, Spline]:
+    """A linear problem r = J theta + C c + noise of variance 1 on a track; returns r, J, C and the track."""
     rng = np.random.default_rng(seed)
-    tracks = Tracks((Spline.over(0.0, 15.0, 0.8), Spline.over(0.0, 20.0, 0.8)), {"a": 0, "b": 1})
-    n, m = 400, tracks.numbers.size
-    J, C = rng.normal(size=(n, 2)), np.zeros((n, m))
-    k = tracks.splines[0].numbers.size
-    C[:200, :k] = 2e4 * tracks.splines[0].design(np.linspace(0, 15, 200))
-    C[200:, k:] = 2e4 * tracks.splines[1].design(np.linspace(0, 20, 200))
-    c = tracks.root(Roughness(amplitude, LENGTHS[1])) @ rng.normal(size=m) if amplitude else np.zeros(m)
-    return J @ [1.0, -2.0] + C @ c + rng.normal(size=n), J, C, tracks
+    track = Spline.over(0.0, 30.0, 0.8)
+    n, m = 400, track.numbers.size
+    J, C = rng.normal(size=(n, 2)), 2e4 * track.design(np.linspace(0, 30, n))
+    c = Roughness(amplitude, LENGTHS[1]).root(track.nodes) @ rng.normal(size=m) if amplitude else np.zeros(m)
+    return J @ [1.0, -2.0] + C @ c + rng.normal(size=n), J, C, track
 
 
-def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, tracks: Tracks, roughness: Roughness) -> float:
+def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, roughness: Roughness) -> float:
     """The log likelihood with parameters and track integrated out, from the covariance of all samples."""
-    L = tracks.root(roughness) if roughness.amplitude else np.zeros((tracks.numbers.size, 1))
+    L = roughness.root(track.nodes) if roughness.amplitude else np.zeros((track.numbers.size, 1))
     S = np.eye(r.size) + C @ L @ L.T @ C.T
     W = np.linalg.solve(S, np.column_stack([J, r]))
     rest = r - J @ np.linalg.solve(J.T @ W[:, :2], J.T @ W[:, 2])
@@ -45,31 +42,30 @@ def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, tracks: Tracks, roughnes
     return flat - 0.5 * float(rest @ np.linalg.solve(S, rest)) - 0.5 * np.linalg.slogdet(S)[1]
 
 
-def test_marginal_likelihood_is_that_of_the_whole_covariance() -> None:
-    r, J, C, tracks = _linear(1e-4, 1)
+def _marginal(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, **grid: object) -> tuple[float, Roughness]:
     A = np.column_stack([J, C])
-    base = -0.5 * float(r @ r)
-    found = marginal(A.T @ A, A.T @ r, [0, 1], range(2, A.shape[1]), tracks, base)
-    best = max(_whole(r, J, C, tracks, Roughness(a, length)) for length in LENGTHS for a in AMPLITUDES)
-    assert found.log_likelihood == pytest.approx(best, abs=1e-5)
-    assert 0.3e-4 < found.roughness.amplitude < 3e-4
+    return marginal(A.T @ A, A.T @ r, 2, track, -0.5 * float(r @ r), **grid)
+
+
+def test_marginal_likelihood_is_that_of_the_whole_covariance() -> None:
+    problem = _linear(1e-4, 1)
+    found, roughness = _marginal(*problem)
+    best = max(_whole(*problem, Roughness(a, length)) for length in LENGTHS for a in AMPLITUDES)
+    assert found == pytest.approx(best, abs=1e-5)
+    assert 0.3e-4 < roughness.amplitude < 3e-4
 
 
 @pytest.mark.parametrize("own", [Roughness(5e-4, 6.0), Roughness(2e-5, 0.5)], ids=["coarse", "finer than its knots"])
 def test_marginal_likelihood_of_one_roughness_is_its_own_and_not_a_better_one_s(own: Roughness) -> None:
-    r, J, C, tracks = _linear(1e-4, 1)
-    A = np.column_stack([J, C])
-    grid = np.array([own.length]), np.array([own.amplitude])
-    found = marginal(A.T @ A, A.T @ r, [0, 1], range(2, A.shape[1]), tracks, -0.5 * float(r @ r), grid=grid)
-    assert found.log_likelihood == pytest.approx(_whole(r, J, C, tracks, own), abs=1e-5)
-    assert found.roughness == own
+    problem = _linear(1e-4, 1)
+    found = _marginal(*problem, grid=(np.array([own.length]), np.array([own.amplitude])))
+    assert found == (pytest.approx(_whole(*problem, own), abs=1e-5), own)
 
 
 def test_no_roughness_is_found_where_there_is_none() -> None:
-    r, J, C, tracks = _linear(0.0, 2)
-    A = np.column_stack([J, C])
-    found = marginal(A.T @ A, A.T @ r, [0, 1], range(2, A.shape[1]), tracks, -0.5 * float(r @ r))
-    assert found.log_likelihood - found.smooth < 4.0
+    problem = _linear(0.0, 2)
+    found, _ = _marginal(*problem)
+    assert found - _whole(*problem, Roughness()) < 4.0
 
 
 @pytest.mark.slow

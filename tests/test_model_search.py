@@ -175,6 +175,19 @@ def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, shared):
         assert gain == pytest.approx(found.gain, rel=1e-8)
 
 
+def test_a_field_that_all_runs_share_counts_alike_under_every_model(tmp_path):
+    """What is known of it at first order speaks against a track's form, and decides nothing between models with none."""
+    effects = ("viscous-drag", "linker-dieterich", "track-topography")
+    found = said(recorded(tmp_path, Physics(alpha=0.03), shared=True), effects=effects)
+    assert found.effects == ("linker-dieterich",)
+    random = [f for f in found.ranked if "track-topography" not in f.name]
+    assert {"none", "linker-dieterich"} <= {f.name for f in random}
+    assert len({f.remainder.shared.gain for f in random}) > 1  # each its own
+    gain = found.best.remainder.shared.gain - CLOSE
+    assert gain > 0 and [f.evidence - f.separate for f in random] == pytest.approx([gain] * len(random))
+    assert all(f.evidence == f.separate for f in found.ranked if f not in random)
+
+
 @pytest.mark.slow
 def test_coloured_gauge_noise_is_not_taken_for_a_fine_field(tmp_path):
     """From the file's start values the fit is as likely as from the field that was drawn."""

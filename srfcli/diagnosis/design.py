@@ -29,9 +29,8 @@ from srfcli.data.writing import DESCRIPTION, experiment_files, run_csv
 from srfcli.diagnosis.augment import augment
 from srfcli.diagnosis.search import Fitted
 from srfcli.diagnosis.verdict import Diagnosis
-from srfcli.inference.fit import Problem
+from srfcli.inference.fit import Problem, solve_scaled
 from srfcli.inference.prediction import of_run, predict, run_parameters, stiffness_share
-from srfcli.inference.random_field import solve_scaled
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 

@@ -25,6 +25,14 @@ def inverse(information: Array) -> Array:
     return np.asarray(inverse / np.outer(d, d))
 
 
+def solve_scaled(A: Array, b: Array) -> Array:
+    """Return the solution of symmetric equations, scaled; directions that nothing determines do not move."""
+    d = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    values, vectors = np.linalg.eigh(A / np.outer(d, d))
+    inverse = np.where(values > 1e-12 * values[-1], 1 / np.maximum(values, 1e-300), 0.0)
+    return np.asarray((((vectors * inverse) @ (vectors.T @ (b.T / d).T)).T / d).T)
+
+
 def root(covariance: Array) -> Array:
     """Return the principal directions of a covariance, one standard deviation long each, as columns."""
     d = np.sqrt(np.diag(covariance))

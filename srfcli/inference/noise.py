@@ -20,26 +20,16 @@ UNEVEN = 1.5  # a spacing so much longer or shorter than its neighbours' ends an
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise e_t = sum_i coefficients[i] e_(t-1-i) + innovation; `innovation` and `level` are standard deviations.
-
-    `pieces` are the noises from given samples on, of a run that is sampled at several rates: colour goes by time, not by samples.
-    `slack` is the relative standard deviation of the power at low frequencies, as the colour is estimated; 0 where it is known.
-    """
+    """Noise e_t = sum_i coefficients[i] e_(t-1-i) + innovation; `innovation` and `level` are standard deviations."""
 
     innovation: float
     coefficients: tuple[float, ...] = ()
     level: float = 0.0
-    pieces: tuple[tuple[int, Noise], ...] = ()
-    slack: float = 0.0
 
     @property
     def order(self) -> int:
         """Return the order p; 0 is white."""
         return len(self.coefficients)
-
-    def at(self, sample: int) -> Noise:
-        """Return the noise at a sample of the run."""
-        return next((own for first, own in reversed(self.pieces) if first <= sample), self)
 
 
 def stretches(t: Array, used: Array) -> list[tuple[int, int]]:
@@ -61,21 +51,19 @@ def whiten(noise: Noise, columns: Array, parts: list[tuple[int, int]]) -> Array:
     The first samples of a stretch are whitened by the lower-order predictors of the same process (Levinson and Durbin), so
     that no sample is lost and the likelihood is exact.
     """
-    out = []
+    out, predictors = [], _predictors(noise)
     for a, b in parts:
-        own = noise.at(a)
-        predictors = _predictors(own)
         piece = columns[a:b]
         white = np.empty_like(piece)
-        for k in range(min(own.order, b - a)):
+        for k in range(min(noise.order, b - a)):
             phi, sd = predictors[k]
             past = sum((c * piece[k - 1 - i] for i, c in enumerate(phi)), np.zeros_like(piece[0]))
             white[k] = (piece[k] - past) / sd
-        if b - a > own.order:
-            rest = piece[own.order :].copy()
-            for i, c in enumerate(own.coefficients):
-                rest -= c * piece[own.order - 1 - i : b - a - 1 - i]
-            white[own.order :] = rest / own.innovation
+        if b - a > noise.order:
+            rest = piece[noise.order :].copy()
+            for i, c in enumerate(noise.coefficients):
+                rest -= c * piece[noise.order - 1 - i : b - a - 1 - i]
+            white[noise.order :] = rest / noise.innovation
         out.append(white)
     return np.concatenate(out) if out else columns[:0]
 
@@ -94,11 +82,9 @@ def _predictors(noise: Noise) -> list[tuple[Array, float]]:
 
 def log_determinant(noise: Noise, parts: list[tuple[int, int]]) -> float:
     """Return the sum of the logarithms of the standard deviations that `whiten` divides by."""
-    total = 0.0
+    total, first = 0.0, [np.log(sd) for _, sd in _predictors(noise)]
     for a, b in parts:
-        n, own = b - a, noise.at(a)
-        first = [np.log(sd) for _, sd in _predictors(own)]
-        total += sum(first[: min(n, own.order)]) + max(n - own.order, 0) * np.log(own.innovation)
+        total += sum(first[: min(b - a, noise.order)]) + max(b - a - noise.order, 0) * np.log(noise.innovation)
     return float(total)
 
 

@@ -20,12 +20,10 @@ from srfcli.inference.fit import (
     Fit,
     Interrupted,
     Problem,
-    RunFit,
     fit_problem,
     scatter_of,
 )
-from srfcli.inference.noise import Noise, estimate_noise, stretches, white_level
-from srfcli.inference.random_field import Latent, LatentFit, Roughness, fit_latent, tracks_for
+from srfcli.inference.shared_field import SharedFit, fit_shared
 from srfcli.inference.state_space import StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
 from srfcli.laws.registry import Registry
 
@@ -241,35 +239,10 @@ def fit_from_several(
     return Several(best, beside, rows, interrupted)
 
 
-# A fit of recordings whose runs slid on one and the same rough track, which is integrated out of its errors.
+# Whether the runs slid on one and the same rough track.
 
 SURELY = 2.0  # in log likelihood, by which one track for all runs has to be likelier than one for each
 ALIKE = 0.5  # mean correlation of the fields of two runs from which one field for all is fitted
-
-
-@dataclass(frozen=True)
-class SharedFit:
-    """A fit in which all runs slid on one track, and what that is like."""
-
-    fit: Fit
-    roughness: Roughness
-
-
-def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] = lambda text: None) -> SharedFit:
-    """Return the fit in which mu0 wanders along one track that all runs share, from where another fit stands.
-
-    The problem's model has the table ("mu", "slip"). Held-out runs are judged on that track.
-    """
-    progress("one rough track for all runs")
-    theta = np.array([begun.values[name] for name in problem.names])
-    noise = {r.name: Noise(r.noise.level) for r in begun.runs if not r.holdout}
-    found = fit_latent(problem, theta, noise, tracks=tracks_for(problem.runs, shared=True))
-    runs = tuple(_judged(problem, found, name) for name in (r.name for r in begun.runs))
-    fitted = replace(
-        begun, values=problem.named(found.point.theta), covariance=found.covariance, runs=runs,
-        log_likelihood=found.log_likelihood, status=Status.OK, evaluations=begun.evaluations + found.evaluations,
-    )  # fmt: skip
-    return SharedFit(fitted, found.point.roughness)
 
 
 def shared_field(found: StateSpaceFit) -> float:
@@ -302,15 +275,3 @@ def slip_along(run: Run, x: Array, states: tuple[str, ...]) -> Array:
 def slip_from(run: Run, u: Array) -> Array:
     """Return the slip (n,) in um from the run's start on: what the stage moved less what the spring was stretched, u (n,)."""
     return np.asarray(run.start + (cumulative_trapezoid(run.drive(run.t), run.t, initial=0.0) - (u - u[0])))
-
-
-def _judged(problem: Problem, found: LatentFit, name: str) -> RunFit:
-    run, tracks = next(r for r in problem.experiment.runs if r.name == name), found.point.tracks
-    if name not in tracks.of:
-        tracks = replace(tracks, of={**tracks.of, name: 0})
-    prediction = Latent(problem).predicted(run, found.point.theta, tracks, slopes=False)
-    residual = run.observed - prediction.y
-    parts = stretches(run.t, run.used)
-    return RunFit(
-        name, run.holdout, prediction, residual, parts, estimate_noise(residual, parts), white_level(residual, parts)
-    )

@@ -1,0 +1,285 @@
+"""The fit in which all runs slid on one and the same rough track: mu0 wanders along slip by a random function.
+
+The function is a cubic spline whose numbers have a Gaussian prior with a Matern covariance (smoothness 3/2) of unknown amplitude
+and length. Parameters and numbers are estimated together by Gauss-Newton steps on the motion itself, so that a stick-slip cycle
+that comes too early finds its cause in the track; amplitude and length by the marginal likelihood of the linearised problem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.integrate import trapezoid
+
+from srfcli.codegen.model import Array
+from srfcli.codegen.splines import Spline
+from srfcli.core.errors import Status
+from srfcli.data.values import Run
+from srfcli.inference.fit import Fit, Problem, RunFit, inverse, solve_scaled
+from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
+from srfcli.inference.prediction import Prediction, predict
+
+SPACING = 0.8  # um between knots: contacts are renewed over half of it, and a finer track fits no better
+MOST = 300  # numbers of a track: a longer one has wider knots
+AMPLITUDES = np.array([0.0, *np.geomspace(2e-5, 3e-3, 12)])
+LENGTHS = np.geomspace(1.0, 30.0, 6)
+GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the roughness that are tried
+ROUNDS = 4  # of roughness, parameters and noise in turn
+AGREED = 0.5  # in log likelihood, between two rounds that agree
+STEPS = 25
+SETTLED = 0.02  # gain of twice the log likelihood below which the minimum is reached
+EARLY = 2.0  # the same while roughness and noise still change
+FAR = (
+    (1.5, 1e-6),
+    (4.0, 1e-4),
+    (np.inf, 1e-2),
+)  # of chi-squared, the same up to so many times the samples: no minimum there matters
+ROUGHLY = 6.0  # chi-squared per sample within which roughness is estimated: farther off it would take up what is not its own
+BAD = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
+HUGE = 1e100  # a slope that is no slope any more: its square would overflow
+
+
+@dataclass(frozen=True)
+class Roughness:
+    """Standard deviation of mu0 along the track and its correlation length (um); amplitude 0 is a smooth track."""
+
+    amplitude: float = 0.0
+    length: float = 5.0
+
+    def root(self, nodes: Array) -> Array:
+        """Return L with L L' the covariance of a track's numbers."""
+        d = np.abs(nodes[:, None] - nodes[None, :]) * np.sqrt(3) / self.length
+        K = (1 + d) * np.exp(-d) + 1e-8 * np.eye(nodes.size)
+        return self.amplitude * np.linalg.cholesky(K)
+
+
+USUAL = Roughness(3e-4, 8.0)  # of a track until its own is estimated: polished contacts wander by so much
+
+
+@dataclass(frozen=True)
+class SharedFit:
+    """A fit in which all runs slid on one track, and what that is like."""
+
+    fit: Fit
+    roughness: Roughness
+
+
+def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] = lambda text: None) -> SharedFit:
+    """Return the fit in which mu0 wanders along one track that all runs share, from where another fit stands.
+
+    The problem's model has the table ("mu", "slip"). Noise, roughness and parameters are estimated in turn until they agree.
+    Held-out runs are judged on that track.
+    """
+    progress("one rough track for all runs")
+    likelihood, noise = TrackLikelihood(problem), {r.name: Noise(r.noise.level) for r in begun.runs if not r.holdout}
+    theta = np.array([begun.values[name] for name in problem.names])
+    point, before = likelihood.at(theta, _track(problem.runs), noise, Roughness()), -np.inf
+    for number in range(ROUNDS):
+        point = replace(point, roughness=likelihood.roughness(point))
+        if not point.roughness.amplitude:
+            point = replace(point, track=point.track.with_numbers(np.zeros(point.track.numbers.size)))
+        point = likelihood.minimise(point, noise, settled=EARLY if number + 1 < ROUNDS else SETTLED)
+        noise = likelihood.noise(point)
+        point = likelihood.at(point.theta, point.track, noise, point.roughness)
+        own = np.array([point.roughness.length]), np.array([point.roughness.amplitude])
+        attained = marginal(point.N, point.g, theta.size, point.track, point.log_likelihood, grid=own)[0]
+        total = min(attained, point.log_likelihood)  # no prior adds any
+        if abs(total - before) < AGREED:
+            break
+        before = total
+    runs = tuple(_judged(likelihood, point, r.name) for r in begun.runs)
+    fitted = replace(
+        begun, values=problem.named(point.theta), covariance=likelihood.covariance(point), runs=runs, log_likelihood=total,
+        status=Status.OK, evaluations=begun.evaluations + likelihood.evaluations,
+    )  # fmt: skip
+    return SharedFit(fitted, point.roughness)
+
+
+def _track(runs: Sequence[Run]) -> Spline:
+    """Return a smooth track that covers the slip of these runs."""
+    low, high = min(r.start for r in runs), max(r.start + float(trapezoid(r.drive(r.t), r.t)) for r in runs)
+    return Spline.over(low - 1.0, high + 2.0, max(SPACING, (high - low) / (MOST - 3)))
+
+
+def _judged(likelihood: TrackLikelihood, point: Point, name: str) -> RunFit:
+    run = next(r for r in likelihood.problem.experiment.runs if r.name == name)
+    prediction = likelihood.predicted(run, point.theta, point.track, slopes=False)
+    residual = run.observed - prediction.y
+    parts = stretches(run.t, run.used)
+    return RunFit(
+        name, run.holdout, prediction, residual, parts, estimate_noise(residual, parts), white_level(residual, parts)
+    )
+
+
+@dataclass(frozen=True)
+class Point:
+    """Parameters and track, what they predict, and the normal equations there: `N` and `g` over (theta, numbers), theta scaled.
+
+    `log_likelihood` is that of the whitened residuals; `chi2` their sum of squares.
+    """
+
+    theta: Array
+    track: Spline
+    roughness: Roughness
+    predictions: dict[str, Prediction] = field(repr=False)
+    N: Array = field(repr=False)
+    g: Array = field(repr=False)
+    chi2: float
+    log_likelihood: float
+
+    @property
+    def penalised(self) -> float:
+        """Return minus twice the log posterior, but for what does not change with parameters and track."""
+        if not self.roughness.amplitude:
+            return self.chi2
+        return self.chi2 + float(np.sum(np.linalg.solve(self.roughness.root(self.track.nodes), self.track.numbers) ** 2))
+
+
+class TrackLikelihood:
+    """The likelihood of a problem whose model has the track as its first table."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.scale = np.maximum(np.abs(problem.start), 1e-3 * (problem.upper - problem.lower))
+        self.evaluations = 0
+        self.samples = sum(int(run.used.sum()) for run in problem.runs)
+
+    def predicted(self, run: Run, theta: Array, track: Spline, *, slopes: bool = True) -> Prediction:
+        """Return the prediction of a run, with slopes by parameters and by the numbers of the track."""
+        problem = self.problem
+        return predict(
+            problem.model, problem.experiment, run, problem.named(theta), by=problem.names if slopes else (),
+            trend=None if run.holdout else problem.trend, tables=(track,), by_tables=(0,) if slopes else (),
+        )  # fmt: skip
+
+    def at(self, theta: Array, track: Spline, noise: Mapping[str, Noise], roughness: Roughness) -> Point:
+        """Return everything at these parameters and this track."""
+        n, k = theta.size, theta.size + track.numbers.size
+        N, g, chi2, total, found = np.zeros((k, k)), np.zeros(k), 0.0, 0.0, {}
+        self.evaluations += 1
+        for run in self.problem.runs:
+            p = found[run.name] = self.predicted(run, theta, track)
+            parts, own = stretches(run.t, run.used), noise[run.name]
+            difference = run.observed - p.y
+            bad = ~((np.abs(difference) < BAD * own.innovation) & (np.abs(p.J) < HUGE).all(axis=1))
+            difference[bad] = BAD * own.innovation
+            J = np.where(bad[:, None], 0.0, p.J)
+            J[:, :n] *= self.scale
+            white = whiten(own, np.column_stack([difference, J]), parts)
+            r, slopes = white[:, 0], white[:, 1:]
+            N += slopes.T @ slopes
+            g += slopes.T @ r
+            chi2 += float(r @ r)
+            total -= 0.5 * float(r @ r) + log_determinant(own, parts) + 0.5 * r.size * np.log(2 * np.pi)
+        return Point(theta, track, roughness, found, N, g, chi2, total)
+
+    def minimise(self, point: Point, noise: Mapping[str, Noise], *, settled: float = SETTLED) -> Point:
+        """Return the most probable parameters and numbers under this noise and roughness, by Levenberg and Marquardt."""
+        problem, damping = self.problem, 0.0
+        n, low, high = point.theta.size, problem.lower, problem.upper
+        point = self.at(point.theta, point.track, noise, point.roughness)
+        rough = point.roughness.amplitude > 0
+        L = point.roughness.root(point.track.nodes) if rough else np.zeros((0, 0))
+        for _ in range(STEPS if n or rough else 0):
+            free = np.ones(n, dtype=bool)
+            while True:  # parameters that a step would push out stay at their bounds
+                move, gain = self._step(point, L, free, damping)
+                theta = point.theta + move[:n] * self.scale
+                out = free & ((theta < low) & (point.theta <= low) | (theta > high) & (point.theta >= high))
+                if not out.any():
+                    break
+                free &= ~out
+            theta = np.clip(theta, low, high)
+            track = point.track.with_numbers(point.track.numbers + move[n:]) if rough else point.track
+            trial = self.at(theta, track, noise, point.roughness)
+            gained = point.penalised - trial.penalised
+            if gained > 0:
+                point = trial
+                damping = 0.0 if damping < 1e-6 else damping / 8
+                if gained < self.worth(point, settled):
+                    break
+            else:
+                if gain < self.worth(point, settled) or damping > 1e6:
+                    break
+                damping = max(8 * damping, 1e-4)
+        return point
+
+    def worth(self, point: Point, settled: float) -> float:
+        """Return the gain below which a further step is not worth it."""
+        share = point.chi2 / max(self.samples, 1)
+        return max(settled, next(far for most, far in FAR if share < most or most == np.inf) * point.chi2)
+
+    def roughness(self, point: Point) -> Roughness:
+        """Return the roughness at which the marginal likelihood is largest, the one so far where that means nothing."""
+        if point.chi2 > ROUGHLY * self.samples:
+            return point.roughness if point.roughness.amplitude else USUAL
+        return marginal(point.N, point.g, point.theta.size, point.track, point.log_likelihood)[1]
+
+    def _step(self, point: Point, L: Array, free: Array, damping: float) -> tuple[Array, float]:
+        """Return the step over (scaled theta, numbers), and what it should gain in minus twice the log posterior."""
+        n = free.size
+        T = np.zeros((point.g.size, int(free.sum()) + L.shape[1]))
+        T[np.nonzero(free)[0], np.arange(free.sum())] = 1.0
+        T[n : n + L.shape[0], free.sum() :] = L
+        A, b = T.T @ point.N @ T, T.T @ point.g
+        if L.size:
+            A[free.sum() :, free.sum() :] += np.eye(L.shape[1])
+            b[free.sum() :] -= np.linalg.solve(L, point.track.numbers)
+        if not A.size:  # every parameter stands at a bound, and there is no track
+            return np.zeros(point.g.size), 0.0
+        A[np.diag_indices_from(A)] *= 1 + damping
+        A[np.diag_indices_from(A)] += 1e-12 * np.diag(A).max()
+        x = np.linalg.solve(A, b)
+        return T @ x, float(x @ b)
+
+    def noise(self, point: Point) -> dict[str, Noise]:
+        """Return the noise of each run's residuals."""
+        found = {}
+        for run in self.problem.runs:
+            residual = run.observed - point.predictions[run.name].y
+            found[run.name] = estimate_noise(residual, stretches(run.t, run.used & np.isfinite(residual)))
+        return found
+
+    def covariance(self, point: Point) -> Array:
+        """Return the covariance of the free parameters, the track's uncertainty included."""
+        n = point.theta.size
+        information = point.N[:n, :n]
+        if point.roughness.amplitude:
+            L = point.roughness.root(point.track.nodes)
+            core = L.T @ point.N[n:, n:] @ L + np.eye(L.shape[1])
+            cross = point.N[:n, n:] @ L
+            information = information - cross @ np.linalg.solve(core, cross.T)
+        return np.asarray(inverse(information) * np.outer(self.scale, self.scale))
+
+
+def marginal(
+    N: Array, g: Array, n: int, track: Spline, log_likelihood: float, *, grid: tuple[Array, Array] = GRID
+) -> tuple[float, Roughness]:
+    """Return the largest marginal likelihood over amplitude and length, and where, from normal equations at `track`.
+
+    The first n columns are those of flat parameters, the others those of the track; `log_likelihood` is that of the residuals.
+    """
+    base, G, h = log_likelihood, N[n:, n:], g[n:]
+    if n:
+        solved = solve_scaled(N[:n, :n], np.column_stack([g[:n], N[:n, n:]]))
+        base += 0.5 * float(g[:n] @ solved[:, 0])
+        G, h = G - N[n:, :n] @ solved[:, 1:], h - N[n:, :n] @ solved[:, 0]
+    now = track.numbers
+    b = h + G @ now
+    smooth = base - float(h @ now) - 0.5 * float(now @ G @ now)
+    lengths, amplitudes = grid
+    best = (smooth if 0.0 in amplitudes else -np.inf, Roughness())
+    wide = lengths[lengths >= 1.2 * track.spacing]
+    for length in wide if wide.size else lengths[-1:]:
+        unit = Roughness(1.0, float(length)).root(track.nodes)
+        core, forced = unit.T @ G @ unit, unit.T @ b
+        values, vectors = np.linalg.eigh(core)
+        values, along = np.maximum(values, 0.0), vectors.T @ forced
+        for amplitude in amplitudes[amplitudes > 0]:
+            s2 = amplitude**2
+            found = smooth + 0.5 * float(np.sum(s2 * along**2 / (1 + s2 * values)) - np.sum(np.log1p(s2 * values)))
+            if found > best[0]:
+                best = (found, Roughness(float(amplitude), float(length)))
+    return best
