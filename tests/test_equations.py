@@ -171,7 +171,7 @@ def random_points(model: Any, p: np.ndarray) -> list[tuple[np.ndarray, dict[str,
 
 
 def prepared(make_model: Any, names: dict[str, Any]) -> tuple[System, Any, np.ndarray]:
-    system, model = build_system(REGISTRY, **names), make_model(**names)
+    system, model = build_system(REGISTRY, **names), make_model(**names, stability=False)
     run = {
         "V": 9.0,
         "W0": 6.0,

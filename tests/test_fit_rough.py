@@ -13,6 +13,7 @@ import srfcli as srf
 from srfcli.cli.main import cli
 from srfcli.codegen.c_source import compiler
 from srfcli.data.groups import grouped, labels
+from srfcli.diagnosis.goodness_of_fit import uneven_noise
 from srfcli.inference.fit import between_groups
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
@@ -272,6 +273,8 @@ def test_gauge_noise_may_be_a_run_s_own(loud):
     assert np.std(seen[0]) == pytest.approx(1.0, abs=0.06) and np.std(seen[1]) > 2
     shared = {f.run.name: np.std(f.white) for f in one.state_space.maximum.point.runs}
     assert shared["up0"] < 0.6 and shared["up1"] > 1.2
+    (advice,) = uneven_noise(one.state_space)
+    assert advice.startswith("up1 is louder and up0 quieter") and not uneven_noise(own.state_space)
 
 
 def test_noise_alone_may_be_asked_for(loud):

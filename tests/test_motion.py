@@ -47,7 +47,7 @@ def motion_of(model, how, *, rtol, by=(), S0=None, change=None):
 @needs_compiler
 @pytest.mark.parametrize("names", SYSTEMS, ids=str)
 def test_compiled_motion_is_that_of_lsoda(make_model, names):
-    model = make_model(**names)
+    model = make_model(**names, stability=False)
     ours, other = motion_of(model, "compiled", rtol=1e-9), motion_of(model, "lsoda", rtol=1e-11)
     assert ours.status.ok and other.status.ok
     scale = 1.0 + np.abs(other.x).max(axis=0)
@@ -59,7 +59,7 @@ def test_compiled_motion_is_that_of_lsoda(make_model, names):
 @pytest.mark.parametrize("names", SYSTEMS, ids=str)
 @pytest.mark.parametrize("how", ["compiled", "lsoda"])
 def test_sensitivities_are_those_of_differences(make_model, names, how):
-    model = make_model(**names)
+    model = make_model(**names, stability=False)
     wanted = [n for n in ("mu0", "A", "D0", "lambda", "K") if n in model.names]
     by = [model.index(n) for n in wanted]
     found = motion_of(model, how, rtol=1e-8, by=by).S
@@ -172,7 +172,7 @@ def test_no_step_of_the_clock_is_lost_in_short_steps(make_model):
 @needs_compiler
 @pytest.mark.parametrize("names", [{}, {"inertia": False}, {"interface": "rigid"}], ids=str)
 def test_age_that_collapses_after_a_long_hold(make_model, names):
-    model = make_model(ageing="perrin-rice-zheng", **names)
+    model = make_model(ageing="perrin-rice-zheng", stability=False, **names)
     t = np.concatenate([np.linspace(0.0, 1010.0, 102), np.linspace(1010.0, 1012.0, 2001)[1:], [1030.0]])
     found = moved(model, Drive.steps([(0, 8.0), (10, 0.0), (1010, 8.0)]), ConstantLoad(5.0), t, W0=5.0)
     assert found.status.ok
@@ -186,7 +186,7 @@ def test_age_that_collapses_after_a_long_hold(make_model, names):
 def test_what_the_equations_cannot_follow_is_said(make_model, inertia):
     """Friction that vanishes with v lets the slider turn, which ln v cannot; without inertia B > A runs away in finite time."""
     model, t = (
-        make_model(law="rice-regularized", ageing="kato-tullis", interface="rigid", inertia=inertia),
+        make_model(law="rice-regularized", ageing="kato-tullis", interface="rigid", inertia=inertia, stability=False),
         np.linspace(0, 5, 501),
     )
     load = LoadSteps.sequence([(1, 9.0, 9.0), (4, 0.9, 0.9)], start=0.0, rise=0.01)

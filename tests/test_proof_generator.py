@@ -117,7 +117,7 @@ def predicted(make_model, folder, p, plan, rig, u):
     for name, text in case_files("neutral", p, {plan: u}, rig=rig).items():
         (folder / name).write_text(text)
     experiment = read_experiment(folder, registry=load_registry())
-    model = make_model(**asdict(experiment.choice))
+    model = make_model(**asdict(experiment.choice), stability=False)
     values = {PARAMETERS.get(n, n): getattr(p, n) for n in (*OF_LAW[p.law_name], "lam", "nagata", "V0")}
     values = {n: v for n, v in {**values, "Vb": p.Vsat}.items() if n in model.names}
     made = predict(model, experiment, experiment.runs[0], values, rtol=1e-9)

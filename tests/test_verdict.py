@@ -27,7 +27,7 @@ def fitted(*names, evidence, fine=True, scores=(), told=0.0):
     hypothesis = Hypothesis(tuple(SHIPPED.get("effect", n) for n in names))
     return SimpleNamespace(
         hypothesis=hypothesis, name=hypothesis.name, evidence=evidence, fine=fine,
-        against=() if fine else ("a stretch of steps is off",), promised=scores, told=told,
+        against=() if fine else ("a stretch of steps is off",), promised=scores, told=told, fit=None,
     )  # fmt: skip
 
 
@@ -46,6 +46,7 @@ def concluded(monkeypatch):
         monkeypatch.setattr(module, "foretold", lambda fit, whole: fit.told)
         monkeypatch.setattr(module, "on_the_track_of", lambda best, baseline: baseline)
         monkeypatch.setattr(module, "at_bounds", lambda best: [])
+        monkeypatch.setattr(module, "uneven_noise", lambda fit: [])
         ranked = sorted(fits, key=lambda f: -f.evidence)
         baseline = next(f for f in fits if f.name == "none")
         search = SimpleNamespace(

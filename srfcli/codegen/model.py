@@ -134,21 +134,22 @@ def open_model(
     effects: Sequence[str] = (),
     tables: Sequence[tuple[str, str]] = (),
     random_field: bool = False,
-    stability: bool = False,
+    stability: bool | None = None,
     anew: bool = False,
 ) -> GeneratedModel:
     """Return the model of the system that these names describe: a shipped one, or from the cache where it was built before.
 
-    With effects, tables or a random friction field it holds what motion in time needs, and nothing of stability; with effects
-    and `stability` it holds that of sliding under a constant load, or one that is modulated for ever, and leaves out the effects
-    that critical loads do not depend on.
+    With effects, tables or a random friction field it holds what motion in time needs, and nothing of stability, as it does where
+    `stability` is not wanted of a plain system that is not shipped. With effects and `stability` it holds that of sliding under a
+    constant load, or one that is modulated for ever, and leaves out the effects that critical loads do not depend on.
     With `anew` the text is derived whatever is there.
     """
     base, *modifiers = ageing.split("+")
     wanted = [("friction", law), ("ageing", base), *(("modifier", m) for m in modifiers), ("interface", interface)]
     wanted += [("effect", name) for name in effects]
     parts, laws = [_writers(), loading, str(inertia), repr(tuple(tables)), str(random_field)], []
-    stability = (stability or not effects) and not (tables or random_field)
+    plain = not (effects or tables or random_field)
+    stability = (not effects if stability is None else stability) and not (tables or random_field)
     parts += ["stability"] if effects and stability else []
     for kind, name in wanted:
         found, fingerprint = _source(registry, kind, name.strip())
@@ -170,6 +171,8 @@ def open_model(
         return load_source(build(), key=key, laws=tuple(laws))
     if (shipped := find_built(key)) is not None:
         return load_source(shipped.source, key=key, laws=tuple(laws), code=shipped.code)
+    if plain and not stability:
+        key = content_key([*parts, "motion"])
     return load_source(cached_source(key, build), key=key, laws=tuple(laws))
 
 

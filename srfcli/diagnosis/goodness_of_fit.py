@@ -97,6 +97,18 @@ def shortcomings(found: StateSpaceFit) -> list[str]:
     return [text for size, text in sorted(tests, reverse=True) if size > 1.0]
 
 
+def uneven_noise(found: StateSpaceFit) -> list[str]:
+    """Return what to try where innovations of one run are larger and those of another smaller than the noise that both share."""
+    groups: dict[str, list[tuple[float, str]]] = {}
+    for f in found.maximum.point.runs:
+        off = (float(f.white @ f.white) - f.white.size) / np.sqrt(2 * f.white.size)
+        groups.setdefault(found.likelihood.problem.noise_group(f.run), []).append((off, f.run.name))
+    for (least, quiet), (most, loud) in ((min(runs), max(runs)) for runs in groups.values()):
+        if least < -DEVIATION and most > DEVIATION:
+            return [f"{loud} is louder and {quiet} quieter than the noise that both share: --vary noise gives each its own"]
+    return []
+
+
 def field_share(found: StateSpaceFit) -> float:
     """Return the amplitude of a fit's random friction field over the largest that a track may have; 0 without a field."""
     if found.smooth:

@@ -39,7 +39,7 @@ def applicable(
 
     Among the former are those that could join it only beside another one that brings what they need.
     """
-    base = open_model(registry, **asdict(experiment.choice))
+    base = open_model(registry, **asdict(experiment.choice), stability=False)
     scales = scales_of(experiment.runs, experiment.parameters, experiment.thresholds)
     found, excluded, waiting = [], [], []
     free = {p.name for p in experiment.parameters if not p.fixed}
@@ -145,7 +145,7 @@ class Hypothesis:
         if not experiment.runs:
             return self.stability(registry, experiment)
         choice = self.experiment(experiment).choice.plus(e.name for e in self.effects)
-        return open_model(registry, **asdict(choice), random_field=random_field)
+        return open_model(registry, **asdict(choice), random_field=random_field, stability=False)
 
     def stability(self, registry: Registry, experiment: Experiment) -> GeneratedModel:
         """Return the model of critical loads."""

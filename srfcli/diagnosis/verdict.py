@@ -11,7 +11,7 @@ import numpy as np
 from srfcli.core.errors import Status
 from srfcli.core.units import from_base
 from srfcli.data.values import Experiment, Run
-from srfcli.diagnosis.goodness_of_fit import improbability, loudness
+from srfcli.diagnosis.goodness_of_fit import improbability, loudness, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, typical_sizes
 from srfcli.diagnosis.scores import Score
 from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, Fitted, ModelSearch
@@ -131,7 +131,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     ungated, reasons = _said(best, close, scores)
     refused = refusal(best, baseline, held, held_loads) if ungated != "unknown" else ""
     verdict = "unknown" if refused else ungated
-    reasons += [refused] if refused else []
+    reasons += [refused] if refused else uneven_noise(best.fit) if verdict == "unknown" else []
     if whole.runs and not baseline.fit.likelihood.problem.runs:
         reasons.append("held-out runs are not judged, as no run was fitted that would tell the gauge's noise")
     reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]

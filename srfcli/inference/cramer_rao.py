@@ -171,10 +171,10 @@ def _with_memory(choice: ModelChoice, registry: Registry) -> GeneratedModel:
     """Return the model with Linker and Dieterich's term, or without where its laws do not take it."""
     if MODIFIER not in choice.ageing.split("+"):
         try:
-            return open_model(registry, **asdict(replace(choice, ageing=f"{choice.ageing}+{MODIFIER}")))
+            return open_model(registry, **asdict(replace(choice, ageing=f"{choice.ageing}+{MODIFIER}")), stability=False)
         except SrfError:  # the friction law has no B, or another modifier an alpha of its own
             pass
-    return open_model(registry, **asdict(choice))
+    return open_model(registry, **asdict(choice), stability=False)
 
 
 @dataclass(frozen=True)

@@ -413,7 +413,7 @@ def runs_again(
     """
     experiment.check_recorded("to simulate")
     choice = replace(experiment.choice, **laws)
-    model = mover = open_model(registry, **asdict(choice))
+    model = mover = open_model(registry, **asdict(choice), stability=False)
     values = _values(model, parameters)
     runs = experiment.named(names)
     observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in runs))
