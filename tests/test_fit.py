@@ -14,7 +14,7 @@ import srfcli as srf
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run
 from srfcli.inference.fit import fit_problem
-from srfcli.inference.noise import Noise, estimate_noise, lag_one, log_determinant, stretches, white_level, whiten
+from srfcli.inference.noise import Noise, difference_level, estimate_noise, lag_one, log_determinant, stretches, whiten
 from srfcli.inference.posterior import profile
 from srfcli.inference.prediction import basis, own_names, own_start, predict
 from srfcli.inference.recordings import fit_from_several
@@ -118,7 +118,7 @@ def test_stretches_end_at_gaps_and_changes_of_rate():
 def test_levels_of_noise():
     t, rng = np.linspace(0, 10, 5000), np.random.default_rng(5)
     white = 0.02 * rng.standard_normal(t.size)
-    assert white_level(np.sin(t) + white, [(0, t.size)]) == pytest.approx(0.02, rel=0.05)
+    assert difference_level(np.sin(t) + white, [(0, t.size)]) == pytest.approx(0.02, rel=0.05)
     assert lag_one(ar_noise(2, 20_000, (0.9,), 1.0), [(0, 20_000)]) == pytest.approx(0.9, abs=0.02)
 
 

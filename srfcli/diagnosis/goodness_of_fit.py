@@ -16,7 +16,7 @@ from scipy.special import erfcx
 
 from srfcli.codegen.model import Array
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
-from srfcli.inference.noise import stretches, white_level
+from srfcli.inference.noise import difference_level, stretches
 from srfcli.inference.state_space import (
     LAGS,
     LOST,
@@ -125,7 +125,7 @@ def loudness(likelihood: Likelihood, point: Point) -> list[tuple[float, str]]:
         rate, gauges = f.run.sampling.at, iter(likelihood.gauges(f.run))
         for signal, k in product(f.run.signals, range(len(f.run.sampling.spacings))):
             here = signal.used & (rate == k)
-            seen = white_level(signal.observed, stretches(f.run.t, here))
+            seen = difference_level(signal.observed, stretches(f.run.t, here))
             levels.setdefault(next(gauges)["gauge_white"], []).append((max(seen, 1e-300), signal.quantum, int(here.sum())))
     for name, shown in levels.items():
         quantum = max(q for _, q, _ in shown) / np.sqrt(12)

@@ -113,7 +113,7 @@ def estimate_noise(residual: Array, parts: list[tuple[int, int]], *, orders: int
     return Noise(sqrt(best[2]), tuple(best[1].tolist()), level)
 
 
-def white_level(values: Array, parts: list[tuple[int, int]], *, order: int = 3) -> float:
+def difference_level(values: Array, parts: list[tuple[int, int]], *, order: int = 3) -> float:
     """Return the standard deviation of white noise under a smooth signal, from its differences of this order.
 
     White noise alone is measured: coloured noise is smooth at the sampling interval and counts in part as signal.

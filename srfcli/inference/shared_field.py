@@ -18,7 +18,7 @@ from srfcli.codegen.splines import Spline
 from srfcli.core.errors import Status
 from srfcli.data.values import Run
 from srfcli.inference.fit import Fit, Problem, RunFit, inverse, solve_scaled
-from srfcli.inference.noise import Noise, estimate_noise, log_determinant, stretches, white_level, whiten
+from srfcli.inference.noise import Noise, difference_level, estimate_noise, log_determinant, stretches, whiten
 from srfcli.inference.prediction import Prediction, predict
 
 SPACING = 0.8  # um between knots: contacts are renewed over half of it, and a finer track fits no better
@@ -109,7 +109,7 @@ def _judged(likelihood: TrackLikelihood, point: Point, name: str) -> RunFit:
     residual = run.observed - prediction.y
     parts = stretches(run.t, run.used)
     return RunFit(
-        name, run.holdout, prediction, residual, parts, estimate_noise(residual, parts), white_level(residual, parts)
+        name, run.holdout, prediction, residual, parts, estimate_noise(residual, parts), difference_level(residual, parts)
     )
 
 

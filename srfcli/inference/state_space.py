@@ -32,7 +32,7 @@ from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
 from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, inverse, root
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
-from srfcli.inference.noise import Noise, stretches, white_level
+from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
     TINY,
     Prediction,
@@ -689,7 +689,7 @@ def _spacings(run: Run) -> list[float]:
 
 def first_level(t: Array, signal: Signal) -> float:
     """Return the standard deviation of white noise that the readings of a signal at the times t (n,) show themselves."""
-    level = white_level(signal.observed, stretches(t, signal.used))
+    level = difference_level(signal.observed, stretches(t, signal.used))
     return max(level, signal.quantum / np.sqrt(12), 1e-9 * float(np.ptp(signal.observed)), 1e-300)
 
 
