@@ -267,6 +267,7 @@ def test_held_out_runs_are_judged_only(rock_model):
     assert found.rms_over_noise() == pytest.approx(1.0, abs=0.1) and found.rms_over_noise(holdout=True) > 10
 
 
+@pytest.mark.slow
 def test_open_case_with_nothing_concealed(shared):
     truth = json.loads((shared / "cases" / "truth.json").read_text())["open-01"]["parameters"]
     found = srf.fit(shared / "cases" / "open-01").found.fit

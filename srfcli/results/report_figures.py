@@ -396,6 +396,7 @@ def _pieces(t: Array) -> list[tuple[int, int]]:
 
 BINS = 3  # of an axis, from which it has a panel of its own
 FINEST = 240  # columns in which a spectrum is drawn by its maxima
+THIN = 0.003  # of an axis: a bin so narrow is a line, as it would hardly be seen as a bar
 LEVEL = 0.01  # of the p-value adjusted for all that was looked at
 WIDE_AXIS = 100.0  # ratio from which an axis is logarithmic
 APART = ("run", "window")  # axes that the figures of the runs show
@@ -508,9 +509,11 @@ def _bins(axis: Axes, found: Sequence[Spot]) -> None:
     log = positive and max(s.high for s in bins) > WIDE_AXIS * min(s.high for s in bins)
     if len(bins) > FINEST:
         bins = _columns(bins, log)
+    place = np.log if log else np.asarray
+    width = float(place(max(s.high for s in bins)) - place(min(s.low for s in bins)))
     for spot in bins:
         colour, alpha = (BEFORE if spot.sure else "#AAAAAA"), (1.0 if spot is bins[0] else 0.5)
-        if spot.high > spot.low:
+        if float(place(spot.high) - place(spot.low)) > THIN * width:
             axis.bar(spot.low, spot.height, spot.high - spot.low, align="edge", color=colour, alpha=alpha, linewidth=0)
         else:
             axis.vlines(spot.low, 0, spot.height, color=colour, alpha=alpha, linewidth=1.6)
