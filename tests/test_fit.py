@@ -63,14 +63,6 @@ def fit(problem, smooth=True):
     return as_fit(fit_state_space(problem, smooth=smooth))
 
 
-def fitter(problem):
-    def one(start, progress):
-        found = fit_state_space(replace(problem, start=start), smooth=True, progress=progress)
-        return as_fit(found), found
-
-    return one
-
-
 @pytest.mark.parametrize("coefficients", [(), (0.85,), (1.2, -0.5), (0.5, 0.2, 0.1)])
 def test_noise_is_estimated(coefficients):
     values = ar_noise(3, 20_000, coefficients, 0.1)
@@ -234,9 +226,9 @@ def test_stick_slip_from_afar(make_model):
 
 def test_several_starts_agree_and_are_seeded(rock_model):
     problem = fit_problem(rock_model, rock(rock_model, runs=1))
-    found = fit_from_several(problem, fitter(problem), count=2, seed=4)
+    found = fit_from_several(problem, smooth=True, count=2, seed=4)
     assert len(found.rows) == 2 and all(same for _, same in found.rows) and not found.interrupted
-    assert fit_from_several(problem, fitter(problem), count=2, seed=4).best.values == found.best.values
+    assert fit_from_several(problem, smooth=True, count=2, seed=4).best.values == found.best.values
 
 
 def test_starts_that_were_not_done_are_not_passed_over(rock_model):
@@ -247,7 +239,7 @@ def test_starts_that_were_not_done_are_not_passed_over(rock_model):
         if text.startswith("start 2 of 3"):
             raise KeyboardInterrupt
 
-    found = fit_from_several(problem, fitter(problem), count=3, seed=4, progress=stop)
+    found = fit_from_several(problem, smooth=True, count=3, seed=4, progress=stop)
     assert found.interrupted and len(found.rows) == 1
 
 

@@ -159,10 +159,7 @@ static int explicit_steps(Imposed *force, History *q, double b, double rtol, con
     double h = fmin(first_step(force, now, b - now->t, own_rtol, atol), longest);
     while (now->t < b) {
         if (*stop || stats[0] + stats[1] >= max_steps) return -1 - next;
-        double left = b - now->t;
-        int final = h >= left * (1.0 - 1e-12);
-        if (final) h = left;
-        else if (2.0 * h > left) h = 0.5 * left;
+        int final = fitted(&h, b - now->t);
         if (h < 64.0 * DBL_EPSILON * fmax(fabs(now->t), fabs(b)) && !final) break;
         for (int i = 1; i < 12; i++) {
             ex_sum(NX, i, EX_A[i], h, now->x, k[0], stage);
@@ -207,7 +204,7 @@ static int explicit_steps(Imposed *force, History *q, double b, double rtol, con
         stiff = stiffness > STIFF ? stiff + 1 : 0;
         stats[0] += 1;
         stats[2] += 1;
-        double ahead = h + carry, after = final ? b : now->t + ahead;
+        double after = time_after(now->t, h, b, final, &carry);
         if (next < nt && t[next] <= after) {
             for (int i = 13; i < 16; i++) {
                 ex_sum(NX, i, EX_A[i], h, now->x, k[0], stage);
@@ -220,7 +217,6 @@ static int explicit_steps(Imposed *force, History *q, double b, double rtol, con
                 if (ns) ex_dense(wide, q->S, S_after, h, K, s, S + (size_t)next * wide);
             }
         }
-        carry = final ? 0.0 : ahead - (after - now->t);
         now->t = after;
         memcpy(now->x, x, sizeof x);
         memcpy(k[0], k[12], sizeof k[0]);

@@ -220,10 +220,8 @@ static NOINLINE int advance(Imposed *force, Course *course, Belief *belief, doub
         if (!(course->h > 0.0)) course->h = fmin(first_step(force, &now, b - a, course->rtol, course->atol), course->longest);
         for (;;) {
             if (*course->stop || course->steps + course->rejected >= course->max_steps) return 0;
-            double left = b - now.t, h = course->h;
-            int final = h >= left * (1.0 - 1e-12);
-            if (final) h = left;
-            else if (2.0 * h > left) h = 0.5 * left;
+            double h = course->h;
+            int final = fitted(&h, b - now.t);
             if (h < 4.0 * DBL_EPSILON * fmax(fabs(now.t), fabs(b)) && !final && ++unseen > MAX_UNSEEN) return 0;
             if (course->before > 0.0) predict(course->Z, course->before, h, Z0);
             else memset(Z0, 0, sizeof Z0);
@@ -249,8 +247,7 @@ static NOINLINE int advance(Imposed *force, Course *course, Belief *belief, doub
                 if (course->h < 1e-300 || !finite_all(belief->x, NX)) return 0;
                 continue;
             }
-            double ahead = h + carry, after = final ? b : now.t + ahead;
-            carry = final ? 0.0 : ahead - (after - now.t);
+            double after = time_after(now.t, h, b, final, &carry);
             if (!first && course->last_h > 0.0) { /* predictive controller of Gustafsson */
                 double predicted = safety * (h / course->last_h) * pow(error * error / course->last_error, -0.25);
                 factor_ = fmin(factor_, fmax(0.2, fmin(8.0, predicted)));

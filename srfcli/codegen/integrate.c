@@ -331,10 +331,7 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
     double h = fmin(first_step(force, now, b - now->t, rtol, atol), longest);
     while (now->t < b) {
         if (*stop || stats[0] + stats[1] >= max_steps) return -1 - next;
-        double left = b - now->t;
-        int final = h >= left * (1.0 - 1e-12);
-        if (final) h = left;
-        else if (2.0 * h > left) h = 0.5 * left;
+        int final = fitted(&h, b - now->t);
         /* A slider that stops passes through many decades of v in less time than t can tell apart: t is summed with its carry,
            and the steps may be as small as they like, though not for ever. */
         if (h < 4.0 * DBL_EPSILON * fmax(fabs(now->t), fabs(b)) && !final && ++unseen > MAX_UNSEEN) return -1 - next;
@@ -371,9 +368,7 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
             continue;
         }
         Node after;
-        double ahead = h + carry;
-        after.t = final ? b : now->t + ahead;
-        carry = final ? 0.0 : ahead - (after.t - now->t);
+        after.t = time_after(now->t, h, b, final, &carry);
         for (int r = 0; r < NX; r++) after.x[r] = now->x[r] + Z[2 * NX + r];
         double f_after[NX];
         memset(f_after, 0, sizeof f_after);

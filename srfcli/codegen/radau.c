@@ -129,6 +129,21 @@ typedef struct {
     double t, x[NX], f[NX];                 /* f is the slope for output: from the increments, see segment() of integrate.c */
 } Node;
 
+/* shortens a step to what is left, or to half of it, so that no sliver remains; returns whether it is the last */
+static int fitted(double *h, double left) {
+    int final = *h >= left * (1.0 - 1e-12);
+    if (final) *h = left;
+    else if (2.0 * *h > left) *h = 0.5 * left;
+    return final;
+}
+
+/* the time after a step towards b, and in `carry` what it has lost of h by rounding */
+static double time_after(double t, double h, double b, int final, double *carry) {
+    double ahead = h + *carry, after = final ? b : t + ahead;
+    *carry = final ? 0.0 : ahead - (after - t);
+    return after;
+}
+
 /* one attempt at a step: fills Z; returns the Newton count, 0 where it failed */
 static NOINLINE int stages(Imposed *force, const Node *from, double h, const double *Z0, double rtol, const double *atol, double *Z, double J[3][NX * NX]) {
     double matrix[NZ * NZ], residual[NZ], F[3][NX], x[NX], V[3], W[3], W_dot[3];

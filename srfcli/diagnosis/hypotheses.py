@@ -39,7 +39,7 @@ def applicable(
 
     Among the former are those that could join it only beside another one that brings what they need.
     """
-    base = open_model(registry, **asdict(experiment.choice), stability=False)
+    base = open_model(registry, **asdict(experiment.choice), random_field=bool(experiment.runs), stability=False)
     scales = scales_of(experiment.runs, experiment.parameters, experiment.thresholds)
     found, excluded, waiting = [], [], []
     free = {p.name for p in experiment.parameters if not p.fixed}

@@ -131,7 +131,10 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     ungated, reasons = _said(best, close, scores)
     refused = refusal(best, baseline, held, held_loads) if ungated != "unknown" else ""
     verdict = "unknown" if refused else ungated
-    reasons += [refused] if refused else uneven_noise(best.fit) if verdict == "unknown" else []
+    if refused:
+        reasons.append(refused)
+    elif verdict == "unknown":
+        reasons += uneven_noise(best.fit)
     if whole.runs and not baseline.fit.likelihood.problem.runs:
         reasons.append("held-out runs are not judged, as no run was fitted that would tell the gauge's noise")
     reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]

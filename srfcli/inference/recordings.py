@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -131,31 +130,26 @@ def fit_recordings(
         raise SrfError("`track` shared does not go with critical loads", "Leave it out, or name rough.")
     problem = fit_problem(model, experiment, free=free, trend=trend, stability=stability)
     smooth = None if track is None else track == "smooth"
-
-    def one(start: Array, report: Callable[[str], None]) -> tuple[Fit, Any]:
-        moved = replace(problem, start=start)
-        found = fit_state_space(moved, smooth=smooth, progress=report)
-        return as_fit(found), found
-
     try:
-        several = fit_from_several(problem, one, count=starts, seed=seed, progress=progress)
+        several = fit_from_several(problem, smooth=smooth, count=starts, seed=seed, progress=progress)
     except Interrupted as error:
         found = stopped(problem, error.values)
         return RecordingFit(problem, as_fit(found), found, _track(found), (), Status.INTERRUPTED)
-    found, status = several.beside, Status.INTERRUPTED if several.interrupted else several.best.status
-    result = RecordingFit(problem, several.best, found, _track(found), tuple(several.rows), status)
+    found, best = several.best, as_fit(several.best)
+    status = Status.INTERRUPTED if several.interrupted else best.status
+    result = RecordingFit(problem, best, found, _track(found), tuple(several.rows), status)
     result = _with_scatter(result, prior=prior and not several.interrupted)
     if several.interrupted or len(problem.runs) < 2 or problem.tables:
         return result
     try:
         asked = ask_shared and track is None and not (experiment.vary or any(run.others for run in problem.runs))
-        if not (track == "shared" or (asked and shared_field(found) > ALIKE)):
+        if not (track == "shared" or (asked and field_correlation(found) > ALIKE)):
             return result
         tabled = open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),))
-        shared = fit_shared(replace(problem, model=tabled), several.best, progress=progress)
+        shared = fit_shared(replace(problem, model=tabled), best, progress=progress)
     except KeyboardInterrupt:
         return replace(result, status=Status.INTERRUPTED)
-    if track is None and shared.fit.log_likelihood < several.best.log_likelihood + SURELY:
+    if track is None and shared.fit.log_likelihood < best.log_likelihood + SURELY:
         return result
     return replace(result, fit=shared.fit, state_space=None, track=_shared(shared), status=shared.fit.status)
 
@@ -175,7 +169,6 @@ def _shared(found: SharedFit) -> Track:
 # Several starts: the file's own, and others drawn over the bounds, so that a false minimum is found out.
 
 SPREAD = 0.3  # of the way from the start value to each bound, at most
-Fitter = Callable[[Array, Callable[[str], None]], tuple[Fit, Any]]
 SAME = 0.5  # standard errors between two minima that count as one
 
 
@@ -193,30 +186,29 @@ def start_points(problem: Problem, count: int, seed: int) -> list[Array]:
 
 @dataclass(frozen=True)
 class Several:
-    """Fits from several starts: the best with what its fitter returned beside it, and for each start that ended a row.
+    """Fits from several starts: the best, and for each start that ended a row.
 
     A row is the log likelihood, and whether that start ended in the best one's minimum. `interrupted` where not all were done.
     """
 
-    best: Fit
-    beside: Any
+    best: StateSpaceFit
     rows: list[tuple[float, bool]]
     interrupted: bool
 
 
 def fit_from_several(
     problem: Problem,
-    fitter: Fitter,
     *,
+    smooth: bool | None = None,
     count: int = 1,
     seed: int = 0,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Several:
-    """Return the best fit over the starts, each by `fitter(start, progress)`.
+    """Return the best fit over the starts; `smooth` as in `fit_state_space`.
 
     Ctrl-C ends them where one is done, and is `Interrupted` where none is.
     """
-    fits: list[tuple[Fit, Any]] = []
+    fits: list[StateSpaceFit] = []
     interrupted = False
     for number, start in enumerate(start_points(problem, count, seed), 1):
         prefix = f"start {number} of {count}: " if count > 1 else ""
@@ -225,18 +217,17 @@ def fit_from_several(
             progress(prefix + text)
 
         try:
-            fits.append(fitter(start, report))
+            fits.append(fit_state_space(replace(problem, start=start), smooth=smooth, progress=report))
         except (Interrupted, KeyboardInterrupt):
             if not fits:
                 raise
             interrupted = True
             break
-    best, beside = max(fits, key=lambda f: f[0].log_likelihood)
-    away = [
-        max(abs(f.values[n] - best.values[n]) / max(best.stderr[n], 1e-300) for n in problem.names) for f, _ in fits
-    ]
-    rows = [(f.log_likelihood, d < SAME) for (f, _), d in zip(fits, away, strict=True)]
-    return Several(best, beside, rows, interrupted)
+    best = max(fits, key=lambda f: f.log_likelihood)
+    errors = np.maximum(np.sqrt(np.diag(best.covariance)), 1e-300)
+    away = [max(abs(f.values[n] - best.values[n]) / e for n, e in zip(problem.names, errors, strict=False)) for f in fits]
+    rows = [(f.log_likelihood, d < SAME) for f, d in zip(fits, away, strict=True)]
+    return Several(best, rows, interrupted)
 
 
 # Whether the runs slid on one and the same rough track.
@@ -245,7 +236,7 @@ SURELY = 2.0  # in log likelihood, by which one track for all runs has to be lik
 ALIKE = 0.5  # mean correlation of the fields of two runs from which one field for all is fitted
 
 
-def shared_field(found: StateSpaceFit) -> float:
+def field_correlation(found: StateSpaceFit) -> float:
     """Return the mean correlation of the smoothed fields of any two runs over the slip that both have; 0 where none has any."""
     if found.smooth or len(found.likelihood.problem.runs) < 2:
         return 0.0
