@@ -15,6 +15,7 @@ import contextlib
 import ctypes
 import importlib.util
 import os
+import re
 import platform
 import shlex
 import shutil
@@ -249,8 +250,25 @@ def _step_source(model: GeneratedModel) -> str:
         functions = FUNCTIONS | TABLE_FUNCTIONS
     text += _own("lambertw.c") if "lambertw(" in model.source else ""
     text += _own("tables.c") if tables else ""
-    text += "\n".join(c_function(model.source, name, label=label) for name, label in functions.items())
-    return text + _own("radau.c")
+    parts = {name: c_function(model.source, name, label=label) for name, label in functions.items()}
+    return text + "\n".join(parts.values()) + _elimination(len(model.states), parts["rates_jacobian"]) + _own("radau.c")
+
+
+def _elimination(states: int, jacobian: str) -> str:
+    """Return where a Jacobian may differ from zero, and in which order states are eliminated: that few depend on first."""
+    entries = sorted({int(k) for k in re.findall(r"^ *out\[(\d+)\] =", jacobian, re.MULTILINE)})
+    columns = [k % states for k in entries]
+    order = sorted(range(states), key=columns.count)
+    tables = {
+        "JACOBIAN": entries or [0],
+        "PLACE": [order.index(r) for r in range(states)],
+        "ROW": [i * states + r for r in order for i in range(3)],
+        "SAME": [*range(states)],
+    }
+    text = f"#define NJ {len(entries)}\n"
+    for name, numbers in tables.items():
+        text += f"static const int {name}[] = {{{', '.join(map(str, numbers))}}};\n"
+    return text
 
 
 def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_step: float) -> str:

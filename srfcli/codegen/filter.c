@@ -12,6 +12,7 @@
 #define MODES 3                             /* of white noise in a step; as many as stages can tell apart */
 #define NA (NX + 2 * GAUGE_PROCESSES * SIGNALS) /* states with those of gauge noise, at most; matrices are laid out for those there are */
 #define NC (NX + MODES)
+typedef double quad __attribute__((vector_size(32), may_alias));
 #define GAUGE -1
 #define SPRING -2
 #define NO_VARIANCE 1e150                   /* a variance that is none any more */
@@ -24,13 +25,14 @@ typedef struct {
 typedef struct {
     const double *p;
     const dual *q;
-    int slopes, ng, na;                     /* processes of gauge noise, of all signals; states with theirs */
+    int slopes, keep, ng, na;               /* processes of gauge noise, of all signals; states with theirs */
     const int *order;                       /* how many states each of these has */
     double rtol, longest, h;                /* h: the step that the last one suggests */
     const double *atol;
     double Z[NZ], before;                   /* increments and length of the last step, 0 for none */
     double last_error, last_h;
     int first;
+    StageMatrix matrix;                     /* of the last step */
     long steps, rejected, max_steps;
     const volatile int *stop;
 } Course;
@@ -41,24 +43,28 @@ static double legendre(int k, double s) {
 }
 
 /* how the end of a step answers to rates at each of its stages, out (NX, NZ): the last rows of the stages' inverse, times h A */
-static void answers(const double *a, const int *pivot, double h, double *out) {
+static void answers(const StageMatrix *matrix, double *out) {
+    const double *a = matrix->a;
     for (int r = 0; r < NX; r++) {
         double w[NZ] = {0.0};
-        w[2 * NX + r] = 1.0;
-        for (int k = 2 * NX + r; k < NZ; k++) {
+        w[AT(2, r)] = 1.0;
+        for (int k = AT(2, r); k < NZ; k++) {
+            if (w[k] == 0.0) continue;
             w[k] /= a[k * NZ + k];
             for (int i = k + 1; i < NZ; i++) w[i] -= a[k * NZ + i] * w[k];
         }
-        for (int k = NZ - 1; k >= 0; k--)
+        for (int k = NZ - 1; k >= 0; k--) {
+            if (w[k] == 0.0) continue;
             for (int i = 0; i < k; i++) w[i] -= a[k * NZ + i] * w[k];
+        }
         for (int k = NZ - 1; k >= 0; k--) {
             double swap = w[k];
-            w[k] = w[pivot[k]];
-            w[pivot[k]] = swap;
+            w[k] = w[matrix->pivot[k]];
+            w[matrix->pivot[k]] = swap;
         }
         for (int i = 0; i < 3; i++)
             for (int c = 0; c < NX; c++)
-                out[r * NZ + i * NX + c] = h * (A[0][i] * w[c] + A[1][i] * w[NX + c] + A[2][i] * w[2 * NX + c]);
+                out[r * NZ + i * NX + c] = matrix->h * (A[0][i] * w[AT(0, c)] + A[1][i] * w[AT(1, c)] + A[2][i] * w[AT(2, c)]);
     }
 }
 
@@ -75,46 +81,73 @@ static int nonzero(const lanes *d) {
     return some;
 }
 
+/* whether there is nothing random about the states: no variance, and no noise of rate `gain` (3, NX) at any stage */
+static int certain(const Course *course, const Belief *b, const double *gain) {
+    int some = 0;
+    for (int k = 0; k < 3 * NX; k++) some |= gain[k] != 0.0;
+    for (int k = 0; k < NX * course->na; k++) some |= b->P[k] != 0.0;
+    return !some;
+}
+
 /* Covariance and tangents across one step whose stages are solved; the mean is moved too. Returns the error of the covariance
    over what is allowed, by the share that the last polynomial has in the variances; nothing is changed unless it is below 1. */
 static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double t, double h, const double *Z) {
-    int m = NC + (course->slopes ? LANES : 0), na = course->na, pivot[NZ];
-    double J[3][NX * NX], V[3], W[3], W_dot[3], x[NX], gain[NX], matrix[NZ * NZ];
+    int na = course->na;
+    double J[3][NX * NX], V[3], W[3], W_dot[3], x[3][NX], gain[3 * NX];
     double G[NZ * (NC + LANES)] __attribute__((aligned(64))), B[NZ * (NC + LANES)] __attribute__((aligned(64)));
     dual y[NX], f[NX];
+    memset(gain, 0, sizeof gain);
     for (int i = 0; i < 3; i++) {
         imposed(force, t + C[i] * h, &V[i], &W[i], &W_dot[i]);
-        for (int r = 0; r < NX; r++) x[r] = b->x[r] + Z[i * NX + r];
+        for (int r = 0; r < NX; r++) x[i][r] = b->x[r] + Z[i * NX + r];
+        srf_gain(x[i], V[i], W[i], W_dot[i], course->p, gain + i * NX);
+    }
+    int moved_alone = !course->keep && certain(course, b, gain);
+    if (moved_alone && !course->slopes) {
+        for (int r = 0; r < NX; r++) b->x[r] += Z[2 * NX + r];
+        return 0.0;
+    }
+    int nc = moved_alone ? 0 : NC, m = nc + (course->slopes ? LANES : 0);
+    for (int i = 0; i < 3; i++) {
         memset(J[i], 0, sizeof J[i]);
-        memset(gain, 0, sizeof gain);
-        srf_jacobian(x, V[i], W[i], W_dot[i], course->p, J[i]);
-        srf_gain(x, V[i], W[i], W_dot[i], course->p, gain);
+        srf_jacobian(x[i], V[i], W[i], W_dot[i], course->p, J[i]);
         for (int r = 0; r < NX; r++) {
             double *g = G + (i * NX + r) * m;
-            for (int c = 0; c < NX; c++) g[c] = J[i][r * NX + c];
-            for (int k = 0; k < MODES; k++) g[NX + k] = gain[r] * legendre(k, C[i]) / sqrt(h);
+            for (int c = 0; nc && c < NX; c++) g[c] = J[i][r * NX + c];
+            for (int k = 0; nc && k < MODES; k++) g[NX + k] = gain[i * NX + r] * legendre(k, C[i]) / sqrt(h);
         }
         if (course->slopes) {
-            for (int r = 0; r < NX; r++) y[r].v = x[r], y[r].d = b->xd[r];
+            for (int r = 0; r < NX; r++) y[r].v = x[i][r], y[r].d = b->xd[r];
             memset(f, 0, sizeof f);
             srf_d_rates(y, V[i], W[i], W_dot[i], course->q, f);
-            for (int r = 0; r < NX; r++) memcpy(G + (i * NX + r) * m + NC, &f[r].d, sizeof(lanes));
+            for (int r = 0; r < NX; r++) memcpy(G + (i * NX + r) * m + nc, &f[r].d, sizeof(lanes));
         }
     }
-    if (!stage_matrix((const double(*)[NX * NX])J, h, matrix, pivot)) return INFINITY;
+    if (!stage_matrix(&course->matrix, (const double(*)[NX * NX])J, h)) return INFINITY;
     int rows = NX * m;
     for (int i = 0; i < 3; i++)
         for (int r = 0; r < rows; r++) B[i * rows + r] = h * (A[i][0] * G[r] + A[i][1] * G[rows + r] + A[i][2] * G[2 * rows + r]);
-    solve(NZ, matrix, pivot, B, m);
+    solve_stages(&course->matrix, B, m);
+    if (moved_alone) {
+        if (!finite_all(B, NZ * m)) return INFINITY;
+        for (int r = 0; r < NX; r++) {
+            lanes moved;
+            memcpy(&moved, B + (2 * NX + r) * m, sizeof moved);
+            b->x[r] += Z[2 * NX + r];
+            b->xd[r] += moved;
+        }
+        return 0.0;
+    }
     double Phi[NX * NC];
     for (int r = 0; r < NX; r++)
         for (int c = 0; c < NC; c++) Phi[r * NC + c] = B[(2 * NX + r) * m + c] + (r == c ? 1.0 : 0.0);
     if (!finite_all(Phi, NX * NC)) return INFINITY;
     lanes dPhi[NX * NC];
     if (course->slopes) {
+        int felt[NZ], n = 0;                /* rows whose rates have derivatives */
         double K[NX * NZ];
-        answers(matrix, pivot, h, K);
-        memset(dPhi, 0, sizeof dPhi);
+        lanes dG[NZ * NC];
+        answers(&course->matrix, K);
         for (int i = 0; i < 3; i++) {
             dual dJ[NX * NX], dgain[NX];
             for (int r = 0; r < NX; r++) {
@@ -123,21 +156,35 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
                 y[r].v = b->x[r] + Z[i * NX + r];
                 y[r].d = b->xd[r] + moved;
             }
-            memset(dJ, 0, sizeof dJ);
             memset(dgain, 0, sizeof dgain);
             srf_d_jacobian(y, V[i], W[i], W_dot[i], course->q, dJ);
             srf_d_gain(y, V[i], W[i], W_dot[i], course->q, dgain);
-            for (int r = 0; r < NX; r++) {
-                lanes dG[NC];
-                memset(dG, 0, sizeof dG);
-                for (int k = 0; k < MODES; k++) add_scaled(LANES, legendre(k, C[i]) / sqrt(h), &dgain[r].d, dG + NX + k);
-                for (int k = 0; k < NX; k++)
-                    if (nonzero(&dJ[r * NX + k].d))
-                        for (int c = 0; c < NC; c++)
-                            add_scaled(LANES, B[(i * NX + k) * m + c] + (k == c ? 1.0 : 0.0), &dJ[r * NX + k].d, dG + c);
-                for (int s = 0; s < NX; s++) add_scaled(NC * LANES, K[s * NZ + i * NX + r], dG, dPhi + s * NC);
+            for (int r = 0, entry = 0; r < NX; r++) {
+                lanes *out = dG + n * NC;
+                int some = nonzero(&dgain[r].d);
+                memset(out, 0, NC * sizeof *out);
+                for (int k = 0; some && k < MODES; k++) add_scaled(LANES, legendre(k, C[i]) / sqrt(h), &dgain[r].d, out + NX + k);
+                for (; entry < NJ && JACOBIAN[entry] / NX == r; entry++) {
+                    int k = JACOBIAN[entry] % NX;
+                    const lanes *slope = &dJ[JACOBIAN[entry]].d;
+                    if (!nonzero(slope)) continue;
+                    some = 1;
+                    for (int c = 0; c < NC; c++) add_scaled(LANES, B[(i * NX + k) * m + c] + (k == c ? 1.0 : 0.0), slope, out + c);
+                }
+                if (some) felt[n++] = i * NX + r;
             }
         }
+        for (int s = 0; s < NX; s++)
+            for (int c = 0; c < NC; c++) {
+                quad a = {0.0}, b_ = {0.0}, c_ = {0.0}, d = {0.0};
+                for (int k = 0; k < n; k++) {
+                    double g = K[s * NZ + felt[k]];
+                    const quad *from = (const quad *)(dG + k * NC + c);
+                    a += g * from[0], b_ += g * from[1], c_ += g * from[2], d += g * from[3];
+                }
+                quad *to = (quad *)(dPhi + s * NC + c);
+                to[0] = a, to[1] = b_, to[2] = c_, to[3] = d;
+            }
     }
     double M[NX * NA], P[NX * NX];
     lanes dM[NX * NA];
@@ -206,7 +253,7 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
 
 /* carries the belief from a to b, between which all that is imposed is smooth; returns 0 where it stops early */
 static NOINLINE int advance(Imposed *force, Course *course, Belief *belief, double a, double b) {
-    double V, W, W_dot, Z[NZ], Z0[NZ], J[3][NX * NX], J0[NX * NX], f0[NX], carry = 0.0;
+    double V, W, W_dot, Z[NZ], Z0[NZ], J0[NX * NX], f0[NX], carry = 0.0;
     int rejected = 0, unseen = 0, first = course->first;
     Node now;
     now.t = a;
@@ -225,10 +272,10 @@ static NOINLINE int advance(Imposed *force, Course *course, Belief *belief, doub
             if (h < 4.0 * DBL_EPSILON * fmax(fabs(now.t), fabs(b)) && !final && ++unseen > MAX_UNSEEN) return 0;
             if (course->before > 0.0) predict(course->Z, course->before, h, Z0);
             else memset(Z0, 0, sizeof Z0);
-            int newton = stages(force, &now, h, Z0, course->rtol, course->atol, Z, J);
+            int newton = stages(force, &now, h, Z0, course->rtol, course->atol, Z, &course->matrix);
             if (!newton && course->before > 0.0) {
                 memset(Z0, 0, sizeof Z0);
-                newton = stages(force, &now, h, Z0, course->rtol, course->atol, Z, J);
+                newton = stages(force, &now, h, Z0, course->rtol, course->atol, Z, &course->matrix);
             }
             double error = INFINITY;
             if (newton) {
@@ -377,7 +424,7 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
     double values[NP];
     dual q[NP], colour[3 * GAUGE_PROCESSES * SIGNALS], y[NX], one, g[NX];
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values};
-    Course course = {values, q, slopes, ng, NX, order, rtol, longest, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, 0, 0, max_steps, stop};
+    Course course = {values, q, slopes, keep, ng, NX, order, rtol, longest, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
     Belief b;
     int na, segment_ = -1, filled = 0, begins[NA] = {0}; /* 1 + the signal of the process whose first state this is */
     double now = t[0], last = t[0];

@@ -204,8 +204,9 @@ static double between(const Node *from, double h, const double *Z, double rtol, 
 /* S after the step: the linear equations of the stages with their converged Jacobians. A column that nothing feeds during the
    step, as that of a table's number which is not felt there, is only carried on. */
 static NOINLINE int step_sensitivities(History *q, Imposed *force, const Node *from, double h, const double *Z) {
-    int ns = q->ns, na = q->own, pivot[NZ], carried = ns > q->own;
-    double matrix[NZ * NZ], J[3][NX * NX], P[3][NX * NP], x[NX], V, W, W_dot, *B = q->work;
+    int ns = q->ns, na = q->own, carried = ns > q->own;
+    StageMatrix matrix;
+    double J[3][NX * NX], P[3][NX * NP], x[NX], V, W, W_dot, *B = q->work;
     Felt felt[3];
     const double *S = q->S + (size_t)(q->nodes - 1) * NX * ns;
     for (int i = 0; i < 3; i++) {
@@ -247,8 +248,8 @@ static NOINLINE int step_sensitivities(History *q, Imposed *force, const Node *f
     for (int i = 0; i < 3; i++)
         for (size_t r = 0; r < rows; r++)
             B[(size_t)i * rows + r] = h * (A[i][0] * G[r] + A[i][1] * G[rows + r] + A[i][2] * G[2 * rows + r]);
-    if (!stage_matrix((const double(*)[NX * NX])J, h, matrix, pivot)) return 0;
-    solve(NZ, matrix, pivot, B, m);
+    if (!stage_matrix(&matrix, (const double(*)[NX * NX])J, h)) return 0;
+    solve_stages(&matrix, B, m);
     double *after = q->S + (size_t)q->nodes * NX * ns;
     for (int r = 0; r < NX; r++) {
         double *out = after + (size_t)r * ns;
@@ -280,7 +281,7 @@ static double estimate_sensitivities(const History *q, double h, const double *J
             const double *b = B + (size_t)r * q->stride + k;
             e[r * own + k] = (E[0] * b[0] + E[1] * b[rows] + E[2] * b[2 * rows]) / h + F[(size_t)r * ns + k];
         }
-    solve(NX, matrix, pivot, e, own);
+    solve(NX, matrix, pivot, SAME, e, own);
     for (int k = 0; k < own; k++) {
         double sum = 0.0;
         for (int r = 0; r < NX; r++) {
@@ -294,9 +295,11 @@ static double estimate_sensitivities(const History *q, double h, const double *J
 
 /* how long a step Radau IIA would make from a node, tried with h; 0 where Newton's method fails */
 static double implicit_reach(Imposed *force, const Node *from, double h, double rtol, const double *atol) {
-    double V, W, W_dot, Z[NZ], Z0[NZ], J[3][NX * NX], J0[NX * NX];
+    StageMatrix matrix;
+    double V, W, W_dot, Z[NZ], Z0[NZ], J0[NX * NX];
     memset(Z0, 0, sizeof Z0);
-    if (!(h > 0.0) || !stages(force, from, h, Z0, rtol, atol, Z, J)) return 0.0;
+    matrix.h = 0.0;
+    if (!(h > 0.0) || !stages(force, from, h, Z0, rtol, atol, Z, &matrix)) return 0.0;
     imposed(force, from->t, &V, &W, &W_dot);
     memset(J0, 0, sizeof J0);
     srf_jacobian(from->x, V, W, W_dot, force->p, J0);
@@ -308,7 +311,8 @@ static int explicit_steps(Imposed *force, History *q, double b, double rtol, con
 
 /* integrates one smooth segment [a, b], explicitly as far as it is not stiff; returns the next output index, or -1 - (it) where it stopped early */
 static NOINLINE int segment(Imposed *force, History *q, double a, double b, double rtol, const double *atol, double longest, long max_steps, int next, int nt, const double *t, double *X, double *S, double *stats, const volatile int *stop) {
-    double V, W, W_dot, Z[NZ], Z0[NZ], J[3][NX * NX], J0[NX * NX], f0[NX], before = 0.0, last_error = 1.0, last_h = 0.0;
+    StageMatrix matrix;
+    double V, W, W_dot, Z[NZ], Z0[NZ], J0[NX * NX], f0[NX], before = 0.0, last_error = 1.0, last_h = 0.0;
     double carry = 0.0;
     int rejected = 0, first = 1, unseen = 0, handed = 0;
     Node *now = &q->node[0];
@@ -339,10 +343,12 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
         else memset(Z0, 0, sizeof Z0);
         double kept[NZ];
         memcpy(kept, Z, before > 0.0 ? sizeof kept : 0);
-        int newton = stages(force, now, h, Z0, rtol, atol, Z, J);
+        matrix.h = 0.0;
+        int newton = stages(force, now, h, Z0, rtol, atol, Z, &matrix);
         if (!newton && before > 0.0) {
             memset(Z0, 0, sizeof Z0);
-            newton = stages(force, now, h, Z0, rtol, atol, Z, J);
+            matrix.h = 0.0;
+            newton = stages(force, now, h, Z0, rtol, atol, Z, &matrix);
         }
         double error = INFINITY;
         if (newton) {

@@ -2,8 +2,11 @@
 
    Compiled together with a model: NX states, NP parameters, and
      srf_rates(x, V, W, W_dot, p, out[NX])        srf_jacobian(..., out[NX*NX])
+     NJ, JACOBIAN[NJ]                             where its entries may differ from zero
+     PLACE[NX]                                    of each state in the order of elimination
    Method and error estimate: Hairer & Wanner, Solving Ordinary Differential Equations II, IV.8. The stage equations are solved by
-   Newton's method with the Jacobian of each stage. */
+   Newton's method with the Jacobian of each stage. Their matrix is sparse: states that few rates depend on are eliminated first,
+   and a pivot is left on the diagonal unless it is small (Duff, Erisman and Reid, Direct Methods for Sparse Matrices, 1986). */
 
 #include <float.h>
 #include <math.h>
@@ -12,6 +15,8 @@
 
 #define NZ (3 * NX)
 #define MAX_NEWTON 12
+#define ALIKE 0.02                          /* of a step's length, within which the matrix of another is tried for it */
+#define SLOW 0.1                            /* contraction of Newton's method from which such a matrix is renewed */
 #define MAX_UNSEEN 100000                   /* steps shorter than the resolution of t */
 
 static const double C[3] = {0.15505102572168219018, 0.64494897427831780982, 1.0};
@@ -47,11 +52,14 @@ static void imposed(Imposed *f, double t, double *V, double *W, double *W_dot) {
     *V = f->V + f->acceleration * (t - f->since);
 }
 
+#define PIVOT 0.1                           /* of the largest of its column, from which the diagonal is a pivot */
+#define AT(i, r) (3 * PLACE[r] + (i))       /* place of state r of stage i in the stages' matrix */
+
 /* LU with partial pivoting in place, row-major; returns 0 where the matrix is singular */
-static int factor(int n, double *a, int *pivot) {
+static inline int factor(int n, double *a, int *pivot) {
     for (int k = 0; k < n; k++) {
         int best = k;
-        double largest = fabs(a[k * n + k]);
+        double largest = fabs(a[k * n + k]) / PIVOT;
         for (int i = k + 1; i < n; i++)
             if (fabs(a[i * n + k]) > largest) largest = fabs(a[i * n + k]), best = i;
         if (!(largest > 0.0) || !(largest <= DBL_MAX)) return 0;
@@ -64,50 +72,67 @@ static int factor(int n, double *a, int *pivot) {
             }
         double inverse = 1.0 / a[k * n + k];
         for (int i = k + 1; i < n; i++) {
-            double m = a[i * n + k] * inverse;
-            a[i * n + k] = m;
-            if (m != 0.0)
-                for (int j = k + 1; j < n; j++) a[i * n + j] -= m * a[k * n + j];
+            if (a[i * n + k] == 0.0) continue;
+            double m = a[i * n + k] *= inverse;
+            for (int j = k + 1; j < n; j++) a[i * n + j] -= m * a[k * n + j];
         }
     }
     return 1;
 }
 
-/* columns of b (n x m, row-major) are solved in place */
-static void solve(int n, const double *a, const int *pivot, double *b, int m) {
+/* columns of b (n x m, row-major) are solved in place; `row` (n) says which of its rows belongs to each unknown */
+static inline void solve(int n, const double *a, const int *pivot, const int *row, double *b, int m) {
     for (int k = 0; k < n; k++) {
-        if (pivot[k] != k)
+        if (pivot[k] != k) {
+            double *one = b + row[k] * m, *other = b + row[pivot[k]] * m;
             for (int j = 0; j < m; j++) {
-                double swap = b[k * m + j];
-                b[k * m + j] = b[pivot[k] * m + j];
-                b[pivot[k] * m + j] = swap;
+                double swap = one[j];
+                one[j] = other[j];
+                other[j] = swap;
             }
+        }
     }
-    for (int k = 0; k < n; k++)
-        for (int i = k + 1; i < n; i++) {
+    for (int i = 1; i < n; i++)
+        for (int k = 0; k < i; k++) {
             double l = a[i * n + k];
-            if (l != 0.0)
-                for (int j = 0; j < m; j++) b[i * m + j] -= l * b[k * m + j];
+            if (l == 0.0) continue;
+            const double *from = b + row[k] * m;
+            double *to = b + row[i] * m;
+            for (int j = 0; j < m; j++) to[j] -= l * from[j];
         }
-    for (int k = n - 1; k >= 0; k--) {
-        double inverse = 1.0 / a[k * n + k];
-        for (int j = 0; j < m; j++) b[k * m + j] *= inverse;
-        for (int i = 0; i < k; i++) {
+    for (int i = n - 1; i >= 0; i--) {
+        double *to = b + row[i] * m, inverse = 1.0 / a[i * n + i];
+        for (int k = i + 1; k < n; k++) {
             double u = a[i * n + k];
-            if (u != 0.0)
-                for (int j = 0; j < m; j++) b[i * m + j] -= u * b[k * m + j];
+            if (u == 0.0) continue;
+            const double *from = b + row[k] * m;
+            for (int j = 0; j < m; j++) to[j] -= u * from[j];
         }
+        for (int j = 0; j < m; j++) to[j] *= inverse;
     }
 }
 
-/* I - h A (x) J with the Jacobian of each stage */
-static int stage_matrix(const double J[3][NX * NX], double h, double *matrix, int *pivot) {
-    for (int i = 0; i < 3; i++)
-        for (int r = 0; r < NX; r++)
-            for (int j = 0; j < 3; j++)
-                for (int c = 0; c < NX; c++)
-                    matrix[(i * NX + r) * NZ + j * NX + c] = (i == j && r == c ? 1.0 : 0.0) - h * A[i][j] * J[j][r * NX + c];
-    return factor(NZ, matrix, pivot);
+/* LU of I - h A (x) J with the Jacobian of each stage; h is 0 where there is none */
+typedef struct {
+    double a[NZ * NZ], h;
+    int pivot[NZ];
+} StageMatrix;
+
+static int stage_matrix(StageMatrix *m, const double J[3][NX * NX], double h) {
+    memset(m->a, 0, sizeof m->a);
+    for (int k = 0; k < NZ; k++) m->a[k * NZ + k] = 1.0;
+    for (int n = 0; n < NJ; n++) {
+        int r = JACOBIAN[n] / NX, c = JACOBIAN[n] % NX;
+        for (int i = 0; i < 3; i++)
+            for (int j = 0; j < 3; j++) m->a[AT(i, r) * NZ + AT(j, c)] -= h * A[i][j] * J[j][JACOBIAN[n]];
+    }
+    m->h = factor(NZ, m->a, m->pivot) ? h : 0.0;
+    return m->h > 0.0;
+}
+
+/* B (3 x NX x m) is solved in place */
+static NOINLINE void solve_stages(const StageMatrix *matrix, double *B, int m) {
+    solve(NZ, matrix->a, matrix->pivot, ROW, B, m);
 }
 
 static double norm(const double *d, const double *x, double rtol, const double *atol) {
@@ -144,20 +169,26 @@ static double time_after(double t, double h, double b, int final, double *carry)
     return after;
 }
 
-/* one attempt at a step: fills Z; returns the Newton count, 0 where it failed */
-static NOINLINE int stages(Imposed *force, const Node *from, double h, const double *Z0, double rtol, const double *atol, double *Z, double J[3][NX * NX]) {
-    double matrix[NZ * NZ], residual[NZ], F[3][NX], x[NX], V[3], W[3], W_dot[3];
-    int pivot[NZ];
-    double last = 0.0;
-    memcpy(Z, Z0, NZ * sizeof(double));
+/* the stages' matrix at the increments Z, with loads and drive of the stages; returns 0 where it is none */
+static int linearised(StageMatrix *matrix, const Node *from, double h, const double *Z, const double *V, const double *W, const double *W_dot, const double *p) {
+    double J[3][NX * NX], x[NX];
     for (int i = 0; i < 3; i++) {
-        imposed(force, from->t + C[i] * h, &V[i], &W[i], &W_dot[i]);
         for (int r = 0; r < NX; r++) x[r] = from->x[r] + Z[i * NX + r];
         memset(J[i], 0, sizeof J[i]);
-        srf_jacobian(x, V[i], W[i], W_dot[i], force->p, J[i]);
+        srf_jacobian(x, V[i], W[i], W_dot[i], p, J[i]);
         if (!finite_all(J[i], NX * NX)) return 0;
     }
-    if (!stage_matrix((const double(*)[NX * NX])J, h, matrix, pivot)) return 0;
+    return stage_matrix(matrix, (const double(*)[NX * NX])J, h);
+}
+
+/* One attempt at a step: fills Z; returns the Newton count, 0 where it failed. `matrix` is taken as it is where it belongs to about
+   this h, and renewed where Newton's method is slow with it. */
+static NOINLINE int stages(Imposed *force, const Node *from, double h, const double *Z0, double rtol, const double *atol, double *Z, StageMatrix *matrix) {
+    double residual[NZ], F[3][NX], x[NX], V[3], W[3], W_dot[3], last = 0.0;
+    int fresh = !(fabs(matrix->h - h) <= ALIKE * h);
+    memcpy(Z, Z0, NZ * sizeof(double));
+    for (int i = 0; i < 3; i++) imposed(force, from->t + C[i] * h, &V[i], &W[i], &W_dot[i]);
+    if (fresh && !linearised(matrix, from, h, Z, V, W, W_dot, force->p)) return 0;
     for (int newton = 1; newton <= MAX_NEWTON; newton++) {
         for (int i = 0; i < 3; i++) {
             for (int r = 0; r < NX; r++) x[r] = from->x[r] + Z[i * NX + r];
@@ -167,17 +198,28 @@ static NOINLINE int stages(Imposed *force, const Node *from, double h, const dou
         for (int i = 0; i < 3; i++)
             for (int r = 0; r < NX; r++)
                 residual[i * NX + r] = h * (A[i][0] * F[0][r] + A[i][1] * F[1][r] + A[i][2] * F[2][r]) - Z[i * NX + r];
-        if (!finite_all(residual, NZ)) return 0;
-        solve(NZ, matrix, pivot, residual, 1);
-        double size = 0.0;
-        for (int i = 0; i < 3; i++) {
-            double e = norm(residual + i * NX, from->x, rtol, atol);
-            size = e > size ? e : size;
+        int finite = finite_all(residual, NZ);
+        double size = 0.0, rate = INFINITY;
+        if (finite) {
+            solve(NZ, matrix->a, matrix->pivot, ROW, residual, 1);
+            for (int i = 0; i < 3; i++) {
+                double e = norm(residual + i * NX, from->x, rtol, atol);
+                size = e > size ? e : size;
+            }
+            rate = newton > 1 ? size / last : 0.0;
         }
+        if (!fresh && rate > SLOW) { /* from the start: what was gone may lead astray */
+            memcpy(Z, Z0, NZ * sizeof(double));
+            if (!linearised(matrix, from, h, Z, V, W, W_dot, force->p)) return 0;
+            fresh = 1;
+            newton = 0;
+            continue;
+        }
+        if (!finite) return 0;
         for (int k = 0; k < NZ; k++) Z[k] += residual[k];
-        double rate = newton > 1 ? size / last : 0.0;
-        if (newton > 1 && rate >= 1.0 && size > 1e-3) return 0;
-        if (size <= 1e-3 || (newton > 1 && rate < 1.0 && size * rate / (1.0 - rate) <= 1e-3)) return newton;
+        double enough = fresh ? 1e-3 : 1e-4;  /* of the tolerance */
+        if (newton > 1 && rate >= 1.0 && size > enough) return 0;
+        if (size <= enough || (newton > 1 && rate < 1.0 && size * rate / (1.0 - rate) <= enough)) return newton;
         last = size;
     }
     return 0;
@@ -193,7 +235,7 @@ static double estimate(Imposed *force, const Node *from, const double *f0, doubl
         e[r] = known[r] + f0[r];
     }
     if (!factor(NX, matrix, pivot)) return INFINITY;
-    solve(NX, matrix, pivot, e, 1);
+    solve(NX, matrix, pivot, SAME, e, 1);
     double size = norm(e, from->x, rtol, atol);
     if (size >= 1.0 && cautious) {
         imposed(force, from->t, &V, &W, &W_dot);
@@ -202,7 +244,7 @@ static double estimate(Imposed *force, const Node *from, const double *f0, doubl
         srf_rates(x, V, W, W_dot, force->p, f);
         for (int r = 0; r < NX; r++) e[r] = known[r] + f[r];
         if (finite_all(e, NX)) {
-            solve(NX, matrix, pivot, e, 1);
+            solve(NX, matrix, pivot, SAME, e, 1);
             size = norm(e, from->x, rtol, atol);
         }
     }

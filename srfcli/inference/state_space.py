@@ -1462,17 +1462,20 @@ def _with_or_without(
 
 
 def _small_field(rough: Likelihood, bare: Point) -> Point | None:
-    """Return where a few steps lead from the likeliest of a few small fields beside a fit, None where that gains too little."""
-    best: tuple[float, Array] = (-np.inf, bare.x)
-    for share in FAINT_FIELDS:
-        for short in SHORT:
-            x = _under_field(rough, rough.coordinates(bare.values), share * FAINT, short)
-            found = rough.at(x, slopes=False).log_likelihood
-            if found > best[0]:
-                best = found, x
-    if not np.isfinite(best[0]):
+    """Return where a few steps lead from the likeliest of a few small fields beside a fit, None where that gains too little.
+
+    The likeliest amplitude is taken at the middle length, and then the likeliest length.
+    """
+    x, middle = rough.coordinates(bare.values), len(SHORT) // 2
+
+    def tried(share: float, short: float) -> tuple[float, float, float]:
+        return rough.at(_under_field(rough, x, share * FAINT, short), slopes=False).log_likelihood, share, short
+
+    likeliest = max(tried(share, SHORT[middle]) for share in FAINT_FIELDS)
+    height, share, short = max(likeliest, *(tried(likeliest[1], s) for s in (*SHORT[:middle], *SHORT[middle + 1 :])))
+    if not np.isfinite(height):
         return None
-    point = maximise(rough, best[1], steps=FIELD_STEPS, widths=()).point
+    point = maximise(rough, _under_field(rough, x, share * FAINT, short), steps=FIELD_STEPS, widths=()).point
     return point if point.log_likelihood > bare.log_likelihood + NEEDED else None
 
 
