@@ -150,6 +150,7 @@ class ModelSearch:
         self.queue: list[_Move] = []
         self.count = 0
         self.processes: tuple[str, ...] = ()
+        self._tried: dict[str, Array] = {}  # from where each other ageing law was tried last
 
     # ------------------------------------------------------------------ models and their fits
 
@@ -528,18 +529,22 @@ class ModelSearch:
 
         The one that promises most goes on from there: a law that is right lies further from the stated one than a step tells.
         """
+        best = self.best()
         stated, *modifiers = self.experiment.choice.ageing.split("+")
         reached: list[tuple[float, Hypothesis, Likelihood, Maximum]] = []
         for name in self.laws:
             hypothesis = Hypothesis((), "+".join([name, *modifiers]))
-            if name == stated or hypothesis == self.best().hypothesis:
+            if name == stated or hypothesis == best.hypothesis:
                 continue
             likelihood = self._likelihood(hypothesis, node, name)
             if likelihood is None:
                 continue
-            starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in (node, self.best())]
+            starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in (node, best)]
             heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts]
             x = starts[int(np.argmax(heights))]
+            if np.array_equal(x, self._tried.get(name)):  # with what came of it in the queue
+                continue
+            self._tried[name] = x
             found = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
             if not (np.isfinite(found.away) and found.point.log_likelihood > node.fit.log_likelihood - ASTRAY):
                 continue

@@ -738,6 +738,7 @@ def maximise(
         return Maximum(point, np.inf, Status.INTEGRATION, np.full((x.size, x.size), np.nan))
     away, sure, slow, more, left = np.inf, True, 0, np.zeros((x.size, x.size)), [*(WIDTHS if widths is None else widths), 0.0]
     winding = False  # whether straight steps go to and fro, as along a ridge that bends
+    trail: list[Array] = []  # where the last steps led
     for _ in range(steps):
         low, high = point.x <= likelihood.lower, point.x >= likelihood.upper
         while True:
@@ -760,6 +761,7 @@ def maximise(
         progress(f"log likelihood {point.log_likelihood:.1f}, {away:.2g} standard errors from the maximum{within}")
         if not width and (away < close or slow == 2):
             break
+        bent = winding
         while damping < 1e8:
             x = point.x.copy()
             move = directions @ (steep / (size + damping)) / d
@@ -781,11 +783,15 @@ def maximise(
                 last, point, sure = point, trial, share > 0.25
                 more = more if width else _curvature_beyond(last, point)
                 winding = winding or share < 0.5
+                if not width and gain < 1.0:
+                    point = _farther(likelihood, point, trail)
+                trail = [*trail[-1:], point.x]
                 slow = slow + 1 if gain < (1.0 if width else close**2 / 8) else 0
                 break
-            winding = True
-            least = 1e-3 if width else 1e-6  # a step that bends needs little damping
-            damping, sure = max(10 * damping, least), False  # what may fail is tried without derivatives: a quarter of the work
+            sure = False  # what may fail is tried without derivatives: a quarter of the work
+            if bent or width:
+                damping = max(10 * damping, 1e-3 if width else 1e-6)
+            winding = bent = True  # the step is tried bent before it is tried shorter
         else:
             if not width:
                 break
@@ -795,6 +801,23 @@ def maximise(
     covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound)[0]
     covariance[np.ix_(inner, inner)] = inverse(point.information[np.ix_(inner, inner)])
     return Maximum(point, away, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE, covariance)
+
+
+def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Point:
+    """Return the likeliest point on the way from the last but one of the points before, 2, 4, 8 times as far; else the point.
+
+    Steps that go to and fro across a ridge lead along it two by two: the pattern move of Hooke and Jeeves, J. ACM 8 (1961).
+    """
+    if len(trail) < 2:
+        return point
+    best, x = point.log_likelihood, point.x
+    for factor in 2.0 ** np.arange(1, 6):
+        y = np.clip(trail[0] + factor * (point.x - trail[0]), likelihood.lower, likelihood.upper)
+        found = likelihood.at(y, slopes=False, like=point).log_likelihood
+        if not found > best:
+            break
+        best, x = found, y
+    return point if x is point.x else likelihood.at(x)
 
 
 def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -> tuple[Array, Array, list[Array]]:
@@ -1164,14 +1187,16 @@ def _fitted(
     best = StateSpaceFit(wide, found, wide.evaluations)
     if found.status is Status.INTEGRATION:
         return best
-    walked = fresh and found.away < 1.0
-    if walked:
-        best = StateSpaceFit(wide, _along_ridges(wide, found, 1.0, progress), wide.evaluations)
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
-    best = _with_colour(best, likelihood, progress, cautious) if processes is None else best
+    best = first = _with_colour(best, likelihood, progress, cautious) if processes is None else best
+    walked = fresh and best.maximum.away < 1.0
+    if walked:
+        own = best.likelihood
+        best = StateSpaceFit(own, _along_ridges(own, best.maximum, 1.0, progress), own.evaluations)
     best = _with_or_without(best, smooth, likelihood, close, progress)
     if thorough and processes is None:
-        wider = _with_colour(best, likelihood, progress, cautious)
+        moved = best.smooth or best.log_likelihood > first.log_likelihood + NEEDED
+        wider = _with_colour(best, likelihood, progress, cautious) if moved else best
         grown = len(wider.likelihood.processes) > len(best.likelihood.processes)
         best = _with_or_without(wider, smooth, likelihood, close, progress) if grown else wider
         known = best.likelihood.processes
