@@ -15,8 +15,8 @@ import contextlib
 import ctypes
 import importlib.util
 import os
-import re
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -319,10 +319,16 @@ def filter_source(model: GeneratedModel) -> str:
 
 @cache
 def compiler() -> tuple[str, ...] | None:
-    """Return the command of the C compiler: SRF_CC, CC, cc, gcc, clang or the package ziglang; None where there is none."""
+    """Return the command of the C compiler: SRF_CC, CC, cc, gcc, clang or the package ziglang; None where there is none.
+
+    Raises SrfError where SRF_CC names a program that there is not.
+    """
     named = os.environ.get("SRF_CC")
     if named is not None:
-        return tuple(shlex.split(named)) or None
+        command = tuple(shlex.split(named))
+        if command and not shutil.which(command[0]):
+            raise SrfError(f"SRF_CC: there is no program {command[0]}", "Name a C compiler, or unset SRF_CC.")
+        return command or None
     for candidate in (os.environ.get("CC", ""), "cc", "gcc", "clang"):
         words = shlex.split(candidate)
         if words and shutil.which(words[0]):

@@ -542,7 +542,7 @@ class ModelSearch:
             starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in (node, best)]
             heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts]
             x = starts[int(np.argmax(heights))]
-            if np.array_equal(x, self._tried.get(name)):  # with what came of it in the queue
+            if np.array_equal(x, self._tried.get(name, ())):  # with what came of it in the queue
                 continue
             self._tried[name] = x
             found = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)

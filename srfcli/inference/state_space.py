@@ -1191,8 +1191,9 @@ def _fitted(
     best = first = _with_colour(best, likelihood, progress, cautious) if processes is None else best
     walked = fresh and best.maximum.away < 1.0
     if walked:
-        own = best.likelihood
-        best = StateSpaceFit(own, _along_ridges(own, best.maximum, 1.0, progress), own.evaluations)
+        under, before = best.likelihood, best.likelihood.evaluations
+        likelier = _along_ridges(under, best.maximum, 1.0, progress)
+        best = replace(best, maximum=likelier, evaluations=best.evaluations + under.evaluations - before)
     best = _with_or_without(best, smooth, likelihood, close, progress)
     if thorough and processes is None:
         moved = best.smooth or best.log_likelihood > first.log_likelihood + NEEDED
@@ -1500,8 +1501,14 @@ def _small_field(rough: Likelihood, bare: Point) -> Point | None:
     height, share, short = max(likeliest, *(tried(likeliest[1], s) for s in (*SHORT[:middle], *SHORT[middle + 1 :])))
     if not np.isfinite(height):
         return None
-    point = maximise(rough, _under_field(rough, x, share * FAINT, short), steps=FIELD_STEPS, widths=()).point
-    return point if point.log_likelihood > bare.log_likelihood + NEEDED else None
+    x, least = _under_field(rough, x, share * FAINT, short), bare.log_likelihood + NEEDED
+    for _ in range(FIELD_STEPS // 2):
+        found = maximise(rough, x, steps=2, widths=())
+        promised = found.point.log_likelihood + 0.5 * found.away**2
+        if promised < least or found.away < CONVERGED or np.array_equal(found.point.x, x):
+            break
+        x = found.point.x
+    return found.point if found.point.log_likelihood > least else None
 
 
 def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
