@@ -12,7 +12,7 @@
 #define MODES 3                             /* of white noise in a step; as many as stages can tell apart */
 #define NA (NX + 2 * GAUGE_PROCESSES * SIGNALS) /* states with those of gauge noise, at most; matrices are laid out for those there are */
 #define NC (NX + MODES)
-typedef double quad __attribute__((vector_size(32), may_alias));
+typedef double quad __attribute__((vector_size(32), may_alias)); /* wider vectors are taken apart in memory; LANES is a multiple of 16 */
 #define GAUGE -1
 #define SPRING -2
 #define NO_VARIANCE 1e150                   /* a variance that is none any more */
@@ -175,16 +175,16 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
             }
         }
         for (int s = 0; s < NX; s++)
-            for (int c = 0; c < NC; c++) {
-                quad a = {0.0}, b_ = {0.0}, c_ = {0.0}, d = {0.0};
-                for (int k = 0; k < n; k++) {
-                    double g = K[s * NZ + felt[k]];
-                    const quad *from = (const quad *)(dG + k * NC + c);
-                    a += g * from[0], b_ += g * from[1], c_ += g * from[2], d += g * from[3];
+            for (int c = 0; c < NC; c++)
+                for (int l = 0; l < LANES / 4; l += 4) { /* four sums at a time stay in registers */
+                    quad first = {0.0}, second = {0.0}, third = {0.0}, fourth = {0.0}, *to = (quad *)(dPhi + s * NC + c) + l;
+                    for (int k = 0; k < n; k++) {
+                        double g = K[s * NZ + felt[k]];
+                        const quad *from = (const quad *)(dG + k * NC + c) + l;
+                        first += g * from[0], second += g * from[1], third += g * from[2], fourth += g * from[3];
+                    }
+                    to[0] = first, to[1] = second, to[2] = third, to[3] = fourth;
                 }
-                quad *to = (quad *)(dPhi + s * NC + c);
-                to[0] = a, to[1] = b_, to[2] = c_, to[3] = d;
-            }
     }
     double M[NX * NA], P[NX * NX];
     lanes dM[NX * NA];
