@@ -160,9 +160,13 @@ class Remainder:
         root = np.linalg.cholesky((1 + r) * np.exp(-r) + 1e-9 * np.eye(count))
         hat = Shape("slip", lambda s, k: np.interp(s, nodes, np.arange(count) == k), ("node",))
         columns = self.padded([_carried(f, self.fitted, [(hat, [k]) for k in range(count)]) for f in self.runs])
-        u, size, _ = np.linalg.svd(self.free(columns @ root), full_matrices=False)
+        columns = self.free(columns @ root)
+        power, directions = np.linalg.eigh(columns.T @ columns)
+        known = power > 1e-12 * power[-1]
+        size = np.sqrt(power[known])
+        u = columns @ (directions[:, known] / size)
         left = u.T @ self.left
-        best = SharedField(u, np.zeros(count), left, 0.0)
+        best = SharedField(u, np.zeros(size.size), left, 0.0)
         for amplitude in values["field_amplitude"] * np.geomspace(0.01, 3.0, 30):
             power = (amplitude * size) ** 2
             gain = 0.5 * float(np.sum(left**2 * power / (1 + power) - np.log1p(power)))
@@ -521,18 +525,19 @@ def _carried(
             if by_V is None:
                 by_V = _rates_by_V(model, fitted, run, kept.mean[:, : len(states)])
             inputs[1:, : len(states), j] = 0.5 * (by_V[1:] + by_V[:-1]) * total[:, None]
-    signals = len(run.signals)
-    c, out = np.zeros((a, inputs.shape[2])), np.zeros((every.nu.size, inputs.shape[2]))
-    for k in range(every.nu.size):
-        if k % signals == 0:
-            at_sample = k // signals
-            c = every.kept.transition[k] @ c + inputs[at_sample] if k else inputs[0].copy()
-        seen = every.kept.gradient[k] @ c
-        if late and k % signals == 0:  # a delay is that of the first signal's gauge
-            seen[-1] += shown[at_sample]
-        out[k] = seen
-        if f.taken[k]:
-            c -= np.outer(every.kept.covariance[k] @ every.kept.gradient[k] / every.S[k], seen)
+    signals, known = len(run.signals), every.kept
+    gain = np.where(f.taken, 1 / every.S, 0.0)[:, None] * np.einsum("kij,kj->ki", known.covariance, known.gradient)
+    lost = np.einsum("kij,kj->ki", known.transition[1:], gain[:-1])  # of what a reading shows, by the next one
+    through = known.transition.copy()
+    through[1:] -= lost[:, :, None] * known.gradient[:-1, None, :]
+    moved = np.zeros((every.nu.size, a, inputs.shape[2]))  # the states expected, of each column
+    moved[::signals] = inputs
+    if late:  # a delay is that of the first signal's gauge
+        moved[1::signals, :, -1] -= (lost * np.repeat(shown, signals)[:-1, None])[::signals]
+    for k in range(1, len(moved)):
+        moved[k] += through[k] @ moved[k - 1]
+    out = np.einsum("ka,kaq->kq", known.gradient, moved)
+    out[::signals, -1] += shown if late else 0.0
     white = out[f.used] / np.sqrt(every.S[f.used])[:, None]
     return _stacked(white, np.zeros_like(white))
 
