@@ -146,6 +146,8 @@ def test_a_run_is_cut_between_its_steps(ladder, tmp_path):
     assert [line.split(",")[0] for line in done.stdout.splitlines()[1:]] == [f"simulated-{k}" for k in (1, 2, 3)]
     done = CliRunner().invoke(cli, ["fit", str(own), "--track", "smooth", "--csv"])
     assert "mu0[simulated-3]" in done.stdout
+    done = CliRunner().invoke(cli, ["fit", str(ladder), "--track", "shared"])
+    assert done.exit_code == 2 and "for several runs" in done.stderr
 
 
 def test_steps_up_and_down_and_strokes_are_groups(ladder, tmp_path):

@@ -70,3 +70,12 @@ def test_who_asks_for_none_is_told_nothing(tmp_path: Path, monkeypatch: pytest.M
         check=False,
     )  # fmt: skip
     assert done.returncode == 0 and "Warning" not in done.stderr
+
+
+def test_a_program_that_is_none_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SRF_CC", "/no/such/cc -O1")
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, "simulate", "--drive", "0.1:10", "--W0", "5"], cwd=tmp_path, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 2 and "SRF_CC: there is no program /no/such/cc" in done.stderr
