@@ -130,7 +130,9 @@ def fit_recordings(
         raise SrfError("`track` shared does not go with critical loads", "Leave it out, or name rough.")
     problem = fit_problem(model, experiment, free=free, trend=trend, stability=stability)
     if track == "shared" and len(problem.runs) < 2:
-        raise SrfError(f"`track` shared is for several runs, and {experiment.path} has one to fit", "Name rough, or leave it out.")
+        raise SrfError(
+            f"`track` shared is for several runs, and {experiment.path} has one to fit", "Name rough, or leave it out."
+        )
     smooth = None if track is None else track == "smooth"
     try:
         several = fit_from_several(problem, smooth=smooth, count=starts, seed=seed, progress=progress)

@@ -784,7 +784,8 @@ def maximise(
                 more = more if width else _curvature_beyond(last, point)
                 winding = winding or share < 0.5
                 if not width and gain < 1.0:
-                    point = _farther(likelihood, point, trail)
+                    point = _farther(likelihood, trial, trail)
+                    gain += point.log_likelihood - trial.log_likelihood
                 trail = [*trail[-1:], point.x]
                 slow = slow + 1 if gain < (1.0 if width else close**2 / 8) else 0
                 break
@@ -817,7 +818,8 @@ def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Po
         if not found > best:
             break
         best, x = found, y
-    return point if x is point.x else likelihood.at(x)
+    found = point if x is point.x else likelihood.at(x)
+    return max(point, found, key=lambda p: p.log_likelihood)
 
 
 def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -> tuple[Array, Array, list[Array]]:
