@@ -818,8 +818,8 @@ def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Po
         if not found > best:
             break
         best, x = found, y
-    found = point if x is point.x else likelihood.at(x)
-    return max(point, found, key=lambda p: p.log_likelihood)
+    farthest = point if x is point.x else likelihood.at(x)
+    return farthest if farthest.log_likelihood > point.log_likelihood else point
 
 
 def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -> tuple[Array, Array, list[Array]]:
