@@ -63,19 +63,18 @@ def test_boundaries_need_none(tmp_path: Path) -> None:
     assert values[0] == pytest.approx(10.141263156, rel=1e-7) and values[0] == pytest.approx(values[1], rel=1e-8)
 
 
+def simulated(named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> subprocess.CompletedProcess[str]:
+    """Return a simulation with the compiler that SRF_CC names."""
+    monkeypatch.setenv("SRF_CC", named)
+    words = ["simulate", "--drive", "0.1:10", "--W0", "5"]
+    return subprocess.run([sys.executable, "-c", RUN, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+
+
 def test_who_asks_for_none_is_told_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SRF_CC", "")
-    done = subprocess.run(
-        [sys.executable, "-c", RUN, "simulate", "--drive", "0.1:10", "--W0", "5"], cwd=tmp_path, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
+    done = simulated("", tmp_path, monkeypatch)
     assert done.returncode == 0 and "Warning" not in done.stderr
 
 
 def test_a_program_that_is_none_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SRF_CC", "/no/such/cc -O1")
-    done = subprocess.run(
-        [sys.executable, "-c", RUN, "simulate", "--drive", "0.1:10", "--W0", "5"], cwd=tmp_path, capture_output=True, text=True,
-        check=False,
-    )  # fmt: skip
+    done = simulated("/no/such/cc -O1", tmp_path, monkeypatch)
     assert done.returncode == 2 and "SRF_CC: there is no program /no/such/cc" in done.stderr

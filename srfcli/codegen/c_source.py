@@ -250,8 +250,9 @@ def _step_source(model: GeneratedModel) -> str:
         functions = FUNCTIONS | TABLE_FUNCTIONS
     text += _own("lambertw.c") if "lambertw(" in model.source else ""
     text += _own("tables.c") if tables else ""
-    parts = {name: c_function(model.source, name, label=label) for name, label in functions.items()}
-    return text + "\n".join(parts.values()) + _elimination(len(model.states), parts["rates_jacobian"]) + _own("radau.c")
+    written = {name: c_function(model.source, name, label=label) for name, label in functions.items()}
+    text += "\n".join(written.values()) + _elimination(len(model.states), written["rates_jacobian"])
+    return text + _own("lu.c") + _own("radau.c")
 
 
 def _elimination(states: int, jacobian: str) -> str:
@@ -262,8 +263,7 @@ def _elimination(states: int, jacobian: str) -> str:
     tables = {
         "JACOBIAN": entries or [0],
         "PLACE": [order.index(r) for r in range(states)],
-        "ROW": [i * states + r for r in order for i in range(3)],
-        "SAME": [*range(states)],
+        "ROWS": [i * states + r for r in order for i in range(3)],
     }
     text = f"#define NJ {len(entries)}\n"
     for name, numbers in tables.items():
@@ -300,7 +300,7 @@ def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_
     }
     for table, (head, before, after) in forms.items():
         text += f"{head} {{\n{before}    switch (which) {{\n{calls[table]}    }}\n{after}}}\n"
-    return text + _own("orbit.c")
+    return text + _own("lu.c") + _own("orbit.c")
 
 
 def filter_source(model: GeneratedModel) -> str:

@@ -89,6 +89,18 @@ static int certain(const Course *course, const Belief *b, const double *gain) {
     return !some;
 }
 
+/* the mean across a step, and its derivatives by what the stages answer to them, of `B` (3, NX, m) from column `at` on */
+static void move_mean(const Course *course, Belief *b, const double *Z, const double *B, int m, int at) {
+    for (int r = 0; r < NX; r++) {
+        b->x[r] += Z[2 * NX + r];
+        if (course->slopes) {
+            lanes moved;
+            memcpy(&moved, B + (2 * NX + r) * m + at, sizeof moved);
+            b->xd[r] += moved;
+        }
+    }
+}
+
 /* Covariance and tangents across one step whose stages are solved; the mean is moved too. Returns the error of the covariance
    over what is allowed, by the share that the last polynomial has in the variances; nothing is changed unless it is below 1. */
 static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double t, double h, const double *Z) {
@@ -102,12 +114,11 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
         for (int r = 0; r < NX; r++) x[i][r] = b->x[r] + Z[i * NX + r];
         srf_gain(x[i], V[i], W[i], W_dot[i], course->p, gain + i * NX);
     }
-    int moved_alone = !course->keep && certain(course, b, gain);
-    if (moved_alone && !course->slopes) {
-        for (int r = 0; r < NX; r++) b->x[r] += Z[2 * NX + r];
+    int nc = course->keep || !certain(course, b, gain) ? NC : 0, m = nc + (course->slopes ? LANES : 0);
+    if (!m) {
+        move_mean(course, b, Z, NULL, 0, 0);
         return 0.0;
     }
-    int nc = moved_alone ? 0 : NC, m = nc + (course->slopes ? LANES : 0);
     for (int i = 0; i < 3; i++) {
         memset(J[i], 0, sizeof J[i]);
         srf_jacobian(x[i], V[i], W[i], W_dot[i], course->p, J[i]);
@@ -128,14 +139,9 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
     for (int i = 0; i < 3; i++)
         for (int r = 0; r < rows; r++) B[i * rows + r] = h * (A[i][0] * G[r] + A[i][1] * G[rows + r] + A[i][2] * G[2 * rows + r]);
     solve_stages(&course->matrix, B, m);
-    if (moved_alone) {
+    if (!nc) {
         if (!finite_all(B, NZ * m)) return INFINITY;
-        for (int r = 0; r < NX; r++) {
-            lanes moved;
-            memcpy(&moved, B + (2 * NX + r) * m, sizeof moved);
-            b->x[r] += Z[2 * NX + r];
-            b->xd[r] += moved;
-        }
+        move_mean(course, b, Z, B, m, 0);
         return 0.0;
     }
     double Phi[NX * NC];
@@ -218,15 +224,8 @@ static NOINLINE double moments(Imposed *force, Course *course, Belief *b, double
     }
     double error = pow(share, 0.8); /* of order 5 in h where the controller takes 4 */
     if (!(error < 1.0)) return error;
-    for (int r = 0; r < NX; r++) {
-        b->x[r] += Z[2 * NX + r];
-        if (course->slopes) {
-            lanes moved;
-            memcpy(&moved, B + (2 * NX + r) * m + NC, sizeof moved);
-            b->xd[r] += moved;
-        }
-        memcpy(b->T + r * na, G + r * na, na * sizeof(double));
-    }
+    move_mean(course, b, Z, B, m, NC);
+    for (int r = 0; r < NX; r++) memcpy(b->T + r * na, G + r * na, na * sizeof(double));
     for (int r = 0; r < NX; r++) {
         for (int c = NX; c < na; c++) {
             b->P[r * na + c] = b->P[c * na + r] = M[r * na + c];

@@ -272,16 +272,14 @@ static double estimate_sensitivities(const History *q, double h, const double *J
     size_t size = (size_t)NX * ns, rows = (size_t)NX * q->stride;
     double matrix[NX * NX], worst = 0.0, *B = q->work, *e = B + 3 * rows;
     const double *S = q->S + (q->nodes - 1) * size, *F = q->Sf_now;
-    for (int r = 0; r < NX; r++)
-        for (int c = 0; c < NX; c++) matrix[r * NX + c] = (r == c ? U1 / h : 0.0) - J0[r * NX + c];
     if (!own) return 0.0;
-    if (!factor(NX, matrix, pivot)) return INFINITY;
+    if (!estimate_matrix(J0, h, matrix, pivot)) return INFINITY;
     for (int r = 0; r < NX; r++)
         for (int k = 0; k < own; k++) {
             const double *b = B + (size_t)r * q->stride + k;
             e[r * own + k] = (E[0] * b[0] + E[1] * b[rows] + E[2] * b[2 * rows]) / h + F[(size_t)r * ns + k];
         }
-    solve(NX, matrix, pivot, SAME, e, own);
+    filter_estimate(matrix, pivot, e, own);
     for (int k = 0; k < own; k++) {
         double sum = 0.0;
         for (int r = 0; r < NX; r++) {

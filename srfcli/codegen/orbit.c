@@ -1,21 +1,16 @@
 /* Newton's equations of periodic orbits: Gauss collocation over one forcing period, condensed interval by interval.
 
    The same equations, in the same order, as numerics/collocation.py and numerics/boundary.py, which hold where there is no
-   compiler. Compiled together with a model: NX states, NP parameters, MS Gauss points, LOGS, LOG_STEP, and
+   compiler. Compiled together with lu.c and a model: NX states, NP parameters, MS Gauss points, LOGS, LOG_STEP, and
      srf_cycle(tau, x, p, out[NX])                    srf_cycle_jacobian(tau, x, p, out[NX*NX])
      srf_cycle_parameter(which, tau, x, p, out[NX])
      srf_bilinear(tau, x, p, w, a, out[NX])           srf_bilinear_parameter(which, tau, x, p, w, a)
    MI is the inverse of the collocation matrix, STEP the weights of x_1 = x_0 + STEP . (X - x_0).
    Arrays are row-major, batches of parameter points first; p is (points, NP). */
 
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
-
 #define S (MS * NX)
 #define PAD (8 * ((NX + 3 + 7) / 8)) /* columns of the right side, room for two parameters among them */
 #define T (S + PAD)
-#define THRESHOLD 0.1 /* of a column's largest entry: a diagonal entry above it is the pivot */
 
 #ifdef _WIN32
 #define EXPORT __declspec(dllexport)
@@ -23,62 +18,8 @@
 #define EXPORT
 #endif
 
-/* LU with partial pivoting in place; returns 0 where the matrix is singular or not finite */
-static int orbit_factor(int n, double *a, int *pivot) {
-    for (int k = 0; k < n; k++) {
-        int best = k;
-        double largest = fabs(a[k * n + k]);
-        for (int i = k + 1; i < n; i++)
-            if (fabs(a[i * n + k]) > largest) {
-                largest = fabs(a[i * n + k]);
-                best = i;
-            }
-        pivot[k] = best;
-        if (!(largest > 0.0) || !isfinite(largest)) return 0;
-        if (best != k)
-            for (int j = 0; j < n; j++) {
-                double t = a[k * n + j];
-                a[k * n + j] = a[best * n + j];
-                a[best * n + j] = t;
-            }
-        double inverse = 1.0 / a[k * n + k];
-        for (int i = k + 1; i < n; i++) {
-            double f = a[i * n + k] *= inverse;
-            if (f != 0.0)
-                for (int j = k + 1; j < n; j++) a[i * n + j] -= f * a[k * n + j];
-        }
-    }
-    return 1;
-}
-
-/* b := a^-1 b for w columns */
-static void orbit_solve(int n, int w, const double *a, const int *pivot, double *b) {
-    for (int k = 0; k < n; k++)
-        if (pivot[k] != k)
-            for (int j = 0; j < w; j++) {
-                double t = b[k * w + j];
-                b[k * w + j] = b[pivot[k] * w + j];
-                b[pivot[k] * w + j] = t;
-            }
-    for (int i = 1; i < n; i++)
-        for (int k = 0; k < i; k++) {
-            double f = a[i * n + k];
-            if (f != 0.0)
-                for (int j = 0; j < w; j++) b[i * w + j] -= f * b[k * w + j];
-        }
-    for (int i = n - 1; i >= 0; i--) {
-        for (int k = i + 1; k < n; k++) {
-            double f = a[i * n + k];
-            if (f != 0.0)
-                for (int j = 0; j < w; j++) b[i * w + j] -= f * b[k * w + j];
-        }
-        double inverse = 1.0 / a[i * n + i];
-        for (int j = 0; j < w; j++) b[i * w + j] *= inverse;
-    }
-}
-
 /* b := a^-T b for two columns */
-static void orbit_solve_transposed(int n, const double *a, const int *pivot, double *b) {
+static void solve_transposed(int n, const double *a, const int *pivot, double *b) {
     for (int i = 0; i < n; i++) {
         double inverse = 1.0 / a[i * n + i], re = b[2 * i] * inverse, im = b[2 * i + 1] * inverse;
         b[2 * i] = re;
@@ -180,7 +121,7 @@ static int interval(double h, const double *tau, const double *p, const double *
     for (int c = PAD; c < w; c++) {
         double column[S];
         for (int s = 0; s < S; s++) column[s] = local[s * w + c];
-        orbit_solve(S, 1, lu, pivot, column);
+        solve(S, lu, pivot, NULL, column, 1);
         for (int s = 0; s < S; s++) local[s * w + c] = column[s];
     }
     double rest = 1.0;
@@ -244,8 +185,8 @@ EXPORT int srf_orbits(int B, int N, const double *tau, const double *h, const do
                 }
                 start[a] = now[a * w + NX];
             }
-            if (!orbit_factor(NX, matrix, pivot)) break;
-            orbit_solve(NX, 1, matrix, pivot, start);
+            if (!factor(NX, 1.0, matrix, pivot)) break;
+            solve(NX, matrix, pivot, NULL, start, 1);
             double change = 0.0, swing = 0.0;
             int finite = 1;
             for (int i = 0; i < N; i++) {
@@ -291,14 +232,14 @@ static int shifted(const double *M, int transposed, const double *sigma, double 
         a[i * m + NX + i] = sigma[1];
         a[(NX + i) * m + i] = -sigma[1];
     }
-    return orbit_factor(m, a, pivot);
+    return factor(m, 1.0, a, pivot);
 }
 
 /* One step of inverse iteration: v becomes the unit vector along (M - sigma)^-1 v, rho what the step says of the eigenvalue */
 static void iterated(const double *a, const int *pivot, const double *sigma, double *v, double *rho) {
     double before[2 * NX], square = 0.0, re = 0.0, im = 0.0;
     memcpy(before, v, sizeof before);
-    orbit_solve(2 * NX, 1, a, pivot, v);
+    solve(2 * NX, a, pivot, NULL, v, 1);
     for (int i = 0; i < NX; i++) {
         square += v[i] * v[i] + v[NX + i] * v[NX + i];
         re += v[i] * before[i] + v[NX + i] * before[NX + i];
@@ -400,7 +341,7 @@ static void growth_row(int N, int k, const int *which, const double *tau, const 
                 v[c][s] = sum;
                 seed[2 * s + c] = STEP[s / NX] * back[2 * (s % NX) + c];
             }
-        orbit_solve_transposed(S, at->lu + (size_t)i * S * S, at->pivot + i * S, seed);
+        solve_transposed(S, at->lu + (size_t)i * S * S, at->pivot + i * S, seed);
         memset(own_row, 0, sizeof(double) * w);
         for (int j = 0; j < MS; j++) {
             double w_re[NX], w_im[NX], g[NX], g_im[NX];
@@ -500,9 +441,9 @@ EXPORT int srf_boundary(int B, int N, int k, const int *which, int d, int column
         for (int a = 0; a < NX; a++) right[a * columns] = -end[a * w + NX];
         right[NX * columns] = -0.5 * log(rho[2 * b] * rho[2 * b] + rho[2 * b + 1] * rho[2 * b + 1]) - row[NX];
         if (columns > 1) right[(m - 1) * columns + 1] = 1.0;
-        good[b] = (unsigned char)orbit_factor(m, matrix, c.pivot + (size_t)N * S);
+        good[b] = (unsigned char)factor(m, 1.0, matrix, c.pivot + (size_t)N * S);
         if (!good[b]) continue;
-        orbit_solve(m, columns, matrix, c.pivot + (size_t)N * S, right);
+        solve(m, matrix, c.pivot + (size_t)N * S, NULL, right, columns);
         for (int j = 0; j < columns; j++) {
             const size_t at = (size_t)j * B + b;
             double head[NX + 1 + k], full[NX + 1 + k], *to = dx + at * N * NX, *TO = dX + at * N * S;

@@ -1,17 +1,12 @@
 /* Radau IIA of order 5 for one slider: one step.
 
-   Compiled together with a model: NX states, NP parameters, and
+   Compiled together with lu.c and a model: NX states, NP parameters, and
      srf_rates(x, V, W, W_dot, p, out[NX])        srf_jacobian(..., out[NX*NX])
      NJ, JACOBIAN[NJ]                             where its entries may differ from zero
-     PLACE[NX]                                    of each state in the order of elimination
+     PLACE[NX], ROWS[NZ]                          of each state in the order of elimination; of each unknown among the stages' states
    Method and error estimate: Hairer & Wanner, Solving Ordinary Differential Equations II, IV.8. The stage equations are solved by
    Newton's method with the Jacobian of each stage. Their matrix is sparse: states that few rates depend on are eliminated first,
    and a pivot is left on the diagonal unless it is small (Duff, Erisman and Reid, Direct Methods for Sparse Matrices, 1986). */
-
-#include <float.h>
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
 
 #define NZ (3 * NX)
 #define MAX_NEWTON 12
@@ -52,65 +47,7 @@ static void imposed(Imposed *f, double t, double *V, double *W, double *W_dot) {
     *V = f->V + f->acceleration * (t - f->since);
 }
 
-#define PIVOT 0.1                           /* of the largest of its column, from which the diagonal is a pivot */
 #define AT(i, r) (3 * PLACE[r] + (i))       /* place of state r of stage i in the stages' matrix */
-
-/* LU with partial pivoting in place, row-major; returns 0 where the matrix is singular */
-static inline int factor(int n, double *a, int *pivot) {
-    for (int k = 0; k < n; k++) {
-        int best = k;
-        double largest = fabs(a[k * n + k]) / PIVOT;
-        for (int i = k + 1; i < n; i++)
-            if (fabs(a[i * n + k]) > largest) largest = fabs(a[i * n + k]), best = i;
-        if (!(largest > 0.0) || !(largest <= DBL_MAX)) return 0;
-        pivot[k] = best;
-        if (best != k)
-            for (int j = 0; j < n; j++) {
-                double swap = a[k * n + j];
-                a[k * n + j] = a[best * n + j];
-                a[best * n + j] = swap;
-            }
-        double inverse = 1.0 / a[k * n + k];
-        for (int i = k + 1; i < n; i++) {
-            if (a[i * n + k] == 0.0) continue;
-            double m = a[i * n + k] *= inverse;
-            for (int j = k + 1; j < n; j++) a[i * n + j] -= m * a[k * n + j];
-        }
-    }
-    return 1;
-}
-
-/* columns of b (n x m, row-major) are solved in place; `row` (n) says which of its rows belongs to each unknown */
-static inline void solve(int n, const double *a, const int *pivot, const int *row, double *b, int m) {
-    for (int k = 0; k < n; k++) {
-        if (pivot[k] != k) {
-            double *one = b + row[k] * m, *other = b + row[pivot[k]] * m;
-            for (int j = 0; j < m; j++) {
-                double swap = one[j];
-                one[j] = other[j];
-                other[j] = swap;
-            }
-        }
-    }
-    for (int i = 1; i < n; i++)
-        for (int k = 0; k < i; k++) {
-            double l = a[i * n + k];
-            if (l == 0.0) continue;
-            const double *from = b + row[k] * m;
-            double *to = b + row[i] * m;
-            for (int j = 0; j < m; j++) to[j] -= l * from[j];
-        }
-    for (int i = n - 1; i >= 0; i--) {
-        double *to = b + row[i] * m, inverse = 1.0 / a[i * n + i];
-        for (int k = i + 1; k < n; k++) {
-            double u = a[i * n + k];
-            if (u == 0.0) continue;
-            const double *from = b + row[k] * m;
-            for (int j = 0; j < m; j++) to[j] -= u * from[j];
-        }
-        for (int j = 0; j < m; j++) to[j] *= inverse;
-    }
-}
 
 /* LU of I - h A (x) J with the Jacobian of each stage; h is 0 where there is none */
 typedef struct {
@@ -126,13 +63,13 @@ static int stage_matrix(StageMatrix *m, const double J[3][NX * NX], double h) {
         for (int i = 0; i < 3; i++)
             for (int j = 0; j < 3; j++) m->a[AT(i, r) * NZ + AT(j, c)] -= h * A[i][j] * J[j][JACOBIAN[n]];
     }
-    m->h = factor(NZ, m->a, m->pivot) ? h : 0.0;
+    m->h = factor(NZ, THRESHOLD, m->a, m->pivot) ? h : 0.0;
     return m->h > 0.0;
 }
 
 /* B (3 x NX x m) is solved in place */
 static NOINLINE void solve_stages(const StageMatrix *matrix, double *B, int m) {
-    solve(NZ, matrix->a, matrix->pivot, ROW, B, m);
+    solve(NZ, matrix->a, matrix->pivot, ROWS, B, m);
 }
 
 static double norm(const double *d, const double *x, double rtol, const double *atol) {
@@ -201,7 +138,7 @@ static NOINLINE int stages(Imposed *force, const Node *from, double h, const dou
         int finite = finite_all(residual, NZ);
         double size = 0.0, rate = INFINITY;
         if (finite) {
-            solve(NZ, matrix->a, matrix->pivot, ROW, residual, 1);
+            solve(NZ, matrix->a, matrix->pivot, ROWS, residual, 1);
             for (int i = 0; i < 3; i++) {
                 double e = norm(residual + i * NX, from->x, rtol, atol);
                 size = e > size ? e : size;
@@ -217,7 +154,7 @@ static NOINLINE int stages(Imposed *force, const Node *from, double h, const dou
         }
         if (!finite) return 0;
         for (int k = 0; k < NZ; k++) Z[k] += residual[k];
-        double enough = fresh ? 1e-3 : 1e-4;  /* of the tolerance */
+        double enough = fresh ? 1e-3 : 1e-4;  /* of the tolerance: the first correction by an older matrix leaves more */
         if (newton > 1 && rate >= 1.0 && size > enough) return 0;
         if (size <= enough || (newton > 1 && rate < 1.0 && size * rate / (1.0 - rate) <= enough)) return newton;
         last = size;
@@ -225,17 +162,28 @@ static NOINLINE int stages(Imposed *force, const Node *from, double h, const dou
     return 0;
 }
 
+/* U1 / h - J0 factored, by which error estimates are filtered; returns 0 where it is singular */
+static NOINLINE int estimate_matrix(const double *J0, double h, double *matrix, int *pivot) {
+    for (int r = 0; r < NX; r++)
+        for (int c = 0; c < NX; c++) matrix[r * NX + c] = (r == c ? U1 / h : 0.0) - J0[r * NX + c];
+    return factor(NX, 1.0, matrix, pivot);
+}
+
+/* columns of e (NX x m) are filtered in place */
+static NOINLINE void filter_estimate(const double *matrix, const int *pivot, double *e, int m) {
+    solve(NX, matrix, pivot, NULL, e, m);
+}
+
 /* the embedded estimate of order 3, filtered by the Jacobian at the step's start */
 static double estimate(Imposed *force, const Node *from, const double *f0, double h, const double *Z, const double *J0, double rtol, const double *atol, int cautious) {
     double matrix[NX * NX], known[NX], e[NX], x[NX], f[NX], V, W, W_dot;
     int pivot[NX];
     for (int r = 0; r < NX; r++) {
-        for (int c = 0; c < NX; c++) matrix[r * NX + c] = (r == c ? U1 / h : 0.0) - J0[r * NX + c];
         known[r] = (E[0] * Z[r] + E[1] * Z[NX + r] + E[2] * Z[2 * NX + r]) / h;
         e[r] = known[r] + f0[r];
     }
-    if (!factor(NX, matrix, pivot)) return INFINITY;
-    solve(NX, matrix, pivot, SAME, e, 1);
+    if (!estimate_matrix(J0, h, matrix, pivot)) return INFINITY;
+    filter_estimate(matrix, pivot, e, 1);
     double size = norm(e, from->x, rtol, atol);
     if (size >= 1.0 && cautious) {
         imposed(force, from->t, &V, &W, &W_dot);
@@ -244,7 +192,7 @@ static double estimate(Imposed *force, const Node *from, const double *f0, doubl
         srf_rates(x, V, W, W_dot, force->p, f);
         for (int r = 0; r < NX; r++) e[r] = known[r] + f[r];
         if (finite_all(e, NX)) {
-            solve(NX, matrix, pivot, SAME, e, 1);
+            filter_estimate(matrix, pivot, e, 1);
             size = norm(e, from->x, rtol, atol);
         }
     }

@@ -29,6 +29,7 @@ from srfcli.diagnosis.hypotheses import (
     own_parameters,
 )
 from srfcli.inference.critical_loads import TableLikelihood, apparatus
+from srfcli.inference.kalman import gains
 from srfcli.inference.recordings import slip_along
 from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns, filter_run
 from srfcli.laws.registry import Registry
@@ -526,8 +527,7 @@ def _carried(
                 by_V = _rates_by_V(model, fitted, run, kept.mean[:, : len(states)])
             inputs[1:, : len(states), j] = 0.5 * (by_V[1:] + by_V[:-1]) * total[:, None]
     signals, known = len(run.signals), every.kept
-    gain = np.where(f.taken, 1 / every.S, 0.0)[:, None] * np.einsum("kij,kj->ki", known.covariance, known.gradient)
-    lost = np.einsum("kij,kj->ki", known.transition[1:], gain[:-1])  # of what a reading shows, by the next one
+    lost = np.einsum("kij,kj->ki", known.transition[1:], gains(every, f.taken)[:-1])  # of what a reading shows, by the next one
     through = known.transition.copy()
     through[1:] -= lost[:, :, None] * known.gradient[:-1, None, :]
     moved = np.zeros((every.nu.size, a, inputs.shape[2]))  # the states expected, of each column
@@ -537,7 +537,8 @@ def _carried(
     for k in range(1, len(moved)):
         moved[k] += through[k] @ moved[k - 1]
     out = np.einsum("ka,kaq->kq", known.gradient, moved)
-    out[::signals, -1] += shown if late else 0.0
+    if late:
+        out[::signals, -1] += shown
     white = out[f.used] / np.sqrt(every.S[f.used])[:, None]
     return _stacked(white, np.zeros_like(white))
 

@@ -530,6 +530,7 @@ class ModelSearch:
         The one that promises most goes on from there: a law that is right lies further from the stated one than a step tells.
         """
         best = self.best()
+        parents = (node,) if best is node else (node, best)
         stated, *modifiers = self.experiment.choice.ageing.split("+")
         reached: list[tuple[float, Hypothesis, Likelihood, Maximum]] = []
         for name in self.laws:
@@ -539,8 +540,8 @@ class ModelSearch:
             likelihood = self._likelihood(hypothesis, node, name)
             if likelihood is None:
                 continue
-            starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in (node, best)]
-            heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts]
+            starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in parents]
+            heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts] if len(starts) > 1 else [0.0]
             x = starts[int(np.argmax(heights))]
             if np.array_equal(x, self._tried.get(name, ())):  # with what came of it in the queue
                 continue

@@ -184,11 +184,18 @@ class Smoothed:
     N: Array
 
 
-def smooth(found: Innovations, used: NDArray[np.bool_]) -> Smoothed:
-    """Return the fixed-interval smoother of what the filter kept."""
+def gains(found: Innovations, used: NDArray[np.bool_]) -> Array:
+    """Return by how much the states expected follow each innovation (n, a), zero where a reading is not used."""
     kept = found.kept
     if kept is None:
         raise SrfError("the filter kept nothing to smooth", "kalman_filter(..., keep=True)")
+    return np.where(used, 1 / found.S, 0.0)[:, None] * np.einsum("kij,kj->ki", kept.covariance, kept.gradient)
+
+
+def smooth(found: Innovations, used: NDArray[np.bool_]) -> Smoothed:
+    """Return the fixed-interval smoother of what the filter kept."""
+    gain, kept = gains(found, used), found.kept
+    assert kept is not None
     n, a = kept.mean.shape
     r, N = np.zeros(a), np.zeros((a, a))
     mean, P = kept.mean.copy(), kept.covariance.copy()
@@ -196,8 +203,7 @@ def smooth(found: Innovations, used: NDArray[np.bool_]) -> Smoothed:
     for k in range(n - 1, -1, -1):
         if used[k] and k < found.reached:
             H, S = kept.gradient[k], found.S[k]
-            gain = kept.covariance[k] @ H / S
-            through = np.eye(a) - np.outer(gain, H)
+            through = np.eye(a) - np.outer(gain[k], H)
             r = H * (found.nu[k] / S) + through.T @ r
             N = np.outer(H, H) / S + through.T @ N @ through
         scores[k], information[k] = r, N
