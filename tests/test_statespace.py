@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 from srfcli.codegen.c_source import compiler
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run, Signal
-from srfcli.inference.fit import Interrupted, fit_problem
+from srfcli.inference.fit import Interrupted, fit_problem, inverse
 from srfcli.inference.prediction import predict
 from srfcli.inference.state_space import Likelihood, as_fit, filter_run, fit_state_space, maximise, stopped
 from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps, Modulation
@@ -474,3 +474,9 @@ def test_coloured_gauge_noise_is_found(make_model):
     for name, error in zip(found.likelihood.names, errors, strict=True):
         if name in ROCK_VALUES:
             assert abs(found.values[name] - ROCK_VALUES[name]) < 3.5 * error, name
+
+
+def test_what_nothing_determines_has_an_enormous_variance():
+    """A track that explains all that a parameter does leaves of its information what cancels, which may be just below zero."""
+    covariance = inverse(np.array([[4.0, 0.0], [0.0, -1e-18]]))
+    assert covariance[0, 0] == pytest.approx(0.25) and 1e12 < covariance[1, 1] < np.inf

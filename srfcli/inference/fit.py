@@ -19,7 +19,7 @@ from srfcli.inference.prediction import Prediction, own_names, own_start, run_pa
 
 def inverse(information: Array) -> Array:
     """Return the inverse, after scaling; a direction that nothing determines gets an enormous variance, not a failure."""
-    d = np.maximum(np.sqrt(np.diag(information)), 1e-8)  # of scaled parameters: nothing that matters is so flat
+    d = np.sqrt(np.maximum(np.diag(information), 1e-16))  # of scaled parameters: nothing that matters is so flat
     values, vectors = np.linalg.eigh(information / np.outer(d, d))
     inverse = (vectors / np.maximum(values, 1e-14)) @ vectors.T
     return np.asarray(inverse / np.outer(d, d))
