@@ -24,6 +24,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -64,9 +65,9 @@ _SLOPES = {  # of f at x where f(x) = v
 }  # fmt: skip
 
 
-def dual_arithmetic(source: str) -> str:
-    """Return the C text of dual numbers, with the functions that a generated module calls."""
-    text = _own("dual.c")
+def _functions_of_duals(source: str) -> str:
+    """Return the C text of the functions of dual numbers that a generated module calls."""
+    text = ""
     for name, known in _FUNCTIONS.items():
         if known in _SLOPES and f"{name}(" in source:
             body = f"double v = {known}(a.v); return srf_scaled(v, {_SLOPES[known]}, a);"
@@ -75,7 +76,7 @@ def dual_arithmetic(source: str) -> str:
 
 
 def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str:
-    """Return function `name` of the generated module `source` as `static void label(..., out)`, its arguments as they are.
+    """Return function `name` of the generated module `source` as `MODEL void label(..., out)`, its arguments as they are.
 
     In dual numbers x, p and out are such. Entries of `out` that the formulas leave at zero are not written: the caller clears it.
     Raises SrfError for no such function.
@@ -108,7 +109,7 @@ def c_function(source: str, name: str, *, label: str, dual: bool = False) -> str
     kinds = {a: "const dual *" if dual else "const double *" for a in _POINTERS}
     declared = ", ".join(f"{kinds.get(a, 'const double ')}{_safe(a)}" for a in arguments)
     body = "\n".join(f"    {line}" for line in lines)
-    return f"static NOINLINE void {label}({declared}, {'dual' if dual else 'double'} *out) {{\n   {unused}\n{body}\n}}\n"
+    return f"MODEL void {label}({declared}, {'dual' if dual else 'double'} *out) {{\n   {unused}\n{body}\n}}\n"
 
 
 @lru_cache(maxsize=4)
@@ -209,7 +210,7 @@ def _text(node: ast.AST) -> str:
 # of the time to compile
 FLAGS = (
     "-O2", "-ftree-vectorize", "-fpeel-loops",
-    "-std=c99", "-shared", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off", "-Wno-psabi",
+    "-std=c99", "-fPIC", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off", "-Wno-psabi",
 )  # fmt: skip
 VECTORS = ("avx512f", "avx2")  # instruction sets that carry derivatives several at a time, the widest first
 FUNCTIONS = {"rates": "srf_rates", "rates_jacobian": "srf_jacobian", "rates_parameters": "srf_parameters"}
@@ -221,6 +222,8 @@ ORBIT_FUNCTIONS = {"cycle": "srf_cycle", "cycle_jacobian": "srf_cycle_jacobian",
 LANES = 16  # derivatives that the filter carries along at a time: a run has 11 to 14
 GAUGE_PROCESSES = 3  # of coloured gauge noise, at most, of one state or two
 SIGNALS = 3  # of a run, each with its own gauge noise, at most
+LIBRARIES = () if sys.platform == "win32" else ("-lm",)
+_methods: dict[str, bytes] = {}  # compiled, by their keys
 _ONE = threading.Lock()  # one thread writes and compiles at a time; Python 3.11 takes parsing in two for an error
 TABLE_FUNCTIONS = {"table_arguments": "srf_table_arguments", "rates_tables": "srf_rates_tables"}
 
@@ -230,29 +233,53 @@ def _own(name: str) -> str:
     return (files("srfcli") / "codegen" / name).read_text(encoding="utf-8")
 
 
-def _head(model: GeneratedModel) -> str:
-    """Return what C texts begin with; a function that is not inlined takes as long to run and half of the time to compile."""
-    text = "#include <math.h>\n#define NOINLINE __attribute__((noinline))\n"
-    return text + f"#define NX {len(model.states)}\n#define NP {len(model.names)}\n"
+@dataclass(frozen=True)
+class CText:
+    """C text in two parts that are linked: of a model alone, and of a `method`, the same for all models of as many states."""
+
+    model: str
+    method: str
 
 
-def integrator_source(model: GeneratedModel) -> str:
+# what a model has for a method is a symbol of the library's own; a function that is not inlined takes half of the time to compile
+_HEAD = """#include <math.h>
+#define NOINLINE __attribute__((noinline))
+#define MODEL __attribute__((visibility("hidden")))
+"""
+
+
+def integrator_source(model: GeneratedModel) -> CText:
     """Return the C text of the integrator for this model."""
-    return _step_source(model) + _own("integrate.c") + _own("dop853.c")
+    tables = model.namespace.get("TABLES", ())
+    sizes = {"NX": len(model.states)} | ({"NT": len(tables)} if tables else {})
+    method = _HEAD + _defined(sizes) + _own("lu.c") + _own("radau.c") + (_own("tables.c") if tables else "")
+    own = _step_source(model, FUNCTIONS | (TABLE_FUNCTIONS if tables else {}))
+    return CText(own, method + _own("integrate.c") + _own("dop853.c"))
 
 
-def _step_source(model: GeneratedModel) -> str:
-    """Return the C text of a model's rates and of one step of Radau IIA."""
-    text = _head(model)
-    tables, functions = model.namespace.get("TABLES", ()), FUNCTIONS
-    if tables:
-        text += f"#define NT {len(tables)}\n"
-        functions = FUNCTIONS | TABLE_FUNCTIONS
+def filter_source(model: GeneratedModel) -> CText:
+    """Return the C text of the filter for a model with a random friction field."""
+    sizes = _defined({"LANES": LANES, "GAUGE_PROCESSES": GAUGE_PROCESSES, "SIGNALS": SIGNALS})
+    text = _step_source(model, {n: FUNCTIONS[n] for n in ("rates", "rates_jacobian")} | {"field_gain": "srf_gain"})
+    text += sizes + _own("dual.c") + _functions_of_duals(model.source)
+    for name, label in DUAL_FUNCTIONS.items():  # the spring as it is may be what the gauge shows
+        known = name if name in model.namespace else name.replace("spring", "reading")
+        text += c_function(model.source, known, label=label, dual=True)
+    head = _HEAD + _defined({"NX": len(model.states)}) + sizes
+    return CText(text, head + _own("lu.c") + _own("radau.c") + _own("dual.c") + _own("filter.c"))
+
+
+def _step_source(model: GeneratedModel, functions: Mapping[str, str]) -> str:
+    """Return the C text of a model's functions, by the names in its module, and of what else a step of Radau IIA asks for."""
+    text = _HEAD + f"MODEL const int NP = {len(model.names)};\n"
     text += _own("lambertw.c") if "lambertw(" in model.source else ""
-    text += _own("tables.c") if tables else ""
+    text += _own("tables.c") if model.namespace.get("TABLES") else ""
     written = {name: c_function(model.source, name, label=label) for name, label in functions.items()}
-    text += "\n".join(written.values()) + _elimination(len(model.states), written["rates_jacobian"])
-    return text + _own("lu.c") + _own("radau.c")
+    return text + "\n".join(written.values()) + _elimination(len(model.states), written["rates_jacobian"])
+
+
+def _defined(sizes: Mapping[str, object]) -> str:
+    return "".join(f"#define {name} {size}\n" for name, size in sizes.items())
 
 
 def _elimination(states: int, jacobian: str) -> str:
@@ -265,21 +292,20 @@ def _elimination(states: int, jacobian: str) -> str:
         "PLACE": [order.index(r) for r in range(states)],
         "ROWS": [i * states + r for r in order for i in range(3)],
     }
-    text = f"#define NJ {len(entries)}\n"
+    text = f"MODEL const int NJ = {len(entries)};\n"
     for name, numbers in tables.items():
-        text += f"static const int {name}[] = {{{', '.join(map(str, numbers))}}};\n"
+        text += f"MODEL const int {name}[] = {{{', '.join(map(str, numbers))}}};\n"
     return text
 
 
-def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_step: float) -> str:
+def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_step: float) -> CText:
     """Return the C text of Newton's equations of periodic orbits; `scheme` holds the arrays of the collocation."""
-    stages = len(scheme["STEP"])
-    text = f"{_head(model)}#define MS {stages}\n"
-    text += f"#define LOG_STEP {log_step!r}\n"
-    text += f"static const int LOGS[NX] = {{{', '.join(str(int(v)) for v in model.logarithmic)}}};\n"
+    method = _HEAD + _defined({"NX": len(model.states), "MS": len(scheme["STEP"]), "LOG_STEP": repr(log_step)})
     for name, array in scheme.items():
         sizes = "".join(f"[{n}]" for n in array.shape)
-        text += f"static const double {name}{sizes} = {{{', '.join(repr(float(v)) for v in array.ravel())}}};\n"
+        method += f"static const double {name}{sizes} = {{{', '.join(repr(float(v)) for v in array.ravel())}}};\n"
+    text = _HEAD + f"MODEL const int NP = {len(model.names)};\n"
+    text += f"MODEL const int LOGS[] = {{{', '.join(str(int(v)) for v in model.logarithmic)}}};\n"
     text += _own("lambertw.c") if "lambertw(" in model.source else ""
     text += "\n".join(c_function(model.source, name, label=label) for name, label in ORBIT_FUNCTIONS.items())
     calls = {"CYCLE_PARAMETER": "", "CYCLE_BILINEAR_PARAMETER": ""}
@@ -291,30 +317,16 @@ def orbit_source(model: GeneratedModel, scheme: Mapping[str, NDArray[Any]], log_
             calls[table] += f"    case {place}: srf_{own}(tau, {rest}); break;\n"
     point = "int which, double tau, const double *x, const double *p"
     forms = {
-        "CYCLE_PARAMETER": (f"static void srf_cycle_parameter({point}, double *out)", "", ""),
+        "CYCLE_PARAMETER": (f"MODEL void srf_cycle_parameter({point}, double *out)", "", ""),
         "CYCLE_BILINEAR_PARAMETER": (
-            f"static double srf_bilinear_parameter({point}, const double *_w, const double *_a)",
+            f"MODEL double srf_bilinear_parameter({point}, const double *_w, const double *_a)",
             "    double out = 0.0;\n",
             "    return out;\n",
         ),
     }
     for table, (head, before, after) in forms.items():
         text += f"{head} {{\n{before}    switch (which) {{\n{calls[table]}    }}\n{after}}}\n"
-    return text + _own("lu.c") + _own("orbit.c")
-
-
-def filter_source(model: GeneratedModel) -> str:
-    """Return the C text of the filter for a model with a random friction field."""
-    sizes = {"LANES": LANES, "GAUGE_PROCESSES": GAUGE_PROCESSES, "SIGNALS": SIGNALS}
-    text = _step_source(model) + "".join(f"#define {name} {size}\n" for name, size in sizes.items())
-    text += dual_arithmetic(model.source)
-    text += c_function(model.source, "field_gain", label="srf_gain")
-    for name, label in DUAL_FUNCTIONS.items():
-        if name in model.namespace:
-            text += c_function(model.source, name, label=label, dual=True)
-        else:  # the spring as it is, where that is what the gauge shows
-            text += f"#define {label} {DUAL_FUNCTIONS[name.replace('spring', 'reading')]}\n"
-    return text + _own("filter.c")
+    return CText(text, method + _own("lu.c") + _own("orbit.c"))
 
 
 @cache
@@ -376,27 +388,21 @@ def _writers() -> str:
     return content_key([path.read_text(encoding="utf-8") for path in written])
 
 
-def library_of(write: Callable[[], str], parts: Sequence[str]) -> ctypes.CDLL:
-    """Return the C text of `write` compiled and loaded, from the cache where it was built before from the same `parts`.
+def library_of(write: Callable[[], CText], parts: Sequence[str]) -> ctypes.CDLL:
+    """Return the C text of `write` compiled, linked and loaded, from the cache where it was built before from the same `parts`.
 
     With this package's own files the parts determine the text, which is therefore written only where it must be compiled. Raises
     SrfError where the compiler fails on it.
     """
-    command = compiler()
-    assert command is not None
-    key = content_key(
-        [*parts, _writers(), " ".join(command), " ".join(flags()), platform.platform(), platform.machine()]
-    )
+    key = _key([*parts, _writers()])
     folder = cache_folder()
     if folder is not None:
         path = folder / f"{key}.so"
         with contextlib.suppress(OSError):  # a cache that cannot be written, or a disk from which nothing may be run
-            return _load(path if _intact(path) else _build(command, write(), path, sealed=True))
+            return _load(path if _intact(path) else _build(write(), path, sealed=True))
     try:
         with tempfile.TemporaryDirectory(prefix="srf-", ignore_cleanup_errors=True) as scratch:
-            return _load(
-                _build(command, write(), Path(scratch) / f"{key}.so")
-            )  # it stays in memory when its file is gone
+            return _load(_build(write(), Path(scratch) / f"{key}.so"))  # it stays in memory when its file is gone
     except OSError as error:
         raise SrfError(
             f"no model can be compiled in {error.filename or 'the folder of temporary files'}: {error.strerror or error}",
@@ -405,32 +411,74 @@ def library_of(write: Callable[[], str], parts: Sequence[str]) -> ctypes.CDLL:
         ) from error
 
 
-def _build(command: tuple[str, ...], source: str, path: Path, *, sealed: bool = False) -> Path:
-    """Compile to a file beside `path`, then put it in place, sealed for a later process if it is to stay."""
+def _key(parts: Sequence[str]) -> str:
+    """Return the key of what is compiled from these texts here: by this compiler, for this processor."""
+    return content_key([*parts, " ".join(_command()), " ".join(flags()), platform.platform(), platform.machine()])
+
+
+def _command() -> tuple[str, ...]:
+    command = compiler()
+    assert command is not None
+    return command
+
+
+def _build(source: CText, path: Path, *, sealed: bool = False) -> Path:
+    """Compile and link to a file beside `path`, then put it in place, sealed for a later process if it is to stay."""
+    method = _method(source.method)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
-        text, library = Path(folder) / "model.c", Path(folder) / "model.so"
-        text.write_text(source, encoding="utf-8")
-        end = [] if sys.platform == "win32" else ["-lm"]
-        done = subprocess.run(
-            [*command, *flags(), "-o", str(library), str(text), *end],
-            capture_output=True,
-            text=True,
-            check=False,
-            env={**os.environ, "PYTHONSAFEPATH": "1"},  # `python -m ziglang` would look in the current folder first
-        )
-        if done.returncode:
-            first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
-            raise SrfError(f"{' '.join(command)} cannot compile a model: {first}", "SRF_CC= turns compiling off")
-        if sealed:
-            mark = Path(folder) / "model.sum"
-            mark.write_text(seal(path.name, library.read_bytes()), encoding="ascii")
-            mark.replace(path.with_suffix(".sum"))
-        library.replace(path)
+        library = Path(folder) / "model.so"
+        (Path(folder) / "method.o").write_bytes(method)
+        _run(Path(folder), source.model, "-shared", "-o", str(library), "text.c", "method.o", *LIBRARIES)
+        _put(library, path, sealed=sealed)
     return path
 
 
+def _method(text: str) -> bytes:
+    """Return the object of a method, compiled once for all models: kept in the cache, or as long as this process lasts."""
+    key = _key([text])
+    if key in _methods:
+        return _methods[key]
+    folder = cache_folder()
+    path = folder / f"{key}.o" if folder else None
+    if path is None or not _intact(path):
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
+            found = Path(scratch) / "method.o"
+            _run(Path(scratch), text, "-c", "-o", str(found), "text.c")
+            _methods[key] = found.read_bytes()
+            if path is not None:
+                _put(found, path, sealed=True)
+    else:
+        _methods[key] = read_plain(path, limit=LARGEST)
+    return _methods[key]
+
+
+def _run(folder: Path, text: str, *arguments: str) -> None:
+    """Run the compiler in `folder` on a text, which it finds there as text.c."""
+    (folder / "text.c").write_text(text, encoding="utf-8")
+    done = subprocess.run(
+        [*_command(), *flags(), *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=folder,
+        env={**os.environ, "PYTHONSAFEPATH": "1"},  # `python -m ziglang` would look in the current folder first
+    )
+    if done.returncode:
+        first = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip()[:200])
+        raise SrfError(f"{' '.join(_command())} cannot compile a model: {first}", "SRF_CC= turns compiling off")
+
+
+def _put(built: Path, path: Path, *, sealed: bool) -> None:
+    """Put in place what was built, and before it its seal."""
+    if sealed:
+        mark = built.with_suffix(".sum")
+        mark.write_text(seal(path.name, built.read_bytes()), encoding="ascii")
+        mark.replace(path.with_suffix(".sum"))
+    built.replace(path)
+
+
 def _intact(path: Path) -> bool:
-    """Return whether a library lies there as this user built it: to load it is to run it, and half of one ends the process."""
+    """Return whether a file lies there as this user built it: to load it is to run it, and half of one ends the process."""
     try:
         found = read_plain(path.with_suffix(".sum"), limit=1000).decode("ascii", errors="replace")
         return is_sealed(path.name, read_plain(path, limit=LARGEST), found)

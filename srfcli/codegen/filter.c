@@ -1,13 +1,20 @@
 /* Continuous-discrete extended Kalman filter for one slider on a random friction field, with exact derivatives.
 
-   Compiled behind radau.c with a model that has such a field:
-     srf_gain(x, V, W, W_dot, p, out[NX])        where the field's white noise enters the rates
-     srf_d_rates, srf_d_jacobian, srf_d_gain, srf_d_reading, srf_d_reading_gradient      the same and the gauge in dual numbers
-     srf_d_spring, srf_d_spring_gradient                                         the spring as it is, without the gauge's own lag
+   Compiled behind radau.c and dual.c, for all models of NX states. A model has where the field's white noise enters the rates, and
+   that, its rates, its gauge and the spring as it is, without the gauge's own lag, in dual numbers.
    The mean follows Radau IIA; the covariance follows the exact derivative of each of its steps, P -> Phi P Phi' + sum c c', where
    c are the responses to the MODES lowest Legendre polynomials of the white noise over the step. Everything is carried along in
    dual numbers, so that innovations and their variances have the derivatives of what was computed.
    Jazwinski, Stochastic Processes and Filtering Theory, 1970; Griewank and Walther, Evaluating Derivatives, 2008. */
+
+MODEL void srf_gain(const double *x, double V, double W, double W_dot, const double *p, double *out); /* (NX) */
+MODEL void srf_d_rates(const dual *x, double V, double W, double W_dot, const dual *p, dual *out);
+MODEL void srf_d_jacobian(const dual *x, double V, double W, double W_dot, const dual *p, dual *out);
+MODEL void srf_d_gain(const dual *x, double V, double W, double W_dot, const dual *p, dual *out);
+MODEL void srf_d_reading(const dual *x, double V, double W, double W_dot, const dual *p, dual *out);          /* one number */
+MODEL void srf_d_reading_gradient(const dual *x, double V, double W, double W_dot, const dual *p, dual *out); /* (NX) */
+MODEL void srf_d_spring(const dual *x, double V, double W, double W_dot, const dual *p, dual *out);
+MODEL void srf_d_spring_gradient(const dual *x, double V, double W, double W_dot, const dual *p, dual *out);
 
 #define MODES 3                             /* of white noise in a step; as many as stages can tell apart */
 #define NA (NX + 2 * GAUGE_PROCESSES * SIGNALS) /* states with those of gauge noise, at most; matrices are laid out for those there are */

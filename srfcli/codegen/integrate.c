@@ -1,9 +1,14 @@
 /* Motion in time from one output to the next, with the exact derivatives of its discrete solution by parameters and initial state.
 
-   Compiled together with a model, radau.c and dop853.c: NA appended constants, and
-     srf_parameters(x, V, W, W_dot, p, out[NX*NP])
+   Compiled behind radau.c, with dop853.c behind it, for all models of NX states and NT tables.
    Output between steps by the quintic Hermite polynomial through three nodes. One more factorisation with the converged Jacobians
    of the stages differentiates the step exactly. */
+
+MODEL void srf_parameters(const double *x, double V, double W, double W_dot, const double *p, double *out); /* (NX, NP) */
+#ifdef NT
+MODEL void srf_table_arguments(const double *x, double V, double W, double W_dot, const double *p, double *out); /* (NT) */
+MODEL void srf_rates_tables(const double *x, double V, double W, double W_dot, const double *p, double *out); /* (NX, 2 NT) */
+#endif
 
 #define SHARE 30.0                          /* sensitivities are held to so much less than the states */
 #define NODES 4                             /* kept for output between steps */

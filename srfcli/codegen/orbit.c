@@ -1,12 +1,17 @@
 /* Newton's equations of periodic orbits: Gauss collocation over one forcing period, condensed interval by interval.
 
    The same equations, in the same order, as numerics/collocation.py and numerics/boundary.py, which hold where there is no
-   compiler. Compiled together with lu.c and a model: NX states, NP parameters, MS Gauss points, LOGS, LOG_STEP, and
-     srf_cycle(tau, x, p, out[NX])                    srf_cycle_jacobian(tau, x, p, out[NX*NX])
-     srf_cycle_parameter(which, tau, x, p, out[NX])
-     srf_bilinear(tau, x, p, w, a, out[NX])           srf_bilinear_parameter(which, tau, x, p, w, a)
+   compiler. Compiled behind lu.c, for all models of NX states, with MS Gauss points and LOG_STEP; linked with a model, whose text
+   has what is declared here.
    MI is the inverse of the collocation matrix, STEP the weights of x_1 = x_0 + STEP . (X - x_0).
    Arrays are row-major, batches of parameter points first; p is (points, NP). */
+
+MODEL void srf_cycle(double tau, const double *x, const double *p, double *out);          /* (NX) */
+MODEL void srf_cycle_jacobian(double tau, const double *x, const double *p, double *out); /* (NX, NX) */
+MODEL void srf_cycle_parameter(int which, double tau, const double *x, const double *p, double *out);
+MODEL void srf_bilinear(double tau, const double *x, const double *p, const double *w, const double *a, double *out); /* (NX) */
+MODEL double srf_bilinear_parameter(int which, double tau, const double *x, const double *p, const double *w, const double *a);
+MODEL extern const int NP, LOGS[];          /* parameters; which states are logarithms */
 
 #define S (MS * NX)
 #define PAD (8 * ((NX + 3 + 7) / 8)) /* columns of the right side, room for two parameters among them */

@@ -1,14 +1,19 @@
 /* Radau IIA of order 5 for one slider: one step.
 
-   Compiled together with lu.c and a model: NX states, NP parameters, and
-     srf_rates(x, V, W, W_dot, p, out[NX])        srf_jacobian(..., out[NX*NX])
-     NJ, JACOBIAN[NJ]                             where its entries may differ from zero
-     PLACE[NX], ROWS[NZ]                          of each state in the order of elimination; of each unknown among the stages' states
+   Compiled behind lu.c, for all models of NX states; linked with a model, whose text has what is declared here.
    Method and error estimate: Hairer & Wanner, Solving Ordinary Differential Equations II, IV.8. The stage equations are solved by
    Newton's method with the Jacobian of each stage. Their matrix is sparse: states that few rates depend on are eliminated first,
    and a pivot is left on the diagonal unless it is small (Duff, Erisman and Reid, Direct Methods for Sparse Matrices, 1986). */
 
 #define NZ (3 * NX)
+
+MODEL void srf_rates(const double *x, double V, double W, double W_dot, const double *p, double *out);    /* (NX) */
+MODEL void srf_jacobian(const double *x, double V, double W, double W_dot, const double *p, double *out); /* (NX, NX) */
+MODEL extern const int NP;                  /* parameters */
+MODEL extern const int NJ, JACOBIAN[];      /* where the Jacobian's entries may differ from zero */
+MODEL extern const int PLACE[];             /* of each state in the order of elimination */
+MODEL extern const int ROWS[];              /* of each unknown among the stages' states */
+
 #define MAX_NEWTON 12
 #define ALIKE 0.02                          /* of a step's length, within which the matrix of another is tried for it */
 #define SLOW 0.1                            /* contraction of Newton's method from which such a matrix is renewed */
