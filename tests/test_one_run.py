@@ -35,11 +35,11 @@ def srf(*arguments) -> Result:
     return CliRunner().invoke(cli, [str(a) for a in arguments], prog_name="srf")
 
 
-def written(folder, only):
+def written(folder, only, plans=PLANS):
     """Write the recordings of the independent generator: the load pushes along the track in the runs `only`."""
     rng, calm = np.random.default_rng(5), Physics()
     pushed = replace(calm, cross=SHARE)
-    readings = {p: read_gauge(move(pushed if p.name in only else calm, p).u, Gauge(), rng) for p in PLANS}
+    readings = {p: read_gauge(move(pushed if p.name in only else calm, p).u, Gauge(), rng) for p in plans}
     for name, text in case_files("one run", calm, readings).items():
         (folder / name).write_text(text)
     return folder
@@ -63,6 +63,16 @@ def test_a_diagnosis_names_the_run_in_which_alone_an_effect_acts(only, tmp_path)
     (q,) = (q for q in augmented.parameters if q.name == "share")
     assert (q.runs, q.elsewhere) == (("down",), 0.0)
     assert [q.name in augmented.elsewhere(run) for run in augmented.runs] == [True, False, True]
+
+
+@needs_compiler
+def test_held_out_runs_tell_in_which_run_an_effect_acts_that_the_others_cannot_see(tmp_path):
+    """Under a constant load nothing pushes: the runs that are fitted are explained as well by an effect in all of them."""
+    plans = (replace(PLANS[0], steps=()), *PLANS[1:])
+    done = srf("diagnose", str(written(tmp_path, ("down",), plans)), "--effect", NAME, "--json")
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert (told["verdict"], told["effects"], told["acts_in"]) == ("identified", [NAME], {NAME: "down"})
 
 
 STATED = """

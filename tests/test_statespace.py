@@ -16,7 +16,16 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment, FitParameter, ModelChoice, Run, Signal
 from srfcli.inference.fit import Interrupted, fit_problem, inverse
 from srfcli.inference.prediction import predict
-from srfcli.inference.state_space import Likelihood, as_fit, filter_run, fit_state_space, maximise, stopped
+from srfcli.inference.state_space import (
+    Likelihood,
+    StateSpaceFit,
+    as_fit,
+    filter_run,
+    fit_state_space,
+    maximise,
+    stopped,
+    with_less_colour,
+)
 from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps, Modulation
 
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
@@ -474,6 +483,11 @@ def test_coloured_gauge_noise_is_found(make_model):
     for name, error in zip(found.likelihood.names, errors, strict=True):
         if name in ROCK_VALUES:
             assert abs(found.values[name] - ROCK_VALUES[name]) < 3.5 * error, name
+    wider = found.likelihood.beside(found.likelihood.problem, ("relaxation", "relaxation"))
+    more = StateSpaceFit(wider, maximise(wider, wider.coordinates(found.values), steps=8), wider.evaluations)
+    fewer = with_less_colour(more, 0.1)
+    assert fewer.likelihood.processes == ("relaxation",)
+    assert fewer.log_likelihood == pytest.approx(found.log_likelihood, abs=0.1)
 
 
 def test_what_nothing_determines_has_an_enormous_variance():

@@ -338,7 +338,7 @@ class Scores:
         if len(runs) < 2:
             return []
         every = {s.effect.reported: s.gain + float(np.log(len(runs))) for s in self.singles}
-        apparatus = [c for c in self.columns if _may_befall_one_run(c.effect)]
+        apparatus = [c for c in self.columns if may_befall_one_run(c.effect)]
         for f in runs:
             rows = slice(end, end := end + 2 * f.white.size)
             best: list[Score] = []
@@ -460,7 +460,7 @@ class Scores:
         return sorted(found, key=lambda p: -p.gain)[:most]
 
 
-def _may_befall_one_run(effect: Effect) -> bool:
+def may_befall_one_run(effect: Effect) -> bool:
     """Return whether an effect is a fault of the apparatus, and no law of the contact, the spring or the frame under load."""
     elastic = any(
         slot == "K" or (slot == "V" and {"W", "W_dot"} & {str(s) for s in formula.free_symbols})

@@ -24,7 +24,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.goodness_of_fit import DEVIATION, field_share, log_evidence, mass_at_bounds, shortcomings
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
-from srfcli.diagnosis.scores import Remainder, Score, Scores
+from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
     LOST,
@@ -37,7 +37,9 @@ from srfcli.inference.state_space import (
     fit_state_space,
     likeliest_beside,
     maximise,
+    processes_in,
     thinned,
+    with_less_colour,
 )
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
@@ -149,7 +151,6 @@ class ModelSearch:
         self.fitted: dict[str, Fitted] = {}
         self.queue: list[_Move] = []
         self.count = 0
-        self.processes: tuple[str, ...] = ()
         self._tried: dict[str, Array] = {}  # from where each other ageing law was tried last
 
     # ------------------------------------------------------------------ models and their fits
@@ -157,7 +158,7 @@ class ModelSearch:
     def fit(self, move: _Move | None) -> Fitted:
         """Return a model fitted from where its parent stands, and judged; the baseline from the file's own start values."""
         hypothesis = move.hypothesis if move else Hypothesis()
-        options = {"processes": self.processes if move else None, "cautious": True, **self.options}
+        options = {"processes": _colours(move.values) if move else None, "cautious": True, **self.options}
 
         def fitted(values: dict[str, float] | None) -> StateSpaceFit:
             problem = self._problem(hypothesis, values or {})
@@ -172,7 +173,8 @@ class ModelSearch:
                 found = max(found, fitted(self._started(move)), key=lambda f: f.log_likelihood)
         else:
             found = fitted(self._started(move) if move else None)
-        self.processes = found.likelihood.processes
+        if move and "processes" not in self.options:
+            found = with_less_colour(found, NEAR, self.progress)
         judged = self._judged(hypothesis, found)
         if move is None and judged.fine:  # else it is not what is reported
             judged = self._judged(hypothesis, likeliest_beside(found, NEAR, self.progress))
@@ -193,7 +195,7 @@ class ModelSearch:
                 values = self._sized(move, share, shifts)
                 problem = self._problem(move.hypothesis, values)
                 values = _followable(values, problem)
-                likelihood = Likelihood(problem, processes=self.processes, rtol=COARSE)
+                likelihood = Likelihood(problem, processes=_colours(move.values), rtol=COARSE)
                 found = likelihood.at(likelihood.coordinates(values), slopes=False).log_likelihood
                 if found > best[0]:
                     best = found, values
@@ -274,7 +276,7 @@ class ModelSearch:
                 again(self.baseline)
                 self._search()
         self.cut_short = self.spent and bool(self.queue)
-        self._in_all_runs()
+        self._where_effects_act()
         self._rebase()
         self._eliminate()
         if self.experiment.runs is not self.whole.runs:
@@ -294,7 +296,7 @@ class ModelSearch:
                 progress=self.progress, **options,
             )  # fmt: skip
             fitted[node.name] = replace(self._judged(node.hypothesis, found), scores=node.scores)
-            options["processes"] = self.processes = found.likelihood.processes
+            options["processes"] = found.likelihood.processes
         self.fitted = fitted
         self._grant()
 
@@ -302,7 +304,6 @@ class ModelSearch:
         """Search on from models that another search has fitted."""
         for node in nodes:
             self.fitted[node.name] = node
-            self.processes = node.fit.likelihood.processes
         for node in nodes:
             self._expand(node)
         self._search()
@@ -428,7 +429,7 @@ class ModelSearch:
         except SrfError as error:
             self.excluded.append(Excluded(name, error.message))
             return None
-        return Likelihood(problem, processes=self.processes, rtol=COARSE)
+        return Likelihood(problem, processes=node.fit.likelihood.processes, rtol=COARSE)
 
     def _build(self, node: Fitted, effect: Effect, one: float) -> None:
         """Push an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
@@ -497,11 +498,11 @@ class ModelSearch:
         best = self.best()
         if "processes" in self.options or correlated(best.fit.maximum.point) < DEVIATION:
             return
-        self.processes = self._refitted(best, None).fit.likelihood.processes
-        if self.processes != best.fit.likelihood.processes:
+        processes = self._refitted(best, None).fit.likelihood.processes
+        if processes != best.fit.likelihood.processes:
             for node in {f.name: f for f in (base, *self.ranked()[:SINGLES])}.values():
-                if node.fit.likelihood.processes != self.processes:
-                    self._refitted(node, self.processes)
+                if node.fit.likelihood.processes != processes:
+                    self._refitted(node, processes)
             self.queue.clear()
 
     def _refitted(self, node: Fitted, processes: Sequence[str] | None) -> Fitted:
@@ -559,14 +560,29 @@ class ModelSearch:
             expected = promise - node.fit.log_likelihood + node.attainable
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
 
-    def _in_all_runs(self) -> None:
-        """Fit the best model in all runs where an effect acts in one: another that was missing may have misled its score."""
+    def _where_effects_act(self) -> None:
+        """Fit the best model with its effects in all runs where one acts in one, and in one where the others do not need it.
+
+        Another effect that was missing may have misled the score of one run; recordings that hardly see an effect do not tell
+        whether they have it, and held-out runs then do.
+        """
         best = self.best()
-        effects = tuple(replace(e, run="") for e in best.hypothesis.effects)
-        whole = Hypothesis(effects, best.hypothesis.ageing)
+        effects, ageing = best.hypothesis.effects, best.hypothesis.ageing
+        whole = Hypothesis(tuple(replace(e, run="") for e in effects), ageing)
         if whole.name not in self.fitted:
             self._fit_from(best, whole, self._sizes(best))
             self._search()
+        for i, effect in enumerate(effects if len(self.experiment.runs) > 1 else ()):
+            if effect.run or not may_befall_one_run(effect):
+                continue
+            heights = []
+            for run in best.fit.likelihood.problem.runs:
+                one = Hypothesis((*effects[:i], replace(effect, run=run.name), *effects[i + 1 :]), ageing)
+                own = best.fit.likelihood.beside(self._problem(one, best.fit.values))
+                heights.append((own.at(own.coordinates(best.fit.values), slopes=False).log_likelihood, run.name, one))
+            likeliest, _, one = max(heights)
+            if likeliest > best.fit.log_likelihood - WORTH and one.name not in self.fitted:
+                self._fit_from(best, one, self._sizes(best))
 
     def _fit_from(self, node: Fitted, hypothesis: Hypothesis, sizes: tuple[dict[str, float], ...]) -> None:
         """Fit a model from the parameters of another that was fitted; what cannot be fitted is left out, with the reason."""
@@ -580,8 +596,8 @@ class ModelSearch:
         best, base = self.best(), self.baseline
         if best is base or not self.experiment.runs:
             return
-        values, processes = best.fit.values, best.fit.likelihood.processes
-        own = Likelihood(self._problem(Hypothesis(), values), smooth=best.fit.smooth, processes=processes, rtol=COARSE)
+        values = best.fit.values
+        own = best.fit.likelihood.beside(self._problem(Hypothesis(), values))
         if not own.at(own.coordinates(values), slopes=False).log_likelihood > base.fit.log_likelihood + NEEDED:
             return
         try:
@@ -640,6 +656,11 @@ class ModelSearch:
     def best(self) -> Fitted:
         """Return the model with the best evidence."""
         return self.ranked()[0]
+
+
+def _colours(values: Mapping[str, float]) -> list[str]:
+    """Return the processes of coloured gauge noise of the model that was fitted with these values."""
+    return processes_in({name.partition("[")[0] for name in values})
 
 
 def _followable(values: Mapping[str, float], problem: Problem) -> dict[str, float]:

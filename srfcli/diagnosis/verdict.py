@@ -14,9 +14,9 @@ from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import improbability, loudness, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, typical_sizes
 from srfcli.diagnosis.scores import Score
-from srfcli.diagnosis.search import CLOSE, COARSE, NEAR, Fitted, ModelSearch
+from srfcli.diagnosis.search import CLOSE, NEAR, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.state_space import Filtered, Foretold, Likelihood, StateSpaceFit, maximise
+from srfcli.inference.state_space import Filtered, Foretold, StateSpaceFit, maximise
 
 NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
 HELD = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
@@ -202,9 +202,9 @@ def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
     """
     if best is baseline or not baseline.fit.likelihood.problem.runs:
         return baseline
-    old = baseline.fit.likelihood
-    likelihood = Likelihood(old.problem, smooth=best.fit.smooth, processes=best.fit.likelihood.processes, rtol=COARSE)
-    held = [n for n in likelihood.names if n not in old.problem.names]
+    problem = baseline.fit.likelihood.problem
+    likelihood = best.fit.likelihood.beside(problem)
+    held = [n for n in likelihood.names if n not in problem.names]
     found = maximise(likelihood, likelihood.coordinates(best.fit.values), held=held, close=NEAR)
     if found.status is Status.INTEGRATION:
         return baseline

@@ -430,6 +430,11 @@ class Likelihood:
         )
         self._tables = [self._table(loads) for loads in problem.tables]
 
+    def beside(self, problem: Problem, processes: Sequence[str] | None = None) -> Likelihood:
+        """Return the likelihood of another problem with the same track and tolerance, and coloured noise unless that is given."""
+        given = self.processes if processes is None else processes
+        return Likelihood(problem, smooth=self.smooth, processes=given, rtol=self.base_rtol)
+
     @property
     def samples(self) -> int:
         """Return the number of readings used, and of critical loads."""
@@ -568,7 +573,7 @@ class Likelihood:
             problem, runs=(replace(run, holdout=False),), names=tuple(own), start=start, lower=lower, upper=upper, held=held,
             priors=(), tables=(),
         )  # fmt: skip
-        likelihood = Likelihood(alone, smooth=self.smooth, processes=self.processes, rtol=self.base_rtol)
+        likelihood = self.beside(alone)
         known = {n: values[n] for n in FIELD}
         for alone_names, names in zip(likelihood.gauges(alone.runs[0]), self.gauges(run), strict=True):
             known |= {name: values[names[local]] for local, name in alone_names.items()}
@@ -986,7 +991,7 @@ class StateSpaceFit:
             lower=np.append(problem.lower, own.problem.lower[shared]),
             upper=np.append(problem.upper, own.problem.upper[shared]),
         )
-        wide = Likelihood(both, smooth=own.smooth, processes=own.processes, rtol=own.base_rtol)
+        wide = own.beside(both)
         point = wide.at(wide.coordinates(point.values))
         if not np.isfinite(point.log_likelihood):
             return Foretold(-np.inf, np.inf, by_itself)
@@ -1073,8 +1078,7 @@ def fit_state_space(
 def with_priors(found: StateSpaceFit, priors: Sequence[tuple[tuple[str, ...], float]]) -> StateSpaceFit:
     """Return the fit with the values of groups, each with the scatter of its prior, drawn towards their means."""
     own = found.likelihood
-    problem = replace(own.problem, priors=tuple(priors))
-    likelihood = Likelihood(problem, smooth=own.smooth, processes=own.processes, rtol=own.base_rtol)
+    likelihood = own.beside(replace(own.problem, priors=tuple(priors)))
     maximum = maximise(likelihood, likelihood.coordinates(found.values), widths=())
     return StateSpaceFit(likelihood, maximum, found.evaluations + likelihood.evaluations)
 
@@ -1205,10 +1209,16 @@ def _fitted(
         known = best.likelihood.processes
         wanted = not grown and smooth is None and not best.smooth
         if wanted and (not known or (_short_field(best) and len(known) < GAUGE_PROCESSES)):
-            other = _coloured(best, likelihood(True, (*known, "relaxation")), progress)  # colour in place of the field?
+            instead = likelihood(True, (*known, "relaxation"))
+            other = _coloured(best, instead, progress)  # colour in place of the field?
+            if fresh and _short_field(best):  # which may have led the other parameters astray
+                k = len(instead.problem.names)
+                x = np.concatenate([instead.coordinates(start)[:k], other.maximum.point.x[k:]])
+                anew = maximise(instead, x, steps=STEPS // 2, close=1.0, progress=progress)
+                other = max(other, StateSpaceFit(instead, anew, instead.evaluations), key=lambda f: f.log_likelihood)
             if other.criterion > best.criterion - CLOSE_CALL:
-                own = maximise(other.likelihood, other.maximum.point.x, close=close, progress=progress)
-                other = StateSpaceFit(other.likelihood, own, other.likelihood.evaluations)
+                own = maximise(instead, other.maximum.point.x, close=close, progress=progress)
+                other = StateSpaceFit(instead, own, instead.evaluations)
             better, worse = (other, best) if other.criterion > best.criterion else (best, other)
             best = replace(better, evaluations=better.evaluations + worse.evaluations)
     if fresh:
@@ -1389,6 +1399,36 @@ def _with_colour(
             return replace(best, evaluations=spent)
         best = replace(found, evaluations=spent)
     return best
+
+
+def with_less_colour(
+    found: StateSpaceFit, close: float, progress: Callable[[str], None] = lambda text: None
+) -> StateSpaceFit:
+    """Return a fit without the fainter processes of its coloured gauge noise, as far as Schwarz's criterion prefers that.
+
+    What a model lacks looks like colour, and the colour is not needed once the model has it.
+    """
+    while known := found.likelihood.processes:
+        own, rows = found.likelihood, gauge_rows(known)
+        levels = [max(found.values[name[row[1]]] for name in map(own.gauge_names, own.kinds)) for row in rows]
+        faintest = int(np.argmin(levels))
+        kept = [*range(faintest), *range(faintest + 1, len(known))]
+        fewer = own.beside(own.problem, [known[j] for j in kept])
+        values = dict(found.values)
+        for old, new in zip((rows[j] for j in kept), gauge_rows(fewer.processes), strict=True):
+            for kind in own.kinds:
+                before, after = own.gauge_names(kind), fewer.gauge_names(kind)
+                values |= {after[b]: found.values[before[a]] for a, b in zip(old, new, strict=True)}
+        x = fewer.coordinates(values)
+        if fewer.at(x, slopes=False).log_likelihood < found.log_likelihood - CLOSE_CALL:
+            break
+        progress(f"coloured gauge noise: {', '.join(fewer.processes) or 'none'}")
+        bare = StateSpaceFit(fewer, maximise(fewer, x, close=close, widths=(), progress=progress), fewer.evaluations)
+        better = found if found.criterion > bare.criterion else bare
+        found = replace(better, evaluations=found.evaluations + bare.evaluations)
+        if better is not bare:
+            break
+    return found
 
 
 def correlated(point: Point) -> float:
