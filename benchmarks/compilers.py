@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import resource
 import os
+import resource
 import shlex
 import shutil
 import sys

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from srfcli.tasks.stability import critical as critical
     from srfcli.tasks.stability import floquet as floquet
     from srfcli.tasks.stability import linear as linear
+    from srfcli.tasks.stability import response as response
 
 
 # name: the module that has it, imported when the name is first used
@@ -44,6 +45,7 @@ PUBLIC = {
     "critical": "srfcli.tasks.stability",
     "floquet": "srfcli.tasks.stability",
     "linear": "srfcli.tasks.stability",
+    "response": "srfcli.tasks.stability",
     "load_law": "srfcli.codegen.slider",
     "map": "srfcli.tasks.map",
     "compare": "srfcli.tasks.map",

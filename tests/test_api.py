@@ -82,6 +82,14 @@ def test_commands_print_what_the_functions_return(slider: srf.SlidingSystem, lin
     assert counts == sorted(counts) and counts[-1] == len(boundary.atlases[0].branches) > 1  # it grows
     state = srf.floquet(slider.at(V=8, W0=9, eps=0.09))
     assert [list(r) for r in state.table.rows] == rows_of("floquet", "--V", "8", "--W0", "9", "--eps", "0.09")
+    gains = srf.response(slider.at(V=10, W0=6), over={"f": (10, 20, 60)})
+    assert [list(r) for r in gains.table.rows] == rows_of("response", "--V", "10", "--W0", "6", "--over", "f=10,20,60")
+    mean = srf.response(slider.at(V=10, W0=6), over={"f": (60,)}, eps=(0.05, 0.1))
+    asked = ("response", "--V", "10", "--W0", "6", "--over", "f=60", "--mean", "--eps", "0.05,0.1")
+    assert [list(r) for r in mean.table.rows] == rows_of(*asked)
+    for wrong in ({"f": 1, "V": 1}, {"eps": [0.1]}, {"g": [1]}):
+        with pytest.raises(srf.SrfError):
+            srf.response(slider, over=wrong)
 
 
 def test_a_map_has_two_dimensions(slider: srf.SlidingSystem) -> None:

@@ -42,7 +42,7 @@ COMMANDS = {
     ),
     "map": ("srfcli.cli.map:map_", "The stability of the forced sliding state over a plane of two parameters."),
     "response": (
-        "srfcli.cli.response:command",
+        "srfcli.cli.stability:response",
         "How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t).",
     ),
     "compare": (

@@ -1,4 +1,4 @@
-"""`srf linear`, `critical`, `floquet` and `continue`: the stability of sliding under a constant and under a modulated load."""
+"""`srf linear`, `response`, `critical`, `floquet` and `continue`: sliding under a constant and under a modulated load."""
 
 from __future__ import annotations
 
@@ -134,6 +134,65 @@ def _window(text: str) -> Range:
     if found is None or not found.lo > 0:
         raise SrfError(f"--window {text!r} is not LOW:HIGH, two rising loads above 0", "Write --window 4:500.")
     return found
+
+
+# `srf response`: how sliding follows a modulated load.
+
+RESPONSE = """
+srf response --V 10 --W0 6 --over f=1:1000:200 --plot response.svg
+srf response --V 10 --W0 6 --over f=1:1000:200 --csv
+srf response --V 10 --W0 6 --mean --eps 0.05,0.1,0.2 --over f=20:400:30
+"""
+
+
+@click.command("response", cls=SrfCommand, epilog=RESPONSE)
+@stability_options
+@value_option("V", "Driving velocity in um/s.")
+@value_option("W0", "Mean normal load in N.")
+@values_option(AMPLITUDE, about="relative modulation amplitudes, for --mean")
+@over_option(
+    default=("f=1:1000:200",), help="The frequencies (Hz), or another parameter: NAME=LOW:HIGH[:POINTS[:log|lin]]."
+)
+@click.option(
+    "--mean", is_flag=True, help="The drop of the mean friction at the amplitudes --eps, from the forced states."
+)
+@click.option("--tol", type=float, help="Relative error of the mean friction; 1e-6 unless set.")
+@output_options
+def response(
+    system: SystemOptions,
+    V: str | None,
+    W0: str | None,
+    eps: tuple[float, ...] | None,
+    over: tuple[Range, ...],
+    mean: bool,
+    tol: float | None,
+    output: OutputOptions,
+) -> None:
+    """How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t).
+
+    To first order in eps: gain and phase of friction, position and slip velocity, and where they resonate. With --mean:
+    what the modulation takes off the mean friction force, at any amplitude.
+    """
+    from srfcli.cli.emit import emit, finish
+    from srfcli.tasks import stability
+
+    if len(over) != 1:
+        raise SrfError(f"--over is given {len(over)} times", "One parameter is swept: --over f=1:1000:200.")
+    if mean and not eps:
+        raise SrfError("--mean needs amplitudes", "Give some: --mean --eps 0.05,0.1,0.2.")
+    if eps and not mean:
+        raise SrfError("--eps has no part in the linear response", "Leave it out, or ask for --mean.")
+    if over[0].name == "eps":
+        raise SrfError("eps is not swept", "Give amplitudes: --mean --eps 0.05,0.1,0.2; the linear response has none.")
+    slider = system.slider(V=V, W0=W0)
+    swept = over[0].fitted(slider.model.parameters, where=slider.model.title)
+    check_axes({swept.name}, {"V": V, "W0": W0})
+    system.say_defaults(slider.resolved, {"V", "W0"} - {swept.name})
+    tolerance, begun = system.tolerance(tol).value, time.perf_counter()
+    found = stability.response(slider, over={swept.name: swept.points()}, eps=eps or None, tol=tolerance)
+    timings = {"solve": time.perf_counter() - begun}
+    emit(found.table, output, laws=slider.model.laws, timings=timings, figure=found.plot)
+    finish(found.status)
 
 
 # `srf floquet`: one forced periodic state in full.

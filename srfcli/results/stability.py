@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from srfcli.core.errors import Status
+from srfcli.core.errors import Status, worst
 from srfcli.results.tables import STATUS, Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from srfcli.numerics.boundary import BoundaryPoint
     from srfcli.numerics.continuation import Atlas
     from srfcli.numerics.floquet import FloquetResult
+    from srfcli.numerics.response import LinearResponse, MeanFriction
 
 # Steady sliding under constant load: critical loads from the characteristic polynomial.
 
@@ -101,6 +102,150 @@ def spread(values: tuple[float, ...]) -> bool:
         return False
     ratio = (values[-1] / values[0]) ** (1 / (len(values) - 1))
     return all(abs(b / a / ratio - 1) < 1e-6 for a, b in itertools.pairwise(values))
+
+
+# The response to a modulated load: to first order, and in the mean at any amplitude.
+
+QUANTITIES = {  # whose response is found: unit of the gain, what it is of, its name in a figure
+    "friction": ("1", "of the friction coefficient", "µ"),
+    "force": ("1", "of the friction force over W0", "µW/W$_0$"),
+    "position": ("um", "of the slider's position", "x  [µm]"),
+    "velocity": ("1", "of the interface's slip velocity over V", "v/V"),
+}
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class ResponseResult(Result):
+    """The response of steady sliding to a modulated load, to first order in its amplitude, over one parameter.
+
+    Attributes
+    ----------
+    system : SlidingSystem
+        The laws and the parameters that were not swept.
+    name : str
+        The parameter that was swept.
+    values : tuple of float
+        Its values (n,) in its declared unit.
+    response : LinearResponse
+        Transfer functions (n,) of friction, force, position and velocity.
+    """
+
+    system: SlidingSystem
+    name: str
+    values: tuple[float, ...] = field(repr=False)
+    response: LinearResponse = field(repr=False)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return gain and phase of each quantity, a row for each value; notes say where they resonate."""
+        import numpy as np
+
+        from srfcli.numerics.response import resonance
+
+        found, status = self.response, self.response.status
+        parts = {name: getattr(found, name) for name in QUANTITIES}
+        cells = [f(values) for values in parts.values() for f in (np.abs, np.angle)]
+        steady = [("stable" if found.stable[i] else "unstable") if s.ok else None for i, s in enumerate(status)]
+        rows = [(x, *(float(c[i]) for c in cells), steady[i], status[i].value) for i, x in enumerate(self.values)]
+        columns = [_swept(self.system, self.name)]
+        for name, (unit, about, _) in QUANTITIES.items():
+            columns.append(Column(f"{name}_gain", unit, f"amplitude {about} for eps = 1, to first order"))
+            columns.append(Column(f"{name}_phase", "rad", "ahead of the load"))
+        columns += [Column("type", "", "stable or unstable: steady sliding"), Column("status")]
+        notes = ["to first order in eps: amplitudes are eps times the gains"]
+        if self.name == "f":
+            for name, values in parts.items():
+                top = resonance(np.array(self.values), np.abs(values))
+                where = "none inside the range" if top is None else f"{top[0]:.6g} Hz, gain {top[1]:.6g}"
+                notes.append(f"resonance of {name}: {where}")
+        if "unstable" in steady:
+            notes.append("where steady sliding is unstable the response is not what would be seen")
+        kept = self.system.described(without=(self.name, "eps"))
+        return Table("srf.response/2", tuple(columns), rows, self.system.model.title, tuple(notes), kept)
+
+    @property
+    def status(self) -> Status:
+        """Return the worst status of the rows."""
+        return worst(self.response.status)
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return gain and phase of each quantity over the parameter that was swept."""
+        from srfcli.results import plots
+        from srfcli.results.figures import gains
+
+        own_figure(ax, "a response")
+        drawn = {label: getattr(self.response, name) for name, (_, _, label) in QUANTITIES.items()}
+        title = plots.titled(self.table.title, self.table.parameters)
+        label = plots.axis_label(self.name, _swept(self.system, self.name).unit)
+        return gains(self.values, drawn, xlabel=label, logx=spread(self.values), title=title)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class MeanFrictionResult(Result):
+    """The mean friction of the forced periodic states under a modulated load, over one parameter.
+
+    Attributes
+    ----------
+    system : SlidingSystem
+        The laws and the parameters that were not swept.
+    name : str
+        The parameter that was swept.
+    values : tuple of float
+        Its values (n,) in its declared unit.
+    means : Mapping[float, MeanFriction]
+        Time means (n,) over a forcing period, by the amplitude eps.
+    """
+
+    system: SlidingSystem
+    name: str
+    values: tuple[float, ...] = field(repr=False)
+    means: Mapping[float, MeanFriction] = field(repr=False)
+
+    @cached_property
+    def table(self) -> Table:
+        """Return mean friction, and what modulation takes off it, a row for each amplitude and value."""
+        rows = []
+        for eps, found in self.means.items():
+            cells = (found.steady, found.force, found.drop, found.friction, found.growth, found.error)
+            rows += [
+                (eps, x, *(float(c[i]) for c in cells), found.status[i].value) for i, x in enumerate(self.values)
+            ]
+        about = "ln of the leading multiplier's modulus; the forced state is stable where negative"
+        columns = (
+            Column("eps", "1", "modulation amplitude"),
+            _swept(self.system, self.name),
+            Column("steady_force", "1", "friction force of steady sliding over W0"),
+            Column("mean_force", "1", "mean friction force over W0"),
+            Column("force_drop", "1", "what modulation takes off the mean friction force, over W0"),
+            Column("mean_friction", "1", "mean friction coefficient"),
+            Column("growth_per_period", "1", about),
+            Column("error", "1", "estimated error of the mesh", ".2g"),
+            Column("status", "", STATUS),
+        )
+        notes = ("mean over a forcing period of the forced periodic state, stable or not",)
+        kept = self.system.described(without=(self.name, "eps"))
+        return Table("srf.response.mean/2", columns, rows, self.system.model.title, notes, kept)
+
+    @property
+    def status(self) -> Status:
+        """Return the worst status of the rows."""
+        return worst([s for found in self.means.values() for s in found.status])
+
+    def plot(self, ax: Axes | None = None) -> Figure:
+        """Return the drop of the mean friction force over the parameter that was swept, a curve for each amplitude."""
+        from srfcli.results import plots
+
+        curves = [found.drop.tolist() for found in self.means.values()]
+        names = [f"ε = {eps:g}" for eps in self.means]
+        label = plots.axis_label(self.name, _swept(self.system, self.name).unit)
+        ylabel = "drop of the mean friction force / W$_0$"
+        title = plots.titled(self.table.title, self.table.parameters)
+        return plots.lines(self.values, curves, names, label, ylabel, spread(self.values), title=title, ax=ax)
+
+
+def _swept(system: SlidingSystem, name: str) -> Column:
+    """Return the column of the parameter that was swept."""
+    return Column(name, system.model.parameters[system.model.index(name)].unit, "", ".8g")
 
 
 # One forced periodic state: its Floquet multipliers, mean friction and harmonics.

@@ -1,4 +1,4 @@
-"""`linear`, `floquet`, `critical` and `continue`: the stability of sliding under a constant and under a modulated load."""
+"""`linear`, `response`, `floquet`, `critical` and `continue`: sliding under a constant and under a modulated load."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ from srfcli.core.settings import check_value, require_parameter
 from srfcli.core.units import to_base
 from srfcli.numerics.hopf import HopfPoint, closed_forms, hopf_points, steady_is_stable, weakening
 from srfcli.numerics.plane import Axis, Plane, check_count
-from srfcli.results.stability import BoundaryResult, CriticalResult, LinearResult, PeriodicResult
+from srfcli.results.stability import (
+    BoundaryResult,
+    CriticalResult,
+    LinearResult,
+    MeanFrictionResult,
+    PeriodicResult,
+    ResponseResult,
+)
 
 if TYPE_CHECKING:
     from srfcli.codegen.model import Array
@@ -24,6 +31,9 @@ if TYPE_CHECKING:
     from srfcli.numerics.boundary import BoundaryPoint
     from srfcli.numerics.continuation import Atlas, AtlasSettings
     from srfcli.numerics.critical import LoadWindow
+
+Values = Sequence[float] | float
+Said = Callable[[str], None]
 
 
 def swept(model: GeneratedModel, over: Mapping[str, Sequence[float] | float]) -> dict[str, tuple[float, ...]]:
@@ -130,6 +140,77 @@ def _point_cells(point: HopfPoint, value: dict[str, float]) -> dict[str, Any]:
     return cells | {"status": "ok" if known else "no Lyapunov coefficient: the Jacobian overflows"}
 
 
+# `response`: how sliding follows a modulated load.
+
+FREQUENCIES = tuple(np.geomspace(1.0, 1000.0, 200).tolist())  # Hz
+
+
+def response(
+    system: SlidingSystem,
+    *,
+    over: Mapping[str, Sequence[float] | float] | None = None,
+    eps: Values | None = None,
+    tol: float = 1e-6,
+) -> ResponseResult | MeanFrictionResult:
+    """Return how friction, position and slip velocity follow a modulated load, to first order; with `eps` the mean friction.
+
+    Parameters
+    ----------
+    system : SlidingSystem
+        The slider, from `srfcli.system`.
+    over : mapping from one parameter to values, optional
+        Values in declared units; f from 1 to 1000 Hz if left out.
+    eps : number or sequence, optional
+        Relative amplitudes at which the mean friction of the forced periodic states is found in place of the linear response.
+    tol : float
+        Relative error of the mean friction.
+
+    Returns
+    -------
+    ResponseResult or MeanFrictionResult
+        A row for each value, and each amplitude; the status is the worst of the rows.
+
+    Raises
+    ------
+    SrfError
+        For several parameters, one that the system does not have or eps, a value out of bounds, or a law without a value under
+        a load that changes.
+
+    References
+    ----------
+    Perfettini, Schmittbuhl, Rice and Cocco (2001), J. Geophys. Res. 106, 13455: the linear response.
+    Bureau, Baumberger and Caroli (2000), Phys. Rev. E 62, 6810: the mean friction.
+
+    Examples
+    --------
+    >>> import srfcli as srf
+    >>> slider = srf.system(V=10, W0=6)
+    >>> found = srf.response(slider, over={"f": [10, 100]})
+    >>> [round(gain, 4) for gain in found.to_dataframe()["position_gain"]]
+    [6.7659, 0.6162]
+    >>> drop = srf.response(slider, over={"f": [120]}, eps=0.2).table.rows[0][4]
+    >>> round(drop, 5)
+    0.07176
+    """
+    from srfcli.numerics.response import linear_response, mean_friction
+
+    over = {"f": FREQUENCIES} if over is None else over
+    if len(over) != 1:
+        raise SrfError(f"over has {len(over)} parameters", "One parameter is swept: over={'f': [1, 10, 100]}.")
+    model, ((name, values),) = system.model, swept(system.model, over).items()
+    if name == "eps":
+        raise SrfError("eps is not swept", "Give amplitudes by `eps`; the linear response has none.")
+    model.check_changing_load(system.vector())
+
+    def at(amplitude: float) -> Array:
+        return np.stack([system.vector(**{name: value, "eps": amplitude}) for value in values], axis=1)
+
+    if eps is None:
+        return ResponseResult(system, name, values, linear_response(model, at(0.0)))
+    means = {amplitude: mean_friction(model, at(amplitude), tol=tol) for amplitude in checked(model, "eps", eps)}
+    return MeanFrictionResult(system, name, values, means)
+
+
 # `floquet`: one forced periodic state in full.
 
 
@@ -179,8 +260,6 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
 # `critical` and `continue`: the stability boundary under modulation, point by point and as curves.
 
 LINES = 5  # that are followed outwards to find the loads to look between
-Values = Sequence[float] | float
-Said = Callable[[str], None]
 
 
 def critical(
