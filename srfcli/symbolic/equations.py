@@ -98,7 +98,7 @@ def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
         if sp.simplify(reduced.subs(y, guess)) == 0:
             return guess
     try:
-        roots = [r for r in sp.solve(reduced, y) if not r.has(sp.I)]
+        roots = [r for r in sp.solve(reduced, y) if not r.has(sp.I)] if _may_be_solved(reduced, y) else []
     except (NotImplementedError, TypeError):  # the latter where sympy compares symbols on its way
         roots = []
     if not roots:
@@ -107,6 +107,35 @@ def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
             "write the rate in terms of v*phi/D0 so that it vanishes at a constant, as 1 - v*phi/D0 does",
         )
     return roots[0]
+
+
+def _may_be_solved(reduced: sp.Expr, y: sp.Symbol) -> bool:
+    """Return whether reduced = 0 may have a closed form in y; sympy takes many seconds to find that it has none.
+
+    Of terms c y^p (ln y)^q two at most, a quadratic in a power of y, or three with one logarithm, whose roots are Lambert functions;
+    of any other terms nobody knows.
+    """
+    powers: set[tuple[sp.Expr, sp.Expr]] = set()
+    for term in sp.Add.make_args(sp.expand(reduced.as_independent(y, as_Add=False)[1])):
+        p = q = sp.S.Zero
+        for factor in sp.Mul.make_args(term.as_independent(y, as_Add=False)[1]):
+            base, exponent = factor.as_base_exp()
+            if base == y:
+                p += exponent
+            elif base == sp.log(y):
+                q += exponent
+            elif factor.has(y):
+                return True
+        powers.add((p, q))
+    if len(powers) < 3:
+        return True
+    logarithmic = [p for p, q in powers if q != 0]
+    if logarithmic:
+        return len(powers) == 3 and len(logarithmic) == 1
+    exponents = [p for p, _ in powers]
+    lowest = [p for p in exponents if all((other - p).is_nonnegative for other in exponents)]
+    gaps = [p - lowest[0] for p in exponents if p != lowest[0]] if lowest else []
+    return len(gaps) == 2 and (gaps[0] - 2 * gaps[1] == 0 or gaps[1] - 2 * gaps[0] == 0)
 
 
 @dataclass(frozen=True)
