@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from srfcli.codegen.model import GeneratedModel
 from srfcli.core.cache import LARGEST, cache_folder, content_key, is_sealed, seal
 from srfcli.core.errors import SrfError
-from srfcli.core.files import read_plain
+from srfcli.core.files import read_plain, write_atomic
 
 # Generated array functions as C: `x[..., i]` becomes `x[i]`, `out[..., i, j] = e` one assignment to a flat array.
 
@@ -399,7 +399,7 @@ def library_of(write: Callable[[], CText], parts: Sequence[str]) -> ctypes.CDLL:
     if folder is not None:
         path = folder / f"{key}.so"
         with contextlib.suppress(OSError):  # a cache that cannot be written, or a disk from which nothing may be run
-            return _load(path if _intact(path) else _build(write(), path, sealed=True))
+            return _load(path if _kept(path) else _build(write(), path, sealed=True))
     try:
         with tempfile.TemporaryDirectory(prefix="srf-", ignore_cleanup_errors=True) as scratch:
             return _load(_build(write(), Path(scratch) / f"{key}.so"))  # it stays in memory when its file is gone
@@ -425,42 +425,45 @@ def _command() -> tuple[str, ...]:
 def _build(source: CText, path: Path, *, sealed: bool = False) -> Path:
     """Compile and link to a file beside `path`, then put it in place, sealed for a later process if it is to stay."""
     method = _method(source.method)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as folder:
-        library = Path(folder) / "model.so"
-        (Path(folder) / "method.o").write_bytes(method)
-        _run(Path(folder), source.model, "-shared", "-o", str(library), "text.c", "method.o", *LIBRARIES)
-        _put(library, path, sealed=sealed)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".build-") as scratch:
+        folder = Path(scratch)
+        library, known, mark = (folder / name for name in ("model.so", "method.o", "model.sum"))
+        known.write_bytes(method)
+        _run(folder, source.model, "-shared", "-o", str(library), str(known), end=LIBRARIES)
+        if sealed:
+            mark.write_text(seal(path.name, library.read_bytes()), encoding="ascii")
+            mark.replace(path.with_suffix(".sum"))
+        library.replace(path)
     return path
 
 
 def _method(text: str) -> bytes:
     """Return the object of a method, compiled once for all models: kept in the cache, or as long as this process lasts."""
-    key = _key([text])
-    if key in _methods:
-        return _methods[key]
-    folder = cache_folder()
+    key, folder = _key([text]), cache_folder()
     path = folder / f"{key}.o" if folder else None
-    if path is None or not _intact(path):
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".build-") as scratch:
-            found = Path(scratch) / "method.o"
-            _run(Path(scratch), text, "-c", "-o", str(found), "text.c")
-            _methods[key] = found.read_bytes()
-            if path is not None:
-                _put(found, path, sealed=True)
-    else:
-        _methods[key] = read_plain(path, limit=LARGEST)
-    return _methods[key]
+    found = _methods.get(key) or (_kept(path) if path else None)
+    if found is None:
+        with tempfile.TemporaryDirectory(prefix="srf-", ignore_cleanup_errors=True) as scratch:
+            built = Path(scratch) / "method.o"
+            _run(Path(scratch), text, "-c", "-o", str(built))
+            found = built.read_bytes()
+        if path is not None:
+            with contextlib.suppress(OSError):
+                write_atomic(path.with_suffix(".sum"), seal(path.name, found))
+                write_atomic(path, found)
+    _methods[key] = found
+    return found
 
 
-def _run(folder: Path, text: str, *arguments: str) -> None:
-    """Run the compiler in `folder` on a text, which it finds there as text.c."""
-    (folder / "text.c").write_text(text, encoding="utf-8")
+def _run(folder: Path, text: str, *arguments: str, end: Sequence[str] = ()) -> None:
+    """Run the compiler on a text, which is put into `folder`, with `arguments` before it and those of the `end` behind."""
+    source = folder / "text.c"
+    source.write_text(text, encoding="utf-8")
     done = subprocess.run(
-        [*_command(), *flags(), *arguments],
+        [*_command(), *flags(), *arguments, str(source), *end],
         capture_output=True,
         text=True,
         check=False,
-        cwd=folder,
         env={**os.environ, "PYTHONSAFEPATH": "1"},  # `python -m ziglang` would look in the current folder first
     )
     if done.returncode:
@@ -468,22 +471,14 @@ def _run(folder: Path, text: str, *arguments: str) -> None:
         raise SrfError(f"{' '.join(_command())} cannot compile a model: {first}", "SRF_CC= turns compiling off")
 
 
-def _put(built: Path, path: Path, *, sealed: bool) -> None:
-    """Put in place what was built, and before it its seal."""
-    if sealed:
-        mark = built.with_suffix(".sum")
-        mark.write_text(seal(path.name, built.read_bytes()), encoding="ascii")
-        mark.replace(path.with_suffix(".sum"))
-    built.replace(path)
-
-
-def _intact(path: Path) -> bool:
-    """Return whether a file lies there as this user built it: to load it is to run it, and half of one ends the process."""
+def _kept(path: Path) -> bytes | None:
+    """Return what lies there as this user built it: to load it is to run it, and half of one ends the process. Else None."""
     try:
-        found = read_plain(path.with_suffix(".sum"), limit=1000).decode("ascii", errors="replace")
-        return is_sealed(path.name, read_plain(path, limit=LARGEST), found)
+        mark = read_plain(path.with_suffix(".sum"), limit=1000).decode("ascii", errors="replace")
+        found = read_plain(path, limit=LARGEST)
+        return found if is_sealed(path.name, found, mark) else None
     except (OSError, SrfError):
-        return False
+        return None
 
 
 def _load(path: Path) -> ctypes.CDLL:

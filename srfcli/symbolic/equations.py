@@ -112,8 +112,8 @@ def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
 def _may_be_solved(reduced: sp.Expr, y: sp.Symbol) -> bool:
     """Return whether reduced = 0 may have a closed form in y; sympy takes many seconds to find that it has none.
 
-    Of terms c y^p (ln y)^q two at most, a quadratic in a power of y, or three with one logarithm, whose roots are Lambert functions;
-    of any other terms nobody knows.
+    A sum of terms c y^p (ln y)^q has one if there are two at most, or three that are a quadratic in a power of y or hold one
+    logarithm, for a Lambert function. Of a sum with any other terms it is not known.
     """
     powers: set[tuple[sp.Expr, sp.Expr]] = set()
     for term in sp.Add.make_args(sp.expand(reduced.as_independent(y, as_Add=False)[1])):
