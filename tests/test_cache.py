@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from srfcli.cli.main import cli
+from srfcli.codegen import c_source
 from srfcli.codegen.c_source import compiled, compiler
 from srfcli.codegen.model import open_model
 from srfcli.core import cache
@@ -280,6 +281,34 @@ def test_a_forged_library_is_never_loaded(folder: Path, tmp_path: Path, make_mod
         assert found(place) == 13  # with the right seal it is what is loaded: the others were refused for theirs
     finally:
         compiled.cache_clear(), compiler.cache_clear()
+
+
+@pytest.mark.usefixtures("fresh")
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("how", ["as it was", "of another name", "not to be written"])
+def test_a_method_that_is_not_this_user_s_is_compiled_anew(folder: Path, make_model, how: str) -> None:
+    """What is no object would end the linker; a place that cannot be written is done without."""
+
+    def build() -> None:
+        compiled.cache_clear(), c_source._methods.clear()
+        assert compiled(make_model()) is not None
+
+    try:
+        build()
+        (method,) = folder.glob("*.o")
+        mark, whole, forged = method.with_suffix(".sum"), method.read_bytes(), b"forged"
+        for library in folder.glob("*.so"):
+            library.unlink()
+        method.write_bytes(forged)
+        if how == "of another name":
+            mark.write_text(cache.seal("other.o", forged))
+        if how == "not to be written":
+            mark.unlink()
+            mark.mkdir()
+        build()
+        assert method.read_bytes() == (forged if mark.is_dir() else whole)  # a compiler makes the same of the same text
+    finally:
+        compiled.cache_clear(), c_source._methods.clear()
 
 
 @POSIX

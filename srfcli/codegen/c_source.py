@@ -448,7 +448,7 @@ def _method(text: str) -> bytes:
             _run(Path(scratch), text, "-c", "-o", str(built))
             found = built.read_bytes()
         if path is not None:
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, SrfError):
                 write_atomic(path.with_suffix(".sum"), seal(path.name, found))
                 write_atomic(path, found)
     _methods[key] = found
