@@ -118,7 +118,7 @@ def test_a_changed_law_is_derived_anew(folder: Path, tmp_path: Path) -> None:
 def test_a_second_start_imports_no_sympy(folder: Path) -> None:
     code = (
         "import sys; from srfcli.codegen.model import open_model; from srfcli.laws.registry import load_registry; "
-        "open_model(load_registry(), inertia=False, loading='inclined'); print('sympy' in sys.modules)"
+        "open_model(load_registry(), law='dieterich-ruina', interface='rigid'); print('sympy' in sys.modules)"
     )
     environment = {**os.environ, "SRF_CACHE": str(folder)}
     runs = [
@@ -318,7 +318,7 @@ def test_a_command_says_once_that_nothing_is_cached(folder: Path) -> None:
     folder.chmod(0o777)
     for more, said in ((), 1), (("-q",), 0):
         cache._warn.cache_clear()
-        done = CliRunner().invoke(cli, ["linear", "--no-inertia", "--loading", "inclined", *more], prog_name="srf")
+        done = CliRunner().invoke(cli, ["linear", "--law", "dieterich-ruina", "--interface", "rigid", *more], prog_name="srf")
         assert done.exit_code == 0, done.output
         assert done.stderr.count("Warning: nothing is cached: others may write to") == said
     assert not list(folder.iterdir())

@@ -23,6 +23,9 @@ def shipped_systems() -> list[dict[str, Any]]:
     asked += [{"interface": name} for name in laws["interface"] if name != "elastic"]
     asked += [{"ageing": "dieterich+linker-dieterich"}, {"loading": "inclined"}, {"inertia": False}]
     asked += [{"random_field": True}, {"tables": (("mu", "slip"),)}]  # `srf fit` and `srf diagnose` begin with these
+    for ageing in ("dieterich", "ruina"):  # a rock press
+        rock = {"law": "dieterich-ruina", "ageing": ageing, "interface": "rigid", "inertia": False}
+        asked += [rock, {**rock, "random_field": True}]
     return asked
 
 
