@@ -39,12 +39,24 @@ ROUNDS = 4  # in which the calm stretches are chosen anew
 NEIGHBOURS = 1.94  # powers over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
 WHITE = 1e-3  # standard deviation of each part over that of the whole noise, at least
 LEAST = 1e-150  # standard deviation whose square is still a number
-STEP = 1e-5  # of the central differences by which a covariance is differentiated, in the logarithms of its parameters
 
 
 def covariance(colour: tuple[float, ...], lag: Array) -> Array:
     """Return the covariance at lags >= 0 (s) of a relaxation (time, sd) or an oscillation (frequency, sd, quality)."""
-    return np.asarray(colour[1] ** 2 * transition(colour, lag)[..., 0, 0])
+    if len(colour) == 2:
+        return np.asarray(colour[1] ** 2 * np.exp(-lag / colour[0]))
+    a, _, c, s, _ = _swing(colour, lag)
+    return np.asarray(colour[1] ** 2 * (c + a * s))
+
+
+def covariance_slopes(colour: tuple[float, ...], lag: Array) -> list[Array]:
+    """Return the derivatives of `covariance` by the logarithms of time, or of frequency and quality."""
+    if len(colour) == 2:
+        return [covariance(colour, lag) * lag / colour[0]]
+    a, b, c, s, square = _swing(colour, lag)
+    near = np.abs(square) < 1e-4
+    curved = np.where(near, np.exp(-a) * (1 / 3 + square / 30), (c - s) / np.where(near, 1.0, square))
+    return [-(colour[1] ** 2) * b**2 * s, -(colour[1] ** 2) * a * b**2 * curved]
 
 
 def transition(colour: tuple[float, ...], lag: Array) -> Array:
@@ -52,16 +64,19 @@ def transition(colour: tuple[float, ...], lag: Array) -> Array:
     lag = np.asarray(lag, dtype=float)
     if len(colour) == 2:
         return np.exp(-lag / colour[0])[..., None, None]
+    a, b, c, s, _ = _swing(colour, lag)
+    return np.stack([np.stack([c + a * s, b * s], -1), np.stack([-b * s, c - a * s], -1)], -2)
+
+
+def _swing(colour: tuple[float, ...], lag: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Return a = omega lag/(2 q), b = omega lag, exp(-a) times cosh(r) and sinh(r)/r, and r^2 = a^2 - b^2."""
     b = 2 * np.pi * colour[0] * lag
     a = b / (2 * colour[2])
     root = np.sqrt((a**2 - b**2).astype(complex))
     small = np.abs(root) < 1e-6
     grown, fallen = np.exp(root - a), np.exp(-root - a)
-    c, s = (
-        ((grown + fallen) / 2).real,
-        np.where(small, np.exp(-a), ((grown - fallen) / (2 * np.where(small, 1, root))).real),
-    )
-    return np.stack([np.stack([c + a * s, b * s], -1), np.stack([-b * s, c - a * s], -1)], -2)
+    s = np.where(small, np.exp(-a), ((grown - fallen) / (2 * np.where(small, 1, root))).real)
+    return a, b, ((grown + fallen) / 2).real, s, a**2 - b**2
 
 
 def colour_text(colour: tuple[float, ...]) -> str:
@@ -318,7 +333,7 @@ class _Whittle:
         for colour in colours:
             C = covariance(colour, self.lag)
             total = total + C
-            by = [self.slope(colour, i) for i in range(len(colour)) if i != 1]
+            by = covariance_slopes(colour, self.lag)
             slopes += [by[0], 2 * C, *by[1:]]
         columns = self.calm.window.expected @ np.column_stack([total, *slopes])
         E, E_x = columns[:, 0], columns[:, 1:]
@@ -326,11 +341,6 @@ class _Whittle:
             return np.inf, np.zeros(x.size)
         ratio = self.calm.mean / E
         return self.weight * float(np.sum(np.log(E) + ratio)), self.weight * ((1 - ratio) / E) @ E_x
-
-    def slope(self, colour: tuple[float, ...], i: int) -> Array:
-        """Return the derivative of a process's covariance by the logarithm of its i-th parameter."""
-        sides = [covariance((*colour[:i], colour[i] * np.exp(e), *colour[i + 1 :]), self.lag) for e in (STEP, -STEP)]
-        return np.asarray((sides[0] - sides[1]) / (2 * STEP))
 
     def climb(self, kinds: Sequence[str], starts: Sequence[Sequence[Array]]) -> tuple[float, Array]:
         """Return the log likelihood and x of the likeliest maximum, from the likeliest of each group of starts."""
