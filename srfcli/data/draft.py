@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from srfcli.core.errors import SrfError, did_you_mean
-from srfcli.core.files import toml_value
+from srfcli.core.files import toml_value, unused_name
 from srfcli.core.settings import Parameter
 from srfcli.core.units import (
     GEOMETRY_UNITS,
@@ -403,11 +403,7 @@ def _as_file(text: str) -> Iterator[Path]:
 def _run_names(files: Sequence[Path]) -> list[str]:
     names: list[str] = []
     for path in files:
-        stem, number = path.stem, 2
-        name = stem
-        while name in names:
-            name, number = f"{stem}-{number}", number + 1
-        names.append(name)
+        names.append(unused_name(path.stem, "", names))
     return names
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.errors import SrfError
 from srfcli.core.units import to_base
-from srfcli.data.values import Experiment, Run
+from srfcli.data.values import Experiment, Run, per_elongation
 from srfcli.diagnosis.hypotheses import (
     Excluded,
     Shape,
@@ -557,10 +557,7 @@ def _elongation_rate(run: Run, x: Array, model: GeneratedModel, fitted: StateSpa
         rate = V - slipping
     else:
         rate = np.gradient(np.asarray(model.elongation(x[:, : len(states)], V, W, W_dot, p)), run.t)
-    K = p[model.index("K")]
-    return np.asarray(
-        rate if run.observable == "elongation" else rate * K / (W if run.observable == "friction" else 1.0)
-    )
+    return np.asarray(rate * per_elongation(run.observable, p[model.index("K")], W))
 
 
 def _rates_by_V(model: GeneratedModel, fitted: StateSpaceFit, run: Run, x: Array) -> Array:

@@ -700,9 +700,8 @@ def first_level(t: Array, signal: Signal) -> float:
 
 def typical_friction(run: Run) -> float:
     """Return the typical friction coefficient of a recording."""
-    observed, W = run.observed[run.used], run.load(run.t)[0][run.used]
-    over = W if run.observable == "friction" else run.stiffness if run.observable == "elongation" else 1.0
-    return float(np.median(np.abs(observed * over / W)))
+    W = run.load(run.t[run.used])[0]
+    return float(np.median(np.abs(run.observed[run.used] * run.friction_factor(W))))
 
 
 @dataclass(frozen=True)
