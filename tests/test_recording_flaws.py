@@ -20,7 +20,7 @@ from srfcli.data.clock import Place
 from srfcli.data.experiment import KINDS, check_run, read_experiment
 from srfcli.data.gauge import GaugeNoise, find_noise, whiten
 from srfcli.data.imposed import find_modulation, load_from_column
-from srfcli.data.noise import measured
+from srfcli.data.noise import measured, spikes
 from srfcli.data.values import Run
 from srfcli.laws.registry import load_registry
 from srfcli.motion.imposed import ConstantLoad
@@ -266,6 +266,14 @@ def test_no_flaw_is_found_in_the_noise_of_a_laboratory(seed: int, tmp_path: Path
     c.heading, c.toml = HEADING.replace("velocity [um/s]", "displacement [um]"), NO_DRIVE
     kinds = {n.kind for n in c.read(tmp_path).notices}
     assert not kinds & {"spike", "reset", "saturation"}, kinds
+
+
+@pytest.mark.parametrize("place", [499, 501, 502, 503])  # 500 is the slip itself
+def test_a_spike_beside_a_slip_is_found_and_the_slip_is_none(place: int) -> None:
+    x = np.tile(np.linspace(0.0, 2.0, 100), 10) + 0.02 * np.random.default_rng(3).standard_normal(1000)
+    assert not spikes(x).any()
+    x[place] += 5.0
+    assert np.flatnonzero(spikes(x)).tolist() == [place]
 
 
 def test_a_lone_spike_on_a_constant_load_is_bridged(tmp_path: Path) -> None:

@@ -112,9 +112,10 @@ def local_scale(x: Array, m: Array) -> Array:
 def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: float = 0.0) -> Mask:
     """Return which samples of x (n,) are spikes: up to three that stand out from both sides, with the same level after them.
 
-    A slip event or any other step is no spike, as the level after it is another. `rise` (n,), if given, is the largest rise from
-    each sample to the next that the drive allows: a rise at that pace is reloading, and no spike. No spike is smaller than
-    `least`.
+    That is the level of a few samples, or of the next one beside a slip event. A slip or any other step is no spike, as both are
+    others.
+    `rise` (n,), if given, is the largest rise from each sample to the next that the drive allows: a rise at that pace is
+    reloading, and no spike. No spike is smaller than `least`.
     """
     from scipy.ndimage import median_filter
 
@@ -133,8 +134,13 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
         threshold = np.maximum(FACTOR * np.maximum(scale[first - 3], scale[first + width + 2]) + 2 * quantum, least)
         if rise is not None:  # from the median before, three samples back, to the median after
             threshold = np.maximum(threshold, 3 * (width + 5) * rise[first])
-        hit = (size > threshold) & (np.abs(after - before) < 0.5 * size)
-        hit &= _off_neighbours(x, first, width) > CREST * size
+        off, apart = _off_neighbours(x, first, width), np.abs(after - before)
+        hit = (size > threshold) & (apart < 0.5 * size) & (off > CREST * size)
+        if width == 1:  # beside a slip, which is at most three samples away, the next ones tell the level
+            last, following = x[first - 1], x[first + width]
+            near = np.maximum(group[0] - np.maximum(last, following), np.minimum(last, following) - group[0])
+            alone = near > np.maximum(threshold, 4 * np.abs(following - last))
+            hit |= (size > threshold) & (apart > threshold) & alone & (off > CREST * near)
         for k in range(width):
             found[first[hit] + k] = True
     return found
