@@ -609,18 +609,25 @@ class ModelSearch:
             self._search()
 
     def _eliminate(self) -> None:
-        """Refit the parts of the best model, and of those that come close, alone from its parameters (backward elimination)."""
-        top = self.best().evidence
-        close = [f for f in self.ranked() if top - f.evidence < CLOSE and len(f.hypothesis.effects) > 1]
-        for node in close:
-            for effect, own in zip(node.hypothesis.effects, self._sizes(node), strict=True):
-                part = Hypothesis((effect,), node.hypothesis.ageing)
+        """Refit the best model, and what comes close, with fewer parts from its parameters (backward elimination).
+
+        Each effect of a pair alone, and effects beside another ageing law under the stated one.
+        """
+        for node in [f for f in self.ranked() if len(f.hypothesis.reported) > 1]:
+            top = self.best().evidence
+            if node.evidence < top - CLOSE:
+                break
+            effects, ageing, sizes = node.hypothesis.effects, node.hypothesis.ageing, self._sizes(node)
+            parts = [(Hypothesis(effects), sizes)] if ageing else []
+            if len(effects) > 1:
+                parts += [(Hypothesis((e,), ageing), (own,)) for e, own in zip(effects, sizes, strict=True)]
+            for part, own in parts:
                 known = self.fitted.get(part.name)
                 if known is not None and known.fine and known.evidence > top - CLOSE:
                     continue
-                if any(n not in self._stated for n in effect.needs):
+                if any(n not in self._stated for e in part.effects for n in e.needs):
                     continue  # it is nothing without the other
-                self._fit_from(node, part, (own,))
+                self._fit_from(node, part, own)
 
     @cached_property
     def _stated(self) -> frozenset[str]:
