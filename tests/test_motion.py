@@ -12,7 +12,6 @@ import time
 import numpy as np
 import pytest
 
-from srfcli.codegen import c_source as compiled_module
 from srfcli.codegen.c_source import compiled, compiler
 from srfcli.core.errors import SrfError, Status
 from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps, Modulation
