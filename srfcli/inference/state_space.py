@@ -431,7 +431,7 @@ class Likelihood:
         self._tables = [self._table(loads) for loads in problem.tables]
 
     def beside(self, problem: Problem, processes: Sequence[str] | None = None) -> Likelihood:
-        """Return the likelihood of another problem with the same track and tolerance, and coloured noise unless that is given."""
+        """Return the likelihood of another problem: same track, same tolerance, same coloured noise unless that is given."""
         given = self.processes if processes is None else processes
         return Likelihood(problem, smooth=self.smooth, processes=given, rtol=self.base_rtol)
 
