@@ -38,6 +38,7 @@ from srfcli.cli.options import (
 from srfcli.core import settings
 from srfcli.core.errors import ExpressionError, SrfError, Status
 from srfcli.core.settings import Parameter, TomlSettings, find_toml, load_toml, resolve
+from srfcli.core.units import to_base
 from srfcli.results.tables import Column, Table
 
 ROOT = Path(srfcli.__file__).parents[1]
@@ -52,6 +53,12 @@ def no_settings_of_the_caller(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
         monkeypatch.delenv(name)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
+
+
+def base_points(over: Range) -> list[float]:
+    """Return every value of a range in um, s, N and radians."""
+    fitted = over.fitted(PARAMETERS)
+    return [to_base(value, fitted.unit) for value in fitted.points()]
 
 
 @click.group("srf", cls=SrfGroup, context_settings=CONTEXT, params=switches())
@@ -78,7 +85,7 @@ def run(system: SystemOptions, over: tuple[Range, ...], output: OutputOptions, V
     if fail in failures:
         raise failures[fail]
     resolved = system.resolve(PARAMETERS, V=V[0] if V else None)
-    rows = [(x, None, float("nan")) for x in over[0].base_points(PARAMETERS)]
+    rows = [(x, None, float("nan")) for x in base_points(over[0])]
     table = Table("srf.demo/1", (Column("V", "um/s"), Column("a"), Column("b")), rows, parameters=resolved.described())
     emit(table, output, figure=lambda: _figure(rows), seed=1)
     if fail:
@@ -371,7 +378,7 @@ def test_options_repeat_what_the_system_says() -> None:
     ],
 )
 def test_ranges(text: str, points: list[float]) -> None:
-    found = parse_over(text).base_points(PARAMETERS)
+    found = base_points(parse_over(text))
     assert found == pytest.approx(points, rel=1e-14) and len(found) == len(points)
 
 

@@ -16,11 +16,12 @@ import pytest
 from srfcli.codegen.c_source import compiler
 from srfcli.codegen.model import COMPLEX_STEP, load_source
 from srfcli.core.errors import SrfError
+from srfcli.laws.expression import symbol
 from srfcli.laws.registry import bundled_registry
 from srfcli.laws.values import Effect
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.integrators import integrate, integrate_lsoda, scalar_function
-from srfcli.symbolic.equations import equations_of
+from srfcli.symbolic.equations import equations_of, steady_states
 from srfcli.symbolic.system import System, build_system
 from srfcli.tasks.law_check import evaluate
 
@@ -357,3 +358,32 @@ def test_every_shipped_effect_is_here():
         e.name for e in REGISTRY.entries("effect")
     }
     assert all(isinstance(REGISTRY.get("effect", n), Effect) for c in WITH for n in c["effects"])
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [
+        "1 - 0.5*v*phi/D0 - 0.25*(v*phi/D0)**3",  # a polynomial
+        "2 - sqrt(v*phi/D0) - v*phi/D0",
+        "2 - log(v*phi/D0) - 0.3*log(v*phi/D0)**2",
+        "2 - v*phi/D0 - 0.3*log(v*phi/D0)",  # a Lambert function
+        "2 - (v*phi/D0)**q - 0.3*(v*phi/D0)**(2*q)",
+        None,
+    ],
+)
+def test_a_law_of_one_s_own_has_its_steady_state(rate: str | None, tmp_path: Path) -> None:
+    """The rate vanishes there; a law without a closed form is told so."""
+    law = tmp_path / "own.toml"
+    head = 'format = "srf-law/1"\nkind = "ageing"\nname = "own"\nabout = "made up"\n'
+    end = '\n[parameters]\nq = { default = 0.7, unit = "1", bounds = [0.1, 3], about = "x" }\n'
+    law.write_text(f'{head}rate = "{rate or "1 - 0.7*v*phi/D0 - 0.2*(v*phi/D0)**q - 0.3*log(v*phi/D0)**2"}"{end}')
+    system = build_system(REGISTRY, ageing=str(law))
+    if rate is None:
+        with pytest.raises(SrfError, match="no closed form for the steady state"):
+            steady_states(system)
+        return
+    (phi,) = steady_states(system)
+    at = {"v": 3.0, "D0": 0.4, "q": 0.7}
+    y = float(phi.subs({symbol(n): value for n, value in at.items()})) * at["v"] / at["D0"]
+    names = {"sqrt": np.sqrt, "log": np.log, "phi": y * at["D0"] / at["v"], **at}
+    assert y > 0 and abs(eval(rate, {"__builtins__": {}}, names)) < 1e-12

@@ -37,7 +37,7 @@ from srfcli.core.settings import (
     require_parameter,
     resolve,
 )
-from srfcli.core.units import convert, parse_quantity, split_quantity, tidy, to_base
+from srfcli.core.units import convert, parse_quantity, split_quantity, tidy
 from srfcli.results.plots import check_plot
 
 if TYPE_CHECKING:
@@ -97,11 +97,6 @@ class Range:
         if self.values is not None:
             hint = f"An axis runs from a low to a high end: --over {self.name}=1:100."
             raise SrfError(f"--over {self.name} lists values", hint)
-
-    def base_points(self, parameters: Sequence[Parameter], *, where: str = "this system") -> list[float]:
-        """Return every value in um, s, N and radians."""
-        fitted = self.fitted(parameters, where=where)
-        return [to_base(value, fitted.unit) for value in fitted.points()]
 
 
 def parse_over(text: str) -> Range:

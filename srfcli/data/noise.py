@@ -113,9 +113,8 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
     """Return which samples of x (n,) are spikes: up to three that stand out from both sides, with the same level after them.
 
     That is the level of a few samples, or of the next one beside a slip event. A slip or any other step is no spike, as both are
-    others.
-    `rise` (n,), if given, is the largest rise from each sample to the next that the drive allows: a rise at that pace is
-    reloading, and no spike. No spike is smaller than `least`.
+    others. `rise` (n,), if given, is the largest rise from each sample to the next that the drive allows: a rise at that pace
+    is reloading, and no spike. No spike is smaller than `least`.
     """
     from scipy.ndimage import median_filter
 

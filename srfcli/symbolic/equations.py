@@ -112,8 +112,9 @@ def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
 def _may_be_solved(reduced: sp.Expr, y: sp.Symbol) -> bool:
     """Return whether reduced = 0 may have a closed form in y; sympy takes many seconds to find that it has none.
 
-    A sum of terms c y^p (ln y)^q has one if there are two at most, or three that are a quadratic in a power of y or hold one
-    logarithm, for a Lambert function. Of a sum with any other terms it is not known.
+    A sum of terms c y^p (ln y)^q may have one if there are two at most, if all p are numbers and there is no logarithm, if all
+    p are alike, or if there are three that are a quadratic in a power of y or hold one logarithm, for a Lambert function. Of a
+    sum with any other terms it is not known.
     """
     powers: set[tuple[sp.Expr, sp.Expr]] = set()
     for term in sp.Add.make_args(sp.expand(reduced.as_independent(y, as_Add=False)[1])):
@@ -127,15 +128,11 @@ def _may_be_solved(reduced: sp.Expr, y: sp.Symbol) -> bool:
             elif factor.has(y):
                 return True
         powers.add((p, q))
-    if len(powers) < 3:
+    exponents, logarithms = [p for p, _ in powers], sum(q != 0 for _, q in powers)
+    if len(powers) < 3 or len(set(exponents)) == 1 or (not logarithms and all(p.is_number for p in exponents)):
         return True
-    logarithmic = [p for p, q in powers if q != 0]
-    if logarithmic:
-        return len(powers) == 3 and len(logarithmic) == 1
-    exponents = [p for p, _ in powers]
-    lowest = [p for p in exponents if all((other - p).is_nonnegative for other in exponents)]
-    gaps = [p - lowest[0] for p in exponents if p != lowest[0]] if lowest else []
-    return len(gaps) == 2 and (gaps[0] - 2 * gaps[1] == 0 or gaps[1] - 2 * gaps[0] == 0)
+    quadratic = not logarithms and any(sp.expand(sp.Add(*exponents) - 3 * middle) == 0 for middle in exponents)
+    return len(powers) == 3 and (quadratic or logarithms == 1)
 
 
 @dataclass(frozen=True)

@@ -202,8 +202,11 @@ def response(
         raise SrfError("eps is not swept", "Give amplitudes by `eps`; the linear response has none.")
     model.check_changing_load(system.vector())
 
+    unit = model.parameters[model.index(name)].unit
+    points = np.array([to_base(value, unit) for value in values])
+
     def at(amplitude: float) -> Array:
-        return np.stack([system.vector(**{name: value, "eps": amplitude}) for value in values], axis=1)
+        return model.with_values(system.vector(), **{name: points, "eps": amplitude})
 
     if eps is None:
         return ResponseResult(system, name, values, linear_response(model, at(0.0)))
