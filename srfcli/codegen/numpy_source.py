@@ -17,7 +17,7 @@ import sympy as sp
 from srfcli.core.settings import Parameter
 from srfcli.laws.expression import NUMPY_FUNCTIONS, NumPyText, python_name, renamed, symbol
 from srfcli.symbolic.derive import Linearisation, closed_limits, in_law_parameters, linearise
-from srfcli.symbolic.equations import Equations, equations_of, lut, lut1, tidy
+from srfcli.symbolic.equations import Equations, equations_of, lut, lut1, partial_derivative, tidy
 from srfcli.symbolic.system import RANDOM_FIELD, RUN, System
 
 # Formulas in steps: named intermediate values, then outputs in them; derivatives are taken step by step.
@@ -90,7 +90,7 @@ def side_by_side(columns: Sequence[Staged]) -> Staged:
 
 def _total(formula: sp.Expr, rates: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
     moving = sorted(formula.free_symbols & rates.keys(), key=str)
-    return sp.Add(*(sp.diff(formula, s) * rates[s] for s in moving))
+    return sp.Add(*(partial_derivative(formula, s) * rates[s] for s in moving))
 
 
 # Sympy expressions to one readable NumPy module: original names, shared subexpressions, the same text every time.

@@ -41,8 +41,31 @@ class Equations:
     def derivative(self, expression: sp.Expr, index: int) -> sp.Expr:
         """Return d(expression)/d(unknown), by the logarithm where the unknown is logarithmic."""
         s = self.unknowns[index]
-        d = sp.diff(expression, s)
+        d = partial_derivative(expression, s)
         return s * d if self.logarithmic[index] else d
+
+
+@lru_cache(maxsize=1 << 17)
+def partial_derivative(formula: sp.Expr, s: sp.Symbol) -> sp.Expr:
+    """Return what `sp.diff` returns, but each subexpression is differentiated once, whatever formulas it stands in."""
+    if formula == s:
+        return sp.S.One
+    if not formula.args:
+        return sp.S.Zero
+    slopes = [(i, d) for i, a in enumerate(formula.args) if (d := partial_derivative(a, s)) != 0]
+    if not slopes:
+        return sp.S.Zero
+    if isinstance(formula, sp.Add):
+        return sp.Add(*(d for _, d in slopes))
+    if isinstance(formula, sp.Mul):
+        return sp.Add(*(sp.Mul(*formula.args[:i], d, *formula.args[i + 1 :]) for i, d in slopes))
+    if isinstance(formula, sp.Pow):
+        base, exponent = formula.args
+        rise = partial_derivative(exponent, s) * sp.log(base)
+        return formula * (rise + partial_derivative(base, s) * exponent / base)
+    if isinstance(formula, sp.Function) and type(formula)._eval_derivative is sp.Function._eval_derivative:
+        return sp.Add(*(formula.fdiff(i + 1) * d for i, d in slopes))
+    return sp.diff(formula, s)
 
 
 class lut(sp.Function):
