@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from srfcli.tasks.diagnose import diagnose as diagnose
     from srfcli.tasks.map import compare as compare
     from srfcli.tasks.map import map as map
+    from srfcli.tasks.recordings import check as check
     from srfcli.tasks.recordings import fit as fit
     from srfcli.tasks.recordings import read_experiment as read_experiment
     from srfcli.tasks.simulate import simulate as simulate
@@ -50,6 +51,7 @@ PUBLIC = {
     "map": "srfcli.tasks.map",
     "compare": "srfcli.tasks.map",
     "diagnose": "srfcli.tasks.diagnose",
+    "check": "srfcli.tasks.recordings",
     "fit": "srfcli.tasks.recordings",
     "read_experiment": "srfcli.tasks.recordings",
     "simulate": "srfcli.tasks.simulate",

@@ -18,6 +18,7 @@ from click.testing import CliRunner
 import srfcli as srf
 from srfcli.cli.main import cli
 from srfcli.inference.prediction import run_parameters
+from srfcli.results.tables import plain_value
 
 FUNCTIONS = [name for name in srf.__all__ if inspect.isfunction(getattr(srf, name))]
 TASKS = sorted({inspect.getmodule(getattr(srf, name)).__name__ for name in FUNCTIONS})
@@ -114,22 +115,16 @@ def test_a_simulation_under_modulation_ends_in_the_periodic_state(slider: srf.Sl
         srf.simulate(slider, t=[0, 1], drive=[(0, 0)])
 
 
-def test_an_experiment_is_read_and_fitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_experiment_is_read_checked_and_fitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    made = [
-        "simulate",
-        "--drive",
-        "0.5:10, 1:20",
-        "--W0",
-        "5",
-        "--rate",
-        "200",
-        "--noise",
-        "0.02",
-        "--out-dir",
-        "steps",
-    ]
-    assert CliRunner().invoke(cli, made).exit_code == 0
+    made = ("--drive", "0.5:10, 1:20", "--W0", "5", "--rate", "200", "--noise", "0.02", "--out-dir", "steps")
+    assert CliRunner().invoke(cli, ["simulate", *made]).exit_code == 0
+    told = srf.check("steps")
+    assert [plain_value(r) for r in told.table.rows] == rows_of("check", "steps")
+    assert told.runs[0].noise.total == pytest.approx(0.02, rel=0.3) and told.forecast.together is None
+    assert told.plot().axes[0].get_title(loc="left") == told.runs[0].run.name
+    with pytest.raises(srf.SrfError, match="no run 'other'"):
+        srf.check("steps", runs=["other"])
     found = srf.fit(srf.read_experiment("steps"), free=["mu0", "D0"], track="smooth")
     options = ("--free", "mu0,D0", "--track", "smooth")
     assert [list(r) for r in found.table.rows] == rows_of("fit", "steps", *options)

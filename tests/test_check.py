@@ -15,7 +15,6 @@ import pytest
 from click.testing import CliRunner, Result
 from recording_cases import TOML, data, write
 
-from srfcli.cli.check import CAN, verdict_of
 from srfcli.cli.main import cli
 from srfcli.codegen.model import open_model
 from srfcli.data.experiment import check_run, read_experiment
@@ -26,6 +25,7 @@ from srfcli.inference.fit import fit_problem
 from srfcli.inference.prediction import predict
 from srfcli.inference.state_space import as_fit, fit_state_space
 from srfcli.laws.registry import load_registry
+from srfcli.results.check import CAN, verdict_of
 
 REGISTRY = load_registry(user=False, entry_points=False)
 

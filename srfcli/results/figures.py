@@ -10,6 +10,7 @@ from srfcli.results.plots import (
     COLOURS,
     DASHES,
     NAME,
+    NO_LAYOUT,
     QUANTITY,
     Values,
     bare_figure,
@@ -245,8 +246,13 @@ def recordings(runs: Sequence[Mapping[str, Any]], *, title: str = "") -> Figure:
 
 def _settle(figure: Figure) -> None:
     """Fix the layout at rounded positions: the last digits of the layout solver differ from run to run."""
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
+    from matplotlib import rc_context
+
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+    with rc_context(NO_LAYOUT):
+        figure.set_layout_engine(None)  # a placeholder, which "none" leaves, has every file drawn twice
     for axis in figure.axes:
         left, bottom, width, height = (round(float(x), 5) for x in axis.get_position().bounds)
         axis.set_position((left, bottom, width, height))

@@ -62,6 +62,9 @@ STYLE: dict[str, Any] = {
     "pdf.compression": 6,
 }
 
+# A figure whose layout is settled has no engine; under this one it is given none by being saved.
+NO_LAYOUT = {"figure.constrained_layout.use": False}
+
 # Dates would make two equal figures differ.
 _METADATA: dict[str, dict[str, Any]] = {
     ".svg": {"Date": None},
@@ -140,8 +143,10 @@ def new_figure(rows: int = 1, *, size: tuple[float, float] | None = None) -> tup
 
 def figure_bytes(figure: Figure, suffix: str, *, dpi: float | None = None) -> bytes:
     """Return the figure as a .png, .svg or .pdf file's content; equal figures give equal bytes."""
+    from matplotlib import rc_context
+
     buffer = io.BytesIO()
-    with house_style():
+    with house_style(), rc_context(NO_LAYOUT):
         form, dots = suffix.lstrip(".").lower(), dpi or STYLE["savefig.dpi"]
         figure.savefig(buffer, format=form, metadata=_METADATA[suffix.lower()], dpi=dots)
     return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Recordings: read, and fitted."""
+"""Recordings: read, checked and fitted."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.data import experiment as description
 from srfcli.data.values import Experiment
 from srfcli.inference import posterior as posteriors
+from srfcli.inference.cramer_rao import forecast
 from srfcli.inference.recordings import fit_recordings
 from srfcli.laws.registry import Registry, load_registry
+from srfcli.results.check import CheckResult
 from srfcli.results.fit import FitResult
 
 if TYPE_CHECKING:
@@ -71,6 +73,72 @@ def read_experiment(
     """
     known = registry or load_registry([Path(p) for p in plugins])
     return description.read_experiment(Path(path), registry=known, format=format, holdout=holdout)
+
+
+def check(
+    experiment: Experiment | Path | str,
+    *,
+    runs: Sequence[str] = (),
+    simulate: bool = True,
+    registry: Registry | None = None,
+    progress: Callable[[str], None] = lambda run: None,
+) -> CheckResult:
+    """Return what an experiment's recordings are like, and what can be identified from them.
+
+    Parameters
+    ----------
+    experiment : path or Experiment
+        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`, which also takes a reader and plugins.
+    runs : sequence of str
+        Names of runs; all if left out.
+    simulate : bool
+        Whether each run is simulated, to say what its load can tell.
+    registry : Registry, optional
+        Laws, where they are at hand already.
+    progress : callable
+        Told the name of each run before it is simulated.
+
+    Returns
+    -------
+    CheckResult
+        A row for each run; `.runs` has all that was found in each, in um, s, N.
+
+    Raises
+    ------
+    SrfError
+        For what cannot be read, a run that there is not, or an experiment of critical loads alone.
+
+    References
+    ----------
+    Cramer (1946), Mathematical Methods of Statistics: the bound on what a recording tells.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> import srfcli as srf
+    >>> mu = 0.6 + np.random.default_rng(1).normal(0, 2e-4, 200)
+    >>> lines = ["time [s],load_point_velocity [um/s],friction", *(f"{0.1 * i:.1f},3,{x}" for i, x in enumerate(mu))]
+    >>> _ = Path("run.csv").write_text("\\n".join(lines))
+    >>> described = '''
+    ... format = "srf-experiment/1"
+    ... apparatus = { stiffness = "3e-3 1/um" }
+    ... model = { law = "dieterich-ruina", ageing = "ruina", interface = "rigid", inertia = false }
+    ... parameters = { D0 = { value = 10.0, lower = 1.0, upper = 100.0 } }
+    ... runs = [{ name = "run", file = "run.csv", load = "10 MPa" }]
+    ... '''
+    >>> _ = Path("experiment.toml").write_text(described)
+    >>> found = srf.check(".")
+    >>> found.runs[0].run.t.size, round(found.runs[0].noise.total, 4)
+    (200, 0.0002)
+    """
+    registry = registry or load_registry()
+    if not isinstance(experiment, Experiment):
+        experiment = read_experiment(experiment, registry=registry)
+    experiment.check_recorded("to check")
+    found = tuple(description.check_run(run) for run in experiment.named(runs))
+    told = forecast(experiment, found, registry=registry, progress=progress) if simulate else None
+    return CheckResult(experiment, found, told)
 
 
 def fit(
