@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,13 +52,25 @@ def empty_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports without figures, which cost more to draw than all else of them; what is written depends on them in nothing else."""
+def _hide_matplotlib(patch: pytest.MonkeyPatch) -> None:
     import importlib.util
 
     find, place = importlib.util.find_spec, "srfcli.results.report.importlib.util.find_spec"
-    monkeypatch.setattr(place, lambda name: None if name == "matplotlib" else find(name))
+    patch.setattr(place, lambda name: None if name == "matplotlib" else find(name))
+
+
+@pytest.fixture
+def without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without figures, which cost more to draw than all else of them; what is written depends on them in nothing else."""
+    _hide_matplotlib(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def without_figures() -> Iterator[None]:
+    """The same for all tests of a module."""
+    with pytest.MonkeyPatch.context() as patch:
+        _hide_matplotlib(patch)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -57,7 +57,7 @@ BLIND = (replace(PLANS[0], steps=()), *PLANS[1:])  # under a constant load nothi
         pytest.param(("up", "down", "again"), PLANS, id="all", marks=pytest.mark.slow),
     ],
 )
-def test_a_diagnosis_names_the_run_in_which_alone_an_effect_acts(only, plans, tmp_path):
+def test_a_diagnosis_names_the_run_in_which_alone_an_effect_acts(only, plans, tmp_path, without_matplotlib):
     """Where a run that is fitted cannot tell whether it has the effect, the one that was held out does."""
     folder = written(tmp_path, only, plans)
     done = srf("diagnose", str(folder), "--effect", NAME, "--json", "--out", str(tmp_path / "found"))
@@ -97,7 +97,8 @@ def test_a_simulation_and_a_fit_have_it_in_that_run_alone(tmp_path):
     """Against the same simulation without the effect: in the other runs nothing differs, in that one the load pushes."""
     stated(tmp_path)
     for name, share in (("with", SHARE), ("without", 0)):
-        done = srf("simulate", str(tmp_path), "--set", f"share={share}", "--out-dir", str(tmp_path / name))
+        noise = ("--noise", "0.01", "--seed", "1")
+        done = srf("simulate", str(tmp_path), "--set", f"share={share}", *noise, "--out-dir", str(tmp_path / name))
         assert done.exit_code == 0, done.output
     one, other = (read_experiment(tmp_path / name, registry=SHIPPED) for name in ("with", "without"))
     apart = {a.name: np.abs(a.observed - b.observed) for a, b in zip(one.runs, other.runs, strict=True)}
@@ -107,7 +108,7 @@ def test_a_simulation_and_a_fit_have_it_in_that_run_alone(tmp_path):
     done = srf("fit", str(tmp_path / "with"), "--track", "smooth", "--json")
     assert done.exit_code == 0, done.output
     rows = {row["parameter"]: row for row in json.loads(done.stdout)["rows"]}
-    assert rows["share"]["value"] == pytest.approx(SHARE, rel=1e-3)
+    assert abs(rows["share"]["value"] - SHARE) < 4 * rows["share"]["stderr"] < 0.02 * SHARE
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import srfcli as srf
 from srfcli.cli.main import cli
 from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis import design as parting
@@ -33,13 +34,13 @@ from srfcli.diagnosis.design import (
     vary,
 )
 from srfcli.diagnosis.hypotheses import Hypothesis
-from srfcli.diagnosis.search import ModelSearch
-from srfcli.diagnosis.verdict import Diagnosis, conclude
+from srfcli.diagnosis.verdict import Diagnosis
 from srfcli.inference.prediction import run_parameters
 from srfcli.inference.state_space import Likelihood, fit_state_space
 from srfcli.laws.registry import bundled_registry
 from srfcli.motion.imposed import ConstantLoad, Drive
 from srfcli.motion.integrators import integrate
+from srfcli.results.diagnosis import DiagnosisResult
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, move
@@ -68,19 +69,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def diagnosis(folder: Path) -> Diagnosis:
-    """Its diagnosis."""
-    search = ModelSearch(SHIPPED, read_experiment(folder, registry=SHIPPED, holdout=False), effects=RIVALS)
-    search.run()
-    return conclude(search, read_experiment(folder, registry=SHIPPED))
+def result(folder: Path) -> DiagnosisResult:
+    """What a diagnosis among the two finds."""
+    return srf.diagnose(folder, effects=RIVALS)
 
 
 @pytest.fixture(scope="module")
-def found(diagnosis: Diagnosis) -> parting.Parting:
+def diagnosis(result: DiagnosisResult) -> Diagnosis:
+    """The models that were fitted, and the verdict."""
+    return result.diagnosis
+
+
+@pytest.fixture(scope="module")
+def found(result: DiagnosisResult) -> parting.Parting:
     """The run that parts its hypotheses."""
-    best = parting_experiment(SHIPPED, diagnosis)
-    assert best is not None
-    return best
+    assert result.parting is not None
+    return result.parting
 
 
 def gap(diagnosis: Diagnosis, proposal: Proposal, true: str) -> float:
@@ -325,18 +329,17 @@ def test_words_and_numbers_agree(diagnosis: Diagnosis, found: parting.Parting) -
 
 
 @pytest.mark.usefixtures("without_matplotlib")
-def test_the_command_says_it(folder: Path, found: parting.Parting) -> None:
+def test_what_is_written_says_it(folder: Path, result: DiagnosisResult, found: parting.Parting) -> None:
     """The answer has the experiment; what each hypothesis foretells is an experiment that `srf simulate` repeats."""
     out = folder.parent / "found"
-    chosen = [x for name in RIVALS for x in ("--effect", name)]
-    result = CliRunner().invoke(cli, ["diagnose", str(folder), *chosen, "--out", str(out)])
-    assert result.exit_code == 0, result.output
+    result.write(out)
     answer = json.loads((out / "answer.json").read_text())
     told = answer["experiment"]
     assert answer["verdict"] == "ambiguous" and told["parts"]
     assert told["gain"] == pytest.approx(found.gain, rel=1e-3)
     page = re.sub(r"\s+", " ", (out / "report.html").read_text())
-    assert all(s in result.stdout and s in page for s in told["sentences"])
+    notes = " ".join(result.table.notes)
+    assert all(s in notes and s in page for s in told["sentences"])
     assert "[[runs]]" in page and 'href="parting/linker-dieterich/experiment.toml"' in page
     for name in RIVALS:
         home = out / "parting" / name

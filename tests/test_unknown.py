@@ -66,7 +66,7 @@ def bump(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def age(tmp_path_factory):
+def age(tmp_path_factory, without_figures):
     """The folder that `srf diagnose` writes where contacts age by another power, which no effect that is named describes."""
     folder = tmp_path_factory.mktemp("age")
     out = folder / "found"

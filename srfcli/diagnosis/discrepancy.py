@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 import sympy as sp
-from scipy.stats import rankdata
 
 from srfcli.codegen.model import Array
 from srfcli.core.settings import Parameter
@@ -115,6 +114,8 @@ def coordinates_of(runs: Mapping[str, RunForce]) -> dict[str, float]:
     weights = np.concatenate([1 / np.maximum((r.high - r.low) ** 2, 1e-18) for r in runs.values()])
     if not np.any(values):
         return {}
+    from scipy.stats import rankdata
+
     whole, found = float(weights @ values**2), {}
     for name in COORDINATES:
         x = np.concatenate([getattr(r, name) for r in runs.values()])

@@ -106,6 +106,6 @@ def joined_slopes(matched: Matched, names: Sequence[str], varying: Mapping[str, 
 
 def chance_of(cost: float, freedom: float) -> float:
     """Return how likely a chi2 is to be as large by chance, 1 without degrees of freedom."""
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
-    return float(chi2.sf(cost, freedom)) if freedom > 0 else 1.0
+    return float(chdtrc(freedom, cost)) if freedom > 0 else 1.0

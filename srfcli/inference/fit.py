@@ -248,7 +248,7 @@ def between_groups(values: Array, covariance: Array) -> BetweenGroups:
     k - 1 degrees of freedom, about the mean weighted by the covariance.
     """
     from scipy.optimize import minimize_scalar
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     k = values.size
     most = 3.0 * float(np.ptp(values)) + 1e-300
@@ -264,7 +264,7 @@ def between_groups(values: Array, covariance: Array) -> BetweenGroups:
     found = minimize_scalar(lambda s: about(s)[3], bounds=(0.0, most), method="bounded", options={"xatol": 1e-6 * most})
     scatter = float(found.x) if found.fun < about(0.0)[3] else 0.0
     mean, variance = about(scatter)[:2]
-    return BetweenGroups(mean, float(np.sqrt(variance)), scatter, float(chi2.sf(about(0.0)[2], k - 1)))
+    return BetweenGroups(mean, float(np.sqrt(variance)), scatter, float(chdtrc(k - 1, about(0.0)[2])))
 
 
 def scatter_of(fit: Fit, names: Sequence[str]) -> BetweenGroups | None:

@@ -178,10 +178,10 @@ SAME = 0.5  # standard errors between two minima that count as one
 
 def start_points(problem: Problem, count: int, seed: int) -> list[Array]:
     """Return `count` starting points (k,): the problem's own first, then a Latin hypercube about it, within the bounds."""
-    from scipy.stats import qmc
-
     points = [problem.start]
     if count > 1:
+        from scipy.stats import qmc
+
         cube = 2 * qmc.LatinHypercube(d=problem.start.size, rng=np.random.default_rng(seed)).random(count - 1) - 1
         reach = np.where(cube > 0, problem.upper - problem.start, problem.start - problem.lower)
         points += list(problem.start + SPREAD * cube * reach)

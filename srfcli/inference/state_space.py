@@ -21,7 +21,7 @@ from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from scipy.signal import lfilter, welch
+from scipy.linalg.lapack import dtbtrs
 
 from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
@@ -1439,10 +1439,17 @@ def correlated(point: Point) -> float:
     for span in np.geomspace(1.0, max(longest / 10, 2.0), 6):
         product, square = 0.0, 0.0
         for white in (np.clip(w, -5.0, 5.0) for f in point.runs for w in f.parts):
-            before = lfilter([0.0, 1.0], [1.0, -np.exp(-1.0 / span)], white)
+            before = _faded(white, np.exp(-1.0 / span))
             product, square = product + float(white @ before), square + float(before @ before)
         worst = max(worst, abs(product) / np.sqrt(square) if square else 0.0)
     return worst
+
+
+def _faded(white: Array, carry: float) -> Array:
+    """Return the sum (n,) of the samples (n,) before each, each `carry` times the weight of the next one."""
+    band = np.array([[1.0], [-carry]]) * np.ones(white.size)
+    before = np.concatenate([[0.0], white[:-1]])
+    return np.asarray(dtbtrs(band, before[:, None], uplo="L")[0][:, 0])
 
 
 def steadily_coloured(point: Point) -> bool:
@@ -1601,6 +1608,8 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
 
 def _peaks(fitted: StateSpaceFit, kinds: Sequence[Kind]) -> list[list[float]]:
     """Return, for each kind, frequencies (Hz) at which an oscillation may be: where innovations are strongest, and two others."""
+    from scipy.signal import welch  # which takes longer to import than all else that a fit needs
+
     found = []
     for of in kinds:
         pieces = [white for white, _, own in fitted.likelihood.pieces(fitted.maximum.point) if own == of]

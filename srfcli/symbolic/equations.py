@@ -104,16 +104,16 @@ def steady_states(system: System) -> tuple[sp.Expr, ...]:
 
     Raises SrfError where no closed form is found; laws with phi = y D0/v, y a constant or a Lambert function, have one.
     """
-    v = symbol("v")
     still = {symbol(n): sp.S.Zero for n in ("mu_dot", "W_dot", "F_dot_over_W")}
-    found = []
-    for state in system.friction.states:
-        rate = state_rate(system, state).subs(still)
-        length, phi = symbol(state.length), symbol(state.name)
-        y = sp.Symbol("y", positive=True)
-        reduced = sp.expand_log(sp.simplify(rate.subs(phi, y * length / v)), force=True)
-        found.append(_steady_root(reduced, y, system.ageing.name) * length / v)
-    return tuple(found)
+    rates = [(state_rate(system, s).subs(still), symbol(s.length), symbol(s.name)) for s in system.friction.states]
+    return tuple(_steady_state(*rate, system.ageing.name) for rate in rates)
+
+
+@lru_cache(maxsize=32)  # systems that differ in what has no part in a rate have one in common
+def _steady_state(rate: sp.Expr, length: sp.Symbol, phi: sp.Symbol, name: str) -> sp.Expr:
+    v, y = symbol("v"), sp.Symbol("y", positive=True)
+    reduced = sp.expand_log(sp.simplify(rate.subs(phi, y * length / v)), force=True)
+    return _steady_root(reduced, y, name) * length / v
 
 
 def _steady_root(reduced: sp.Expr, y: sp.Symbol, name: str) -> sp.Expr:
