@@ -23,7 +23,7 @@ from srfcli.inference import cramer_rao as reach
 from srfcli.inference.cramer_rao import Forecast, Reach, forecast
 from srfcli.inference.fit import fit_problem
 from srfcli.inference.prediction import predict
-from srfcli.inference.state_space import as_fit, fit_state_space
+from srfcli.inference.state_space import Likelihood, StateSpaceFit, as_fit, fit_state_space, maximise
 from srfcli.laws.registry import load_registry
 from srfcli.results.check import CAN, verdict_of
 
@@ -176,7 +176,9 @@ def test_errors_are_those_of_a_fit(made: Path) -> None:
     experiment = read_experiment(made, registry=REGISTRY)
     found = told(experiment)
     problem = fit_problem(open_model(REGISTRY, **asdict(experiment.choice), random_field=True), experiment)
-    errors = as_fit(fit_state_space(problem, smooth=True)).stderr
+    likelihood = Likelihood(problem, smooth=True, processes=("relaxation",))
+    maximum = maximise(likelihood, likelihood.coordinates(problem.named(problem.start)))
+    errors = as_fit(StateSpaceFit(likelihood, maximum, likelihood.evaluations)).stderr
     lam = next(p.value for p in experiment.parameters if p.name == "lambda")
     assert found.together is not None and len(found.runs) == 2
     assert found.together.errors["alpha"] == pytest.approx(errors["alpha"], rel=0.15)
