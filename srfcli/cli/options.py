@@ -440,8 +440,7 @@ def _read_system(
     toml = load_toml(find_toml())
     chosen = {key: choose(key, taken[key], toml=toml) for key in CHOICES}
     flags = read_flags(taken, assignments)
-    folders = [Path(p) for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
-    return SystemOptions(**chosen, flags=flags, plugins=(*plugins, *folders), toml=toml, effects=effects)
+    return SystemOptions(**chosen, flags=flags, plugins=plugins, toml=toml, effects=effects)
 
 
 def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, str]:

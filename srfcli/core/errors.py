@@ -48,7 +48,7 @@ class SrfError(Exception):
     """Misuse that stops a command: `message` says what and where, `hint` what to do instead.
 
     `exit_code` is 2 for usage, laws and recordings; 1 for I/O. `kind` names an error that some caller treats by itself:
-    "no file", "unknown name", "no contact".
+    "no file", "unknown name", "no contact", "unit" where the hint says what unit would do.
     """
 
     exit_code = 2

@@ -153,19 +153,22 @@ def unit_factor(written: str, unit: str, geometry: Geometry = NO_GEOMETRY, *, wh
         return factor / geometry.area if geometry.area and force else factor
     ratio = found.factor / wanted.factor
     gap = tuple(w - f for w, f in zip(wanted.powers, found.powers, strict=True))
-    hint = "Give a plain number." if unit == "1" else f"Give a unit of the dimension of {unit!r}."
+    hint, kind = "Give a plain number." if unit == "1" else f"Give a unit of the dimension of {unit!r}.", ""
     if gap[1:3] == (0, 0):
         turns = {(-1, 0): -1, (1, -1): 1, (-2, 1): -2}.get((gap[0], gap[3]))  # torque; angle; torque over angle
         if turns is not None and (found.powers[2], found.powers[3]) != (0, 0):
             if geometry.radius:
                 return ratio * geometry.radius**turns / (geometry.area or 1.0 if wanted.powers[2] else 1.0)
             hint = f'A rotary rig needs its radius, from which {unit} follow: [apparatus] radius = "25 mm"'
+            kind = "unit"
         elif gap == (1, 0, 0, 0) and found.powers[2] == 0:  # a strain for a length
             if geometry.thickness:
                 return ratio * geometry.thickness
             hint = f'A strain needs the layer\'s thickness, from which {unit} follow: [apparatus] thickness = "4 mm"'
+            kind = "unit"
     prefix = f"{where}: " if where else ""
-    raise SrfError(f"{prefix}{written!r} measures {describe(found.powers)}, not {describe(wanted.powers)}", hint)
+    said = f"{prefix}{written!r} measures {describe(found.powers)}, not {describe(wanted.powers)}"
+    raise SrfError(said, hint, kind=kind)
 
 
 def same_dimension(text: str, unit: str) -> bool:
@@ -231,13 +234,13 @@ def _from_pint(text: str, prefix: str, word: str) -> Unit:
         registry = _pint_registry()
     except ImportError as error:
         hint = f'{did_you_mean(word, _TABLE)}, products and powers of these; more with pip install "srfcli[units]"'
-        raise SrfError(f"{prefix}unknown unit {text!r}", hint) from error
+        raise SrfError(f"{prefix}unknown unit {text!r}", hint, kind="unit") from error
     try:
         quantity = registry.Quantity(1.0, registry.Unit(text)).to_base_units()
         powers = {name: float(power) for name, power in quantity.unit_items()}
         factor = float(quantity.magnitude)
     except Exception as error:  # pint raises its own, tokenizer and arithmetic errors for a bad unit
-        raise SrfError(f"{prefix}unknown unit {text!r}", did_you_mean(word, _TABLE)) from error
+        raise SrfError(f"{prefix}unknown unit {text!r}", did_you_mean(word, _TABLE), kind="unit") from error
     mass, metre = powers.pop("kilogram", 0.0), powers.pop("meter", 0.0)
     second, radian = powers.pop("second", 0.0), powers.pop("radian", 0.0)
     exponents = (metre - mass, second + 2 * mass, mass, radian)  # kg = 1e-6 N s^2/um

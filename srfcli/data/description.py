@@ -193,16 +193,13 @@ def _apparatus(node: Node) -> Apparatus:
         stiffness.expected("text with a number and its unit", hint)
     try:
         number, unit = split_quantity(stiffness.value, name="stiffness", example="0.21 N/um")
-        if not unit:
-            stiffness.fail(f"'{stiffness.value}' has no unit, and two are possible", hint)
-        per_load = same_dimension(unit, "1/um")
+        per_load = bool(unit) and same_dimension(unit, "1/um")
         base = "1/um" if per_load else "N/um"
-        value = number * unit_factor(unit, base, geometry)
+        value = number * unit_factor(unit, base, geometry) if unit else 0.0
     except SrfError as error:
-        if error.message.startswith(str(node.file)):
-            raise
-        told = "unknown unit" in error.message or "rotary" in (error.hint or "")
-        stiffness.fail(error.message, error.hint if told else hint)
+        stiffness.fail(error.message, error.hint if error.kind == "unit" else hint)
+    if not unit:
+        stiffness.fail(f"'{stiffness.value}' has no unit, and two are possible", hint)
     if not value > 0:
         stiffness.expected("a positive stiffness")
     mass = node.get("mass")

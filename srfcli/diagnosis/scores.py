@@ -31,6 +31,7 @@ from srfcli.diagnosis.hypotheses import (
 from srfcli.inference.critical_loads import TableLikelihood, apparatus
 from srfcli.inference.kalman import gains
 from srfcli.inference.recordings import slip_along
+from srfcli.inference.shared_field import Roughness
 from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns, filter_run
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
@@ -157,11 +158,9 @@ class Remainder:
         first, last = min(s.min() for s in slips), max(s.max() for s in slips)
         count = int(np.clip(np.ceil((last - first) / (NODES * values["field_length"])) + 1, 2, MOST_NODES))
         nodes = np.linspace(first, last, count)
-        r = np.sqrt(3) * np.abs(nodes[:, None] - nodes) / values["field_length"]
-        root = np.linalg.cholesky((1 + r) * np.exp(-r) + 1e-9 * np.eye(count))
         hat = Shape("slip", lambda s, k: np.interp(s, nodes, np.arange(count) == k), ("node",))
         columns = self.padded([_carried(f, self.fitted, [(hat, [k]) for k in range(count)]) for f in self.runs])
-        columns = self.free(columns @ root)
+        columns = self.free(columns @ Roughness(1.0, values["field_length"]).root(nodes))
         power, directions = np.linalg.eigh(columns.T @ columns)
         known = power > 1e-12 * power[-1]
         size = np.sqrt(power[known])
