@@ -26,9 +26,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 # Files of long tests: what takes longest is begun first, so that no worker is left alone with it at the end.
 LONG = (
-    "test_unknown.py", "test_effects.py", "test_readme.py", "test_proof_generator.py", "test_model_search.py", "test_parting.py",
-    "test_prove.py", "test_notebooks.py", "test_threshold_experiments.py", "test_fit.py", "test_equations.py", "test_motion.py",
-    "test_diagnose_command.py", "test_system.py",
+    "test_unknown.py", "test_effects.py", "test_readme.py", "test_proof_generator.py", "test_model_search.py",
+    "test_discriminating.py", "test_prove.py", "test_notebooks.py", "test_threshold_experiments.py", "test_fit.py",
+    "test_equations.py", "test_motion.py", "test_diagnose_command.py", "test_system.py", "test_same_bytes.py", "test_site.py",
 )  # fmt: skip
 
 

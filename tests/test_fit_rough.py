@@ -286,7 +286,7 @@ def test_noise_alone_may_be_asked_for(loud):
     assert wrong.exit_code == 2 and "noise" in wrong.stderr
 
 
-def test_what_a_held_out_run_adds_to_the_evidence_is_what_is_foretold_of_it(loud):
+def test_what_a_held_out_run_adds_to_the_evidence_is_what_is_predicted_of_it(loud):
     """By Laplace's method p(second | first) = p(both) / p(first), where the priors are flat."""
     whole = srf.read_experiment(loud)
     first, second, _ = whole.runs
@@ -298,7 +298,7 @@ def test_what_a_held_out_run_adds_to_the_evidence_is_what_is_foretold_of_it(loud
     quiet = replace(second, observed=0.7 * first.observed + 0.3 * second.observed)  # of noise near the first's
     fit, alone = evidence((first,))
     both = evidence((first, quiet))[1]
-    told = fit.foretold(quiet)
+    told = fit.predictive(quiet)
     assert told.log_likelihood == pytest.approx(both - alone, abs=0.3)
     plain = fit.likelihood.held_out(quiet, fit.values)
     assert told.rms <= np.sqrt(np.mean(plain.white**2)) + 1e-9

@@ -87,7 +87,7 @@ def test_disturbances_on_the_boundary_grow_as_it_says(model, V, number, sign):
     assert (rates[1] - rates[0]) / (squares[1] - squares[0]) == pytest.approx(strobe.d, rel=0.08)
 
 
-def test_a_torus_of_the_foretold_amplitude_attracts_beyond_a_direct_boundary(model):
+def test_a_torus_of_the_predicted_amplitude_attracts_beyond_a_direct_boundary(model):
     point = crossing(model, 1, V=20.0, eps=0.18)
     p, orbit = point.p.copy(), single(point)
     p[model.index("W0")] *= 1 + 2e-3 / point.slope  # g = 2e-3 beyond
@@ -97,10 +97,10 @@ def test_a_torus_of_the_foretold_amplitude_attracts_beyond_a_direct_boundary(mod
     assert g == pytest.approx(2e-3, rel=0.05)
     here = Discretisation(beyond.orbit.x[0], beyond.orbit.stages[0], orbit.edges)
     strobe = Stroboscope(model, p, here, complex(beyond.multipliers[0, 0]))
-    foretold = np.sqrt(g / -strobe.d)
+    predicted = np.sqrt(g / -strobe.d)
     for size in (0.6, 1.4):
-        z = strobe.amplitudes(size * foretold, 900)
-        assert np.sqrt((z[-200:] ** 2).mean()) == pytest.approx(foretold, rel=0.08)
+        z = strobe.amplitudes(size * predicted, 900)
+        assert np.sqrt((z[-200:] ** 2).mean()) == pytest.approx(predicted, rel=0.08)
 
 
 def test_criticality_changes_where_the_coefficient_vanishes(model):

@@ -139,7 +139,7 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
             "note": "at eps = 0.18",
         }
     if verdict == "ambiguous":
-        material["parting"] = ["Step the load from 5 to 9 N."]
+        material["discriminating"] = ["Step the load from 5 to 9 N."]
     return material
 
 
@@ -224,7 +224,7 @@ SENTENCES: dict[str, list[str]] = {  # in their order: what is wrong, what to do
     ],
     "ambiguous": [
         "Something is missing, and these recordings cannot tell which of linker-dieterich or second-state it is.",
-        "What to do. Make the experiment described below: the candidates foretell different records of it.",
+        "What to do. Make the experiment described below: the candidates predict different records of it.",
     ],
     "unknown": [
         "Something is missing that no registered effect explains.",
@@ -298,7 +298,7 @@ def test_the_run_with_most_of_the_misfit_comes_first(tmp_path: Path) -> None:
 
 def test_no_name_breaks_out_of_the_page(tmp_path: Path) -> None:
     answer, material = made_answer("ambiguous", HOSTILE), made_material("ambiguous", HOSTILE)
-    material |= {"title": HOSTILE, "parting": [HOSTILE], "about": {HOSTILE: HOSTILE}}
+    material |= {"title": HOSTILE, "discriminating": [HOSTILE], "about": {HOSTILE: HOSTILE}}
     answer |= {"effects": [HOSTILE], "model": HOSTILE, "confidence": {HOSTILE: 1.0}}
     answer["not_identifiable"] = [{"effect": HOSTILE, "reason": HOSTILE}]
     material["ranked"][0]["name"] = material["scores"][0]["effect"] = material["parameters"][0]["name"] = HOSTILE

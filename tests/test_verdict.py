@@ -34,7 +34,7 @@ def fitted(*names, evidence, fine=True, scores=(), told=0.0):
 def held(rms, gain=1.0, whole=True):
     white = rms * np.where(np.arange(400) % 2, 1.0, -1.0)
     told = SimpleNamespace(rms=rms)
-    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain, foretold=(told, told), loud="")
+    return SimpleNamespace(augmented=SimpleNamespace(white=white, whole=whole), gain=gain, predictive=(told, told), loud="")
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def concluded(monkeypatch):
 
     def verdict(*fits, held=(), cut_short=False):
         monkeypatch.setattr(module, "held_out", lambda *_: tuple(held))
-        monkeypatch.setattr(module, "foretold", lambda fit, whole: fit.told)
+        monkeypatch.setattr(module, "predictive", lambda fit, whole: fit.told)
         monkeypatch.setattr(module, "on_the_track_of", lambda best, baseline: baseline)
         monkeypatch.setattr(module, "at_bounds", lambda best: [])
         monkeypatch.setattr(module, "uneven_noise", lambda fit: [])

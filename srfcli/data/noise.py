@@ -14,7 +14,7 @@ from srfcli.codegen.model import Array
 from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError
 from srfcli.data.clock import Mask
-from srfcli.motion.imposed import runs_of, unforetold
+from srfcli.motion.imposed import interpolation_error, runs_of
 
 SEGMENT = 256  # samples of a periodogram
 NEIGHBOURS = 16  # from which a sample is interpolated: to 1e-4 for sines of five samples a period or more
@@ -29,7 +29,7 @@ def white_level(x: Array, t: Array | None = None) -> float:
     error of interpolation from neighbouring samples.
     """
     if t is not None and x.size > 4 * NEIGHBOURS and np.median(np.abs(np.diff(t, 2))) > JITTER * np.median(np.diff(t)):
-        missed, unit = unforetold(t, x, NEIGHBOURS // 2)
+        missed, unit = interpolation_error(t, x, NEIGHBOURS // 2)
         return float(np.median(missed / unit) / 0.6745)
     length = min(SEGMENT, 2 ** int(np.log2(max(x.size, 1))))
     if length < 16:

@@ -10,7 +10,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array
 from srfcli.data.values import CriticalLoads, Run, per_elongation
-from srfcli.diagnosis.design import Parting, described
+from srfcli.diagnosis.design import DiscriminatingRun, described
 from srfcli.diagnosis.discrepancy import RunForce, unexplained_friction
 from srfcli.diagnosis.residual_scan import Location, Row
 from srfcli.diagnosis.verdict import Diagnosis, parameters_of
@@ -71,11 +71,11 @@ def answer(
     location: Location,
     *,
     model: str = "augmented/experiment.toml",
-    parting: Parting | None = None,
+    discriminating: DiscriminatingRun | None = None,
 ) -> dict[str, Any]:
     """Return the object of the format `srf.diagnose/1`; `model` is where the augmented experiment is, relative to it.
 
-    `parting` is the run that would part what is ambiguous.
+    `discriminating` is the run that discriminates between what is ambiguous.
     """
     views, loads, last = run_views(diagnosis), load_views(diagnosis), diagnosis.final
     sides = {}
@@ -112,8 +112,8 @@ def answer(
         ]
     if diagnosis.verdict == "inconclusive":
         found["detectable"] = dict(diagnosis.detectable)
-    if diagnosis.verdict == "ambiguous" and parting is not None:
-        found["experiment"] = described(parting, diagnosis.experiment)
+    if diagnosis.verdict == "ambiguous" and discriminating is not None:
+        found["experiment"] = described(discriminating, diagnosis.experiment)
     return found
 
 

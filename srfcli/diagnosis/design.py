@@ -34,11 +34,11 @@ from srfcli.inference.prediction import of_run, predict, run_parameters, stiffne
 from srfcli.laws.registry import Registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 
-# The experiment that would part hypotheses which explain a recording equally well.
+# The experiment that would discriminate between hypotheses which explain a recording equally well.
 
 ENOUGH = 12.0  # of log likelihood: hypotheses so far apart are told apart
 LEAST = 3.0  # below which a run is not worth making
-MOST = 3  # hypotheses that are to be parted
+MOST = 3  # hypotheses between which a run is to discriminate
 DRAWN, VARIED = 60, 16  # runs that are tried, and variations of the best of them
 LOOKED = 36  # of these, how many with derivatives, at most
 CONFIRMED = 3  # of the best, how many with the motion itself
@@ -49,12 +49,12 @@ PARTS = 60  # of a run, in which it is found how much of it suffices
 
 
 @dataclass(frozen=True)
-class Parting:
-    """The run that parts hypotheses best: `proposal`, the same as a `run`, and the `gain` in log likelihood to be expected.
+class DiscriminatingRun:
+    """The run that discriminates best between hypotheses: `proposal`, as a `run` too, and the expected `gain` in log likelihood.
 
     `gains` has what the others lose by the name of the true one, the gain is the least of them. `seconds` of such a recording
-    gain 12, in `repeats` of the run, or None where no number of them does. The two of `pair`, which are parted least, differ
-    most at `at` s, the wrong one refitted: the first is `peak` above the second, in the observable's `unit`, `peak_um` of the
+    gain 12, in `repeats` of the run, or None where no number of them does. The two of `pair`, which are least apart, differ most
+    at `at` s, the wrong one refitted: the first is `peak` above the second, in the observable's `unit`, `peak_um` of the
     spring's elongation. `noise` is the gauge's level, `predicted` (n,) what each shows, `tried` how many runs were looked at.
     """
 
@@ -75,7 +75,7 @@ class Parting:
     tried: int = 0
 
     @property
-    def parts(self) -> bool:
+    def discriminates(self) -> bool:
         """Return whether the run is worth making."""
         return self.gain >= LEAST
 
@@ -131,7 +131,7 @@ class Side:
         return bool(np.linalg.eigvals(J).real.max() * float(np.ptp(run.t)) < GROWS)
 
     def predicted(self, run: Run) -> Array | None:
-        """Return what the hypothesis foretells (n,), on a smooth track; None if it cannot be followed."""
+        """Return what the hypothesis predicts (n,), on a smooth track; None if it cannot be followed."""
         values = {**self.values(), "field_amplitude": 0.0}
         found = predict(self.problem.model, self.problem.experiment, run, values)
         return found.y if found.status.ok and np.isfinite(found.y).all() else None
@@ -171,7 +171,7 @@ class Loss:
 
 @dataclass(frozen=True)
 class Trial:
-    """A run as the hypotheses foretell it: `y` (n,) by name; `bound` no gain exceeds, `gain` at first order where known."""
+    """A run as the hypotheses predict it: `y` (n,) by name; `bound` no gain exceeds, `gain` at first order where known."""
 
     proposal: Proposal
     run: Run
@@ -180,8 +180,8 @@ class Trial:
     gain: float = 0.0
 
 
-def parting_experiment(registry: Registry, diagnosis: Diagnosis, *, seed: int = 0) -> Parting | None:
-    """Return the run that would part what a diagnosis found equally good; None where there is nothing to part.
+def discriminating_run(registry: Registry, diagnosis: Diagnosis, *, seed: int = 0) -> DiscriminatingRun | None:
+    """Return the run that would discriminate between what a diagnosis found equally good; None where that is one hypothesis.
 
     Looked for are runs with the apparatus' own velocities, loads and modulations, and up to twice beyond them.
     """
@@ -192,7 +192,7 @@ def parting_experiment(registry: Registry, diagnosis: Diagnosis, *, seed: int = 
 
 
 def foremost(diagnosis: Diagnosis) -> tuple[Side, ...]:
-    """Return the hypotheses that are to be parted, three at most."""
+    """Return the hypotheses between which a run is to discriminate, three at most."""
     return tuple(Side.of(f) for f in diagnosis.close[:MOST])
 
 
@@ -205,14 +205,14 @@ class Design:
         self.rng = np.random.default_rng(seed)
         self.tried = 0
 
-    def best(self) -> Parting | None:
+    def best(self) -> DiscriminatingRun | None:
         """Return the best run, None where no model can be followed through any."""
         looked = self.look(draw(self.reach, DRAWN, self.rng), LOOKED)
         if not looked:
             return None
         near = vary(looked[0].proposal, self.reach, VARIED, self.rng)
         looked = sorted([*looked, *self.look(near, VARIED, above=looked[0].gain)], key=lambda t: -t.gain)
-        best: Parting | None = None
+        best: DiscriminatingRun | None = None
         for trial in looked[:CONFIRMED]:
             found = self.judge(trial)
             if found is not None and (best is None or found.gain > best.gain):
@@ -222,7 +222,7 @@ class Design:
     def look(self, proposals: Sequence[Proposal], most: int, *, above: float = -1.0) -> list[Trial]:
         """Return runs with their gains at first order, the best first; those that cannot be best are left out."""
         self.tried += len(proposals)
-        trials = [t for t in map(self.foretell, proposals) if t is not None]
+        trials = [t for t in map(self.predict, proposals) if t is not None]
         by_kind: dict[str, list[Trial]] = {}
         for trial in sorted(trials, key=lambda t: -t.bound):
             by_kind.setdefault(trial.proposal.kind, []).append(trial)
@@ -235,8 +235,8 @@ class Design:
                     found.append(trial)
         return sorted(found, key=lambda t: -t.gain)
 
-    def foretell(self, proposal: Proposal) -> Trial | None:
-        """Return a run as all hypotheses foretell it, None where it cannot begin or one cannot be followed."""
+    def predict(self, proposal: Proposal) -> Trial | None:
+        """Return a run as all hypotheses predict it, None where it cannot begin or one cannot be followed."""
         begun = self.begun(proposal)
         if begun is None:
             return None
@@ -247,13 +247,13 @@ class Design:
             if found is None:
                 return None
             y[side.name] = found
-        parted = []
+        apart = []
         for true, wrong in self.pairs():
             seen = wrong.filtered(run, y[true.name], slopes=False)
             if seen is None:
                 return None
-            parted.append(0.5 * float(seen[0] @ seen[0]))
-        return Trial(proposal, run, y, min(parted))
+            apart.append(0.5 * float(seen[0] @ seen[0]))
+        return Trial(proposal, run, y, min(apart))
 
     def begun(self, proposal: Proposal) -> tuple[Proposal, Run] | None:
         """Return a run that begins in stable sliding, whichever hypothesis is true: as it is, or led in."""
@@ -269,7 +269,7 @@ class Design:
         return list(permutations(self.sides, 2))
 
     def gain(self, trial: Trial) -> float:
-        """Return the gain at first order: that of the least parted pair, the worse way round."""
+        """Return the gain at first order: that of the pair least apart, the worse way round."""
         least = np.inf
         for true, wrong in self.pairs():
             seen = wrong.filtered(trial.run, trial.y[true.name])
@@ -278,7 +278,7 @@ class Design:
             least = min(least, Loss(seen[0], seen[2], wrong.precision, seen[1]).gain())
         return least
 
-    def judge(self, trial: Trial) -> Parting | None:
+    def judge(self, trial: Trial) -> DiscriminatingRun | None:
         """Return what a run is worth, every wrong model refitted by the motion itself."""
         losses: dict[tuple[str, str], Loss] = {}
         for true, wrong in self.pairs():
@@ -295,7 +295,7 @@ class Design:
         left = losses[true_name, wrong_name].left * (1.0 if true_name == first else -1.0)
         at = int(np.argmax(np.abs(left)))
         factor = float(per_elongation(run.observable, run.stiffness, run.load(run.t)[0][at]))
-        return Parting(
+        return DiscriminatingRun(
             names, trial.proposal, run, worth[true_name, wrong_name],
             {a: min(g for (true, _), g in worth.items() if true == a) for a in names}, seconds, repeats, (first, second),
             float(run.t[at]), float(left[at]), abs(float(left[at])) / factor, OBSERVABLES[run.observable],
@@ -356,7 +356,7 @@ MANY = 12  # velocities of a recorded drive that stand for all of them
 MOST_EPS = 0.9
 LEAD = 0.1  # of a run, in which it begins fast; the same of its way
 UNKNOWN = 1.0  # N: what stands for a load that no recording tells
-NAME = "parting"
+NAME = "discriminating"
 STEPS, HOLD, LOAD, WAVE = "velocity steps", "slide-hold-slide", "load steps", "modulation"
 
 
@@ -618,29 +618,29 @@ def run_of(proposal: Proposal, experiment: Experiment) -> Run:
     return replace(run, stiffness=like.stiffness * share)
 
 
-# What is told of the run that would part hypotheses: sentences, plain data, and an experiment for what each foretells.
+# What is told of the discriminating run: sentences, plain data, and an experiment for what each hypothesis predicts.
 
-FOLDER = "parting"
+FOLDER = "discriminating"
 RUNS, COLUMNS = "\n[[runs]]\n", "\n[columns]\n"
 
 
-def sentences(found: Parting) -> list[str]:
-    """Return what is to be done, what it is worth, and what to look for; or that nothing parts these hypotheses."""
+def sentences(found: DiscriminatingRun) -> list[str]:
+    """Return what is to be done, what it is worth, and what to look for; or that nothing discriminates between them."""
     names, run = _listed([_name(n) for n in found.names]), found.proposal
-    if not found.parts:
+    if not found.discriminates:
         return [
-            f"Nothing within this apparatus' reach parts {names}: of {found.tried} runs that were tried, the best would gain "
-            f"{found.gain:.2g} in log likelihood, and {ENOUGH:g} are wanted. For this apparatus they are one class."
+            f"Nothing within this apparatus' reach discriminates between {names}: of {found.tried} runs tried, the best "
+            f"would gain {found.gain:.2g} in log likelihood, and {ENOUGH:g} are wanted. For this apparatus they are one class."
         ]
     return [
-        f"What would part {names} is {run.kind}: {run.text()}; sampled at {1 / run.interval:.4g} Hz.",
+        f"What would discriminate between {names} is {run.kind}: {run.text()}; sampled at {1 / run.interval:.4g} Hz.",
         f"Whichever of them is true, the others then lose at least {found.gain:.3g} in log likelihood, refitted to all runs. "
         + _long(found),
         _look(found),
     ]
 
 
-def _long(found: Parting) -> str:
+def _long(found: DiscriminatingRun) -> str:
     if found.seconds is None or found.repeats is None:
         return f"No number of repeats of this run gains {ENOUGH:g}: its parameters would have to be known better first."
     if found.repeats > 1:
@@ -648,7 +648,7 @@ def _long(found: Parting) -> str:
     return f"{ENOUGH:g} are gained in the first {found.seconds:.3g} s of it."
 
 
-def _look(found: Parting) -> str:
+def _look(found: DiscriminatingRun) -> str:
     """Return where to look, and for how much."""
     first, second = map(_name, found.pair)
     before = [(t, what) for t, what in found.proposal.changes() if t <= found.at]
@@ -668,11 +668,11 @@ def _listed(names: list[str]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def described(found: Parting, experiment: Experiment) -> dict[str, Any]:
+def described(found: DiscriminatingRun, experiment: Experiment) -> dict[str, Any]:
     """Return the value of the answer's key `experiment`."""
     return {
         "hypotheses": list(found.names),
-        "parts": found.parts,
+        "discriminates": found.discriminates,
         "sentences": sentences(found),
         "gain": found.gain,
         "gains": dict(found.gains),
@@ -691,18 +691,18 @@ def described(found: Parting, experiment: Experiment) -> dict[str, Any]:
     }
 
 
-def run_text(found: Parting, experiment: Experiment) -> str:
-    """Return the run as experiment.toml describes one; its file has times and load, and what a hypothesis foretells."""
+def run_text(found: DiscriminatingRun, experiment: Experiment) -> str:
+    """Return the run as experiment.toml describes one; its file has times and load, and what a hypothesis predicts."""
     run = replace(found.run, holdout=False)
     description = experiment_files(replace(experiment, runs=(run,)))[DESCRIPTION]
     load = found.proposal.text().partition("; load ")[2]
     return f"[[runs]]\n# load {load}, as the file has it\n{description.rpartition(RUNS)[2]}"
 
 
-def parting_files(
-    registry: Registry, diagnosis: Diagnosis, found: Parting, *, folder: Path, reader: str | None = None
+def discriminating_files(
+    registry: Registry, diagnosis: Diagnosis, found: DiscriminatingRun, *, folder: Path, reader: str | None = None
 ) -> dict[str, str]:
-    """Return, by place in `folder`, an experiment for each hypothesis whose one run is the proposed one as it foretells it."""
+    """Return, by place in `folder`, an experiment for each hypothesis whose one run is the proposed one as it predicts it."""
     files: dict[str, str] = {}
     run = replace(found.run, holdout=False)
     text = run_text(found, diagnosis.experiment)

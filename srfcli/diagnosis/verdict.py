@@ -16,7 +16,7 @@ from srfcli.diagnosis.hypotheses import Excluded, typical_sizes
 from srfcli.diagnosis.scores import Score
 from srfcli.diagnosis.search import CLOSE, NEAR, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
-from srfcli.inference.state_space import Filtered, Foretold, StateSpaceFit, maximise
+from srfcli.inference.state_space import Filtered, Predictive, StateSpaceFit, maximise
 
 NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
 HELD = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
@@ -33,7 +33,7 @@ UNEXPLAINED, MISSED = 0.09, 0.5
 class Held:
     """One held-out run filtered under the baseline and under the best model, both as they were fitted to the other runs.
 
-    `shown` is that of the baseline with the best model's field and gauge noise. `foretold` says how well each of the first two
+    `shown` is that of the baseline with the best model's field and gauge noise. `predictive` says how well each of the first two
     predicts it, with parameters as uncertain as their fits leave them. `loud` says whether the best model needs more gauge noise
     than the run shows, where no run that was fitted has its noise.
     """
@@ -41,7 +41,7 @@ class Held:
     baseline: Filtered
     augmented: Filtered
     shown: Filtered
-    foretold: tuple[Foretold, Foretold]
+    predictive: tuple[Predictive, Predictive]
     loud: str = ""
 
     @property
@@ -52,7 +52,7 @@ class Held:
     @property
     def gain(self) -> float:
         """Return what the best model gains in log marginal likelihood."""
-        return self.foretold[1].log_likelihood - self.foretold[0].log_likelihood
+        return self.predictive[1].log_likelihood - self.predictive[0].log_likelihood
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted
     """
     least = -np.inf if ranked[0].fine else ranked[0].evidence - CLOSE
     passed = [f for f in ranked if f.fine and f.evidence > least]
-    told = {f.name: foretold(f, whole) for f in passed}
+    told = {f.name: predictive(f, whole) for f in passed}
     if not any(np.isfinite(t) for t in told.values()):  # no model follows what is held out
         told = {}
     passed.sort(key=lambda f: -f.evidence - told.get(f.name, 0.0))
@@ -177,10 +177,10 @@ def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted
     return tuple(f for f in best.values() if not any(_is_that_law(f, other, joint) for other in close)), joint
 
 
-def foretold(fitted: Fitted, whole: Experiment) -> float:
+def predictive(fitted: Fitted, whole: Experiment) -> float:
     """Return the log likelihood of all that is held out, with the model's parameters as uncertain as its fit leaves them."""
     own = fitted.fit.likelihood
-    runs = sum(fitted.fit.foretold(run).log_likelihood for run in whole.runs if run.holdout and own.problem.runs)
+    runs = sum(fitted.fit.predictive(run).log_likelihood for run in whole.runs if run.holdout and own.problem.runs)
     return runs + sum(own.held_out_table(t, fitted.fit.values).log_likelihood for t in whole.thresholds if t.holdout)
 
 
@@ -219,7 +219,7 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
     found = []
     for run in (run for run in whole.runs if run.holdout):
         first, last, seen = (f.fit.likelihood.held_out(run, f.fit.values) for f in models)
-        before, after, loud = baseline.fit.foretold(run), best.fit.foretold(run), ""
+        before, after, loud = baseline.fit.predictive(run), best.fit.predictive(run), ""
         if best.fit.likelihood.noisy_alone(run):
             loud = next((text for size, text in loudness(*after.alone) if size > 1.0), "")
         found.append(Held(first, last, seen, (before, after), loud))
@@ -273,7 +273,7 @@ def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequenc
         return "held-out runs cannot be followed"
     if loud := next((f"{h.run.name}: {h.loud}" for h in held if h.loud), ""):
         return f"held-out runs are not predicted: in {loud}"
-    sizes, levels = [h.augmented.white.size for h in held], [h.foretold[1].rms for h in held]
+    sizes, levels = [h.augmented.white.size for h in held], [h.predictive[1].rms for h in held]
     rms = float(np.sqrt(np.average(np.square(levels), weights=sizes)))
     if not rms < HELD:
         return f"held-out runs are not predicted: innovations have an rms of {rms:.3f} with the parameters moved as they may"

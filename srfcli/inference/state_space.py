@@ -921,7 +921,7 @@ def _curvature_beyond(last: Point, point: Point) -> Array:
 
 
 @dataclass(frozen=True)
-class Foretold:
+class Predictive:
     """Log marginal likelihood of a run under a fit to others, and the rms of its innovations with what parameters may move.
 
     `alone` is the likelihood by what belongs to the run alone, at the fit's values of the rest, and its maximum.
@@ -939,7 +939,7 @@ class StateSpaceFit:
     likelihood: Likelihood
     maximum: Maximum
     evaluations: int
-    _told: dict[str, tuple[Run, Foretold]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _told: dict[str, tuple[Run, Predictive]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def smooth(self) -> bool:
@@ -962,17 +962,17 @@ class StateSpaceFit:
         """Return the log likelihood at the maximum."""
         return self.maximum.point.log_likelihood
 
-    def foretold(self, run: Run) -> Foretold:
+    def predictive(self, run: Run) -> Predictive:
         """Return how well a run that was not fitted is predicted, with the parameters as uncertain as they are.
 
         Laplace's method: the fit is the prior of the parameters that the run shares with others. Each run is predicted once.
         """
         known = self._told.get(run.name)
         if known is None or known[0] is not run:
-            known = self._told[run.name] = (run, self._foretold(run))
+            known = self._told[run.name] = (run, self._predictive(run))
         return known[1]
 
-    def _foretold(self, run: Run) -> Foretold:
+    def _predictive(self, run: Run) -> Predictive:
         own, (alone, point) = self.likelihood, self.likelihood.alone(run, self.values)
         by_itself = (alone, point)
         problem, like = alone.problem, dict(zip(own.names, range(len(own.names)), strict=True))
@@ -993,7 +993,7 @@ class StateSpaceFit:
         wide = own.beside(both)
         point = wide.at(wide.coordinates(point.values))
         if not np.isfinite(point.log_likelihood):
-            return Foretold(-np.inf, np.inf, by_itself)
+            return Predictive(-np.inf, np.inf, by_itself)
         covariance = np.diag((wide.upper - wide.lower) ** 2)  # of what belongs to the run alone
         known = [i for i, n in enumerate(wide.names) if n in like]
         there = [like[wide.names[i]] for i in known]
@@ -1017,7 +1017,7 @@ class StateSpaceFit:
         bent = np.eye(z.size) + away.T @ best.information[np.ix_(free, free)] @ away
         white, cost = best.runs[0].white, float(z @ z)
         evidence = best.log_likelihood - 0.5 * (cost + float(np.linalg.slogdet(bent)[1]))
-        return Foretold(evidence, float(np.sqrt((white @ white + cost) / white.size)), by_itself)
+        return Predictive(evidence, float(np.sqrt((white @ white + cost) / white.size)), by_itself)
 
     @property
     def criterion(self) -> float:

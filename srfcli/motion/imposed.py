@@ -226,8 +226,8 @@ def _check_positive(name: str, value: float) -> None:
 UNEVEN = 1.6  # ratio of an interval to its neighbours' median at which a stretch ends
 WANDER = 10.0  # times the median of the logarithms of these ratios, if that is more: of times that are all uneven
 SHORTEST = 16  # samples of a stretch that carries the spline
-REACH = 4  # samples on each side from which a sample is foretold
-ROUGH = 0.02  # share of the local range by which a sample may differ from what its neighbours foretell
+REACH = 4  # samples on each side from which a sample is interpolated
+ROUGH = 0.02  # share of the local range by which a sample may differ from what its neighbours predict
 FAINT = 1e-4  # share of the whole range below which nothing is a corner
 MOSTLY = 0.3  # share of rough samples at which a load is coarsely sampled rather than cornered
 SPACINGS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # samples between the knots of a smoothing spline
@@ -356,12 +356,12 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
         rough = _rough(t[a : b + 1], W[a : b + 1], total, noise)
         if rough.mean() > MOSTLY:
             rough[:] = False
-        calm = ~(rough[1:] | rough[:-1])  # intervals between two samples that their neighbours foretell
+        calm = ~(rough[1:] | rough[:-1])  # intervals between two samples that their neighbours predict
         smooth += [(a + c, a + d + 1) for c, d in runs_of(calm) if d - c >= SHORTEST - 2]
     return smooth
 
 
-def unforetold(t: Array, x: Array, reach: int) -> tuple[Array, Array]:
+def interpolation_error(t: Array, x: Array, reach: int) -> tuple[Array, Array]:
     """Return by how much the polynomial through `reach` samples on both sides misses each of x (n,) at times t, but for the ends.
 
     And what it is (n - 2 reach,) for white noise of standard deviation 1.
@@ -376,10 +376,10 @@ def unforetold(t: Array, x: Array, reach: int) -> tuple[Array, Array]:
 
 
 def _rough(t: Array, W: Array, total: float, noise: float) -> NDArray[np.bool_]:
-    """Return which samples of a stretch the polynomial through their eight neighbours does not foretell."""
+    """Return which samples of a stretch the polynomial through their eight neighbours does not predict."""
     from numpy.lib.stride_tricks import sliding_window_view
 
-    error, unit = unforetold(t, W, REACH)
+    error, unit = interpolation_error(t, W, REACH)
     ranges = np.ptp(sliding_window_view(W, 2 * REACH + 1), axis=1)
     rough = np.zeros(W.size, bool)
     rough[REACH:-REACH] = error > np.maximum(ROUGH * ranges, np.maximum(FAINT * total, 5 * noise * unit))

@@ -450,7 +450,7 @@ CROSSED = 0.5  # a cell that a boundary crosses is halved, too, where its error 
 JUMP = 0.5  # of a state's logarithms between neighbours: it may be another state then,
 LEFT = 0.1  # if what the tangents of the two do not explain of it exceeds this
 
-# in units of half a cell: its middle and the middles of its sides, and the corners whose mean foretells each
+# in units of half a cell: its middle and the middles of its sides, and the corners whose mean predicts each
 MIDDLES = np.array([(1, 0), (1, 2), (0, 1), (2, 1), (1, 1)])
 PARENTS = ((0, 1), (2, 3), (0, 2), (1, 3), (0, 1, 2, 3))
 CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # the order of a cell's corners, and of its quarters
@@ -588,8 +588,8 @@ def _halved(task: TileTask, model: GeneratedModel, points: _Points, cells: Cells
     points.add(task, model, at.reshape(-1, 2), parents)
     g = points.samples.g
     middle, old = g[points.index(at)], g[corners]
-    foretold = np.stack([old[:, list(k)].mean(axis=1) for k in PARENTS], axis=1)
-    off = np.nan_to_num(np.abs(middle - foretold))
+    interpolated = np.stack([old[:, list(k)].mean(axis=1) for k in PARENTS], axis=1)
+    off = np.nan_to_num(np.abs(middle - interpolated))
     sides = np.maximum(off[:, 0], off[:, 1]) + np.maximum(off[:, 2], off[:, 3])
     error = SAFETY * SHRINKS * np.maximum(sides, off[:, 4])
     quarters = cells.at[:, None, :] + half * CORNERS

@@ -268,7 +268,7 @@ def line_orbits(
     A few that are spread over the line come first; the others start from what was found around them.
     """
     count, stride = p.shape[1], STRIDE
-    while stride > 1 and count < stride * NEIGHBOURS:  # fewer to start from would foretell little
+    while stride > 1 and count < stride * NEIGHBOURS:  # fewer to start from would predict little
         stride //= 2
     first, *later = levels(count, stride)
     orbits = OrbitBatch.empty(p, edges, len(model.states))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from srfcli.data.values import Run
     from srfcli.diagnosis.answer import RunView
-    from srfcli.diagnosis.design import Parting
+    from srfcli.diagnosis.design import DiscriminatingRun
     from srfcli.diagnosis.residual_scan import Location
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.laws.registry import Registry
@@ -85,7 +85,7 @@ class DiagnosisResult(Result):
     location: Location = field(repr=False)
     registry: Registry = field(repr=False)
     missing: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    parting: Parting | None = field(default=None, repr=False)
+    discriminating: DiscriminatingRun | None = field(default=None, repr=False)
     stopped: bool = False
     reader: str | None = None
     seed: int = 0
@@ -123,7 +123,7 @@ class DiagnosisResult(Result):
         """Return the answer as plain data."""
         from srfcli.diagnosis.answer import answer
 
-        found: dict[str, Any] = plain_value(answer(self.diagnosis, self.location, parting=self.parting))
+        found: dict[str, Any] = plain_value(answer(self.diagnosis, self.location, discriminating=self.discriminating))
         if self.missing:
             kept = {k: v for k, v in self.missing.items() if k not in ("force", "toml", "csv")}
             found["missing"] = plain_value(kept)
@@ -267,8 +267,8 @@ class DiagnosisResult(Result):
                     write_atomic(fresh / name, content)
                 if self.missing["toml"] is not None:
                     write_atomic(fresh / FORM, self.missing["toml"])
-            if self.parting is not None:
-                made_of["parting"] = _proposed(fresh, folder, found, self)
+            if self.discriminating is not None:
+                made_of["discriminating"] = _proposed(fresh, folder, found, self)
             _report(fresh, found, made_of, told, debug)
 
 
@@ -380,13 +380,13 @@ def _velocities(run: Run) -> list[tuple[float, float]]:
 
 def _proposed(fresh: Path, folder: Path, found: Mapping[str, Any], result: DiagnosisResult) -> list[str]:
     """Write each hypothesis' prediction of the discriminating run, and return the report's sentences on it."""
-    from srfcli.diagnosis.design import parting_files
+    from srfcli.diagnosis.design import discriminating_files
 
     told = found["experiment"]
-    assert result.parting is not None
-    if not told["parts"]:
+    assert result.discriminating is not None
+    if not told["discriminates"]:
         return list(told["sentences"])
-    files = parting_files(result.registry, result.diagnosis, result.parting, folder=folder, reader=result.reader)
+    files = discriminating_files(result.registry, result.diagnosis, result.discriminating, folder=folder, reader=result.reader)
     for place, text in files.items():
         (fresh / place).parent.mkdir(parents=True, exist_ok=True)
         write_atomic(fresh / place, text)

@@ -68,7 +68,7 @@ SHADED = (
     "Shaded are the times at which the baseline parts from the recording, the darker the more; that its parameters may have been "
     "bent to follow elsewhere is allowed for, so a residual may also be large outside."
 )
-FILES = ("answer.json", "prediction-*.csv", "missing-*.csv", "augmented/**/*", "parting/**/*", "figures/*.svg")
+FILES = ("answer.json", "prediction-*.csv", "missing-*.csv", "augmented/**/*", "discriminating/**/*", "figures/*.svg")
 
 
 @dataclass(frozen=True)
@@ -302,10 +302,10 @@ def left_out(matter: Matter) -> Markup:
         parts.append(
             tag("p", f"{joined(list(names))} leave the same trace in these runs: nothing here tells them apart.")
         )
-    parting = matter.tables.get("parting")
-    if parting:
-        parts.append(tag("h3", "The experiment that would part them"))
-        parts += [commands([p.rstrip()]) if p.startswith("[[runs]]") else tag("p", p) for p in parting]
+    discriminating = matter.tables.get("discriminating")
+    if discriminating:
+        parts.append(tag("h3", "The experiment that discriminates between them"))
+        parts += [commands([p.rstrip()]) if p.startswith("[[runs]]") else tag("p", p) for p in discriminating]
     return section("left-out", "What was left out", parts)
 
 
@@ -654,7 +654,7 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     ranked: {name, evidence, rms_over_noise, field, confidence, against};
     scores: {effect, gain, size, stderr, surviving, detectable};
     parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma};
-    and, where there are any, parting: paragraphs on the discriminating run; force {run: {t, force, band (2, n), v, phi, W},
+    and, where there are any, discriminating: paragraphs on that run; force {run: {t, force, band (2, n), v, phi, W},
     "form": text}; diagram {V, note, and for baseline and augmented model: W0, V of these, W0_hopf}.
     Without matplotlib the page has all but the figures, and says so.
     """

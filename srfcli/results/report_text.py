@@ -235,8 +235,8 @@ def remedy(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
         rest = "go on with the augmented model in the folder beside this page, which has it"
         return _capital("; ".join([*told, rest])) + "."
     if verdict == "ambiguous":
-        if material.get("parting"):
-            return "Make the experiment described below: the candidates foretell different records of it."
+        if material.get("discriminating"):
+            return "Make the experiment described below: the candidates predict different records of it."
         return "Vary in another run what these runs have in common: the load, the velocity or the stiffness."
     if verdict == "unknown":
         form = (material.get("force") or {}).get("form")

@@ -11,7 +11,7 @@ from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment
-from srfcli.diagnosis.design import parting_experiment
+from srfcli.diagnosis.design import discriminating_run
 from srfcli.diagnosis.discrepancy import explain_unknown
 from srfcli.diagnosis.residual_scan import locate
 from srfcli.diagnosis.search import ModelSearch
@@ -122,7 +122,7 @@ def diagnose(
     told("location")
     last = diagnosis.final if diagnosis.final is not diagnosis.baseline and diagnosis.final.fine else None
     location = locate(diagnosis.baseline, last=last, seed=seed)
-    missing, parting = {}, None
+    missing, discriminating = {}, None
     if not stopped and not fitted.thresholds and diagnosis.verdict == "unknown":
 
         def interrupted() -> None:
@@ -133,9 +133,9 @@ def diagnose(
         missing = explain_unknown(search, diagnosis, stopped=interrupted)
     if not stopped and not fitted.thresholds and diagnosis.verdict == "ambiguous":
         told("ambiguous: the run that would tell them apart")
-        parting = parting_experiment(registry, diagnosis, seed=seed)
+        discriminating = discriminating_run(registry, diagnosis, seed=seed)
     return DiagnosisResult(
-        diagnosis, location, registry, missing, parting, stopped, reader, seed, time.perf_counter() - begun
+        diagnosis, location, registry, missing, discriminating, stopped, reader, seed, time.perf_counter() - begun
     )
 
 

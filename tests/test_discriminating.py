@@ -1,4 +1,4 @@
-"""The run that would part what is ambiguous: within the apparatus' reach, worth what it promises, and told where to look."""
+"""The run that discriminates between what is ambiguous: within reach, worth what it promises, and where to look."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from click.testing import CliRunner
 import srfcli as srf
 from srfcli.cli.main import cli
 from srfcli.data.experiment import read_experiment
-from srfcli.diagnosis import design as parting
+from srfcli.diagnosis import design as module
 from srfcli.diagnosis.design import (
     ENOUGH,
     FACTOR,
     LEAST,
     Design,
+    DiscriminatingRun,
     Loss,
     Proposal,
     Side,
     described,
+    discriminating_run,
     draw,
     foremost,
     led_in,
-    parting_experiment,
     reach_of,
     run_of,
     sentences,
@@ -59,7 +60,7 @@ POOR = Proposal("velocity steps", ((0.6, 8.0), (0.4, 60.0), (0.6, 12.0)), 5.0, "
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A weak effect of the rate of load, in an experiment with one short modulation: its rival does as well."""
-    folder = tmp_path_factory.mktemp("parting") / "case"
+    folder = tmp_path_factory.mktemp("discriminating") / "case"
     folder.mkdir()
     rng = np.random.default_rng(1)
     readings = {plan: read_gauge(move(replace(Physics(), alpha=0.006), plan).u, Gauge(), rng) for plan in PLANS}
@@ -81,10 +82,10 @@ def diagnosis(result: DiagnosisResult) -> Diagnosis:
 
 
 @pytest.fixture(scope="module")
-def found(result: DiagnosisResult) -> parting.Parting:
-    """The run that parts its hypotheses."""
-    assert result.parting is not None
-    return result.parting
+def found(result: DiagnosisResult) -> DiscriminatingRun:
+    """The run that discriminates between its hypotheses."""
+    assert result.discriminating is not None
+    return result.discriminating
 
 
 def gap(diagnosis: Diagnosis, proposal: Proposal, true: str) -> float:
@@ -115,19 +116,19 @@ def test_the_case_is_ambiguous(diagnosis: Diagnosis) -> None:
 
 
 @pytest.mark.parametrize("true", [RIVALS[0], pytest.param(RIVALS[1], marks=pytest.mark.slow)])
-def test_the_promise_is_kept(diagnosis: Diagnosis, found: parting.Parting, true: str) -> None:
+def test_the_promise_is_kept(diagnosis: Diagnosis, found: DiscriminatingRun, true: str) -> None:
     """Made by the independent generator and refitted with the old runs: the gap is what was promised, within a factor of two."""
     assert found.gain > 2 * ENOUGH and found.gain == min(found.gains.values())
     assert 0.5 < gap(diagnosis, found.proposal, true) / found.gains[true] < 2
 
 
 def test_a_poor_run_parts_nothing(diagnosis: Diagnosis) -> None:
-    """Both effects are those of a load that changes: under a constant one nothing parts them."""
+    """Both effects are those of a load that changes: under a constant one nothing discriminates between them."""
     design = Design(diagnosis.experiment, foremost(diagnosis), 0)
-    trial = design.foretell(POOR)
+    trial = design.predict(POOR)
     assert trial is not None and trial.bound > 0
     judged = design.judge(trial)
-    assert judged is not None and judged.gain < 0.2 and judged.seconds is None and not judged.parts
+    assert judged is not None and judged.gain < 0.2 and judged.seconds is None and not judged.discriminates
 
 
 @pytest.mark.slow
@@ -135,7 +136,7 @@ def test_refits_do_not_part_by_a_poor_run_either(diagnosis: Diagnosis) -> None:
     assert abs(gap(diagnosis, POOR, RIVALS[0])) < 1
 
 
-def test_a_part_of_the_run_is_enough(diagnosis: Diagnosis, found: parting.Parting) -> None:
+def test_a_part_of_the_run_is_enough(diagnosis: Diagnosis, found: DiscriminatingRun) -> None:
     """The run cut to its first `seconds` promises 12, to half of that less."""
     design = Design(diagnosis.experiment, foremost(diagnosis), 0)
     assert found.seconds is not None and found.repeats == 1 and 0 < found.seconds < found.proposal.duration
@@ -145,13 +146,13 @@ def test_a_part_of_the_run_is_enough(diagnosis: Diagnosis, found: parting.Partin
         for d, V in found.proposal.drive:
             drive.append((max(min(d, left), 1e-9), V))
             left -= d
-        trial = design.foretell(replace(found.proposal, drive=tuple(drive)))
+        trial = design.predict(replace(found.proposal, drive=tuple(drive)))
         assert trial is not None
         gains.append(design.gain(trial))
     assert gains[1] < ENOUGH * 0.9 and 0.8 * ENOUGH < gains[0] < 2 * ENOUGH
 
 
-def test_the_difference_is_where_it_is_said_to_be(diagnosis: Diagnosis, found: parting.Parting) -> None:
+def test_the_difference_is_where_it_is_said_to_be(diagnosis: Diagnosis, found: DiscriminatingRun) -> None:
     """After the refit no sample differs by more, and before it the two differ by more somewhere."""
     a, b = (found.predicted[n] for n in found.pair)
     assert found.run.t[0] <= found.at <= found.run.t[-1]
@@ -161,30 +162,30 @@ def test_the_difference_is_where_it_is_said_to_be(diagnosis: Diagnosis, found: p
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_run(diagnosis: Diagnosis, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parting, "DRAWN", 4)
-    monkeypatch.setattr(parting, "VARIED", 1)
-    made = [parting_experiment(SHIPPED, diagnosis, seed=seed) for seed in (1, 1, 2)]
+    monkeypatch.setattr(module, "DRAWN", 4)
+    monkeypatch.setattr(module, "VARIED", 1)
+    made = [discriminating_run(SHIPPED, diagnosis, seed=seed) for seed in (1, 1, 2)]
     assert made[0] is not None and made[1] is not None and made[2] is not None
     assert made[0].proposal == made[1].proposal != made[2].proposal and made[0].gain == made[1].gain
     assert made[0].tried == 5
 
 
 def test_one_class_is_said_to_be_one(diagnosis: Diagnosis, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A hypothesis beside its own double, and a third: no run parts the least parted pair."""
-    monkeypatch.setattr(parting, "DRAWN", 4)
-    monkeypatch.setattr(parting, "VARIED", 1)
+    """A hypothesis beside its own double, and a third: no run discriminates between these two."""
+    monkeypatch.setattr(module, "DRAWN", 4)
+    monkeypatch.setattr(module, "VARIED", 1)
     first, second = diagnosis.close
     (effect,) = first.hypothesis.effects
     double = replace(first, hypothesis=Hypothesis((replace(effect, name="double", answers="double"),)))
-    best = parting_experiment(SHIPPED, replace(diagnosis, close=(first, double, second)))
+    best = discriminating_run(SHIPPED, replace(diagnosis, close=(first, double, second)))
     assert best is not None and best.names == (first.name, "double", second.name)
-    assert best.gain < 1e-3 < LEAST and not best.parts and best.repeats is None
+    assert best.gain < 1e-3 < LEAST and not best.discriminates and best.repeats is None
     assert "one class" in sentences(best)[0] and first.name in sentences(best)[0]
 
 
 def test_nothing_to_part_is_no_experiment(diagnosis: Diagnosis) -> None:
-    assert parting_experiment(SHIPPED, replace(diagnosis, verdict="identified")) is None
-    assert parting_experiment(SHIPPED, replace(diagnosis, close=diagnosis.close[:1])) is None
+    assert discriminating_run(SHIPPED, replace(diagnosis, verdict="identified")) is None
+    assert discriminating_run(SHIPPED, replace(diagnosis, close=diagnosis.close[:1])) is None
 
 
 # ---- what counts
@@ -208,8 +209,8 @@ def test_the_gain_is_what_no_refit_absorbs(seed: int) -> None:
     assert Loss(X @ rng.standard_normal(5), X, 1e-9 * Q, w).gain() < 1e-6
 
 
-def test_a_random_field_takes_its_share(diagnosis: Diagnosis, found: parting.Parting) -> None:
-    """What a rough track could do parts nothing."""
+def test_a_random_field_takes_its_share(diagnosis: Diagnosis, found: DiscriminatingRun) -> None:
+    """What a rough track could do discriminates between nothing."""
     gains = []
     for amplitude in (0.0, 3e-4, 3e-3):
         sides = []
@@ -220,7 +221,7 @@ def test_a_random_field_takes_its_share(diagnosis: Diagnosis, found: parting.Par
             fit = replace(side.fitted.fit, likelihood=likelihood, maximum=replace(side.fitted.fit.maximum, point=point))
             sides.append(Side.of(replace(side.fitted, fit=fit)))
         design = Design(diagnosis.experiment, sides, 0)
-        trial = design.foretell(found.proposal)
+        trial = design.predict(found.proposal)
         assert trial is not None
         gains.append(design.gain(trial))
     assert gains[0] > 1.02 * gains[1] > gains[2] > 0
@@ -312,7 +313,7 @@ def test_a_load_that_nothing_tells_is_left_alone(diagnosis: Diagnosis) -> None:
 # ---- what is told
 
 
-def test_words_and_numbers_agree(diagnosis: Diagnosis, found: parting.Parting) -> None:
+def test_words_and_numbers_agree(diagnosis: Diagnosis, found: DiscriminatingRun) -> None:
     told = described(found, diagnosis.experiment)
     assert json.loads(json.dumps(told)) == told
     whole = " ".join(told["sentences"])
@@ -329,20 +330,20 @@ def test_words_and_numbers_agree(diagnosis: Diagnosis, found: parting.Parting) -
 
 
 @pytest.mark.usefixtures("without_matplotlib")
-def test_what_is_written_says_it(folder: Path, result: DiagnosisResult, found: parting.Parting) -> None:
-    """The answer has the experiment; what each hypothesis foretells is an experiment that `srf simulate` repeats."""
+def test_what_is_written_says_it(folder: Path, result: DiagnosisResult, found: DiscriminatingRun) -> None:
+    """The answer has the experiment; what each hypothesis predicts is an experiment that `srf simulate` repeats."""
     out = folder.parent / "found"
     result.write(out)
     answer = json.loads((out / "answer.json").read_text())
     told = answer["experiment"]
-    assert answer["verdict"] == "ambiguous" and told["parts"]
+    assert answer["verdict"] == "ambiguous" and told["discriminates"]
     assert told["gain"] == pytest.approx(found.gain, rel=1e-3)
     page = re.sub(r"\s+", " ", (out / "report.html").read_text())
     notes = " ".join(result.table.notes)
     assert all(s in notes and s in page for s in told["sentences"])
-    assert "[[runs]]" in page and 'href="parting/linker-dieterich/experiment.toml"' in page
+    assert "[[runs]]" in page and 'href="discriminating/linker-dieterich/experiment.toml"' in page
     for name in RIVALS:
-        home = out / "parting" / name
+        home = out / "discriminating" / name
         assert (home / "experiment.toml").read_text().endswith(told["run"])
         done = CliRunner().invoke(cli, ["simulate", str(home), "--csv"])
         assert done.exit_code == 0, done.output
