@@ -20,7 +20,7 @@ from srfcli.codegen.model import open_model
 from srfcli.data.experiment import check_run, read_experiment
 from srfcli.data.values import Experiment, FitParameter
 from srfcli.inference import cramer_rao as reach
-from srfcli.inference.cramer_rao import Forecast, Reach, forecast
+from srfcli.inference.cramer_rao import CramerRaoBound, Forecast, forecast
 from srfcli.inference.fit import fit_problem
 from srfcli.inference.prediction import predict
 from srfcli.inference.state_space import Likelihood, StateSpaceFit, as_fit, fit_state_space, maximise
@@ -284,7 +284,7 @@ def test_a_simulation_unlike_the_recording_is_not_believed(small: Path) -> None:
      (0.2, 9.0, "can hardly be identified"), (2.0, 9.0, "cannot be identified"), (math.inf, 0.0, "cannot be identified")],
 )  # fmt: skip
 def test_verdicts(error: float, peak: float, verdict: str) -> None:
-    assert verdict_of("alpha", Reach("a", False, 0.1, {"alpha": error}, {"alpha": peak})) == verdict
+    assert verdict_of("alpha", CramerRaoBound("a", False, 0.1, {"alpha": error}, {"alpha": peak})) == verdict
 
 
 @pytest.mark.parametrize(

@@ -149,6 +149,6 @@ def test_a_baseline_in_a_false_maximum_is_fitted_again_from_a_better_model(tmp_p
     experiment = read_experiment(written(tmp_path, ()), registry=SHIPPED)
     search = Stuck(SHIPPED, experiment.fitted(), effects=["slip-evolution", "viscous-drag", "second-state"])
     best = search.run()
-    assert best.name == "none" and best.fine
+    assert best.name == "none" and best.passes
     assert best.evidence == pytest.approx(search.right, abs=1.0)
     assert len(search.fitted) > 1

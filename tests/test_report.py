@@ -121,7 +121,7 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
                         "augmented_stderr": 1.3e-4, "shift_sigma": 10.06},
                        {"name": "alpha", "unit": "1", "baseline": None, "baseline_stderr": None, "augmented": 0.012,
                         "augmented_stderr": 0.0004, "shift_sigma": None}],
-        "scores": [{"effect": "linker-dieterich", "gain": 812.0, "size": 0.011, "stderr": 0.0003, "surviving": 0.12,
+        "scores": [{"effect": "linker-dieterich", "gain": 812.0, "size": 0.011, "stderr": 0.0003, "tolerance": 0.12,
                     "detectable": 0.0011}],
     }  # fmt: skip
     if verdict == "unknown":

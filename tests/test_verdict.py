@@ -23,11 +23,11 @@ def score(name, detectable, direction=(1.0, 0.0)):
     return Score(SHIPPED.get("effect", name), 1.0, {}, 0.0, 1.0, detectable, 0.5, np.array(direction))
 
 
-def fitted(*names, evidence, fine=True, scores=(), told=0.0):
+def fitted(*names, evidence, passes=True, scores=(), told=0.0):
     hypothesis = Hypothesis(tuple(SHIPPED.get("effect", n) for n in names))
     return SimpleNamespace(
-        hypothesis=hypothesis, name=hypothesis.name, evidence=evidence, fine=fine,
-        against=() if fine else ("a stretch of steps is off",), promised=scores, told=told, fit=None,
+        hypothesis=hypothesis, name=hypothesis.name, evidence=evidence, passes=passes,
+        against=() if passes else ("a stretch of steps is off",), promised=scores, told=told, fit=None,
     )  # fmt: skip
 
 
@@ -57,7 +57,7 @@ def concluded(monkeypatch):
     return verdict
 
 
-LOST = fitted(evidence=0.0, fine=False)
+LOST = fitted(evidence=0.0, passes=False)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ LOST = fitted(evidence=0.0, fine=False)
 )
 def test_a_model_that_passes_is_taken_where_one_that_does_not_is_hardly_ahead_of_it(concluded, evidence, said):
     found = concluded(
-        fitted("slip-evolution", evidence=100.0, fine=False), fitted("viscous-drag", evidence=evidence), LOST
+        fitted("slip-evolution", evidence=100.0, passes=False), fitted("viscous-drag", evidence=evidence), LOST
     )
     assert (found.verdict, found.effects) == said
     assert found.final is (found.best if said[1] else found.ranked[0])
@@ -122,7 +122,7 @@ def test_a_baseline_that_passes_is_refused_by_held_out_runs_too(concluded):
 
 
 def test_a_model_far_off_has_no_share_of_the_confidence(concluded):
-    found = concluded(fitted("viscous-drag", evidence=100.0, fine=False), LOST)
+    found = concluded(fitted("viscous-drag", evidence=100.0, passes=False), LOST)
     assert found.verdict == "unknown" and found.confidence["viscous-drag"] == 0.0
     assert found.confidence["unknown"] == pytest.approx(1 - MISSED) and found.confidence["missed"] == pytest.approx(MISSED)
     sure = concluded(fitted("viscous-drag", evidence=100.0), LOST)
@@ -133,13 +133,13 @@ def test_effects_of_one_signal_are_one_class(concluded):
     scores = [
         score("viscous-drag", SEEN), score("slip-evolution", SEEN, (0.99, 0.1411)), score("friction-drift", SEEN, (0.0, 1.0)),
     ]  # fmt: skip
-    baseline = fitted(evidence=0.0, fine=False, scores=scores)
+    baseline = fitted(evidence=0.0, passes=False, scores=scores)
     found = concluded(fitted("viscous-drag", evidence=100.0), baseline)
     assert found.equivalent == (("viscous-drag", "slip-evolution"),)
 
 
 def test_an_effect_that_parameters_absorb_is_not_identifiable(concluded):
-    lost = replace(score("viscous-drag", HIDDEN), surviving=1e-4)
+    lost = replace(score("viscous-drag", HIDDEN), tolerance=1e-4)
     found = concluded(fitted(evidence=0.0, scores=[lost, score("friction-drift", SEEN)]))
     assert [x.effect for x in found.not_identifiable] == ["viscous-drag"]
     assert "99.99 %" in found.not_identifiable[0].reason

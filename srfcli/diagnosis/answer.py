@@ -240,7 +240,7 @@ def parameter_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 def score_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return what each effect could still explain, at first order."""
     return [
-        {"effect": s.effect.name, "gain": s.gain, "size": s.size, "stderr": s.stderr, "surviving": s.surviving,
+        {"effect": s.effect.name, "gain": s.gain, "size": s.size, "stderr": s.stderr, "tolerance": s.tolerance,
          "detectable": s.detectable}
         for s in diagnosis.scores
     ]  # fmt: skip

@@ -155,7 +155,7 @@ def best_form(search: ModelSearch, diagnosis: Diagnosis) -> ClosedForm | None:
     names = {e.name for e in registry.entries("effect") if e.origin == ORIGIN}
     own = ModelSearch(registry, search.experiment, search.progress, sorted(names), search.trend)
     start = [diagnosis.baseline]
-    if diagnosis.best is not diagnosis.baseline and not diagnosis.best.fine:
+    if diagnosis.best is not diagnosis.baseline and not diagnosis.best.passes:
         start.append(diagnosis.best)
     own.extend(start)
     least = max(f.evidence for f in start) + CLOSE
@@ -294,7 +294,7 @@ class ClosedForm:
             "terms": [t.described() for t in self.terms],
             "beside": [e.name for e in self.beside],
             "rms_over_noise": self.fitted.fit.maximum.point.rms,
-            "leaves_noise_alone": self.fitted.fine,
+            "leaves_noise_alone": self.fitted.passes,
             "held_rms_over_noise": {"baseline": rms[0], "form": rms[1]},
         }
 

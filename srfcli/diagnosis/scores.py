@@ -46,7 +46,7 @@ FINE = 20  # points between samples at which a function of slip or stage is aver
 class Score:
     """One effect's score: `gain` in log likelihood at first order, the `values` expected of its parameters there.
 
-    `size` and `stderr` are those of its first parameter, `detectable` the size that would gain 12 in log likelihood, `surviving`
+    `size` and `stderr` are those of its first parameter, `detectable` the size that would gain 12 in log likelihood, `tolerance`
     the share of the effect's squared signal that what was fitted cannot absorb. `shifts` are what it does to the parameters that
     were fitted.
     """
@@ -57,7 +57,7 @@ class Score:
     size: float
     stderr: float
     detectable: float
-    surviving: float
+    tolerance: float
     direction: Array = field(repr=False, compare=False)
     shifts: dict[str, float] = field(repr=False, compare=False, default_factory=dict)
 

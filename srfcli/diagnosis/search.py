@@ -93,7 +93,7 @@ class Fitted:
         return self.separate + self.granted
 
     @property
-    def fine(self) -> bool:
+    def passes(self) -> bool:
         """Return whether the model passes every test of what a fit leaves."""
         return not self.against
 
@@ -176,7 +176,7 @@ class ModelSearch:
         if move and "processes" not in self.options:
             found = with_less_colour(found, NEAR, self.progress)
         judged = self._judged(hypothesis, found)
-        if move is None and judged.fine:  # else it is not what is reported
+        if move is None and judged.passes:  # else it is not what is reported
             judged = self._judged(hypothesis, likeliest_beside(found, NEAR, self.progress))
         return judged
 
@@ -261,14 +261,14 @@ class ModelSearch:
         base = self._record(self.fit(None))
         self.budget = max(BUDGET, BASELINES * (time.process_time() - self.begun))
         base = self._expand(base)
-        if not base.fine:
+        if not base.passes:
             self._swap(base)
         self._search()
         for further in (self._recolour, self._together, self._swap):  # dearer, or less likely
             best = self.best()
-            wanting = best is not self.baseline or not self.baseline.fine
+            wanting = best is not self.baseline or not self.baseline.passes
             imitated = further == self._swap and wanting  # an effect may pass for another ageing law
-            if (imitated or not best.fine) and not self.spent:
+            if (imitated or not best.passes) and not self.spent:
                 further(self.baseline)
                 self._search()
         if self.best().hypothesis.ageing and not self.spent:  # another law is much like it; its noise may have been misjudged
@@ -324,7 +324,7 @@ class ModelSearch:
         while not self.spent:
             best = self.best()
             promised = bool(self.queue) and -self.queue[0].expected >= best.evidence - CLOSE
-            if self.queue and self.experiment.thresholds and not best.fine:  # at first order a model far off promises too little
+            if self.queue and self.experiment.thresholds and not best.passes:  # far off the first order promises too little
                 promised = promised or self.queue[0].direction is not None
             if not promised:
                 if best.scores is not None or len(best.hypothesis.effects) >= LARGEST:
@@ -343,7 +343,7 @@ class ModelSearch:
                 self._expect_elsewhere(move)
                 continue
             self._revise(move, found)
-            if found is self.best() and not found.fine and not move.again:
+            if found is self.best() and not found.passes and not move.again:
                 again = self._again(found)
                 if again:
                     heapq.heappush(self.queue, again)
@@ -379,10 +379,10 @@ class ModelSearch:
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
         one = -float(np.log(2 * len(self.candidates))) - 3.0  # prior and Occam's factor of an effect
-        least = WORTH if node.fine else WORTH / 2
-        if node.fine and not node.hypothesis.reported and (not node.fit.smooth or node.fit.likelihood.processes):
+        least = WORTH if node.passes else WORTH / 2
+        if node.passes and not node.hypothesis.reported and (not node.fit.smooth or node.fit.likelihood.processes):
             least = HINT
-        alone = scores.alone() if not node.fine or any(s.gain > least for s in scores.singles) else []
+        alone = scores.alone() if not node.passes or any(s.gain > least for s in scores.singles) else []
         promised = [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in alone]
         promised = sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])
         for gain, score in promised[:SINGLES]:
@@ -390,7 +390,7 @@ class ModelSearch:
             sizes = (*self._sizes(node), score.values)
             own = {n: score.shifts[n] for n in node.fit.likelihood.problem.names if score.shifts.get(n)}
             self._push(node.attainable + gain + one, hypothesis, node, sizes, direction=score.direction, shifts=own)
-        if not node.fine:
+        if not node.passes:
             for effect in (e for e in joining if e.settings or e.observed):
                 self._build(node, effect, one)
         return node
@@ -623,7 +623,7 @@ class ModelSearch:
                 parts += [(Hypothesis((e,), ageing), (own,)) for e, own in zip(effects, sizes, strict=True)]
             for part, own in parts:
                 known = self.fitted.get(part.name)
-                if known is not None and known.fine and known.evidence > top - CLOSE:
+                if known is not None and known.passes and known.evidence > top - CLOSE:
                     continue
                 if any(n not in self._stated for e in part.effects for n in e.needs):
                     continue  # it is nothing without the other

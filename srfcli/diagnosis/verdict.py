@@ -125,7 +125,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     baseline, best = search.baseline, ranked[0]
     close, joint = may_be_it(ranked, whole)
     best = close[0] if close else best
-    shown = on_the_track_of(best, baseline) if best.fine else baseline
+    shown = on_the_track_of(best, baseline) if best.passes else baseline
     held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
     scores = tuple(baseline.promised)
     ungated, reasons = _said(best, close, scores)
@@ -141,9 +141,9 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     if search.cut_short:
         reasons.append(f"the search ended at its budget of {search.budget:.0f} s of CPU, with models left to fit")
     absorbed = [
-        Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.surviving):.2f} % of it")
+        Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.tolerance):.2f} % of it")
         for s in scores
-        if s.surviving < ABSORBED and s.detectable > interesting(s)
+        if s.tolerance < ABSORBED and s.detectable > interesting(s)
     ]
     return Diagnosis(
         whole, verdict, best, baseline, baseline if verdict in NOTHING else shown, ranked, close,
@@ -160,8 +160,8 @@ def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted
     the same likelihood as the best of these. Of two that come close one that holds the other gives way, and one that
     became the other; of an effect in all runs or in one, that which is worse.
     """
-    least = -np.inf if ranked[0].fine else ranked[0].evidence - CLOSE
-    passed = [f for f in ranked if f.fine and f.evidence > least]
+    least = -np.inf if ranked[0].passes else ranked[0].evidence - CLOSE
+    passed = [f for f in ranked if f.passes and f.evidence > least]
     told = {f.name: predictive(f, whole) for f in passed}
     if not any(np.isfinite(t) for t in told.values()):  # no model follows what is held out
         told = {}
@@ -238,7 +238,7 @@ def held_out_loads(baseline: Fitted, best: Fitted, whole: Experiment) -> tuple[H
 
 
 def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score]) -> tuple[str, list[str]]:
-    if not best.fine:
+    if not best.passes:
         return "unknown", [f"{best.name}: {reason}" for reason in best.against]
     reasons = [f"{best.name}: nothing is left that a test finds"]
     if any(not f.hypothesis.reported for f in close):
@@ -314,11 +314,11 @@ def _equivalent(scores: Sequence[Score], close: Sequence[Fitted]) -> tuple[tuple
 
 def _confidence(ranked: Sequence[Fitted], joint: Mapping[str, float], verdict: str) -> dict[str, float]:
     """Return the stated confidence in each model, by evidence, in `unknown`, in what the search `missed` where none passes."""
-    weights = {f.name: joint[f.name] - (0.0 if f.fine else LACKING) for f in ranked}
+    weights = {f.name: joint[f.name] - (0.0 if f.passes else LACKING) for f in ranked}
     top = max(weights.values())
     share = {name: float(np.exp(max((w - top) / TEMPER, -60.0))) for name, w in weights.items()}
     total, unknown = sum(share.values()), 1 - MISSED if verdict == "unknown" else UNEXPLAINED
-    passed = any(f.fine for f in ranked)  # else none of them is it
+    passed = any(f.passes for f in ranked)  # else none of them is it
     found = {name: (1 - unknown) * v / total if passed else 0.0 for name, v in share.items()}
     found |= {"unknown": unknown} | ({} if passed else {"missed": 1 - unknown})
     return dict(sorted(found.items(), key=lambda item: -item[1]))

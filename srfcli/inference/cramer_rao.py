@@ -43,7 +43,7 @@ UNKNOWN = 100.0  # an error beyond this tells nothing: alpha and n are of order 
 
 
 @dataclass(frozen=True)
-class Reach:
+class CramerRaoBound:
     """Smallest errors of alpha, lambda (relative) and n, by these names, from one run or several: inf where nothing is told.
 
     What the model does not have is missing. `peaks` are the largest changes that SIZES make and nothing else can, over the
@@ -68,10 +68,10 @@ class Reach:
 
 @dataclass(frozen=True)
 class Forecast:
-    """A `Reach` for each run, one for all that are fitted and believed (None for fewer than two), and what else is unknown."""
+    """A bound for each run, one for all that are fitted and believed (None for fewer than two), and what else is unknown."""
 
-    runs: tuple[Reach, ...]
-    together: Reach | None
+    runs: tuple[CramerRaoBound, ...]
+    together: CramerRaoBound | None
     free: tuple[str, ...]
 
 
@@ -115,7 +115,7 @@ def forecast(
         told = _simulated(question, check)
         errors, peaks = _errors(question, [told])
         name, holdout = check.run.name, check.run.holdout
-        one = Reach(name, holdout, _variation([check]), errors, peaks, told.misfit, told.status, told.reached)
+        one = CramerRaoBound(name, holdout, _variation([check]), errors, peaks, told.misfit, told.status, told.reached)
         runs.append(one)
         if one.believed and not holdout:
             fitted.append((check, told))
@@ -125,7 +125,7 @@ def forecast(
     if len(fitted) < 2:
         return Forecast(tuple(runs), None, free)
     errors, peaks = _errors(question, [told for _, told in fitted])
-    together = Reach("all fitted runs", False, _variation([check for check, _ in fitted]), errors, peaks)
+    together = CramerRaoBound("all fitted runs", False, _variation([check for check, _ in fitted]), errors, peaks)
     return Forecast(tuple(runs), together, free)
 
 

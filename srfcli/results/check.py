@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from srfcli.data.experiment import RunCheck
     from srfcli.data.gauge import GaugeNoise
-    from srfcli.inference.cramer_rao import Forecast, Reach
+    from srfcli.inference.cramer_rao import CramerRaoBound, Forecast
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -42,7 +42,7 @@ class CheckResult(Result):
     forecast: Forecast | None = field(default=None, repr=False)
 
     @property
-    def _told(self) -> Sequence[Reach | None]:
+    def _told(self) -> Sequence[CramerRaoBound | None]:
         return [None] * len(self.runs) if self.forecast is None else self.forecast.runs
 
     @cached_property
@@ -165,7 +165,7 @@ COLUMNS = (
 CHANGE_HEADINGS = {"alpha": "0.2 makes", "lambda": "10 % makes", "n": "0.1 makes"}
 
 
-def row(check: RunCheck, told: Reach | None) -> tuple[Any, ...]:
+def row(check: RunCheck, told: CramerRaoBound | None) -> tuple[Any, ...]:
     """Return the cells of one run under COLUMNS."""
     import numpy as np
 
@@ -288,7 +288,7 @@ def _told(forecast: Forecast) -> Table:
     return _text_table(["run", "load varies", *headings], cells, title)
 
 
-def _errors(told: Reach, name: str) -> tuple[str, str]:
+def _errors(told: CramerRaoBound, name: str) -> tuple[str, str]:
     error = told.errors[name]
     if math.isinf(error):
         return "untold", "-"
@@ -299,7 +299,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2g} %"
 
 
-def described(check: RunCheck, told: Reach | None) -> dict[str, Any]:
+def described(check: RunCheck, told: CramerRaoBound | None) -> dict[str, Any]:
     """Return everything that was found in a run."""
     run, load = check.run, check.load
     return {
@@ -330,7 +330,7 @@ def described(check: RunCheck, told: Reach | None) -> dict[str, Any]:
     }
 
 
-def tells(told: Reach) -> dict[str, Any]:
+def tells(told: CramerRaoBound) -> dict[str, Any]:
     """Return as plain data what one run, or all together, can identify."""
     simulation = {"status": told.status.value, "misfit": told.misfit, "believed": told.believed}
     return {
@@ -387,7 +387,7 @@ def sentences(forecast: Forecast) -> list[str]:
     return told
 
 
-def _not_believed(told: Reach) -> str:
+def _not_believed(told: CramerRaoBound) -> str:
     if not told.status.ok:
         return f"{told.name}: the simulation ended at {told.reached:.6g} s; the rest of the run tells nothing here"
     return (
@@ -396,7 +396,7 @@ def _not_believed(told: Reach) -> str:
     )
 
 
-def _sentence(name: str, judge: Reach, forecast: Forecast) -> str:
+def _sentence(name: str, judge: CramerRaoBound, forecast: Forecast) -> str:
     error, varied = judge.errors[name], any(r.variation >= CONSTANT and not r.holdout for r in forecast.runs)
     if name == "alpha" and not varied:
         return f"{SUBJECTS[name]} cannot be identified: no fitted run has a load that changes"
@@ -414,7 +414,7 @@ def _sentence(name: str, judge: Reach, forecast: Forecast) -> str:
     return said
 
 
-def verdict_of(name: str, told: Reach) -> str:
+def verdict_of(name: str, told: CramerRaoBound) -> str:
     """Return whether a parameter can, can hardly, or cannot be identified, from its error and peak."""
     clear, hardly = LIMITS[name]
     error, peak = told.errors[name], told.peaks[name]

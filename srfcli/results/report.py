@@ -352,7 +352,7 @@ def scores(matter: Matter) -> Markup:
     rows = []
     for s in found:
         size, least = with_error(s.get("size"), s.get("stderr")), number(s.get("detectable"), 2)
-        rows.append([s["effect"], number(s.get("gain")), size, percent(s.get("surviving")), least])
+        rows.append([s["effect"], number(s.get("gain")), size, percent(s.get("tolerance")), least])
     caption = (
         "At first order: the gain in log likelihood that each effect promises, the size it would have from its neutral value, "
         "the share of its signal that the baseline's own parameters cannot absorb, and the smallest size that this experiment "
@@ -652,7 +652,7 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     thresholds: {name, holdout, table, baseline, augmented, chi2 (of both models)}, critical loads (n,) in N;
     atlas, the residual scan: {axis, run, kind, low, high, log_p, p_value};
     ranked: {name, evidence, rms_over_noise, field, confidence, against};
-    scores: {effect, gain, size, stderr, surviving, detectable};
+    scores: {effect, gain, size, stderr, tolerance, detectable};
     parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma};
     and, where there are any, discriminating: paragraphs on that run; force {run: {t, force, band (2, n), v, phi, W},
     "form": text}; diagram {V, note, and for baseline and augmented model: W0, V of these, W0_hopf}.

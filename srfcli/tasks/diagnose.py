@@ -120,7 +120,7 @@ def diagnose(
     told("held-out runs")
     diagnosis = conclude(search, read(holdout=True))
     told("location")
-    last = diagnosis.final if diagnosis.final is not diagnosis.baseline and diagnosis.final.fine else None
+    last = diagnosis.final if diagnosis.final is not diagnosis.baseline and diagnosis.final.passes else None
     location = locate(diagnosis.baseline, last=last, seed=seed)
     missing, discriminating = {}, None
     if not stopped and not fitted.thresholds and diagnosis.verdict == "unknown":

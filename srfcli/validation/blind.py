@@ -228,7 +228,7 @@ def _evidence(fitted: Fitted) -> Mapping[str, float]:
         "parameters": len(likelihood.names),
         "samples": likelihood.samples,
         "evidence": round(float(fitted.evidence), 3),
-        "fine": int(fitted.fine),
+        "fine": int(fitted.passes),
     }
 
 

@@ -127,7 +127,7 @@ def mark(truth: Mapping[str, Any], answer: Answer, sight: Sight) -> Mark:
         right or _listed(truth, answer),
         top,
         shares.get(top, 0.0),
-        _key(top) in allowed,
+        hypothesis(top) in allowed,
         _ratio(answer, sight, "augmented"),
         _ratio(answer, sight, "baseline"),
         deviation(truth, answer),
@@ -169,8 +169,8 @@ def accepted(truth: Mapping[str, Any], invisible: tuple[str, ...]) -> Accepted:
     `accept` in the truth lists further verdicts, or effects as "a" or "a+b". Where all that is concealed is invisible, so are
     none, inconclusive and ambiguous; of two effects with one invisible, the other one alone.
     """
-    found = {_key("+".join(truth["effects"]) if truth["verdict"] == "identified" else truth["verdict"])}
-    found |= {(name, frozenset()) if name in VERDICTS else _key(name) for name in truth.get("accept", ())}
+    found = {hypothesis("+".join(truth["effects"]) if truth["verdict"] == "identified" else truth["verdict"])}
+    found |= {(name, frozenset()) if name in VERDICTS else hypothesis(name) for name in truth.get("accept", ())}
     left = frozenset(truth["effects"]) - frozenset(invisible)
     if invisible and left:
         found.add(("identified", left))
@@ -179,7 +179,7 @@ def accepted(truth: Mapping[str, Any], invisible: tuple[str, ...]) -> Accepted:
     return frozenset(found)
 
 
-def _key(name: str) -> tuple[str, frozenset[str]]:
+def hypothesis(name: str) -> tuple[str, frozenset[str]]:
     """Return the verdict and effects that a hypothesis stands for: none, unknown, or names joined by +."""
     return (name, frozenset()) if name in ("none", "unknown", "") else ("identified", frozenset(name.split("+")))
 

@@ -1,0 +1,131 @@
+"""What the stated confidence of a sealed trial should have been: its temper, its share of the unknown, and what they are worth.
+
+    python benchmarks/calibration.py TRIAL [TRIAL ...] [--check TRIAL]
+
+Each TRIAL is a folder of `srf prove`, unsealed. A confidence is exp(log evidence / temper), normalised over the models that were
+fitted, times 1 - unexplained where one passes every test; where none does, 1 - missed is what `unknown` has. The three numbers
+are those under which the truths are likeliest (log score; Good, J. R. Stat. Soc. B 14, 1952), and their intervals come of cases
+drawn again. Whether they hold is seen in cases that did not take part: each fifth of the cases by the others, and --check.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import common  # noqa: F401  before NumPy: it fixes the number of threads
+import numpy as np
+from common import Report
+from marked import marked
+
+from srfcli.diagnosis.verdict import MISSED, TEMPER, UNEXPLAINED
+from srfcli.validation.blind import read_answers
+from srfcli.validation.cases import unseal
+from srfcli.validation.marks import Mark, calibrated, calibration_of, hypothesis
+
+TEMPERS = np.geomspace(0.5, 60.0, 97)
+LEAST = 0.5  # cases that are added to each side of a share, so that none is 0 or 1 (Jeffreys)
+FLOOR = 1e-3  # least probability that a truth is given: of a model that was never fitted
+DRAWS, FOLDS = 400, 5
+Three = tuple[float, float, float]
+
+
+def passed(m: Mark) -> bool:
+    """Return whether a model passed every test, so that hypotheses have a share, and held-out runs do not refuse it."""
+    return m.answer.verdict != "unknown"
+
+
+def restated(m: Mark, numbers: Three) -> Mark:
+    """Return the mark with the confidence that these numbers state."""
+    temper, unexplained, missed = numbers
+    unknown = unexplained if passed(m) else 1 - missed
+    weights = {n: c for n, c in m.answer.confidence.items() if n not in ("unknown", "missed")}
+    power = {n: c ** (TEMPER / temper) for n, c in weights.items()}
+    total = sum(power.values())
+    found: dict[str, float] = {n: (1 - unknown) * c / total for n, c in power.items()} if total else {"missed": 1 - unknown}
+    found["unknown"] = unknown
+    top = max(found, key=lambda n: found[n])
+    return replace(m, answer=replace(m.answer, confidence=found), top=top, stated=found[top], hit=hit(m, top))
+
+
+def hit(m: Mark, name: str) -> bool:
+    """Return whether a hypothesis is the truth, or as good."""
+    return hypothesis(name) in m.accepted
+
+
+def score(m: Mark) -> float:
+    """Return the log of the confidence in the truth."""
+    share = sum(c for n, c in m.answer.confidence.items() if hit(m, n))
+    return math.log(max(share, FLOOR))
+
+
+def fitted(marks: Sequence[Mark]) -> Three:
+    """Return temper, unexplained and missed under which the truths are likeliest."""
+    spoken, silent = [m for m in marks if passed(m)], [m for m in marks if not passed(m)]
+    other = sum(not any(hit(m, n) for n in m.answer.confidence if n not in ("unknown", "missed")) for m in spoken)
+    wrong = sum(not hit(m, "unknown") for m in silent)
+    unexplained = (other + LEAST) / (len(spoken) + 2 * LEAST)
+    missed = (wrong + LEAST) / (len(silent) + 2 * LEAST)
+    scores = [sum(score(restated(m, (t, unexplained, missed))) for m in spoken) for t in TEMPERS.tolist()]
+    return float(TEMPERS[int(np.argmax(scores))]), unexplained, missed
+
+
+def tell(report: Report, who: str, marks: Sequence[Mark]) -> None:
+    """Say mean log score, expected calibration error and the bins of stated confidence."""
+    error = calibration_of(marks)[1]
+    mean = float(np.mean([score(m) for m in marks]))
+    report.say(f"\n{who}: {len(marks)} cases, mean log score {mean:.3f}, expected calibration error {error:.3f}")
+    table = calibrated(marks)
+    rows = [["" if v is None else f"{v:.3g}" for v in row] for row in table.rows]
+    report.table([c.name for c in table.columns], rows)
+
+
+def by_others(marks: Sequence[Mark]) -> list[Mark]:
+    """Return each fifth of the cases with the confidence that the others' numbers state."""
+    order = np.random.default_rng(0).permutation(len(marks))
+    found = []
+    for k in range(FOLDS):
+        inside = {int(i) for i in order[k::FOLDS]}
+        numbers = fitted([m for i, m in enumerate(marks) if i not in inside])
+        found += [restated(m, numbers) for i, m in enumerate(marks) if i in inside]
+    return found
+
+
+def read(folders: Sequence[Path]) -> list[Mark]:
+    """Return the marks of the cases with an answer."""
+    found: list[Mark] = []
+    for folder in folders:
+        truths: Mapping[str, object] = unseal(folder / "bank", folder / "truths.json")
+        answers = [a for a in read_answers(folder / "answers.jsonl").values() if a.confidence]
+        known = folder / "known.jsonl"
+        found += marked(dict(truths), answers, known if known.exists() else None)
+    return found
+
+
+def main() -> None:
+    """Fit the three numbers to the trials, say what they are worth, and check them on another trial."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("trials", type=Path, nargs="+")
+    parser.add_argument("--check", type=Path, action="append", default=[])
+    given = parser.parse_args()
+    report, marks = Report("calibration", __doc__ or ""), read(given.trials)
+    best, rng = fitted(marks), np.random.default_rng(0)
+    drawn = np.array([fitted([marks[i] for i in rng.integers(len(marks), size=len(marks))]) for _ in range(DRAWS)])
+    low, high = np.quantile(drawn, (0.025, 0.975), axis=0)
+    names, stated = ("temper", "unexplained", "missed"), (TEMPER, UNEXPLAINED, MISSED)
+    numbers = zip(names, stated, best, low, high, strict=True)
+    rows = [(n, f"{s:g}", f"{b:.3g}", f"{a:.3g} to {c:.3g}") for n, s, b, a, c in numbers]
+    report.table(("number", "as it is", "likeliest", "95 %"), rows)
+    tell(report, "as stated", marks)
+    tell(report, "each fifth by the numbers of the others", by_others(marks))
+    for folder in given.check:
+        other = read([folder])
+        tell(report, f"{folder.name}, as stated", other)
+        tell(report, f"{folder.name}, by these numbers", [restated(m, best) for m in other])
+
+
+if __name__ == "__main__":
+    main()
