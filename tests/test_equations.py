@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sympy as sp
 
 from srfcli.codegen.c_source import compiler
 from srfcli.codegen.model import COMPLEX_STEP, load_source
@@ -21,7 +22,7 @@ from srfcli.laws.registry import bundled_registry
 from srfcli.laws.values import Effect
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.integrators import integrate, integrate_lsoda, scalar_function
-from srfcli.symbolic.equations import equations_of, steady_states
+from srfcli.symbolic.equations import equations_of, lut, partial_derivative, steady_states
 from srfcli.symbolic.system import System, build_system
 from srfcli.tasks.law_check import evaluate
 
@@ -74,6 +75,26 @@ OF_ONES_OWN += [
     {"effects": (str(OWN / "load-memory.toml"), "linker-dieterich"), "interface": "rigid"},
 ]
 WITH = [c for c in SINGLE if c["effects"][0] != "age-saturation"] + OTHER + PAIRS + OF_ONES_OWN
+
+
+def formulas() -> list[sp.Expr]:
+    """Return the formulas of all shipped laws and effects, and some that none of them has."""
+    found = []
+    for kind, get in (("friction", "mu"), ("ageing", "rate"), ("modifier", "rate"), ("interface", "kappa")):
+        found += [getattr(REGISTRY.get(kind, e.name), get, None) for e in REGISTRY.entries(kind)]
+    found += [f for e in REGISTRY.entries("effect") for _, f in REGISTRY.get("effect", e.name).changes]
+    x, y = symbol("v"), symbol("phi")
+    found += [x**y, sp.LambertW(x * y), lut(sp.Integer(2), x * y) * sp.exp(-x / y), sp.Max(x, y), sp.sqrt(x) / (x + y) ** 2]
+    return [sp.sympify(f) for f in found if f is not None]
+
+
+def test_partial_derivatives_are_those_of_sympy() -> None:
+    seen = 0
+    for formula in formulas():
+        for name in formula.free_symbols | {symbol("v")}:
+            assert partial_derivative(formula, name) == sp.diff(formula, name), (formula, name)
+            seen += 1
+    assert seen > 150
 
 
 def name_of(names: dict[str, Any]) -> str:
