@@ -15,9 +15,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 import common  # noqa: F401  before NumPy: it fixes the number of threads
 import numpy as np
+import numpy.typing as npt
 from common import Report
 from marked import marked
 
@@ -30,7 +32,8 @@ TEMPERS = np.geomspace(0.5, 60.0, 97)
 LEAST = 0.5  # cases that are added to each side of a share, so that none is 0 or 1 (Jeffreys)
 FLOOR = 1e-3  # least probability that a truth is given: of a model that was never fitted
 DRAWS, FOLDS = 400, 5
-Three = tuple[float, float, float]
+Three: TypeAlias = tuple[float, float, float]
+Array: TypeAlias = npt.NDArray[np.float64]
 
 
 def passed(m: Mark) -> bool:
@@ -62,15 +65,28 @@ def score(m: Mark) -> float:
     return math.log(max(share, FLOOR))
 
 
-def fitted(marks: Sequence[Mark]) -> Three:
-    """Return temper, unexplained and missed under which the truths are likeliest."""
-    spoken, silent = [m for m in marks if passed(m)], [m for m in marks if not passed(m)]
-    other = sum(not any(hit(m, n) for n in m.answer.confidence if n not in ("unknown", "missed")) for m in spoken)
-    wrong = sum(not hit(m, "unknown") for m in silent)
-    unexplained = (other + LEAST) / (len(spoken) + 2 * LEAST)
-    missed = (wrong + LEAST) / (len(silent) + 2 * LEAST)
-    scores = [sum(score(restated(m, (t, unexplained, missed))) for m in spoken) for t in TEMPERS.tolist()]
-    return float(TEMPERS[int(np.argmax(scores))]), unexplained, missed
+def shares(marks: Sequence[Mark]) -> Array:
+    """Return what the truth has of the confidence in models that were fitted (n, m), before that in `unknown`, for TEMPERS."""
+    found = np.zeros((len(marks), TEMPERS.size))
+    for k, m in enumerate(marks):
+        models = {n: c for n, c in m.answer.confidence.items() if n not in ("unknown", "missed")}
+        power = np.array(list(models.values()))[:, None] ** (TEMPER / TEMPERS)
+        true = np.array([hit(m, n) for n in models])
+        total = power.sum(axis=0)
+        found[k] = np.divide(power[true].sum(axis=0), total, out=np.zeros_like(total), where=total > 0)
+    return found
+
+
+def fitted(marks: Sequence[Mark], share: Array | None = None) -> Three:
+    """Return temper, unexplained and missed under which the truths are likeliest; `share` is that of these marks."""
+    share = shares(marks) if share is None else share
+    spoken, unknown = np.array([passed(m) for m in marks]), np.array([hit(m, "unknown") for m in marks])
+    known = np.array([any(hit(m, n) for n in m.answer.confidence if n not in ("unknown", "missed")) for m in marks])
+    unexplained = (np.sum(spoken & ~known) + LEAST) / (np.sum(spoken) + 2 * LEAST)
+    missed = (np.sum(~spoken & ~unknown) + LEAST) / (np.sum(~spoken) + 2 * LEAST)
+    given = (1 - unexplained) * share[spoken] + unexplained * unknown[spoken, None]
+    best = int(np.argmax(np.sum(np.log(np.maximum(given, FLOOR)), axis=0)))
+    return float(TEMPERS[best]), float(unexplained), float(missed)
 
 
 def tell(report: Report, who: str, marks: Sequence[Mark]) -> None:
@@ -113,7 +129,8 @@ def main() -> None:
     given = parser.parse_args()
     report, marks = Report("calibration", __doc__ or ""), read(given.trials)
     best, rng = fitted(marks), np.random.default_rng(0)
-    drawn = np.array([fitted([marks[i] for i in rng.integers(len(marks), size=len(marks))]) for _ in range(DRAWS)])
+    share, chosen = shares(marks), rng.integers(len(marks), size=(DRAWS, len(marks)))
+    drawn = np.array([fitted([marks[i] for i in own], share[own]) for own in chosen])
     low, high = np.quantile(drawn, (0.025, 0.975), axis=0)
     names, stated = ("temper", "unexplained", "missed"), (TEMPER, UNEXPLAINED, MISSED)
     numbers = zip(names, stated, best, low, high, strict=True)

@@ -18,7 +18,7 @@ from srfcli.diagnosis.scores import Remainder, Scores
 from srfcli.diagnosis.search import CLOSE, ModelSearch
 from srfcli.diagnosis.verdict import conclude
 from srfcli.inference import state_space
-from srfcli.inference.state_space import COLOUR, Likelihood, StateSpaceFit, correlated, fit_state_space, maximise
+from srfcli.inference.state_space import DEVIATION, Likelihood, StateSpaceFit, correlated, fit_state_space, maximise
 from srfcli.laws.registry import bundled_registry
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
@@ -198,7 +198,7 @@ def test_coloured_gauge_noise_is_not_taken_for_a_fine_field(tmp_path):
     drawn = {"field_amplitude": 3e-4, "field_length": 6.0 * np.sqrt(3)}
     other = fit_state_space(problem, start=drawn, processes=("relaxation",), smooth=False)
     assert found.log_likelihood > other.log_likelihood - 1.0
-    assert correlated(found.maximum.point) < COLOUR
+    assert correlated(found.maximum.point) < DEVIATION
 
 
 def test_evidence_charges_for_what_is_free(tmp_path):

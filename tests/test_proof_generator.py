@@ -372,6 +372,15 @@ def test_steady_age_does_not_change(change, V):
     assert abs(ageing(p)(V, steady_age(p, V), 5.0, 0.0)) < 1e-8 * V / p.D0
 
 
+def test_slip_that_nothing_ends_is_no_case():
+    """After a hold a slider without inertia or cut-off slips without end; with a mass it stops in time."""
+    p = Physics(massless=True, bare=True, ageing="kato-tullis", A=0.01247, B=0.02686, D0=0.4524, lam=0.5664, mu0=0.4673)
+    plan = Plan("holds", ((1.7, 7.05), (2.47, 0.0), (1.7, 7.05)), 5.0, 0.006)
+    assert not move(p, plan).complete
+    trace = move(replace(p, massless=False), plan)
+    assert trace.complete and trace.u.min() > 0
+
+
 def test_terms_add_up():
     terms = at_unit_velocity(Physics(C=1e-3, topo=1e-3, topo_L=8.0), 100.0)
     m, a = terms(0.0, 4.0, np.log(0.0402), 0.0, 7.0)

@@ -276,6 +276,26 @@ def test_a_spike_beside_a_slip_is_found_and_the_slip_is_none(place: int) -> None
     assert np.flatnonzero(spikes(x)).tolist() == [place]
 
 
+def test_a_sudden_spike_is_found_where_samples_are_few() -> None:
+    """From one sample to the next the drive may raise friction by a twentieth of the spike; five samples away by more than it."""
+    x = 0.6 + 1e-4 * np.random.default_rng(3).standard_normal(400)
+    rise = np.full(x.size, 0.02)
+    x[205] += 0.3
+    x[300] -= 0.3
+    assert np.flatnonzero(spikes(x, rise=rise)).tolist() == [205, 300]
+    ramp = np.interp(np.arange(400.0), [0, 200, 204, 399], [0.6, 0.6, 0.68, 0.6])  # reloading at that pace, and a slip
+    assert not spikes(ramp + 1e-4 * np.random.default_rng(4).standard_normal(400), rise=rise).any()
+
+
+def test_dips_under_a_modulated_load_are_no_spikes(tmp_path: Path) -> None:
+    """Friction follows the load at once: what the load brings about in a sample outruns the drive."""
+    c = Columns()
+    c.W = 5.0 * (1 + 0.15 * np.cos(2 * np.pi * 12.1 * c.t))
+    c.u[np.flatnonzero((np.roll(c.W, 1) > c.W) & (np.roll(c.W, -1) >= c.W))[5:50:20]] -= 1.2
+    c.toml += "corrections = [\"spike\"]\n"
+    assert c.read(tmp_path).used.all()
+
+
 def test_a_lone_spike_on_a_constant_load_is_bridged(tmp_path: Path) -> None:
     """Also where it is negative: a transducer's accident is no loss of contact."""
     for value in (6.0, -5.0):

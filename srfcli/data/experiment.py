@@ -498,8 +498,9 @@ def clean_observable(
         edge = float(filled[np.flatnonzero(clipped)[0]])
         told = f"at the extreme value {edge:.6g} of '{place.heading}': saturated, not compared"
         notices += place.spots("saturation", clipped, told)
-    steps = np.append(np.diff(t), t[-1] - t[-2])
-    spiky = spikes(filled, quantum, rise * steps) & ~clipped
+    steps, W = np.append(np.diff(t), t[-1] - t[-2]), load(t)[0]
+    by_load = np.abs(np.diff(W, append=W[-1])) / W * float(np.median(np.abs(filled)))  # friction follows the load at once
+    spiky = spikes(filled, quantum, rise * steps + by_load) & ~clipped
     if spiky.sum() > ACCIDENTS + x.size // 500:  # the tail of the noise, and no accidents
         spiky[:] = False
     left = "not compared" if "spike" in corrections else 'compared as they are; corrections = ["spike"] leaves them out'

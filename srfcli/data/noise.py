@@ -60,6 +60,7 @@ def calm_level(x: Array) -> float:
 WIDEST_SPIKE = 3  # samples of a spike
 BESIDE = 5  # samples before and after that tell the level
 FACTOR = 8.0  # robust standard deviations
+SUDDEN = 4.0  # times as far off as noise is: from there on one step that outruns the drive makes a spike
 CREST = 0.5  # share of a spike's size by which it is off a cubic through its neighbours, at least
 NEARBY = 101  # samples that share a level of noise
 FEW = 0.02  # share of samples off their running median, below which the channel counts as constant and without noise
@@ -113,8 +114,8 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
     """Return which samples of x (n,) are spikes: up to three that stand out from both sides, with the same level after them.
 
     That is the level of a few samples, or of the next one beside a slip event. A slip or any other step is no spike, as both are
-    others. `rise` (n,), if given, is the largest rise from each sample to the next that the drive allows: a rise at that pace
-    is reloading, and no spike. No spike is smaller than `least`.
+    others. `rise` (n,), if given, is the largest rise from each sample to the next that drive and load allow: a rise at
+    that pace is reloading, and no spike. No spike is smaller than `least`.
     """
     from scipy.ndimage import median_filter
 
@@ -131,8 +132,11 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
         below = np.minimum(before, after) - group.max(axis=0)
         size = np.maximum(above, below)
         threshold = np.maximum(FACTOR * np.maximum(scale[first - 3], scale[first + width + 2]) + 2 * quantum, least)
-        if rise is not None:  # from the median before, three samples back, to the median after
-            threshold = np.maximum(threshold, 3 * (width + 5) * rise[first])
+        if rise is not None:  # from the median before, three samples back, to the median after, or far and in one sample
+            step = np.where(above > below, group.min(axis=0) - x[first - 1], x[first + width] - group.max(axis=0))
+            pace = 3 * np.max([rise[first + k] for k in range(-1, width)], axis=0)
+            sudden = (step > pace) & (size > SUDDEN * threshold)
+            size = np.where(sudden | (size > (width + 5) * pace), size, 0.0)
         off, apart = _off_neighbours(x, first, width), np.abs(after - before)
         hit = (size > threshold) & (apart < 0.5 * size) & (off > CREST * size)
         if width == 1:  # beside a slip, which is at most three samples away, the next ones tell the level

@@ -18,6 +18,7 @@ from srfcli.codegen.model import Array
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
 from srfcli.inference.noise import difference_level, stretches
 from srfcli.inference.state_space import (
+    DEVIATION,
     LAGS,
     LOST,
     Filtered,
@@ -29,7 +30,6 @@ from srfcli.inference.state_space import (
     typical_friction,
 )
 
-DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
 PLAUSIBLE = 3e-3  # amplitude of a random friction field over mu beyond which it is not the track's: ten times a polished one
 STEADY = 2.0  # gauge's noise: a stretch whose readings are expected to vary by less is one of steady sliding
 LEVELS = ("gauge_white", "gauge_colour")
@@ -115,6 +115,11 @@ def field_share(found: StateSpaceFit) -> float:
         return 0.0
     friction = max(float(np.median([typical_friction(f.run) for f in found.maximum.point.runs])), 1e-6)
     return found.values["field_amplitude"] / friction / PLAUSIBLE
+
+
+def taken_up(found: StateSpaceFit) -> bool:
+    """Return whether field or gauge noise has taken up more than either can be."""
+    return field_share(found) > 1 or any(size > 1 for size, _ in loudness(found.likelihood, found.maximum.point))
 
 
 def loudness(likelihood: Likelihood, point: Point) -> list[tuple[float, str]]:

@@ -22,11 +22,12 @@ import numpy as np
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment
-from srfcli.diagnosis.goodness_of_fit import DEVIATION, field_share, log_evidence, mass_at_bounds, shortcomings
+from srfcli.diagnosis.goodness_of_fit import field_share, log_evidence, mass_at_bounds, shortcomings, taken_up
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
 from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
+    DEVIATION,
     LOST,
     NEEDED,
     Likelihood,
@@ -384,16 +385,40 @@ class ModelSearch:
             least = HINT
         alone = scores.alone() if not node.passes or any(s.gain > least for s in scores.singles) else []
         promised = [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in alone]
-        promised = sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])
-        for gain, score in promised[:SINGLES]:
-            hypothesis = Hypothesis((*present, score.effect), node.hypothesis.ageing)
-            sizes = (*self._sizes(node), score.values)
-            own = {n: score.shifts[n] for n in node.fit.likelihood.problem.names if score.shifts.get(n)}
-            self._push(node.attainable + gain + one, hypothesis, node, sizes, direction=score.direction, shifts=own)
+        self._promise(node, node, promised, least)
         if not node.passes:
             for effect in (e for e in joining if e.settings or e.observed):
                 self._build(node, effect, one)
+        if taken_up(node.fit):
+            self._expand_plain(node, joining)
         return node
+
+    def _promise(self, node: Fitted, at: Fitted, promised: Sequence[tuple[float, Score]], least: float) -> None:
+        """Push the effects that promise most beside those of `node`, by their gains (m,) at first order from the fit `at`."""
+        one = -float(np.log(2 * len(self.candidates))) - 3.0  # prior and Occam's factor of an effect
+        for gain, score in sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])[:SINGLES]:
+            hypothesis = Hypothesis((*node.hypothesis.effects, score.effect), node.hypothesis.ageing)
+            sizes = (*self._sizes(at), score.values)
+            own = {n: score.shifts[n] for n in at.fit.likelihood.problem.names if score.shifts.get(n)}
+            self._push(node.attainable + gain + one, hypothesis, at, sizes, direction=score.direction, shifts=own)
+
+    def _expand_plain(self, node: Fitted, joining: Sequence[Effect]) -> None:
+        """Push what effects promise from a fit without field and colour, where these have taken up what the model lacks.
+
+        Under a field that no track has, the scores of what is missing are as low as those of what is not.
+        """
+        problem = node.fit.likelihood.problem
+        try:
+            found = fit_state_space(
+                problem, start=_followable(node.fit.values, problem), smooth=True, processes=(), beside=False, close=NEAR,
+                rtol=COARSE, progress=self.progress,
+            )  # fmt: skip
+            plain = self._judged(node.hypothesis, found)
+        except SrfError:  # without a field nothing follows the recordings
+            return
+        self.progress(f"{node.name}: scores without field and colour")
+        scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, joining)
+        self._promise(node, plain, [(s.gain, s) for s in scores.singles], WORTH)
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""

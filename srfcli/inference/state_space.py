@@ -85,7 +85,7 @@ CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
 SAME_RATE = 0.25  # in the logarithm of the sampling interval, within which a gauge's noise is the same
-COLOUR = 6.0  # standard deviations of a correlation between innovations from which coloured gauge noise is fitted
+DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fails: a dozen tests, five runs
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
 PERIODOGRAM = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
 SURVEYS = 3  # of all lines of the tables of critical loads at a maximum, and fits from where that finds nearer crossings
@@ -1384,7 +1384,7 @@ def _with_colour(
     One whose correlation falls off exponentially is tried first, an oscillation where that leaves most stretches correlated: what
     the physics lack leaves a few.
     """
-    while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > COLOUR:
+    while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > DEVIATION:
         if cautious and known and not steadily_coloured(best.maximum.point):
             break
         found, spent = best, best.evaluations
@@ -1454,7 +1454,7 @@ def _faded(white: Array, carry: float) -> Array:
 
 def steadily_coloured(point: Point) -> bool:
     """Return whether the innovations are correlated all along, as a gauge's noise is, and not in a few stretches."""
-    if correlated(point) < COLOUR:
+    if correlated(point) < DEVIATION:
         return False
     found = [portmanteau(piece) > SYSTEMATIC for f in point.runs for white in f.parts for piece in cut(white)]
     return 2 * sum(found) > len(found)

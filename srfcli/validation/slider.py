@@ -646,6 +646,10 @@ class Slider:
         u = y[self._gauge] if self._gauge else self.sliding(t, y)[0][1]
         return u + self.p.creep * (y[self._late] - u) if self._late else u
 
+    def ran_away(self, t: float, y: list[float]) -> bool:
+        """Return whether friction pulls: slip that nothing ends, as without inertia, went on beyond where the spring is slack."""
+        return self.p.massless and self.sliding(t, y)[0][2] < 0
+
     def steady(self) -> list[float]:
         """Return the states of steady sliding at the run's first velocity and load."""
         p, V, felt = self.p, self.plan.drive[0][1], self._felt(0.0)
@@ -713,7 +717,7 @@ def _through(slider: Slider, solver: ode, trace: Trace, end: float) -> Array | N
         for k in np.flatnonzero((t >= solver.t - 1e-9) & (t < end - 1e-9)).tolist():
             if t[k] > solver.t + 1e-9:  # a solver fails that is asked for a step of the last digits
                 solver.integrate(t[k])
-            if not (solver.successful() and np.isfinite(solver.y).all()):
+            if not (solver.successful() and np.isfinite(solver.y).all()) or slider.ran_away(float(t[k]), solver.y.tolist()):
                 return None
             trace.u[k] = slider.shown(float(t[k]), solver.y.tolist())
         y: Array = solver.integrate(end)
