@@ -143,6 +143,8 @@ def test_an_effect_that_parameters_absorb_is_not_identifiable(concluded):
     found = concluded(fitted(evidence=0.0, scores=[lost, score("friction-drift", SEEN)]))
     assert [x.effect for x in found.not_identifiable] == ["viscous-drag"]
     assert "99.99 %" in found.not_identifiable[0].reason
+    baseline = fitted(evidence=0.0, passes=False, scores=[lost])
+    assert not concluded(fitted("viscous-drag", evidence=100.0), baseline).not_identifiable  # it is found all the same
 
 
 def test_an_interesting_size_is_in_base_units():

@@ -140,10 +140,11 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     reasons += [f"{name} of {best.name} stands at its bound" for name in at_bounds(best)]
     if search.cut_short:
         reasons.append(f"the search ended at its budget of {search.budget:.0f} s of CPU, with models left to fit")
+    named = {n for f in close for n in f.hypothesis.reported}  # found all the same
     absorbed = [
         Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.tolerance):.2f} % of it")
         for s in scores
-        if s.tolerance < ABSORBED and s.detectable > interesting(s)
+        if s.tolerance < ABSORBED and s.detectable > interesting(s) and s.effect.reported not in named
     ]
     return Diagnosis(
         whole, verdict, best, baseline, baseline if verdict in NOTHING else shown, ranked, close,
