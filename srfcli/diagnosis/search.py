@@ -389,7 +389,7 @@ class ModelSearch:
         if not node.passes:
             for effect in (e for e in joining if e.settings or e.observed):
                 self._build(node, effect, one)
-        if taken_up(node.fit):
+        if node is self.baseline and taken_up(node.fit):
             self._expand_plain(node, joining)
         return node
 
