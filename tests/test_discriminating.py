@@ -42,6 +42,7 @@ from srfcli.laws.registry import bundled_registry
 from srfcli.motion.imposed import ConstantLoad, Drive
 from srfcli.motion.integrators import integrate
 from srfcli.results.diagnosis import DiagnosisResult
+from srfcli.results.tables import to_text
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, move
@@ -339,8 +340,8 @@ def test_what_is_written_says_it(folder: Path, result: DiagnosisResult, found: D
     assert answer["verdict"] == "ambiguous" and told["discriminates"]
     assert told["gain"] == pytest.approx(found.gain, rel=1e-3)
     page = re.sub(r"\s+", " ", (out / "report.html").read_text())
-    notes = " ".join(result.table.notes)
-    assert all(s in notes and s in page for s in told["sentences"])
+    shown = to_text(result.table)
+    assert all(s in shown and s in page for s in told["sentences"])
     assert "[[runs]]" in page and 'href="discriminating/linker-dieterich/experiment.toml"' in page
     for name in RIVALS:
         home = out / "discriminating" / name

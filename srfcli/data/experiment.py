@@ -506,7 +506,7 @@ def clean_observable(
     left = "not compared" if "spike" in corrections else 'compared as they are; corrections = ["spike"] leaves them out'
     notices += place.spots("spike", spiky, f"standing out in '{place.heading}', {left}")
     calm = np.interp(t, t[~spiky], filled[~spiky])
-    level, beside, told_jumps = _without_jumps(place, calm, rise, load, quantum, taken_out="reset" in corrections)
+    level, beside, told_jumps = _without_jumps(place, calm, rise, W, quantum, taken_out="reset" in corrections)
     proposed = level if spiky.any() or (level != calm).any() else None
     observed = np.where(spiky, filled + level - calm, level) if "reset" in corrections else filled
     beside = beside & ("reset" in corrections)
@@ -522,9 +522,8 @@ def clean_observable(
 
 
 def _without_jumps(
-    place: Place, x: Array, rise: Array, load: Load, quantum: float, *, taken_out: bool
+    place: Place, x: Array, rise: Array, W: Array, quantum: float, *, taken_out: bool
 ) -> tuple[Array, Mask, list[Notice]]:
-    W, _ = load(place.t)
     change = np.abs(np.diff(W, prepend=W[0])) / W
     jumps = observable_jumps(x, place.t, rise, change < CALM, quantum)
     level, beside = rejoined(x, jumps)

@@ -162,10 +162,7 @@ class ModelSearch:
         options = {"processes": _colours(move.values) if move else None, "cautious": True, **self.options}
 
         def fitted(values: dict[str, float] | None) -> StateSpaceFit:
-            problem = self._problem(hypothesis, values or {})
-            return fit_state_space(
-                problem, start=values, beside=False, close=NEAR, rtol=COARSE, progress=self.progress, **options
-            )
+            return self._state_space(self._problem(hypothesis, values or {}), start=values, beside=False, **options)
 
         if move and not self.experiment.runs:  # without a field a parent that is far off leads to the crossings next to its own
             stated = {q.name: q.value for q in self.experiment.parameters}
@@ -180,6 +177,9 @@ class ModelSearch:
         if move is None and judged.passes:  # else it is not what is reported
             judged = self._judged(hypothesis, likeliest_beside(found, NEAR, self.progress))
         return judged
+
+    def _state_space(self, problem: Problem, **choice: Any) -> StateSpaceFit:
+        return fit_state_space(problem, close=NEAR, rtol=COARSE, progress=self.progress, **choice)
 
     def _problem(self, hypothesis: Hypothesis, at: Mapping[str, float]) -> Problem:
         return hypothesis.problem(self.registry, self.experiment, at=at, trend=self.trend)
@@ -250,6 +250,11 @@ class ModelSearch:
         return -len(hypothesis.reported) * each - sum(self._rarer for e in hypothesis.effects if e.run)
 
     @property
+    def _one_more(self) -> float:
+        """Return what an effect more is expected to cost in log evidence: its prior, and Occam's factor."""
+        return -float(np.log(2 * len(self.candidates))) - 3.0
+
+    @property
     def _rarer(self) -> float:
         """Return by how much less likely an effect is in one run alone than in all, in the logarithm."""
         return float(np.log(max(len(self.experiment.runs), 1)))
@@ -292,10 +297,7 @@ class ModelSearch:
         options = {"processes": None, "cautious": True, **self.options}
         for node in parts.values():
             self.progress(f"{node.name}: all readings")
-            found = fit_state_space(
-                self._problem(node.hypothesis, node.fit.values), part=node.fit, close=NEAR, rtol=COARSE,
-                progress=self.progress, **options,
-            )  # fmt: skip
+            found = self._state_space(self._problem(node.hypothesis, node.fit.values), part=node.fit, **options)
             fitted[node.name] = replace(self._judged(node.hypothesis, found), scores=node.scores)
             options["processes"] = found.likelihood.processes
         self.fitted = fitted
@@ -379,7 +381,6 @@ class ModelSearch:
         self.excluded += scores.excluded
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
-        one = -float(np.log(2 * len(self.candidates))) - 3.0  # prior and Occam's factor of an effect
         least = WORTH if node.passes else WORTH / 2
         if node.passes and not node.hypothesis.reported and (not node.fit.smooth or node.fit.likelihood.processes):
             least = HINT
@@ -388,19 +389,18 @@ class ModelSearch:
         self._promise(node, node, promised, least)
         if not node.passes:
             for effect in (e for e in joining if e.settings or e.observed):
-                self._build(node, effect, one)
+                self._build(node, effect)
         if node is self.baseline and taken_up(node.fit):
             self._expand_plain(node, joining)
         return node
 
     def _promise(self, node: Fitted, at: Fitted, promised: Sequence[tuple[float, Score]], least: float) -> None:
         """Push the effects that promise most beside those of `node`, by their gains (m,) at first order from the fit `at`."""
-        one = -float(np.log(2 * len(self.candidates))) - 3.0  # prior and Occam's factor of an effect
         for gain, score in sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])[:SINGLES]:
             hypothesis = Hypothesis((*node.hypothesis.effects, score.effect), node.hypothesis.ageing)
             sizes = (*self._sizes(at), score.values)
             own = {n: score.shifts[n] for n in at.fit.likelihood.problem.names if score.shifts.get(n)}
-            self._push(node.attainable + gain + one, hypothesis, at, sizes, direction=score.direction, shifts=own)
+            self._push(node.attainable + gain + self._one_more, hypothesis, at, sizes, direction=score.direction, shifts=own)
 
     def _expand_plain(self, node: Fitted, joining: Sequence[Effect]) -> None:
         """Push what effects promise from a fit without field and colour, where these have taken up what the model lacks.
@@ -409,10 +409,8 @@ class ModelSearch:
         """
         problem = node.fit.likelihood.problem
         try:
-            found = fit_state_space(
-                problem, start=_followable(node.fit.values, problem), smooth=True, processes=(), beside=False, close=NEAR,
-                rtol=COARSE, progress=self.progress,
-            )  # fmt: skip
+            start = _followable(node.fit.values, problem)
+            found = self._state_space(problem, start=start, smooth=True, processes=(), beside=False)
             plain = self._judged(node.hypothesis, found)
         except SrfError:  # without a field nothing follows the recordings
             return
@@ -456,7 +454,7 @@ class ModelSearch:
             return None
         return Likelihood(problem, processes=node.fit.likelihood.processes, rtol=COARSE)
 
-    def _build(self, node: Fitted, effect: Effect, one: float) -> None:
+    def _build(self, node: Fitted, effect: Effect) -> None:
         """Push an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
         hypothesis = Hypothesis((*node.hypothesis.effects, effect), node.hypothesis.ageing)
         likelihood = self._likelihood(hypothesis, node, effect.reported)
@@ -477,7 +475,7 @@ class ModelSearch:
             found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
             values = found.point.values
             self.count += 1
-            expected = found.point.log_likelihood - node.fit.log_likelihood + node.attainable + one
+            expected = found.point.log_likelihood - node.fit.log_likelihood + node.attainable + self._one_more
             sizes = (*self._sizes(node), {own[0]: values[own[0]]})
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
 
@@ -532,10 +530,9 @@ class ModelSearch:
 
     def _refitted(self, node: Fitted, processes: Sequence[str] | None) -> Fitted:
         """Return a fitted model with other gauge noise, which takes its place."""
-        found = fit_state_space(
-            node.fit.likelihood.problem, start=_followable(node.fit.values, node.fit.likelihood.problem), close=NEAR, rtol=COARSE,
-            progress=self.progress, **{**self.options, "processes": processes},
-        )  # fmt: skip
+        problem = node.fit.likelihood.problem
+        start = _followable(node.fit.values, problem)
+        found = self._state_space(problem, start=start, **{**self.options, "processes": processes})
         try:
             return self._record(self._judged(node.hypothesis, found), anew=True)
         except SrfError:  # it stays as it was
@@ -545,10 +542,9 @@ class ModelSearch:
         """Push the pairs of effects that promise more together than the best alone."""
         if node.scores is None or not node.promised:
             return
-        one = -float(np.log(2 * len(self.candidates))) - 3.0
         for pair in node.scores.pairs(PAIRS):
             if pair.gain > node.promised[0].gain + WORTH:
-                self._push(node.attainable + pair.gain + 2 * one, Hypothesis(pair.effects), node, pair.values)
+                self._push(node.attainable + pair.gain + 2 * self._one_more, Hypothesis(pair.effects), node, pair.values)
 
     def _swap(self, node: Fitted) -> None:
         """Push the other ageing laws, each after a few steps from where the model or the best one stands, with what it promises.

@@ -12,7 +12,7 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.groups import NOISE, labels
 from srfcli.data.values import CriticalLoads, Experiment, Run
-from srfcli.inference.critical_loads import Matched
+from srfcli.inference.critical_loads import Matched, chance_of
 from srfcli.inference.noise import Noise
 from srfcli.inference.prediction import Prediction, own_names, own_start, run_parameters
 
@@ -248,7 +248,6 @@ def between_groups(values: Array, covariance: Array) -> BetweenGroups:
     k - 1 degrees of freedom, about the mean weighted by the covariance.
     """
     from scipy.optimize import minimize_scalar
-    from scipy.special import chdtrc
 
     k = values.size
     most = 3.0 * float(np.ptp(values)) + 1e-300
@@ -264,7 +263,7 @@ def between_groups(values: Array, covariance: Array) -> BetweenGroups:
     found = minimize_scalar(lambda s: about(s)[3], bounds=(0.0, most), method="bounded", options={"xatol": 1e-6 * most})
     scatter = float(found.x) if found.fun < about(0.0)[3] else 0.0
     mean, variance = about(scatter)[:2]
-    return BetweenGroups(mean, float(np.sqrt(variance)), scatter, float(chdtrc(k - 1, about(0.0)[2])))
+    return BetweenGroups(mean, float(np.sqrt(variance)), scatter, chance_of(about(0.0)[2], k - 1))
 
 
 def scatter_of(fit: Fit, names: Sequence[str]) -> BetweenGroups | None:

@@ -45,7 +45,7 @@ class Equations:
         return s * d if self.logarithmic[index] else d
 
 
-@lru_cache(maxsize=1 << 17)
+@lru_cache(maxsize=1 << 15)  # a system has some ten thousand
 def partial_derivative(formula: sp.Expr, s: sp.Symbol) -> sp.Expr:
     """Return what `sp.diff` returns, but each subexpression is differentiated once, whatever formulas it stands in."""
     if formula == s:

@@ -717,9 +717,12 @@ def _through(slider: Slider, solver: ode, trace: Trace, end: float) -> Array | N
         for k in np.flatnonzero((t >= solver.t - 1e-9) & (t < end - 1e-9)).tolist():
             if t[k] > solver.t + 1e-9:  # a solver fails that is asked for a step of the last digits
                 solver.integrate(t[k])
-            if not (solver.successful() and np.isfinite(solver.y).all()) or slider.ran_away(float(t[k]), solver.y.tolist()):
+            if not (solver.successful() and np.isfinite(solver.y).all()):
                 return None
-            trace.u[k] = slider.shown(float(t[k]), solver.y.tolist())
+            now, states = float(t[k]), solver.y.tolist()
+            if slider.ran_away(now, states):
+                return None
+            trace.u[k] = slider.shown(now, states)
         y: Array = solver.integrate(end)
     except OverflowError:  # a state ran away
         return None
