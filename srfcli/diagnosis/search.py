@@ -28,6 +28,7 @@ from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
     DEVIATION,
+    FIELD,
     LOST,
     NEEDED,
     Likelihood,
@@ -60,6 +61,8 @@ FARTHEST = 10.0  # in the logarithm of a parameter, that a score can move it: be
 BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
 FAR = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
 AGAIN = 9  # of them, about the best, whose other parameters are fitted too where the model fails a test: 26 % apart
+STRIDES = 12  # steps of another ageing law from the file's own start values, or on from where it promises to be likelier
+FIELDS = (1.0, 3.0, 10.0, 30.0)  # of the field of the model beside, under which the file's own start values are followed
 HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
 FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
@@ -270,13 +273,13 @@ class ModelSearch:
         if not base.passes:
             self._swap(base)
         self._search()
-        for further in (self._recolour, self._together, self._swap):  # dearer, or less likely
-            best = self.best()
-            wanting = best is not self.baseline or not self.baseline.passes
-            imitated = further == self._swap and wanting  # an effect may pass for another ageing law
-            if (imitated or not best.passes) and not self.spent:
+        for further in (self._expand_plain, self._recolour, self._together):  # dearer, or less likely
+            if not (self.best().passes or self.spent):
                 further(self.baseline)
                 self._search()
+        if not self.spent:  # an effect, or the field beside the baseline, may pass for another ageing law
+            self._swap(self.baseline, afresh=True)
+            self._search()
         if self.best().hypothesis.ageing and not self.spent:  # another law is much like it; its noise may have been misjudged
             for again in (self._swap, self._recolour):
                 again(self.baseline)
@@ -372,10 +375,7 @@ class ModelSearch:
 
     def _expand(self, node: Fitted) -> Fitted:
         """Push what a fitted model promises: one more effect, two at once, something built in, another ageing law."""
-        present = node.hypothesis.effects
-        names = {e.reported for e in present}
-        there = {p.name for p in node.fit.likelihood.problem.model.parameters}
-        joining = [e for e in self.candidates if e.reported not in names and there.issuperset(e.needs)]
+        present, joining = node.hypothesis.effects, self._joining(node)
         self.progress(f"{node.name}: scores")
         scores = Scores(self.registry, node.fit.likelihood.problem.experiment, node.remainder, present, joining)
         self.excluded += scores.excluded
@@ -387,12 +387,15 @@ class ModelSearch:
         alone = scores.alone() if not node.passes or any(s.gain > least for s in scores.singles) else []
         promised = [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in alone]
         self._promise(node, node, promised, least)
-        if not node.passes:
-            for effect in (e for e in joining if e.settings or e.observed):
-                self._build(node, effect)
-        if node is self.baseline and taken_up(node.fit):
-            self._expand_plain(node, joining)
+        for effect in (e for e in joining if e.settings or e.observed):
+            self._build(node, effect)
         return node
+
+    def _joining(self, node: Fitted) -> list[Effect]:
+        """Return the effects that a fitted model lacks and could have."""
+        names = {e.reported for e in node.hypothesis.effects}
+        there = {p.name for p in node.fit.likelihood.problem.model.parameters}
+        return [e for e in self.candidates if e.reported not in names and there.issuperset(e.needs)]
 
     def _promise(self, node: Fitted, at: Fitted, promised: Sequence[tuple[float, Score]], least: float) -> None:
         """Push the effects that promise most beside those of `node`, by their gains (m,) at first order from the fit `at`."""
@@ -402,11 +405,13 @@ class ModelSearch:
             own = {n: score.shifts[n] for n in at.fit.likelihood.problem.names if score.shifts.get(n)}
             self._push(node.attainable + gain + self._one_more, hypothesis, at, sizes, direction=score.direction, shifts=own)
 
-    def _expand_plain(self, node: Fitted, joining: Sequence[Effect]) -> None:
+    def _expand_plain(self, node: Fitted) -> None:
         """Push what effects promise from a fit without field and colour, where these have taken up what the model lacks.
 
         Under a field that no track has, the scores of what is missing are as low as those of what is not.
         """
+        if not taken_up(node.fit):
+            return
         problem = node.fit.likelihood.problem
         try:
             start = _followable(node.fit.values, problem)
@@ -415,7 +420,7 @@ class ModelSearch:
         except SrfError:  # without a field nothing follows the recordings
             return
         self.progress(f"{node.name}: scores without field and colour")
-        scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, joining)
+        scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, self._joining(node))
         self._promise(node, plain, [(s.gain, s) for s in scores.singles], WORTH)
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
@@ -475,7 +480,10 @@ class ModelSearch:
             found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
             values = found.point.values
             self.count += 1
-            expected = found.point.log_likelihood - node.fit.log_likelihood + node.attainable + self._one_more
+            gain = _promise(found) - node.fit.log_likelihood
+            if not gain > (WORTH if node.passes else 0.0):
+                return
+            expected = gain + node.attainable + self._one_more
             sizes = (*self._sizes(node), {own[0]: values[own[0]]})
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
 
@@ -546,14 +554,16 @@ class ModelSearch:
             if pair.gain > node.promised[0].gain + WORTH:
                 self._push(node.attainable + pair.gain + 2 * self._one_more, Hypothesis(pair.effects), node, pair.values)
 
-    def _swap(self, node: Fitted) -> None:
-        """Push the other ageing laws, each after a few steps from where the model or the best one stands, with what it promises.
+    def _swap(self, node: Fitted, *, afresh: bool = False) -> None:
+        """Push the other ageing laws, each after a few steps from where the model or the best one stands.
 
-        The one that promises most goes on from there: a law that is right lies further from the stated one than a step tells.
+        `afresh` also from the file's own values: a fit that has made up for a wrong law may stand where no step leads to the
+        right one. The law that promises most goes on from there: the right one lies further off than a step tells.
         """
         best = self.best()
         parents = (node,) if best is node else (node, best)
         stated, *modifiers = self.experiment.choice.ageing.split("+")
+        least = node.fit.log_likelihood + (WORTH if node.passes else -ASTRAY)  # log likelihood
         reached: list[tuple[float, Hypothesis, Likelihood, Maximum]] = []
         for name in self.laws:
             hypothesis = Hypothesis((), "+".join([name, *modifiers]))
@@ -565,21 +575,33 @@ class ModelSearch:
             starts = [likelihood.coordinates(_followable(f.fit.values, likelihood.problem)) for f in parents]
             heights = [likelihood.at(x, slopes=False).log_likelihood for x in starts] if len(starts) > 1 else [0.0]
             x = starts[int(np.argmax(heights))]
-            if np.array_equal(x, self._tried.get(name, ())):  # with what came of it in the queue
-                continue
+            places = []
+            if not np.array_equal(x, self._tried.get(name, ())):  # else what came of it is in the queue
+                places.append(maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress))
+            if afresh and self.experiment.runs:
+                start = self._at_the_file(likelihood, hypothesis, best.fit.values)
+                places.append(maximise(likelihood, start, steps=STRIDES, close=1.0, progress=self.progress))
             self._tried[name] = x
-            found = maximise(likelihood, x, steps=3, close=1.0, widths=(), progress=self.progress)
-            if not (np.isfinite(found.away) and found.point.log_likelihood > node.fit.log_likelihood - ASTRAY):
-                continue
-            reached.append((found.point.log_likelihood + 0.5 * found.away**2, hypothesis, likelihood, found))
+            found = max(places, key=_promise, default=None)
+            if found is not None and _promise(found) > least:
+                reached.append((_promise(found), hypothesis, likelihood, found))
         reached.sort(key=lambda r: -r[0])
         for number, (promise, hypothesis, likelihood, found) in enumerate(reached):
             if number == 0 and found.away > NEAR:
-                found = maximise(likelihood, found.point.x, steps=9, close=1.0, widths=(), progress=self.progress)
-                promise = found.point.log_likelihood + 0.5 * found.away**2
+                found = maximise(likelihood, found.point.x, steps=STRIDES, close=1.0, widths=(), progress=self.progress)
+                promise = _promise(found)
             self.count += 1
             expected = promise - node.fit.log_likelihood + node.attainable
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
+
+    def _at_the_file(self, likelihood: Likelihood, hypothesis: Hypothesis, values: Mapping[str, float]) -> Array:
+        """Return the file's own start values under the gauge noise of `values` and the likeliest of a few fields."""
+        own = likelihood.beside(self._problem(hypothesis, {}))
+        around = {name: value for name, value in values.items() if name not in own.problem.names}
+        narrow = _followable(around, own.problem)
+        fields = [{**around, **{n: narrow[n] for n in FIELD}, FIELD[0]: w * narrow[FIELD[0]]} for w in FIELDS]
+        starts = [own.coordinates(values) for values in fields]
+        return max(starts, key=lambda x: own.at(x, slopes=False).log_likelihood)
 
     def _where_effects_act(self) -> None:
         """Fit the best model with its effects in all runs where one acts in one, and in one where the others do not need it.
@@ -684,6 +706,11 @@ class ModelSearch:
     def best(self) -> Fitted:
         """Return the model with the best evidence."""
         return self.ranked()[0]
+
+
+def _promise(found: Maximum) -> float:
+    """Return the log likelihood that the maximum is expected to have from where a few steps have led."""
+    return found.point.log_likelihood + (0.5 * found.away**2 if np.isfinite(found.away) else 0.0)
 
 
 def _colours(values: Mapping[str, float]) -> list[str]:
