@@ -1385,14 +1385,14 @@ def _with_colour(
     the physics lack leaves a few.
     """
     while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > DEVIATION:
-        if cautious and known and not steadily_coloured(best.maximum.point):
+        if cautious and known and not steadily_coloured(best):
             break
         found, spent = best, best.evaluations
         for kind in PROCESSES:
             wider = _coloured(best, likelihood(best.smooth, (*known, kind)), progress)
             spent += wider.evaluations
             found = max(found, wider, key=lambda f: f.criterion)
-            if not steadily_coloured(wider.maximum.point):
+            if not steadily_coloured(wider):
                 break
         if found is best:
             return replace(best, evaluations=spent)
@@ -1452,12 +1452,37 @@ def _faded(white: Array, carry: float) -> Array:
     return np.asarray(dtbtrs(band, before[:, None], uplo="L")[0][:, 0])
 
 
-def steadily_coloured(point: Point) -> bool:
-    """Return whether the innovations are correlated all along, as a gauge's noise is, and not in a few stretches."""
+def steadily_coloured(found: StateSpaceFit) -> bool:
+    """Return whether the innovations are correlated all along, as a gauge's noise is, and not in a few stretches.
+
+    Most stretches are, or most have the same line in their spectra.
+    """
+    point = found.maximum.point
     if correlated(point) < DEVIATION:
         return False
-    found = [portmanteau(piece) > SYSTEMATIC for f in point.runs for white in f.parts for piece in cut(white)]
-    return 2 * sum(found) > len(found)
+    judged = [portmanteau(piece) > SYSTEMATIC for f in point.runs for white in f.parts for piece in cut(white)]
+    return 2 * sum(judged) > len(judged) or any(line(spectra) > DEVIATION for spectra in _spectra(found).values())
+
+
+def _spectra(found: StateSpaceFit) -> dict[Kind, Array]:
+    """Return periodograms (q, PERIODOGRAM / 2) of stretches of innovations at each kind of gauge noise, without the mean."""
+    pieces: dict[Kind, list[Array]] = {}
+    for white, _, kind in found.likelihood.pieces(found.maximum.point):
+        count = white.size // PERIODOGRAM
+        pieces.setdefault(kind, []).append(np.clip(white[: count * PERIODOGRAM], -5.0, 5.0).reshape(count, PERIODOGRAM))
+    every = {kind: np.concatenate(parts) for kind, parts in pieces.items()}
+    return {kind: np.abs(np.fft.rfft(parts, axis=1)[:, 1:]) ** 2 for kind, parts in every.items()}
+
+
+def line(spectra: Array) -> float:
+    """Return how far the median of periodograms (q, m) is above that of white noise at its highest, in standard deviations.
+
+    A line of the gauge is at one frequency in most stretches; a drive's or a track's changes with the velocity.
+    """
+    if not spectra.size:
+        return 0.0
+    highest = float(np.max(np.median(spectra, axis=0)) / np.mean(spectra))
+    return float((highest - np.log(2)) * np.sqrt(len(spectra)))
 
 
 def portmanteau(white: Array) -> float:
@@ -1608,13 +1633,11 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
 
 def _peaks(fitted: StateSpaceFit, kinds: Sequence[Kind]) -> list[list[float]]:
     """Return, for each kind, frequencies (Hz) at which an oscillation may be: where innovations are strongest, and two others."""
-    from scipy.signal import welch  # which takes longer to import than all else that a fit needs
-
     found = []
+    spectra = _spectra(fitted)
     for of in kinds:
-        pieces = [white for white, _, own in fitted.likelihood.pieces(fitted.maximum.point) if own == of]
-        power = [welch(w, fs=1 / of[1], nperseg=PERIODOGRAM)[1][1:] * w.size for w in pieces if w.size >= PERIODOGRAM]
-        peak = (1 + int(np.argmax(sum(power)))) / (PERIODOGRAM * of[1]) if power else 0.05 / of[1]
+        own = spectra[of]
+        peak = (1 + int(np.argmax(np.median(own, axis=0)))) / (PERIODOGRAM * of[1]) if own.size else 0.05 / of[1]
         found.append([peak, 0.03 / of[1], 0.15 / of[1]])
     return found
 
