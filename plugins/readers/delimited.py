@@ -112,7 +112,7 @@ def _layout(head: bytes) -> _Layout | None:
             cells = cells[:-1]
         if len(cells) != count:
             break
-        if names is None and all(_is_unit(cell) for cell in cells):
+        if names is None and units is None and 2 * sum(_is_unit(cell) for cell in cells) > count:  # degC, V, say, are none
             units = cells
         elif names is None:
             names = cells

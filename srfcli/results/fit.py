@@ -94,6 +94,7 @@ ADVICE = {
 }
 CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
 BROAD = 3e-3  # of the friction: a random friction field ten times that of a polished track
+FAILED = 3  # tests that a fit fails, of which its notes tell, the worst first
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -260,6 +261,12 @@ class FitResult(Result):
                     f"that field is {100 * share:.1g} % of the friction, more than a track has: it may stand in for physics that "
                     "the model lacks. Try another ageing law or friction law, or `srf diagnose`."
                 )
+        if found.state_space is not None and found.status is not Status.INTERRUPTED:
+            from srfcli.diagnosis.goodness_of_fit import coarse_readings, shortcomings, uneven_noise
+
+            failed = [text for text in shortcomings(found.state_space) if not text.startswith("the field's amplitude")]
+            notes += [f"the fit fails a test: {text}" for text in failed[:FAILED]]
+            notes += [*uneven_noise(found.state_space), *coarse_readings(found.state_space)]
         if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
             notes.append(f"interrupted: {len(found.starts)} of {self.asked} starts were done")
         return notes
