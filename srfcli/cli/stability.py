@@ -48,7 +48,7 @@ def linear(system: SystemOptions, over: tuple[Range, ...], all_roots: bool, outp
     """Critical load, K/W0 and frequency of steady sliding under constant load.
 
     From the exact characteristic polynomial: all its Hopf points, with the direction of crossing checked and the first
-    Lyapunov coefficient (direct: stick-slip grows from nothing; inverted: it starts with a jump). Beside them stand the
+    Lyapunov coefficient (supercritical: stick-slip grows from nothing; subcritical: it starts with a jump). Beside them stand the
     closed forms for a rigid interface, and for a rigid interface without inertia.
     """
     from srfcli.cli.emit import emit

@@ -96,9 +96,14 @@ def read_experiment(
     if choice.effects and (runs or tables):
         from srfcli.symbolic.system import apart  # only for a description that has effects
 
-        own = [registry.get("effect", name) for name in choice.effects]
+        own = apart([e for e in (registry.get("effect", name) for name in choice.effects) if isinstance(e, Effect)])
         stated = described.parameters.value if described.parameters is not None else {}
-        parameters = own_bounds(parameters, apart([e for e in own if isinstance(e, Effect)]), runs, stated, tables)
+        silent = [p for e in own for p in e.parameters if p.name not in stated and p.name not in e.fixed]
+        if silent:
+            values = ", ".join(f"{p.name} = {p.default:g}" + (f" {p.unit}" if p.unit != "1" else "") for p in silent)
+            what = f"not listed, and so fixed: {values}; list them, as in {silent[0].name} = {{}}, to fit them"
+            notices += (Notice("start-value", f"{described.path.name}: [parameters]", what),)
+        parameters = own_bounds(parameters, own, runs, stated, tables)
     vary, by = read_groups(described.model)
     found = Experiment(
         described.path,

@@ -35,7 +35,7 @@ class HopfPoint:
     residual: float
 
     @property
-    def direct(self) -> bool:
+    def supercritical(self) -> bool:
         """True where stick-slip grows from zero amplitude."""
         return self.lyapunov < 0
 

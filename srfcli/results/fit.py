@@ -249,6 +249,8 @@ class FitResult(Result):
         found = self.found
         notes = _notes(found.fit, self.intervals, found.starts)
         notes += filter(None, [self.experiment.rescaled()])
+        notes += [str(n) for n in self.experiment.notices if n.kind == "start-value"]
+        notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind == "reset"]
         notes += [] if self.posterior is None else _posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
         if found.track is not None:
