@@ -178,7 +178,7 @@ def test_errors_are_those_of_a_fit(made: Path) -> None:
     problem = fit_problem(open_model(REGISTRY, **asdict(experiment.choice), random_field=True), experiment)
     likelihood = Likelihood(problem, smooth=True, processes=("relaxation",))
     maximum = maximise(likelihood, likelihood.coordinates(problem.named(problem.start)))
-    errors = as_fit(StateSpaceFit(likelihood, maximum, likelihood.evaluations)).stderr
+    errors = as_fit(StateSpaceFit(likelihood, maximum)).stderr
     lam = next(p.value for p in experiment.parameters if p.name == "lambda")
     assert found.together is not None and len(found.runs) == 2
     assert found.together.errors["alpha"] == pytest.approx(errors["alpha"], rel=0.15)

@@ -484,7 +484,7 @@ def test_coloured_gauge_noise_is_found(make_model):
         if name in ROCK_VALUES:
             assert abs(found.values[name] - ROCK_VALUES[name]) < 3.5 * error, name
     wider = found.likelihood.beside(found.likelihood.problem, ("relaxation", "relaxation"))
-    more = StateSpaceFit(wider, maximise(wider, wider.coordinates(found.values), steps=8), wider.evaluations)
+    more = StateSpaceFit(wider, maximise(wider, wider.coordinates(found.values), steps=8))
     fewer = with_less_colour(more, 0.1)
     assert fewer.likelihood.processes == ("relaxation",)
     assert fewer.log_likelihood == pytest.approx(found.log_likelihood, abs=0.1)

@@ -271,22 +271,22 @@ class ModelSearch:
         self.budget = max(BUDGET, BASELINES * (time.process_time() - self.begun))
         base = self._expand(base)
         if not base.passes:
-            self._swap(base)
+            self._try_ageing_laws(base)
         self._search()
-        for further in (self._expand_plain, self._recolour, self._together):  # dearer, or less likely
+        for further in (self._expand_without_field, self._refit_noise, self._try_pairs):  # dearer, or less likely
             if not (self.best().passes or self.spent):
                 further(self.baseline)
                 self._search()
         if not self.spent:  # an effect, or the field beside the baseline, may pass for another ageing law
-            self._swap(self.baseline, afresh=True)
+            self._try_ageing_laws(self.baseline, afresh=True)
             self._search()
         if self.best().hypothesis.ageing and not self.spent:  # another law is much like it; its noise may have been misjudged
-            for again in (self._swap, self._recolour):
+            for again in (self._try_ageing_laws, self._refit_noise):
                 again(self.baseline)
                 self._search()
         self.cut_short = self.spent and bool(self.queue)
         self._where_effects_act()
-        self._rebase()
+        self._refit_baseline()
         self._eliminate()
         if self.experiment.runs is not self.whole.runs:
             self._fit_all()
@@ -304,7 +304,7 @@ class ModelSearch:
             fitted[node.name] = replace(self._judged(node.hypothesis, found), scores=node.scores)
             options["processes"] = found.likelihood.processes
         self.fitted = fitted
-        self._grant()
+        self._grant_shared_field()
 
     def extend(self, nodes: Sequence[Fitted]) -> None:
         """Search on from models that another search has fitted."""
@@ -350,7 +350,7 @@ class ModelSearch:
                 continue
             self._revise(move, found)
             if found is self.best() and not found.passes and not move.again:
-                again = self._again(found)
+                again = self._restart(found)
                 if again:
                     heapq.heappush(self.queue, again)
 
@@ -388,7 +388,7 @@ class ModelSearch:
         promised = [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in alone]
         self._promise(node, node, promised, least)
         for effect in (e for e in joining if e.settings or e.observed):
-            self._build(node, effect)
+            self._try_built_in(node, effect)
         return node
 
     def _joining(self, node: Fitted) -> list[Effect]:
@@ -405,7 +405,7 @@ class ModelSearch:
             own = {n: score.shifts[n] for n in at.fit.likelihood.problem.names if score.shifts.get(n)}
             self._push(node.attainable + gain + self._one_more, hypothesis, at, sizes, direction=score.direction, shifts=own)
 
-    def _expand_plain(self, node: Fitted) -> None:
+    def _expand_without_field(self, node: Fitted) -> None:
         """Push what effects promise from a fit without field and colour, where these have taken up what the model lacks.
 
         Under a field that no track has, the scores of what is missing are as low as those of what is not.
@@ -459,7 +459,7 @@ class ModelSearch:
             return None
         return Likelihood(problem, processes=node.fit.likelihood.processes, rtol=COARSE)
 
-    def _build(self, node: Fitted, effect: Effect) -> None:
+    def _try_built_in(self, node: Fitted, effect: Effect) -> None:
         """Push an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
         hypothesis = Hypothesis((*node.hypothesis.effects, effect), node.hypothesis.ageing)
         likelihood = self._likelihood(hypothesis, node, effect.reported)
@@ -487,7 +487,7 @@ class ModelSearch:
             sizes = (*self._sizes(node), {own[0]: values[own[0]]})
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
 
-    def _again(self, node: Fitted) -> _Move | None:
+    def _restart(self, node: Fitted) -> _Move | None:
         """Return a model that fails a test, to be fitted anew where its fit may have ended in a false maximum.
 
         From another size of what is built in where that is likelier, else from where it stands, under a wider field, if a part of
@@ -524,7 +524,7 @@ class ModelSearch:
         likeliest = max(trials, key=lambda f: f.point.log_likelihood)
         return maximise(likelihood, likeliest.point.x, steps=12, close=1.0, widths=(), progress=self.progress).point
 
-    def _recolour(self, base: Fitted) -> None:
+    def _refit_noise(self, base: Fitted) -> None:
         """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""
         best = self.best()
         if "processes" in self.options or correlated(best.fit.maximum.point) < DEVIATION:
@@ -546,7 +546,7 @@ class ModelSearch:
         except SrfError:  # it stays as it was
             return node
 
-    def _together(self, node: Fitted) -> None:
+    def _try_pairs(self, node: Fitted) -> None:
         """Push the pairs of effects that promise more together than the best alone."""
         if node.scores is None or not node.promised:
             return
@@ -554,7 +554,7 @@ class ModelSearch:
             if pair.gain > node.promised[0].gain + WORTH:
                 self._push(node.attainable + pair.gain + 2 * self._one_more, Hypothesis(pair.effects), node, pair.values)
 
-    def _swap(self, node: Fitted, *, afresh: bool = False) -> None:
+    def _try_ageing_laws(self, node: Fitted, *, afresh: bool = False) -> None:
         """Push the other ageing laws, each after a few steps from where the model or the best one stands.
 
         `afresh` also from the file's own values: a fit that has made up for a wrong law may stand where no step leads to the
@@ -634,7 +634,7 @@ class ModelSearch:
         except SrfError as error:
             self.excluded.append(Excluded(hypothesis.name, error.message))
 
-    def _rebase(self) -> None:
+    def _refit_baseline(self) -> None:
         """Fit the baseline anew from the best model's parameters where it is likelier than it was: it had a false maximum."""
         best, base = self.best(), self.baseline
         if best is base or not self.experiment.runs:
@@ -684,10 +684,10 @@ class ModelSearch:
         self.progress(f"{name}: {text}")
         if known is None or anew or found.separate > known.separate:
             self.fitted[name] = found
-            self._grant()
+            self._grant_shared_field()
         return self.fitted[name]
 
-    def _grant(self) -> None:
+    def _grant_shared_field(self) -> None:
         """Grant all models what the likeliest gains by a field that all runs share: first-order gains do not decide."""
         under = {f.name: f for f in self.fitted.values() if f.shared is not None}
         if under:

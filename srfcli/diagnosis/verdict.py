@@ -209,7 +209,7 @@ def on_the_track_of(best: Fitted, baseline: Fitted) -> Fitted:
     found = maximise(likelihood, likelihood.coordinates(best.fit.values), held=held, close=NEAR)
     if found.status is Status.INTEGRATION:
         return baseline
-    return replace(baseline, fit=StateSpaceFit(likelihood, found, likelihood.evaluations))
+    return replace(baseline, fit=StateSpaceFit(likelihood, found))
 
 
 def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | None = None) -> tuple[Held, ...]:

@@ -938,7 +938,7 @@ class StateSpaceFit:
 
     likelihood: Likelihood
     maximum: Maximum
-    evaluations: int
+    evaluations: int = 0  # 0 while it is being sought
     _told: dict[str, tuple[Run, Predictive]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
@@ -1060,15 +1060,17 @@ def fit_state_space(
         "smooth": smooth, "processes": processes, "cautious": cautious, "close": close, "progress": progress,
     }  # fmt: skip
     try:
-        if not problem.runs:
-            return _surveyed(_of_tables(likelihood, start or {}, close, progress), close, progress)
         if part is None and start is None and (runs := thinned(problem.runs)) is not problem.runs:
             part = fit_state_space(replace(problem, runs=runs), thorough=thorough, beside=beside, rtol=rtol, **choice)
-        if part is not None and part.maximum.status is not Status.INTEGRATION:
+        if not problem.runs:  # there is neither field nor gauge
+            own = likelihood(True, ())
+            found = StateSpaceFit(own, maximise(own, own.coordinates(start or {}), close=close, progress=progress))
+        elif part is not None and part.maximum.status is not Status.INTEGRATION:
             found = _on_all(part, likelihood, **choice)
         else:
             found = _fitted(likelihood, start or {}, thorough=thorough, beside=beside, **choice)
-        return _surveyed(found, close, progress) if problem.tables else found
+        found = _surveyed(found, close, progress) if problem.tables else found
+        return replace(found, evaluations=sum(own.evaluations for own in tried) + (part.evaluations if part else 0))
     except KeyboardInterrupt as error:
         last = next((own.best for own in reversed(tried) if own.best is not None), None)
         raise Interrupted(last.values if last else problem.named(problem.start)) from error
@@ -1082,20 +1084,9 @@ def with_priors(found: StateSpaceFit, priors: Sequence[tuple[tuple[str, ...], fl
     return StateSpaceFit(likelihood, maximum, found.evaluations + likelihood.evaluations)
 
 
-def _of_tables(
-    likelihood: Callable[[bool, Sequence[str]], Likelihood],
-    start: Mapping[str, float],
-    close: float,
-    progress: Callable[[str], None],
-) -> StateSpaceFit:
-    """Return the fit of a problem without runs: there is neither field nor gauge."""
-    own = likelihood(True, ())
-    return StateSpaceFit(own, maximise(own, own.coordinates(start), close=close, progress=progress), own.evaluations)
-
-
 def _surveyed(found: StateSpaceFit, close: float, progress: Callable[[str], None]) -> StateSpaceFit:
     """Return a fit whose critical loads are the nearest of all: where a search of every line finds nearer ones, it goes on."""
-    own, maximum, before = found.likelihood, found.maximum, found.likelihood.evaluations
+    own, maximum = found.likelihood, found.maximum
     if maximum.status is Status.INTEGRATION:
         return found
     for _ in range(SURVEYS):
@@ -1105,7 +1096,7 @@ def _surveyed(found: StateSpaceFit, close: float, progress: Callable[[str], None
             break
         progress(f"nearer critical loads: log likelihood {point.log_likelihood:.1f}")
         maximum = maximise(own, point.x, close=close, widths=(), progress=progress)
-    return StateSpaceFit(own, maximum, found.evaluations + own.evaluations - before)
+    return StateSpaceFit(own, maximum)
 
 
 def stopped(problem: Problem, values: Mapping[str, float]) -> StateSpaceFit:
@@ -1144,15 +1135,14 @@ def _on_all(
     """Return the fit to all readings from that to a part of them; a small field and further colours may show in all alone."""
     whole = likelihood(part.smooth, part.likelihood.processes)
     x = whole.coordinates(_carried(part, whole))
-    best = StateSpaceFit(whole, maximise(whole, x, close=close, progress=progress), whole.evaluations)
+    best = StateSpaceFit(whole, maximise(whole, x, close=close, progress=progress))
     if processes is None:
         best = _with_colour(best, likelihood, progress, cautious)
     if smooth is None and best.smooth:
         rough = likelihood(False, best.likelihood.processes)
         small = _small_field(rough, best.maximum.point)
-        best = replace(best, evaluations=best.evaluations + rough.evaluations)
         if small is not None:
-            best = StateSpaceFit(rough, replace(best.maximum, point=small), best.evaluations)
+            best = StateSpaceFit(rough, replace(best.maximum, point=small))
     settled = best.likelihood is whole and best.maximum.away < close
     return best if settled else _with_or_without(best, smooth, likelihood, close, progress)
 
@@ -1189,16 +1179,14 @@ def _fitted(
     assert found is not None
     if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
         found = maximise(wide, found.point.x, steps=STEPS // 2, close=1.0, progress=progress)
-    best = StateSpaceFit(wide, found, wide.evaluations)
+    best = StateSpaceFit(wide, found)
     if found.status is Status.INTEGRATION:
         return best
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
     best = first = _with_colour(best, likelihood, progress, cautious) if processes is None else best
     walked = fresh and best.maximum.away < 1.0
     if walked:
-        under, before = best.likelihood, best.likelihood.evaluations
-        likelier = _along_ridges(under, best.maximum, 1.0, progress)
-        best = replace(best, maximum=likelier, evaluations=best.evaluations + under.evaluations - before)
+        best = replace(best, maximum=_along_ridges(best.likelihood, best.maximum, 1.0, progress))
     best = _with_or_without(best, smooth, likelihood, close, progress)
     if thorough and processes is None:
         moved = best.smooth or best.log_likelihood > first.log_likelihood + NEEDED
@@ -1214,16 +1202,13 @@ def _fitted(
                 k = len(instead.problem.names)
                 x = np.concatenate([instead.coordinates(start)[:k], other.maximum.point.x[k:]])
                 anew = maximise(instead, x, steps=STEPS // 2, close=1.0, progress=progress)
-                other = max(other, StateSpaceFit(instead, anew, instead.evaluations), key=lambda f: f.log_likelihood)
+                other = max(other, StateSpaceFit(instead, anew), key=lambda f: f.log_likelihood)
             if other.criterion > best.criterion - CLOSE_CALL:
                 own = maximise(instead, other.maximum.point.x, close=close, progress=progress)
-                other = StateSpaceFit(instead, own, instead.evaluations)
-            better, worse = (other, best) if other.criterion > best.criterion else (best, other)
-            best = replace(better, evaluations=better.evaluations + worse.evaluations)
+                other = StateSpaceFit(instead, own)
+            best = other if other.criterion > best.criterion else best
     if fresh:
-        before = best.likelihood.evaluations
-        likelier = best.maximum if walked else _along_ridges(best.likelihood, best.maximum, close, progress)
-        best = replace(best, maximum=likelier, evaluations=best.evaluations + best.likelihood.evaluations - before)
+        best = best if walked else replace(best, maximum=_along_ridges(best.likelihood, best.maximum, close, progress))
         best = likeliest_beside(best, close, progress) if beside else best
     if fresh and smooth is None and best.smooth:
         best = _with_faint_fields(best, likelihood(False, best.likelihood.processes))
@@ -1236,7 +1221,7 @@ def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFi
     Averaged over amplitudes, the prior even in their logarithm from SMALL on, and over lengths, each with the posterior of the
     other parameters by Laplace's method, one step of scoring from the fit (Rue, Martino and Chopin, J. R. Stat. Soc. B 71, 2009).
     """
-    plain, maximum, before = fitted.likelihood, fitted.maximum, rough.evaluations
+    plain, maximum = fitted.likelihood, fitted.maximum
     inner = np.nonzero(np.diag(maximum.covariance) > 0)[0]
     at = [rough.names.index(plain.names[i]) for i in inner]
     bare, logs = rough.coordinates(fitted.values), np.log(np.array(FAINT_FIELDS) * FAINT / SMALL)
@@ -1259,8 +1244,7 @@ def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFi
     whole = sum(w * (C + np.outer(d, d)) for w, C, d in zip(weight, covariances, moves, strict=True))
     spread = np.zeros_like(maximum.covariance) + maximum.spread
     spread[np.ix_(inner, inner)] += whole - covariances[0]
-    count = fitted.evaluations + rough.evaluations - before
-    return replace(fitted, maximum=replace(maximum, spread=spread), evaluations=count)
+    return replace(fitted, maximum=replace(maximum, spread=spread))
 
 
 def _laplace(point: Point, at: Array) -> tuple[float, Array, Array]:
@@ -1287,7 +1271,7 @@ def likeliest_beside(found: StateSpaceFit, close: float, progress: Callable[[str
     curvature wants, it has maximum beside maximum: readings of an oscillation of the contact that is faster than the sampling
     are alike for many compliances. Where none of these stands out, the parameter is as uncertain as all of them are together.
     """
-    likelihood, maximum, before = found.likelihood, found.maximum, found.likelihood.evaluations
+    likelihood, maximum = found.likelihood, found.maximum
     for _ in range(HOPS):
         spread, best = np.zeros_like(maximum.covariance), maximum.point
         for j in _ridges(likelihood, maximum):
@@ -1299,8 +1283,7 @@ def likeliest_beside(found: StateSpaceFit, close: float, progress: Callable[[str
         other = maximise(likelihood, best.x, close=close, widths=(), progress=progress)
         progress(f"log likelihood {other.point.log_likelihood:.1f} beside {maximum.point.log_likelihood:.1f}")
         maximum = other
-    count = found.evaluations + likelihood.evaluations - before
-    return replace(found, maximum=replace(maximum, spread=spread), evaluations=count)
+    return replace(found, maximum=replace(maximum, spread=spread))
 
 
 def _ridges(likelihood: Likelihood, maximum: Maximum) -> list[int]:
@@ -1387,16 +1370,15 @@ def _with_colour(
     while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > DEVIATION:
         if cautious and known and not steadily_coloured(best):
             break
-        found, spent = best, best.evaluations
+        found = best
         for kind in PROCESSES:
             wider = _coloured(best, likelihood(best.smooth, (*known, kind)), progress)
-            spent += wider.evaluations
             found = max(found, wider, key=lambda f: f.criterion)
             if not steadily_coloured(wider):
                 break
         if found is best:
-            return replace(best, evaluations=spent)
-        best = replace(found, evaluations=spent)
+            break
+        best = found
     return best
 
 
@@ -1422,11 +1404,10 @@ def with_less_colour(
         if fewer.at(x, slopes=False).log_likelihood < found.log_likelihood - CLOSE_CALL:
             break
         progress(f"coloured gauge noise: {', '.join(fewer.processes) or 'none'}")
-        bare = StateSpaceFit(fewer, maximise(fewer, x, close=close, widths=(), progress=progress), fewer.evaluations)
-        better = found if found.criterion > bare.criterion else bare
-        found = replace(better, evaluations=found.evaluations + bare.evaluations)
-        if better is not bare:
+        bare = StateSpaceFit(fewer, maximise(fewer, x, close=close, widths=(), progress=progress))
+        if found.criterion > bare.criterion:
             break
+        found = bare
     return found
 
 
@@ -1506,10 +1487,10 @@ def _with_or_without(
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
     """Return the fit from where one begun stands, with a field or without, as `smooth` says or the likelihood."""
-    rough, count = begun.likelihood, begun.evaluations
+    rough = begun.likelihood
     if rough.smooth:
         own = maximise(rough, begun.maximum.point.x, close=close, progress=progress)
-        return StateSpaceFit(rough, own, rough.evaluations)
+        return StateSpaceFit(rough, own)
     plain = likelihood(True, rough.processes)
     at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
     faint = rough.lower[at] + np.log(FAINT / SMALL)
@@ -1518,7 +1499,7 @@ def _with_or_without(
         progress("without a field")
         values = plain.coordinates(found.point.values)
         own = maximise(plain, values, steps=steps, close=close, progress=progress)
-        return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
+        return StateSpaceFit(plain, own)
 
     tried: StateSpaceFit | None = None
     if not np.isfinite(found.away):
@@ -1544,7 +1525,7 @@ def _with_or_without(
                 found = replace(found, point=small)
     if found.away >= close:  # a longer run knows the curvature of its last step, by which scoring alone goes to and fro
         found = maximise(rough, found.point.x, close=close, widths=(), progress=progress)
-    best = StateSpaceFit(rough, found, count + rough.evaluations - before + plain.evaluations)
+    best = StateSpaceFit(rough, found)
     if smooth is False:
         return best
     lost = found.point.log_likelihood - HOPELESS
@@ -1557,7 +1538,7 @@ def _with_or_without(
     if tried.maximum.away < close:
         return tried
     own = maximise(plain, tried.maximum.point.x, close=close, progress=progress)
-    return StateSpaceFit(plain, own, count + rough.evaluations - before + plain.evaluations)
+    return StateSpaceFit(plain, own)
 
 
 def _small_field(rough: Likelihood, bare: Point) -> Point | None:
@@ -1628,7 +1609,7 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
     progress(f"coloured gauge noise: {', '.join(wider.processes)}")
     steps = 20 if best > fitted.log_likelihood - HOPELESS else 0
     maximum = maximise(wider, x, steps=steps, close=1.0, progress=progress)
-    return StateSpaceFit(wider, maximum, wider.evaluations)
+    return StateSpaceFit(wider, maximum)
 
 
 def _peaks(fitted: StateSpaceFit, kinds: Sequence[Kind]) -> list[list[float]]:
