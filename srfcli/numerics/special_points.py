@@ -170,73 +170,34 @@ def _strong_ends(model: GeneratedModel, branch: Branch) -> Iterator[SpecialPoint
 
 
 def locate(
-    model: GeneratedModel,
-    plane: Plane,
-    branch: Branch,
-    between: tuple[int, int],
-    test: Test,
-    *,
-    what: str,
-    axis: str = "",
-    max_iterations: int = 40,
+    model: GeneratedModel, plane: Plane, branch: Branch, between: tuple[int, int], test: Test, *, what: str, axis: str = ""
 ) -> SpecialPoint:
     """Return the zero of `test` between two points of a branch; where it is not met, the nearest point with its status."""
+    from scipy.optimize import brentq
+
     chord = _Chord.between(model, plane, branch.points[between[0]], branch.points[between[1]])
-    a, b = (chord.corrected(model, plane, s) for s in (0.0, 1.0))
-    best = min(((s, c) for s, c in ((0.0, a), (1.0, b)) if c is not None), key=lambda t: abs(test(t[1])), default=None)
-    if a is None or b is None or test(a) * test(b) > 0 or best is None:
-        return _special(model, branch, between, what, axis, best, Status.NO_CONVERGENCE)
-    # the bracket's end found last, the other one, and what the last took the place of: (share, value)
-    last, other, before = (1.0, test(b)), (0.0, test(a)), (0.0, test(a))
-    share, status = 0.5, Status.NO_CONVERGENCE
-    for _ in range(max_iterations):
-        width = abs(other[0] - last[0])
-        s = last[0] + float(np.clip(share, 1e-3, 1 - 1e-3)) * (other[0] - last[0])
+    met: list[tuple[float, CurvePoint, float]] = []
+    best: tuple[float, CurvePoint, float] | None
+
+    def along(s: float) -> float:
         point = chord.corrected(model, plane, s)
         if point is None:
-            break
-        value = test(point)
-        best = (s, point)
-        before, last, other = (last, (s, value), other) if value * last[1] > 0 else (other, (s, value), last)
-        width = abs(other[0] - last[0])
-        if width < CLOSE or abs(value) < 1e-9:
-            status = Status.OK
-            break
-        share = _inverse_quadratic(last, other, before)
-    return _special(model, branch, between, what, axis, best, status, width=width)
+            raise ValueError("the curve was lost")
+        met.append((s, point, test(point)))
+        return met[-1][2]
 
-
-def _inverse_quadratic(last: tuple[float, float], other: tuple[float, float], before: tuple[float, float]) -> float:
-    """Return where between the ends `last` and `other` of a bracket to look next, as a share (Chandrupatla 1997)."""
-    (x1, f1), (x2, f2), (x3, f3) = last, other, before
-    if f1 == f2 or f3 in (f1, f2):
-        return 0.5
-    place, value = (x1 - x2) / (x3 - x2), (f1 - f2) / (f3 - f2)
-    if not (1 - np.sqrt(max(1 - place, 0.0)) < value < np.sqrt(max(place, 0.0))):
-        return 0.5
-    return float(f1 / (f2 - f1) * f3 / (f2 - f3) + (x3 - x1) / (x2 - x1) * f1 / (f3 - f1) * f2 / (f3 - f2))
-
-
-def _special(
-    model: GeneratedModel,
-    branch: Branch,
-    between: tuple[int, int],
-    what: str,
-    axis: str,
-    best: tuple[float, CurvePoint] | None,
-    status: Status,
-    *,
-    width: float = 1.0,
-) -> SpecialPoint:
-    """Return what was located; without any point, the branch's own next to it."""
-    if best is None:
+    status = Status.OK
+    try:
+        zero = brentq(along, 0.0, 1.0, xtol=CLOSE)
+        best = min(met, key=lambda m: abs(m[0] - zero))
+    except ValueError:  # or its ends are of one sign
+        status, best = Status.NO_CONVERGENCE, min(met, key=lambda m: abs(m[2]), default=None)
+    if best is None:  # the branch's own point next to it
         near = branch.points[between[0]]
         return SpecialPoint(what, axis, float(between[0]), near.p, near.rho, np.inf, status)
-    s, point = best
+    s, point, _ = best
     place = between[0] + s * (between[1] - between[0])
-    error = float(mesh_error(model, point.orbit))
-    if status is not Status.OK:
-        error += width
+    error = float(mesh_error(model, point.orbit)) + (0.0 if status is Status.OK else 1.0)
     return SpecialPoint(what, axis, place, point.p, point.rho, error, status)
 
 
