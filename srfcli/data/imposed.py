@@ -238,7 +238,7 @@ def _turns(x: Array, least: float) -> list[int]:
 FEWEST = 5  # samples of a piece
 ROUNDS = 40  # of the search for the places of the corners
 STRETCH = 128  # samples over which noise has its colour
-BURST = 100  # samples of a burst of noise, at most
+BURST = STRETCH  # samples of a burst of noise, at most
 AROUND = 15  # neighbouring stretches from which the noise of one is estimated
 NEARBY = 101  # samples that share a level of white noise
 CLEAR = 8.0  # standard deviations about the lines beside it that a level jump exceeds
@@ -378,7 +378,7 @@ def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
 
 
 def _without_bursts(t: Array, sigma: Array, knots: Array, heights: Array) -> Array:
-    """Return the knots without those of bursts: of a hundred samples or fewer, after which the line continues as before.
+    """Return the knots without those of bursts: of BURST samples or fewer, after which the line continues as before.
 
     A hold is no burst: after it the line continues later.
     """
@@ -386,9 +386,9 @@ def _without_bursts(t: Array, sigma: Array, knots: Array, heights: Array) -> Arr
     places = np.searchsorted(t, knots)
     keep = np.ones(knots.size, bool)
     for i in range(1, knots.size - 2):
-        for j in range(i + 1, min(i + 6, knots.size - 1)):
+        for j in range(i + 1, int(np.searchsorted(places[: knots.size - 1], places[i] + BURST, side="right"))):
             before, after = slopes[i - 1], slopes[j]
-            if places[j] - places[i] > BURST or abs(after - before) > 0.1 * max(abs(before), abs(after)):
+            if abs(after - before) > 0.1 * max(abs(before), abs(after)):
                 continue
             late = heights[j] - heights[i] - 0.5 * (before + after) * (knots[j] - knots[i])
             if abs(late) < 6 * sigma[min(places[i], sigma.size - 1)]:
