@@ -169,6 +169,12 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         f"a continuous line of {slopes.size} {pieces}, {told} um/s, fitted through the displacements, "
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
+    most_back = int(np.argmin(np.diff(line.heights)))
+    if -np.diff(line.heights)[most_back] > line.misfit:
+        what += (
+            f"; it goes back by {-np.diff(line.heights)[most_back]:.3g} um at t = {line.knots[most_back]:.7g} s: state the run's "
+            "drive if the stage did not"
+        )
     return drive, [*notices, Notice("drive-fitted", where, what)]
 
 
