@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import tempfile
@@ -34,7 +35,7 @@ from srfcli.laws.registry import Registry
 
 KINDS = ("steps", "shs", "oscillation")
 NAMED = {  # role -> what headings call it, in small letters without their unit; the first that a file has is taken
-    "time": ("time", "t", "elapsed_time", "elapsed", "test_time", "run_time"),
+    "time": ("time", "t", "x_value", "elapsed_time", "elapsed", "test_time", "run_time"),
     "load_point_velocity": (
         "load_point_velocity", "lp_velocity", "lp_vel", "v_lp", "loading_velocity", "drive_velocity", "velocity", "vel", "v",
         "loading_rate", "slip_rate",
@@ -45,11 +46,12 @@ NAMED = {  # role -> what headings call it, in small letters without their unit;
     ),
     "normal_stress": (
         "normal_stress", "effective_normal_stress", "norm_stress", "sigma_n", "sigman", "sig_n", "sigma", "sn", "ns",
+        "nor_stress",
     ),
     "normal_load": ("normal_load", "normal_force", "fn", "f_n", "norm_force", "load", "n", "w"),
     "elongation": ("elongation", "spring_elongation", "deflection", "spring_deflection", "u"),
     "force": ("force", "shear_force", "friction_force", "tangential_force", "shear_load", "spring_force", "fs", "ft", "f"),
-    "shear_stress": ("shear_stress", "shear", "tau", "ss"),
+    "shear_stress": ("shear_stress", "shear", "tau", "ss", "shr_stress"),
     "friction": (
         "friction", "friction_coefficient", "coefficient_of_friction", "friction_coeff", "apparent_friction", "mu", "cof",
         "fnorm",
@@ -349,14 +351,16 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     for name in wish.holdout:
         if name not in sketch.names:
             raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, sketch.names))
-    runs, free = _read(sketch, registry)
+    sketch, runs = _read(sketch, registry)
+    if sketch.negative:
+        remarks.append("compression is negative in the file: the load counts with the other sign")
     modulations = _modulations(runs)
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
     remarks.append(f"kind of experiment: {kind}, {why}")
-    if still := [name for name in free if name not in sketch.strokes]:
+    if still := [name for name in sketch.free if name not in sketch.strokes]:
         remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(still)}")
     sketch = replace(
-        sketch, kind=kind, why=why, free=free, modulations=modulations if kind == "oscillation" else {},
+        sketch, kind=kind, why=why, modulations=modulations if kind == "oscillation" else {},
         durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
     )  # fmt: skip
     text = sketch.text(_parameters(sketch, runs, registry))
@@ -422,6 +426,7 @@ class _Sketch:
     modulations: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     durations: Mapping[str, float] = field(default_factory=dict)
     strokes: Mapping[str, Stroke] = field(default_factory=dict)  # by name, where a file holds several
+    negative: bool = False  # whether a load in compression is negative in the files
 
     @property
     def ageing(self) -> str:
@@ -453,11 +458,12 @@ class _Sketch:
         if parameters:
             lines += ["", "[parameters]   # start values and bounds of what is fitted; a wide bound costs little"]
             lines += parameters
-        said = [n for n in self.columns if n.said]
+        turned = ("normal_stress", "normal_load") if self.negative else ()
+        said = [n for n in self.columns if n.said or n.role in turned]
         if said:
             lines += ["", "[columns]   # what the headings of the data files mean"]
             lines += [f"{n.role} = {{ name = {toml_value(split_heading(n.heading)[0] if self._alone(n) else n.heading)}, "
-                      f"unit = {toml_value(n.unit)} }}" for n in said]  # fmt: skip
+                      f"unit = {toml_value(n.unit)}{', scale = -1' * (n.role in turned)} }}" for n in said]  # fmt: skip
         if self.kind in KINDS and self.why:
             lines += ["", f"# The runs, of kind {self.kind}: {self.why}."]
         for path, name in zip(self.files, self.names, strict=True):
@@ -503,17 +509,22 @@ class _Sketch:
         return lines
 
 
-def _read(sketch: _Sketch, registry: Registry) -> tuple[list[Run], tuple[str, ...]]:
-    """Return the runs as an experiment reads them, and those that have to begin from a free state."""
-    free = sketch.free
+def _read(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[Run]]:
+    """Return the runs as an experiment reads them, and the sketch with those that have to begin from a free state.
+
+    Loads that are negative throughout are taken with the other sign.
+    """
     while True:
-        with _as_file(replace(sketch, free=free).text((), absolute=True)) as file:
+        with _as_file(sketch.text((), absolute=True)) as file:
             try:
-                return list(read_experiment(file, registry=registry).runs), free
+                return sketch, list(read_experiment(file, registry=registry).runs)
             except StartsAtRest as error:
-                free = (*free, error.run)
+                sketch = replace(sketch, free=(*sketch.free, error.run))
             except SrfError as error:
                 apart = error.kind == "no contact"
+                if apart and not sketch.negative:
+                    with contextlib.suppress(SrfError):
+                        return _read(replace(sketch, negative=True), registry)
                 hint = "Take the part in contact: --window FROM,TO in seconds." if apart else error.hint
                 raise SrfError(re.sub(rf"{re.escape(str(file))}(, line \d+)?: ", "", error.message), hint) from None
 
