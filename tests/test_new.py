@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -83,6 +84,7 @@ FORMS = {
     "rotary": (["time [s]", "Angle [deg]", "Torque [N m]", "Axial load [N]"], (1, DEGREES, SIGMA * 0.025, 1), "txmS", "40 N/mm"),
     "strain": (["time [s]", "Shear strain", "Shear traction [MPa]", "eff. normal stress [MPa]"], (1, 1 / 4000, SIGMA, 1), "txmS",
                "40 MPa/mm"),
+    "compression": (["X_Value", "lp_disp_um", "Shr_stress_MPa", "nor_stress_MPa"], (1, 1, SIGMA, -1), "txmS", "40 MPa/mm"),
     "area": (["time [s]", "Angular speed [rpm]", "Torque [mN m]", "Fn [N]"], (1, DEGREES / 6, SIGMA * 50 * 25, 50), "tVmS",
              "1250 N m/rad"),
 }  # fmt: skip
@@ -230,6 +232,52 @@ def test_the_draft_says_what_it_is_and_can_be_piped(step: dict[str, np.ndarray])
     assert "A is a, B is b, D0 is Dc" in done.stdout and not Path("experiment.toml").exists()
     assert "left aside: layer thickness" in done.stderr
     assert tomli.loads(done.stdout)["columns"]["friction"] == {"name": "mu", "unit": "1"}
+
+
+def test_a_unit_that_nobody_knows_keeps_the_names_of_columns(step: dict[str, np.ndarray]) -> None:
+    heat = np.full(step["t"].size, 21.5)
+    path = table(["Time", "Stage", "Shear", "Normal", "Heat"], [step[c] for c in ("t", "x", "mu", "sigma")] + [heat], by="\t")
+    first, rest = path.read_text().split("\n", 1)
+    path.write_text(f"{first}\ns\tum\t1\tMPa\tdegC\n{rest}")
+    done = srf("new", "run1.csv", "--stiffness", "2e-3 1/um", "--column", "friction=Shear")
+    assert "left aside: Heat [degC]" in done.stderr and "from 1 to 10 um/s" in done.stderr
+
+
+def with_noise(step: dict[str, np.ndarray], noise: np.ndarray, name: str) -> Path:
+    columns = [step["t"], step["V"], SIGMA * (step["mu"] + noise), step["sigma"]]
+    return table(["time_s", "velocity_um_s", "tau_MPa", "sigma_n_MPa"], columns, name)
+
+
+def test_a_line_in_the_noise_is_found_and_not_taken_for_a_short_correlation(step: dict[str, np.ndarray]) -> None:
+    """A line at 0.52 Hz of quality 25 with most of the variance, as a damped oscillator that white noise drives."""
+    rng, dt, about = np.random.default_rng(3), step["t"][1] - step["t"][0], 2 * np.pi * 0.52
+    damped = np.exp((-about / 50 + 1j * about) * dt)
+    z = np.zeros(step["t"].size, complex)
+    drive = np.sqrt(1 - abs(damped) ** 2) * (rng.standard_normal(z.size) + 1j * rng.standard_normal(z.size))
+    for i in range(1, z.size):
+        z[i] = damped * z[i - 1] + drive[i]
+    with_noise(step, 2e-4 * z.real, "run1.csv")
+    srf("new", "run1.csv", "--stiffness", f"{k * SIGMA * 1e3:g} MPa/mm")
+    said = srf("fit", ".", "--track", "smooth").stdout
+    found = re.search(r"gauge noise: (\S+) about (\S+) Hz, of quality", said)
+    assert found, said
+    assert float(found[2]) == pytest.approx(0.52, rel=0.03) and float(found[1]) == pytest.approx(2e-4 * SIGMA, rel=0.35)
+    assert "fails a test" not in said
+
+
+def test_a_fit_says_what_speaks_against_it(step: dict[str, np.ndarray]) -> None:
+    """One run four times as loud as the other, and readings that are rounded to steps of ten times the noise."""
+    loud = np.random.default_rng(4).normal(0.0, 4e-4, step["t"].size)
+    with_noise(step, np.zeros(loud.size), "one.csv")
+    with_noise(step, loud, "two.csv")
+    srf("new", "one.csv", "two.csv", "--stiffness", f"{k * SIGMA * 1e3:g} MPa/mm")
+    said = srf("fit", ".", "--track", "smooth").stdout
+    assert "fails a test: innovations of two have an rms of 1.3" in said and "--vary noise gives each its own" in said
+    coarse = np.round(step["mu"] / 1e-3) * 1e-3 - step["mu"]
+    with_noise(step, coarse, "three.csv")
+    srf("new", "three.csv", "--stiffness", f"{k * SIGMA * 1e3:g} MPa/mm", "--out", "three.toml")
+    said = srf("fit", "three.toml", "--track", "smooth").stdout
+    assert "readings of three are rounded to steps of more than 4 times the noise" in said
 
 
 def test_holds_and_oscillations_are_told_from_steps() -> None:
