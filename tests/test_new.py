@@ -277,7 +277,7 @@ def test_a_fit_says_what_speaks_against_it(step: dict[str, np.ndarray]) -> None:
     with_noise(step, coarse, "three.csv")
     srf("new", "three.csv", "--stiffness", f"{k * SIGMA * 1e3:g} MPa/mm", "--out", "three.toml")
     said = srf("fit", "three.toml", "--track", "smooth").stdout
-    assert "readings of three are rounded to steps of more than 4 times the noise" in said
+    assert "readings of three are rounded to steps of more than four times the noise" in said
 
 
 def test_holds_and_oscillations_are_told_from_steps() -> None:
