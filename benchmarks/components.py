@@ -98,12 +98,8 @@ def compare_components(report: Report, model: GeneratedModel) -> None:
         only = [k for k, gap in enumerate(extra) if gap > 0.5 * length(a[k])]
         said += [f"eps {eps}, missed by the default: {describe(model, dense, k)}" for k in missed]
         said += [f"eps {eps}, missed by the dense one: {describe(model, usual, k)}" for k in only]
-        said += [
-            f"eps {eps}, default ended {s.status.name}: {' '.join(s.notes[1:])}" for s in (usual,) if not s.status.ok
-        ]
-        said += [
-            f"eps {eps}, dense ended {s.status.name}: {' '.join(s.notes[1:])}" for s in (dense,) if not s.status.ok
-        ]
+        said += [f"eps {eps}, default ended {s.status.name}: {' '.join(s.notes[1:])}" for s in (usual,) if not s.status.ok]
+        said += [f"eps {eps}, dense ended {s.status.name}: {' '.join(s.notes[1:])}" for s in (dense,) if not s.status.ok]
         lengths = [f"{q:.3f}" for q in (sum(map(length, a)), sum(map(length, b)), sum(gaps), sum(extra))]
         rows.append([eps, len(a), len(b), len(missed), *lengths, f"{cheap:.1f}", f"{dear:.1f}"])
         report.say(f"  (eps {eps} done)")
@@ -148,9 +144,7 @@ def dense_crossings(model: GeneratedModel, base: np.ndarray) -> tuple[np.ndarray
     return fine[change] + share * (fine[change + 1] - fine[change]), int((~np.isfinite(g)).sum())
 
 
-def compare_lines(
-    report: Report, model: GeneratedModel, eps: float, rng: np.random.Generator, said: list[str]
-) -> Count:
+def compare_lines(report: Report, model: GeneratedModel, eps: float, rng: np.random.Generator, said: list[str]) -> Count:
     """Return what the default search misses at LINES random velocities."""
     count, spacing = Count(), np.log(HI / LO) / (LOADS - 1)
     for V in np.exp(rng.uniform(0, np.log(100), LINES)):
@@ -199,9 +193,7 @@ def main() -> None:
     head = [f"< {b:g}" if b < np.inf else "farther" for b in BINS[1:]]
     report.say("critical loads: missed/all, by distance in ln W0 to the nearest other one")
     report.table(["eps", "lines", *head, "only in default", "no orbit", "CPU s a line", "dense"], rows)
-    report.say(
-        f"missed in all: {total.missed.sum()} of {total.all.sum()} ({total.missed.sum() / max(1, total.all.sum()):.2%})"
-    )
+    report.say(f"missed in all: {total.missed.sum()} of {total.all.sum()} ({total.missed.sum() / max(1, total.all.sum()):.2%})")
     for line in said:
         report.say(line)
 

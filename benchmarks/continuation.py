@@ -33,16 +33,7 @@ from common import Report, interleaved
 
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.laws.registry import load_registry
-from srfcli.numerics.continuation import (
-    AtlasSettings,
-    Branch,
-    Curve,
-    CurvePoint,
-    correct,
-    find_components,
-    polish_curve,
-    trace,
-)
+from srfcli.numerics.continuation import AtlasSettings, Branch, Curve, CurvePoint, correct, find_components, polish_curve, trace
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.plane import Axis, Plane
 
@@ -91,11 +82,7 @@ def moved(model: GeneratedModel, plane: Plane, curve: Curve) -> np.ndarray:
     fine = replace(SETTINGS, tol=1e-10, max_mesh=1024)
     coarse, exact = (
         np.array(
-            [
-                [pt.value(model, name) for name in plane.names]
-                for b in polish_curve(model, plane, curve, s)
-                for pt in b.points
-            ]
+            [[pt.value(model, name) for name in plane.names] for b in polish_curve(model, plane, curve, s) for pt in b.points]
         )
         for s in (SETTINGS, fine)
     )
@@ -182,9 +169,7 @@ def main() -> None:
         "ends",
     ]
     report.table(head, rows)
-    report.say(
-        f"target: under {TARGET:g} ms a point on all of them: {'MISSED on ' + ', '.join(missed) if missed else 'met'}"
-    )
+    report.say(f"target: under {TARGET:g} ms a point on all of them: {'MISSED on ' + ', '.join(missed) if missed else 'met'}")
     report.say()
     rows = []
     for eps in (0.09, 0.18):

@@ -29,14 +29,7 @@ from srfcli.laws.registry import load_registry
 from srfcli.motion.imposed import ConstantLoad, Drive, Modulation
 
 TRUE = {"mu0": 0.33, "A": 0.0126, "B": 0.0246, "D0": 0.395, "Vsat": 235.0, "lambda": 0.54}
-BOUNDS = {
-    "mu0": (0.2, 0.5),
-    "A": (0.006, 0.03),
-    "B": (0.01, 0.06),
-    "D0": (0.1, 1.5),
-    "Vsat": (50, 2000),
-    "lambda": (0.2, 1.5),
-}
+BOUNDS = {"mu0": (0.2, 0.5), "A": (0.006, 0.03), "B": (0.01, 0.06), "D0": (0.1, 1.5), "Vsat": (50, 2000), "lambda": (0.2, 1.5)}
 NOISE, QUANTUM = 0.02, 0.005
 LAGS = (0.0, 0.85)
 KEPT = Kept("coverage", ("seed", "lag"))
@@ -86,14 +79,7 @@ def one(task: tuple[int, float]) -> dict[str, Any]:
     found = as_fit(fit_state_space(problem))
     spent = time.process_time() - begun
     z = [float((found.values[n] - TRUE[n]) / found.stderr[n]) for n in TRUE]
-    return {
-        "seed": seed,
-        "lag": lag,
-        "z": z,
-        "cpu": spent,
-        "rms": float(found.rms_over_noise()),
-        "status": found.status.value,
-    }
+    return {"seed": seed, "lag": lag, "z": z, "cpu": spent, "rms": float(found.rms_over_noise()), "status": found.status.value}
 
 
 def tell(report: Report, lag: float, rows: list[dict[str, Any]]) -> None:
@@ -120,9 +106,7 @@ def tell(report: Report, lag: float, rows: list[dict[str, Any]]) -> None:
     report.say(
         f"all: {100 * inside.mean():.1f} % inside; CPU {np.median(cpu):.1f} s a fit (median), {cpu.max():.1f} s the longest"
     )
-    report.say(
-        f"rms over noise {rms.mean():.4f} +- {rms.std():.4f}; statuses {sorted({row['status'] for row in rows})}"
-    )
+    report.say(f"rms over noise {rms.mean():.4f} +- {rms.std():.4f}; statuses {sorted({row['status'] for row in rows})}")
 
 
 def main() -> None:

@@ -89,15 +89,7 @@ def main() -> None:
             lines, agreeing, crossings = lines + len(V), agreeing + same, crossings + count
             total = time.process_time() - begun
             rows.append(
-                (
-                    name,
-                    f"{eps:g}",
-                    count,
-                    f"{same} of {len(V)}",
-                    " ".join(statuses),
-                    f"{spent:.1f}",
-                    f"{total - spent:.1f}",
-                )
+                (name, f"{eps:g}", count, f"{same} of {len(V)}", " ".join(statuses), f"{spent:.1f}", f"{total - spent:.1f}")
             )
             print(*rows[-1], flush=True)
     head = ("system", "eps", "crossings", "lines that agree", "status at each V", "critical CPU s", "brute CPU s")

@@ -182,13 +182,9 @@ def main() -> None:
             slowest[name] = max(slowest[name], time.process_time() - at)
     print("| parser | inputs | read | refused | failed | slowest [s CPU] |\n|---|---|---|---|---|---|")
     for name, count in counts.items():
-        print(
-            f"| {name} | {count.total()} | {count['read']} | {count['refused']} | {count['failed']} | {slowest[name]:.2f} |"
-        )
+        print(f"| {name} | {count.total()} | {count['read']} | {count['refused']} | {count['failed']} | {slowest[name]:.2f} |")
     whole = sum(counts.values(), collections.Counter[str]())
-    print(
-        f"| all | {whole.total()} | {whole['read']} | {whole['refused']} | {whole['failed']} | {max(slowest.values()):.2f} |"
-    )
+    print(f"| all | {whole.total()} | {whole['read']} | {whole['refused']} | {whole['failed']} | {max(slowest.values()):.2f} |")
 
 
 if __name__ == "__main__":

@@ -86,9 +86,7 @@ def differences(problem: Problem, rtol: float, step: float) -> tuple[dict[str, t
 
     def motions(theta: Array) -> tuple[list[Array], float]:
         begun = time.process_time()
-        return [
-            solved(run, slider_of(problem, theta, run), functions, rtol) for run in problem.runs
-        ], time.process_time() - begun
+        return [solved(run, slider_of(problem, theta, run), functions, rtol) for run in problem.runs], time.process_time() - begun
 
     base, one = motions(problem.start)
     forward: list[list[Array]] = []
@@ -147,9 +145,7 @@ def main() -> None:
     report = Report("gradient", __doc__ or "")
     problem = load_problem(Path(sys.argv[1]))
     samples = sum(run.t.size for run in problem.runs)
-    report.say(
-        f"# {Path(sys.argv[1]).name}: {len(problem.runs)} runs, {samples} samples, {len(problem.names)} parameters"
-    )
+    report.say(f"# {Path(sys.argv[1]).name}: {len(problem.runs)} runs, {samples} samples, {len(problem.names)} parameters")
     exact = ours(problem, 1e-11)
     report.say(f"exact J to {error(checked(problem), exact):.0e} of each column")
     report.say()

@@ -53,18 +53,7 @@ COMMANDS = {  # {a|b} is a in variant A and b in B
     "fit": ("fit", "given-{a|b}", "--free", "A", "--out", "fit.json", "--plot", "fit.svg"),
     "report": ("report", "results", "--title", "{one|two}", "--out", "page.html"),
     "diagnose": ("diagnose", "given-{a|b}", "--effect", "inertia", "--out", "found"),
-    "prove --resume": (
-        "prove",
-        "--cases",
-        "1",
-        "--seed",
-        "{1|2}",
-        "--limit",
-        "0.03",
-        "--out",
-        "trial-{a|b}",
-        "--resume",
-    ),
+    "prove --resume": ("prove", "--cases", "1", "--seed", "{1|2}", "--limit", "0.03", "--out", "trial-{a|b}", "--resume"),
 }
 FOLDERS = ("made", "found")  # whole at every moment
 PROGRESS = ("parts-a", "parts-b", "trial-a", "trial-b")  # which grow, and from which the command goes on
@@ -170,9 +159,7 @@ def state(folder: Path) -> dict[str, bytes]:
 
 def torn(found: dict[str, bytes], variants: list[dict[str, bytes]]) -> list[str]:
     """The files, and the folders that are written as one, that are those of neither variant."""
-    wrong = [
-        n for n, data in found.items() if n.split("/")[0] not in FOLDERS and data not in (v.get(n) for v in variants)
-    ]
+    wrong = [n for n, data in found.items() if n.split("/")[0] not in FOLDERS and data not in (v.get(n) for v in variants)]
     for folder in FOLDERS:
         whole = [{n: d for n, d in some.items() if n.startswith(f"{folder}/")} for some in (found, *variants, {})]
         wrong += [folder] * (whole[0] not in whole[1:])
@@ -255,10 +242,7 @@ def main() -> None:
                 count["other bytes"] += bool(differ)
                 count["left behind"] += bool(hidden)
                 if wrong or again not in ENDED or differ or hidden:
-                    print(
-                        f"{name} {number.name}: torn {wrong}, then {again}, differ {differ}, hidden {hidden}",
-                        flush=True,
-                    )
+                    print(f"{name} {number.name}: torn {wrong}, then {again}, differ {differ}, hidden {hidden}", flush=True)
             print(f"{name}: {dict(counts[name])}, {usual:.1f} s a run", file=sys.stderr, flush=True)
     columns = ("kills", "SIG in time", "130 in time", "too late", "partial", "torn", "did not go on", "other bytes")
     columns += ("left behind",)

@@ -43,9 +43,7 @@ RTOLS = (1e-3, 1e-4, 1e-5, 1e-6)
 
 def grid_of(model: GeneratedModel, columns: int, rows: int) -> MapGrid:
     """Return the window with so many points."""
-    return MapGrid(
-        model.vector({"eps": EPS}), MapAxis("V", 1.0, 100.0, columns), MapAxis("W0", 0.005, 0.03, rows, False, "K")
-    )
+    return MapGrid(model.vector({"eps": EPS}), MapAxis("V", 1.0, 100.0, columns), MapAxis("W0", 0.005, 0.03, rows, False, "K"))
 
 
 def timed_map(model: GeneratedModel, columns: int, rows: int, **settings: int) -> tuple[StabilityMap, float]:
@@ -136,25 +134,12 @@ def two_workers(report: Report) -> None:
     report.say(
         f"{len(seconds)} tiles of 24,000 points: {sum(seconds):.2f} s of CPU; two workers get {loads[0]:.2f} and {loads[1]:.2f} s"
     )
-    command = [
-        sys.executable,
-        "-m",
-        "srfcli",
-        "map",
-        "--eps",
-        str(EPS),
-        "--over",
-        "V=1:100:120",
-        "--over",
-        "K/W0=0.005:0.03:200",
-    ]
+    command = [sys.executable, "-m", "srfcli", "map", "--eps", str(EPS), "--over", "V=1:100:120", "--over", "K/W0=0.005:0.03:200"]
     for count in (1, 2):
         spent, wall = [], []
         for _ in range(3):
             before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-            subprocess.run(
-                [*command, "--csv", "--workers", str(count)], check=True, capture_output=True, cwd=common.ROOT
-            )
+            subprocess.run([*command, "--csv", "--workers", str(count)], check=True, capture_output=True, cwd=common.ROOT)
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
             wall.append(time.monotonic() - begun)
             spent.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)

@@ -172,9 +172,7 @@ def own_mesh(model: GeneratedModel, p: Matrix, reference: Matrix, goal: float) -
     raise SystemExit(f"no mesh of up to 256 intervals meets {goal:g}")
 
 
-def loosest(
-    s: Slider, start: Matrix, method: str, reference: Matrix, allowed: float, goal: float
-) -> tuple[float, float]:
+def loosest(s: Slider, start: Matrix, method: str, reference: Matrix, allowed: float, goal: float) -> tuple[float, float]:
     """Return the loosest rtol of the ladder whose error, from the converged orbit on, is at most `allowed`."""
     for rtol in LADDER[1.001e4 * goal >= LADDER]:
         try:
@@ -198,10 +196,7 @@ def compare(model: GeneratedModel, V: float, W0: float, crossing: int, goal: flo
     }
     errors, notes = {"ours": error}, {"ours": f"N = {intervals}"}
     floquet = solve_floquet(model, p[:, 0], tol=goal)
-    errors["floquet"], notes["floquet"] = (
-        difference(floquet.multipliers, reference),
-        f"N = {len(floquet.orbit.edges) - 1}",
-    )
+    errors["floquet"], notes["floquet"] = (difference(floquet.multipliers, reference), f"N = {len(floquet.orbit.edges) - 1}")
     for method in METHODS:
         rtol, _ = loosest(s, state, method, reference, 3 * error, goal)
         while True:  # from the distant start the error may differ from that beside the orbit
@@ -217,14 +212,7 @@ def compare(model: GeneratedModel, V: float, W0: float, crossing: int, goal: flo
         seconds[name] /= 20
     place = f"V = {V:g}, W0 = {W0:.3f} (below crossing {crossing})"
     return [
-        [
-            place,
-            name,
-            f"{1e3 * seconds[name]:.2f}",
-            f"{errors[name]:.1e}",
-            f"{seconds[name] / seconds['ours']:.0f}",
-            notes[name],
-        ]
+        [place, name, f"{1e3 * seconds[name]:.2f}", f"{errors[name]:.1e}", f"{seconds[name] / seconds['ours']:.0f}", notes[name]]
         for name in tasks
     ]
 

@@ -165,10 +165,7 @@ def main() -> None:
         rows = []
         for t in targets:
             names = tuple(f"x{i}" for i in range(t.best.size))
-            ours = [
-                draw(t.log_posterior, names, t.best, t.covariance, (t.lower, t.upper), count, seed=s)
-                for s in range(SEEDS)
-            ]
+            ours = [draw(t.log_posterior, names, t.best, t.covariance, (t.lower, t.upper), count, seed=s) for s in range(SEEDS)]
             rows.append(row(t, "srf", ours))
             for name, moves in (
                 ("stretch", [(emcee.moves.StretchMove(), 1.0)]),

@@ -163,14 +163,7 @@ class Methods:
             p = self.model.vector({"V": record.drive.piece(0.0)[0], "W0": record.W0})
             atol = rtol * np.ones(4)
             return integrate(
-                self.model,
-                p,
-                drive=record.drive,
-                load=record.load,
-                t=record.t,
-                start=record.start(),
-                rtol=rtol,
-                atol=atol,
+                self.model, p, drive=record.drive, load=record.load, t=record.t, start=record.start(), rtol=rtol, atol=atol
             ).x
         x = np.full((record.t.size, 4), np.nan)
         x[0] = state = record.start()
@@ -257,14 +250,10 @@ def main() -> None:
         found = measure(report, methods, record)
         for error in ERRORS:
             ours = at_error(*found["ours"], error)
-            others = [
-                f"{at_error(*found[name], error) / ours:.2f}" if name in found else "-" for name in list(TOLERANCES)[1:]
-            ]
+            others = [f"{at_error(*found[name], error) / ours:.2f}" if name in found else "-" for name in list(TOLERANCES)[1:]]
             ratios.append([record.name, f"{error:.0e}", f"{1e3 * ours:.1f}", *others])
     report.say()
-    report.say(
-        "At equal error: milliseconds of ours, and how many times as long the others take (nan: an error not measured)"
-    )
+    report.say("At equal error: milliseconds of ours, and how many times as long the others take (nan: an error not measured)")
     report.table(["record", "error (um)", "ours (ms)", *list(TOLERANCES)[1:]], ratios)
 
 

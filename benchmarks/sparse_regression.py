@@ -136,9 +136,7 @@ def answer_case(registry: Registry, folder: Path, kept: Path | None) -> Answer:
             break
     verdict = "unknown" if lost else "identified" if chosen.effects else "none"
     said = verdict if verdict != "identified" else "+".join(chosen.effects)
-    stated = (
-        min((chosen.inclusion.get(e, 0.0) for e in chosen.effects), default=1.0) if verdict == "identified" else 1.0
-    )
+    stated = min((chosen.inclusion.get(e, 0.0) for e in chosen.effects), default=1.0) if verdict == "identified" else 1.0
     note = f"remainder {np.sqrt(chosen.blocks.mean()):.3f}, of noise {np.sqrt(usual.mean()):.3f}; " + (
         f"{'with' if track else 'without'} a track; set {'+'.join(chosen.effects) or 'empty'}; baseline {fitting:.1f} s"
     )
@@ -184,12 +182,8 @@ def main() -> None:
     parser.add_argument("bank", type=Path)
     parser.add_argument("truths", type=Path)
     parser.add_argument("--known", type=Path, help="known.jsonl of the trial: what was visible")
-    parser.add_argument(
-        "--beside", type=Path, help="answers.jsonl of the trial: the diagnosis's answers, marked beside"
-    )
-    parser.add_argument(
-        "--kept", type=Path, help="folder of the baseline's fits and the answers: a later run goes on there"
-    )
+    parser.add_argument("--beside", type=Path, help="answers.jsonl of the trial: the diagnosis's answers, marked beside")
+    parser.add_argument("--kept", type=Path, help="folder of the baseline's fits and the answers: a later run goes on there")
     parser.add_argument("--note", help="what to say of the bank at the head of the results")
     given = parser.parse_args()
     warnings.simplefilter("ignore")  # PySINDy warns of every empty set

@@ -13,11 +13,7 @@ from sparse_signals import Array, Baseline, Signals, Sizes, columns
 
 from srfcli.codegen.splines import Spline
 
-RIDGE, MODELS, KEPT = (
-    0.05,
-    12,
-    0.6,
-)  # of STLSQ (PySINDy's own); bagged fits, and the share of them that a column survives
+RIDGE, MODELS, KEPT = (0.05, 12, 0.6)  # of STLSQ (PySINDy's own); bagged fits, and the share of them that a column survives
 THRESHOLDS = np.geomspace(0.03, 3.0, 15)  # of a column's rms contribution, in standard errors of a sample
 FORWARD = 5  # columns that FROLS adds at most
 SES = 2.0  # standard errors within which a smaller set does as well

@@ -113,11 +113,7 @@ def smoothed(y: Array, windows: list[Window], *, noise: float) -> tuple[Array, A
     A window agrees while its mean square is the noise's, and its first derivative lies in the intersection of the confidence
     intervals of those before (Goldenshluger and Nemirovski 1997).
     """
-    best, cov, bad = (
-        np.zeros((DERIVATIVES, y.size)),
-        np.zeros((y.size, DERIVATIVES, DERIVATIVES)),
-        np.ones(y.size, bool),
-    )
+    best, cov, bad = (np.zeros((DERIVATIVES, y.size)), np.zeros((y.size, DERIVATIVES, DERIVATIVES)), np.ones(y.size, bool))
     low, high, going = np.full(y.size, -np.inf), np.full(y.size, np.inf), np.ones(y.size, bool)
     for w in windows:
         if 2 * w.half + 1 > y.size:
@@ -270,9 +266,7 @@ def inverse(s: Signals, base: Baseline, p: Sizes) -> Inverse:
     none = np.zeros_like(W)
     into_v = np.array([none, 1 + yields * K, none, yields * M, none])  # of -v; u' < 0 is faster
     into = steep * into_v + np.array([K / weight, none, M / weight, none, none])
-    error, error_v = (
-        np.sqrt(np.maximum(np.einsum("dn,nde,en->n", c, s.covariance, c), 1e-300)) for c in (into, into_v)
-    )
+    error, error_v = (np.sqrt(np.maximum(np.einsum("dn,nde,en->n", c, s.covariance, c), 1e-300)) for c in (into, into_v))
     sure = (v > SLOWEST) & (error_v < SURE * fast)
     lost = ~s.usable if s.modulated else ~s.usable | ~sure  # pulses of v under a modulation are a few samples long
     usable = sure & (np.convolve(lost, np.ones(2 * ASIDE + 1), "same") == 0)  # the neighbours are doubtful
@@ -300,9 +294,7 @@ def felt(s: Signals, p: Sizes) -> tuple[Array, Array]:
             rho * s.W_rate + a * s.second[2] + b * s.second[3])  # fmt: skip
 
 
-def friction(
-    s: Signals, base: Baseline, p: Sizes, *, fast: Array, v: Array, slip: Array, W: Array, W_rate: Array
-) -> Array:
+def friction(s: Signals, base: Baseline, p: Sizes, *, fast: Array, v: Array, slip: Array, W: Array, W_rate: Array) -> Array:
     """Return the friction coefficient that law and effects give for a sliding that is known."""
     get, D0 = p.get, p["D0"]
     phi = age(s.t, slip, D0, v0=float(s.V[0]), shrink=get("linker-dieterich", 0.0) / p["B"] * W_rate / W,
@@ -349,9 +341,7 @@ def _carried(first: float, decay: Array, grow: Array) -> Array:
     return np.concatenate(parts)
 
 
-def columns(
-    s: Signals, base: Baseline, p: Sizes, names: Sequence[str], *, residual: bool = True
-) -> tuple[Inverse, Array]:
+def columns(s: Signals, base: Baseline, p: Sizes, names: Sequence[str], *, residual: bool = True) -> tuple[Inverse, Array]:
     """Return what is left in a run, and (n, k) how much of it each parameter or size would explain, -dr/d(size).
 
     Columns, errors and what is usable come from the motion that is near: with v's noise in both, columns would explain noise.
@@ -386,9 +376,4 @@ def added(s: Signals, p: Sizes, name: str, *, slip: Array) -> Array | None:
 
 
 ADDED = ("second-state", "friction-drift", "friction-drift-slip", "track-topography.cos", "track-topography.sin")
-STEPS = {
-    "inertia": 1e-8,
-    "viscous-drag": 1e-6,
-    "age-saturation": 1e-5,
-    "slip-evolution": 1e-3,
-}  # of a difference; others 1e-4
+STEPS = {"inertia": 1e-8, "viscous-drag": 1e-6, "age-saturation": 1e-5, "slip-evolution": 1e-3}  # of a difference; others 1e-4

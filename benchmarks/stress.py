@@ -63,16 +63,10 @@ def drawn(parameter: Parameter, chance: random.Random, decades: float) -> float:
         return chance.uniform(max(parameter.lower, -10 * size), min(parameter.upper, 10 * size))
     low = max(parameter.lower, size * 10**-decades)
     high = min(parameter.upper, size * 10**decades)
-    return (
-        0.0
-        if parameter.lower == 0 and chance.random() < 0.05
-        else math.exp(chance.uniform(math.log(low), math.log(high)))
-    )
+    return 0.0 if parameter.lower == 0 and chance.random() < 0.05 else math.exp(chance.uniform(math.log(low), math.log(high)))
 
 
-def draw(
-    parameters: tuple[Parameter, ...], chance: random.Random, decades: float
-) -> tuple[list[str], dict[str, float]]:
+def draw(parameters: tuple[Parameter, ...], chance: random.Random, decades: float) -> tuple[list[str], dict[str, float]]:
     """Options that set every parameter but those of the point, and a point V, W0, eps, f."""
     own = [p for p in parameters if p.name not in ("V", "W0", "eps", "f")]
     options = [word for p in own for word in ("--set", f"{p.name}={drawn(p, chance, decades)!r}")]
@@ -147,9 +141,7 @@ def verdict(arguments: list[str]) -> tuple[str, str]:
         return ("failed" if "at these values" in done.stderr else "not converged"), f"{said[:1]} names no parameter"
     found = json.loads(done.stdout)
     for row in found["rows"]:
-        missing = [
-            n for n in NEEDED.get(arguments[0], ()) if row.get("status", found["status"]) == "ok" and row[n] is None
-        ]
+        missing = [n for n in NEEDED.get(arguments[0], ()) if row.get("status", found["status"]) == "ok" and row[n] is None]
         if missing:
             return "failed", f"no number for {missing} in a row that is ok: {row}"
     if nothing := [note for note in found["notes"] if re.search(r"\b(nan|inf)\b", note)]:
@@ -180,9 +172,7 @@ def compared(points: int, chance: random.Random, seconds: float) -> collections.
         by_hand = stable_by_hand(s)
         given = {"V": s.V, "W0": s.W0, "eps": s.eps, "f": s.f, "K": s.K}
         options = [w for n, v in given.items() for w in (f"--{n}", repr(v))]
-        options += [
-            w for n, v in (("A", s.A), ("B", s.B), ("D0", s.D0), ("lambda", s.lam)) for w in ("--set", f"{n}={v!r}")
-        ]
+        options += [w for n, v in (("A", s.A), ("B", s.B), ("D0", s.D0), ("lambda", s.lam)) for w in ("--set", f"{n}={v!r}")]
         done = CliRunner().invoke(cli, ["floquet", *options, "--json"], prog_name="srf")
         if by_hand is None or done.exit_code != 0:
             counts["by hand not found" if by_hand is None else "not converged"] += 1
@@ -284,9 +274,7 @@ def main() -> None:
                 said, why = verdict([*arguments, *named, *options])
                 counts[command][said] += 1
                 if said == "not converged":
-                    reasons[
-                        command, why_not(open_model(registry, **names), values | point) if command == "floquet" else why
-                    ] += 1
+                    reasons[command, why_not(open_model(registry, **names), values | point) if command == "floquet" else why] += 1
                 if said == "failed":
                     print(f"FAILED draw {number}: srf {' '.join([*arguments, *named, *options])}: {why}", flush=True)
     print("| command | draws | ok | not converged | refused | failed |\n|---|---|---|---|---|---|")

@@ -99,9 +99,7 @@ def derivatives(report: Report, model: GeneratedModel, table: Thresholds) -> Non
         difference = (exact.match(step).loads - exact.match(-step).loads) / 2e-4
         worst.append(float((np.abs(rates[:, j] - difference) / table.W0c).max()))
     report.say()
-    report.say(
-        "exact d ln W0c / d ln p against central differences of polished loads, largest over the table, trial set"
-    )
+    report.say("exact d ln W0c / d ln p against central differences of polished loads, largest over the table, trial set")
     report.table(list(NAMES), [[f"{w:.1e}" for w in worst]])
     warm = Matcher(model, table, values=values, scale=scale_from(model, TRIAL, table))
     warm.match(np.zeros(len(NAMES)))
@@ -144,9 +142,7 @@ def coverage(report: Report, model: GeneratedModel, table: Thresholds, draws: in
     inside = np.abs(found - truth) < 1.96 * error
     spread = np.log(found).std(axis=0, ddof=1) / np.sqrt(((error / found) ** 2).mean(axis=0))
     report.say()
-    report.say(
-        f"coverage over {draws} draws of 3 % noise (seeds {SEED} to {SEED + draws - 1}), least squares from the trial set"
-    )
+    report.say(f"coverage over {draws} draws of 3 % noise (seeds {SEED} to {SEED + draws - 1}), least squares from the trial set")
     rows = [
         ["within 1.96 errors", *(f"{c:.0%}" for c in inside.mean(axis=0)), f"{inside.mean():.1%}"],
         ["spread / error, in ln p", *(f"{s:.2f}" for s in spread), ""],

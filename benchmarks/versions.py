@@ -55,11 +55,7 @@ def failures(python: str) -> list[str]:
         (work := Path(place) / "work").mkdir()
         for words in COMMANDS:
             done = subprocess.run(
-                [python, "-m", "srfcli.cli.main", *words],
-                cwd=work,
-                env={**os.environ, **inside},
-                capture_output=True,
-                text=True,
+                [python, "-m", "srfcli.cli.main", *words], cwd=work, env={**os.environ, **inside}, capture_output=True, text=True
             )
             warned = any("srfcli" in line and "Warning:" in line for line in done.stderr.splitlines())
             if done.returncode != 0 or "Traceback" in done.stderr or warned:

@@ -17,9 +17,7 @@ from srfcli.validation.cases import NAMES, OUTSIDE_NAMES, make_case
 def main() -> None:
     """Write the experiment and its truth."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "effects", nargs="*", help=f"what to conceal, nothing for nothing: {', '.join((*NAMES, *OUTSIDE_NAMES))}"
-    )
+    parser.add_argument("effects", nargs="*", help=f"what to conceal, nothing for nothing: {', '.join((*NAMES, *OUTSIDE_NAMES))}")
     parser.add_argument("--out", type=Path, required=True, help="the new folder")
     parser.add_argument("--seed", type=int, default=1, help="of laws, protocol, noise and track")
     parser.add_argument("--size", type=float, default=0.6, help="from 0, hardly there, to 1, strong")

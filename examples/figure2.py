@@ -67,9 +67,7 @@ def print_critical_velocities(model: GeneratedModel) -> None:
     still = root_in_V(lambda V: hopf_load(model, V) - W0, 1.0, 30.0)
     shaken = root_in_V(lambda V: lowest_load(model, V, 0.09) - W0, 0.05, 5.0)
     progress()
-    print(
-        f"at K/W0 = {STIFFNESS_PER_LOAD:g} /um (W0 = {W0:.6f} N): sliding is stable from V = {still:.6f} um/s on at eps = 0,"
-    )
+    print(f"at K/W0 = {STIFFNESS_PER_LOAD:g} /um (W0 = {W0:.6f} N): sliding is stable from V = {still:.6f} um/s on at eps = 0,")
     print(f"  from V = {shaken:.6f} um/s on at eps = 0.09: {still / shaken:.4f} times lower")
 
 

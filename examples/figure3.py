@@ -77,9 +77,7 @@ def main() -> None:
     model = paper_model()
     print(f"V = {V:g} um/s, W0 = {W0:g} N")
     for eps in AMPLITUDES:
-        critical = (
-            critical_line(model, model.vector({"V": V, "eps": eps}), lo=4.0, hi=40.0).points[0].value(model, "W0")
-        )
+        critical = critical_line(model, model.vector({"V": V, "eps": eps}), lo=4.0, hi=40.0).points[0].value(model, "W0")
         measured, theory = growth_rates(model, eps)
         progress()
         print(
@@ -93,9 +91,7 @@ def main() -> None:
         progress(f"trace at eps = {eps:g}")
         trace = record(model, eps, start)
         progress()
-        print(
-            f"eps = {eps:5.3f}: elongation swings by {swing(trace):.4f} um, {AFTER:g} s after switch-on ({trace.status.value})"
-        )
+        print(f"eps = {eps:5.3f}: elongation swings by {swing(trace):.4f} um, {AFTER:g} s after switch-on ({trace.status.value})")
         traces.append(trace)
     draw(traces, args.out)
 
@@ -107,9 +103,7 @@ def draw(traces: list[Trace], out: Path) -> None:
         base = float(np.mean(traces[0].u))
         for i, (eps, trace) in enumerate(zip(AMPLITUDES, traces, strict=True)):
             ax.plot(trace.t, trace.u - base + OFFSET * i, color=COLOURS[i], linewidth=0.9)
-            ax.annotate(
-                f"ε = {eps:g}", (AFTER + 0.3, trace.u[-1000:].mean() - base + OFFSET * i), color=COLOURS[i], va="center"
-            )
+            ax.annotate(f"ε = {eps:g}", (AFTER + 0.3, trace.u[-1000:].mean() - base + OFFSET * i), color=COLOURS[i], va="center")
         ax.axvline(0.0, color="#555555", linewidth=0.8, linestyle=(0, (4, 2)))
         ax.set_xlim(-BEFORE, AFTER + 3.6)
         ax.set_ylim(-1.8, OFFSET * 3 + 4.6)

@@ -43,9 +43,7 @@ def main() -> None:
             progress()
             print(f"V = {V:g} um/s: W0c(0) = {hopf.W0:.6f} N, {len(atlas.branches)} component(s), {atlas.status.value}")
             for eps in PRINTED:
-                line = critical_line(
-                    model, model.vector({"V": V, "eps": eps}), lo=REDUCED[0] * hopf.W0, hi=REDUCED[1] * hopf.W0
-                )
+                line = critical_line(model, model.vector({"V": V, "eps": eps}), lo=REDUCED[0] * hopf.W0, hi=REDUCED[1] * hopf.W0)
                 loads = ", ".join(f"{q.value(model, 'W0') / hopf.W0:.6f}" for q in line.points)
                 print(f"  eps = {eps:g}: W0c/W0c(0) = {loads}")
             style = {"color": COLOURS[index], "linestyle": DASHES[index]}

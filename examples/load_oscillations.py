@@ -68,6 +68,7 @@ V0 = {{ value = {V0}, fixed = true }}
 """
 CUTOFF = "Vsat = {{ value = {0:g}, lower = {1:g}, upper = {2:g} }}\n"
 
+
 @dataclass(frozen=True)
 class Model:
     """One that is fitted: its ageing law, effects, the line of its own parameter, and that parameter's name."""
@@ -200,7 +201,7 @@ def description(options: argparse.Namespace, model: Model, mu: float) -> str:
 def _column(text: str) -> str:
     """Return a column of the description from `name` or `name [unit]`."""
     name, _, unit = text.partition("[")
-    own = f', unit = {json.dumps(unit.rstrip("]").strip())}' if unit else ""
+    own = f", unit = {json.dumps(unit.rstrip(']').strip())}" if unit else ""
     return f"{{ name = {json.dumps(name.strip())}{own} }}"
 
 
@@ -214,9 +215,7 @@ def experiment_of(options: argparse.Namespace, model: Model, mu: float = 0.6) ->
 # ---- the models against each other
 
 
-def compare(
-    options: argparse.Namespace, told: list[str] | None = None, *, models: Sequence[Model] = MODELS
-) -> list[Fitted]:
+def compare(options: argparse.Namespace, told: list[str] | None = None, *, models: Sequence[Model] = MODELS) -> list[Fitted]:
     """Return the fits of the models, best evidence first; what the recordings are is appended to `told`."""
     plain = experiment_of(options, MODELS[0])
     lines = check(plain)

@@ -97,9 +97,7 @@ def by_prominence(force: Array) -> tuple[int, int]:
     return counts[0], counts[0] - counts[1]
 
 
-def row(
-    data: Path, stiffness: int, V: int, duration: float, other: tuple[int, float | None, float | None] | None
-) -> list[str]:
+def row(data: Path, stiffness: int, V: int, duration: float, other: tuple[int, float | None, float | None] | None) -> list[str]:
     """Return one line of the table; `slipped` is the drop over what the drive moves in a mean period."""
     found, force = events(recorded(data, stiffness, V, duration))
     _, repeated = by_prominence(force[::SPARSE])
@@ -120,8 +118,7 @@ def main() -> None:
     print("  ".join(HEAD))
     for case in CASES:
         print(
-            "  ".join(cell.rjust(len(head)) for cell, head in zip(row(Path(sys.argv[1]), *case), HEAD, strict=True)),
-            flush=True,
+            "  ".join(cell.rjust(len(head)) for cell, head in zip(row(Path(sys.argv[1]), *case), HEAD, strict=True)), flush=True
         )
 
 

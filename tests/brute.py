@@ -143,9 +143,7 @@ def hopf_load(s: Slider) -> tuple[float, float]:
         at = replace(s, W0=W0, eps=0.0)
         x = steady(at)
         values = np.linalg.eigvals(jacobian(at, 0.0, x[2], x[3]))
-        return max(
-            (complex(v) for v in values if abs(v.imag) > 0), key=lambda v: v.real, default=complex(values.real.max())
-        )
+        return max((complex(v) for v in values if abs(v.imag) > 0), key=lambda v: v.real, default=complex(values.real.max()))
 
     W0 = float(brentq(lambda w: pair(w).real, 4.0, 40.0, xtol=1e-14, rtol=1e-14))
     return W0, abs(pair(W0).imag)

@@ -54,9 +54,7 @@ def data(rows: int = 120, *, heading: str = HEADING) -> list[str]:
     return [heading, *(",".join(f"{x:.6g}" for x in row) for row in zip(t, V, W, u, strict=True))]
 
 
-def write(
-    folder: Path, *, toml: str = TOML, one: list[str] | bytes | None = None, two: list[str] | None = None
-) -> Path:
+def write(folder: Path, *, toml: str = TOML, one: list[str] | bytes | None = None, two: list[str] | None = None) -> Path:
     """Write the experiment into `folder` and return it; lines or bytes given replace a data file."""
     (folder / "experiment.toml").write_text(toml, encoding="utf-8")
     for name, lines in (("one.csv", one), ("two.csv", two)):

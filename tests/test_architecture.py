@@ -26,10 +26,7 @@ ORDER = (
     "results", "tasks", "validation", "cli",
 )  # fmt: skip
 # folders that keep to fewer than stand before them
-NOTHING_BUT = {
-    "numerics": {"core", "codegen", "motion"},
-    "motion": {"core", "codegen"},
-}
+NOTHING_BUT = {"numerics": {"core", "codegen", "motion"}, "motion": {"core", "codegen"}}
 HEAVY = {"sympy", "scipy", "numpy", "matplotlib", "pint", "numba"}
 # libraries that a folder or a file leaves to others, also inside functions
 WITHOUT = {
@@ -215,9 +212,7 @@ def test_every_command_is_documented(name: str, command: click.Command) -> None:
     for option in command.params:
         assert not isinstance(option, click.Option) or option.help, f"{name} {option.name}"
     assert f"`{name}`" in (ROOT / "README.md").read_text(encoding="utf-8")
-    section = (
-        (ROOT / "docs" / "cli.md").read_text(encoding="utf-8").partition(f"\n## `{name}`\n")[2].partition("\n## ")[0]
-    )
+    section = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8").partition(f"\n## `{name}`\n")[2].partition("\n## ")[0]
     assert f"\n$ {name}" in section or f" {name} " in section, f"docs/cli.md has no section with an example of {name}"
 
 

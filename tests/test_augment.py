@@ -69,10 +69,7 @@ def test_law_files_say_what_the_effects_said(choice: ModelChoice, names: tuple[s
     settings = dict(s for e in effects(*names) for s in e.settings)
     chosen = {"law": choice.law, "ageing": choice.ageing, "interface": choice.interface, "inertia": choice.inertia}
     one, values = rates({**chosen, "effects": names})
-    files = {
-        k: str(tmp_path / f"{f}.toml")
-        for k, f in (("law", "friction"), ("ageing", "ageing"), ("interface", "interface"))
-    }
+    files = {k: str(tmp_path / f"{f}.toml") for k, f in (("law", "friction"), ("ageing", "ageing"), ("interface", "interface"))}
     two, defaults = rates({"inertia": settings.get("inertia", choice.inertia), **files})
     assert set(one) == set(two)
     own = {p.name: p.default for e in effects(*names) for p in e.parameters if p.name != "lambda"}
@@ -80,9 +77,7 @@ def test_law_files_say_what_the_effects_said(choice: ModelChoice, names: tuple[s
     rng = np.random.default_rng(4)
     symbols = sorted({s for e in (*one.values(), *two.values()) for s in e.free_symbols}, key=str)
     at = {s: values.get(str(s), 0.0) or float(rng.uniform(0.3, 3.0)) for s in symbols}
-    at |= {
-        s: float(rng.uniform(0.3, 3.0)) for s in symbols if str(s) in ("v", "phi", "phi2", "u", "z", "W", "W_dot", "V")
-    }
+    at |= {s: float(rng.uniform(0.3, 3.0)) for s in symbols if str(s) in ("v", "phi", "phi2", "u", "z", "W", "W_dot", "V")}
     for name in one:
         a, b = (float(sp.N(e.subs(at))) for e in (one[name], two[name]))
         assert b == pytest.approx(a, rel=1e-10), name
@@ -101,9 +96,7 @@ def test_law_files_say_what_the_effects_said(choice: ModelChoice, names: tuple[s
         (PMMA, ("stiffness-error",), ()),
     ],
 )  # fmt: skip
-def test_what_laws_cannot_say_stays_beside_them(
-    choice: ModelChoice, names: tuple[str, ...], left: tuple[str, ...]
-) -> None:
+def test_what_laws_cannot_say_stays_beside_them(choice: ModelChoice, names: tuple[str, ...], left: tuple[str, ...]) -> None:
     assert tuple(e.name for e in fold(REGISTRY, choice, effects(*names)).left) == left
 
 
@@ -128,9 +121,7 @@ def fitted(experiment: Experiment, **values: tuple[float, float, float, str]) ->
     listed = tuple(FitParameter(n, *v[:3], False, v[3]) for n, v in values.items())
     kept = tuple(q for q in experiment.parameters if q.name not in values)
     return SimpleNamespace(
-        likelihood=SimpleNamespace(
-            problem=SimpleNamespace(experiment=replace(experiment, parameters=(*kept, *listed)))
-        ),
+        likelihood=SimpleNamespace(problem=SimpleNamespace(experiment=replace(experiment, parameters=(*kept, *listed)))),
         values={n: v[0] for n, v in values.items()},
     )
 
@@ -178,10 +169,7 @@ def test_effects_beside_the_laws_keep_names_that_read_back(experiment: Experimen
     )  # fmt: skip
     again, found = written(experiment, names, fit, tmp_path / "new")
     assert found.left == again.choice.effects == ("tangential-crosstalk",)
-    assert {q.name: q.value for q in again.parameters if "share" in q.name} == {
-        "slip_evolution_share": 0.2,
-        "share": 0.01,
-    }
+    assert {q.name: q.value for q in again.parameters if "share" in q.name} == {"slip_evolution_share": 0.2, "share": 0.01}
 
 
 def test_an_effect_of_ones_own_goes_along(experiment: Experiment, tmp_path: Path) -> None:
@@ -195,11 +183,7 @@ def test_an_effect_of_ones_own_goes_along(experiment: Experiment, tmp_path: Path
     effect = registry.get("effect", "dust")
     assert isinstance(effect, Effect)
     found = augment(
-        registry,
-        experiment,
-        Hypothesis((effect,)),
-        fitted(experiment, d=(1e-3, -1.0, 1.0, "1/um")),
-        folder=tmp_path / "new",
+        registry, experiment, Hypothesis((effect,)), fitted(experiment, d=(1e-3, -1.0, 1.0, "1/um")), folder=tmp_path / "new"
     )
     (tmp_path / "new").mkdir()
     for name, text in found.files.items():

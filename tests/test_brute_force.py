@@ -43,9 +43,7 @@ def test_rates_agree_with_the_paper_written_by_hand(model):
     x = steady(s) + np.array((0.3, -2.0, 0.7, -0.4))
     assert steady(s) == pytest.approx(model.steady(p), rel=1e-14)
     assert rates(s, 0.3 / s.f, *x) == pytest.approx(model.cycle(0.3, x, p) * s.f, rel=1e-12)
-    assert jacobian(s, 0.3 / s.f, x[2], x[3]) == pytest.approx(
-        model.cycle_jacobian(0.3, x, p) * s.f, rel=1e-12, abs=1e-12
-    )
+    assert jacobian(s, 0.3 / s.f, x[2], x[3]) == pytest.approx(model.cycle_jacobian(0.3, x, p) * s.f, rel=1e-12, abs=1e-12)
 
 
 @pytest.mark.parametrize(("V", "f", "eps"), [(20.0, 10.0, 0.2), (3.0, 3.0, 0.4)])
@@ -77,9 +75,7 @@ def test_critical_loads_against_brute_force(model, V, eps, count):
         assert (point.slope > 0) == (number % 2 == 1)
         assert point.theta == pytest.approx(abs(np.angle(orbit.multipliers[0])), abs=1e-6)
         assert point.orbit.x[0, 0] == pytest.approx(orbit.start, rel=1e-5, abs=1e-5)
-        assert orbit.multipliers.size == 4 and max(np.abs(orbit.multipliers[2:])) == pytest.approx(
-            point.others, abs=1e-6
-        )
+        assert orbit.multipliers.size == 4 and max(np.abs(orbit.multipliers[2:])) == pytest.approx(point.others, abs=1e-6)
 
 
 @pytest.mark.parametrize(("lo", "hi"), [(4.0, 400.0), (14.0, 16.0), (14.3, 15.8)])
@@ -220,9 +216,7 @@ def test_a_state_of_slip_events_returns_by_integration(model, eps):
     )  # fmt: skip
     assert period.success
     assert period.y[:, -1] == pytest.approx(start, rel=1e-4, abs=1e-4)
-    t = np.concatenate(
-        [np.linspace(a, b, 20, endpoint=False) for a, b in itertools.pairwise(period.t)] + [period.t[-1:]]
-    )
+    t = np.concatenate([np.linspace(a, b, 20, endpoint=False) for a, b in itertools.pairwise(period.t)] + [period.t[-1:]])
     u, _, ln_v, ln_phi = period.sol(t)
     mu = s.mu0 + s.A * (ln_v - np.log(s.V0)) + s.B * np.log1p(s.Vsat * np.exp(ln_phi) / s.D0)
     assert found.mean_friction == pytest.approx(np.trapezoid(mu, t) * s.f, rel=1e-5)

@@ -156,9 +156,7 @@ def kept_nowhere(folder: Path, caplog: pytest.LogCaptureFixture, said: str) -> N
 @POSIX
 @pytest.mark.usefixtures("fresh")
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o707, 0o1777])
-def test_a_folder_that_others_may_write_to_is_refused(
-    folder: Path, caplog: pytest.LogCaptureFixture, mode: int
-) -> None:
+def test_a_folder_that_others_may_write_to_is_refused(folder: Path, caplog: pytest.LogCaptureFixture, mode: int) -> None:
     cached_source("k", lambda: "evil = 1\n")
     folder.chmod(mode)
     kept_nowhere(folder, caplog, f"others may write to {folder}")
@@ -235,19 +233,12 @@ def test_a_forged_entry_never_runs(folder: Path, tmp_path: Path) -> None:
 def test_a_forged_library_is_never_loaded(folder: Path, tmp_path: Path, make_model, monkeypatch) -> None:
     command = compiler()
     assert command is not None
-    for name, code in (
-        ("good", "int srf_integrate(void) { return 7; }"),
-        ("evil", "int srf_integrate(void) { return 13; }"),
-    ):
+    for name, code in (("good", "int srf_integrate(void) { return 7; }"), ("evil", "int srf_integrate(void) { return 13; }")):
         (tmp_path / f"{name}.c").write_text(code)
-        subprocess.run(
-            [*command, "-shared", "-fPIC", "-o", tmp_path / f"{name}.so", tmp_path / f"{name}.c"], check=True
-        )
+        subprocess.run([*command, "-shared", "-fPIC", "-o", tmp_path / f"{name}.so", tmp_path / f"{name}.c"], check=True)
     evil = (tmp_path / "evil.so").read_bytes()
     quick = tmp_path / "cc.py"  # compiles everything to good.so
-    quick.write_text(
-        f"import shutil, sys\nshutil.copy({str(tmp_path / 'good.so')!r}, sys.argv[sys.argv.index('-o') + 1])\n"
-    )
+    quick.write_text(f"import shutil, sys\nshutil.copy({str(tmp_path / 'good.so')!r}, sys.argv[sys.argv.index('-o') + 1])\n")
     monkeypatch.setenv("SRF_CC", f"{sys.executable} {quick}")
     model = make_model()
 

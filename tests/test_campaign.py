@@ -35,9 +35,7 @@ def experiment(name: str, *, seed: int, drift: float = 0.0) -> Path:
             rows.append(f"{i * dt:.4g},{V},{LOAD * (mu + drift * x + rng.normal(0, 1e-4)):.8g},{LOAD}")
         mu, phi, x = mu + dt * K * (V - v), phi + dt * (1 - v * phi / TRUE["D0"]), x + dt * v
     Path(name).mkdir()
-    (Path(name) / "a.csv").write_text(
-        "\n".join(["time [s],load_point_velocity,shear_stress,normal_stress", *rows]) + "\n"
-    )
+    (Path(name) / "a.csv").write_text("\n".join(["time [s],load_point_velocity,shear_stress,normal_stress", *rows]) + "\n")
     srf("new", f"{name}/a.csv", "--stiffness", f"{K * LOAD} MPa/um", "--out", f"{name}/experiment.toml")
     return Path(name)
 
@@ -57,18 +55,12 @@ def test_a_row_for_each_experiment_and_a_reason_for_those_without_a_fit() -> Non
     rows = rows_of(Path("out.csv"))
     assert list(rows) == ["one", "broken", "drifts"]
     assert rows["broken"]["status"] == "failed" and "broken/experiment.toml" in rows["broken"]["reason"]
-    one = {
-        key: float(value)
-        for key, value in rows["one"].items()
-        if key not in ("experiment", "flags", "reason") and _is(value)
-    }
+    one = {key: float(value) for key, value in rows["one"].items() if key not in ("experiment", "flags", "reason") and _is(value)}
     for name, true in TRUE.items():
         assert abs(one[name] - true) < 4 * one[f"{name}_stderr"] < 0.4 * true
     # the error of A - B is that of two numbers that go together
     variance = one["A_stderr"] ** 2 + one["B_stderr"] ** 2 - 2 * one["cov_A_B"]
-    assert one["A_minus_B"] == pytest.approx(one["A"] - one["B"]) and one["A_minus_B_stderr"] == pytest.approx(
-        variance**0.5
-    )
+    assert one["A_minus_B"] == pytest.approx(one["A"] - one["B"]) and one["A_minus_B_stderr"] == pytest.approx(variance**0.5)
     assert one["A_minus_B_stderr"] < one["A_stderr"]
     assert (one["k"], rows["one"]["k_unit"], rows["one"]["k_stderr"]) == (pytest.approx(K * LOAD), "MPa/um", "")
     assert one["load"] == pytest.approx(LOAD) and one["rms_over_noise"] == pytest.approx(1.0, abs=0.15)

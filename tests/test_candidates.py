@@ -97,10 +97,7 @@ def test_what_one_effect_brings_another_may_need(rigid, tmp_path):
 def test_a_held_out_run_has_a_trend_of_its_own(tmp_path):
     """Where drifts are fitted, that of a held-out run is: it says nothing against a model."""
     rng, drift = np.random.default_rng(3), 0.08  # um/s: four times the noise each second
-    plans = (
-        Plan("up", ((0.6, 10), (0.6, 40)), 3.0, 0.002),
-        Plan("down", ((0.6, 40), (0.8, 15)), 3.0, 0.002, holdout=True),
-    )
+    plans = (Plan("up", ((0.6, 10), (0.6, 40)), 3.0, 0.002), Plan("down", ((0.6, 40), (0.8, 15)), 3.0, 0.002, holdout=True))
     readings = {p: read_gauge(move(Physics(), p).u + drift * p.times(), Gauge(), rng) for p in plans}
     whole = experiment_of(tmp_path, *plans, readings=readings)
     search = ModelSearch(SHIPPED, replace(whole, runs=tuple(r for r in whole.runs if not r.holdout)), trend="time")

@@ -127,15 +127,7 @@ def test_the_axes_of_what_is_imposed() -> None:
     from srfcli.results.figures import recordings
 
     t = np.arange(200.0)
-    run = {
-        "name": "a",
-        "t": t,
-        "observed": t,
-        "label": "x",
-        "used": t < 150,
-        "W": np.full(200, 5.0),
-        "gaps": [(20, 30)],
-    }
+    run = {"name": "a", "t": t, "observed": t, "label": "x", "used": t < 150, "W": np.full(200, 5.0), "gaps": [(20, 30)]}
     scales = {}
     for name, V in (("log", np.where(t < 9, 0.1, 10)), ("symlog", np.where(t < 9, -900.0, 2)), ("linear", t + 1e3)):
         axes = recordings([{**run, "V": V}]).axes
@@ -163,9 +155,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     text = (folder / "modulated" / "experiment.toml").read_text(encoding="utf-8")
     second = (folder / "stepped" / "experiment.toml").read_text(encoding="utf-8")
     runs = "[[runs]]" + second.partition("[[runs]]")[2]
-    text = text.replace('name = "simulated"', 'name = "modulated"').replace(
-        '"simulated.csv"', '"modulated/simulated.csv"'
-    )
+    text = text.replace('name = "simulated"', 'name = "modulated"').replace('"simulated.csv"', '"modulated/simulated.csv"')
     runs = runs.replace('name = "simulated"', 'name = "stepped"').replace('"simulated.csv"', '"stepped/simulated.csv"')
     (folder / "experiment.toml").write_text(f"{text}\n{runs}", encoding="utf-8")
     return folder
@@ -195,8 +185,7 @@ def test_stiffness_and_trends_are_unknown_too_and_cost_what_they_cost_a_fit(made
     assert found.free[-2:] == ("K", "a trend of each run") and "K" not in known.free
     stated = experiment.runs[0].stiffness
     free = replace(
-        experiment,
-        parameters=(*experiment.parameters, FitParameter("K", stated, stated / 2, 2 * stated, False, "N/um")),
+        experiment, parameters=(*experiment.parameters, FitParameter("K", stated, stated / 2, 2 * stated, False, "N/um"))
     )
     problem = fit_problem(open_model(REGISTRY, **asdict(experiment.choice), random_field=True), free, trend="slip")
     errors = as_fit(fit_state_space(problem, smooth=True)).stderr
@@ -294,9 +283,7 @@ def test_verdicts(error: float, peak: float, verdict: str) -> None:
         ("dieterich-ruina", "dieterich+linker-dieterich", "power", {"alpha", "lambda", "n"}),
     ],
 )
-def test_other_laws_are_asked_what_they_have(
-    law: str, ageing: str, interface: str, asked: set[str], small: Path
-) -> None:
+def test_other_laws_are_asked_what_they_have(law: str, ageing: str, interface: str, asked: set[str], small: Path) -> None:
     toml = TOML.replace("srf-vsat", law).replace('"dieterich"', f'"{ageing}"').replace('"elastic"', f'"{interface}"')
     experiment = read_experiment(write(small, toml=toml), registry=REGISTRY)
     assert set(told(experiment).runs[0].errors) == asked
@@ -314,10 +301,7 @@ def test_a_load_file_is_read_by_a_named_reader(make_file: Callable[[str], Path])
     assert rows[0] == rows[1] and len(rows[0].splitlines()) > 50
     stderr = srf("simulate", "--V", "8", "--load-file", str(path), "--format", "npz", code=2).stderr
     assert "load.dat: not a whole archive" in stderr
-    assert (
-        "unknown reader 'cvs'"
-        in srf("simulate", "--V", "8", "--load-file", str(path), "--format", "cvs", code=2).stderr
-    )
+    assert "unknown reader 'cvs'" in srf("simulate", "--V", "8", "--load-file", str(path), "--format", "cvs", code=2).stderr
     assert "--format names the reader of a file" in srf("simulate", "--V", "8", "--format", "csv", code=2).stderr
 
 

@@ -113,9 +113,7 @@ def test_critical_agrees_with_the_reference(shared: Path) -> None:
         assert float(row["W0"]) == pytest.approx(one["W0c_N"], rel=2e-8)
         assert float(row["theta"]) == pytest.approx(one["theta_rad"], rel=1e-6)
         assert float(row["K_over_W0"]) == pytest.approx(K / float(row["W0"]), rel=1e-14)
-        assert float(row["W0_low"]) <= one["W0c_N"] * (1 + 2e-10) and one["W0c_N"] * (1 - 2e-10) <= float(
-            row["W0_high"]
-        )
+        assert float(row["W0_low"]) <= one["W0c_N"] * (1 + 2e-10) and one["W0c_N"] * (1 - 2e-10) <= float(row["W0_high"])
         assert (row["type"], row["crossing"], row["component"], row["status"]) == ("ns", "1", "", "ok")
 
 

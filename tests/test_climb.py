@@ -96,9 +96,7 @@ def test_climbing_leads_where_a_good_guess_does(model):
 
 
 def test_a_state_that_is_not_found_is_neither_stable_nor_unstable():
-    run = CliRunner().invoke(
-        cli, ["floquet", "--interface", "rigid", "--V", "8", "--W0", "6", "--eps", "0.8", "--json"]
-    )
+    run = CliRunner().invoke(cli, ["floquet", "--interface", "rigid", "--V", "8", "--W0", "6", "--eps", "0.8", "--json"])
     assert run.exit_code == 3
     told = json.loads(run.stdout)
     assert told["meta"]["stable"] is None and "no forced periodic state was found" in told["notes"][0]

@@ -181,13 +181,7 @@ def made(*crossings):
     """Return a study with the given crossings and nothing else."""
     count = len(crossings)
     return LawStudy(
-        tuple(crossings),
-        ((),) * count,
-        (0,) * count,
-        (0,) * count,
-        (np.nan, np.nan),
-        (np.nan, np.nan),
-        (Status.OK,) * count,
+        tuple(crossings), ((),) * count, (0,) * count, (0,) * count, (np.nan, np.nan), (np.nan, np.nan), (Status.OK,) * count
     )
 
 
@@ -223,9 +217,7 @@ def test_highest_fold():
     curve = np.array([[1.0, 5], [3, 5], [2, 5], [2.5, 5], [2.2, 5], [4, 5]])
     found = LawStudy((), ((curve,),), (3,), (0,), (0.0, 0.0), (np.nan, np.nan), (Status.OK,))
     assert highest_fold(found, 0) == 3.0
-    assert (
-        highest_fold(LawStudy((), ((curve[:2],),), (0,), (0,), (0.0, 0.0), (np.nan, np.nan), (Status.OK,)), 0) is None
-    )
+    assert highest_fold(LawStudy((), ((curve[:2],),), (0,), (0,), (0.0, 0.0), (np.nan, np.nan), (Status.OK,)), 0) is None
 
 
 @pytest.mark.parametrize("matched", [True, False])
@@ -234,9 +226,7 @@ def test_a_figure_names_what_its_laws_were_given(matched):
     slider = system()
     lines = np.full((WINDOW.velocities().size, 1), 9.0)
     curve = np.array([[5.0, 10], [9, 12]])
-    study = LawStudy(
-        (lines, lines), ((), (curve,)), (0, 0), (0, 0), (np.nan, np.nan), (np.nan, np.nan), (Status.OK,) * 2
-    )
+    study = LawStudy((lines, lines), ((), (curve,)), (0, 0), (0, 0), (np.nan, np.nan), (np.nan, np.nan), (Status.OK,) * 2)
     p = slider.vector()
     matches = (Match(p, (), 0.0, Status.OK), Match(p, ("A", "D0") if matched else (), 0.0, Status.OK))
     goal = observe(slider.model, p, 10.0)
@@ -258,14 +248,7 @@ SMALL = ("--over", "V=5:40:12", "--over", "K/W0=0.006:0.03:20", "--eps", "0.13")
 
 def test_the_command_compares(tmp_path):
     code, out, _ = run(
-        "--ageing",
-        "dieterich",
-        "--ageing",
-        "dieterich+linker-dieterich",
-        *SMALL,
-        "--json",
-        "--plot",
-        str(tmp_path / "a.svg"),
+        "--ageing", "dieterich", "--ageing", "dieterich+linker-dieterich", *SMALL, "--json", "--plot", str(tmp_path / "a.svg")
     )
     data = json.loads(out)
     assert code == 0 and data["schema"] == "srf.compare/2"

@@ -29,9 +29,7 @@ from srfcli.symbolic.derive import (
 from srfcli.symbolic.system import build_system
 
 REGISTRY = bundled_registry()
-K, M, W0, D0, V, kappa, mu_v, mu_phi, mu_ss = map(
-    symbol, ["K", "M", "W0", "D0", "V", "kappa", "mu_v", "mu_phi", "mu_ss"]
-)
+K, M, W0, D0, V, kappa, mu_v, mu_phi, mu_ss = map(symbol, ["K", "M", "W0", "D0", "V", "kappa", "mu_v", "mu_phi", "mu_ss"])
 DMU = mu_phi - mu_v
 
 
@@ -194,8 +192,7 @@ def test_linker_dieterich_is_silent_under_constant_load() -> None:
 def test_linker_dieterich_speaks_under_an_inclined_spring(make_model: Callable[..., Any]) -> None:
     names = {"loading": "inclined", "ageing": "dieterich+linker-dieterich"}
     plain, with_term = (
-        characteristic_polynomial(build_system(REGISTRY, loading="inclined", ageing=a))
-        for a in ("dieterich", names["ageing"])
+        characteristic_polynomial(build_system(REGISTRY, loading="inclined", ageing=a)) for a in ("dieterich", names["ageing"])
     )
     differing = [k for k, (a, b) in enumerate(zip(plain, with_term, strict=True)) if not same(a, b)]
     assert differing

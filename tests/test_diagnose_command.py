@@ -64,14 +64,9 @@ def make(folder: Path) -> Path:
     text, t = TOML, np.arange(0, 3.0, 0.005)
     for name, (drive, before, after, holdout) in RUNS.items():
         steps = ", ".join(f"{{ duration = {d}, velocity = {V} }}" for d, V in drive)
-        text += (
-            f'\n[[runs]]\nname = "{name}"\nfile = "{name}.csv"\nholdout = {str(holdout).lower()}\ndrive = [{steps}]\n'
-        )
+        text += f'\n[[runs]]\nname = "{name}"\nfile = "{name}.csv"\nholdout = {str(holdout).lower()}\ndrive = [{steps}]\n'
         W = before + (after - before) * (1 + np.tanh((t - 1.5) / 0.05)) / 2
-        rows = [
-            f"{a!r},{b!r},{float(0.45 * b + 1e-3 * np.sin(7 * a))!r}"
-            for a, b in zip(t.tolist(), W.tolist(), strict=True)
-        ]
+        rows = [f"{a!r},{b!r},{float(0.45 * b + 1e-3 * np.sin(7 * a))!r}" for a, b in zip(t.tolist(), W.tolist(), strict=True)]
         (base / f"{name}.csv").write_text("\n".join(["time [s],normal_load [N],elongation [um]", *rows]) + "\n")
     (base / "experiment.toml").write_text(text)
     srf("simulate", base, "--out-dir", folder / "made", "--noise", 0.004, "--quantum", 0.001, "--seed", 3)
@@ -184,9 +179,7 @@ def test_the_diagram_of_the_augmented_model_is_one_command_away(folder: Path) ->
     rows = json.loads(srf("linear", *laws, "--K", 1.0, "--over", "V=5:20:2", "--json").stdout)["rows"]
     assert all(r["status"] == "ok" for r in rows)
     plain = json.loads(srf("linear", "--K", 1.0, "--over", "V=5:20:2", "--json").stdout)["rows"]
-    assert rows[0]["W0"] == pytest.approx(
-        plain[0]["W0"], rel=0.1
-    )  # the same physics under constant load, fitted numbers
+    assert rows[0]["W0"] == pytest.approx(plain[0]["W0"], rel=0.1)  # the same physics under constant load, fitted numbers
 
 
 def test_a_reader_gets_a_sentence_and_tables(experiment: Path, found: dict[str, Any]) -> None:
@@ -197,9 +190,7 @@ def test_a_reader_gets_a_sentence_and_tables(experiment: Path, found: dict[str, 
     assert text == srf("diagnose", experiment, *EFFECTS, "--seed", 0).stdout  # nothing random without a seed
 
 
-def test_a_diagnosis_is_replaced_on_demand_only_and_nothing_else_ever(
-    folder: Path, experiment: Path, tmp_path: Path
-) -> None:
+def test_a_diagnosis_is_replaced_on_demand_only_and_nothing_else_ever(folder: Path, experiment: Path, tmp_path: Path) -> None:
     assert "--force" in srf("diagnose", experiment, "--out", folder, code=2).stderr
     strange = tmp_path / "mine"
     strange.mkdir()
@@ -263,9 +254,7 @@ def test_interrupted_before_there_is_anything_it_writes_nothing(
 @pytest.mark.usefixtures("without_matplotlib")
 def test_where_nothing_is_missing_the_augmented_model_is_the_baseline(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "again"
-    found = json.loads(
-        srf("diagnose", folder / "augmented", "--effect", "tangential-crosstalk", "--json", "--out", out).stdout
-    )
+    found = json.loads(srf("diagnose", folder / "augmented", "--effect", "tangential-crosstalk", "--json", "--out", out).stdout)
     assert found["verdict"] in ("none", "inconclusive") and found["effects"] == []
     assert found["augmented"] == found["baseline"] and found["location"]["runs"] == []
     described = tomli.loads((out / "augmented" / "experiment.toml").read_text())

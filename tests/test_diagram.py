@@ -38,9 +38,7 @@ def found(experiment):
     """The diagram where half of the modulation is said to reach the asperities."""
     rho = FitParameter("rho", 0.5, 0.0, 2.0, fixed=False, unit="1")
     augmented = replace(
-        experiment,
-        choice=replace(experiment.choice, effects=("load-transmission",)),
-        parameters=(*experiment.parameters, rho),
+        experiment, choice=replace(experiment.choice, effects=("load-transmission",)), parameters=(*experiment.parameters, rho)
     )
     return stability(SHIPPED, experiment, {q.name: q.value for q in experiment.parameters}, augmented)
 

@@ -90,9 +90,7 @@ def test_a_python_effect_may_bring_an_unknown():
     assert late.about == "The gauge lags" and late.sizes == ("tau_g",)
     assert {o.check: o.verdict for o in check_law(late)}["derivatives"] == "ok"
     shipped = SHIPPED.get("effect", "sensor-lag")
-    assert str(late.states[0].rate).replace("reading", "lag").replace("tau_g", "time_constant") == str(
-        shipped.states[0].rate
-    )
+    assert str(late.states[0].rate).replace("reading", "lag").replace("tau_g", "time_constant") == str(shipped.states[0].rate)
 
 
 @pytest.mark.parametrize(
@@ -128,11 +126,7 @@ def test_faults_of_python_effects_are_told(returned, states, message):
         ("[parameters]", 'settings = { loading = "inclined" }\n[parameters]', "settings.loading: unknown key"),
         ("[parameters]", "settings = { inertia = 1 }\n[parameters]", "settings.inertia: found 1"),
         ("[parameters]", 'states = [{ name = "q", rate = "1" }]\n[parameters]', "states.0..steady: missing"),
-        (
-            "[parameters]",
-            'states = [{ name = "phi", rate = "1", steady = "1" }]\n[parameters]',
-            "'phi' already has a meaning",
-        ),
+        ("[parameters]", 'states = [{ name = "phi", rate = "1", steady = "1" }]\n[parameters]', "'phi' already has a meaning"),
         ("[parameters]", 'observed = "q"\n[parameters]', "observed = 'q' is no state"),
         ("[parameters]", 'needs = "Vsat"\n[parameters]', "needs: expected a list"),
         ("[parameters]", "constitutive = 1\n[parameters]", "constitutive: expected true or false"),
@@ -192,9 +186,7 @@ def test_constants_stand_in_formulas_in_um_s_N(tmp_path):
 def test_show_gives_every_part_as_json():
     told = CliRunner().invoke(law_group, ["show", "second-state", "--json"])
     (document,) = json.loads(told.output)["laws"]
-    assert (
-        document["kind"] == "effect" and document["neutral"] == {"B2": 0.0} and document["reported"] == "second-state"
-    )
+    assert document["kind"] == "effect" and document["neutral"] == {"B2": 0.0} and document["reported"] == "second-state"
     assert document["states"] == [{"name": "phi2", "rate": "1 - phi2*v/D2", "steady": "D2/v", "logarithmic": True}]
     for name in NAMES:
         shown = CliRunner().invoke(law_group, ["show", name, "--kind", "effect"])

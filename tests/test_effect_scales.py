@@ -62,9 +62,7 @@ def test_the_scales_of_a_recording(tmp_path: Path) -> None:
     expected = {"segment": 1200.0, "track": 2000.0, "duration": 119.9, "interval": 0.1, "V_low": 10.0, "V_high": 30.0,
                 "load": 20.0, "D0": 20.0, "V0": 1.0}  # fmt: skip
     assert found == pytest.approx(expected, rel=2e-3)
-    out = replace(
-        experiment, runs=(*experiment.runs, replace(experiment.runs[0], holdout=True, t=experiment.runs[0].t * 9))
-    )
+    out = replace(experiment, runs=(*experiment.runs, replace(experiment.runs[0], holdout=True, t=experiment.runs[0].t * 9)))
     assert scales_of(out.runs, out.parameters) == found  # what is held out has no say
 
 

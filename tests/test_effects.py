@@ -84,9 +84,7 @@ def compared(folder: Path, generated, names, *, effect: str = "", fields=None) -
     for run, (plan, trace) in zip(experiment.runs, traces.items(), strict=True):
         made = predict(model, experiment, run, values, rtol=1e-8)
         assert made.status.ok
-        found.append(
-            (run.name, float(np.abs(made.y - trace.u).max()), float(np.abs(moved(baseline, plan).u - trace.u).max()))
-        )
+        found.append((run.name, float(np.abs(made.y - trace.u).max()), float(np.abs(moved(baseline, plan).u - trace.u).max())))
     return found
 
 
@@ -235,6 +233,4 @@ def test_a_modulation_that_was_always_there_has_no_onset(shared):
     found = of_run(replace(strong, t=strong.t.copy(), load=Modulation(7.0, 0.2, 110.0, phase=0.7)))
     assert (found["modulated"], found["onset0"]) == (1.0, -1e6)
     assert found["psi"] == pytest.approx(0.7, abs=1e-2)
-    assert {name: of_run(run)["modulated"] for name, run in runs.items()} == {
-        name: float(bool(PLANS[name].eps)) for name in runs
-    }
+    assert {name: of_run(run)["modulated"] for name, run in runs.items()} == {name: float(bool(PLANS[name].eps)) for name in runs}

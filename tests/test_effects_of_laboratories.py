@@ -30,9 +30,7 @@ def moved(
     effect: str, own: dict[str, float], *, drive: Drive = STEP, load: Load | None = None, end: float = 60.0
 ) -> tuple[GeneratedModel, np.ndarray, Motion]:
     """Return the model of a gouge with the effect, times (n,) in s and the motion from steady sliding at 1 um/s under 20 MPa."""
-    model = open_model(
-        REGISTRY, law="dieterich-ruina", ageing="dieterich", interface="rigid", inertia=False, effects=(effect,)
-    )
+    model = open_model(REGISTRY, law="dieterich-ruina", ageing="dieterich", interface="rigid", inertia=False, effects=(effect,))
     p = model.vector({**{k: v for k, v in GOUGE.items() if k in model.names}, **own})
     t = np.linspace(0.0, end, 601)
     motion = integrate(
@@ -48,9 +46,7 @@ def moved(
     return model, t, motion
 
 
-def friction(
-    model: GeneratedModel, own: dict[str, float], t: np.ndarray, motion: Motion, drive: Drive = STEP
-) -> np.ndarray:
+def friction(model: GeneratedModel, own: dict[str, float], t: np.ndarray, motion: Motion, drive: Drive = STEP) -> np.ndarray:
     """Return K u/W (n,) under 20 MPa."""
     p = model.vector({**{k: v for k, v in GOUGE.items() if k in model.names}, **own})
     if "u" in model.states:
@@ -89,11 +85,7 @@ def test_heat_weakens_as_drag_strengthens_once_it_is_quick_and_comes_late_where_
     quick, _, fast = moved("frictional-heating", {"drop": drop, "cooling": 1e-3})
     drag, _, dragged = moved("viscous-drag", {"c": -drop})
     one, other = friction(quick, {"drop": drop, "cooling": 1e-3}, t, fast), friction(drag, {"c": -drop}, t, dragged)
-    assert (
-        np.abs(one - other).max()
-        < 2e-5
-        < np.abs(friction(model, {"drop": drop, "cooling": 4.0}, t, slow) - other).max()
-    )
+    assert np.abs(one - other).max() < 2e-5 < np.abs(friction(model, {"drop": drop, "cooling": 4.0}, t, slow) - other).max()
 
 
 def _lagged(t: np.ndarray, v: np.ndarray, cooling: float) -> np.ndarray:
@@ -238,7 +230,7 @@ def test_what_is_never_fitted_follows_the_recording(tmp_path: Path) -> None:
     """The load under which the stiffness holds is that of the recording, is no free parameter, and may be stated."""
     rows = [f"{0.1 * k},{20 + 0.02 * k},{12 + 0.01 * k}" for k in range(100)]
     (tmp_path / "a.csv").write_text("\n".join(["time [s],normal_load [N],force [N]", *rows]))
-    text = '''format = "srf-experiment/1"
+    text = """format = "srf-experiment/1"
 [apparatus]
 stiffness = "0.1 N/um"
 [model]
@@ -253,7 +245,7 @@ m = { value = 0.0 }
 name = "ramp"
 file = "a.csv"
 drive = [{ duration = 10.0, velocity = 3.0 }]
-'''
+"""
 
     def held(stated: str = "") -> FitParameter:
         (tmp_path / "experiment.toml").write_text(text % stated)
@@ -335,9 +327,7 @@ Wref = { value = 7.0 }
 @pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here")
 def test_a_concealed_servo_is_found_where_it_is_asked_for(tmp_path: Path) -> None:
     """Of another code: near its modulations a servo is almost a smaller load-transmission, and its frequency has false maxima."""
-    truth = make_case(
-        tmp_path / "servo", 7, effects=["load-servo"], size=0.6, rough=0.0, strengths=False
-    )["physics"]
+    truth = make_case(tmp_path / "servo", 7, effects=["load-servo"], size=0.6, rough=0.0, strengths=False)["physics"]
     found = diagnose(tmp_path / "servo", effects=["load-servo", "load-transmission"], registry=REGISTRY)
     assert (found.verdict, found.effects) == ("identified", ("load-servo",))
     fitted = found.diagnosis.final.fit.values

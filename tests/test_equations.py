@@ -99,12 +99,7 @@ def test_partial_derivatives_are_those_of_sympy() -> None:
 
 def name_of(names: dict[str, Any]) -> str:
     return (
-        "+".join(
-            [
-                *(Path(e).stem for e in names.get("effects", ())),
-                *(f"{k}={v}" for k, v in names.items() if k != "effects"),
-            ]
-        )
+        "+".join([*(Path(e).stem for e in names.get("effects", ())), *(f"{k}={v}" for k, v in names.items() if k != "effects")])
         or "default"
     )
 
@@ -186,9 +181,7 @@ def random_points(model: Any, p: np.ndarray) -> list[tuple[np.ndarray, dict[str,
         for name, scale in (("slip", 30.0), ("stage", 30.0), ("time", 1.5)):
             if name in model.states:
                 x[model.states.index(name)] = scale * rng.uniform()
-        found.append(
-            (x, {"V": 9 * rng.uniform(0.7, 1.3), "W": 6 * rng.uniform(0.8, 1.2), "W_dot": 300 * rng.standard_normal()})
-        )
+        found.append((x, {"V": 9 * rng.uniform(0.7, 1.3), "W": 6 * rng.uniform(0.8, 1.2), "W_dot": 300 * rng.standard_normal()}))
     return found
 
 
@@ -239,9 +232,7 @@ def test_the_rates_fulfil_the_balance(make_model, names):
         for extra in system.extra_states:
             at = list(map(lambda n: n.removeprefix("ln_"), names_of)).index(extra.name)
             grown = r[at] * (now[extra.name] if extra.logarithmic else 1.0)
-            assert grown == pytest.approx(
-                evaluate(extra.rate, {**now, "W": point["W"], "V": point["V"]}), rel=1e-9, abs=1e-9
-            )
+            assert grown == pytest.approx(evaluate(extra.rate, {**now, "W": point["W"], "V": point["V"]}), rel=1e-9, abs=1e-9)
         shown = now["gauge"]
         for effect in system.effects:
             shown = now[effect.observed] if effect.observed else shown
@@ -310,9 +301,7 @@ def test_compiled_motion_is_that_of_lsoda(make_model, names):
 
 def test_parameters_of_one_name_are_told_apart(make_model):
     model = make_model(effects=("drive-ripple", "track-topography"))
-    assert {"drive_ripple_amplitude", "track_topography_amplitude", "drive_ripple_phase", "pitch", "wavelength"} <= {
-        *model.names
-    }
+    assert {"drive_ripple_amplitude", "track_topography_amplitude", "drive_ripple_phase", "pitch", "wavelength"} <= {*model.names}
     assert "amplitude" not in model.names
     single = make_model(effects=("drive-ripple",))
     both = {"drive_ripple_amplitude": 0.05, "drive_ripple_phase": 0.3, "track_topography_amplitude": 0.0}
@@ -375,9 +364,7 @@ def test_a_motion_module_of_a_plain_system_is_the_whole_one_s(make_model):
 
 
 def test_every_shipped_effect_is_here():
-    assert {n for c in WITH for n in c["effects"] if not n.endswith(".toml")} == {
-        e.name for e in REGISTRY.entries("effect")
-    }
+    assert {n for c in WITH for n in c["effects"] if not n.endswith(".toml")} == {e.name for e in REGISTRY.entries("effect")}
     assert all(isinstance(REGISTRY.get("effect", n), Effect) for c in WITH for n in c["effects"])
 
 

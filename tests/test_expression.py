@@ -136,9 +136,7 @@ _ATOMS = st.sampled_from(["v", "phi", "A", "lambda", "0", "1", "2", "0.6", "9", 
 
 
 def _grow(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
-    function = st.sampled_from(
-        ["exp", "log", "log1p", "expm1", "sqrt", "sinh", "cosh", "tanh", "asinh", "atan", "lambertw"]
-    )
+    function = st.sampled_from(["exp", "log", "log1p", "expm1", "sqrt", "sinh", "cosh", "tanh", "asinh", "atan", "lambertw"])
     return st.one_of(
         st.builds("({}){}({})".format, inner, st.sampled_from(["+", "-", "*", "/", "**", " "]), inner),
         st.builds("{}{}{}".format, inner, st.sampled_from(["+", "-", "*", "/", "**"]), inner),

@@ -207,10 +207,7 @@ def test_stick_slip_from_afar(make_model):
     base = Experiment(Path(), "", PMMA, 2.37e-6, "0.21 N/um", parameters, (), ())
     runs = []
     for k, (drive, load) in enumerate(
-        [
-            (Drive.steps([(0, 12.0), (0.3, 8.0)]), ConstantLoad(9.0)),
-            (Drive.constant(20.0), Modulation(7.0, 0.2, 30.0, 0.5)),
-        ]
+        [(Drive.steps([(0, 12.0), (0.3, 8.0)]), ConstantLoad(9.0)), (Drive.constant(20.0), Modulation(7.0, 0.2, 30.0, 0.5))]
     ):
         run = Run(f"p{k}", Path("x"), False, 0.0, "steady", t, np.zeros(t.size), "elongation", np.ones(t.size, bool),
                   drive, load, 0.21, None, 0.0, ())  # fmt: skip
@@ -244,8 +241,7 @@ def test_starts_that_were_not_done_are_not_passed_over(rock_model):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [({"free": ["a"]}, "'a' has no start value"), ({"free": []}, "no parameter is free")],
+    ("change", "message"), [({"free": ["a"]}, "'a' has no start value"), ({"free": []}, "no parameter is free")]
 )
 def test_misuse(rock_model, change, message):
     with pytest.raises(SrfError, match=message):

@@ -23,9 +23,7 @@ pytestmark = pytest.mark.usefixtures("empty_folder")
         (("--tol", "1e-6"), "--tol is for fits of critical loads", "Leave it out"),
     ],
 )
-def test_what_an_experiment_says_itself_is_refused(
-    options: tuple[str, ...], message: str, hint: str, tmp_path: Path
-) -> None:
+def test_what_an_experiment_says_itself_is_refused(options: tuple[str, ...], message: str, hint: str, tmp_path: Path) -> None:
     folder = tmp_path / "small"
     folder.mkdir()
     done = CliRunner().invoke(cli, ["fit", str(write(folder)), *options], prog_name="srf")

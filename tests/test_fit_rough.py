@@ -35,8 +35,7 @@ def fitted(request, tmp_path_factory):
     folder, rng, base = tmp_path_factory.mktemp("rough"), np.random.default_rng(5), Physics()
     tracks = [Track(2e-3, 6.0, seed) for seed in request.param]
     readings = {
-        q: read_gauge(move(replace(base, track=track), q).u, Gauge(), rng)
-        for q, track in zip(PLANS, tracks, strict=True)
+        q: read_gauge(move(replace(base, track=track), q).u, Gauge(), rng) for q, track in zip(PLANS, tracks, strict=True)
     }
     for name, text in case_files("small", base, readings).items():
         (folder / name).write_text(text)

@@ -49,13 +49,7 @@ def response(f, amplitudes, start, eps):
                 s = Slider(V=V, W0=W0, eps=y[3] * 1e-4, f=f)
                 x0 = np.array([y[0], y[1], ln_v, y[2]])
                 motion = solve_ivp(
-                    lambda t, x: rates(s, t, *x),
-                    (0, 1 / f),
-                    x0,
-                    method="LSODA",
-                    first_step=1e-6,
-                    rtol=1e-10,
-                    atol=1e-10,
+                    lambda t, x: rates(s, t, *x), (0, 1 / f), x0, method="LSODA", first_step=1e-6, rtol=1e-10, atol=1e-10
                 )
                 return motion.y[:, -1] - x0
 

@@ -35,9 +35,7 @@ def test_text_does_not_depend_on_the_hash_seed() -> None:
     outputs = []
     for seed in ("1", "4711"):
         environment = {**os.environ, "PYTHONHASHSEED": seed}
-        done = subprocess.run(
-            [sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=environment, check=True
-        )
+        done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, env=environment, check=True)
         outputs.append(done.stdout)
     assert len(outputs[0].split()) == 2
     assert outputs[0] == outputs[1]

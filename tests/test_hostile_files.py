@@ -462,9 +462,7 @@ def test_any_data_file(data: bytes) -> None:
 
 @settings(QUICK, max_examples=150)
 @example("1e-320").via("reported")
-@given(
-    st.one_of(ANY, st.from_regex(r"[-+]?\d{0,30}\.?\d{0,30}([eE][-+]?\d{1,5})? ?[a-zA-Z*/^0-9]{0,12}", fullmatch=True))
-)
+@given(st.one_of(ANY, st.from_regex(r"[-+]?\d{0,30}\.?\d{0,30}([eE][-+]?\d{1,5})? ?[a-zA-Z*/^0-9]{0,12}", fullmatch=True)))
 def test_any_number(text: str) -> None:
     for parse in (
         lambda: parse_quantity(text, "N/um", name="K"),

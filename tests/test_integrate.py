@@ -20,14 +20,8 @@ from srfcli.numerics.orbit import solve_orbits, steady_guess, uniform_mesh
 
 def combinations():
     """Every kind of system with the paper's laws; the slow ones, which take long to derive, with others."""
-    for law, ageing in (
-        ("srf-vsat", "dieterich"),
-        ("two-state", "ruina+linker-dieterich"),
-        ("rice-regularized", "kato-tullis"),
-    ):
-        for interface, loading, inertia in itertools.product(
-            ("elastic", "rigid"), ("vertical", "inclined"), (True, False)
-        ):
+    for law, ageing in (("srf-vsat", "dieterich"), ("two-state", "ruina+linker-dieterich"), ("rice-regularized", "kato-tullis")):
+        for interface, loading, inertia in itertools.product(("elastic", "rigid"), ("vertical", "inclined"), (True, False)):
             names = {"law": law, "ageing": ageing, "interface": interface, "loading": loading, "inertia": inertia}
             marks = [pytest.mark.slow] if law != "srf-vsat" else []
             yield pytest.param(names, marks=marks, id="-".join(str(v) for v in names.values()))
@@ -67,14 +61,10 @@ def test_a_modulated_record_agrees_with_another_integrator(model):
     t = np.linspace(0.0, 0.5, 101)
     drive, load = Drive.constant(s.V), Modulation(s.W0, s.eps, s.f)
     trace = simulate(model, model.vector(), drive=drive, load=load, t=t, start=start, rtol=1e-11)
-    other = solve_ivp(
-        lambda t, x: rates(s, t, *x), (0.0, 0.5), start, method="DOP853", rtol=1e-11, atol=1e-11, t_eval=t
-    )
+    other = solve_ivp(lambda t, x: rates(s, t, *x), (0.0, 0.5), start, method="DOP853", rtol=1e-11, atol=1e-11, t_eval=t)
     assert trace.x == pytest.approx(other.y.T, rel=1e-6, abs=1e-6)
     assert pytest.approx(s.W0 * (1 + s.eps * np.cos(2 * np.pi * s.f * t)), rel=1e-13) == trace.W
-    assert trace.mu == pytest.approx(
-        s.mu0 + s.A * np.log(trace.v) + s.B * np.log1p(s.Vsat * trace.phi / s.D0), rel=1e-12
-    )
+    assert trace.mu == pytest.approx(s.mu0 + s.A * np.log(trace.v) + s.B * np.log1p(s.Vsat * trace.phi / s.D0), rel=1e-12)
 
 
 @pytest.mark.parametrize("eps", [0.03, 0.045])
@@ -86,9 +76,7 @@ def test_growth_on_a_trace_is_the_floquet_multiplier(model, eps):
     t = np.arange(201) / 120.0
     kick = np.array([0.0, 0.0, 1e-4, 0.0])
     up, down = (
-        simulate(
-            model, p, drive=Drive.constant(8.0), load=Modulation(8.1, eps, 120.0), t=t, start=orbit + k, rtol=1e-12
-        )
+        simulate(model, p, drive=Drive.constant(8.0), load=Modulation(8.1, eps, 120.0), t=t, start=orbit + k, rtol=1e-12)
         for k in (kick, -kick)
     )
     d = (up.x - down.x)[60:]
@@ -154,9 +142,7 @@ def test_switch_on_is_smooth():
 def test_an_integration_that_stops_is_a_status(model, monkeypatch):
     monkeypatch.setattr(motion, "MAX_STEPS", 300)
     t = np.array([0.0, 1e-4, 2e-4, 1.0, 2.0])
-    trace = simulate(
-        model, model.vector(), drive=Drive.constant(8.0), load=Modulation(8.0, 0.18, 120.0), t=t, rtol=1e-10
-    )
+    trace = simulate(model, model.vector(), drive=Drive.constant(8.0), load=Modulation(8.0, 0.18, 120.0), t=t, rtol=1e-10)
     assert trace.status is Status.INTEGRATION and not trace.status.ok
     assert np.isfinite(trace.x[:2]).all() and np.isnan(trace.x[-1]).all() and np.isnan(trace.mu[-1])
     assert trace.reached < 1.0

@@ -93,11 +93,7 @@ def hidden() -> list[str]:
 FILE = ("linear", "--over", "V={}", "--out", "a.csv", "--force")
 FOLDER = ("simulate", "--V", "8", "--W0", "{}", "--for", "0.2", "--rate", "50", "--out-dir", "made", "--force")
 LAW = ("law", "new", "my-law", "--force", "--kind", "{}")
-CASES = {
-    "result and sidecar": (FILE, "8", "9"),
-    "experiment": (FOLDER, "5", "6"),
-    "law": (LAW, "friction", "interface"),
-}
+CASES = {"result and sidecar": (FILE, "8", "9"), "experiment": (FOLDER, "5", "6"), "law": (LAW, "friction", "interface")}
 
 
 def command(words: tuple[str, ...], value: str) -> tuple[str, ...]:
@@ -106,10 +102,7 @@ def command(words: tuple[str, ...], value: str) -> tuple[str, ...]:
 
 @pytest.mark.parametrize(
     ("case", "number", "stride"),
-    [
-        *((case, signal.SIGKILL, 1) for case in CASES),
-        *((case, n, 7) for case in CASES for n in (signal.SIGTERM, signal.SIGINT)),
-    ],
+    [*((case, signal.SIGKILL, 1) for case in CASES), *((case, n, 7) for case in CASES for n in (signal.SIGTERM, signal.SIGINT))],
     ids=lambda v: getattr(v, "name", str(v)),
 )
 def test_at_every_step(case: str, number: signal.Signals, stride: int) -> None:
@@ -327,8 +320,6 @@ main()
 )
 def test_while_modules_are_imported(module: str, number: int, code: int, said: str) -> None:
     """Nothing is left, no traceback is shown, and the caller sees by what it ended."""
-    done = subprocess.run(
-        [sys.executable, "-c", AT_IMPORT.format(module=module, number=number)], capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", AT_IMPORT.format(module=module, number=number)], capture_output=True, text=True)
     assert done.returncode == code and done.stderr.strip() == said and done.stdout == ""
     assert not list(Path().iterdir())

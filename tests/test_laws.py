@@ -25,15 +25,7 @@ from srfcli.tasks import law_check as checking
 from srfcli.tasks.law_check import check_law, evaluate, reference_values, steady_age
 
 SHIPPED = bundled_registry()
-FRICTION = {
-    "srf-vsat",
-    "dieterich-ruina",
-    "dieterich-cutoff",
-    "rice-regularized",
-    "log-log",
-    "bowden-tabor",
-    "two-state",
-}
+FRICTION = {"srf-vsat", "dieterich-ruina", "dieterich-cutoff", "rice-regularized", "log-log", "bowden-tabor", "two-state"}
 MINIMAL = """format = "srf-law/1"
 kind = "friction"
 mu = "mu0 + A*log(v/V0) + B*log(1 + phi*V0/D0)"
@@ -66,13 +58,7 @@ def write(tmp_path: Path, text: str, name: str = "mine.toml") -> Path:
 
 def test_the_shipped_laws_are_there() -> None:
     assert {e.name for e in SHIPPED.entries("friction")} == FRICTION
-    assert {e.name for e in SHIPPED.entries("ageing")} == {
-        "dieterich",
-        "ruina",
-        "perrin-rice-zheng",
-        "kato-tullis",
-        "nagata",
-    }
+    assert {e.name for e in SHIPPED.entries("ageing")} == {"dieterich", "ruina", "perrin-rice-zheng", "kato-tullis", "nagata"}
     assert {e.name for e in SHIPPED.entries("modifier")} == {"linker-dieterich"}
     assert {e.name for e in SHIPPED.entries("interface")} == {"elastic", "constant", "power", "rigid"}
     assert not SHIPPED.problems
@@ -117,9 +103,7 @@ def test_power_with_exponent_one_is_elastic() -> None:
     assert SHIPPED.get("interface", "rigid").kappa is None
 
 
-@pytest.mark.parametrize(
-    ("name", "y"), [("dieterich", 1.0), ("ruina", 1.0), ("perrin-rice-zheng", 2.0), ("nagata", 1.0)]
-)
+@pytest.mark.parametrize(("name", "y"), [("dieterich", 1.0), ("ruina", 1.0), ("perrin-rice-zheng", 2.0), ("nagata", 1.0)])
 def test_steady_age(name: str, y: float) -> None:
     law = SHIPPED.get("ageing", name)
     values = {"D0": 0.402, "B": 0.0241, **reference_values(law.parameters)}
@@ -336,9 +320,7 @@ def test_check_says_what_fails_and_exits_2(tmp_path: Path) -> None:
     path = write(tmp_path, MINIMAL.replace("log(v/V0)", "log(v/Vo)"))
     result = CliRunner().invoke(law_group, ["check", str(path)])
     assert result.exit_code == 2
-    assert (
-        "FAIL     parses" in result.output and "log(v/Vo)" in result.output and "\n" + " " * 16 + "^" in result.output
-    )
+    assert "FAIL     parses" in result.output and "log(v/Vo)" in result.output and "\n" + " " * 16 + "^" in result.output
 
 
 def test_listing_and_showing() -> None:

@@ -50,11 +50,7 @@ def test_the_load_is_twice_differentiable_across_its_breaks() -> None:
 
 @pytest.mark.parametrize(
     "load",
-    [
-        STEPS,
-        ModulatedLoad(STEPS, Modulation(1.0, 0.5, 120.0, onset=0.0)),
-        ModulatedLoad(STEPS, Modulation(1.0, 0.3, 0.7)),
-    ],
+    [STEPS, ModulatedLoad(STEPS, Modulation(1.0, 0.5, 120.0, onset=0.0)), ModulatedLoad(STEPS, Modulation(1.0, 0.3, 0.7))],
     ids=["steps", "120 Hz", "0.7 Hz"],
 )
 def test_polynomials_are_the_load(load: Any) -> None:
@@ -84,17 +80,13 @@ pieces = st.tuples(st.floats(1e-3, 10), st.floats(0.01, 100), st.floats(0.01, 10
 
 @given(st.lists(pieces, min_size=1, max_size=6), st.floats(1e-3, 3.0))
 @settings(max_examples=80, deadline=None)
-def test_the_load_never_leaves_the_range_of_its_pieces(
-    given_pieces: list[tuple[float, float, float]], rise: float
-) -> None:
+def test_the_load_never_leaves_the_range_of_its_pieces(given_pieces: list[tuple[float, float, float]], rise: float) -> None:
     load = LoadSteps.sequence(given_pieces, rise=rise)
     ends = [W for _, first, last in given_pieces for W in (first, last)]
     t = np.linspace(-1.0, sum(p[0] for p in given_pieces) + rise + 1, 400)
     W, _ = load(t)
     assert W.min() >= min(ends) - 1e-8 * max(ends) and W.max() <= max(ends) * (1 + 1e-8)
-    assert W[0] == pytest.approx(ends[0], rel=1e-12) and W[-1] == pytest.approx(
-        ends[-1], rel=1e-8, abs=1e-8 * max(ends)
-    )
+    assert W[0] == pytest.approx(ends[0], rel=1e-12) and W[-1] == pytest.approx(ends[-1], rel=1e-8, abs=1e-8 * max(ends))
 
 
 def test_a_load_of_one_level_is_constant() -> None:
@@ -199,11 +191,7 @@ def test_smallest_drop_is_the_users() -> None:
 
 @pytest.mark.parametrize(
     ("t", "u", "options", "message"),
-    [
-        (T, T[1:], {}, "as many values"),
-        (T[::-1], T, {}, "must rise"),
-        (T, T, {"ripple": -1.0}, "no frequency"),
-    ],
+    [(T, T[1:], {}, "as many values"), (T[::-1], T, {}, "must rise"), (T, T, {"ripple": -1.0}, "no frequency")],
 )
 def test_what_is_no_record_is_refused(t: np.ndarray, u: np.ndarray, options: dict[str, Any], message: str) -> None:
     with pytest.raises(SrfError, match=message):
@@ -232,8 +220,6 @@ def test_a_real_recording(shared: Path, name: str, events: int, drop: float, eve
     for sparse in (1, 20):
         found = stick_slip(t[::sparse], force[::sparse], smallest=0.04)
         tilted = force[::sparse] - 1e-9 * np.arange(t[::sparse].size)  # no two tops are equal
-        assert found.times.size == pytest.approx(
-            find_peaks(tilted, prominence=0.04)[0].size, abs=1
-        )  # the last may be cut
+        assert found.times.size == pytest.approx(find_peaks(tilted, prominence=0.04)[0].size, abs=1)  # the last may be cut
         assert found.drop == pytest.approx(drop, rel=0.04)
         assert np.mean(found.recurrence) == pytest.approx(every, rel=0.12)

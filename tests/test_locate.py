@@ -122,8 +122,7 @@ def test_a_line_is_no_harmonic_because_it_is_near_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "function"),
-    [("v", lambda x: 3 * np.sin(6 * x)), ("phi", lambda x: 2 * x**2), ("W", lambda x: 2 * np.cos(4 * x))],
+    ("name", "function"), [("v", lambda x: 3 * np.sin(6 * x)), ("phi", lambda x: 2 * x**2), ("W", lambda x: 2 * np.cos(4 * x))]
 )
 def test_the_quantity_that_the_misfit_goes_with_is_named(name: str, function: Callable) -> None:
     pieces = design()

@@ -20,9 +20,7 @@ from srfcli.numerics.special_points import crossings_at, special_points
 
 
 def window(model, eps, columns, rows, *, V=(1.0, 100.0), ratio=(0.0021, 0.03), **values):
-    return MapGrid(
-        model.vector({"eps": eps, **values}), MapAxis("V", *V, columns), MapAxis("W0", *ratio, rows, True, "K")
-    )
+    return MapGrid(model.vector({"eps": eps, **values}), MapAxis("V", *V, columns), MapAxis("W0", *ratio, rows, True, "K"))
 
 
 def finished(model, found, settings=None):
@@ -154,10 +152,7 @@ def test_an_island_is_found_and_closed(model):
     f = np.array([pt.value(model, "f") for pt in islands[0].points])
     assert (f.min(), f.max()) == pytest.approx((155.966, 182.97), rel=2e-3)
     assert not len(unexplained(model, found, atlas))
-    assert (
-        brute_growth(model, V=30.0, W0=13.0, eps=0.3, f=168.0) * brute_growth(model, V=30.0, W0=13.0, eps=0.15, f=168.0)
-        < 0
-    )
+    assert brute_growth(model, V=30.0, W0=13.0, eps=0.3, f=168.0) * brute_growth(model, V=30.0, W0=13.0, eps=0.15, f=168.0) < 0
 
 
 def brute_growth(model, **values):

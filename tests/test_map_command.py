@@ -108,16 +108,13 @@ def test_misuse_is_told_before_anything_is_computed(arguments, said):
 
 
 def test_a_ratio_takes_a_unit():
-    code, out, _ = run(
-        "map", "--eps", "0.1", "--over", "V=8:9:2", "--over", "K/W0=0.02:0.03 1/um:3", "--no-boundaries", "--csv"
-    )
+    code, out, _ = run("map", "--eps", "0.1", "--over", "V=8:9:2", "--over", "K/W0=0.02:0.03 1/um:3", "--no-boundaries", "--csv")
     assert code == 0
     assert [line.split(",")[3] for line in out.splitlines()[1:4]] == ["0.02", "0.025", "0.03"]
 
 
 @pytest.mark.parametrize(
-    ("powers", "text"),
-    [((-1, 0, 0, 0), "1/um"), ((0, 0, 0, 0), "1"), ((1, -1, 0, 0), "um/s"), ((-2, 2, 1, 0), "s^2*N/um^2")],
+    ("powers", "text"), [((-1, 0, 0, 0), "1/um"), ((0, 0, 0, 0), "1"), ((1, -1, 0, 0), "um/s"), ((-2, 2, 1, 0), "s^2*N/um^2")]
 )
 def test_units_of_ratios(powers, text):
     assert describe(powers) == text

@@ -68,9 +68,7 @@ def test_a_friction_of_each_runs_own_is_no_missing_physics(tmp_path):
         readings[plan] = read_gauge(move(own, plan).u, Gauge(), rng)
     for name, text in case_files("small", Physics(), readings).items():
         (tmp_path / name).write_text(text)
-    search = ModelSearch(
-        SHIPPED, grouped(read_experiment(tmp_path, registry=SHIPPED, holdout=False), ["mu0"]), effects=FEW
-    )
+    search = ModelSearch(SHIPPED, grouped(read_experiment(tmp_path, registry=SHIPPED, holdout=False), ["mu0"]), effects=FEW)
     search.run()
     found = conclude(search, grouped(read_experiment(tmp_path, registry=SHIPPED), ["mu0"]))
     assert found.verdict in ("none", "inconclusive") and found.best is found.baseline

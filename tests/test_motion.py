@@ -108,9 +108,7 @@ def test_a_smooth_modulation_takes_the_steps_of_order_eight(model):
     x0 = np.asarray(model.steady(p))
     by = [model.index(name) for name in ("mu0", "A", "D0")]
     found, fine = (
-        integrate(
-            model, p, drive=Drive.constant(8.0), load=load, t=t, start=x0, by=by, rtol=rtol, atol=np.full(4, rtol)
-        )
+        integrate(model, p, drive=Drive.constant(8.0), load=load, t=t, start=x0, by=by, rtol=rtol, atol=np.full(4, rtol))
         for rtol in (1e-10, 1e-12)
     )
     assert found.steps < 3000
@@ -148,9 +146,7 @@ def test_a_rigid_slider_pushed_back_comes_to_rest_and_slides_again(make_model):
     p = dict(zip(model.names, model.vector({}), strict=True))
     settled = rest & (t > t[rest][0] + 0.01)
     mu = (
-        p["mu0"]
-        + p["A"] * (ln_v[settled] - np.log(p["V0"]))
-        + p["B"] * np.log(1 + p["Vsat"] * np.exp(ln_phi[settled]) / p["D0"])
+        p["mu0"] + p["A"] * (ln_v[settled] - np.log(p["V0"])) + p["B"] * np.log(1 + p["Vsat"] * np.exp(ln_phi[settled]) / p["D0"])
     )
     assert 0.5 * mu == pytest.approx(p["K"] * u[settled], rel=1e-6)
     assert np.diff(u[settled]) == pytest.approx(8.0 * 0.001, abs=2e-6)  # it does not move, the drive does

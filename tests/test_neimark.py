@@ -37,9 +37,7 @@ def test_without_modulation_it_is_the_lyapunov_coefficient(make_model, names, V)
     model = make_model(**names)
     hopf, _ = critical_point(model, model.vector({"V": V}))
     eps = 1e-4
-    line = critical_line(
-        model, model.vector({"V": V, "eps": eps}), lo=0.98 * hopf.W0, hi=1.02 * hopf.W0, tol=1e-9, samples=12
-    )
+    line = critical_line(model, model.vector({"V": V, "eps": eps}), lo=0.98 * hopf.W0, hi=1.02 * hopf.W0, tol=1e-9, samples=12)
     [point] = line.points
     d = normal_form(model, point.p, single(point), point.rho)[0]
     assert d == pytest.approx(hopf.lyapunov * hopf.Omega / 120.0, rel=2e-3)

@@ -88,11 +88,7 @@ FORMS = {
     "area": (["time [s]", "Angular speed [rpm]", "Torque [mN m]", "Fn [N]"], (1, DEGREES / 6, SIGMA * 50 * 25, 50), "tVmS",
              "1250 N m/rad"),
 }  # fmt: skip
-RIGS = {
-    "rotary": ["--radius", "25 mm"],
-    "strain": ["--thickness", "4 mm"],
-    "area": ["--radius", "25 mm", "--area", "50 mm^2"],
-}
+RIGS = {"rotary": ["--radius", "25 mm"], "strain": ["--thickness", "4 mm"], "area": ["--radius", "25 mm", "--area", "50 mm^2"]}
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -110,9 +106,7 @@ def test_a_laboratory_s_table_becomes_an_experiment(form: str, step: dict[str, n
     mu0 = tomli.loads(Path("experiment.toml").read_text())["parameters"]["mu0"]["value"]
     stiff = json.loads(srf("check", ".", "--no-simulate", "--json").stdout)["meta"]["runs"][0]["stiffness"]
     assert stiff == pytest.approx(k * SIGMA * {"brackets": 2.5}.get(form, 1.0)), form
-    assert {"suffixes": "shear stress [MPa]", "forces": "force [N]", "spring": "elongation [um]"}.get(
-        form, "run1"
-    ) in checked
+    assert {"suffixes": "shear stress [MPa]", "forces": "force [N]", "spring": "elongation [um]"}.get(form, "run1") in checked
     assert mu0 == pytest.approx(0.605, abs=0.01)
 
 
@@ -137,17 +131,10 @@ def test_what_a_rig_has_to_say(headings: list[str], options: tuple[str, ...], sa
 
 def test_a_stiffness_per_load_is_never_rescaled_in_silence(step: dict[str, np.ndarray]) -> None:
     for name, load in (("one.csv", SIGMA), ("two.csv", 2 * SIGMA)):
-        table(
-            ["time_s", "v", "tau_MPa", "sigma_n_MPa"],
-            [step["t"], step["V"], load * step["mu"], load + 0 * step["t"]],
-            name,
-        )
+        table(["time_s", "v", "tau_MPa", "sigma_n_MPa"], [step["t"], step["V"], load * step["mu"], load + 0 * step["t"]], name)
     srf("new", "one.csv", "two.csv", "--stiffness", "2e-3 1/um")
     said = srf("check", ".", "--no-simulate").stdout
-    assert (
-        "0.04 MPa/um under 20 MPa in one, 0.08 MPa/um under 40 MPa in two; a machine's own stiffness does not grow"
-        in said
-    )
+    assert "0.04 MPa/um under 20 MPa in one, 0.08 MPa/um under 40 MPa in two; a machine's own stiffness does not grow" in said
     text = Path("experiment.toml").read_text().replace("# K =", "K =")
     Path("experiment.toml").write_text(text.replace('upper = "0.004 1/um"', 'upper = "0.08 MPa/um"'))
     assert "a stiffness in MPa/um beside that of [apparatus], which is in 1/um" in srf("check", ".", code=2).stderr
@@ -180,10 +167,7 @@ def test_a_reciprocating_tribometer_becomes_a_run_for_each_stroke() -> None:
         ("run1-1", None, False), ("run1-2", "backward", False),
     ]  # fmt: skip
     assert 40 < runs[1]["window"][0] < 50 and runs[1]["window"][1] == pytest.approx(80, abs=0.1)
-    rows = {
-        line.split(",")[0]: line.split(",")
-        for line in srf("fit", ".", "--track", "smooth", "--csv").stdout.splitlines()
-    }
+    rows = {line.split(",")[0]: line.split(",") for line in srf("fit", ".", "--track", "smooth", "--csv").stdout.splitlines()}
     for name, true in (("A", 0.012), ("B", 0.008), ("D0", 4.0)):
         value, error = float(rows[name][1]), float(rows[name][2])
         assert abs(value - true) < 4 * error < 0.5 * true, name
@@ -210,9 +194,7 @@ def test_friction_alone_does_not_go_with_a_stiffness_of_stress(step: dict[str, n
 
 
 def test_the_first_fit_is_two_commands_away_and_in_the_units_of_the_recording(step: dict[str, np.ndarray]) -> None:
-    table(
-        ["time_s", "velocity_um_s", "tau_MPa", "sigma_n_MPa"], [step["t"], step["V"], SIGMA * step["mu"], step["sigma"]]
-    )
+    table(["time_s", "velocity_um_s", "tau_MPa", "sigma_n_MPa"], [step["t"], step["V"], SIGMA * step["mu"], step["sigma"]])
     srf("new", "run1.csv", "--stiffness", f"{k * SIGMA * 1e3:g} MPa/mm")
     lines = Path("experiment.toml").read_text().replace("# K =", "K =")
     Path("experiment.toml").write_text(lines)
@@ -315,11 +297,7 @@ def test_holds_and_oscillations_are_told_from_steps() -> None:
         (["run1.csv", "--stiffness", "1 1/um", "--column", "friction"], "is no ROLE=HEADING", "As in"),
         (["run1.csv", "--stiffness", "1 1/um", "--window", "3"], "is not FROM,TO", "--window 100,900"),
         (["run1.csv", "--stiffness", "1 1/um", "--window", "900,999"], "no sample of", "file's own clock"),
-        (
-            ["run1.csv", "--stiffness", "1 1/um", "--law", "dietrich-ruina"],
-            "dietrich-ruina",
-            "Did you mean 'dieterich-ruina'?",
-        ),
+        (["run1.csv", "--stiffness", "1 1/um", "--law", "dietrich-ruina"], "dietrich-ruina", "Did you mean 'dieterich-ruina'?"),
         (["run1.csv", "--stiffness", "1 1/um", "--holdout", "run7"], "no such run", "Did you mean 'run1'?"),
         (["still.csv", "--stiffness", "1 1/um"], "no column has the load point's velocity", "--drive VELOCITY"),
         (["still.csv", "--stiffness", "1 1/um"], "no column has", "--column load_point_displacement=HEADING"),
@@ -328,9 +306,7 @@ def test_holds_and_oscillations_are_told_from_steps() -> None:
         (["lift.csv", "--stiffness", "1 1/um"], "the load is -1 N", "--window FROM,TO"),
     ],
 )
-def test_what_is_missing_or_wrong_is_said_in_a_line_and_nothing_is_written(
-    arguments: list[str], said: str, hint: str
-) -> None:
+def test_what_is_missing_or_wrong_is_said_in_a_line_and_nothing_is_written(arguments: list[str], said: str, hint: str) -> None:
     t = np.arange(0.0, 10.0, 0.1)
     table(["t", "v", "mu", "sigma_MPa"], [t, 1 + t, 0.6 + 0 * t, 5 + 0 * t])
     table(["t", "mu"], [t, t], "still.csv")

@@ -128,11 +128,7 @@ def test_modes_links_and_devices(tmp_path: Path) -> None:
 
 def test_targets_are_refused_with_a_way_out(tmp_path: Path) -> None:
     (tmp_path / "x").write_text("")
-    for path, said in (
-        (tmp_path / "x", "exists already"),
-        (tmp_path, "is a directory"),
-        (tmp_path / "n" / "x", "mkdir -p"),
-    ):
+    for path, said in ((tmp_path / "x", "exists already"), (tmp_path, "is a directory"), (tmp_path / "n" / "x", "mkdir -p")):
         with pytest.raises(SrfError) as caught:
             check_target(path, force=False)
         assert said in f"{caught.value.message} {caught.value.hint}"
@@ -142,12 +138,7 @@ def test_targets_are_refused_with_a_way_out(tmp_path: Path) -> None:
 def test_a_sidecar_is_stable_but_for_its_timings(tmp_path: Path) -> None:
     source, place = tmp_path / "law.toml", tmp_path / "x.csv"
     source.write_text("mu = 'mu0'")
-    kept: dict[str, Any] = {
-        "arguments": ("linear",),
-        "laws": (Law("l", source=str(source)),),
-        "inputs": (source,),
-        "seed": 3,
-    }
+    kept: dict[str, Any] = {"arguments": ("linear",), "laws": (Law("l", source=str(source)),), "inputs": (source,), "seed": 3}
     first, second = (Provenance(**kept, timings={"solve": t}) for t in (0.1, 0.2))
     assert describe(first) == describe(second)
     texts = [sidecar(place, b"abc", p) for p in (first, second)]
@@ -204,9 +195,7 @@ def test_the_curves_of_one_amplitude_are_shaded_where_sliding_is_stable() -> Non
 @pytest.mark.parametrize("count", [2, 5, 9])
 def test_many_names_stand_below_the_axes_and_cover_nothing(count: int) -> None:
     pytest.importorskip("matplotlib")
-    curves = [
-        {"eps": k, "label": f"law-{k}/dieterich", "V": [1, 10], "K_over_W0": [0.01 + k / 1e3] * 2} for k in range(count)
-    ]
+    curves = [{"eps": k, "label": f"law-{k}/dieterich", "V": [1, 10], "K_over_W0": [0.01 + k / 1e3] * 2} for k in range(count)]
     figure = plots.stability_diagram(curves)
     figure.canvas.draw()
     (axes,) = figure.axes

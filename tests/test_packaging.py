@@ -24,13 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def call(*arguments: str | Path, folder: Path, env: dict[str, str] | None = None) -> str:
     """Return what a command prints; an exit code other than 0 fails the test with its stderr."""
     done = subprocess.run(
-        [str(a) for a in arguments],
-        cwd=folder,
-        env=env,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=1200,
+        [str(a) for a in arguments], cwd=folder, env=env, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=1200
     )
     assert done.returncode == 0, f"{arguments}\n{done.stdout}\n{done.stderr}"
     return done.stdout
@@ -99,9 +93,7 @@ def test_the_wheel_holds_plugins_and_data(wheel: Path) -> None:
 
 
 def test_nothing_comes_from_the_checkout(installed: Path, tmp_path: Path) -> None:
-    where = call(
-        installed / "python", "-c", "import srfcli; print(srfcli.__file__)", folder=tmp_path, env=clean_environment()
-    )
+    where = call(installed / "python", "-c", "import srfcli; print(srfcli.__file__)", folder=tmp_path, env=clean_environment())
     assert Path(where.strip()).is_relative_to(installed.parent)
 
 
@@ -119,9 +111,7 @@ def test_laws_are_found_in_site_packages(run, installed: Path) -> None:  # type:
 )
 def test_numbers_are_those_of_the_checkout(run, arguments: tuple[str, ...], tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     names = ("V", "K_over_W0", "W0")
-    here, there = (
-        list(csv.DictReader(io.StringIO(text))) for text in (run(*arguments), in_tree(*arguments, folder=tmp_path))
-    )
+    here, there = (list(csv.DictReader(io.StringIO(text))) for text in (run(*arguments), in_tree(*arguments, folder=tmp_path)))
     assert len(here) == len(there) > 0
     for one, other in zip(here, there, strict=True):
         assert [float(one[n]) for n in names] == pytest.approx([float(other[n]) for n in names], rel=1e-10)

@@ -55,16 +55,7 @@ def test_every_derived_form_is_compared() -> None:
     assert {e["form"] for e in EQUATIONS} == set(FORMS)
 
 
-MUTATIONS = (
-    ("kappa", "K"),
-    ("K", "kappa"),
-    ("-", "+"),
-    ("V", "D0"),
-    ("mu_v", "mu_phi"),
-    ("D0", "V"),
-    ("W0", "W"),
-    ("v", "V"),
-)
+MUTATIONS = (("kappa", "K"), ("K", "kappa"), ("-", "+"), ("V", "D0"), ("mu_v", "mu_phi"), ("D0", "V"), ("W0", "W"), ("v", "V"))
 
 
 @pytest.mark.parametrize("entry", EQUATIONS, ids=[str(e["label"]) for e in EQUATIONS])

@@ -300,11 +300,7 @@ def cluster(tmp_path_factory):
 
     def start(*words):
         return subprocess.Popen(
-            [sys.executable, "-m", *words],
-            cwd=folder,
-            env=environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            [sys.executable, "-m", *words], cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
 
     scheduler = start("distributed.cli.dask_scheduler", *local, "--port", "0", "--no-dashboard")
@@ -365,9 +361,7 @@ def test_a_cluster_gives_the_same_bytes(model, cluster):
     there = dict(Spread(cluster=address).run(solve_tile, tile_tasks(model, small_grid(model), SMALL)))
     assert sorted(there) == sorted(here)
     for index, tile in here.items():
-        assert {k: v.tobytes() for k, v in there[index].items()} == {
-            k: np.asarray(v).tobytes() for k, v in tile.items()
-        }
+        assert {k: v.tobytes() for k, v in there[index].items()} == {k: np.asarray(v).tobytes() for k, v in tile.items()}
 
 
 @pytest.mark.filterwarnings("default")

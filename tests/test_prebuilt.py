@@ -73,9 +73,7 @@ def test_an_edited_law_of_a_shipped_name_is_derived_anew(tmp_path: Path) -> None
     assert find_built(one.key) is not None and find_built(other.key) is None
 
 
-def test_a_module_of_another_key_or_a_damaged_one_is_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_module_of_another_key_or_a_damaged_one_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     key = open_model(bundled_registry()).key
     place = tmp_path / f"{key[:16]}.py"
     shutil.copy(FOLDER / place.name, place)
@@ -89,9 +87,7 @@ def test_a_module_of_another_key_or_a_damaged_one_is_passed_over(
 
 
 def test_a_first_start_derives_nothing(tmp_path: Path) -> None:
-    script = (
-        "import sys; from srfcli.cli.main import main\ntry: main(['linear'])\nfinally: print('sympy' in sys.modules)"
-    )
+    script = "import sys; from srfcli.cli.main import main\ntry: main(['linear'])\nfinally: print('sympy' in sys.modules)"
     environment = {**os.environ, "SRF_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path, env=environment)
     assert (done.returncode, done.stdout.splitlines()[-1]) == (0, "False"), done.stderr

@@ -271,9 +271,7 @@ def test_the_wide_bank_draws_what_it_says():
 
 def test_an_effect_in_one_run_leaves_the_others_alone(set_in, tmp_path):
     set_in(Setting("rock", "load-steps", "dieterich-ruina", "dieterich", "dieterich"))
-    truth = make_case(
-        tmp_path / "c", 4, kind="one-run", effects=["tangential-crosstalk"], size=1.0, rough=False, bank="wide"
-    )
+    truth = make_case(tmp_path / "c", 4, kind="one-run", effects=["tangential-crosstalk"], size=1.0, rough=False, bank="wide")
     assert truth["verdict"] == "identified" and truth["accept"] == ["unknown"]
     moved = truth["strength"]["tangential-crosstalk"]["rms_over_noise"]
     assert truth["only"] in ("first", "second") and moved[truth["only"]] > 1
@@ -377,9 +375,7 @@ def _lost(bank):
     bank.apart.unlink()
 
 
-@pytest.mark.parametrize(
-    "tamper", [_truths, _salt, _reading, _extra, _swapped, _gone, _unlisted, _garbled, _foreign, _lost]
-)
+@pytest.mark.parametrize("tamper", [_truths, _salt, _reading, _extra, _swapped, _gone, _unlisted, _garbled, _foreign, _lost])
 def test_tampering_is_found(bank, tamper):
     tamper(bank)
     with pytest.raises(SrfError) as caught:

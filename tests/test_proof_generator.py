@@ -360,9 +360,7 @@ def test_distortion_is_a_second_harmonic_that_the_record_does_not_show(tmp_path)
 def test_inverting_friction(R, a, c):
     x = log_velocity(R, a, c)
     if c == 0 or x < 60:
-        assert a * min(x, 60) + c * np.exp(min(x, 60)) == pytest.approx(
-            min(R, a * 60) if c == 0 else R, rel=1e-9, abs=1e-9
-        )
+        assert a * min(x, 60) + c * np.exp(min(x, 60)) == pytest.approx(min(R, a * 60) if c == 0 else R, rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("change", [{}, {"p_age": 2.0}, {"slip_share": 0.5}, {"age_rate": 3.0}, {"D_power": 0.3}])

@@ -38,17 +38,7 @@ from srfcli.validation.blind import (
     to_line,
     write_answers,
 )
-from srfcli.validation.cases import (
-    BANKS,
-    KINDS,
-    NAMES,
-    WIDE_KINDS,
-    make_case,
-    plan_bank,
-    plan_wide,
-    possible_pairs,
-    variants,
-)
+from srfcli.validation.cases import BANKS, KINDS, NAMES, WIDE_KINDS, make_case, plan_bank, plan_wide, possible_pairs, variants
 from srfcli.validation.gauge import Gauge
 from srfcli.validation.marks import (
     INVISIBLE,
@@ -78,9 +68,7 @@ SURE = {"none": 0.0, "unknown": 0.01}
 
 
 def says_none(folder, plugins):
-    return Answer(
-        "", "none", confidence={"none": 0.95, "unknown": 0.05}, held={"wave": {"augmented": 0.02, "baseline": 0.02}}
-    )
+    return Answer("", "none", confidence={"none": 0.95, "unknown": 0.05}, held={"wave": {"augmented": 0.02, "baseline": 0.02}})
 
 
 def careless(folder, plugins):
@@ -341,23 +329,13 @@ def test_tables_count_what_was_marked():
     assert (found["wrong name, stated above 0.9"], found["wrong name, of all names"]) == ((4, 8), (4, 5))
     assert found["unknown recognised"] == (1, 2)
     alone = rows(report.by_effect(marks))
-    assert (alone[ALPHA]["hits"], alone[ALPHA]["cases"], alone[ALPHA]["in_pairs"], alone[ALPHA]["named_in_pairs"]) == (
-        1,
-        2,
-        1,
-        0,
-    )
+    assert (alone[ALPHA]["hits"], alone[ALPHA]["cases"], alone[ALPHA]["in_pairs"], alone[ALPHA]["named_in_pairs"]) == (1, 2, 1, 0)
     assert (alone[DRAG]["cases"], alone[DRAG]["class_right"], alone[DRAG]["named_in_pairs"]) == (1, 1, 1)
     assert rows(report.by_outside(marks))["age-exponent"]["called"] == "slip-evolution"
     power = [r for r in report.by_strength(marks).records() if r["measure"] == "standard errors"]
     assert [(r["from"], r["cases"], r["seen"], r["named"]) for r in power] == [(5.0, 1, 1, 0), (50.0, 2, 2, 1)]
     errors = rows(report.held(marks))["named rightly"]
-    assert (errors["cases"], errors["median"], errors["within"], errors["baseline_median"]) == (
-        1,
-        pytest.approx(1.05),
-        1.0,
-        2.0,
-    )
+    assert (errors["cases"], errors["median"], errors["within"], errors["baseline_median"]) == (1, pytest.approx(1.05), 1.0, 2.0)
     assert rows(report.calibrated(marks))
 
 
@@ -408,9 +386,7 @@ def test_a_report_holds_everything_and_survives_json():
 def test_answers_survive_their_file(tmp_path):
     answers = [m.answer for m in sample()[:1]] + [
         Answer("case-001", "failed", failure="x"),
-        Answer(
-            "case-002", "ambiguous", (ALPHA, LAG), {ALPHA: 0.5}, ((ALPHA, LAG),), (DRAG,), {"alpha": {"value": 0.01}}
-        ),
+        Answer("case-002", "ambiguous", (ALPHA, LAG), {ALPHA: 0.5}, ((ALPHA, LAG),), (DRAG,), {"alpha": {"value": 0.01}}),
     ]
     write_answers(tmp_path / "a", reversed(answers))
     assert read_answers(tmp_path / "a") == {a.case: a for a in answers}
@@ -692,9 +668,7 @@ def test_the_command_from_bank_to_report(stub, tmp_path, capsys):
     digest = Trial(folder).digest()
     assert printed.err.startswith(f"SHA-256 of the sealed truths: {digest}\n")
     kept = (folder / "report.txt").read_text()
-    assert [line.split("  ")[0] for line in kept.splitlines()] == [
-        line.split("  ")[0] for line in printed.out.splitlines()
-    ]
+    assert [line.split("  ")[0] for line in kept.splitlines()] == [line.split("  ")[0] for line in printed.out.splitlines()]
     for title in ("What was concealed", "Rates", "Stated confidence", "Held-out error", "CPU of a diagnosis"):
         assert title in printed.out
     kept = (folder / "report.json").read_bytes()

@@ -222,9 +222,7 @@ def test_structure_of_hdf5_and_tdms(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("kind", "extra"), [("hdf5", "srfcli[hdf5]"), ("tdms", "srfcli[tdms]")])
-def test_without_its_library_a_reader_says_how(
-    kind: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_its_library_a_reader_says_how(kind: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a").write_bytes(EXTRAS[kind](table()))
     monkeypatch.setitem(sys.modules, {"hdf5": "h5py", "tdms": "nptdms"}[kind], None)
     with pytest.raises(SrfError, match="is not installed") as caught:
@@ -283,9 +281,7 @@ def test_matlab_matrices_and_strangers(tmp_path: Path) -> None:
     from scipy.io import savemat
 
     t = np.arange(30.0)
-    savemat(
-        tmp_path / "a.mat", {"t": t, "data": np.stack([t, 2 * t], axis=1), "k": 168.0, "name": "paper", "s": {"a": 1}}
-    )
+    savemat(tmp_path / "a.mat", {"t": t, "data": np.stack([t, 2 * t], axis=1), "k": 168.0, "name": "paper", "s": {"a": 1}})
     source = open_source(tmp_path / "a.mat", registry=REGISTRY)
     assert source.headings == ("t", "data_1", "data_2")
     assert np.array_equal(columns(source), [t, t, 2 * t])
@@ -333,9 +329,7 @@ def test_two_readers_that_know_a_file_are_named(tmp_path: Path) -> None:
 
 def test_the_reader_in_the_docs_reads(tmp_path: Path) -> None:
     text = (Path(__file__).resolve().parents[1] / "docs" / "recordings.md").read_text(encoding="utf-8")
-    (tmp_path / "pairs.py").write_text(
-        re.search(r"^```python\n(# pairs\.py.*?)^```", text, re.M | re.S)[1], encoding="utf-8"
-    )
+    (tmp_path / "pairs.py").write_text(re.search(r"^```python\n(# pairs\.py.*?)^```", text, re.M | re.S)[1], encoding="utf-8")
     (tmp_path / "run.pairs").write_text("0 1000\n1 2000.5\n", encoding="utf-8")
     source = open_source(tmp_path / "run.pairs", registry=load_registry((tmp_path,), user=False, entry_points=False))
     assert source.headings == ("time [ms]", "elongation [nm]")
@@ -355,9 +349,7 @@ BAD_READERS = {
 @pytest.mark.parametrize("name", BAD_READERS)
 def test_a_reader_that_fails_is_named(name: str, tmp_path: Path) -> None:
     body, message = BAD_READERS[name]
-    text = (
-        f"from srfcli.laws.api import reader\n\n\n@reader(name='bad', suffixes=('.bad',))\ndef bad(path):\n    {body}\n"
-    )
+    text = f"from srfcli.laws.api import reader\n\n\n@reader(name='bad', suffixes=('.bad',))\ndef bad(path):\n    {body}\n"
     (tmp_path / "bad.py").write_text(text, encoding="utf-8")
     (tmp_path / "x.bad").write_bytes(b"1")
     registry = load_registry((tmp_path,), user=False, entry_points=False)
@@ -474,9 +466,7 @@ def toml_text(value: object) -> str:
 
 
 NUMBERS = st.one_of(
-    st.floats(allow_nan=True, allow_infinity=True),
-    st.sampled_from([0.0, 1.0, 5.0, 1e-300, 1e300, -1.0]),
-    st.floats(0, 10),
+    st.floats(allow_nan=True, allow_infinity=True), st.sampled_from([0.0, 1.0, 5.0, 1e-300, 1e300, -1.0]), st.floats(0, 10)
 )
 
 

@@ -179,11 +179,7 @@ def test_a_law_of_ones_own_takes_three_commands() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     story = text.partition("### From nothing to your own law")[2].partition("\n## ")[0]
     commands = [line[2:] for line in story.splitlines() if line.startswith("$ ")]
-    assert [c.split()[:3] for c in commands] == [
-        ["srf", "law", "new"],
-        ["srf", "law", "check"],
-        ["srf", "continue", "--plugins"],
-    ]
+    assert [c.split()[:3] for c in commands] == [["srf", "law", "new"], ["srf", "law", "check"], ["srf", "continue", "--plugins"]]
 
 
 @pytest.mark.parametrize("marker", ["diagram-command", "test-command"])

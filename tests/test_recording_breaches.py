@@ -168,10 +168,7 @@ def test_what_no_column_and_no_key_gives(what: str, tmp_path: Path, registry: Re
 
 def test_a_saturated_load_is_refused(tmp_path: Path, registry: Registry) -> None:
     lines, W = data(400), np.minimum(5 + np.sin(np.arange(400) / 9), 5.8)
-    lines = [
-        lines[0],
-        *(",".join([*c[:2], f"{w:.4f}", c[3]]) for w, c in zip(W, (x.split(",") for x in lines[1:]), strict=True)),
-    ]
+    lines = [lines[0], *(",".join([*c[:2], f"{w:.4f}", c[3]]) for w, c in zip(W, (x.split(",") for x in lines[1:]), strict=True))]
     found, hint = answer(write(tmp_path, toml=TOML.replace("duration = 1.0", "duration = 9.0"), one=lines), registry)
     assert "samples sit at the extreme value 5.8 N: the gauge is saturated" in found and "window" in hint
 
@@ -181,9 +178,7 @@ def test_every_role_refuses_a_unit_of_another_dimension(role: str, tmp_path: Pat
     unit = "kg" if role != "friction" else "um"
     toml = TOML.replace('elongation = { name = "spring", unit = "um" }', f'{role} = {{ name = "x", unit = "{unit}" }}')
     found, hint = answer(write(tmp_path, toml=toml), registry)
-    assert found.startswith(f"experiment.toml, line 19: columns.{role}.unit: '{unit}' measures ") and hint.startswith(
-        "Give"
-    )
+    assert found.startswith(f"experiment.toml, line 19: columns.{role}.unit: '{unit}' measures ") and hint.startswith("Give")
 
 
 # the experiment itself
@@ -295,9 +290,7 @@ LARGE = [csv_of_2_gb, npz_of_2_gb, mat_of_2_gb, look_of_2_gb]
 
 
 @pytest.mark.parametrize("make", LARGE, ids=lambda f: f.__name__)
-def test_a_recording_of_2_gb_is_refused_unread(
-    make: Callable[[Path], Path], tmp_path: Path, registry: Registry
-) -> None:
+def test_a_recording_of_2_gb_is_refused_unread(make: Callable[[Path], Path], tmp_path: Path, registry: Registry) -> None:
     """Its size is told, and the way out, and little memory is touched."""
     write(tmp_path)
     toml = TOML.replace("one.csv", make(tmp_path).name).replace("window = [0.0, 10.0]\n", "")
@@ -319,15 +312,12 @@ def test_a_window_of_a_large_recording_is_read(tmp_path: Path, registry: Registr
     """With 10 kB allowed, 5000 samples are too many and a hundred are not."""
     lines = data(5000)
     toml = TOML.replace(
-        "[{ duration = 0.5, velocity = 8.0 }, { duration = 1.0, velocity = 12.0 }]",
-        "[{ duration = 99, velocity = 8.0 }]",
+        "[{ duration = 0.5, velocity = 8.0 }, { duration = 1.0, velocity = 12.0 }]", "[{ duration = 99, velocity = 8.0 }]"
     )
     folder = write(tmp_path, toml=toml.replace("window = [0.0, 10.0]", "window = [20.0, 20.99]"), one=lines)
     run = read_experiment(folder, registry=registry, limit=10_000).runs[0]
     assert (run.t[0], run.t[-1], run.t.size) == (20.0, 20.99, 100)
-    with pytest.raises(
-        SrfError, match=r"too large to hold: what is needed of it exceeds .* above the limit of 0\.009537 MB"
-    ):
+    with pytest.raises(SrfError, match=r"too large to hold: what is needed of it exceeds .* above the limit of 0\.009537 MB"):
         read_experiment(write(tmp_path, toml=toml, one=lines), registry=registry, limit=10_000)
 
 

@@ -141,20 +141,14 @@ FLAWS: dict[str, tuple[Callable[[Columns], None], str]] = {
     "nan": (nan, "one.csv: rows 301-304, t = 3 to 3.03 s: 4 samples without a number in 'spring', not compared"),
     "repeated-time": (repeated, "one.csv: row 501, t = 4.99 s: 1 sample with the time of the sample before, left out"),
     "backward-time": (backward, "one.csv: row 501, t = 4 s: 1 sample whose time does not fit"),
-    "spike": (
-        spike,
-        "one.csv: rows 701-702, t = 7 to 7.01 s: 2 samples standing out in 'spring', compared as they are; ",
-    ),
+    "spike": (spike, "one.csv: rows 701-702, t = 7 to 7.01 s: 2 samples standing out in 'spring', compared as they are; "),
     "reset": (reset, "one.csv: rows 900-901, t = 8.99 to 9 s: 'spring' jumps by "),
     "saturation": (saturation, "at the extreme value 9.7 of 'spring': saturated, not compared"),
     "quantisation": (quantisation, "one.csv: column 'spring': steps of 0.05, "),
     "load-constant": (load_constant, "constant to its noise of 0.0021 of 5.0"),
     "load-smoothed": (load_smoothed, "which dW/dt would amplify: smoothed by a spline"),
     "modulation-differs": (modulation_differs, "relative amplitude declared 0.16, found 0.08; the column counts"),
-    "drive-differs": (
-        drive_differs,
-        "600 of 1200 velocities differ from the declared drive by more than 5 %, the first 8",
-    ),
+    "drive-differs": (drive_differs, "600 of 1200 velocities differ from the declared drive by more than 5 %, the first 8"),
     "drive-segmented": (drive_segmented, "2 constant or straight pieces describe them"),
     "drive-fitted": (drive_fitted, "a continuous line of 2 straight pieces"),
     "unit": (unit, "the heading says 'nm', [columns] says 'um', which counts"),
@@ -292,7 +286,7 @@ def test_dips_under_a_modulated_load_are_no_spikes(tmp_path: Path) -> None:
     c = Columns()
     c.W = 5.0 * (1 + 0.15 * np.cos(2 * np.pi * 12.1 * c.t))
     c.u[np.flatnonzero((np.roll(c.W, 1) > c.W) & (np.roll(c.W, -1) >= c.W))[5:50:20]] -= 1.2
-    c.toml += "corrections = [\"spike\"]\n"
+    c.toml += 'corrections = ["spike"]\n'
     assert c.read(tmp_path).used.all()
 
 
@@ -380,11 +374,7 @@ def test_the_parts_of_the_noise_are_told_apart(seed: int) -> None:
     assert found.white == pytest.approx(0.03, rel=0.05)
     found = find_noise([slow(n) + white + 0.03 * oscillating(n, 5 * dt, 20.0, random)], dt)
     frequency, level, quality = found.colours[0]
-    assert (frequency, level, quality) == (
-        pytest.approx(5, rel=0.01),
-        pytest.approx(0.03, rel=0.15),
-        pytest.approx(20, rel=0.4),
-    )
+    assert (frequency, level, quality) == (pytest.approx(5, rel=0.01), pytest.approx(0.03, rel=0.15), pytest.approx(20, rel=0.4))
     assert found.white == pytest.approx(0.03, rel=0.05) and len(found.colours) == 1
     found = find_noise([slow(n) + 0.03 * oscillating(n, 0.05, 0.5, random)], dt)
     assert found.white < 0.003 and found.colours[0] == pytest.approx((5, 0.03, 0.5), rel=0.2)
@@ -405,9 +395,7 @@ def test_each_rate_has_a_noise_of_its_own_and_rounding_its_part(tmp_path: Path) 
     assert fast.colours[0] == (pytest.approx(5, rel=0.02), pytest.approx(0.03, rel=0.15), pytest.approx(10, rel=0.4))
     assert slow_.colours[0] == pytest.approx((0.5, 0.03), rel=0.35)
     assert (fast.quantum, slow_.quantum) == pytest.approx((0.02, 0.02))
-    assert fast.total == pytest.approx(np.std(c.u[n:]), rel=0.07) and slow_.total == pytest.approx(
-        np.std(c.u[:n]), rel=0.07
-    )
+    assert fast.total == pytest.approx(np.std(c.u[n:]), rel=0.07) and slow_.total == pytest.approx(np.std(c.u[:n]), rel=0.07)
     assert fast.white == pytest.approx(0.01, rel=0.15) and slow_.white == pytest.approx(0.02, rel=0.2)
 
 
@@ -472,9 +460,7 @@ def test_scale_offset_and_intervals(tmp_path: Path) -> None:
     assert run.t == pytest.approx(0.01 * np.arange(1, N + 1), rel=1e-9)
     assert run.observed == pytest.approx(expected, rel=1e-6)
     c.t[7] = -1
-    with pytest.raises(
-        SrfError, match=r"one\.csv, row 8, column 'time \[s\]': found -0.0001 s, expected a sample interval"
-    ):
+    with pytest.raises(SrfError, match=r"one\.csv, row 8, column 'time \[s\]': found -0.0001 s, expected a sample interval"):
         c.read(tmp_path)
 
 

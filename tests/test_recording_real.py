@@ -149,9 +149,7 @@ def test_paper_on_paper(shared: Path, tmp_path: Path) -> None:
 )
 def test_the_concealed_cases_are_sound(case: str, shared: Path) -> None:
     """White noise of 0.02 um, a gauge of 0.005 um, modulations as declared, and no notice."""
-    done = json.loads(
-        srf("check", str(shared / "cases" / case), "--json", "--no-simulate", "--fail-on", "notice").stdout
-    )
+    done = json.loads(srf("check", str(shared / "cases" / case), "--json", "--no-simulate", "--fail-on", "notice").stdout)
     rows = {row["run"]: row for row in done["rows"]}
     assert [rows[n]["quantum"] for n in rows] == pytest.approx([0.005] * 7, rel=1e-9)
     for name, f, eps, onset in (("onset", 120, 0.09, 2.0), ("strong", 120, 0.2, 0.6), ("holdout-mod", 80, 0.13, 0.8)):

@@ -185,12 +185,7 @@ def test_modifiers_are_spelled_with_a_plus() -> None:
     law, modifiers = registry.ageing("dieterich + linker-dieterich")
     assert (law.name, [m.name for m in modifiers]) == ("dieterich", ["linker-dieterich"])
     assert registry.ageing("ruina") == (registry.get("ageing", "ruina"), ())
-    for spelling in (
-        "dieterich+",
-        "+linker-dieterich",
-        "dieterich+linker-dieterich+linker-dieterich",
-        "dieterich+ruina",
-    ):
+    for spelling in ("dieterich+", "+linker-dieterich", "dieterich+linker-dieterich+linker-dieterich", "dieterich+ruina"):
         with pytest.raises(SrfError):
             registry.ageing(spelling)
 
@@ -207,9 +202,7 @@ def test_fingerprint_is_that_of_the_source(tmp_path: Path) -> None:
 def test_an_entry_point_module_loads_on_demand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     marker = tmp_path / "marker"
     module = "from .more import *\n" + PYTHON.format(marker=str(marker), name="strange")
-    package(
-        tmp_path, monkeypatch, "lawpack.laws", lawpack____init___py="1/0 if False else 0\n", lawpack__laws_py=module
-    )
+    package(tmp_path, monkeypatch, "lawpack.laws", lawpack____init___py="1/0 if False else 0\n", lawpack__laws_py=module)
     (tmp_path / "site" / "lawpack" / "more.py").write_text("")
     registry = load_registry()
     assert names(registry, "entry point stranger") == ["strange"]
@@ -220,9 +213,7 @@ def test_an_entry_point_module_loads_on_demand(tmp_path: Path, monkeypatch: pyte
 
 
 def test_an_entry_point_may_be_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    package(
-        tmp_path, monkeypatch, "folderpack.data", folderpack____init___py="", folderpack__data__ageing__told_toml=AGEING
-    )
+    package(tmp_path, monkeypatch, "folderpack.data", folderpack____init___py="", folderpack__data__ageing__told_toml=AGEING)
     assert names(load_registry(), "entry point stranger") == ["told"]
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from srfcli.core.errors import SrfError
 from srfcli.laws.registry import bundled_registry
+from srfcli.laws.values import Effect
 from srfcli.results import report, report_text
 from srfcli.results.plots import figure_bytes
 from srfcli.results.report import VOID, Markup, command_lines, merged, tag, write_report
@@ -59,9 +60,7 @@ class Page(HTMLParser):
         return [attributes for tag, attributes in self.elements if tag == name]
 
 
-def made_run(
-    name: str, *, holdout: bool = False, n: int = 900, seed: int = 0, windows: Any = ((1.0, 1.5),)
-) -> dict[str, Any]:
+def made_run(name: str, *, holdout: bool = False, n: int = 900, seed: int = 0, windows: Any = ((1.0, 1.5),)) -> dict[str, Any]:
     """A run whose baseline fails from 1 to 1.5 s by a wave of ten times the noise; the augmented model leaves noise."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 3.0, n)
@@ -132,12 +131,7 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
         material["force"] = {"quiet": force, "form": "0.3*log(v/V0) < 1", "unit": "1"}
     if verdict == "identified":
         V = np.geomspace(1, 100, 30)
-        material["diagram"] = {
-            "V": V,
-            "W0_baseline": 7 + np.log(V),
-            "W0_augmented": 8 + np.log(V),
-            "note": "at eps = 0.18",
-        }
+        material["diagram"] = {"V": V, "W0_baseline": 7 + np.log(V), "W0_augmented": 8 + np.log(V), "note": "at eps = 0.18"}
     if verdict == "ambiguous":
         material["discriminating"] = ["Step the load from 5 to 9 N."]
     return material
@@ -243,17 +237,20 @@ def test_a_wrong_stiffness_is_told_with_what_was_stated_and_what_to_set(tmp_path
     answer["effects"] = ["stiffness-error"]
     wanted = {"name": "K", "unit": "1/um", "baseline": None, "augmented": 0.006531, "augmented_stderr": 5e-5}
     material["parameters"] = [*material["parameters"], wanted]
-    material |= {"stated": {"stiffness": "0.0050 1/µm"}, "own": {"stiffness-error": ["K"]}}
+    effect = bundled_registry().get("effect", "stiffness-error")
+    assert isinstance(effect, Effect)
+    texts = {"stiffness-error": {"wrong": effect.wrong, "remedy": effect.remedy}}
+    material |= {"stated": {"stiffness": "0.0050 1/µm"}, "own": {"stiffness-error": ["K"]}, "texts": texts}
     text = report_text.verdict_sentence(answer, material)
     assert text == "Stated stiffness 0.0050 1/µm; the recordings want 0.00653(5)\u00a01/µm."
-    assert report_text.remedy(answer, material).startswith(
-        'Set stiffness = "0.006531\u00a01/µm" in [apparatus], and calibrate'
-    )
+    assert report_text.remedy(answer, material).startswith('Set stiffness = "0.006531\u00a01/µm" in [apparatus], and calibrate')
 
 
 def test_every_shipped_effect_has_a_remedy() -> None:
-    shipped = {e.name for e in bundled_registry().entries("effect")}
-    assert shipped <= set(report_text.REMEDIES)
+    registry = bundled_registry()
+    for entry in registry.entries("effect"):
+        effect = registry.get("effect", entry.name)
+        assert isinstance(effect, Effect) and effect.wrong and effect.remedy, entry.name
 
 
 @pytest.mark.parametrize(
@@ -316,9 +313,7 @@ def test_no_name_breaks_out_of_the_page(tmp_path: Path) -> None:
     assert files and all(re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*\.(svg|png)", n) for n in files)
 
 
-def test_two_runs_whose_names_make_one_file_name_keep_both_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_runs_whose_names_make_one_file_name_keep_both_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "figure_bytes", lambda figure, suffix: f"{figure}{suffix}".encode())
     monkeypatch.setattr(report, "overview", lambda traces, narrow=False: None)
     monkeypatch.setattr(report, "scan_figure", lambda rows, narrow=False: None)
@@ -464,10 +459,7 @@ def test_command_lines_are_quoted_and_name_the_laws_that_there_are() -> None:
 
 def test_text_is_escaped_unless_it_is_markup() -> None:
     assert tag("p", "<b>", Markup("<i>x</i>"), ["&"], title='"') == '<p title="&quot;">&lt;b&gt;<i>x</i>&amp;</p>'
-    assert (
-        tag("br") == "<br>"
-        and tag("span", class_="n", aria_hidden="true") == '<span class="n" aria-hidden="true"></span>'
-    )
+    assert tag("br") == "<br>" and tag("span", class_="n", aria_hidden="true") == '<span class="n" aria-hidden="true"></span>'
 
 
 @pytest.mark.usefixtures("without_matplotlib")

@@ -15,15 +15,11 @@ from test_report import made_answer, made_material
 
 from srfcli.results.report import write_report
 
-BROWSER = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
-)
+BROWSER = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
 WIDTHS = (420, 800, 1280)
 SMALLEST = 8.0  # px of text in a figure
 
-pytestmark = pytest.mark.skipif(
-    BROWSER is None, reason="BROWSER ABSENT: no headless Chromium, the report is not laid out"
-)
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="BROWSER ABSENT: no headless Chromium, the report is not laid out")
 
 # The page is measured inside a frame of each width: a frame has no smallest width, and media queries answer to it.
 HARNESS = """<!DOCTYPE html><body><script>

@@ -90,9 +90,7 @@ def test_fit_prints_what_its_draws_are_worth(tmp_path: Path) -> None:
     folder = tmp_path / "small"
     folder.mkdir()
     write(folder)
-    done = CliRunner().invoke(
-        cli, ["fit", str(folder), "--track", "smooth", "--sample", "300", "--json"], prog_name="srf"
-    )
+    done = CliRunner().invoke(cli, ["fit", str(folder), "--track", "smooth", "--sample", "300", "--json"], prog_name="srf")
     assert done.exit_code in (0, 3), done.stderr
     found = json.loads(done.stdout)
     draws = found["meta"]["posterior"]

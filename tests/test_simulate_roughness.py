@@ -288,9 +288,7 @@ def test_an_experiment_with_effects_is_simulated_as_it_is_fitted(
     run = next(r for r in experiment.runs if r.name == "strong")
     name, value = change.split("=")
     expected = predict(model, experiment, run, {name: float(value)}, rtol=1e-8).y
-    found = columns(
-        "case", "--run", "strong", "--set", change, *(("--quantum", "1e-9") if column == "measured" else ())
-    )
+    found = columns("case", "--run", "strong", "--set", change, *(("--quantum", "1e-9") if column == "measured" else ()))
     assert found[column] == pytest.approx(expected, abs=2e-5)
 
 

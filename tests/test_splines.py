@@ -118,10 +118,7 @@ def motion(make_model, tables, *, how="compiled", by_tables=(), by=(), rtol=1e-9
     start = np.asarray(model.steady(appended(p, tables)))
     count = len(by) + sum(tables[i].numbers.size for i in by_tables)
     S0 = np.zeros((start.size, count))
-    columns = [
-        *by,
-        *(int(appended(p, tables)[len(p) + 4 * i]) + j for i in by_tables for j in range(tables[i].numbers.size)),
-    ]
+    columns = [*by, *(int(appended(p, tables)[len(p) + 4 * i]) + j for i in by_tables for j in range(tables[i].numbers.size))]
     for k, place in enumerate(columns):
         q = appended(p, tables).astype(complex)
         q[place] += 1e-30j
@@ -139,8 +136,7 @@ def tables_for(size: float = 1.0) -> tuple[Spline, ...]:
     shapes = (Spline.over(0.0, 8.0, 1.0), Spline.over(0.1, 0.4, 0.05), Spline.over(-1.0, 15.0, 2.0))
     rng = np.random.default_rng(6)
     return tuple(
-        s.with_numbers(size * w * rng.standard_normal(s.numbers.size))
-        for s, w in zip(shapes, (2e-3, 2e-3, 0.05), strict=True)
+        s.with_numbers(size * w * rng.standard_normal(s.numbers.size)) for s, w in zip(shapes, (2e-3, 2e-3, 0.05), strict=True)
     )
 
 
@@ -162,9 +158,7 @@ def test_flat_tables_and_none_are_the_plain_model(make_model):
     p = plain.vector({"V": 20.0, "W0": 6.0})
     t, atol = np.linspace(0.0, 0.5, 101), np.array([1e-9, 2e-8, 1e-9, 1e-9])
     drive, load = Drive.steps([(0.0, 20.0), (0.2, 30.0)]), Modulation(6.0, 0.1, 120.0, 0.25)
-    expected = integrate(
-        plain, p, drive=drive, load=load, t=t, start=np.asarray(plain.steady(p)), rtol=1e-9, atol=atol
-    ).x
+    expected = integrate(plain, p, drive=drive, load=load, t=t, start=np.asarray(plain.steady(p)), rtol=1e-9, atol=atol).x
     none = tuple(Spline(0.0, 1.0, np.zeros(0)) for _ in TABLES)
     for tables in (tables_for(0.0), none):
         assert np.abs(motion(make_model, tables).x[:, :4] - expected).max() < 1e-6
@@ -228,6 +222,4 @@ def test_a_prediction_has_columns_for_numbers_after_those_of_parameters(shared, 
     track = track.with_numbers(1e-3 * np.random.default_rng(2).standard_normal(track.numbers.size))
     found = predict(model, experiment, run, {}, by=("mu0", "A"), tables=(track,), by_tables=(0,), until=0.9)
     assert found.J.shape == (found.y.size, 2 + track.numbers.size)
-    assert found.J[:, 2:].sum(axis=1) == pytest.approx(
-        found.J[:, 0], rel=1e-3, abs=1e-3
-    )  # all numbers together are mu0
+    assert found.J[:, 2:].sum(axis=1) == pytest.approx(found.J[:, 0], rel=1e-3, abs=1e-3)  # all numbers together are mu0

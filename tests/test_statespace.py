@@ -157,9 +157,7 @@ def test_derivatives_are_those_of_the_likelihood(rig):
     for j, name in enumerate(by):
         step = 1e-4 * abs(values[name])
         sides = [
-            filter_run(
-                model, own.experiment, own.run, values | {name: values[name] + sign * step}, trend=own.trend, rtol=1e-8
-            )
+            filter_run(model, own.experiment, own.run, values | {name: values[name] + sign * step}, trend=own.trend, rtol=1e-8)
             for sign in (1, -1)
         ]
         nu_d = (sides[0].found.nu - sides[1].found.nu) / (2 * step)
@@ -235,13 +233,9 @@ def test_a_linear_model_agrees_with_statsmodels(make_model, beside):
     others = [replace(s, observed=-steady.of(k).nu) for k, s in enumerate(run.others, 1)]  # so that all stays where it is linear
     run = replace(run, others=tuple(others))
     own = replace(own, run=run)
-    found = filter_run(
-        model, own.experiment, run, values, by=["r.trend"], gauges=gauges, trend="time", rtol=1e-12, keep=True
-    )
+    found = filter_run(model, own.experiment, run, values, by=["r.trend"], gauges=gauges, trend="time", rtol=1e-12, keep=True)
 
-    p = model.vector(
-        {k: v for k, v in values.items() if k in model.names} | {"V": 5.0, "W0": 5.0, "K": 0.21, "M": 2.37e-6}
-    )
+    p = model.vector({k: v for k, v in values.items() if k in model.names} | {"V": 5.0, "W0": 5.0, "K": 0.21, "M": 2.37e-6})
     x0 = np.asarray(model.steady(p))
     J, g = np.asarray(model.rates_jacobian(x0, 5.0, 5.0, 0.0, p)), np.asarray(model.field_gain(x0, 5.0, 5.0, 0.0, p))
     k, c = x0.size, len(noises)
@@ -367,9 +361,7 @@ def made(model, seed, amplitude, *, sd=3e-4):
     for k in range(2):
         drive = Drive.steps([(0.0, 3.0), (8.0, 10.0 * (k + 1)), (16.0, 3.0)])
         run = recording(t, "friction", drive, ConstantLoad(20.0), stiffness=0.2, name=f"r{k}")
-        waves = (
-            np.abs(rng.standard_t(3, 400)) / 3.0 * np.sqrt(3) / np.sqrt(3)
-        )  # spectrum of Matern 3/2, correlation length 3 um
+        waves = np.abs(rng.standard_t(3, 400)) / 3.0 * np.sqrt(3) / np.sqrt(3)  # spectrum of Matern 3/2, correlation length 3 um
         phases = rng.uniform(0, 2 * np.pi, 400)
         m = amplitude * np.sqrt(2 / 400)
         from srfcli.codegen.splines import Spline
@@ -385,9 +377,7 @@ def made(model, seed, amplitude, *, sd=3e-4):
                       atol=1e-8 * np.ones(x0.size)).x  # fmt: skip
         y = np.asarray(model.friction(x, 3.0, 20.0, 0.0, appended(p, [table])))
         experiment_runs.append(replace(run, observed=y + sd * rng.standard_normal(t.size)))
-    listed = tuple(
-        FitParameter(n, 1.3 * v if n != "mu0" else v, v / 4, v * 4, False, "1") for n, v in ROCK_VALUES.items()
-    )
+    listed = tuple(FitParameter(n, 1.3 * v if n != "mu0" else v, v / 4, v * 4, False, "1") for n, v in ROCK_VALUES.items())
     return Experiment(Path(), "rock", ModelChoice("dieterich-ruina", "ruina", "rigid", False), None, "0.2 N/um", listed,
                       tuple(experiment_runs), ())  # fmt: skip
 

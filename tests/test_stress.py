@@ -34,9 +34,7 @@ def test_any_parameters(law: str, draws: int) -> None:
             if p.name in ("V", "W0", "eps", "f"):
                 continue
             low, high = max(p.lower, p.default / 10), min(p.upper, p.default * 10)
-            value = (
-                chance.uniform(low, high) if p.lower < 0 else math.exp(chance.uniform(math.log(low), math.log(high)))
-            )
+            value = chance.uniform(low, high) if p.lower < 0 else math.exp(chance.uniform(math.log(low), math.log(high)))
             options += ["--set", f"{p.name}={value!r}"]
         V, W0 = repr(10 ** chance.uniform(-1, 2)), repr(10 ** chance.uniform(0, 1.5))
         for command in (
@@ -62,10 +60,7 @@ def test_any_parameters(law: str, draws: int) -> None:
 )  # fmt: skip
 def test_parameters_at_their_bounds(options: list[str]) -> None:
     given = [word for option in options for word in ("--set", option)]
-    for command in (
-        ["linear", "--over", "V=8"],
-        ["simulate", "--V", "8", "--W0", "5", "--for", "0.01", "--rate", "300"],
-    ):
+    for command in (["linear", "--over", "V=8"], ["simulate", "--V", "8", "--W0", "5", "--for", "0.01", "--rate", "300"]):
         done = srf(*command, *given)
         assert done.exit_code in (0, 2, 3) and "unexpected" not in done.stderr, (command, done.stderr)
 
@@ -107,9 +102,7 @@ def test_where_nothing_can_be_computed(command: list[str], ageing: str) -> None:
 
 
 def test_a_jacobian_that_overflows() -> None:
-    words = (
-        "linear --over V=0.027 --law rice-regularized --set A=0.000366 --set B=0.00959 --set V0=163 --set mu0=0.0177"
-    )
+    words = "linear --over V=0.027 --law rice-regularized --set A=0.000366 --set B=0.00959 --set V0=163 --set mu0=0.0177"
     (row,) = json.loads(srf(*words.split(), "--set", "lambda=337", "--set", "D0=29.2", "--json").stdout)["rows"]
     assert row["W0"] > 0 and row["lyapunov"] is None and row["criticality"] is None
     assert row["status"] == "no Lyapunov coefficient: the Jacobian overflows"
@@ -179,21 +172,7 @@ def test_response_where_a_formula_has_no_value(words: str, without: list[int]) -
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "nan",
-        "inf",
-        "-inf",
-        "1e400",
-        "1" * 400,
-        "abc",
-        "",
-        "0:1:3:log",
-        "1:2:0",
-        "1:nan",
-        "1,,2",
-        "1,nan",
-        "1:2:3:lin:x",
-    ],
+    ["nan", "inf", "-inf", "1e400", "1" * 400, "abc", "", "0:1:3:log", "1:2:0", "1:nan", "1,,2", "1,nan", "1:2:3:lin:x"],
     ids=lambda text: text[:12],
 )
 def test_what_is_no_range_is_told(text: str) -> None:

@@ -115,9 +115,7 @@ def test_steady_is_steady(case: tuple[Any, ...], make_model: Callable[..., Any])
     assert np.abs(model.rates(x, 3.0, 9.0, 0.0, p)).max() < 1e-8
     K = p[model.index("K")]
     assert model.elongation(x, 3.0, 9.0, 0.0, p) * K == pytest.approx(9.0 * model.steady_friction(p), rel=1e-12)
-    assert model.cycle_load(0.25, x, p) == pytest.approx(
-        9.0, rel=1e-12
-    )  # W0 is the load in steady sliding, at any angle
+    assert model.cycle_load(0.25, x, p) == pytest.approx(9.0, rel=1e-12)  # W0 is the load in steady sliding, at any angle
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -174,6 +172,4 @@ def test_one_name_in_two_units_is_refused(name: str, unit: str, tmp_path: Path) 
     if unit == "um/s":
         with pytest.raises(SrfError, match="'lambda' is in um/s in velocity and in um in elastic"):
             build_system(REGISTRY, law=str(file))
-    assert (
-        build_system(REGISTRY, law=str(file), interface="rigid" if unit == "um/s" else "elastic").friction.name == name
-    )
+    assert build_system(REGISTRY, law=str(file), interface="rigid" if unit == "um/s" else "elastic").friction.name == name

@@ -316,9 +316,7 @@ def test_the_score_of_critical_loads_is_the_slope_of_their_log_density(alone: Pa
 
 
 def test_the_share_of_a_modulation_is_found_from_the_loads(tmp_path: Path, measured: Thresholds) -> None:
-    text = HEAD.format(
-        model='effects = ["load-transmission"]', parameters="rho = { value = 0.6, lower = 0.2, upper = 1.5 }"
-    )
+    text = HEAD.format(model='effects = ["load-transmission"]', parameters="rho = { value = 0.6, lower = 0.2, upper = 1.5 }")
     folder = folder_of(tmp_path, text + TABLE, loads=replace(measured, eps=measured.eps / RHO))
     found = srf.fit(folder)
     assert found.status.ok
@@ -426,9 +424,7 @@ def test_a_breach_names_file_line_and_key(tmp_path: Path, measured: Thresholds, 
 
 
 @pytest.mark.parametrize("stiffness", ["1e-3 1/um", "3 MPa/mm"])
-def test_loads_in_newton_need_a_stiffness_that_goes_with_them(
-    tmp_path: Path, measured: Thresholds, stiffness: str
-) -> None:
+def test_loads_in_newton_need_a_stiffness_that_goes_with_them(tmp_path: Path, measured: Thresholds, stiffness: str) -> None:
     head = HEAD.format(model="", parameters="").replace("0.21 N/um", stiffness).replace('mass = "2.37 kg"\n', "")
     with pytest.raises(SrfError, match="critical loads are in N"):
         srf.read_experiment(folder_of(tmp_path, head + TABLE, loads=measured))

@@ -20,14 +20,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.settings import Parameter
 from srfcli.data.thresholds import read_thresholds, thresholds, thresholds_csv
 from srfcli.inference.free_parameters import FreeParameter, Scale, free_parameters, with_transmission
-from srfcli.inference.thresholds import (
-    FAR,
-    Matcher,
-    fit_thresholds,
-    forced_slopes,
-    hopf_slopes,
-    uncertainty,
-)
+from srfcli.inference.thresholds import FAR, Matcher, fit_thresholds, forced_slopes, hopf_slopes, uncertainty
 from srfcli.numerics.boundary import along, polish
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import hopf_points
@@ -106,9 +99,7 @@ def test_slopes_against_brute_force(model: Any) -> None:
     h = 1e-3
     for field_name, slope in (("A", slopes[0]), ("lam", slopes[1])):
         value = getattr(slider, field_name)
-        over = [
-            error_of_load(replace(slider, **{field_name: value * (1 + s)}), point.orbit.x[0, 0])[0] for s in (h, -h)
-        ]
+        over = [error_of_load(replace(slider, **{field_name: value * (1 + s)}), point.orbit.x[0, 0])[0] for s in (h, -h)]
         assert slope * value / slider.W0 == pytest.approx(-(over[0] - over[1]) / (2 * h), rel=1e-3)
 
 
@@ -214,9 +205,7 @@ def test_the_cost_does_not_depend_on_the_way(model: Any) -> None:
 def test_the_optimised_set_is_recovered_from_the_trial_set(model: Any, small: Any) -> None:
     names = tuple(TRIAL)
     scale = scale_of(model, names, start_of(model, **TRIAL))
-    fit = fit_thresholds(
-        model, small, scale=scale, values=start_of(model, **TRIAL), methods=["least-squares"], tol=1e-8
-    )
+    fit = fit_thresholds(model, small, scale=scale, values=start_of(model, **TRIAL), methods=["least-squares"], tol=1e-8)
     found = fit.best
     assert fit.status is Status.OK and found.values == pytest.approx([OPTIMISED[n] for n in names], rel=1e-4)
     assert found.start_cost > 15 * found.cost and found.paper_cost[0] > 15 * found.paper_cost[1]
@@ -361,9 +350,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
 
 def test_units_comments_and_assumed_errors(tmp_path: Path) -> None:
     path = tmp_path / "loads.csv"
-    path.write_text(
-        "\ufeff# measured in June\nW0c (N);V [um/s];eps [%];sigma [%]\n8;10;9;5\n\n10;20;4.5;\n", encoding="utf-8"
-    )
+    path.write_text("\ufeff# measured in June\nW0c (N);V [um/s];eps [%];sigma [%]\n8;10;9;5\n\n10;20;4.5;\n", encoding="utf-8")
     table = read_thresholds(path)
     assert table.V.tolist() == [10, 20] and table.eps == pytest.approx([0.09, 0.045]) and table.lines == (3, 5)
     assert table.sigma == pytest.approx([0.4, 0.3]) and "1 of 2 rows" in table.notes[0] and "3%" in table.notes[0]
@@ -377,9 +364,7 @@ def test_a_written_table_reads_back(tmp_path: Path, small: Any) -> None:
 
 
 @settings(max_examples=150, deadline=None)
-@given(
-    st.one_of(st.text(max_size=80), st.text('V,epsW0c sigma[]%\n;\t"#12.e-_', max_size=60).map("V,eps,W0c\n".__add__))
-)
+@given(st.one_of(st.text(max_size=80), st.text('V,epsW0c sigma[]%\n;\t"#12.e-_', max_size=60).map("V,eps,W0c\n".__add__)))
 def test_no_text_crashes_the_reader(tmp_path_factory: Any, text: str) -> None:
     path = tmp_path_factory.getbasetemp() / "fuzzed.csv"
     path.write_text(text, encoding="utf-8", errors="replace", newline="")
@@ -423,17 +408,7 @@ def fit_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
 
 def test_the_command_writes_everything(fit_command: Any, small: Any, tmp_path: Path) -> None:
     Path("loads.csv").write_text(thresholds_csv(with_noise(small, 7)), encoding="utf-8")
-    arguments = [
-        "loads.csv",
-        "--free",
-        "D0,lambda",
-        "--set",
-        "rho=0.43",
-        "--set",
-        "lambda=0.62",
-        "--method",
-        "least-squares",
-    ]
+    arguments = ["loads.csv", "--free", "D0,lambda", "--set", "rho=0.43", "--set", "lambda=0.62", "--method", "least-squares"]
     done = fit_command(*arguments, "--bounds", "D0=300:500 nm", "--plot", "cost.svg", "--out", "fit.json")
     assert done.exit_code == 0, done.output
     data = json.loads(Path("fit.json").read_text(encoding="utf-8"))

@@ -90,9 +90,7 @@ COMMANDS = [
 LAW, OTHERS = 'law = "x.py"', ['ageing = "dieterich+x.py"', 'interface = "./x.py"']
 
 
-@pytest.mark.parametrize(
-    ("command", "line"), [*((c, LAW) for c in COMMANDS), *((c, o) for c in COMMANDS[:2] for o in OTHERS)]
-)
+@pytest.mark.parametrize(("command", "line"), [*((c, LAW) for c in COMMANDS), *((c, o) for c in COMMANDS[:2] for o in OTHERS)])
 def test_settings_run_no_python(command: str, line: str) -> None:
     Path("srf.toml").write_text(f"[defaults]\n{line}\n")
     Path("x.py").write_text(CODE)

@@ -84,9 +84,7 @@ def test_base_units() -> None:
     assert to_base(1, "MPa") == pytest.approx(1e-6, rel=1e-14)  # N/um^2
 
 
-@pytest.mark.parametrize(
-    "unit", ["1", "um", "s", "N", "N/um", "um/s", "1/um", "1/s", "Hz", "kg", "rad", "deg", "N*s/m", "g"]
-)
+@pytest.mark.parametrize("unit", ["1", "um", "s", "N", "N/um", "um/s", "1/um", "1/s", "Hz", "kg", "rad", "deg", "N*s/m", "g"])
 def test_to_base_and_back(unit: str) -> None:
     assert from_base(to_base(0.37, unit), unit) == pytest.approx(0.37, rel=4e-16)
 

@@ -49,9 +49,7 @@ def concluded(monkeypatch):
         monkeypatch.setattr(module, "uneven_noise", lambda fit: [])
         ranked = sorted(fits, key=lambda f: -f.evidence)
         baseline = next(f for f in fits if f.name == "none")
-        search = SimpleNamespace(
-            ranked=lambda: ranked, baseline=baseline, excluded=[], cut_short=cut_short, budget=150.0
-        )
+        search = SimpleNamespace(ranked=lambda: ranked, baseline=baseline, excluded=[], cut_short=cut_short, budget=150.0)
         return conclude(search, SimpleNamespace(runs=(), thresholds=()))
 
     return verdict
@@ -64,9 +62,7 @@ LOST = fitted(evidence=0.0, passes=False)
     ("evidence", "said"), [(98.0, ("identified", ("viscous-drag",))), (90.0, ("unknown", ()))], ids=["hardly", "far"]
 )
 def test_a_model_that_passes_is_taken_where_one_that_does_not_is_hardly_ahead_of_it(concluded, evidence, said):
-    found = concluded(
-        fitted("slip-evolution", evidence=100.0, passes=False), fitted("viscous-drag", evidence=evidence), LOST
-    )
+    found = concluded(fitted("slip-evolution", evidence=100.0, passes=False), fitted("viscous-drag", evidence=evidence), LOST)
     assert (found.verdict, found.effects) == said
     assert found.final is (found.best if said[1] else found.ranked[0])
 
@@ -176,8 +172,7 @@ def test_an_effect_that_became_another_ageing_law_gives_way_to_it(concluded, apa
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
-    [(0.0, ("ambiguous", ("slip-evolution", "viscous-drag"))), (20.0, ("identified", ("viscous-drag",)))],
+    ("told", "said"), [(0.0, ("ambiguous", ("slip-evolution", "viscous-drag"))), (20.0, ("identified", ("viscous-drag",)))]
 )
 def test_held_out_runs_choose_between_models_that_fit_equally_well(concluded, told, said):
     found = concluded(

@@ -75,8 +75,7 @@ def test_a_jump_between_branches_is_no_crossing(model):
 
 
 @pytest.mark.parametrize(
-    ("law", "ageing", "V", "eps"),
-    [("bowden-tabor", "dieterich", 3.0, 0.4), ("srf-vsat", "dieterich", 150.0, 0.1)],
+    ("law", "ageing", "V", "eps"), [("bowden-tabor", "dieterich", 3.0, 0.4), ("srf-vsat", "dieterich", 150.0, 0.1)]
 )
 def test_nothing_is_missed_that_a_wide_scan_sees(make_model, law, ageing, V, eps):
     model = make_model(law=law, ageing=ageing)

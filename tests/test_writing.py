@@ -84,9 +84,7 @@ def test_a_stiffness_is_per_load_by_its_dimension() -> None:
 def test_observables_and_stiffness_per_load(tmp_path: Path, observable: str, stiffness: str) -> None:
     K = 0.21 if stiffness.endswith("N/um") else 1e-3 * math.pi
     quasi_static = ModelChoice("dieterich-ruina", "ruina", "rigid", False)
-    wrote = experiment(
-        run(observable=observable, stiffness=K), stiffness_text=stiffness, mass=None, choice=quasi_static
-    )
+    wrote = experiment(run(observable=observable, stiffness=K), stiffness_text=stiffness, mass=None, choice=quasi_static)
     wrote = dataclasses.replace(wrote, parameters=wrote.parameters[:2])
     read = again(wrote, tmp_path / "made")
     assert read.runs[0].stiffness == pytest.approx(K, rel=1e-15)
@@ -119,8 +117,7 @@ def test_a_ramp_of_the_drive_keeps_the_displacement(tmp_path: Path) -> None:
     fine = np.linspace(0.0, 4.0, 400001)
     at = np.searchsorted(fine, T[1:] - 1e-9)
     moved = [
-        np.concatenate(([0.0], np.cumsum(0.5 * (V[1:] + V[:-1]) * np.diff(fine))))[at]
-        for V in (drive(fine), read.drive(fine))
+        np.concatenate(([0.0], np.cumsum(0.5 * (V[1:] + V[:-1]) * np.diff(fine))))[at] for V in (drive(fine), read.drive(fine))
     ]
     assert moved[1] == pytest.approx(moved[0], abs=2e-3)
     assert read.drive(np.array([0.5, 1.75, 3.5])) == pytest.approx([5.0, 12.5, 20.0], rel=1e-3)

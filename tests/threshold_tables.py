@@ -22,13 +22,7 @@ def with_noise(table: Thresholds, seed: int, *, relative: float = 0.03) -> Thres
 
 
 def generated(
-    model: GeneratedModel,
-    V: Array,
-    eps: Array,
-    *,
-    values: Mapping[str, float],
-    tol: float = 1e-8,
-    relative: float = 0.03,
+    model: GeneratedModel, V: Array, eps: Array, *, values: Mapping[str, float], tol: float = 1e-8, relative: float = 0.03
 ) -> Thresholds:
     """Return the lowest odd critical load of the model at each (V, eps), (n,), with `relative` errors but no noise.
 
@@ -51,8 +45,7 @@ def generated(
             load = None if point is None else point.W0
         if load is None:
             raise SrfError(
-                f"sliding is stable at every load at V = {velocity:g} um/s, eps = {amplitude:g}",
-                "Leave this point out.",
+                f"sliding is stable at every load at V = {velocity:g} um/s, eps = {amplitude:g}", "Leave this point out."
             )
         loads.append(load)
     return thresholds(V, eps, loads, sigma=relative * np.array(loads), source="generated")

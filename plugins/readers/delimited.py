@@ -18,9 +18,7 @@ SAMPLE = 2**16  # bytes by which the number of lines is estimated
 SNIFFED = 4096  # bytes from which a reader is chosen
 NOTHING = {"", "nan", "na", "n/a", "null", "none", "-nan", "#n/a"}
 CLOCK = re.compile(r"\d:\d\d|\d{4}[-/.]\d{1,2}[-/.]\d")
-NUMBER = re.compile(
-    r"[+-]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eEdD][+-]?\d++)?"
-)  # possessive: in the time that the cell is long
+NUMBER = re.compile(r"[+-]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eEdD][+-]?\d++)?")  # possessive: in the time that the cell is long
 INFINITE = re.compile(r"[+-]?inf(?:inity)?", re.IGNORECASE)
 
 
@@ -55,11 +53,7 @@ def tsv(path: Path) -> Source:
     return _open(path, "\t")
 
 
-@reader(
-    name="export",
-    suffixes=(".txt", ".dat", ".asc", ".lvm"),
-    sniff=lambda head: _text(head) and _layout(head) is not None,
-)
+@reader(name="export", suffixes=(".txt", ".dat", ".asc", ".lvm"), sniff=lambda head: _text(head) and _layout(head) is not None)
 def export(path: Path) -> Source:
     """Text that rigs export: a preamble, units in a line of their own, blanks between columns, decimal commas"""
     with path.open("rb") as stream:
@@ -133,9 +127,7 @@ def _layout(head: bytes) -> _Layout | None:
         return None
     units = units or [""] * count
     bare = [unit.strip("[]() ") for unit in units]
-    headings = tuple(
-        f"{n} [{u}]" if u and "[" not in n and "(" not in n else n for n, u in zip(names, bare, strict=True)
-    )
+    headings = tuple(f"{n} [{u}]" if u and "[" not in n and "(" not in n else n for n, u in zip(names, bare, strict=True))
     if len(set(headings)) < count:
         headings = tuple(f"{h}_{k + 1}" if headings.count(h) > 1 else h for k, h in enumerate(headings))
     return _Layout(headings, delimiter, decimal, begin + 1, skipped + sum(len(line) + 1 for line in raw[:begin]))
@@ -148,9 +140,7 @@ def _table_begins(lines: Sequence[str], k: int) -> bool:
         return False
     delimiter, decimal = _how(seen[0])
     rows = [_cells(line, delimiter) for line in seen]
-    return len(rows[0]) > 1 and all(
-        len(row) == len(rows[0]) and all(_is_number(c, decimal) for c in row) for row in rows
-    )
+    return len(rows[0]) > 1 and all(len(row) == len(rows[0]) and all(_is_number(c, decimal) for c in row) for row in rows)
 
 
 def _how(line: str) -> tuple[str, str]:
@@ -376,8 +366,7 @@ class _Table:
         where = f"{self.path}, line {line}, column '{self.headings[column]}'"
         if NUMBER.fullmatch(cell.replace(",", ".", 1)):
             raise SrfError(
-                f"{where}: found {cell!r}, a decimal comma",
-                f"Write a point: {cell.replace(',', '.', 1)}, in the whole file.",
+                f"{where}: found {cell!r}, a decimal comma", f"Write a point: {cell.replace(',', '.', 1)}, in the whole file."
             )
         short = cell if len(cell) <= 40 else cell[:37] + "..."
         hint = "Leave a missing value empty, or write nan."

@@ -39,9 +39,7 @@ def look(path: Path) -> Source:
     records, count = struct.unpack(">ii", head[20:28])
     whole = path.stat().st_size
     # how many headers there are is not written down: what is left over by the numbers tells
-    own = (
-        n for n in CHANNELS for width in (4, 8) if whole == FILE_HEADER + n * CHANNEL_HEADER + width * records * count
-    )
+    own = (n for n in CHANNELS for width in (4, 8) if whole == FILE_HEADER + n * CHANNEL_HEADER + width * records * count)
     channels = next(own, max(CHANNELS))
     begin = FILE_HEADER + channels * CHANNEL_HEADER
     headings, lengths, names = [], [], set()

@@ -38,9 +38,7 @@ class _Variable:
 @reader(
     name="matlab",
     suffixes=(".mat",),
-    sniff=lambda head: (
-        head.startswith(b"MATLAB ") and not head.startswith(b"MATLAB 7.3") and head[126:128] in (b"IM", b"MI")
-    ),
+    sniff=lambda head: head.startswith(b"MATLAB ") and not head.startswith(b"MATLAB 7.3") and head[126:128] in (b"IM", b"MI"),
 )
 def matlab(path: Path) -> Source:
     """MATLAB 5 file, a vector for each column, or a matrix `data` as data_1, data_2, ...; units in [columns]"""

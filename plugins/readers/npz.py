@@ -24,9 +24,7 @@ def npz(path: Path) -> Source:
         members = [m for m in archive.namelist() if m.endswith(".npy")]
         shapes = {m: _header(path, archive, m) for m in members}
         units = _units(path, archive) if "units.npy" in shapes else None
-    columns = [
-        m for m in members if m != "units.npy" and shapes[m][1].kind in "fiu" and _length(shapes[m][0]) is not None
-    ]
+    columns = [m for m in members if m != "units.npy" and shapes[m][1].kind in "fiu" and _length(shapes[m][0]) is not None]
     if not columns:
         raise SrfError(f"{path}: holds no array of numbers in one row", "Save one with np.savez(path, time=t, ...).")
     lengths = {m: _length(shapes[m][0]) for m in columns}
@@ -65,9 +63,7 @@ def _opened(path: Path, archive: zipfile.ZipFile, member: str) -> IO[bytes]:
     try:
         return archive.open(member)
     except Exception as error:  # damaged, encrypted, or packed in a way of its own
-        raise SrfError(
-            f"{path}: array '{member.removesuffix('.npy')}' cannot be opened: {_told(error)}", WHOLE
-        ) from None
+        raise SrfError(f"{path}: array '{member.removesuffix('.npy')}' cannot be opened: {_told(error)}", WHOLE) from None
 
 
 def _told(error: Exception) -> str:

@@ -110,9 +110,7 @@ class SrfGroup(WithExamples, click.Group):
             ctx.exit(EXIT_OK)
         return super().parse_args(ctx, args)
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
         """Return the command that `args` begin with; raises SrfError with the nearest names for a misspelt one."""
         name = args[0]
         if name in self.commands or name.startswith("-") or ctx.resilient_parsing:
@@ -265,9 +263,7 @@ def _ended(group: click.Group, arguments: list[str], session: Session, **extra: 
         return _end(text, "Run with --debug for the traceback.", EXIT_UNEXPECTED, error, session)
 
 
-def _end(
-    message: str, hint: str | None, code: int, error: BaseException, session: Session, *, caret: str | None = None
-) -> int:
+def _end(message: str, hint: str | None, code: int, error: BaseException, session: Session, *, caret: str | None = None) -> int:
     with contextlib.suppress(OSError):
         sys.stdout.flush()  # so that results stand before the error
     if session.debug:

@@ -72,9 +72,7 @@ def command(
     begun, registry = time.perf_counter(), open_registry(plugins)
     read = read_experiment(experiment, registry=registry, format=format, limit=int(limit * 2**20))
     with Progress("check", total=len(read.named(runs))) as progress:
-        found = check(
-            read, runs=runs, simulate=simulate, registry=registry, progress=lambda name: progress.advance(note=name)
-        )
+        found = check(read, runs=runs, simulate=simulate, registry=registry, progress=lambda name: progress.advance(note=name))
     table, *more = found.pages if output.format == "text" else (found.table,)
     inputs = [read.path, *dict.fromkeys(one.run.file for one in found.runs)]
     emit(table, output, more=more, figure=found.plot, inputs=inputs, timings={"check": time.perf_counter() - begun})

@@ -22,9 +22,7 @@ srf fit found/augmented                              the augmented model is an e
 
 @click.command("diagnose", cls=SrfCommand, epilog=DIAGNOSE)
 @click.argument("source", metavar="EXPERIMENT", type=click.Path(path_type=Path))
-@click.option(
-    "--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable."
-)
+@click.option("--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable.")
 @vary_options
 @plugins_option
 @reader_option
@@ -83,15 +81,12 @@ def diagnose(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], 
             click.echo()
         if folder is not None:
             home = folder / "augmented"
-            laws = (
-                f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
-            )
+            laws = f"--law {home / 'friction.toml'} --ageing {home / 'ageing.toml'} --interface {home / 'interface.toml'}"
             click.echo(f"The augmented model: srf fit {home}")
             click.echo(f"Its laws' diagram: srf linear {laws}")
     fitted = ", ".join(sorted(f.name for f in found.diagnosis.ranked))
     finish(
-        found.status,
-        advice=f"the answer rests on what was fitted until then: {fitted}. Effects not among these were not tried.",
+        found.status, advice=f"the answer rests on what was fitted until then: {fitted}. Effects not among these were not tried."
     )
 
 

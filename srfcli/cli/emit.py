@@ -134,9 +134,7 @@ class Progress:
     def __enter__(self) -> Progress:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         if self._active and self._shown_at:
             self._raw.write("\r\x1b[K")  # the line is removed when the loop ends
             self._stream.flush()
@@ -146,9 +144,7 @@ class Progress:
         if label != self.label:
             self.label, self.total, self.done, self._begun = label, None, 0, time.monotonic()
 
-    def advance(
-        self, steps: int = 1, *, note: str = "", share: float | None = None, bound: float | None = None
-    ) -> None:
+    def advance(self, steps: int = 1, *, note: str = "", share: float | None = None, bound: float | None = None) -> None:
         """Count `steps` more and show it, at most ten times a second.
 
         `share` of the work is done, from 0 to 1; `bound` is the share of the largest possible amount of work.

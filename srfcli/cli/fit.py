@@ -45,21 +45,15 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
 
 
 @click.command("fit", cls=SrfCommand, epilog=EXAMPLES)
-@click.argument(
-    "sources", metavar="EXPERIMENT...|THRESHOLDS.csv", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
+@click.argument("sources", metavar="EXPERIMENT...|THRESHOLDS.csv", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--table",
     "place",
     metavar="FILE.csv",
     help="Fit each experiment by itself, and keep a row for each in this file, which is written as they are done.",
 )
-@click.option(
-    "--free", multiple=True, metavar="NAMES", help="Parameters to fit; else those that the experiment leaves free."
-)
-@click.option(
-    "--starts", type=click.IntRange(1, 1000), default=1, show_default=True, help="Starting points to fit from."
-)
+@click.option("--free", multiple=True, metavar="NAMES", help="Parameters to fit; else those that the experiment leaves free.")
+@click.option("--starts", type=click.IntRange(1, 1000), default=1, show_default=True, help="Starting points to fit from.")
 @click.option("--profile", is_flag=True, help="Profile-likelihood intervals.")
 @vary_options
 @click.option(
@@ -73,30 +67,19 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
     type=click.Choice(["smooth", "rough", "shared"]),
     help="Random friction field along slip: none, one for each run, one for all; else the recording decides.",
 )
-@click.option(
-    "--sample", type=click.IntRange(100, 1_000_000), metavar="N", help="Draw N points of the posterior (emcee)."
-)
+@click.option("--sample", type=click.IntRange(100, 1_000_000), metavar="N", help="Draw N points of the posterior (emcee).")
 @click.option("--draws", metavar="FILE.nc", help="Keep the draws of --sample as ArviZ's netCDF.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of further starts and of the sampler.")
 @reader_option
-@click.option(
-    "--bounds", multiple=True, metavar="NAME=LO:HI", help="Bounds of a parameter, for a table of critical loads."
-)
+@click.option("--bounds", multiple=True, metavar="NAME=LO:HI", help="Bounds of a parameter, for a table of critical loads.")
 @click.option("--method", multiple=True, help="Minimiser of the critical loads' cost; both unless named.")
 @click.option("--tol", type=float, help="Relative error of a critical load.")
-@click.option(
-    "--max-evaluations", type=click.IntRange(1), help="Of the cost over the critical loads, for each minimiser."
-)
+@click.option("--max-evaluations", type=click.IntRange(1), help="Of the cost over the critical loads, for each minimiser.")
 @worker_options
 @stability_options
 @output_options
 def command(
-    sources: tuple[Path, ...],
-    place: str | None,
-    spread: Spread,
-    system: SystemOptions,
-    output: OutputOptions,
-    **options: Any,
+    sources: tuple[Path, ...], place: str | None, spread: Spread, system: SystemOptions, output: OutputOptions, **options: Any
 ) -> None:
     """Fit the model of an experiment to its recordings and critical loads, all together, by maximum likelihood.
 
@@ -112,8 +95,7 @@ def command(
 
         if looks_like_recording(source, registry=system.registry()):
             raise SrfError(
-                f"{source}: a recording, and no experiment yet",
-                f"`srf new {source}` writes the experiment.toml to fit.",
+                f"{source}: a recording, and no experiment yet", f"`srf new {source}` writes the experiment.toml to fit."
             )
         meant = ("starts", "profile", "trend", "vary", "by", "prior", "track", "sample", "draws", "reader")
         _refuse(meant, "recordings")
@@ -184,12 +166,7 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
 
 
 def _fit_campaign(
-    sources: Sequence[Path],
-    place: str | None,
-    spread: Spread,
-    system: SystemOptions,
-    output: OutputOptions,
-    **options: Any,
+    sources: Sequence[Path], place: str | None, spread: Spread, system: SystemOptions, output: OutputOptions, **options: Any
 ) -> None:
     """Fit each experiment by itself, a row each; the table is written anew whenever one is done."""
     from srfcli.cli.emit import Progress, emit, finish, render

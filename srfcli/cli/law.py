@@ -64,9 +64,7 @@ def laws_table(registry: Registry, kind: str | None) -> Table:
         rows.append((e.kind, e.name, e.origin, e.about, str(e.location), others or None))
     if not any(row[-1] for row in rows):
         columns, rows = columns[:-1], [row[:-1] for row in rows]
-    problems = [
-        {"name": p.name, "origin": p.origin, "location": p.location, "message": p.message} for p in registry.problems
-    ]
+    problems = [{"name": p.name, "origin": p.origin, "location": p.location, "message": p.message} for p in registry.problems]
     return Table("srf.laws/1", tuple(columns), rows, meta={"problems": problems})
 
 
@@ -128,9 +126,7 @@ def new(name: str, kind: str, python: bool, force: bool) -> None:
     if not valid_name(name):
         raise SrfError(f"{name!r} is not a law name: small letters, digits and single dashes", "srf law new my-law")
     if not force and any(entry.name == name for entry in bundled_registry().entries(kind)):
-        raise SrfError(
-            f"there is a shipped {kind} law '{name}'; two of one name cannot be used", f"srf law new my-{name}"
-        )
+        raise SrfError(f"there is a shipped {kind} law '{name}'; two of one name cannot be used", f"srf law new my-{name}")
     path = Path(name + (".py" if python else ".toml"))
     recover(path)
     if path.exists() and not force:
@@ -305,6 +301,4 @@ def _parameter_lines(one: Law) -> list[str]:
         bounds = "" if math.isinf(p.lower) and math.isinf(p.upper) else f"[{p.lower:g}, {p.upper:g}]"
         rows.append((p.name, f"{p.default:.15g}", p.unit, bounds, p.about))
     widths = [max(len(row[i]) for row in rows) for i in range(4)]
-    return [
-        "  ".join([*(cell.ljust(w) for cell, w in zip(row, widths, strict=False)), row[-1]]).rstrip() for row in rows
-    ]
+    return ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths, strict=False)), row[-1]]).rstrip() for row in rows]

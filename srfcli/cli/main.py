@@ -27,10 +27,7 @@ COMMANDS = {
         "Print the generated NumPy module of a system: rates, Jacobians, derivatives by the parameters, "
         "characteristic polynomial.",
     ),
-    "linear": (
-        "srfcli.cli.stability:linear",
-        "Critical load, K/W0 and frequency of steady sliding under constant load.",
-    ),
+    "linear": ("srfcli.cli.stability:linear", "Critical load, K/W0 and frequency of steady sliding under constant load."),
     "critical": ("srfcli.cli.stability:critical", "Every critical load at the given velocities, numbered from low W0."),
     "continue": (
         "srfcli.cli.stability:continue_",
@@ -41,18 +38,12 @@ COMMANDS = {
         "The forced periodic state at one V, W0 and eps: multipliers, mean friction, harmonics.",
     ),
     "map": ("srfcli.cli.map:map_", "The stability of the forced sliding state over a plane of two parameters."),
-    "response": (
-        "srfcli.cli.stability:response",
-        "How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t).",
-    ),
+    "response": ("srfcli.cli.stability:response", "How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t)."),
     "compare": (
         "srfcli.cli.map:compare",
         "Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment tells them apart.",
     ),
-    "new": (
-        "srfcli.cli.new:command",
-        "Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take.",
-    ),
+    "new": ("srfcli.cli.new:command", "Write a commented experiment.toml for recordings, which `srf check` and `srf fit` take."),
     "check": ("srfcli.cli.check:command", "Read and validate an experiment and report what its recordings are like."),
     "fit": (
         "srfcli.cli.fit:command",
@@ -62,10 +53,7 @@ COMMANDS = {
         "srfcli.cli.diagnose:diagnose",
         "Find where recordings, or critical loads, differ from their model, and which physics the model lacks.",
     ),
-    "report": (
-        "srfcli.cli.diagnose:report",
-        "Write one page on the fits, maps, comparisons and other results of a folder.",
-    ),
+    "report": ("srfcli.cli.diagnose:report", "Write one page on the fits, maps, comparisons and other results of a folder."),
     "simulate": (
         "srfcli.cli.simulate:command",
         "Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding.",

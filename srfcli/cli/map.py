@@ -38,15 +38,7 @@ from srfcli.cli.options import (
     worker_options,
 )
 from srfcli.core.errors import SrfError, did_you_mean
-from srfcli.core.settings import (
-    Resolved,
-    Setting,
-    TomlSettings,
-    choose,
-    find_toml,
-    load_toml,
-    resolve,
-)
+from srfcli.core.settings import Resolved, Setting, TomlSettings, choose, find_toml, load_toml, resolve
 from srfcli.core.units import parse_quantity
 from srfcli.results.map import ratio_powers
 
@@ -70,9 +62,7 @@ srf map --eps 0.4 --workers 8 --resume parts --out map.csv
 @value_option("eps", "Relative modulation amplitude, where it is not an axis.")
 @value_option("V", "Driving velocity in um/s, where it is not an axis.")
 @value_option("W0", "Mean normal load in N, where it is not an axis.")
-@over_option(
-    help="An axis, twice: NAME=LOW:HIGH:POINTS[:log|lin]; NAME may be a ratio, as K/W0, whose second part moves."
-)
+@over_option(help="An axis, twice: NAME=LOW:HIGH:POINTS[:log|lin]; NAME may be a ratio, as K/W0, whose second part moves.")
 @click.option("--boundary", metavar="FILE", help="Write the polished points of the boundaries to FILE (.csv or .json).")
 @click.option("--boundaries/--no-boundaries", default=True, show_default=True, help="Whether boundaries are followed.")
 @click.option(
@@ -89,11 +79,7 @@ srf map --eps 0.4 --workers 8 --resume parts --out map.csv
     help="How often a cell in which a boundary could hide is halved.",
 )
 @click.option(
-    "--mesh-error",
-    type=float,
-    default=3e-4,
-    show_default=True,
-    help="What the map's mesh may shift a boundary by, relatively.",
+    "--mesh-error", type=float, default=3e-4, show_default=True, help="What the map's mesh may shift a boundary by, relatively."
 )
 @step_option
 @click.option("--tol", type=float, help="Relative error of each boundary point; 1e-6 unless set.")
@@ -129,9 +115,7 @@ def map_(
     from srfcli.tasks import map as task
 
     if not 1e-4 <= step <= 0.5 or not 1e-8 <= mesh_error <= 0.1:
-        raise SrfError(
-            f"--step {step:g} or --mesh-error {mesh_error:g} is out of range", "--step 0.035 --mesh-error 3e-4"
-        )
+        raise SrfError(f"--step {step:g} or --mesh-error {mesh_error:g} is out of range", "--step 0.035 --mesh-error 3e-4")
     if boundary is not None and not boundaries:
         raise SrfError("--boundary needs the boundaries that --no-boundaries leaves out", "Drop one of the two.")
     place = None if boundary is None else _boundary_output(boundary, output)
@@ -191,9 +175,7 @@ def read_grid(model: GeneratedModel, base: Array, over: tuple[Range, ...]) -> Ma
     from srfcli.numerics.plane import MapGrid, check_grid
 
     if len(over) > 2:
-        raise SrfError(
-            f"--over is given {len(over)} times", "A map has two axes: --over V=1:100:120 --over K/W0=0.005:0.03:200."
-        )
+        raise SrfError(f"--over is given {len(over)} times", "A map has two axes: --over V=1:100:120 --over K/W0=0.005:0.03:200.")
     ranges = over or (replace(parse_over("V=1:100"), n=COLUMNS),)
     axes = [read_axis(model, r) for r in ranges]
     if len(axes) == 1:
@@ -229,8 +211,7 @@ def _ratio_factor(model: GeneratedModel, given: Range, held: str, moved: str) ->
     unit = find_unit(given.unit, where=f"--over {given.name}")
     if unit.powers != powers:
         raise SrfError(
-            f"--over {given.name}: {given.unit!r} is the wrong unit",
-            f"Write it in {describe(powers)}, or leave it out.",
+            f"--over {given.name}: {given.unit!r} is the wrong unit", f"Write it in {describe(powers)}, or leave it out."
         )
     return unit.factor
 
@@ -264,9 +245,7 @@ srf compare --law srf-vsat --law log-log --eps 0.18 --workers 2 --json
 """
 COMPARED_OPTIONS: Options = {  # those of `system_options`, but that several laws may be named
     "laws": click.option("--law", "laws", multiple=True, metavar="NAME", help="A friction law; repeat for more."),
-    "ageings": click.option(
-        "--ageing", "ageings", multiple=True, metavar="NAME", help="An ageing law; repeat: all pairs count."
-    ),
+    "ageings": click.option("--ageing", "ageings", multiple=True, metavar="NAME", help="An ageing law; repeat: all pairs count."),
     "interface": SYSTEM_OPTIONS["interface"],
     "loading": SYSTEM_OPTIONS["loading"],
     **APPARATUS_OPTIONS,
@@ -280,15 +259,9 @@ COMPARED_OPTIONS: Options = {  # those of `system_options`, but that several law
 @click.command("compare", cls=SrfCommand, epilog=COMPARE)
 @add_options(COMPARED_OPTIONS)
 @values_option(AMPLITUDE, default=(0.18,))
-@click.option(
-    "--at", default="10", show_default=True, metavar="V", help="Velocity (um/s) at which laws are brought together."
-)
-@click.option(
-    "--adjust", default="A,B,D0", show_default=True, help="The three parameters adjusted, with mu0 where there is one."
-)
-@click.option(
-    "--match/--no-match", "matched", default=True, show_default=True, help="Whether parameters are adjusted at all."
-)
+@click.option("--at", default="10", show_default=True, metavar="V", help="Velocity (um/s) at which laws are brought together.")
+@click.option("--adjust", default="A,B,D0", show_default=True, help="The three parameters adjusted, with mu0 where there is one.")
+@click.option("--match/--no-match", "matched", default=True, show_default=True, help="Whether parameters are adjusted at all.")
 @over_option(help="The window: V=LOW:HIGH[:POINTS] and K/W0=LOW:HIGH[:POINTS], each of which may be left out.")
 @worker_options
 @output_options
@@ -356,10 +329,7 @@ def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSe
     for name in flags:
         if name not in known:
             raise SrfError(f"unknown parameter {name!r} in all of these laws", did_you_mean(name, known))
-    return [
-        resolve(m.parameters, {n: v for n, v in flags.items() if n in m.names}, toml=toml, where=m.title)
-        for m in models
-    ]
+    return [resolve(m.parameters, {n: v for n, v in flags.items() if n in m.names}, toml=toml, where=m.title) for m in models]
 
 
 def _window(model: GeneratedModel, over: tuple[Range, ...]) -> dict[str, Any]:

@@ -28,43 +28,27 @@ KINDS = ("steps", "shs", "oscillation")
 
 @click.command("new", cls=SrfCommand, epilog=EXAMPLES)
 @click.argument("files", metavar="DATA...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--stiffness", metavar="K", help="Of the machine: '0.21 N/um', '55 MPa/mm', '5e-3 1/um' (friction per um).")
 @click.option(
-    "--stiffness", metavar="K", help="Of the machine: '0.21 N/um', '55 MPa/mm', '5e-3 1/um' (friction per um)."
+    "--kind", type=click.Choice(KINDS), help="Velocity steps, slide-hold-slide, or a load that oscillates; else as found."
 )
 @click.option(
-    "--kind",
-    type=click.Choice(KINDS),
-    help="Velocity steps, slide-hold-slide, or a load that oscillates; else as found.",
+    "--column", "columns", multiple=True, metavar="ROLE=HEADING", help="Which column plays a role: 'shear_stress=S [kPa]'."
 )
-@click.option(
-    "--column",
-    "columns",
-    multiple=True,
-    metavar="ROLE=HEADING",
-    help="Which column plays a role: 'shear_stress=S [kPa]'.",
-)
-@click.option(
-    "--drive", metavar="V|D:V,...", help="What was imposed, if no column has it: um/s, or durations in s and um/s."
-)
+@click.option("--drive", metavar="V|D:V,...", help="What was imposed, if no column has it: um/s, or durations in s and um/s.")
 @click.option("--load", metavar="W", help="Constant normal load or stress, if no column has it: '5 N', '20 MPa'.")
 @click.option("--mass", metavar="M", help="Of the slider, '2.37 kg'; without it the slider is quasi-static.")
-@click.option(
-    "--radius", metavar="R", help="Of a rotary rig, '25 mm': torque over it is force, angle times it is displacement."
-)
+@click.option("--radius", metavar="R", help="Of a rotary rig, '25 mm': torque over it is force, angle times it is displacement.")
 @click.option("--thickness", metavar="H", help="Of the layer, '4 mm', where strain is recorded.")
 @click.option("--area", metavar="A", help="Of the sliding contact, '25 cm^2': forces then become stresses.")
 @click.option("--window", metavar="FROM,TO", help="Only this part of the recordings, in s of the file's clock.")
 @click.option("--law", metavar="NAME", default="dieterich-ruina", show_default=True, help="Friction law.")
-@click.option(
-    "--ageing", metavar="NAME", help="Ageing law; else dieterich, with Linker's term where the load oscillates."
-)
+@click.option("--ageing", metavar="NAME", help="Ageing law; else dieterich, with Linker's term where the load oscillates.")
 @click.option("--interface", metavar="NAME", default="rigid", show_default=True, help="Elasticity of the interface.")
 @click.option("--holdout", multiple=True, metavar="RUN", help="Keep this run from every fit, to judge it.")
 @click.option("--title", default="", metavar="TEXT", help="Title of the experiment.")
 @reader_option
-@click.option(
-    "--out", metavar="FILE", help="The file to write; - is stdout.  [default: experiment.toml in this folder]"
-)
+@click.option("--out", metavar="FILE", help="The file to write; - is stdout.  [default: experiment.toml in this folder]")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
 @plugins_option
 def command(files: tuple[Path, ...], out: str | None, force: bool, plugins: tuple[Path, ...], **options: Any) -> None:
@@ -169,8 +153,7 @@ def _stiffness(text: str) -> str:
     number, unit = split_quantity(text, name="--stiffness", example="5e-3 1/um")
     if not unit:
         raise SrfError(
-            f"--stiffness {text!r} has no unit",
-            "'5e-3 1/um' is friction per micron, '55 MPa/mm' shear stress per length.",
+            f"--stiffness {text!r} has no unit", "'5e-3 1/um' is friction per micron, '55 MPa/mm' shear stress per length."
         )
     return f"{number!r} {unit}"
 

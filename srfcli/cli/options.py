@@ -175,9 +175,7 @@ def names_of(kind: str) -> Callable[[click.Context, click.Parameter, str], list[
         from srfcli.laws.registry import load_registry
 
         with contextlib.suppress(SrfError):  # a folder that is gone; the command itself says so
-            return [
-                CompletionItem(e.name, help=e.about) for e in load_registry().entries(kind) if e.name.startswith(begun)
-            ]
+            return [CompletionItem(e.name, help=e.about) for e in load_registry().entries(kind) if e.name.startswith(begun)]
         return []
 
     return complete
@@ -362,17 +360,13 @@ def _about(key: str) -> str:
 
 Options = dict[str, Callable[[Any], Any]]  # decorators by the name of the argument that each of them adds
 APPARATUS_OPTIONS: Options = {
-    "inertia": click.option(
-        "--inertia/--no-inertia", default=None, help="Whether the slider's mass counts.  [default: it does]"
-    ),
+    "inertia": click.option("--inertia/--no-inertia", default=None, help="Whether the slider's mass counts.  [default: it does]"),
     **{f"set_{n}": click.option(f"--{n}", f"set_{n}", metavar="VALUE", help=about) for n, about in APPARATUS.items()},
 }
 SYSTEM_OPTIONS: Options = {
     "law": click.option("--law", metavar="NAME", help=_about("law"), shell_complete=names_of("friction")),
     "ageing": click.option("--ageing", metavar="NAME", help=_about("ageing"), shell_complete=names_of("ageing")),
-    "interface": click.option(
-        "--interface", metavar="NAME", help=_about("interface"), shell_complete=names_of("interface")
-    ),
+    "interface": click.option("--interface", metavar="NAME", help=_about("interface"), shell_complete=names_of("interface")),
     "loading": click.option("--loading", type=click.Choice(LOADINGS), help=_about("loading")),
     **APPARATUS_OPTIONS,
     "assignments": click.option(
@@ -472,9 +466,7 @@ def value_option(name: str, help: str) -> Callable[[F], F]:
 def mesh_option(*, least: int, most: int = 8192, default: int = 512) -> Callable[[F], F]:
     """Add --max-mesh; the command gets `max_mesh`."""
     kind = click.IntRange(least, most)
-    return click.option(
-        "--max-mesh", type=kind, default=default, show_default=True, help="Intervals of the finest mesh."
-    )
+    return click.option("--max-mesh", type=kind, default=default, show_default=True, help="Intervals of the finest mesh.")
 
 
 def step_option(function: F) -> F:
@@ -487,9 +479,7 @@ def check_axes(swept: Container[str], given: Mapping[str, str | None]) -> None:
     """Raise SrfError for a parameter that is swept and has a value, too."""
     for name, value in given.items():
         if value is not None and name in swept:
-            raise SrfError(
-                f"{name} is an axis and has a value too", f"Leave out --{name}, or take {name} out of --over."
-            )
+            raise SrfError(f"{name} is an axis and has a value too", f"Leave out --{name}, or take {name} out of --over.")
 
 
 @dataclass(frozen=True)
@@ -509,9 +499,7 @@ OUTPUT_OPTIONS: Options = {
     "out": click.option("--out", metavar="FILE", help="Write to FILE; .json and .csv choose the format, - is stdout."),
     "plot": click.option("--plot", metavar="FILE", help="Draw a figure to FILE.png, .svg or .pdf."),
     "force": click.option("--force", is_flag=True, help="Overwrite existing files."),
-    "provenance": click.option(
-        "--provenance/--no-provenance", default=True, help="Write FILE.provenance.json beside each file."
-    ),
+    "provenance": click.option("--provenance/--no-provenance", default=True, help="Write FILE.provenance.json beside each file."),
 }
 
 
@@ -598,12 +586,8 @@ WORKER_OPTIONS: Options = {
     "workers": click.option(
         "--workers", type=click.IntRange(0, 4096), help="Processes to use, 0 for all cores.  [default: this one only]"
     ),
-    "cluster": click.option(
-        "--cluster", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster, tcp://host:port."
-    ),
-    "resume": click.option(
-        "--resume", metavar="DIR", help="Keep finished parts in DIR, and go on from those found there."
-    ),
+    "cluster": click.option("--cluster", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster, tcp://host:port."),
+    "resume": click.option("--resume", metavar="DIR", help="Keep finished parts in DIR, and go on from those found there."),
 }
 
 

@@ -52,9 +52,7 @@ TRACKS = ("smooth", "shared", "own")
     type=click.Choice(TRACKS),
     help="Random friction field of the cases: none, one that all runs share, or one of each run's own.",
 )
-@click.option(
-    "--workers", type=click.IntRange(0, 4096), default=1, show_default=True, help="Processes, 0 for all cores."
-)
+@click.option("--workers", type=click.IntRange(0, 4096), default=1, show_default=True, help="Processes, 0 for all cores.")
 @click.option("--out", metavar="DIR", type=click.Path(path_type=Path), help="New folder for bank, answers and report.")
 @click.option("--resume", is_flag=True, help="Go on with the trial in --out.")
 @click.option(
@@ -103,9 +101,7 @@ def command(
     if as_json and as_csv:
         raise SrfError("--json and --csv exclude each other", "--report-only prints the other at no cost.")
     if (out is None) == (report is None):
-        said = (
-            "neither --out nor --report-only is given" if out is None else "--out and --report-only exclude each other"
-        )
+        said = "neither --out nor --report-only is given" if out is None else "--out and --report-only exclude each other"
         raise SrfError(said, "srf prove --out DIR makes a trial, srf prove --report-only DIR reads one.")
     count = workers or os.cpu_count() or 1
     asked = {"cases": cases, "seed": seed, "kinds": kinds, "bank": bank, "track": track, "resume": resume}

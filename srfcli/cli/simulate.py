@@ -45,9 +45,7 @@ EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load
 @value_option("eps", "Relative amplitude of a modulation at --f, on top of any load.")
 @click.option("--for", "duration", metavar="TIME", help="Length of the record, in s.  [default: 40 um of driving]")
 @click.option(
-    "--drive",
-    metavar="PIECES",
-    help="Driving velocity as DURATION:VELOCITY, ... in s and um/s; 0 is a hold, 5->20 a ramp.",
+    "--drive", metavar="PIECES", help="Driving velocity as DURATION:VELOCITY, ... in s and um/s; 0 is a hold, 5->20 a ramp."
 )
 @click.option("--load", metavar="PIECES", help="Normal load as DURATION:LOAD, ... in s and N; 5->7 is a ramp.")
 @click.option(
@@ -129,9 +127,7 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
         work = dataclasses.replace(work, parameters={**work.parameters, **_track_parameters(track, given)})
     begun = time.perf_counter()
     with Progress("simulate", total=len(work.jobs)) as progress:
-        found = simulate_work(
-            work, rtol=given["rtol"], progress=lambda name, done: progress.advance(int(done), note=name)
-        )
+        found = simulate_work(work, rtol=given["rtol"], progress=lambda name, done: progress.advance(int(done), note=name))
     timings, table = {"simulate": time.perf_counter() - begun}, found.table
     folder, seed = given["folder"], given["seed"]
     if folder is not None and output.out is None and output.format == "text":
@@ -151,13 +147,9 @@ def _check(given: dict[str, Any], experiment: Path | None, output: OutputOptions
             hint = "Its runs say how they are driven, loaded and sampled."
             raise SrfError(f"{option} does not go with an experiment", hint)
     if experiment is None and given["runs"]:
-        raise SrfError(
-            "--run chooses among the runs of an experiment, and none is given", "srf simulate DIR --run NAME"
-        )
+        raise SrfError("--run chooses among the runs of an experiment, and none is given", "srf simulate DIR --run NAME")
     if given["reader"] is not None and experiment is None and given["load_file"] is None:
-        raise SrfError(
-            "--format names the reader of a file, and none is read", "Give --load-file FILE or an experiment."
-        )
+        raise SrfError("--format names the reader of a file, and none is read", "Give --load-file FILE or an experiment.")
     for one, other in EXCLUSIVE:
         if given[one] is not None and given[other] is not None:
             hint = f"Leave out {OWN_RECORD[one]} or {OWN_RECORD[other]}."
@@ -176,15 +168,11 @@ def _check_folder(given: dict[str, Any], experiment: Path | None, output: Output
 
     source = experiment and (experiment if experiment.is_dir() else experiment.parent)
     if source and folder.resolve() == source.resolve():
-        raise SrfError(
-            f"--out-dir {folder} is the experiment itself", "Recordings are never replaced; name another folder."
-        )
+        raise SrfError(f"--out-dir {folder} is the experiment itself", "Recordings are never replaced; name another folder.")
     check_folder(folder, force=output.force)
 
 
-def _write(
-    found: SimulationResult, folder: Path, seed: int, output: OutputOptions, timings: dict[str, float]
-) -> None:
+def _write(found: SimulationResult, folder: Path, seed: int, output: OutputOptions, timings: dict[str, float]) -> None:
     """Write the experiment folder and its sidecar; an unfinished one is not written, as nothing in it would say so."""
     from srfcli.data.writing import DESCRIPTION, write_experiment
     from srfcli.results.provenance import Provenance, sidecar, sidecar_path
@@ -208,9 +196,7 @@ def _write(
     session.say(f"Wrote {folder} ({len(files) - 1} run{'s' if len(files) != 2 else ''})")
 
 
-def _runs_again(
-    system: SystemOptions, path: Path, given: Mapping[str, Any], track: RoughTrack | None, spread: float
-) -> Work:
+def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], track: RoughTrack | None, spread: float) -> Work:
     """Return the runs of the experiment at `path`; srf.toml and the environment do not choose its laws, flags do."""
     from srfcli.data.experiment import read_experiment
     from srfcli.tasks.simulate import runs_again
@@ -244,13 +230,9 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], track: RoughTra
     values, folder = slider.resolved.values, given["folder"]
     observables = task.check_observables([n.strip() for n in (given["observable"] or "elongation").split(",")])
     if track is not None and system.loading.value != "vertical":
-        raise SrfError(
-            "a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined."
-        )
+        raise SrfError("a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined.")
     if folder is not None and system.loading.value != "vertical":
-        raise SrfError(
-            "an experiment folder cannot say that the spring is inclined", "Leave out --out-dir or --loading."
-        )
+        raise SrfError("an experiment folder cannot say that the spring is inclined", "Leave out --out-dir or --loading.")
     load: Load = ConstantLoad(values["W0"])
     begin, length = 0.0, None
     found: tuple[str, ...] = ()
@@ -308,9 +290,7 @@ def _drive_pieces(given: Mapping[str, Any], V: float, length: float | None) -> t
         for number, (_, first, last) in enumerate(pieces, 1):
             fastest = max(first, last, key=abs)
             if abs(fastest) > LARGEST_VELOCITY:
-                raise SrfError(
-                    f"--drive: piece {number} drives at {fastest:g} um/s", f"Stay within {LARGEST_VELOCITY:g} um/s."
-                )
+                raise SrfError(f"--drive: piece {number} drives at {fastest:g} um/s", f"Stay within {LARGEST_VELOCITY:g} um/s.")
         return pieces
     if given["duration"] is not None:
         length = parse_quantity(given["duration"], "s", name="--for")

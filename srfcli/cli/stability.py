@@ -74,18 +74,10 @@ VELOCITY = Parameter("V", 10.0, "um/s", 1e-12, 1e9, "driving velocities")
 @stability_options
 @values_option(VELOCITY)
 @values_option(AMPLITUDE)
-@click.option(
-    "--window",
-    metavar="LOW:HIGH",
-    help="Loads to look between, in N; else all at which a crossing can be.",
-)
+@click.option("--window", metavar="LOW:HIGH", help="Loads to look between, in N; else all at which a crossing can be.")
 @click.option("--tol", type=float, help="Relative error of a critical load.", default=1e-8, show_default=True)
 @click.option(
-    "--samples",
-    type=click.IntRange(8, 100_000),
-    default=192,
-    show_default=True,
-    help="Loads looked at first, on each line.",
+    "--samples", type=click.IntRange(8, 100_000), default=192, show_default=True, help="Loads looked at first, on each line."
 )
 @click.option(
     "--resolution",
@@ -150,12 +142,8 @@ srf response --V 10 --W0 6 --mean --eps 0.05,0.1,0.2 --over f=20:400:30
 @value_option("V", "Driving velocity in um/s.")
 @value_option("W0", "Mean normal load in N.")
 @values_option(AMPLITUDE, about="relative modulation amplitudes, for --mean")
-@over_option(
-    default=("f=1:1000:200",), help="The frequencies (Hz), or another parameter: NAME=LOW:HIGH[:POINTS[:log|lin]]."
-)
-@click.option(
-    "--mean", is_flag=True, help="The drop of the mean friction at the amplitudes --eps, from the forced states."
-)
+@over_option(default=("f=1:1000:200",), help="The frequencies (Hz), or another parameter: NAME=LOW:HIGH[:POINTS[:log|lin]].")
+@click.option("--mean", is_flag=True, help="The drop of the mean friction at the amplitudes --eps, from the forced states.")
 @click.option("--tol", type=float, help="Relative error of the mean friction; 1e-6 unless set.")
 @output_options
 def response(
@@ -211,9 +199,7 @@ srf floquet --V 8 --W0 9 --eps 0.09 --json --tol 1e-9
 @value_option("eps", "Relative amplitude of the load modulation.")
 @click.option("--tol", type=float, help="Error of the multipliers; 1e-6 unless set.")
 @mesh_option(least=32, most=65536, default=1024)
-@click.option(
-    "--harmonics", type=click.IntRange(1, 200), default=5, show_default=True, help="Harmonics of u and mu to list."
-)
+@click.option("--harmonics", type=click.IntRange(1, 200), default=5, show_default=True, help="Harmonics of u and mu to list.")
 @click.option("--fail-on", type=click.Choice(["unstable", "stable"]), help="Exit with 4 when the state is so.")
 @output_options
 def floquet(
@@ -270,16 +256,10 @@ srf continue --eps 0.09 --law log-log --ageing dieterich+linker-dieterich
     help="Lines on which components are looked for.",
 )
 @click.option(
-    "--samples",
-    type=click.IntRange(8, 100_000),
-    default=64,
-    show_default=True,
-    help="Points looked at first, on each line.",
+    "--samples", type=click.IntRange(8, 100_000), default=64, show_default=True, help="Points looked at first, on each line."
 )
 @step_option
-@click.option(
-    "--max-steps", type=click.IntRange(1, 1_000_000), default=3000, show_default=True, help="Longest curve, each way."
-)
+@click.option("--max-steps", type=click.IntRange(1, 1_000_000), default=3000, show_default=True, help="Longest curve, each way.")
 @click.option("--tol", type=float, help="Relative error of each point; 1e-6 unless set.")
 @mesh_option(least=64)
 @output_options
@@ -307,9 +287,7 @@ def continue_(
     from srfcli.tasks.stability import continue_boundary
 
     if not 1e-4 <= step <= 0.5:
-        raise SrfError(
-            f"--step {step:g} is not a share of the window", "Choose it between 0.0001 and 0.5; 0.035 is usual."
-        )
+        raise SrfError(f"--step {step:g} is not a share of the window", "Choose it between 0.0001 and 0.5; 0.035 is usual.")
     spanned = {r.name for r in over} or {"V"}
     if len(spanned) < 2:
         spanned.add("W0")

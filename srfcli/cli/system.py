@@ -55,9 +55,7 @@ def show(system: SystemOptions, output: OutputOptions) -> None:
     """
     built = system.system()
     resolved = system.resolve(built.parameters)
-    rows: list[tuple[object, ...]] = [
-        (key, s.value, None, s.origin, DEFAULTS[key].about) for key, s in system.choices().items()
-    ]
+    rows: list[tuple[object, ...]] = [(key, s.value, None, s.origin, DEFAULTS[key].about) for key, s in system.choices().items()]
     for p in built.parameters:
         rows.append((p.name, resolved.declared[p.name], p.unit, resolved.origins[p.name], p.about or None))
     notes = (f"settings file: {system.toml.path}",) if system.toml.path else ()
@@ -84,16 +82,10 @@ EXTRAS = {"jacobian": ("jacobian",), "parameters": ("parameters",), "all": ("jac
 @click.command("derive", cls=SrfCommand, epilog=DERIVE)
 @system_options
 @click.option("--format", "form", type=click.Choice(FORMATS), default="text", show_default=True, help="What to write.")
-@click.option(
-    "--with", "extra", type=click.Choice(tuple(EXTRAS)), multiple=True, help="Add long parts; JSON has all of them."
-)
-@click.option(
-    "--check-paper", is_flag=True, help="Compare the paper's printed equations and claims with its own model."
-)
+@click.option("--with", "extra", type=click.Choice(tuple(EXTRAS)), multiple=True, help="Add long parts; JSON has all of them.")
+@click.option("--check-paper", is_flag=True, help="Compare the paper's printed equations and claims with its own model.")
 @out_option
-def derive(
-    system: SystemOptions, form: str, extra: tuple[str, ...], check_paper: bool, out: Path | None, force: bool
-) -> None:
+def derive(system: SystemOptions, form: str, extra: tuple[str, ...], check_paper: bool, out: Path | None, force: bool) -> None:
     """Steady state, slopes, equations, dispersion relation and closed critical loads of a system, by algebra.
 
     The coefficients C0, C1, ... are in the form and normalisation of the paper's appendix. --check-paper looks at the

@@ -39,9 +39,7 @@ from srfcli.core.files import read_plain, write_atomic
 
 # Generated array functions as C: `x[..., i]` becomes `x[i]`, `out[..., i, j] = e` one assignment to a flat array.
 
-_FUNCTIONS = {
-    name: name for name in ("cos", "cosh", "exp", "expm1", "log", "log1p", "sin", "sinh", "sqrt", "tan", "tanh")
-}
+_FUNCTIONS = {name: name for name in ("cos", "cosh", "exp", "expm1", "log", "log1p", "sin", "sinh", "sqrt", "tan", "tanh")}
 _FUNCTIONS |= {name: f"srf_{name}" for name in ("lut", "lut1", "lut2")}
 _FUNCTIONS |= {"arctan": "atan", "arcsinh": "asinh", "lambertw": "srf_lambertw"}
 

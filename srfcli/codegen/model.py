@@ -200,9 +200,7 @@ def _source(registry: Registry, kind: str, name: str) -> tuple[Law, str]:
     return Law(entry.name, about=entry.about, source=str(entry.location)), registry.fingerprint(entry)
 
 
-def load_source(
-    source: str, *, key: str = "", laws: tuple[Law, ...] = (), code: CodeType | None = None
-) -> GeneratedModel:
+def load_source(source: str, *, key: str = "", laws: tuple[Law, ...] = (), code: CodeType | None = None) -> GeneratedModel:
     """Return the model that this generated module text describes; `code` is the text compiled, where that was done before."""
     namespace: dict[str, Any] = {"__name__": f"srf_generated_{key[:12]}"}
     exec(code or compile(source, f"<generated {key[:12]}>", "exec"), namespace)

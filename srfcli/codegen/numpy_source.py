@@ -203,14 +203,7 @@ def generate(system: System) -> str:
 
 
 def _module(
-    writer: Writer,
-    eq: Equations,
-    about: str,
-    facts: Mapping[str, object],
-    *,
-    imports: str = "",
-    more: str = "",
-    last: str = "",
+    writer: Writer, eq: Equations, about: str, facts: Mapping[str, object], *, imports: str = "", more: str = "", last: str = ""
 ) -> str:
     """Return the text of a module: its constants `facts`, then `more`, the functions of `writer` behind `last`."""
     body = "\n\n\n".join(writer.parts)
@@ -346,9 +339,7 @@ def _direction(eq: Equations, by: Sequence[sp.Expr]) -> dict[sp.Symbol, sp.Expr]
 def _gradient(eq: Equations, formulas: Staged) -> list[Staged]:
     """Return the derivatives by each unknown."""
     n = len(eq.unknowns)
-    return [
-        formulas.derivative({k: v for k, v in _direction(eq, sp.eye(n).row(j)).items() if v != 0}) for j in range(n)
-    ]
+    return [formulas.derivative({k: v for k, v in _direction(eq, sp.eye(n).row(j)).items() if v != 0}) for j in range(n)]
 
 
 def _jacobian(eq: Equations, formulas: Staged) -> Staged:
@@ -455,9 +446,7 @@ PARAMETERS = (
 )
 {more}'''
 
-_STATICS = (
-    "Arrays of any leading shape, real or complex; x[..., i] are the STATES, p[i] the PARAMETERS, units um, s, N."
-)
+_STATICS = "Arrays of any leading shape, real or complex; x[..., i] are the STATES, p[i] the PARAMETERS, units um, s, N."
 _MOTION = """Motion only. Arrays of any leading shape; x[..., i] are the STATES, p[i] the PARAMETERS, the numbers of tables \
 after them."""
 

@@ -53,9 +53,7 @@ class SrfError(Exception):
 
     exit_code = 2
 
-    def __init__(
-        self, message: str, hint: str | None = None, *, exit_code: int | None = None, kind: str = ""
-    ) -> None:
+    def __init__(self, message: str, hint: str | None = None, *, exit_code: int | None = None, kind: str = "") -> None:
         message, hint = printable(shortened(message)), hint and printable(shortened(hint))
         super().__init__(message)
         self.message = message

@@ -56,9 +56,7 @@ def check_plain(path: Path) -> os.stat_result:
     # said to be files; reading may wait or fail
     if path.resolve().parts[1:2] in (("proc",), ("sys",)) and os.name == "posix":
         raise SrfError(
-            f"no file {path}, but a part of the running system",
-            "Name a file; copy what is meant to one first.",
-            kind="no file",
+            f"no file {path}, but a part of the running system", "Name a file; copy what is meant to one first.", kind="no file"
         )
     return found
 
@@ -376,17 +374,13 @@ def check_target(path: Path, *, force: bool, what: str = "--out") -> None:
     if path.is_dir():
         raise SrfError(f"{what} {path} is a directory", f"Name a file in it: {what} {path / 'result.csv'}")
     if not path.parent.is_dir():
-        raise SrfError(
-            f"{what} {path}: the directory {path.parent} does not exist", f"Create it: mkdir -p {path.parent}"
-        )
+        raise SrfError(f"{what} {path}: the directory {path.parent} does not exist", f"Create it: mkdir -p {path.parent}")
     if is_special(path):
         return
     if path.exists() and not force:
         raise SrfError(f"{what} {path} exists already", "Overwrite it with --force, or name another file.")
     if not os.access(Path(os.path.realpath(path)).parent, os.W_OK):
-        raise SrfError(
-            f"{what} {path}: the directory {path.parent} is not writable", "Name a file elsewhere.", exit_code=1
-        )
+        raise SrfError(f"{what} {path}: the directory {path.parent} is not writable", "Name a file elsewhere.", exit_code=1)
 
 
 def check_folder_place(folder: Path, *, what: str = "") -> bool:

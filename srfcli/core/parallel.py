@@ -65,11 +65,7 @@ def run_here(function: Callable[[Task], Result], tasks: Sequence[Task]) -> Itera
 
 
 def run_processes(
-    function: Callable[[Task], Result],
-    tasks: Sequence[Task],
-    *,
-    workers: int,
-    lost: Callable[[int], Result] | None = None,
+    function: Callable[[Task], Result], tasks: Sequence[Task], *, workers: int, lost: Callable[[int], Result] | None = None
 ) -> Iterator[tuple[int, Result]]:
     """Yield (index, result) of every task as it is finished by one of `workers` processes.
 
@@ -100,8 +96,7 @@ def run_processes(
                         yield index, lost(index)
                     else:
                         raise SrfError(
-                            f"task {index} ended {ATTEMPTS} worker processes, "
-                            f"the last with exit code {worker.process.exitcode}",
+                            f"task {index} ended {ATTEMPTS} worker processes, the last with exit code {worker.process.exitcode}",
                             "Look whether memory is short; --workers 1 runs it in this process and shows what happens.",
                         )
                     continue
@@ -194,9 +189,7 @@ def _end_with_parent() -> None:
 PATIENCE = "10s"  # for the scheduler's first answer
 
 
-def run_cluster(
-    function: Callable[[Task], Result], tasks: Sequence[Task], *, address: str
-) -> Iterator[tuple[int, Result]]:
+def run_cluster(function: Callable[[Task], Result], tasks: Sequence[Task], *, address: str) -> Iterator[tuple[int, Result]]:
     """Yield (index, result) of every task as the cluster at `address` finishes it.
 
     The workers need this package in the same version. Raises SrfError where dask.distributed is not installed, where no scheduler
@@ -205,9 +198,7 @@ def run_cluster(
     try:
         from distributed import as_completed
     except ImportError as error:
-        raise SrfError(
-            "--cluster needs dask.distributed, which is not installed", 'pip install "srfcli[cluster]"'
-        ) from error
+        raise SrfError("--cluster needs dask.distributed, which is not installed", 'pip install "srfcli[cluster]"') from error
     client = _connected(address)
     try:
         futures = {
@@ -229,8 +220,7 @@ def _connected(address: str) -> Any:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SrfError(
-            f"--cluster {address}: no scheduler answers",
-            "Start one with 'dask scheduler', and give the address it prints.",
+            f"--cluster {address}: no scheduler answers", "Start one with 'dask scheduler', and give the address it prints."
         ) from error
     if not client.scheduler_info()["workers"]:
         client.close(timeout=5)
@@ -276,8 +266,7 @@ class Store:
             seal(self.run, b"")
         except (OSError, RuntimeError) as error:
             raise SrfError(
-                f"--resume {self.folder}: parts cannot be sealed: {error}",
-                "Set XDG_STATE_HOME to a folder of your own.",
+                f"--resume {self.folder}: parts cannot be sealed: {error}", "Set XDG_STATE_HOME to a folder of your own."
             ) from error
         note = self.folder / NOTE
         if self.folder.is_dir():
@@ -286,9 +275,7 @@ class Store:
             try:
                 before = parse_json(read_plain(note), note)
             except (OSError, SrfError) as error:
-                raise SrfError(
-                    f"--resume {note} cannot be read: {error}", "Name another folder, or a new one."
-                ) from error
+                raise SrfError(f"--resume {note} cannot be read: {error}", "Name another folder, or a new one.") from error
             if before != said:
                 raise SrfError(
                     f"--resume {self.folder} holds the parts of another run",
@@ -343,9 +330,7 @@ def fingerprint(tasks: Sequence[Any]) -> str:
     return whole.hexdigest()
 
 
-def stored(
-    run: Runner, store: Store, function: Callable[[Any], Arrays], tasks: Sequence[Any]
-) -> Iterator[tuple[int, Arrays]]:
+def stored(run: Runner, store: Store, function: Callable[[Any], Arrays], tasks: Sequence[Any]) -> Iterator[tuple[int, Arrays]]:
     """Yield every task's result: those in the store as they were kept, the others by `run`, kept as they come."""
     store.open(tasks)
     missing = []

@@ -85,10 +85,7 @@ class Resolved:
 
     def described(self) -> dict[str, dict[str, Any]]:
         """Return name -> {value, unit, origin}, in declared units, as results and sidecars carry it."""
-        return {
-            p.name: {"value": self.declared[p.name], "unit": p.unit, "origin": self.origins[p.name]}
-            for p in self.parameters
-        }
+        return {p.name: {"value": self.declared[p.name], "unit": p.unit, "origin": self.origins[p.name]} for p in self.parameters}
 
 
 def find_toml(start: Path | None = None) -> Path | None:
@@ -110,9 +107,7 @@ def load_toml(path: Path | None) -> TomlSettings:
     try:
         data = parse_toml(read_text(path, what="settings"), path)
     except SrfError as error:
-        raise SrfError(
-            error.message, error.hint or 'A setting looks like K = "0.21 N/um" below [parameters].'
-        ) from error
+        raise SrfError(error.message, error.hint or 'A setting looks like K = "0.21 N/um" below [parameters].') from error
     except OSError as error:
         raise SrfError(f"{path} cannot be read: {error.strerror}", exit_code=1) from error
     _refuse_unknown(data, {"parameters", "defaults"}, f"table in {path}")
@@ -125,9 +120,7 @@ def load_toml(path: Path | None) -> TomlSettings:
         tables["defaults"][name] = _from_here(tables["defaults"][name], path.parent)
     for name, value in tables["parameters"].items():
         if isinstance(value, bool) or not isinstance(value, str | int | float):
-            raise SrfError(
-                f"{path}: {name} is not a number", f'Write {name} = 0.21 or, with its unit, {name} = "0.21 N/um".'
-            )
+            raise SrfError(f"{path}: {name} is not a number", f'Write {name} = 0.21 or, with its unit, {name} = "0.21 N/um".')
     return TomlSettings(path, tables["parameters"], tables["defaults"])
 
 
@@ -219,13 +212,8 @@ def require_parameter(name: str, parameters: Sequence[Parameter], *, where: str 
     for parameter in parameters:
         if parameter.name == name:
             return parameter
-    hint = {
-        "angle": "Only an inclined spring has an angle: `loading` inclined.",
-        "M": "The mass counts only with `inertia`.",
-    }
-    raise SrfError(
-        f"unknown parameter {name!r} in {where}", hint.get(name) or did_you_mean(name, [p.name for p in parameters])
-    )
+    hint = {"angle": "Only an inclined spring has an angle: `loading` inclined.", "M": "The mass counts only with `inertia`."}
+    raise SrfError(f"unknown parameter {name!r} in {where}", hint.get(name) or did_you_mean(name, [p.name for p in parameters]))
 
 
 def check_value(parameter: Parameter, value: str | float, *, origin: str = "flag") -> float:
@@ -273,7 +261,5 @@ def parse_assignment(text: str, *, where: str = "--set") -> tuple[str, str]:
     """Return name and value of NAME=VALUE; raises SrfError for anything else."""
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (name and equals and value):
-        raise SrfError(
-            f"{where}: {text.strip()!r} is not NAME=VALUE", f"Write {where} Vsat=300 or {where} 'D0=0.5 um'."
-        )
+        raise SrfError(f"{where}: {text.strip()!r} is not NAME=VALUE", f"Write {where} Vsat=300 or {where} 'D0=0.5 um'.")
     return name, value

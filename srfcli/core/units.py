@@ -38,15 +38,7 @@ _TABLE = {  # factors to um, s, N, rad
         TIME: {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
         RATE: {"Hz": 1.0, "kHz": 1e3},
         FORCE: {"nN": 1e-9, "uN": 1e-6, "mN": 1e-3, "N": 1.0, "kN": 1e3, "MN": 1e6, "gf": 9.80665e-3, "kgf": 9.80665},
-        STRESS: {
-            "Pa": 1e-12,
-            "kPa": 1e-9,
-            "MPa": 1e-6,
-            "GPa": 1e-3,
-            "bar": 1e-7,
-            "kbar": 1e-4,
-            "psi": 6894.757293168361e-12,
-        },
+        STRESS: {"Pa": 1e-12, "kPa": 1e-9, "MPa": 1e-6, "GPa": 1e-3, "bar": 1e-7, "kbar": 1e-4, "psi": 6894.757293168361e-12},
         MASS: {"g": 1e-9, "kg": 1e-6},  # 1 kg = 1 N s^2/m
         ANGLE: {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "rev": 2 * math.pi},
         TORQUE: {"uNm": 1.0, "mNm": 1e3, "Nm": 1e6, "kNm": 1e9},
@@ -118,13 +110,9 @@ def split_quantity(text: str, *, name: str, example: str = "0.5") -> tuple[float
         raise SrfError(f"{name}: {len(text)} characters are no number", f"Write it as in {name}='{example}'.")
     match = _NUMBER.fullmatch(text)
     if not match:
-        raise SrfError(
-            f"{name} = {text!r} is not a number", f"Write a number and, if you like, its unit: {name}='{example}'."
-        )
+        raise SrfError(f"{name} = {text!r} is not a number", f"Write a number and, if you like, its unit: {name}='{example}'.")
     if re.match(r",\d", match[2]):
-        raise SrfError(
-            f"{name} = {text!r}: a decimal comma is not understood", f"Write a point: {text.replace(',', '.')}."
-        )
+        raise SrfError(f"{name} = {text!r}: a decimal comma is not understood", f"Write a point: {text.replace(',', '.')}.")
     number = float(match[1])
     if not math.isfinite(number):
         raise SrfError(f"{name} = {text!r} is too large to be a number", "Write a finite number, as in 1e-3.")
@@ -245,9 +233,7 @@ def _from_pint(text: str, prefix: str, word: str) -> Unit:
     second, radian = powers.pop("second", 0.0), powers.pop("radian", 0.0)
     exponents = (metre - mass, second + 2 * mass, mass, radian)  # kg = 1e-6 N s^2/um
     if powers or any(not p.is_integer() for p in exponents):
-        raise SrfError(
-            f"{prefix}{text!r} is not a mechanical unit", "Write it in um, s, N, kg, deg or products of these."
-        )
+        raise SrfError(f"{prefix}{text!r} is not a mechanical unit", "Write it in um, s, N, kg, deg or products of these.")
     um, s, newton, rad = (int(p) for p in exponents)
     if not 1e-100 < factor < 1e100 or abs(um) + abs(mass) > 20:
         raise SrfError(f"{prefix}{text!r} is no unit of use", "Write it in um, s, N, kg or products of these.")
@@ -265,15 +251,7 @@ def _pint_registry() -> Any:
 
 Dimension = tuple[Fraction, Fraction, Fraction]  # powers of um, s, N; an angle is a number
 NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
-SYMBOL_UNITS = {
-    "v": "um/s",
-    "phi": "s",
-    "mu": "1",
-    "mu_dot": "1/s",
-    "W": "N",
-    "W_dot": "N/s",
-    "F_dot_over_W": "1/s",
-}
+SYMBOL_UNITS = {"v": "um/s", "phi": "s", "mu": "1", "mu_dot": "1/s", "W": "N", "W_dot": "N/s", "F_dot_over_W": "1/s"}
 QUANTITY_UNITS = {"mu": "1", "rate": "1", "term": "1", "kappa": "N/um"}
 
 

@@ -180,9 +180,7 @@ def find_sampling(t: Array) -> Sampling:
         else:
             rates.append(Rate(a, b, interval))
     rates = [_trimmed(r, steps, rates[i - 1] if i else None) for i, r in enumerate(rates)]
-    rates = [
-        Rate(r.first, rates[i + 1].first if i + 1 < len(rates) else r.last, r.interval) for i, r in enumerate(rates)
-    ]
+    rates = [Rate(r.first, rates[i + 1].first if i + 1 < len(rates) else r.last, r.interval) for i, r in enumerate(rates)]
     allowed = np.repeat([r.interval for r in rates], [r.last - r.first for r in rates])
     allowed = np.maximum(allowed, _spread(steps))
     edges = [r.first for r in rates[1:]]

@@ -196,12 +196,7 @@ class Columns:
 
 
 def read_columns(
-    run: RunDescription,
-    source: Source,
-    specs: Mapping[str, ColumnSpec],
-    *,
-    limit: int = LIMIT,
-    geometry: Geometry = NO_GEOMETRY,
+    run: RunDescription, source: Source, specs: Mapping[str, ColumnSpec], *, limit: int = LIMIT, geometry: Geometry = NO_GEOMETRY
 ) -> Columns:
     """Return what the run needs of its file; raises SrfError for a missing column, a wrong unit or too large a recording."""
     finder = Finder(run.file, source.headings, specs, geometry)
@@ -256,9 +251,7 @@ class Finder:
             found = [i for i in range(len(self.headings)) if test(i)]
             if found:
                 return found
-        spec.node.fail(
-            f"{self.path} has no column '{spec.name}'", did_you_mean(spec.name, (name for name, _ in self.parts))
-        )
+        spec.node.fail(f"{self.path} has no column '{spec.name}'", did_you_mean(spec.name, (name for name, _ in self.parts)))
 
     def _channel(self, role: str, spec: ColumnSpec, column: int) -> Channel:
         written, heading = self.parts[column][1], self.headings[column]

@@ -255,9 +255,7 @@ def _columns(node: Node, geometry: Geometry) -> dict[str, ColumnSpec]:
     return specs
 
 
-def check_unit(
-    unit: str, role: str, node: Node | None = None, where: str = "", geometry: Geometry = NO_GEOMETRY
-) -> float:
+def check_unit(unit: str, role: str, node: Node | None = None, where: str = "", geometry: Geometry = NO_GEOMETRY) -> float:
     """Return the factor from `unit` to um, s, N for a column's role; raises SrfError at `node` or `where`."""
     base = {"um/s": "um/s", "MPa": "N"}.get(ROLES[role], ROLES[role])
     try:
@@ -321,9 +319,7 @@ def _thresholds(node: Node, machine: Apparatus, runs: tuple[RunDescription, ...]
     stress = "counts stresses" if machine.geometry.area or is_stress(machine.stated) else ""
     if machine.per_load or stress:
         which = stress or "has a stiffness in friction per micron, which leaves no load to be critical"
-        entries[0].fail(
-            f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.'
-        )
+        entries[0].fail(f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.')
     found: list[ThresholdsDescription] = []
     for entry in entries:
         entry.keys(_THRESHOLDS)
@@ -334,9 +330,7 @@ def _thresholds(node: Node, machine: Apparatus, runs: tuple[RunDescription, ...]
         frequency = entry.read("frequency", lambda node: node.positive("Hz", "a frequency above 0"), None)
         called = name.text() if name else Path(file.text()).stem
         if called in {*(run.name for run in runs), *(other.name for other in found)}:
-            (name or file).fail(
-                f"'{called}' is the name of another run or table", 'Give it one of its own: name = "...".'
-            )
+            (name or file).fail(f"'{called}' is the name of another run or table", 'Give it one of its own: name = "...".')
         holdout = entry.read("holdout", Node.boolean, False)
         found.append(ThresholdsDescription(called, place, holdout, frequency, entry))
     return tuple(found)
@@ -362,10 +356,7 @@ def _observables(node: Node) -> tuple[str, ...]:
     if len(names) > MOST_OBSERVABLES:
         node.fail(f"{len(names)} observables", f"A run has {MOST_OBSERVABLES} at most.")
     if not set(names) - BESIDE.keys():
-        node.fail(
-            f"{' and '.join(names)} without a force",
-            "One of elongation, force, shear_stress, friction is needed besides.",
-        )
+        node.fail(f"{' and '.join(names)} without a force", "One of elongation, force, shear_stress, friction is needed besides.")
     return tuple(names)
 
 
@@ -554,9 +545,7 @@ def open_node(path: Path) -> Node:
     try:
         text = read_text(path, limit=LARGEST).replace("\r\n", "\n")
     except OSError as error:
-        raise SrfError(
-            f"{path}: cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1
-        ) from None
+        raise SrfError(f"{path}: cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1) from None
     try:
         table = parse_toml(text, path)
     except SrfError as error:

@@ -151,12 +151,7 @@ class Draft:
 
 
 def name_columns(
-    headings: Sequence[str],
-    wish: Mapping[str, str],
-    *,
-    path: Path,
-    per_load: bool,
-    geometry: Geometry = NO_GEOMETRY,
+    headings: Sequence[str], wish: Mapping[str, str], *, path: Path, per_load: bool, geometry: Geometry = NO_GEOMETRY
 ) -> tuple[Named, ...]:
     """Return the columns of a file that play a role; `wish` names some of them, `per_load` prefers friction to a force.
 
@@ -180,9 +175,7 @@ def name_columns(
         actual = _by_unit(role, unit)
         if actual is None or actual in found:
             continue
-        found[actual] = Named(
-            actual, heading, unit or ROLES[actual], name != actual or split_heading(heading)[1] is None
-        )
+        found[actual] = Named(actual, heading, unit or ROLES[actual], name != actual or split_heading(heading)[1] is None)
         taken.add(heading)
     _by_words(headings, found)
     seen = [role for role in (OBSERVABLES if not per_load else OBSERVABLES[::-1]) if role in found]
@@ -303,9 +296,7 @@ def missing(columns: Sequence[Named], wish: Wish, path: Path, headings: Sequence
         option = "--drive VELOCITY, or --column load_point_displacement=HEADING"
         lacks.append((option, f"{path}: no column has the load point's velocity or displacement"))
     if wish.load is None and not roles & {"normal_load", "normal_stress", "friction"}:
-        lacks.append(
-            ("--load '5 N', or --column normal_stress=HEADING", f"{path}: no column has the normal load or stress")
-        )
+        lacks.append(("--load '5 N', or --column normal_stress=HEADING", f"{path}: no column has the normal load or stress"))
     return lacks
 
 
@@ -338,9 +329,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
             raise SrfError(lacks[0][1], " ".join(f"Say it with {option}." for option, _ in lacks))
         _check_rig(own, wish, path)
         if named and [(n.role, n.heading, n.unit) for n in own] != [(n.role, n.heading, n.unit) for n in named]:
-            raise SrfError(
-                f"{path}: its columns are not those of {files[0]}", "Files of one experiment have the same headings."
-            )
+            raise SrfError(f"{path}: its columns are not those of {files[0]}", "Files of one experiment have the same headings.")
         named = own
         aside = [h for h in headings if h not in {n.heading for n in own}]
         if aside and path == files[0]:
@@ -389,9 +378,7 @@ def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
             parts |= {f"{run.name}-{k + 1}": stroke for k, stroke in enumerate(shown)}
             if found:
                 some = f", of which the first {STROKES} are written" if len(found) > STROKES else ""
-                told.append(
-                    f"{run.name} slides to and fro: {len(found)} strokes{some}, a run each, from half the force on"
-                )
+                told.append(f"{run.name} slides to and fro: {len(found)} strokes{some}, a run each, from half the force on")
     return replace(sketch, files=tuple(files), names=names, strokes=parts, free=tuple(parts)), told
 
 
@@ -438,9 +425,7 @@ class _Sketch:
         wish = self.wish
         lines = ['format = "srf-experiment/1"', f"title = {toml_value(wish.title or ', '.join(self.names))}"]
         lines += ["", f"# Letters: {LETTERS}.", "", "[apparatus]"]
-        lines += [
-            f"stiffness = {toml_value(wish.stiffness)}   # of the machine: N/um, MPa/mm, or 1/um for friction per micron"
-        ]
+        lines += [f"stiffness = {toml_value(wish.stiffness)}   # of the machine: N/um, MPa/mm, or 1/um for friction per micron"]
         lines += [f"{key} = {toml_value(value)}   # {RIG[key]}" for key, value in wish.rig.items()]
         if wish.mass:
             lines += [f"mass = {toml_value(wish.mass)}"]
@@ -550,10 +535,7 @@ def _kind(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, flo
             return "shs", f"as the drive of {run.name} holds for {float(np.mean(held)):.0%} of the time"
     ranges = [np.abs(run.drive(run.t)) for run in runs]
     low, high = min(float(V.min()) for V in ranges), max(float(V.max()) for V in ranges)
-    return (
-        "steps",
-        f"as the drive goes from {low:.3g} to {high:.3g} um/s" if high > 1.001 * low else f"at {low:.3g} um/s",
-    )
+    return ("steps", f"as the drive goes from {low:.3g} to {high:.3g} um/s" if high > 1.001 * low else f"at {low:.3g} um/s")
 
 
 def _levels(V: np.ndarray) -> int:

@@ -43,14 +43,7 @@ from srfcli.data.imposed import (
     modulation_notices,
     strokes,
 )
-from srfcli.data.noise import (
-    observable_jumps,
-    quantisation,
-    rejoined,
-    saturation,
-    spikes,
-    white_level,
-)
+from srfcli.data.noise import observable_jumps, quantisation, rejoined, saturation, spikes, white_level
 from srfcli.data.scales import own_bounds
 from srfcli.data.thresholds import read_thresholds
 from srfcli.data.values import (
@@ -70,12 +63,7 @@ from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation
 
 
 def read_experiment(
-    path: Path,
-    *,
-    registry: Registry,
-    format: str | None = None,
-    holdout: bool = True,
-    limit: int = LIMIT,
+    path: Path, *, registry: Registry, format: str | None = None, holdout: bool = True, limit: int = LIMIT
 ) -> Experiment:
     """Return the experiment in the folder or TOML file `path`, every value checked, in um, s, N.
 
@@ -135,9 +123,7 @@ def _check_acting(experiment: Experiment, described: Description) -> None:
 def _read_table(described: ThresholdsDescription) -> CriticalLoads:
     """Return the table of critical loads in a description's file."""
     if not described.file.exists():
-        described.node.child("file").fail(
-            f"no file {described.file}", "Its path is relative to the experiment's folder."
-        )
+        described.node.child("file").fail(f"no file {described.file}", "Its path is relative to the experiment's folder.")
     table = read_thresholds(described.file)
     if described.frequency is None and table.eps.max() > 0:
         line = table.lines[int(np.argmax(table.eps > 0))]
@@ -210,12 +196,8 @@ def read_effects(node: Node, registry: Registry) -> tuple[tuple[str, ...], tuple
         assert isinstance(effect, Effect)
         if effect.settings or effect.frees:
             instead = [f"{key} = {str(value).lower()} in [model]" for key, value in effect.settings]
-            instead += [
-                {"K": "another stiffness in [apparatus]", "M": "a mass in [apparatus]"}.get(n, n) for n in effect.frees
-            ]
-            entry.fail(
-                f"'{effect.name}' only replaces what the description says itself", f"Write {', '.join(instead)}."
-            )
+            instead += [{"K": "another stiffness in [apparatus]", "M": "a mass in [apparatus]"}.get(n, n) for n in effect.frees]
+            entry.fail(f"'{effect.name}' only replaces what the description says itself", f"Write {', '.join(instead)}.")
         names.append(name)
         found.append(effect)
     return tuple(names), tuple(_unbounded(p, effect) for effect in apart(found) for p in effect.parameters)
@@ -281,9 +263,7 @@ def _parameter(entry: Node, parameter: Parameter, geometry: Geometry) -> FitPara
             )
     if not lower < upper:
         key = "lower" if "lower" in entry.value else "upper"
-        entry.child(key).fail(
-            f"lower = {lower:g}{unit} is not below upper = {upper:g}{unit}", "Give two bounds that rise."
-        )
+        entry.child(key).fail(f"lower = {lower:g}{unit} is not below upper = {upper:g}{unit}", "Give two bounds that rise.")
     if not lower <= value <= upper:
         (entry.child("value") if "value" in entry.value else entry).fail(
             f"value = {value:g}{unit} is outside its bounds [{lower:g}, {upper:g}]{unit}", "Change it or the bounds."
@@ -408,10 +388,7 @@ def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
     """Return which readings (n,) are numbers, the readings with the others interpolated, and notices of the others."""
     known = np.isfinite(x)
     if known.sum() < 8:
-        raise SrfError(
-            f"{place.column} has {int(known.sum())} numbers in {x.size} samples",
-            "A recording needs 8 or more.",
-        )
+        raise SrfError(f"{place.column} has {int(known.sum())} numbers in {x.size} samples", "A recording needs 8 or more.")
     notices = place.spots("nan", ~known, f"without a number in '{place.heading}', not compared")
     return known, np.interp(place.t, place.t[known], x[known]), notices
 
@@ -537,9 +514,7 @@ def _without_jumps(
         if not jump.certain:
             done = "faster than the drive moves, but too little to be sure of a transducer set anew; left as it is"
         elif taken_out:
-            done = (
-                "a transducer set anew; what follows is moved back by that much, and the two samples are not compared"
-            )
+            done = "a transducer set anew; what follows is moved back by that much, and the two samples are not compared"
         else:
             done = 'faster than the drive moves; left as it is; corrections = ["reset"] moves what follows back by that much'
         what = f"'{place.heading}' jumps by {jump.size:.4g}: {done}"
@@ -642,6 +617,4 @@ def _drive_pieces(run: Run) -> tuple[tuple[tuple[float, float, float], ...], flo
 def load_history(load: Load, t: Array) -> LoadHistory:
     """Return mean, range, rate and modulation of a load over the times `t`."""
     W, W_dot = load(t)
-    return LoadHistory(
-        float(W.mean()), float(W.min()), float(W.max()), float(np.abs(W_dot / W).max()), find_modulation(t, W)
-    )
+    return LoadHistory(float(W.mean()), float(W.min()), float(W.max()), float(np.abs(W_dot / W).max()), find_modulation(t, W))

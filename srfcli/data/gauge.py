@@ -118,9 +118,7 @@ class GaugeNoise:
 
     def covariance(self, lag: Array) -> Array:
         """Return the covariance at lags >= 0 (s), of which 0 is a sample with itself."""
-        return np.where(lag == 0, self.floor, 0.0) + sum(
-            (covariance(c, lag) for c in self.colours), np.zeros(np.shape(lag))
-        )
+        return np.where(lag == 0, self.floor, 0.0) + sum((covariance(c, lag) for c in self.colours), np.zeros(np.shape(lag)))
 
 
 def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t: Array, columns: Array) -> Array:
@@ -165,9 +163,7 @@ def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t
 # How it is found.
 
 
-def find_noise(
-    pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0, cycles: float | None = None
-) -> GaugeNoise:
+def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0, cycles: float | None = None) -> GaugeNoise:
     """Return the noise in evenly sampled pieces of a recording, `spacing` s between samples, about a parabola over each stretch.
 
     `cycles`, in periods per sample, is a modulation whose first three harmonics are taken out, too.
@@ -189,9 +185,7 @@ def find_noise(
         whittle = _Whittle(calm, spacing, quantum, least)
         if found is not None:
             slow = calm.mean[:SLOW] / whittle.expected(found)[:SLOW]
-            if whittle.samples < found.samples / 2 or slow.mean() > RISE * (
-                1 + 2 * np.sqrt(NEIGHBOURS / (SLOW * calm.count))
-            ):
+            if whittle.samples < found.samples / 2 or slow.mean() > RISE * (1 + 2 * np.sqrt(NEIGHBOURS / (SLOW * calm.count))):
                 break
         found = whittle.noise()
     assert found is not None
@@ -374,9 +368,7 @@ class _Whittle:
         else:
             white, colours = self.split(x, kinds)
             over = self.calm.mean / self.expected(GaugeNoise(white, self.quantum, tuple(colours)))
-            peaks = (
-                np.array([self.calm.window.bins[int(np.argmax(over))] / self.calm.window.n, 0.03, 0.15]) / self.spacing
-            )
+            peaks = np.array([self.calm.window.bins[int(np.argmax(over))] / self.calm.window.n, 0.03, 0.15]) / self.spacing
             places = [*product(np.log(peaks), np.log(QUALITIES))]
         levels = [0, *(2 + i for i in self.places(kinds))]
         variance = float(np.sum(np.exp(2 * x[levels])))

@@ -153,9 +153,7 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         raise SrfError(f"{where}: {int(known.sum())} displacements in it", "Give the run a drive.")
     notices = []
     if not known.all():
-        notices.append(
-            Notice("nan", where, f"{int((~known).sum())} samples without a displacement; a line bridges them")
-        )
+        notices.append(Notice("nan", where, f"{int((~known).sum())} samples without a displacement; a line bridges them"))
     line = corners(t[known], X[known], correct=correct)
     for at, size in line.jumps:
         done = "taken out as a transducer's" if correct else 'left as it is; corrections = ["reset"] takes it out'
@@ -481,9 +479,7 @@ def _cost_without(t: Array, x: Array, sigma: Array, knots: Array, k: int) -> flo
     before, after = slopes[k - low - 1], slopes[k - low]
     if abs(after - before) < WOBBLE * max(abs(before), abs(after)):
         return 0.0
-    return _misfit(t[near], x[near], sigma[near], np.delete(kept, k - low)) - _misfit(
-        t[near], x[near], sigma[near], kept
-    )
+    return _misfit(t[near], x[near], sigma[near], np.delete(kept, k - low)) - _misfit(t[near], x[near], sigma[near], kept)
 
 
 def _misfit(t: Array, x: Array, sigma: Array, knots: Array) -> float:
@@ -754,17 +750,14 @@ def read_load(path: Path, *, registry: Registry, format: str | None = None) -> t
     if time is None or loads is None:
         missing = "time" if time is None else " or ".join(LOADS)
         raise SrfError(
-            f"{path}: no column {missing}; found: {', '.join(source.headings)}",
-            "Head the columns time [s],normal_load [N].",
+            f"{path}: no column {missing}; found: {', '.join(source.headings)}", "Head the columns time [s],normal_load [N]."
         )
     blocks, held = [np.empty((2, 0))], 0
     for block in source.blocks((time.column, loads.column)):
         blocks.append(np.array([block[0] * time.factor, block[1] * loads.factor]))
         held += blocks[-1].nbytes
         if held > LIMIT:
-            raise SrfError(
-                f"{path}: more than {LIMIT / 2**20:g} MB of loads", "Cut the file to the times that are needed."
-            )
+            raise SrfError(f"{path}: more than {LIMIT / 2**20:g} MB of loads", "Cut the file to the times that are needed.")
     t, W = np.concatenate(blocks, axis=1)
     rows = np.arange(1, t.size + 1)
     keep, notices = kept_samples(Place(path, time.heading, rows, t))

@@ -14,9 +14,7 @@ from srfcli.data.values import CriticalLoads, FitParameter, Run
 from srfcli.laws.values import Effect
 
 
-def scales_of(
-    runs: Sequence[Run], parameters: Sequence[FitParameter], tables: Sequence[CriticalLoads] = ()
-) -> dict[str, float]:
+def scales_of(runs: Sequence[Run], parameters: Sequence[FitParameter], tables: Sequence[CriticalLoads] = ()) -> dict[str, float]:
     """Return the scales that effect files may name, in um, s, N, of the runs that are fitted (of all, where none is).
 
     `segment` is the longest slip at one velocity and `track` in one run, `duration` that of the longest run, `interval` the

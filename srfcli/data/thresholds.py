@@ -157,9 +157,7 @@ def _row(cells: list[str], columns: list[tuple[str, float]], where: str) -> tupl
         if not values[name] > 0:
             raise SrfError(f"{where}: {name} = {values[name]:g} {UNITS[name]} is not above 0", "Correct or remove it.")
     if not 0 <= values["eps"] < 1:
-        raise SrfError(
-            f"{where}: eps = {values['eps']:g} is not in [0, 1)", "eps is relative to W0; in percent head it eps [%]."
-        )
+        raise SrfError(f"{where}: eps = {values['eps']:g} is not in [0, 1)", "eps is relative to W0; in percent head it eps [%].")
     assumed = "sigma" not in values
     sigma = RELATIVE_ERROR * values["W0c"] if assumed else values["sigma"]
     if dict(columns).get("sigma", 1.0) < 0 and not assumed:
@@ -176,8 +174,7 @@ def _number(name: str, cell: str, where: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise SrfError(
-            f"{where}: {name} = {cell.strip()!r} is not a finite number",
-            "Write a number as in 11.25, units in the header.",
+            f"{where}: {name} = {cell.strip()!r} is not a finite number", "Write a number as in 11.25, units in the header."
         )
     return value
 

@@ -202,9 +202,7 @@ class Experiment:
     def check_recorded(self, purpose: str) -> None:
         """Raise SrfError where there is no recording, only critical loads."""
         if not self.runs:
-            raise SrfError(
-                f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`."
-            )
+            raise SrfError(f"{self.path} holds critical loads and no recordings {purpose}", "Take `srf fit` or `srf diagnose`.")
 
     def named(self, names: Sequence[str]) -> tuple[Run, ...]:
         """Return the runs of these names, all where none is given; raises SrfError for a name that no run has."""
@@ -265,11 +263,7 @@ class Experiment:
             return ""
         listed = ", ".join(f"{told} in {name}" for told, name in list(under.items())[:6])
         more = ", ..." if len(under) > 6 else ""
-        apart = (
-            "; a machine's own stiffness does not grow with the load: state it in MPa/um or N/um"
-            if len(under) > 1
-            else ""
-        )
+        apart = "; a machine's own stiffness does not grow with the load: state it in MPa/um or N/um" if len(under) > 1 else ""
         return f"the stiffness of {number:g} {unit} counts for each run's first load: {listed}{more}{apart}"
 
     def shown(self, unit: str) -> tuple[str, float]:

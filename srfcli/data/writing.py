@@ -11,16 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from srfcli.core.errors import SrfError
-from srfcli.core.files import (
-    SIDECAR,
-    check_folder_place,
-    clear,
-    parse_toml,
-    read_text,
-    toml_lines,
-    unused_name,
-    whole_folder,
-)
+from srfcli.core.files import SIDECAR, check_folder_place, clear, parse_toml, read_text, toml_lines, unused_name, whole_folder
 from srfcli.core.units import find_unit
 from srfcli.data.description import LARGEST
 from srfcli.data.thresholds import thresholds_csv
@@ -107,9 +98,7 @@ def run_csv(run: Run) -> str:
     header = ["time [s]", "load_point_velocity [um/s]", "normal_stress [MPa]" if run.stress else "normal_load [N]"]
     for signal, name in zip(run.signals, observables(run), strict=True):
         header.append(f"{name} [{run.unit_of(signal.observable)}]")
-        texts.append(
-            repr(y) if used else "" for y, used in zip(signal.observed.tolist(), signal.used.tolist(), strict=True)
-        )
+        texts.append(repr(y) if used else "" for y, used in zip(signal.observed.tolist(), signal.used.tolist(), strict=True))
     return "\n".join([",".join(header), *map(",".join, zip(*texts, strict=True))]) + "\n"
 
 

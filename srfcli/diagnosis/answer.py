@@ -79,17 +79,13 @@ def answer(
     """
     views, loads, last = run_views(diagnosis), load_views(diagnosis), diagnosis.final
     sides = {}
-    for place, (name, fitted, own) in enumerate(
-        (("baseline", diagnosis.shown, diagnosis.baseline), ("augmented", last, last))
-    ):
+    for place, (name, fitted, own) in enumerate((("baseline", diagnosis.shown, diagnosis.baseline), ("augmented", last, last))):
         values = own.fit.values
         sides[name] = {
             "parameters": parameters_of(fitted),
             "fit": {"rms_over_noise": fitted.fit.maximum.point.rms},
             "holdout": {"rms_over_noise": together([*(v for v in views if v.holdout), *(v for v in loads if v.holdout)], place)},
-            "field": None
-            if own.fit.smooth
-            else {"amplitude": values["field_amplitude"], "length_um": values["field_length"]},
+            "field": None if own.fit.smooth else {"amplitude": values["field_amplitude"], "length_um": values["field_length"]},
         }
     found = {
         "schema": SCHEMA,
@@ -185,10 +181,11 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
          "chi2": list(v.chi2)}
         for v in load_views(diagnosis)
     ]  # fmt: skip
-    about = {e.reported: e.about for f in diagnosis.ranked for e in f.hypothesis.effects}
+    effects = [e for f in (*diagnosis.ranked, diagnosis.final) for e in f.hypothesis.effects]  # variants: the final model's
     return {
         "title": diagnosis.experiment.title,
-        "about": about,
+        "about": {e.reported: e.about for e in effects},
+        "texts": {e.reported: {"wrong": e.wrong, "remedy": e.remedy} for e in effects},
         "runs": runs,
         "thresholds": tables,
         "atlas": [atlas_row(row) for row in location.atlas],

@@ -70,11 +70,7 @@ def augment(
     laws = fold(registry, experiment.choice, hypothesis.effects)
     renamed = _final_names(registry, experiment, hypothesis, laws)
     listed = [
-        replace(
-            q,
-            name=renamed.get(q.name, q.name),
-            value=float(np.clip(fitted.values.get(q.name, q.value), q.lower, q.upper)),
-        )
+        replace(q, name=renamed.get(q.name, q.name), value=float(np.clip(fitted.values.get(q.name, q.value), q.lower, q.upper)))
         for q in fitted.likelihood.problem.experiment.parameters
     ]
     values = {q.name: q.value for q in listed}
@@ -88,9 +84,7 @@ def augment(
     recorded, loads = description.get("runs", []), description.get("thresholds", [])
     parts, copies = _parts([*recorded, *loads], experiment.path.parent, folder)
     runs = [{**run, **({"format": reader} if reader else {})} for run in parts[: len(recorded)]]
-    title = experiment.title + (
-        f" (augmented with {', '.join(hypothesis.reported)})" if hypothesis.reported else " (fitted)"
-    )
+    title = experiment.title + (f" (augmented with {', '.join(hypothesis.reported)})" if hypothesis.reported else " (fitted)")
     text = experiment.stiffness_text if "K" not in values else f"{shortest(K, 1.0)!r} {base}"
     rig = {key: description["apparatus"][key] for key in GEOMETRY if key in description["apparatus"]}
     text = text.replace(" N/um", " MPa/um") if "area" in rig else text  # beside an area a force would be divided by it
@@ -136,9 +130,7 @@ def _beside(left: Sequence[Effect]) -> tuple[tuple[str, ...], dict[str, Path]]:
     return tuple(names), sources
 
 
-def _parts(
-    described: Sequence[Mapping[str, Any]], home: Path, folder: Path
-) -> tuple[list[dict[str, Any]], dict[str, Path]]:
+def _parts(described: Sequence[Mapping[str, Any]], home: Path, folder: Path) -> tuple[list[dict[str, Any]], dict[str, Path]]:
     """Return what is described of runs and critical loads, files named as seen from `folder`, and what is to be copied there."""
     paths = {str(run["file"]): (home / str(run["file"])).resolve() for run in described}
     small = sum(p.stat().st_size for p in set(paths.values())) <= LARGEST
@@ -231,11 +223,7 @@ def _folded(laws: Folded, effect: Effect, stays: Sequence[Effect]) -> Folded | N
     if not {str(s) for s in new.free_symbols} <= set(known) or not _sayable(new, known):
         return None
     changed = laws.changed | {KINDS[slot]}
-    common: dict[str, Any] = {
-        "parameters": parameters,
-        "cites": tuple(dict.fromkeys((*law.cites, *effect.cites))),
-        "checks": (),
-    }
+    common: dict[str, Any] = {"parameters": parameters, "cites": tuple(dict.fromkeys((*law.cites, *effect.cites))), "checks": ()}
     common["about"] = f"{law.about.rstrip('.')}; {effect.about[:1].lower()}{effect.about[1:]}"
     if slot == "mu":
         return replace(laws, friction=replace(laws.friction, mu=new, states=every, **common), changed=changed)

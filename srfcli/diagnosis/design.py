@@ -136,9 +136,7 @@ class Side:
         found = predict(self.problem.model, self.problem.experiment, run, values)
         return found.y if found.status.ok and np.isfinite(found.y).all() else None
 
-    def filtered(
-        self, run: Run, y: Array, z: Array | None = None, *, slopes: bool = True
-    ) -> tuple[Array, Array, Array] | None:
+    def filtered(self, run: Run, y: Array, z: Array | None = None, *, slopes: bool = True) -> tuple[Array, Array, Array] | None:
         """Return innovations over what is shown, `y` (n,), standardised and not, and derivatives (n, k) of the former by z."""
         seen = replace(run, observed=y)
         f = self.fitted.fit.likelihood.filtered(seen, self.values(z), slopes=slopes)
@@ -561,9 +559,7 @@ def _drawn(reach: Reach, kind: str, rng: np.random.Generator) -> Proposal:
     drive = _timed([V, other], [0.6, 0.4], span, reach.travel) if stepped else _timed([V], [1.0], span, reach.travel)
     onset = _digits(min(reach.onset, 0.5) * sum(d for d, _ in drive))
     eps = min(near(reach.eps), MOST_EPS)
-    return Proposal(
-        kind, drive, W0, like.name, interval, rise, (), eps, _frequency(near(reach.f), reach, interval), onset
-    )
+    return Proposal(kind, drive, W0, like.name, interval, rise, (), eps, _frequency(near(reach.f), reach, interval), onset)
 
 
 def _timed(V: Sequence[float], shares: Sequence[float], span: float, travel: float) -> tuple[tuple[float, float], ...]:
@@ -679,13 +675,7 @@ def described(found: DiscriminatingRun, experiment: Experiment) -> dict[str, Any
         "seconds": found.seconds,
         "repeats": found.repeats,
         "duration": found.proposal.duration,
-        "look": {
-            "at": found.at,
-            "difference": found.peak,
-            "unit": found.unit,
-            "um": found.peak_um,
-            "of": list(found.pair),
-        },
+        "look": {"at": found.at, "difference": found.peak, "unit": found.unit, "um": found.peak_um, "of": list(found.pair)},
         "run": run_text(found, experiment),
         "tried": found.tried,
     }
@@ -710,9 +700,7 @@ def discriminating_files(
         place = f"{FOLDER}/{fitted.name}"
         if fitted.name not in found.predicted or f"{place}/{DESCRIPTION}" in files:
             continue
-        made = augment(
-            registry, diagnosis.experiment, fitted.hypothesis, fitted.fit, folder=folder / place, reader=reader
-        )
+        made = augment(registry, diagnosis.experiment, fitted.hypothesis, fitted.fit, folder=folder / place, reader=reader)
         head = made.files[DESCRIPTION].partition(RUNS)[0].partition(COLUMNS)[0]
         files |= {f"{place}/{name}": content for name, content in made.files.items()}
         files[f"{place}/{DESCRIPTION}"] = f"{head.rstrip()}\n\n{text}"

@@ -27,9 +27,7 @@ BEYOND = 3.0  # times the slowest and fastest drive of the recordings: how far t
 DRAWN = AtlasSettings(tol=1e-4, max_mesh=256)  # as good as a line in a figure
 
 
-def stability(
-    registry: Registry, baseline: Experiment, at: Mapping[str, float], augmented: Experiment
-) -> dict[str, Any]:
+def stability(registry: Registry, baseline: Experiment, at: Mapping[str, float], augmented: Experiment) -> dict[str, Any]:
     """Return V (um/s), the critical loads (N) of both models under constant load and under the strongest modulation, and a note.
 
     `at` are the baseline's fitted parameters; the augmented experiment has its own. Loads are NaN where sliding is steady at any;
@@ -57,9 +55,7 @@ def stability(
     except SrfError as error:
         return {"note": f"no stability diagram: {error.message}"}
     if not any(np.isfinite(loads).any() for key, loads in found.items() if key.startswith("W0")):
-        notes = [
-            f"Sliding is steady at any load from {V[0]:.3g} to {V[-1]:.3g} um/s, of both models: there is no boundary."
-        ]
+        notes = [f"Sliding is steady at any load from {V[0]:.3g} to {V[-1]:.3g} um/s, of both models: there is no boundary."]
     else:
         if strongest:
             drawn = f"under a load modulated by {strongest[1]:.3g} at {strongest[0]:g} Hz, the strongest here."

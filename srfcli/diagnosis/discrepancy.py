@@ -182,9 +182,7 @@ def _fitted(effect: Effect, fitted: Fitted) -> FittedTerm:
     return FittedTerm(effect, values)
 
 
-def explain_unknown(
-    search: ModelSearch, diagnosis: Diagnosis, *, stopped: Callable[[], None] = lambda: None
-) -> dict[str, Any]:
+def explain_unknown(search: ModelSearch, diagnosis: Diagnosis, *, stopped: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """Return what there is to say where no registered effect explains a recording, as plain data and arrays.
 
     `force` holds, by run, the arrays of `RunForce.described`, and `form`, `unit`; `latent` is how that force was estimated.
@@ -306,9 +304,7 @@ class ClosedForm:
         lines += [f"{slot} = {_text(formula_text(f))}" for slot, f in self.formulas().items()]
         states = [s for e in named for s in e.states]
         if states:
-            rows = [
-                f"name = {_text(s.name)}, rate = {_text(str(s.rate))}, steady = {_text(str(s.steady))}" for s in states
-            ]
+            rows = [f"name = {_text(s.name)}, rate = {_text(str(s.rate))}, steady = {_text(str(s.steady))}" for s in states]
             lines.append("states = [" + ", ".join("{ " + row + " }" for row in rows) + "]")
         needs = list(dict.fromkeys(n for e in named for n in e.needs))
         if needs:

@@ -177,9 +177,7 @@ class Hypothesis:
         at = at or {}
         names = {q.name for q in added}
         kept = [q for q in experiment.parameters if q.name not in names]
-        listed = tuple(
-            replace(q, value=float(np.clip(at.get(q.name, q.value), q.lower, q.upper))) for q in (*kept, *added)
-        )
+        listed = tuple(replace(q, value=float(np.clip(at.get(q.name, q.value), q.lower, q.upper))) for q in (*kept, *added))
         stability = self.stability(registry, experiment) if experiment.thresholds else None
         listed_in = replace(experiment, parameters=listed)
         problem = fit_problem(model, listed_in, trend=trend, stability=stability)

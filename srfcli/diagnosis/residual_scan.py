@@ -36,11 +36,7 @@ LARGE = 10.0  # standard deviations of the noise beyond which a residual counts 
 RUN_CELLS, HELD = 64, 0.8  # of a run, and the share of its excess that its windows must hold
 OWN = ("run", "window")  # axes along a run's time
 MOST = 5  # windows and lines that are named
-PROMINENT, BESIDE, FAINT = (
-    4.0,
-    15,
-    0.01,
-)  # of a line: times its neighbours' median, how many neighbours, share of the strongest
+PROMINENT, BESIDE, FAINT = (4.0, 15, 0.01)  # of a line: times its neighbours' median, how many neighbours, share of the strongest
 EVENTS = 3  # stick-slip events from which there is a cycle
 
 
@@ -502,9 +498,7 @@ class Atlas:
         c, s, block = F.real, -F.imag, self._block(p, p)
         cc, cs, ss = (np.einsum("ij,ij->i", x @ block, y) for x, y in ((c, c), (c, s), (s, s)))
         half = 0.5 / (n * step)
-        item = _Item(
-            "frequency", p.name, "line", tuple((x - half, x + half) for x in f.tolist()), (), freedom=np.full(m, 2.0)
-        )
+        item = _Item("frequency", p.name, "line", tuple((x - half, x + half) for x in f.tolist()), (), freedom=np.full(m, 2.0))
         floor = 1e-3 * n  # a line that parameters absorb altogether has no statistic
         return item, f, slice(a, b), (np.maximum(n / 2 - cc, floor), -cs, np.maximum(n / 2 - ss, floor))
 

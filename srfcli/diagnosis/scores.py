@@ -20,14 +20,7 @@ from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.core.errors import SrfError
 from srfcli.core.units import to_base
 from srfcli.data.values import Experiment, Run, per_elongation
-from srfcli.diagnosis.hypotheses import (
-    Excluded,
-    Shape,
-    along_table,
-    inner_grid,
-    neutral_values,
-    own_parameters,
-)
+from srfcli.diagnosis.hypotheses import Excluded, Shape, along_table, inner_grid, neutral_values, own_parameters
 from srfcli.inference.critical_loads import TableLikelihood, apparatus
 from srfcli.inference.kalman import gains
 from srfcli.inference.recordings import slip_along
@@ -228,9 +221,7 @@ class Scores:
                 values[long] = neutral.get(p.name, to_base(p.default, p.unit))
         return values
 
-    def _columns(
-        self, model: GeneratedModel, added: Sequence[Effect], values: Mapping[str, float], by: Sequence[str]
-    ) -> Array:
+    def _columns(self, model: GeneratedModel, added: Sequence[Effect], values: Mapping[str, float], by: Sequence[str]) -> Array:
         """Return the columns (n, k) by parameters of a model with `added` effects, at values where it is the fitted one."""
         likelihood = self.fitted.likelihood
 
@@ -315,9 +306,7 @@ class Scores:
         blocks = []
         for f in self.remainder.runs:
             functions = [
-                (shapes[e.name], [inner.get(n, 0.0) for n in shapes[e.name].inner])
-                for e, group in wanted
-                for inner in group
+                (shapes[e.name], [inner.get(n, 0.0) for n in shapes[e.name].inner]) for e, group in wanted for inner in group
             ]
             blocks.append(_carried(f, self.fitted, functions))
         every = self.remainder.padded(blocks)

@@ -222,9 +222,7 @@ class ModelSearch:
             longs = {p.name: long for long, p in own_parameters(effect, model).items()}
             neutral = neutral_values(effect)
             for name, value in sizes.items():
-                still = neutral.get(
-                    name, move.values.get("K", self.experiment.runs[0].stiffness) if name == "K" else None
-                )
+                still = neutral.get(name, move.values.get("K", self.experiment.runs[0].stiffness) if name == "K" else None)
                 values[longs.get(name, name)] = value if still is None else still + part * (value - still)
         return values
 
@@ -502,9 +500,7 @@ class ModelSearch:
         assert found is not None
         self.count += 1
         values = dict(found.values)
-        return _Move(
-            -(node.evidence + gain + WORTH), self.count, node.hypothesis, values, self._sizes(node, values), again=True
-        )
+        return _Move(-(node.evidence + gain + WORTH), self.count, node.hypothesis, values, self._sizes(node, values), again=True)
 
     def _resized(self, node: Fitted) -> Point | None:
         """Return the likeliest point from other sizes of what is built in, the other parameters fitted under each.

@@ -246,10 +246,7 @@ def _said(best: Fitted, close: Sequence[Fitted], scores: Sequence[Score]) -> tup
         seen = [s for s in scores if s.detectable < interesting(s)]
         if 2 * len(seen) >= len(scores):
             return "none", [*reasons, "the baseline explains the recordings"]
-        return "inconclusive", [
-            *reasons,
-            "nothing is needed, and most effects of interesting size could not have been seen",
-        ]
+        return "inconclusive", [*reasons, "nothing is needed, and most effects of interesting size could not have been seen"]
     if len({frozenset(f.hypothesis.reported) for f in close}) > 1:
         return "ambiguous", [*reasons, "several models do equally well: " + ", ".join(f.name for f in close)]
     return "identified", reasons

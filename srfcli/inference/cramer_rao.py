@@ -30,11 +30,7 @@ from srfcli.laws.registry import Registry
 
 MODIFIER = "linker-dieterich"
 ASKED = ("alpha", "lambda", "n")
-SIZES = {
-    "alpha": 0.2,
-    "lambda": 0.1,
-    "n": 0.1,
-}  # that one would want to see: of rock's alpha, of lambda's own value, of n
+SIZES = {"alpha": 0.2, "lambda": 0.1, "n": 0.1}  # that one would want to see: of rock's alpha, of lambda's own value, of n
 FAR = 3.0  # root mean square of simulation minus recording over the recording's own spread, from which it is another motion
 STIFFER = 1.5  # from half to twice the stated stiffness
 LONGEST = 20_000  # samples of a run that are simulated; of more, evenly chosen blocks stand for the others
@@ -249,9 +245,7 @@ def _errors(question: _Question, told: Sequence[_Told]) -> tuple[dict[str, float
         error, alone = _error(F, at, rest, np.array([question.widths[question.names[i]] for i in rest]))
         unit = _value(question, column) if asked == "lambda" else 1.0
         errors[asked] = error / unit if error / unit < UNKNOWN else math.inf
-        peaks[asked] = (
-            SIZES[asked] * unit * max((float(np.abs(t.Z @ alone).max(initial=0.0)) for t in told), default=0.0)
-        )
+        peaks[asked] = SIZES[asked] * unit * max((float(np.abs(t.Z @ alone).max(initial=0.0)) for t in told), default=0.0)
     return errors, peaks
 
 

@@ -71,9 +71,7 @@ class TableLikelihood:
         bounds: Mapping[str, tuple[float, float, float]],
     ) -> None:
         self.loads = loads
-        self.scale = Scale(
-            tuple(FreeParameter(Parameter(n, row[0]), *row) for n, row in bounds.items() if n in model.names)
-        )
+        self.scale = Scale(tuple(FreeParameter(Parameter(n, row[0]), *row) for n, row in bounds.items() if n in model.names))
         self.matcher = Matcher(model, loads.table, values=given, scale=self.scale)
 
     def at(self, values: Mapping[str, float], *, slopes: bool = True, anew: bool = False) -> Matched:

@@ -215,9 +215,7 @@ def fit_problem(
     for name, low, high in zip(names, lower, upper, strict=True):
         if not (np.isfinite(low) and np.isfinite(high)):
             raise SrfError(f"'{name}' has no bounds", "give lower and upper in [parameters]")
-    return Problem(
-        model, experiment, runs, tuple(names), start, lower, upper, trend, tables=tables, stability=stability
-    )
+    return Problem(model, experiment, runs, tuple(names), start, lower, upper, trend, tables=tables, stability=stability)
 
 
 def _check_varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[str]) -> None:

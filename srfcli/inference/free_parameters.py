@@ -117,21 +117,15 @@ def free_parameters(
     """
     own = dict(bounds or {})
     if not names:
-        raise SrfError(
-            "no parameter is free", f"Name some in `free`, as A,B,D0; known: {', '.join(p.name for p in parameters)}"
-        )
+        raise SrfError("no parameter is free", f"Name some in `free`, as A,B,D0; known: {', '.join(p.name for p in parameters)}")
     for name in own:
         require_parameter(name, parameters, where=where)
         if name not in names:
-            raise SrfError(
-                f"bounds are given for {name}, which is not free", "Name it in `free`, or leave them out."
-            )
+            raise SrfError(f"bounds are given for {name}, which is not free", "Name it in `free`, or leave them out.")
     found = []
     for position, name in enumerate(names):
         if name in GIVEN:
-            raise SrfError(
-                f"{name} cannot be fitted", f"The table gives {', '.join(GIVEN)}; free what the law declares."
-            )
+            raise SrfError(f"{name} cannot be fitted", f"The table gives {', '.join(GIVEN)}; free what the law declares.")
         if name in names[:position]:
             raise SrfError(f"{name} is named twice", "Name each free parameter once.")
         parameter = require_parameter(name, parameters, where=where)

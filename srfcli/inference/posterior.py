@@ -20,6 +20,7 @@ from srfcli.inference.state_space import CLOSER, StateSpaceFit, maximise
 LEVEL = 3.841458820694124  # of chi-squared with one degree of freedom, 95 %
 FARTHEST = 8.0  # standard errors: an interval that has not ended there is open
 
+
 @dataclass(frozen=True)
 class Interval:
     """A 95 % interval of one parameter, in um, s, N; None where the likelihood does not end it before a bound."""
@@ -148,11 +149,7 @@ def effective_size(chains: Array) -> Array:
 
 
 def sample(
-    found: StateSpaceFit,
-    count: int,
-    *,
-    seed: int = 0,
-    progress: Callable[[str, float], None] = lambda text, share: None,
+    found: StateSpaceFit, count: int, *, seed: int = 0, progress: Callable[[str, float], None] = lambda text, share: None
 ) -> Posterior:
     """Return at least `count` draws of the problem's parameters, as `draw` makes them; field and gauge noise are held."""
     problem = found.likelihood.problem
@@ -166,9 +163,7 @@ def sample(
         return here if np.isfinite(here) else -np.inf
 
     best = np.array([found.values[n] for n in problem.names])
-    return draw(
-        log_posterior, problem.names, best, found.covariance[:k, :k], (lower, upper), count, seed=seed, progress=progress
-    )
+    return draw(log_posterior, problem.names, best, found.covariance[:k, :k], (lower, upper), count, seed=seed, progress=progress)
 
 
 def draw(
@@ -243,9 +238,7 @@ def _slowness(chains: Array) -> float:
     return float(steps * count / np.nanmin(np.maximum(effective_size(chains), 1e-9)))
 
 
-def _with_bounded(
-    log_posterior: Callable[[Array], float], best: Array, covariance: Array, bounds: tuple[Array, Array]
-) -> Array:
+def _with_bounded(log_posterior: Callable[[Array], float], best: Array, covariance: Array, bounds: tuple[Array, Array]) -> Array:
     """Return the covariance with a spread where the fit left a parameter at a bound: there the posterior falls by a half."""
     base, full = log_posterior(best), covariance.copy()
     for k in np.flatnonzero(~(np.diag(covariance) > 0)):

@@ -34,9 +34,7 @@ def own_names(model: GeneratedModel, run: Run, trend: str | None) -> list[str]:
     return initial + ([f"{run.name}.trend"] if trend else []) + gauges
 
 
-def own_start(
-    model: GeneratedModel, run: Run, p: Array, name: str, trend: str | None = None
-) -> tuple[float, float, float]:
+def own_start(model: GeneratedModel, run: Run, p: Array, name: str, trend: str | None = None) -> tuple[float, float, float]:
     """Return a start value and bounds for one of `own_names`; `trend` is what a trend is proportional to, slip if left out."""
     kind = name.rpartition(".")[2]
     if kind == "trend":
@@ -80,12 +78,7 @@ def basis(run: Run, trend: str) -> Array:
 
 
 def start_state(
-    model: GeneratedModel,
-    run: Run,
-    p: Array,
-    values: Mapping[str, float],
-    by: Sequence[str],
-    numbers: Sequence[int] = (),
+    model: GeneratedModel, run: Run, p: Array, values: Mapping[str, float], by: Sequence[str], numbers: Sequence[int] = ()
 ) -> tuple[Array, Array]:
     """Return the state (n,) at the first sample and its derivatives (n, k): steady sliding, or what `values` say of a free start.
 
@@ -219,9 +212,7 @@ def _modulation(run: Run) -> dict[str, float]:
     found = find_modulation(run.t, W)
     answer = {"f": 1.0, "eps": 0.0, "psi": 0.0, "onset0": -1e6, "rise0": 0.02, "modulated": 0.0}
     if found is not None:
-        answer |= {"f": found.frequency, "modulated": 1.0} | _switched(
-            run, W, found.frequency, found.amplitude, found.onset
-        )
+        answer |= {"f": found.frequency, "modulated": 1.0} | _switched(run, W, found.frequency, found.amplitude, found.onset)
     _MODULATIONS[id(run.load)] = (run.load, answer)
     while len(_MODULATIONS) > 64:
         _MODULATIONS.pop(next(iter(_MODULATIONS)))

@@ -14,14 +14,7 @@ from srfcli.codegen.model import Array, open_model
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment, Run
-from srfcli.inference.fit import (
-    BetweenGroups,
-    Fit,
-    Interrupted,
-    Problem,
-    fit_problem,
-    scatter_of,
-)
+from srfcli.inference.fit import BetweenGroups, Fit, Interrupted, Problem, fit_problem, scatter_of
 from srfcli.inference.shared_field import SharedFit, fit_shared
 from srfcli.inference.state_space import StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
 from srfcli.laws.registry import Registry

@@ -196,13 +196,7 @@ class _Rows:
 
 
 def _rows(
-    model: GeneratedModel,
-    run: Run,
-    K: Dual,
-    values: Mapping[str, float],
-    by: Sequence[str],
-    processes: int,
-    trend: str | None,
+    model: GeneratedModel, run: Run, K: Dual, values: Mapping[str, float], by: Sequence[str], processes: int, trend: str | None
 ) -> _Rows:
     n, k, c = run.t.size, len(by), len(run.signals)
     W = run.load(run.t)[0]
@@ -306,10 +300,7 @@ def field_columns(likelihood: Likelihood, run: Run, values: Mapping[str, float])
 
 def gauge_rows(processes: Sequence[str]) -> list[tuple[str, ...]]:
     """Return the names of the parameters of each process of coloured gauge noise; the second is its standard deviation."""
-    forms = {
-        "relaxation": "gauge_time{0} gauge_colour{0}",
-        "oscillation": "gauge_frequency{0} gauge_colour{0} gauge_quality{0}",
-    }
+    forms = {"relaxation": "gauge_time{0} gauge_colour{0}", "oscillation": "gauge_frequency{0} gauge_colour{0} gauge_quality{0}"}
     return [tuple(forms[kind].format(j + 1).split()) for j, kind in enumerate(processes)]
 
 
@@ -408,9 +399,7 @@ class Likelihood:
     within a run too; names then end in `[kind]`. Without runs there is neither field nor gauge.
     """
 
-    def __init__(
-        self, problem: Problem, *, smooth: bool = False, processes: Sequence[str] = (), rtol: float = RTOL
-    ) -> None:
+    def __init__(self, problem: Problem, *, smooth: bool = False, processes: Sequence[str] = (), rtol: float = RTOL) -> None:
         self.problem, self.smooth, self.processes = problem, smooth or not problem.runs, tuple(processes)
         self.base_rtol, self.rtol = rtol, FREE_RUNNING * rtol if smooth else rtol
         self.evaluations = 0
@@ -468,9 +457,7 @@ class Likelihood:
     def values(self, x: Array) -> dict[str, float]:
         """Return parameters by name in um, s, N."""
         plain = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, x, 0.0)), x)
-        found = self.problem.named(plain[: len(self.problem.names)]) | dict(
-            zip(self.names, plain.tolist(), strict=True)
-        )
+        found = self.problem.named(plain[: len(self.problem.names)]) | dict(zip(self.names, plain.tolist(), strict=True))
         for n in {n for own in self.problem.varying.values() for n in own}:  # where no run is asked for, it is the mean
             found[n] = float(np.mean([value for name, value in found.items() if name.startswith(f"{n}[")]))
         return found | ({"field_amplitude": 0.0, "field_length": 1.0} if self.smooth else {})
@@ -512,13 +499,7 @@ class Likelihood:
         return self.gauge_names(min(near, key=lambda known: abs(np.log(known[1] / kind[1]))))
 
     def filtered(
-        self,
-        run: Run,
-        values: Mapping[str, float],
-        *,
-        slopes: bool = False,
-        keep: bool = False,
-        most: int | None = None,
+        self, run: Run, values: Mapping[str, float], *, slopes: bool = False, keep: bool = False, most: int | None = None
     ) -> Filtered:
         """Return one run filtered under values by name, with derivatives by the names that it depends on."""
         gauges, problem = self.gauges(run), self.problem
@@ -607,9 +588,7 @@ class Likelihood:
         with ThreadPoolExecutor(count) as pool:
             return list(pool.map(work, self.problem.runs))
 
-    def at(
-        self, x: Array, *, slopes: bool = True, keep: bool = False, like: Point | None = None, anew: bool = False
-    ) -> Point:
+    def at(self, x: Array, *, slopes: bool = True, keep: bool = False, like: Point | None = None, anew: bool = False) -> Point:
         """Return log likelihood, score and information at x (k,); -inf where a run takes PATIENCE times the steps of `like`.
 
         With `anew` every line of the tables is searched in full.
@@ -1309,18 +1288,14 @@ def _along(likelihood: Likelihood, maximum: Maximum, j: int, d: float) -> Point:
     return likelihood.at(x, slopes=False, like=maximum.point)
 
 
-def _along_ridges(
-    likelihood: Likelihood, maximum: Maximum, close: float, progress: Callable[[str], None]
-) -> Maximum:
+def _along_ridges(likelihood: Likelihood, maximum: Maximum, close: float, progress: Callable[[str], None]) -> Maximum:
     """Return the maximum at the likeliest place that strides along ridges find, the other parameters fitted at each."""
     for j in _ridges(likelihood, maximum):
         maximum = _walked(likelihood, maximum, j, close, progress)
     return maximum
 
 
-def _walked(
-    likelihood: Likelihood, maximum: Maximum, j: int, close: float, progress: Callable[[str], None]
-) -> Maximum:
+def _walked(likelihood: Likelihood, maximum: Maximum, j: int, close: float, progress: Callable[[str], None]) -> Maximum:
     stride = STRIDE * _size(likelihood, maximum.point, j)
     column = maximum.covariance[:, j] / maximum.covariance[j, j]
     best = maximum.point
@@ -1382,9 +1357,7 @@ def _with_colour(
     return best
 
 
-def with_less_colour(
-    found: StateSpaceFit, close: float, progress: Callable[[str], None] = lambda text: None
-) -> StateSpaceFit:
+def with_less_colour(found: StateSpaceFit, close: float, progress: Callable[[str], None] = lambda text: None) -> StateSpaceFit:
     """Return a fit without the fainter processes of its coloured gauge noise, as far as Schwarz's criterion prefers that.
 
     What a model lacks looks like colour, and the colour is not needed once the model has it.
@@ -1529,9 +1502,7 @@ def _with_or_without(
     if smooth is False:
         return best
     lost = found.point.log_likelihood - HOPELESS
-    if smooth or (
-        tried is None and plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood > lost
-    ):
+    if smooth or (tried is None and plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood > lost):
         tried = bare(STEPS)
     if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
         return best
@@ -1651,9 +1622,7 @@ def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[s
         for short in SHORT:
             trial = _under_field(rough, x, wide, short)
             found = rough.at(trial, slopes=False).log_likelihood
-            progress(
-                f"field of {np.exp(trial[amplitude]):.2g} over {np.exp(trial[length]):.2g} um: log likelihood {found:.1f}"
-            )
+            progress(f"field of {np.exp(trial[amplitude]):.2g} over {np.exp(trial[length]):.2g} um: log likelihood {found:.1f}")
             if np.isfinite(found):
                 trials.append((found, trial))
     return [trial for _, trial in sorted(trials, key=lambda t: -t[0])]
@@ -1719,6 +1688,4 @@ def _run_fit(likelihood: Likelihood, f: Filtered, number: int, values: Mapping[s
     y = signal.observed - found.nu
     parts = stretches(run.t, signal.used & np.isfinite(residual))
     prediction = Prediction(y, np.zeros((y.size, 0)), np.zeros((y.size, 0)), Status.OK, float(run.t[-1]))
-    return RunFit(
-        run.name, run.holdout, prediction, residual, parts, Noise(level, (), level), level, colours, signal.observable
-    )
+    return RunFit(run.name, run.holdout, prediction, residual, parts, Noise(level, (), level), level, colours, signal.observable)

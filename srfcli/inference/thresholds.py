@@ -45,10 +45,7 @@ REACH = 0.2  # of ln W0, summed over the parameters' changes since a line's surv
 CLOSE = 0.1  # of the datum's load: a crossing further off than this is followed only to know how far to look
 MOST_MOVED = 0.2  # in ln W0 from where a crossing was expected: it is another one then
 STALE = 0.03  # in ln W0: derivatives from further off no longer predict
-RIVAL = (
-    2.0,
-    0.05,
-)  # crossings within this many times the nearest's distance, and this share of the load, are followed too
+RIVAL = (2.0, 0.05)  # crossings within this many times the nearest's distance, and this share of the load, are followed too
 MAX_MESH = 512
 
 
@@ -103,13 +100,7 @@ class Matcher:
     """Compares a table with a model at one parameter set after another; `surveys` counts lines searched in full."""
 
     def __init__(
-        self,
-        model: GeneratedModel,
-        table: Thresholds,
-        *,
-        values: Mapping[str, float],
-        scale: Scale,
-        tol: float = 1e-6,
+        self, model: GeneratedModel, table: Thresholds, *, values: Mapping[str, float], scale: Scale, tol: float = 1e-6
     ) -> None:
         self.model, self.table, self.scale, self.tol = model, table, scale, tol
         self.surveys = 0
@@ -725,9 +716,7 @@ def uncertainty(scale: Scale, y: Array, jacobian: Array) -> Uncertainty:
             flags[i] = "not identifiable: other parameters undo it exactly"
         elif error > LOOSE:
             flags[i] = "not identifiable: its error exceeds its value" if q.log else "hardly identifiable"
-    return Uncertainty(
-        errors * scale.rates(y), tuple(flags), correlation, values, vectors, _weakest(scale, values, vectors)
-    )
+    return Uncertainty(errors * scale.rates(y), tuple(flags), correlation, values, vectors, _weakest(scale, values, vectors))
 
 
 def _covariance(values: Array, vectors: Array) -> Array:

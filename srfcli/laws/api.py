@@ -43,18 +43,7 @@ from srfcli.laws.law_file import (
     known_symbols,
     valid_name,
 )
-from srfcli.laws.values import (
-    AgeingLaw,
-    AgeingModifier,
-    Check,
-    Effect,
-    ExtraState,
-    FrictionLaw,
-    Interface,
-    Reader,
-    Source,
-    State,
-)
+from srfcli.laws.values import AgeingLaw, AgeingModifier, Check, Effect, ExtraState, FrictionLaw, Interface, Reader, Source, State
 
 __all__ = [
     "AgeingLaw",
@@ -171,12 +160,14 @@ def effect(
     lacks: Iterable[str] = (),
     observed: str = "",
     constitutive: bool = True,
+    wrong: str = "",
+    remedy: str = "",
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Turn a function into an `Effect`: it returns a mapping from slots (mu, rate, kappa, W, force, V) to formulas.
 
     Its arguments are the slots' names for what was there before, and any other name that a formula of an effect may hold;
     `neutral` are the values at which the model is the baseline, `states` the unknowns that the effect adds: the mapping then
-    holds, under the name of each, an `ExtraState`.
+    holds, under the name of each, an `ExtraState`. `wrong` and `remedy` are what a report says where it is found.
     """
 
     def decorate(function: Callable[..., Any]) -> Effect:
@@ -191,7 +182,7 @@ def effect(
                 name=own, parameters=listed, cites=tuple(cites), **_told(function, about),
                 changes=changes, states=extra, neutral=tuple((n, float(v)) for n, v in sizes.items()),
                 scans=tuple((p.name, SCAN) for p in listed if p.name not in sizes), needs=needed, lacks=tuple(lacks),
-                observed=observed, constitutive=constitutive,
+                observed=observed, constitutive=constitutive, wrong=wrong, remedy=remedy,
             )
         )  # fmt: skip
 
@@ -199,11 +190,7 @@ def effect(
 
 
 def reader(
-    *,
-    name: str | None = None,
-    suffixes: Iterable[str] = (),
-    sniff: Callable[[bytes], bool] | None = None,
-    about: str = "",
+    *, name: str | None = None, suffixes: Iterable[str] = (), sniff: Callable[[bytes], bool] | None = None, about: str = ""
 ) -> Callable[[Callable[[Path], Source | Mapping[str, Any]]], Reader]:
     """Turn a function of a path, which returns a `Source` or a mapping from headings to arrays, into a `Reader`."""
 
@@ -211,22 +198,14 @@ def reader(
         own = _name(function, name, "reader", "my-logger")
         endings = tuple(suffixes)
         if not all(isinstance(s, str) and s.startswith(".") for s in endings):
-            raise SrfError(
-                f"reader '{own}': suffixes are {endings!r}", 'Write them with their dot: suffixes=(".dat",).'
-            )
+            raise SrfError(f"reader '{own}': suffixes are {endings!r}", 'Write them with their dot: suffixes=(".dat",).')
         return Reader(own, function, endings, sniff, **_told(function, about))
 
     return decorate
 
 
 def _decorator(
-    kind: str,
-    name: str | None,
-    parameters: Parameters,
-    about: str,
-    cites: Iterable[str],
-    checks: Iterable[Check],
-    **more: Any,
+    kind: str, name: str | None, parameters: Parameters, about: str, cites: Iterable[str], checks: Iterable[Check], **more: Any
 ) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         law_name = _name(function, name, "law", "my-law")
@@ -268,9 +247,7 @@ def _called(function: Callable[..., Any], variables: list[str], parameters: tupl
     arguments: dict[str, Any] = {}
     for argument in inspect.signature(function).parameters:
         if argument != "p" and argument not in variables:
-            raise SrfError(
-                f"{function.__name__}: unknown argument '{argument}'", did_you_mean(argument, [*variables, "p"])
-            )
+            raise SrfError(f"{function.__name__}: unknown argument '{argument}'", did_you_mean(argument, [*variables, "p"]))
         arguments[argument] = Symbols(parameters) if argument == "p" else symbol(argument)
     return function(**arguments)
 
@@ -307,17 +284,14 @@ def _changes(
             raise SrfError(f"{where}: '{key}' is no slot", did_you_mean(str(key), (*SLOTS, *states)))
         if isinstance(value, ExtraState) != (key in states):
             raise SrfError(
-                f"{where}: found {type(value).__name__} under '{key}'",
-                "A formula for a slot, an ExtraState for a state.",
+                f"{where}: found {type(value).__name__} under '{key}'", "A formula for a slot, an ExtraState for a state."
             )
     lacking = [n for n in states if n not in result]
     if lacking:
         raise SrfError(f"{where}: nothing is returned for the state '{lacking[0]}'", "Return an ExtraState for it.")
     changes = tuple((s, _exact(where, result[s], (*known, s))) for s in SLOTS if s in result)
     extra = tuple(
-        ExtraState(
-            n, _exact(where, result[n].rate, known), _exact(where, result[n].steady, known), result[n].logarithmic
-        )
+        ExtraState(n, _exact(where, result[n].rate, known), _exact(where, result[n].steady, known), result[n].logarithmic)
         for n in states
     )
     return changes, extra
@@ -336,7 +310,6 @@ def _exact(where: str, result: Any, known: tuple[str, ...]) -> sympy.Expr:
                 raise SrfError(f"{where}: unknown symbol '{node}'", did_you_mean(node.name, known))
         elif not isinstance(node, (sympy.Add, sympy.Mul, sympy.Pow, sympy.Rational, sympy.NumberSymbol, *allowed)):
             raise SrfError(
-                f"{where}: '{node.func.__name__}' is not part of a formula",
-                f"Functions: {', '.join(sorted(FUNCTIONS))}.",
+                f"{where}: '{node.func.__name__}' is not part of a formula", f"Functions: {', '.join(sorted(FUNCTIONS))}."
             )
     return expr

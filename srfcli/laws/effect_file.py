@@ -21,7 +21,7 @@ PLACES = ("slip", "stage", "time", "theta", "envelope")  # unknowns and abbrevia
 RUN_NAMES = ("W0", "eps", "f", "K", "V", "modulated")
 KEYS = (
     "format", "kind", "name", "about", "cites", "parameters", "constants", *SLOTS, "states", "settings", "frees", "needs",
-    "lacks", "observed", "constitutive", "answers", "on_request",
+    "lacks", "observed", "constitutive", "answers", "on_request", "wrong", "remedy",
 )  # fmt: skip
 MOST = 1000  # values of an inner parameter
 SCAN = 8  # values at which an inner parameter is tried where its author says nothing
@@ -64,8 +64,7 @@ def finished(effect: Effect) -> Effect:
         raise SrfError(f"effect '{effect.name}' changes nothing", f"Give a formula for one of {', '.join(SLOTS)}.")
     if not (effect.neutral or effect.settings or effect.frees):
         raise SrfError(
-            f"effect '{effect.name}': no parameter has a neutral value",
-            "Write neutral = 0.0 for the one that is absent.",
+            f"effect '{effect.name}': no parameter has a neutral value", "Write neutral = 0.0 for the one that is absent."
         )
     declared = {p.name: p for p in effect.parameters}
     for name, value in effect.neutral:
@@ -75,9 +74,7 @@ def finished(effect: Effect) -> Effect:
             raise SrfError(f"the neutral value of '{name}' is {value}", "Give a finite number.")
     states = [state.name for state in effect.states]
     if effect.observed and effect.observed not in states:
-        raise SrfError(
-            f"observed = '{effect.observed}' is no state of the effect", did_you_mean(effect.observed, states)
-        )
+        raise SrfError(f"observed = '{effect.observed}' is no state of the effect", did_you_mean(effect.observed, states))
     return _with_numbers(effect)
 
 
@@ -89,9 +86,7 @@ def _with_numbers(effect: Effect) -> Effect:
         effect,
         written=effect.changes,
         changes=tuple((slot, formula.xreplace(numbers)) for slot, formula in effect.changes),
-        states=tuple(
-            replace(s, rate=s.rate.xreplace(numbers), steady=s.steady.xreplace(numbers)) for s in effect.states
-        ),
+        states=tuple(replace(s, rate=s.rate.xreplace(numbers), steady=s.steady.xreplace(numbers)) for s in effect.states),
     )
 
 
@@ -132,6 +127,7 @@ class EffectReader(LawReader):
             constitutive=self.flag("constitutive", True), answers=self.text("answers"), constants=constants,
             scaled=tuple(self.scaled(parameters)), on_request=self.flag("on_request", False),
             fixed=tuple(n for n, e in self.table.get("parameters", {}).items() if e.get("fixed")),
+            wrong=self.text("wrong"), remedy=self.text("remedy"),
         )  # fmt: skip
         with self.placed():
             return finished(effect)
@@ -144,18 +140,14 @@ class EffectReader(LawReader):
             where = f"parameters.{name}"
             if "neutral" in entry:
                 if "scan" in entry:
-                    self.fail(
-                        f"{where}.scan", "given together with neutral", "A size is fitted; only others are tried."
-                    )
+                    self.fail(f"{where}.scan", "given together with neutral", "A size is fitted; only others are tried.")
                 if entry.get("fixed"):
                     self.fail(f"{where}.fixed", "given together with neutral", "A size is fitted.")
                 neutral.append((name, self.number(f"{where}.neutral", entry["neutral"])))
                 continue
             if entry.get("fixed"):
                 if "scan" in entry:
-                    self.fail(
-                        f"{where}.scan", "given together with fixed", "What is never fitted is tried at no values."
-                    )
+                    self.fail(f"{where}.scan", "given together with fixed", "What is never fitted is tried at no values.")
                 continue
             count = self.number(f"{where}.scan", entry.get("scan", SCAN))
             if not (count.is_integer() and 1 <= count <= MOST):
@@ -203,9 +195,7 @@ class EffectReader(LawReader):
             if not isinstance(entry, dict) or "value" not in entry:
                 self.fail(where, "expected a table with a value", f'Write {name} = {{ value = 7.0, unit = "N" }}.')
             self.keys(where, entry, _CONSTANT)
-            found.append(
-                super().parameter(name, {"default": entry["value"], **{k: v for k, v in entry.items() if k != "value"}})
-            )
+            found.append(super().parameter(name, {"default": entry["value"], **{k: v for k, v in entry.items() if k != "value"}}))
         return tuple(found)
 
     def slot(self, slot: str, known: Iterable[str]) -> sympy.Expr:
@@ -218,11 +208,7 @@ class EffectReader(LawReader):
         """Return the tables under `states`."""
         entries = self.table.get("states", [])
         if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
-            self.fail(
-                "states",
-                "expected a list of tables",
-                'Write states = [{ name = "phi2", rate = "...", steady = "..." }].',
-            )
+            self.fail("states", "expected a list of tables", 'Write states = [{ name = "phi2", rate = "...", steady = "..." }].')
         return entries
 
     def state_names(self) -> list[str]:

@@ -411,9 +411,7 @@ def pretty(name: str, expression: sp.Expr) -> str:
     form = PrettyPrinter({"use_unicode": True, "wrap_line": False})._print(_spelled(expression))
     head = f"{name} = "
     lines = str(form).split("\n")
-    return "\n".join(
-        ((head if i == form.baseline else " " * len(head)) + line).rstrip() for i, line in enumerate(lines)
-    )
+    return "\n".join(((head if i == form.baseline else " " * len(head)) + line).rstrip() for i, line in enumerate(lines))
 
 
 def _spelled(expression: sp.Expr) -> sp.Expr:

@@ -256,9 +256,7 @@ class LawReader:
         if not isinstance(entry, dict):
             if name in (*_COMMON_KEYS, *FORMULA.values(), "states"):
                 self.fail(where, "this key stands below [parameters]", "Move it above the first [table].")
-            self.fail(
-                where, f"found {_shown(entry)}, expected a table", f'Write {name} = {{ default = 1.0, unit = "1" }}.'
-            )
+            self.fail(where, f"found {_shown(entry)}, expected a table", f'Write {name} = {{ default = 1.0, unit = "1" }}.')
         self.keys(where, entry, _PARAMETER_KEYS)
         if "default" not in entry:
             self.fail(f"{where}.default", "missing", "Every parameter has a default.")
@@ -277,9 +275,7 @@ class LawReader:
         if "lower" in entry or "upper" in entry:
             self.fail(f"{where}.bounds", "given together with lower or upper", "Keep one of the two forms.")
         if not isinstance(bounds, list) or len(bounds) != 2:
-            self.fail(
-                f"{where}.bounds", f"found {_shown(bounds)}, expected [lower, upper]", "inf and -inf are numbers."
-            )
+            self.fail(f"{where}.bounds", f"found {_shown(bounds)}, expected [lower, upper]", "inf and -inf are numbers.")
         return self.number(f"{where}.bounds", bounds[0]), self.number(f"{where}.bounds", bounds[1])
 
     def states(self) -> tuple[State, ...]:

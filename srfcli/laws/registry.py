@@ -59,12 +59,7 @@ class Registry:
     """The laws that were found, by kind and name; a law is loaded when it is first asked for, and then kept."""
 
     def __init__(
-        self,
-        entries: Sequence[Entry],
-        problems: Sequence[Problem] = (),
-        *,
-        named: Sequence[Path] = (),
-        trust: bool = False,
+        self, entries: Sequence[Entry], problems: Sequence[Problem] = (), *, named: Sequence[Path] = (), trust: bool = False
     ) -> None:
         self._entries = tuple(sorted(entries, key=lambda e: (PLUGIN_KINDS.index(e.kind), e.name, str(e.location))))
         self.problems = tuple(problems)
@@ -135,9 +130,7 @@ class Registry:
         if not first or not all(rest):
             raise SrfError(f"ageing law '{spelling}' has an empty part", "Write dieterich+linker-dieterich.")
         if len(set(rest)) != len(rest):
-            raise SrfError(
-                f"ageing law '{spelling}' names a modifier twice", "Change the modifier's parameter instead."
-            )
+            raise SrfError(f"ageing law '{spelling}' names a modifier twice", "Change the modifier's parameter instead.")
         law = self.get("ageing", first)
         modifiers = tuple(self.get("modifier", word) for word in rest)
         assert isinstance(law, AgeingLaw)
@@ -146,9 +139,7 @@ class Registry:
             assert isinstance(m, AgeingModifier)
             for p in m.parameters:
                 if p.name in own:
-                    raise SrfError(
-                        f"'{spelling}' has two parameters called '{p.name}'", f"Rename the one of '{m.name}'."
-                    )
+                    raise SrfError(f"'{spelling}' has two parameters called '{p.name}'", f"Rename the one of '{m.name}'.")
                 own.add(p.name)
         return law, modifiers  # type: ignore[return-value]
 
@@ -174,12 +165,7 @@ def untrusted_hint(name: str) -> str:
 
 
 def load_registry(
-    plugins: Sequence[Path] = (),
-    *,
-    user: bool = True,
-    entry_points: bool = True,
-    named: Sequence[Path] = (),
-    trust: bool = False,
+    plugins: Sequence[Path] = (), *, user: bool = True, entry_points: bool = True, named: Sequence[Path] = (), trust: bool = False
 ) -> Registry:
     """Return the laws of the bundled folder, entry points, the user's data folder, SRF_PLUGINS and `plugins`.
 
@@ -203,9 +189,7 @@ def load_registry(
             raise SrfError(f"{origin}: no folder {path}", "Give a folder that holds law files.")
         if not path.is_dir():
             if path.suffix not in (".toml", ".py"):
-                raise SrfError(
-                    f"{origin}: {path} is neither a folder nor a law's file", "A law's file ends in .toml or .py."
-                )
+                raise SrfError(f"{origin}: {path} is neither a folder nor a law's file", "A law's file ends in .toml or .py.")
             check_plain(path)
         collect.folder(origin, path)
     return Registry(collect.entries, collect.problems, named=named, trust=trust)
@@ -342,9 +326,7 @@ def _law_files(folder: Path) -> Iterator[Path]:
         return
     for place in (folder, *(folder / kind for kind in (*PLUGIN_KINDS, "readers"))):
         if place.is_dir():
-            yield from sorted(
-                p for p in place.iterdir() if p.suffix in (".toml", ".py") and not p.name.startswith(("_", "."))
-            )
+            yield from sorted(p for p in place.iterdir() if p.suffix in (".toml", ".py") and not p.name.startswith(("_", ".")))
 
 
 def _known(path: Path) -> list[tuple[str, str, str]] | None:
@@ -426,9 +408,7 @@ def load_module(location: Path, module: str | None) -> ModuleType:
     except (Exception, SystemExit) as error:
         lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(location)]
         at = f", line {lines[-1]}" if lines else ""
-        raise SrfError(
-            f"{location}{at}: {type(error).__name__}: {error}", "Mend the plugin or leave it out."
-        ) from error
+        raise SrfError(f"{location}{at}: {type(error).__name__}: {error}", "Mend the plugin or leave it out.") from error
 
 
 def find_value(entry: Entry) -> Law | Reader:

@@ -98,6 +98,7 @@ class Effect(Law):
     `scaled` holds (parameter, lower, upper or default, formula in the scales of a recording) for what takes a number's place.
     Those in `fixed` are never fitted: a reference load, say.
     One `on_request` is searched for only where it is named.
+    A report says what is `wrong` where it is found, and its `remedy`.
     `constants` are numbers with units that formulas in `written` name; in `changes` and `states` their values stand, um, s, N.
     A hypothesis may have it act in one `run` alone.
     """
@@ -118,6 +119,8 @@ class Effect(Law):
     scaled: tuple[tuple[str, str, sympy.Expr], ...] = ()
     on_request: bool = False
     fixed: tuple[str, ...] = ()
+    wrong: str = ""
+    remedy: str = ""
     run: str = ""
 
     @property

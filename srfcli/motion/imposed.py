@@ -264,9 +264,7 @@ class SampledLoad(Load):
         middles = (self.coefficients * half[:, None] ** np.arange(DEGREE + 1)).sum(axis=1)
         if middles.min() <= 0:
             at = self.knots[int(middles.argmin())]
-            raise SrfError(
-                f"the load between its samples falls to {middles.min():g} N near t = {at:g} s", "sample it finer"
-            )
+            raise SrfError(f"the load between its samples falls to {middles.min():g} N near t = {at:g} s", "sample it finer")
 
     def check(self, start: float, end: float) -> None:
         if start < self._knots[0] or end > self._knots[-1]:
@@ -433,9 +431,7 @@ def _smoothing(x: Array, y: Array, noise: float) -> BSpline:
 def _spacings(misfit: Array, spacings: Array, samples: float, overall: int) -> NDArray[np.int64]:
     """Return which spacing each block takes: `overall`, unless a finer one is needed there or a coarser one does."""
     chosen = np.zeros(misfit.shape[1], np.int64)
-    for k in range(
-        1, spacings.size
-    ):  # spacing k will do where no finer one lowers the misfit by more than chance would
+    for k in range(1, spacings.size):  # spacing k will do where no finer one lowers the misfit by more than chance would
         freedom = samples * (1 / spacings[:k] - 1 / spacings[k])
         excess = (misfit[k] - misfit[:k] - freedom[:, None]) / np.sqrt(2 * freedom)[:, None]
         chosen[(excess < (3.0 if k <= overall else 1.0)).all(axis=0)] = k
@@ -524,9 +520,7 @@ class LoadSteps(Load):
             low = min((*self.first, *self.last))
             raise SrfError(f"a load of {low:g} N lifts the slider off", "give loads above 0")
         if not (math.isfinite(self.rise) and self.rise > 0):
-            raise SrfError(
-                f"a rise of {self.rise:g} s is not a positive time", "20 ms is long beside the slider's bounce"
-            )
+            raise SrfError(f"a rise of {self.rise:g} s is not a positive time", "20 ms is long beside the slider's bounce")
 
     @classmethod
     def sequence(cls, pieces: Sequence[tuple[float, float, float]], *, start: float = 0.0, rise: float) -> LoadSteps:
@@ -538,9 +532,7 @@ class LoadSteps(Load):
     @cached_property
     def corners(self) -> tuple[tuple[float, float, float], ...]:
         """Return (time, jump of W, jump of dW/dt) for each edge where there is one."""
-        rates = [
-            (b - a) / (t1 - t0) for a, b, (t0, t1) in zip(self.first, self.last, pairwise(self.edges), strict=True)
-        ]
+        rates = [(b - a) / (t1 - t0) for a, b, (t0, t1) in zip(self.first, self.last, pairwise(self.edges), strict=True)]
         before = zip((self.first[0], *self.last), (0.0, *rates), strict=True)
         after = zip((*self.first, self.last[-1]), (*rates, 0.0), strict=True)
         found = [(t, W1 - W0, s1 - s0) for t, (W0, s0), (W1, s1) in zip(self.edges, before, after, strict=True)]

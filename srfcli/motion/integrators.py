@@ -128,9 +128,7 @@ def imposed_arguments(t: Array, drive: Drive, load: Load) -> tuple[Any, ...]:
     knots, coefficients = load.polynomials(float(edges[0]), float(edges[-1]))
     places = np.clip(np.searchsorted(knots, edges + 1e-12 * np.abs(edges).max(), side="right") - 1, 0, len(knots) - 2)
     low = places[:-1]
-    high = np.clip(
-        np.searchsorted(knots, edges[1:] - 1e-12 * np.abs(edges).max(), side="left"), low + 1, len(knots) - 1
-    )
+    high = np.clip(np.searchsorted(knots, edges[1:] - 1e-12 * np.abs(edges).max(), side="left"), low + 1, len(knots) - 1)
     ranges = np.column_stack([low, high])
     middle = np.array([drive.piece(0.5 * (a + b)) for a, b in segments], dtype=float)
     return (
@@ -344,13 +342,7 @@ def scalar_source(source: str, name: str) -> str:
             if constant:
                 fixed.add(target.id)
     arguments = ", ".join(a.arg for a in function.args.args if a.arg != "p")
-    lines = [
-        *once,
-        f"def {name}({arguments}):",
-        *(f"    {line}" for line in inside),
-        f"    return {result}",
-        f"return {name}",
-    ]
+    lines = [*once, f"def {name}({arguments}):", *(f"    {line}" for line in inside), f"    return {result}", f"return {name}"]
     return "def bind(p):\n" + "\n".join(f"    {line}" for line in lines) + "\n"
 
 

@@ -80,9 +80,7 @@ def _parameters(model: GeneratedModel, p: Array, drive: Drive, load: Load, t: Ar
     if t.ndim != 1 or t.size < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
         raise SrfError("output times must be two or more finite numbers that rise", "t = np.linspace(0, 10, 2001), say")
     if q.shape != (len(model.names),):
-        raise SrfError(
-            f"one set of {len(model.names)} parameters is needed, not an array of shape {q.shape}", "model.vector()"
-        )
+        raise SrfError(f"one set of {len(model.names)} parameters is needed, not an array of shape {q.shape}", "model.vector()")
     q[model.index("V")] = drive.at(float(t[0]))
     q[model.index("W0")] = load.rest(float(t[0]))
     return q
@@ -91,15 +89,11 @@ def _parameters(model: GeneratedModel, p: Array, drive: Drive, load: Load, t: Ar
 def _start(model: GeneratedModel, q: Array, start: Array | None) -> Array:
     if start is None:
         if q[model.index("V")] <= 0:
-            raise SrfError(
-                "the drive does not move forward at first: there is no steady sliding to start from", "give start"
-            )
+            raise SrfError("the drive does not move forward at first: there is no steady sliding to start from", "give start")
         return np.asarray(model.steady(q))
     x = np.array(start, dtype=float)
     if x.shape != (len(model.states),) or not np.isfinite(x).all():
-        raise SrfError(
-            f"start must be {len(model.states)} finite numbers: {', '.join(model.states)}", "model.steady(p) is one"
-        )
+        raise SrfError(f"start must be {len(model.states)} finite numbers: {', '.join(model.states)}", "model.steady(p) is one")
     return x
 
 

@@ -46,9 +46,7 @@ def upper_half(rho: ComplexArray) -> ComplexArray:
     return rho.real + 1j * np.abs(rho.imag)
 
 
-def linearise_boundary(
-    model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array
-) -> BoundaryLinear:
+def linearise_boundary(model: GeneratedModel, p: Array, orbit: Discretisation, names: Names, target: Array) -> BoundaryLinear:
     """Return the linearisation of {periodicity, ln |rho| = 0}; rho is the multiplier nearest to `target` (...,)."""
     library = kernel(model)
     if library is None or orbit.x.ndim == 2:  # one orbit without the batch's axis

@@ -234,9 +234,7 @@ class Discretisation:
 
 def join(parts: Sequence[Discretisation]) -> Discretisation:
     """Return batches of orbits on one mesh as one batch."""
-    return Discretisation(
-        np.concatenate([o.x for o in parts]), np.concatenate([o.stages for o in parts]), parts[0].edges
-    )
+    return Discretisation(np.concatenate([o.x for o in parts]), np.concatenate([o.stages for o in parts]), parts[0].edges)
 
 
 def stack(orbits: Sequence[Discretisation]) -> Discretisation:

@@ -218,9 +218,7 @@ def law_parts(task: LawTask) -> list[LawPart]:
     largest = max(task.amplitudes)
     between = np.linspace(0, largest, max(1, math.ceil(largest / task.stride)) + 1).tolist()
     looked = [eps for eps in between if min(abs(eps - k) for k in task.amplitudes) > 0.4 * task.stride]
-    return [LawPart(task, eps, True) for eps in task.amplitudes[::-1]] + [
-        LawPart(task, eps, False) for eps in looked[::-1]
-    ]
+    return [LawPart(task, eps, True) for eps in task.amplitudes[::-1]] + [LawPart(task, eps, False) for eps in looked[::-1]]
 
 
 def study_part(part: LawPart) -> dict[str, Array]:
@@ -252,9 +250,7 @@ def join_study(task: LawTask, found: Mapping[LawPart, dict[str, Array]]) -> LawS
     onset, end = _reentrance(tile_model(task.source, task.key), task, several)
     return LawStudy(
         tuple(row["crossings"] for row in rows),
-        tuple(
-            tuple(np.split(row["curves"], np.cumsum(row["sizes"])[:-1])) if row["sizes"].size else () for row in rows
-        ),
+        tuple(tuple(np.split(row["curves"], np.cumsum(row["sizes"])[:-1])) if row["sizes"].size else () for row in rows),
         tuple(int(row["folds"]) for row in rows),
         tuple(int(row["odd"]) for row in rows),
         onset,

@@ -423,11 +423,7 @@ SAME = 1e-3  # of the window's height
 
 
 def find_components(
-    model: GeneratedModel,
-    plane: Plane,
-    settings: AtlasSettings | None = None,
-    *,
-    progress: Progress = lambda text: None,
+    model: GeneratedModel, plane: Plane, settings: AtlasSettings | None = None, *, progress: Progress = lambda text: None
 ) -> Iterator[Atlas]:
     """Yield the atlas as it grows, after each component; the last one yielded is complete and says so in its notes.
 
@@ -445,9 +441,7 @@ def find_components(
                 if start is None:
                     missed += 1
                     continue
-                if any(
-                    abs(h - start.q[1]) < SAME and up == (start.slope_y > 0) for h, up in _heights(curves, start.q[0])
-                ):
+                if any(abs(h - start.q[1]) < SAME and up == (start.slope_y > 0) for h, up in _heights(curves, start.q[0])):
                     continue  # a curve that was followed already, met again from a bracket that the scan's mesh misplaced
                 curve = trace_whole(model, plane, start, settings.steps, progress, f"component {len(curves) + 1}: ")
                 if len(curve.points) > 1:
@@ -492,9 +486,7 @@ def _unclaimed(model: GeneratedModel, plane: Plane, scan: LineScan, curves: list
     y = plane.y.unit(scan.values)
     for i in scan.brackets():
         reach = 0.5 * (y[i + 1] - y[i]) + 2e-3
-        if not any(
-            y[i] - reach <= c <= y[i + 1] + reach and up == (scan.g[i] < scan.g[i + 1]) for c, up in _heights(curves, x)
-        ):
+        if not any(y[i] - reach <= c <= y[i + 1] + reach and up == (scan.g[i] < scan.g[i + 1]) for c, up in _heights(curves, x)):
             yield i
 
 
@@ -565,9 +557,7 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: At
     whole = len(branches) == 1
     return [
         Branch(
-            tuple(b),
-            curve.start if whole or i == 0 else Status.OK,
-            curve.end if whole or i == len(branches) - 1 else Status.OK,
+            tuple(b), curve.start if whole or i == 0 else Status.OK, curve.end if whole or i == len(branches) - 1 else Status.OK
         )
         for i, b in enumerate(branches)
         if len(b) > 1
@@ -601,9 +591,7 @@ def _notes(atlas: Atlas, settings: AtlasSettings, missed: int) -> list[str]:
         f"a component that closes between two lines, or a narrower tongue, is not looked for (--scan-lines for more)"
     ]
     if lost:
-        notes.append(
-            f"no forced periodic state was found at {lost} samples of the scan; boundaries beside them may be missing"
-        )
+        notes.append(f"no forced periodic state was found at {lost} samples of the scan; boundaries beside them may be missing")
     if missed:
         notes.append(f"{missed} sign changes on the lines could not be polished to a point of a boundary")
     return notes

@@ -88,13 +88,7 @@ def critical_line(
         lo, hi = load_window(model, [base])
     values = np.geomspace(lo, hi, samples) if guess is None else guess.values
     scan = scan_line(
-        model,
-        base,
-        name,
-        values,
-        intervals=INTERVALS,
-        guess=None if guess is None else guess.orbit,
-        resolution=resolution,
+        model, base, name, values, intervals=INTERVALS, guess=None if guess is None else guess.orbit, resolution=resolution
     )
     reach = follow_outwards(model, base, scan, scan, resolution=resolution) if whole else None
     line = CriticalLine(name, (), (), scan, (), reach=reach)
@@ -214,9 +208,7 @@ def _notes(
         expected = None if losing is None else not losing
     if line.reach is not None and not line.reach.settled:
         low, high = line.scans[0].values[0], line.scans[-1].values[-1]
-        ends = [f"below {low:.4g} N"] * (not line.reach.settled_below) + [f"above {high:.4g} N"] * (
-            not line.reach.settled_above
-        )
+        ends = [f"below {low:.4g} N"] * (not line.reach.settled_below) + [f"above {high:.4g} N"] * (not line.reach.settled_above)
         notes.append(f"the growth rate had not settled: there may be crossings {' and '.join(ends)}")
         status = Status.UNSETTLED
     return notes, status
@@ -285,9 +277,7 @@ def found_window(model: GeneratedModel, points: Sequence[Array]) -> LoadWindow:
     return LoadWindow(float(lowest), float(highest), float(np.log(highest / lowest) / np.log(hi / lo)), certain)
 
 
-def follow_outwards(
-    model: GeneratedModel, base: Array, low: LineScan, high: LineScan, *, resolution: float = 1e-3
-) -> Reach:
+def follow_outwards(model: GeneratedModel, base: Array, low: LineScan, high: LineScan, *, resolution: float = 1e-3) -> Reach:
     """Return scans along W0 at `base` below the scan `low` and above `high`, as far as it takes the growth rate to settle."""
     below, settled_below = _follow(model, base, low, -1, resolution)
     above, settled_above = _follow(model, base, high, 1, resolution)
@@ -308,9 +298,7 @@ def _follow(
     return tuple(scans), settled
 
 
-def _piece(
-    model: GeneratedModel, base: Array, loads: tuple[float, float], direction: int, resolution: float
-) -> LineScan:
+def _piece(model: GeneratedModel, base: Array, loads: tuple[float, float], direction: int, resolution: float) -> LineScan:
     values = np.geomspace(*loads, PER_DECADE)
     return scan_line(model, base, "W0", values, intervals=WINDOW_INTERVALS[direction], resolution=resolution)
 
@@ -452,9 +440,7 @@ def _suspects(position: Array, g: Array, resolution: float) -> Array:
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         nearest = np.minimum(np.minimum(np.abs(g[:-1]), np.abs(g[1:])), _closest_inside(position, g))
         steepness = np.abs(np.diff(g) / np.diff(position))
-        around = np.maximum(
-            np.maximum(steepness, np.r_[steepness[:1], steepness[:-1]]), np.r_[steepness[1:], steepness[-1:]]
-        )
+        around = np.maximum(np.maximum(steepness, np.r_[steepness[:1], steepness[:-1]]), np.r_[steepness[1:], steepness[-1:]])
         close = ~(nearest > worst + MESH_ERROR * around)  # the mesh shifts g by about its slope times that
     same_side = np.sign(g[:-1]) == np.sign(g[1:])
     return usable[:-1] & usable[1:] & close & (np.diff(position) > 2 * resolution) & (same_side | (worst > 0.1))
@@ -480,9 +466,7 @@ def interpolation_error(position: Array, g: Array) -> Array:
     return error
 
 
-def _with_samples(
-    model: GeneratedModel, base: Array, scan: LineScan, left: Array, share: Array, *, log: bool
-) -> LineScan:
+def _with_samples(model: GeneratedModel, base: Array, scan: LineScan, left: Array, share: Array, *, log: bool) -> LineScan:
     """Return `scan` with samples added in the intervals `left` (M,), each at its `share` (M,) of the interval."""
     a, b = scan.values[left], scan.values[left + 1]
     fresh = a * (b / a) ** share if log else a + share * (b - a)
@@ -492,8 +476,7 @@ def _with_samples(
     added = _samples(model, scan.name, robust_orbits(model, p, guess, scan.orbit.edges))
     order = np.argsort(np.concatenate([scan.values, added.values]))
     values, multipliers, g, swing = (
-        np.concatenate([getattr(part, name) for part in (scan, added)])[order]
-        for name in ("values", "multipliers", "g", "swing")
+        np.concatenate([getattr(part, name) for part in (scan, added)])[order] for name in ("values", "multipliers", "g", "swing")
     )
     p, orbit = np.concatenate([scan.p, p], axis=1)[:, order], join([scan.orbit, added.orbit]).part(order)
     return LineScan(scan.name, p, values, multipliers, g, orbit, swing, scan.resolution)

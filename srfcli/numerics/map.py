@@ -368,9 +368,7 @@ class _Block:
         orbits, converged = self.orbits, self.orbits.converged
         found = np.zeros_like(converged)
         beside = [
-            (c, r, c - dc, r - dr)
-            for dc, dr in STEPS
-            for c, r in np.argwhere(_moved(converged, dc, dr) & ~converged).tolist()
+            (c, r, c - dc, r - dr) for dc, dr in STEPS for c, r in np.argwhere(_moved(converged, dc, dr) & ~converged).tolist()
         ]
         if beside:
             c, r, from_c, from_r = beside[int(share * len(beside))]

@@ -54,11 +54,7 @@ class _Traced:
 
 
 def find_boundaries(
-    model: GeneratedModel,
-    found: StabilityMap,
-    settings: AtlasSettings | None = None,
-    *,
-    progress: Progress = lambda text: None,
+    model: GeneratedModel, found: StabilityMap, settings: AtlasSettings | None = None, *, progress: Progress = lambda text: None
 ) -> Iterator[Atlas]:
     """Yield the atlas of a map's boundaries as it grows; the last one yielded is complete and says so in its notes.
 
@@ -132,9 +128,7 @@ def map_notes(found: StabilityMap) -> list[str]:
         places = "1 point" if found.lost == 1 else f"{found.lost} points"
         notes.append(f"no forced periodic state was found at {places}; boundaries beside them may be missing")
     if len(found.suspect):
-        notes.append(
-            f"in {len(found.suspect)} cells a boundary could still hide below the finest spacing: unresolved there"
-        )
+        notes.append(f"in {len(found.suspect)} cells a boundary could still hide below the finest spacing: unresolved there")
     return notes
 
 
@@ -143,9 +137,7 @@ def starting_point(model: GeneratedModel, plane: Plane, seed: Seed, settings: At
     axis = (plane.x, plane.y)[seed.axis]
     tol = settings.steps.mesh_error
     direction = along(axis.name, 1, log=axis.log, unit=1.0 if axis.log else axis.span)
-    points = polish(
-        model, seed.p[:, None], seed.orbit, np.array([seed.rho]), direction, tol=tol, max_mesh=settings.max_mesh
-    )
+    points = polish(model, seed.p[:, None], seed.orbit, np.array([seed.rho]), direction, tol=tol, max_mesh=settings.max_mesh)
     usable = [pt for pt in points if _inside(model, plane, pt, seed)]
     if not usable and axis.log:
         usable = [pt for pt in _searched(model, axis, seed, settings) if _inside(model, plane, pt, seed)]
@@ -168,15 +160,11 @@ def _searched(model: GeneratedModel, axis: Axis, seed: Seed, settings: AtlasSett
     low, high = axis.value(seed.ends[:, seed.axis]).tolist()
     margin = (high / low) ** 0.5
     values = np.geomspace(low / margin, high * margin, 9)
-    scan = scan_line(
-        model, seed.p, axis.name, values, intervals=2 * seed.orbit.intervals, resolution=settings.resolution
-    )
+    scan = scan_line(model, seed.p, axis.name, values, intervals=2 * seed.orbit.intervals, resolution=settings.resolution)
     return locate_crossings(model, seed.p, scan, tol=settings.steps.mesh_error, max_mesh=settings.max_mesh, depth=2)
 
 
-def follow_curve(
-    model: GeneratedModel, plane: Plane, start: CurvePoint, settings: AtlasSettings, progress: Progress
-) -> Curve:
+def follow_curve(model: GeneratedModel, plane: Plane, start: CurvePoint, settings: AtlasSettings, progress: Progress) -> Curve:
     """Return the curve through `start`, both ways; after a KeyboardInterrupt as far as it was followed.
 
     A step across a narrow tongue lands on its other side, where the curve's unstable side is the other one: it is then followed
@@ -188,11 +176,7 @@ def follow_curve(
         if curve.end is Status.INTERRUPTED or _in_one_piece(curve):
             break
         steps = replace(
-            steps,
-            first=steps.first / 3,
-            largest=steps.largest / 3,
-            turn=steps.turn / 1.5,
-            correction=steps.correction / 4,
+            steps, first=steps.first / 3, largest=steps.largest / 3, turn=steps.turn / 1.5, correction=steps.correction / 4
         )
     return curve
 
@@ -318,10 +302,7 @@ def unexplained(model: GeneratedModel, found: StabilityMap, atlas: Atlas) -> Arr
 FINEST = 2.0**-12  # of the way to the neighbour: where the halving of steps ends
 NEAR = 0.5  # in logarithms, or V, or um: a larger step of the state is not taken for the same state
 MEETS = 0.8  # of the leading multiplier, from where the fold itself is solved for
-STEPS = (
-    3,
-    8,
-)  # of equal length, in which most states reach their neighbour; those that do not in the first try the next
+STEPS = (3, 8)  # of equal length, in which most states reach their neighbour; those that do not in the first try the next
 FOLD_REACH = 0.01  # of the window: a fold farther from where the state was last found is another
 
 

@@ -200,9 +200,7 @@ def solve_orbits(
     return found
 
 
-def _newton(
-    model: GeneratedModel, batch: OrbitBatch, active: Array, size: Array, tol: float, max_iterations: int
-) -> None:
+def _newton(model: GeneratedModel, batch: OrbitBatch, active: Array, size: Array, tol: float, max_iterations: int) -> None:
     """Bring the orbits `active` of a batch to convergence in place, as the compiled equations do."""
     for _ in range(max_iterations):
         with np.errstate(all="ignore"):  # a diverging point overflows; it is dropped below
@@ -260,9 +258,7 @@ def robust_orbits(
     return batch
 
 
-def line_orbits(
-    model: GeneratedModel, p: Array, position: Array, guess: Discretisation | None, edges: Array
-) -> OrbitBatch:
+def line_orbits(model: GeneratedModel, p: Array, position: Array, guess: Discretisation | None, edges: Array) -> OrbitBatch:
     """Return what `robust_orbits` does at points in order, at rising `position` (B,) along a line.
 
     A few that are spread over the line come first; the others start from what was found around them.

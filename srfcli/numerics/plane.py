@@ -68,9 +68,7 @@ class Plane:
 
     def point(self, model: GeneratedModel, q: Array) -> Array:
         """Return the parameters (n_parameters, ...) at unit coordinates q (..., 2)."""
-        return model.with_values(
-            self.base, **{self.x.name: self.x.value(q[..., 0]), self.y.name: self.y.value(q[..., 1])}
-        )
+        return model.with_values(self.base, **{self.x.name: self.x.value(q[..., 0]), self.y.name: self.y.value(q[..., 1])})
 
     def rates(self, model: GeneratedModel, p: Array) -> Array:
         """Return dp/dq of the two parameters at `p` (n_parameters,), as (2,)."""
@@ -197,9 +195,7 @@ def check_grid(model: GeneratedModel, grid: MapGrid) -> None:
                 f"the axis {axis.name} has {axis.count} point", f"Give it two or more: {axis.name}=...:{axis.hi:g}:40."
             )
         if axis.held and not axis.lo > 0:
-            raise SrfError(
-                f"the ratio {axis.name} begins at {axis.lo:g}", "Begin above 0: a ratio of 0 is an infinite value."
-            )
+            raise SrfError(f"the ratio {axis.name} begins at {axis.lo:g}", "Begin above 0: a ratio of 0 is an infinite value.")
         if axis.held and not float(grid.base[model.index(axis.held)]) > 0:
             raise SrfError(f"the ratio {axis.name} needs {axis.held} above 0", f"Set {axis.held} to a positive value.")
     involved = [{a.moved, a.held} - {""} for a in (grid.x, grid.y)]

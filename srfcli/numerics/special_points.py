@@ -107,9 +107,7 @@ def _turns(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[Spec
             yield locate(model, plane, branch, between, turning, what="fold", axis=plane.names[axis])
 
 
-def _cusp(
-    model: GeneratedModel, plane: Plane, branch: Branch, between: tuple[int, int], forward: Array
-) -> SpecialPoint | None:
+def _cusp(model: GeneratedModel, plane: Plane, branch: Branch, between: tuple[int, int], forward: Array) -> SpecialPoint | None:
     """Return the cusp between two points of a branch, where the tangent has no part in the plane, or None."""
     left: dict[float, float] = {}  # of the tangent's length in the plane, by its part along `forward`
 
@@ -323,9 +321,7 @@ def branch_coefficients(model: GeneratedModel, branch: Branch) -> Array:
     return d
 
 
-def criticality_points(
-    model: GeneratedModel, plane: Plane, branch: Branch, coefficients: Array
-) -> Iterator[SpecialPoint]:
+def criticality_points(model: GeneratedModel, plane: Plane, branch: Branch, coefficients: Array) -> Iterator[SpecialPoint]:
     """Yield where d changes sign along a branch, between its points and not through the pole at 1:3."""
     pole = RESONANCES["1:3"]
     for k, ((a, da), (b, db)) in enumerate(pairwise(zip(branch.points, coefficients, strict=True))):

@@ -78,9 +78,7 @@ class CheckResult(Result):
     @cached_property
     def pages(self) -> tuple[Table, ...]:
         """Return the model's line, and tables no wider than a page, rounded: samples, readings, noise, what was imposed."""
-        told = report(
-            self.table.records(), self.runs, self.forecast, load_unit="MPa" if self.experiment.stress else "N"
-        )
+        told = report(self.table.records(), self.runs, self.forecast, load_unit="MPa" if self.experiment.stress else "N")
         told[-1] = dataclasses.replace(told[-1], notes=self.table.notes)
         title = f"{self.table.title}\n{_model_line(self.experiment)}"
         return dataclasses.replace(self.table, columns=(), rows=(), notes=(), title=title), *told
@@ -198,9 +196,7 @@ def _noise_table(checks: Sequence[RunCheck]) -> Table:
             parts = [p for p in noise.parts if p[0] != "rounding" or (p[1] / noise.total) ** 2 >= 0.005]
             for k, (part, sd, colour) in enumerate(parts):
                 own = [check.run.name, rounded(1 / dt, 4)] if k == 0 else ["", None]
-                time, frequency = (
-                    (None, None) if not colour else (colour[0], None) if len(colour) == 2 else (None, colour[0])
-                )
+                time, frequency = (None, None) if not colour else (colour[0], None) if len(colour) == 2 else (None, colour[0])
                 quality = colour[2] if len(colour) == 3 else None
                 share = f"{100 * (sd / noise.total) ** 2:.0f} %"
                 rows.append([*own, part, rounded(sd, 3), share, *(rounded(x, 3) for x in (time, frequency, quality))])
@@ -280,9 +276,7 @@ def rounded(value: Any, digits: int) -> Any:
 def _told(forecast: Forecast) -> Table:
     known = [name for name in CHANGE_HEADINGS if any(name in r.errors for r in forecast.runs)]
     told = [*forecast.runs, *([forecast.together] if forecast.together else [])]
-    cells = [
-        [r.name, _percent(math.expm1(r.variation)), *(c for name in known for c in _errors(r, name))] for r in told
-    ]
+    cells = [[r.name, _percent(math.expm1(r.variation)), *(c for name in known for c in _errors(r, name))] for r in told]
     headings = [heading for name in known for heading in (f"{name} error", CHANGE_HEADINGS[name])]
     title = "What the load can tell at best: errors, and what a change makes, over the noise of a sample"
     return _text_table(["run", "load varies", *headings], cells, title)
@@ -307,23 +301,16 @@ def described(check: RunCheck, told: CramerRaoBound | None) -> dict[str, Any]:
         "file": str(run.file),
         "stiffness": run.stiffness,
         "sampling": [
-            {"first": float(run.t[r.first]), "last": float(run.t[r.last]), "interval": r.interval}
-            for r in check.sampling.rates
+            {"first": float(run.t[r.first]), "last": float(run.t[r.last]), "interval": r.interval} for r in check.sampling.rates
         ],
         "gaps": [[float(run.t[g]), float(run.t[g + 1])] for g in check.sampling.gaps.tolist()],
-        "noise": [
-            {"interval": dt, **_noise(noise)} for dt, noise in zip(check.sampling.spacings, check.noises, strict=True)
-        ],
+        "noise": [{"interval": dt, **_noise(noise)} for dt, noise in zip(check.sampling.spacings, check.noises, strict=True)],
         "friction_noise": check.friction_noise,
         "drive": [{"from": a, "velocity": v, "acceleration": s} for a, v, s in check.drive],
         "load": {"mean": load.mean, "low": load.lowest, "high": load.highest, "rate": load.rate},
         "modulation": None
         if load.modulation is None
-        else {
-            "frequency": load.modulation.frequency,
-            "amplitude": load.modulation.amplitude,
-            "onset": load.modulation.onset,
-        },
+        else {"frequency": load.modulation.frequency, "amplitude": load.modulation.amplitude, "onset": load.modulation.onset},
         "declared_modulation": run.modulation,
         "tells": None if told is None else tells(told),
         "notices": list(map(dataclasses.asdict, run.notices)),
@@ -333,12 +320,7 @@ def described(check: RunCheck, told: CramerRaoBound | None) -> dict[str, Any]:
 def tells(told: CramerRaoBound) -> dict[str, Any]:
     """Return as plain data what one run, or all together, can identify."""
     simulation = {"status": told.status.value, "misfit": told.misfit, "believed": told.believed}
-    return {
-        "variation": told.variation,
-        "errors": dict(told.errors),
-        "peaks": dict(told.peaks),
-        "simulation": simulation,
-    }
+    return {"variation": told.variation, "errors": dict(told.errors), "peaks": dict(told.peaks), "simulation": simulation}
 
 
 def _noise(noise: GaugeNoise) -> dict[str, Any]:

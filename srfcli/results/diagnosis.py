@@ -242,12 +242,7 @@ class DiagnosisResult(Result):
             for name, view in zip(prediction_names([v.run.name for v in views]), views, strict=True):
                 write_atomic(fresh / name, prediction_csv(view))
             augmented = augment(
-                self.registry,
-                diagnosis.experiment,
-                last.hypothesis,
-                last.fit,
-                folder=folder / "augmented",
-                reader=self.reader,
+                self.registry, diagnosis.experiment, last.hypothesis, last.fit, folder=folder / "augmented", reader=self.reader
             )
             (fresh / "augmented").mkdir()
             for name, content in augmented.files.items():
@@ -300,9 +295,7 @@ def _missing(missing: dict[str, Any]) -> list[str]:
     if not missing:
         return []
     latent = missing["latent"]
-    notes = [
-        f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"
-    ]
+    notes = [f"friction of {latent['amplitude']:.2g} that varies within {latent['length']:.2g} um of slip is unexplained"]
     for name, share in list(latent["coordinates"].items())[:1]:
         notes[0] += f"; a function of {name} is {100 * share:.0f} % of it"
     if missing["form"] is None:
@@ -317,9 +310,7 @@ def _places(location: Location) -> list[str]:
     """Return notes on the phase, frequencies and quantity of state that the misfit goes with."""
     notes = []
     if location.forcing_phase is not None:
-        notes.append(
-            "the misfit goes with the forcing: {:.2f} to {:.2f} rad after its maximum".format(*location.forcing_phase)
-        )
+        notes.append("the misfit goes with the forcing: {:.2f} to {:.2f} rad after its maximum".format(*location.forcing_phase))
     if location.frequencies:
         notes.append(f"it has lines at {', '.join(f'{f:.4g}' for f in location.frequencies)} Hz")
     if location.coordinate is not None:
@@ -372,9 +363,7 @@ def _in_shown_units(made_of: dict[str, Any], diagnosis: Diagnosis) -> None:
 
 def _velocities(run: Run) -> list[tuple[float, float]]:
     """Return the velocities at which a run was driven forward, to three digits, and the share of its time for each."""
-    V, counts = np.unique(
-        [float(f"{v:.3g}") for v in run.drive(run.t[:: max(run.t.size // 2000, 1)])], return_counts=True
-    )
+    V, counts = np.unique([float(f"{v:.3g}") for v in run.drive(run.t[:: max(run.t.size // 2000, 1)])], return_counts=True)
     return [(float(v), float(c) / float(counts.sum())) for v, c in zip(V, counts, strict=True) if v > 0]
 
 
@@ -393,9 +382,7 @@ def _proposed(fresh: Path, folder: Path, found: Mapping[str, Any], result: Diagn
     return [*told["sentences"], told["run"]]
 
 
-def _report(
-    folder: Path, found: dict[str, Any], made: dict[str, Any], told: Callable[[str], None], debug: bool
-) -> None:
+def _report(folder: Path, found: dict[str, Any], made: dict[str, Any], told: Callable[[str], None], debug: bool) -> None:
     try:
         from srfcli.results.report import write_report
 

@@ -297,9 +297,7 @@ def _proposed(axis: Axes, t: Any, observed: Any, proposed: Any) -> None:
     if lone.any():
         axis.plot(t[lone], observed[lone], "o", markersize=5, markerfacecolor="none", label="spike, proposed", **style)
     if moved.any():
-        axis.plot(
-            *envelope(t[moved], proposed[moved]), "--", linewidth=0.8, label="level moved back, proposed", **style
-        )
+        axis.plot(*envelope(t[moved], proposed[moved]), "--", linewidth=0.8, label="level moved back, proposed", **style)
     axis.legend(loc="best", fontsize="small")
 
 
@@ -340,9 +338,7 @@ def _mark_unused(axis: Axes, t: Any, x: Any, bad: Any) -> str:
             bad[first : last + 1] = False
     single = np.flatnonzero(bad)
     if single.size > CROSSES:
-        axis.plot(
-            t[single], np.zeros(single.size), "|", color=UNUSED, markersize=6, transform=axis.get_xaxis_transform()
-        )
+        axis.plot(t[single], np.zeros(single.size), "|", color=UNUSED, markersize=6, transform=axis.get_xaxis_transform())
     else:
         axis.plot(t[single], x[single], "x", color=UNUSED, markersize=5, linestyle="none")
     return f": {total} sample{'s' if total > 1 else ''} not compared"
@@ -445,9 +441,7 @@ def _load(ax: Axes, record: Mapping[str, Any]) -> None:
     ax.set_ylabel("W  [N]")
 
 
-def _line(
-    ax: Axes, t: Values, y: Values, colour: str, *, label: str | None = None, dash: Any = "-", width: float = 1.4
-) -> None:
+def _line(ax: Axes, t: Values, y: Values, colour: str, *, label: str | None = None, dash: Any = "-", width: float = 1.4) -> None:
     import numpy as np
 
     x, values = envelope(np.asarray(t, float), np.asarray(y, float))
@@ -504,11 +498,7 @@ def draw_loads(ax: Axes, table: Thresholds, computed: Mapping[str, Values]) -> N
 
 
 def fit_figure(
-    rows: Sequence[FitRow],
-    *,
-    title: str = "",
-    found: str = "",
-    tables: Sequence[tuple[str, bool, Thresholds, Values]] = (),
+    rows: Sequence[FitRow], *, title: str = "", found: str = "", tables: Sequence[tuple[str, bool, Thresholds, Values]] = ()
 ) -> Figure:
     """Return a figure of two panels for each observable of a run.
 

@@ -285,8 +285,7 @@ class FitResult(Result):
         fit, experiment = self.found.fit, self.experiment
         runs = {r.name: r for r in experiment.runs}
         tables = [
-            (t.loads.name, t.loads.holdout, t.loads.table, np.where(t.match.missing, np.nan, t.match.loads))
-            for t in fit.tables
+            (t.loads.name, t.loads.holdout, t.loads.table, np.where(t.match.missing, np.nan, t.match.loads)) for t in fit.tables
         ]
         rows, told = [], []
         for f in self._observables:
@@ -389,9 +388,7 @@ def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float
     if any(f.holdout for f in fit.runs) or any(t.loads.holdout for t in fit.tables):
         notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
     done = [i.name for i in intervals]
-    whose = "profile likelihood" + (
-        f" of {', '.join(done)}, else 1.96 standard errors" if len(done) < len(fit.names) else ""
-    )
+    whose = "profile likelihood" + (f" of {', '.join(done)}, else 1.96 standard errors" if len(done) < len(fit.names) else "")
     notes.append("intervals: " + (whose if intervals else "1.96 standard errors; --profile refits") + ", 95 %")
     if len(starts) > 1:
         notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
@@ -400,9 +397,7 @@ def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float
         notes.append(f"gauge noise: {colour_text(colour)}{comma} besides white noise, or physics that is missing")
     coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
     if coloured:
-        notes.append(
-            f"residuals are coloured in {', '.join(coloured)}: noise of that colour, or physics that is missing"
-        )
+        notes.append(f"residuals are coloured in {', '.join(coloured)}: noise of that colour, or physics that is missing")
     return notes
 
 
@@ -432,11 +427,7 @@ METHODS = (
     Column("gradients", "1", "sets of exact derivatives that the method used"),
     Column("surveys", "1", "lines searched in full"),
 )
-TRACE = (
-    METHOD,
-    Column("evaluation", "1", "of the whole cost, counted from 1"),
-    Column("chi2", "1", "lowest so far"),
-)
+TRACE = (METHOD, Column("evaluation", "1", "of the whole cost, counted from 1"), Column("chi2", "1", "lowest so far"))
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -512,17 +503,7 @@ class ThresholdFitResult(Result):
     def methods(self) -> Table:
         """Return how each method ended, and what it took."""
         rows = [
-            (
-                m.method,
-                m.status.value,
-                m.start_cost,
-                m.cost,
-                self._freedom,
-                *m.paper_cost,
-                m.evaluations,
-                m.gradients,
-                m.surveys,
-            )
+            (m.method, m.status.value, m.start_cost, m.cost, self._freedom, *m.paper_cost, m.evaluations, m.gradients, m.surveys)
             for m in self.found.methods
         ]
         return Table("srf.fit-thresholds.methods/1", METHODS, rows, "Methods")
@@ -562,8 +543,7 @@ class ThresholdFitResult(Result):
                 below.axhline(self._freedom, color="#555555", linestyle=plots.DOTTED, label="degrees of freedom")
             below.set(xscale="log", yscale="log", xlabel="evaluations of the whole cost", ylabel="lowest χ² so far")
             found = ", ".join(
-                plots.valued(q.name, q.declared(float(best.values[i])), q.parameter.unit)
-                for i, q in enumerate(self.found.scale)
+                plots.valued(q.name, q.declared(float(best.values[i])), q.parameter.unit) for i, q in enumerate(self.found.scale)
             )
             plots.heading(figure, f"{plots.name_text(str(table.source))}: {self.laws}\nfit: {found}")
             plots.decade_ticks(below)
@@ -588,9 +568,7 @@ LEADING = (
     Column("load_unit", "", "N or MPa"),
     Column("segments", "", "of constant velocity, one slip length D0 or longer"),
     Column("steady", "", "of them, those that end in steady sliding"),
-    Column(
-        "final_slope", "1/mm", "largest change of friction with slip at the end of a segment, over its error 3 or more"
-    ),
+    Column("final_slope", "1/mm", "largest change of friction with slip at the end of a segment, over its error 3 or more"),
     Column("rms_over_noise", "", "1 where the model explains all but the noise"),
 )
 DERIVED = (
@@ -602,10 +580,7 @@ STATED = (
     Column("k_stderr", "", "empty where the stiffness is the stated one"),
     Column("k_unit", "", "as the experiment states it"),
 )
-TRAILING = (
-    Column("flags", "", "what is to be known before the row is used"),
-    Column("reason", "", "why there is no fit"),
-)
+TRAILING = (Column("flags", "", "what is to be known before the row is used"), Column("reason", "", "why there is no fit"))
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -683,8 +658,5 @@ class CampaignResult(Result):
 
 def _short_names(places: Sequence[str]) -> list[str]:
     """Return the names of folders or files, those of their folders where all are called alike, whole where two are the same."""
-    named = [
-        Path(place).parent.name or place if Path(place).name == "experiment.toml" else Path(place).name
-        for place in places
-    ]
+    named = [Path(place).parent.name or place if Path(place).name == "experiment.toml" else Path(place).name for place in places]
     return [name if named.count(name) == 1 else place for name, place in zip(named, places, strict=True)]

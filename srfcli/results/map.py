@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from srfcli.numerics.special_points import SpecialPoint
 
 
-
 PLACE = ("eps", "V", "K_over_W0", "W0")  # where a point lies; parameters along other axes stand after these
 GROWTH = {
     "growth_per_slip": ("1", "real part of the leading Floquet exponent times D0/V; stable where negative"),
@@ -73,11 +72,7 @@ class MapResult(Result):
         model, found, atlas = self.system.model, self.found, self.atlas
         count = found.kind.size
         share = {name: float((found.kind == k).sum() / count) for k, name in enumerate(KINDS)}
-        meta: dict[str, Any] = {
-            "share": share,
-            "suspect_cells": len(found.suspect),
-            "points_added": len(found.extra_at),
-        }
+        meta: dict[str, Any] = {"share": share, "suspect_cells": len(found.suspect), "points_added": len(found.extra_at)}
         status = Status.NO_CONVERGENCE if found.lost else Status.OK
         if not found.finished:
             left = "interrupted: what was not reached is unresolved, and no boundary was followed"
@@ -97,9 +92,7 @@ class MapResult(Result):
             f"boundaries met by the {len(met)} lines of constant {found.grid.x.name}: {lines}",
         ]
         if len(odd):
-            notes.append(
-                f"the curves do not account for the stability of {len(odd)} of {count} points: one is missing there"
-            )
+            notes.append(f"the curves do not account for the stability of {len(odd)} of {count} points: one is missing there")
             status = Status.NO_CONVERGENCE
         else:
             notes.append(f"the curves account for the stability of all {count} points")
@@ -150,20 +143,13 @@ class MapResult(Result):
             Column("V", "um/s", "driving velocity"),
             Column("K_over_W0", "1/um", "stiffness over mean load", ".10g"),
             Column("W0", "N", "mean load", ".10g"),
-            *(
-                Column(column_name(a), axis_unit(model, a), "" if a.held else declared[a.moved].about, ".10g")
-                for a in extra
-            ),
+            *(Column(column_name(a), axis_unit(model, a), "" if a.held else declared[a.moved].about, ".10g") for a in extra),
             Column("theta", "rad", "angle of the leading multiplier over one forcing period"),
             Column(growth, *GROWTH[growth]),
             Column("growth_per_period", "1", "ln of the leading multiplier's modulus over one forcing period"),
             Column("intervals", "1", "of the mesh"),
         )
-        cells = place | {
-            "type": np.array(KINDS)[found.kind],
-            "theta": np.abs(np.angle(found.leading)),
-            "intervals": found.mesh,
-        }
+        cells = place | {"type": np.array(KINDS)[found.kind], "theta": np.abs(np.angle(found.leading)), "intervals": found.mesh}
         cells |= {growth: found.growth * per_slip(model, p), "growth_per_period": found.growth}
         rows = list(zip(*(cells[c.name].ravel().tolist() for c in columns), strict=True))
         meta = self._summary[1] | {"components": self.components.records(), "special": self.special_points.records()}
@@ -177,17 +163,13 @@ class MapResult(Result):
         model, grid, rows = self.system.model, self.found.grid, []
         for k, (branch, marks) in enumerate(zip(self.atlas.branches, self.special, strict=True), 1):
             p = np.stack([pt.p for pt in branch.points], axis=1)
-            spans = [
-                shown(model, axis, f(axis.quantity(model, p))) for axis in (grid.x, grid.y) for f in (np.min, np.max)
-            ]
+            spans = [shown(model, axis, f(axis.quantity(model, p))) for axis in (grid.x, grid.y) for f in (np.min, np.max)]
             kinds = "+".join(sorted({pt.kind for pt in branch.points}))
             folds = Counter(s.axis for s in marks if s.what == "fold")
             others = ", ".join(sorted({s.what for s in marks} - {"fold"})) or None
             worst = max(pt.error for pt in branch.points)
             turned = [folds.get(axis.moved, 0) for axis in (grid.x, grid.y)]
-            rows.append(
-                (k, len(branch.points), kinds, *spans, *turned, others, branch.start.value, branch.end.value, worst)
-            )
+            rows.append((k, len(branch.points), kinds, *spans, *turned, others, branch.start.value, branch.end.value, worst))
         columns = (
             Column("component", "1", "number of the connected curve"),
             Column("points", "1", "on the curve"),
@@ -240,9 +222,7 @@ class MapResult(Result):
             for k, (branch, numbers, cubic) in enumerate(branches, 1)
             for q, number, d in zip(branch.points, numbers, cubic, strict=True)
         ]
-        about = (
-            "cubic coefficient of the normal form, a period; supercritical where negative, subcritical where positive"
-        )
+        about = "cubic coefficient of the normal form, a period; supercritical where negative, subcritical where positive"
         columns = (*boundary_columns(model, extra), Column("cubic", "1", about))
         return Table("srf.map.boundary/1", columns, rows, **{**self._common, "notes": ()})
 
@@ -258,9 +238,7 @@ class MapResult(Result):
 
         xarray, grid, table = load_xarray(), self.found.grid, self.table
         cells = zip(*table.rows, strict=True)
-        fields = {
-            c.name: np.array(v).reshape(grid.x.count, grid.y.count) for c, v in zip(table.columns, cells, strict=True)
-        }
+        fields = {c.name: np.array(v).reshape(grid.x.count, grid.y.count) for c, v in zip(table.columns, cells, strict=True)}
         x, y = column_name(grid.x), column_name(grid.y)
         coords = {x: fields.pop(x)[:, 0], y: fields.pop(y)[0]}
         made = xarray.Dataset({name: ((x, y), values) for name, values in fields.items()}, coords=coords)
@@ -309,8 +287,7 @@ class MapResult(Result):
         """Return a branch's coordinates and what it is at each; a closed one ends where it begins."""
         points = [self._coordinates(pt.p) for pt in branch.points]
         looks = [
-            "fold" if pt.kind == "fold" else "subcritical" if d > 0 else ""
-            for pt, d in zip(branch.points, cubic, strict=True)
+            "fold" if pt.kind == "fold" else "subcritical" if d > 0 else "" for pt, d in zip(branch.points, cubic, strict=True)
         ]
         if branch.end is Status.CLOSED:
             points.append(points[0])
@@ -326,11 +303,7 @@ def ratio_powers(model: GeneratedModel, held: str, moved: str) -> tuple[int, ...
 
 def axis_unit(model: GeneratedModel, axis: MapAxis) -> str:
     """Return the unit in which an axis is shown: the parameter's declared one, um, s, N for a ratio."""
-    return (
-        describe(ratio_powers(model, axis.held, axis.moved))
-        if axis.held
-        else model.parameters[model.index(axis.moved)].unit
-    )
+    return describe(ratio_powers(model, axis.held, axis.moved)) if axis.held else model.parameters[model.index(axis.moved)].unit
 
 
 def shown(model: GeneratedModel, axis: MapAxis, value: float) -> float:
@@ -355,17 +328,9 @@ def label(model: GeneratedModel, axis: MapAxis) -> str:
 COMPARISON_COLUMNS = (
     Column("law", "", "friction law, ageing law, or both"),
     Column("eps", "1", "modulation amplitude"),
-    Column(
-        "reentrance_eps", "1", "smallest amplitude at which a line of constant V meets more than one boundary", ".4g"
-    ),
-    Column(
-        "reentrance_end", "1", "amplitude from which none does any more, nothing if that is beyond the largest", ".4g"
-    ),
-    Column(
-        "destabilised",
-        "1",
-        "share of the window, in ln V and ln K/W0, stable at a smaller amplitude, unstable at this one",
-    ),
+    Column("reentrance_eps", "1", "smallest amplitude at which a line of constant V meets more than one boundary", ".4g"),
+    Column("reentrance_end", "1", "amplitude from which none does any more, nothing if that is beyond the largest", ".4g"),
+    Column("destabilised", "1", "share of the window, in ln V and ln K/W0, stable at a smaller amplitude, unstable at this one"),
     Column("stabilised", "1", "share of the window unstable without modulation, stable at this amplitude"),
     Column("folds_V", "1", "how often V turns round along the boundaries"),
     Column("components", "1", "connected boundaries in the window"),

@@ -66,11 +66,7 @@ STYLE: dict[str, Any] = {
 NO_LAYOUT = {"figure.constrained_layout.use": False}
 
 # Dates would make two equal figures differ.
-_METADATA: dict[str, dict[str, Any]] = {
-    ".svg": {"Date": None},
-    ".pdf": {"CreationDate": None, "ModDate": None},
-    ".png": {},
-}
+_METADATA: dict[str, dict[str, Any]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None, "ModDate": None}, ".png": {}}
 
 
 def check_plot(path: Path, *, force: bool) -> None:
@@ -191,9 +187,7 @@ def heading(figure: Figure, text: str) -> None:
     """
     if not text:
         return
-    lines = [
-        broken for line in text.split("\n") for broken in _broken(line, figure, (1 - 2 * MARGIN) * figure.bbox.width)
-    ]
+    lines = [broken for line in text.split("\n") for broken in _broken(line, figure, (1 - 2 * MARGIN) * figure.bbox.width)]
     figure.set_figheight(figure.get_figheight() + LINE * len(lines[1:]))
     figure.suptitle("\n".join(lines), x=MARGIN, ha="left", fontsize=HEADING, linespacing=1.3)
 
@@ -235,9 +229,7 @@ def one_panel(ax: Axes | None, *, title: str, size: tuple[float, float] | None =
     with house_style():
         if ax is not None:
             yield cast("Figure", ax.figure), ax
-            ax.set_title(
-                "\n".join(_broken(title.split("\n")[0], cast("Figure", ax.figure), ax.bbox.width)), fontsize=HEADING
-            )
+            ax.set_title("\n".join(_broken(title.split("\n")[0], cast("Figure", ax.figure), ax.bbox.width)), fontsize=HEADING)
             if len(ax.get_legend_handles_labels()[1]) > 1:
                 ax.legend(loc="best", handlelength=2.8, fontsize=NAME)
             return
@@ -250,11 +242,7 @@ def one_panel(ax: Axes | None, *, title: str, size: tuple[float, float] | None =
 
 
 def stability_diagram(
-    branches: Sequence[Mapping[str, Any]],
-    *,
-    hopf: Mapping[str, Any] | None = None,
-    title: str = "",
-    ax: Axes | None = None,
+    branches: Sequence[Mapping[str, Any]], *, hopf: Mapping[str, Any] | None = None, title: str = "", ax: Axes | None = None
 ) -> Figure:
     """Return the stability boundaries K/W0 (1/um) against V (um/s, logarithmic), drawn in `ax` if that is given.
 
@@ -301,9 +289,7 @@ def critical_points(points: Sequence[Mapping[str, Any]], *, title: str = "", ax:
                 marker="os^Dv<>"[index % 7],
                 markersize=5.5,
                 markerfacecolor=style["color"] if lost else "white",
-                label=f"ε = {eps:g}: stability is {'lost' if lost else 'regained'} as W$_0$ rises"
-                if crossing < 3
-                else None,
+                label=f"ε = {eps:g}: stability is {'lost' if lost else 'regained'} as W$_0$ rises" if crossing < 3 else None,
                 clip_on=False,
                 zorder=3,
             )
@@ -432,16 +418,7 @@ def lines(
         return figure
 
 
-def orbit(
-    tau: Values,
-    *,
-    u: Values,
-    v: Values,
-    states: Mapping[str, Values],
-    mu: Values,
-    W: Values,
-    title: str = "",
-) -> Figure:
+def orbit(tau: Values, *, u: Values, v: Values, states: Mapping[str, Values], mu: Values, W: Values, title: str = "") -> Figure:
     """Return one forced period, panels over tau in periods: u (um), v (um/s, logarithmic), ages (s), mu and W (N)."""
     panels: list[tuple[str, Values, bool, str]] = [("u  [µm]", u, False, "u"), ("v  [µm/s]", v, True, "v")]
     panels += [(f"{n.replace('phi', 'φ').replace('_', ' ')}  [s]", ages, True, "state") for n, ages in states.items()]

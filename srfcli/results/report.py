@@ -163,9 +163,7 @@ def places(matter: Matter) -> Markup:
     if any(t.windows for t in matter.fitted):
         parts.append(tag("p", SHADED))
     if matter.fitted:
-        parts.append(
-            tag("p", f"“{matter.fitted[0].name}”, the run with the largest part, is drawn at the top of this page.")
-        )
+        parts.append(tag("p", f"“{matter.fitted[0].name}”, the run with the largest part, is drawn at the top of this page."))
     parts += [_run(matter, one) for one in matter.fitted[1:SHOWN]]
     if len(matter.fitted) > SHOWN:
         parts.append(tag("p", f"The other {len(matter.fitted) - SHOWN} runs are drawn in the folder figures."))
@@ -276,9 +274,7 @@ def residual_scan(matter: Matter) -> Markup:
     found = spots(matter.tables.get("atlas") or ())
     if not found:
         return Markup("")
-    rows = [
-        [axis_text(s.axis), s.place, s.run or "all", number(s.height), probability(s.p_value)] for s in foremost(found)
-    ]
+    rows = [[axis_text(s.axis), s.place, s.run or "all", number(s.height), probability(s.p_value)] for s in foremost(found)]
     heads = ["looked at by", "place", "run", "−log10 p", "p, adjusted"]
     caption = "What stands out most; the last column allows for all that was looked at."
     figure = matter.figure(
@@ -286,9 +282,7 @@ def residual_scan(matter: Matter) -> Markup:
         "How far the misfit stands out in bins of phase, frequency and state.",
         "How improbable each place is under noise alone; grey is what noise may do.",
     )
-    return tag(
-        "div", tag("h3", "What the misfit goes with"), figure, table(heads, rows, caption=caption, numeric=(3, 4))
-    )
+    return tag("div", tag("h3", "What the misfit goes with"), figure, table(heads, rows, caption=caption, numeric=(3, 4)))
 
 
 def left_out(matter: Matter) -> Markup:
@@ -299,9 +293,7 @@ def left_out(matter: Matter) -> Markup:
         parts.append(tag("h3", "What these recordings cannot tell"))
         parts.append(tag("ul", [tag("li", tag("code", x["effect"]), ": ", x["reason"]) for x in unseen]))
     for names in matter.answer.get("equivalent") or ():
-        parts.append(
-            tag("p", f"{joined(list(names))} leave the same trace in these runs: nothing here tells them apart.")
-        )
+        parts.append(tag("p", f"{joined(list(names))} leave the same trace in these runs: nothing here tells them apart."))
     discriminating = matter.tables.get("discriminating")
     if discriminating:
         parts.append(tag("h3", "The experiment that discriminates between them"))
@@ -359,9 +351,7 @@ def scores(matter: Matter) -> Markup:
         "could have seen (in um, s and N, or MPa)."
     )
     heads = ["effect", "gain", "expected size", "survives", "could be seen from"]
-    return tag(
-        "div", tag("h3", "What each effect could explain"), table(heads, rows, caption=caption, numeric=(1, 2, 3, 4))
-    )
+    return tag("div", tag("h3", "What each effect could explain"), table(heads, rows, caption=caption, numeric=(1, 2, 3, 4)))
 
 
 def parameters(matter: Matter) -> Markup:
@@ -734,9 +724,7 @@ def _page(matter: Matter) -> str:
     sections = (places, left_out, missing_force, parameters, held_out, diagram, onward)
     shown = [made for made in (one(matter) for one in sections) if made]
     links = [
-        tag("a", Markup(m[2]), href=f"#{m[1]}")
-        for p in shown
-        if (m := re.match(r'<section id="([a-z-]+)"><h2>(.*?)</h2>', p))
+        tag("a", Markup(m[2]), href=f"#{m[1]}") for p in shown if (m := re.match(r'<section id="([a-z-]+)"><h2>(.*?)</h2>', p))
     ]
     head = [
         tag("p", title, class_="of"),

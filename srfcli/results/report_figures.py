@@ -12,16 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srfcli.results.figures import _imposed, _settle, draw_loads, envelope
-from srfcli.results.plots import (
-    DOTTED,
-    _gaps,
-    bare_figure,
-    curve_style,
-    decade_ticks,
-    house_style,
-    name_text,
-    new_figure,
-)
+from srfcli.results.plots import DOTTED, _gaps, bare_figure, curve_style, decade_ticks, house_style, name_text, new_figure
 from srfcli.results.report_text import finite, number, with_unit
 
 if TYPE_CHECKING:
@@ -563,9 +554,7 @@ def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool =
             ticks = [t for t in (-1000, -100, -30, -10, -3, 0, 3, 10, 30, 100, 1000) if abs(t) < 2 * size]
             axis.set_xticks(ticks, [f"{t}".replace("-", "−") for t in ticks])
             axis.set_xticks([], minor=True)
-            axis.set_xlim(
-                *(1.6 * (end if abs(end) > 3.0 else 3.0 * side) for end, side in ((min(shifts), -1), (max(shifts), 1)))
-            )
+            axis.set_xlim(*(1.6 * (end if abs(end) > 3.0 else 3.0 * side) for end, side in ((min(shifts), -1), (max(shifts), 1))))
         axis.set_xlabel("baseline less augmented model  [standard errors]")
         axis.grid(axis="y", visible=False)
         _settle(figure)
@@ -662,9 +651,7 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
     curves += [("W0_hopf_baseline", "baseline, constant load", BEFORE, DOTTED)]
     curves += [("W0_hopf_augmented", "augmented model, constant load", AFTER, DOTTED)]
     if all(_equal(diagram, key) for key in ("V", "W0", "W0_hopf")):  # nothing was added: one curve would hide the other
-        curves = [
-            (key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]
-        ]
+        curves = [(key, label.replace("baseline", "the model"), colour, dash) for key, label, colour, dash in curves[::2]]
     drawn = [c for c in curves if diagram.get(c[0]) is not None and np.isfinite(_gaps(diagram[c[0]])).any()]
     if not drawn or diagram.get("V") is None:
         return None
@@ -687,9 +674,7 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
             axis.set_yscale("log")
         axis.set_xlabel("V  [µm/s]")
         axis.set_ylabel(f"critical load W$_0$  [{diagram.get('load_unit', 'N')}]")
-        legend = axis.legend(
-            loc="best", handlelength=2.8, title="sliding is steady below the first boundary", alignment="left"
-        )
+        legend = axis.legend(loc="best", handlelength=2.8, title="sliding is steady below the first boundary", alignment="left")
         legend.get_title().set_color("#555555")
         decade_ticks(axis)
         _settle(figure)
@@ -698,10 +683,7 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
 
 def _equal(diagram: Mapping[str, Any], quantity: str) -> bool:
     """Return whether the augmented model's curve is the baseline's."""
-    baseline, augmented = (
-        diagram.get(f"{quantity}_baseline", diagram.get(quantity)),
-        diagram.get(f"{quantity}_augmented"),
-    )
+    baseline, augmented = (diagram.get(f"{quantity}_baseline", diagram.get(quantity)), diagram.get(f"{quantity}_augmented"))
     if augmented is None:
         return quantity == "V" or baseline is None
     if baseline is None:

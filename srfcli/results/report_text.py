@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeGuard
 
@@ -98,114 +99,6 @@ def joined(words: Sequence[str], last: str = "and") -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}" if words else ""
 
 
-REMEDIES = {  # what is wrong, and what to do; {value} is the size with its error, {number} the size, {stated} what was stated
-    "stiffness-error": (
-        "stated stiffness {stated}; the recordings want {value}",
-        'set stiffness = "{number}" in [apparatus], and calibrate the machine',
-    ),
-    "inertia": (
-        "the slider's mass counts, and the model has none; the recordings want {value}",
-        'set mass = "{number}" and inertia = true',
-    ),
-    "interface-compliance": (
-        "the interface is elastic, and the model has it rigid: elastic length {value}",
-        'set interface = "elastic" with lambda = {number}',
-    ),
-    "linker-dieterich": (
-        "a change of the load changes the age of contacts: {value}",
-        'add "+linker-dieterich" to the name of the ageing law, with alpha = {number}',
-    ),
-    "stiffness-exponent": (
-        "the interface stiffens with a power of the load: {value}",
-        'set interface = "power" with n = {number}',
-    ),
-    "age-saturation": (
-        "young contacts do not weaken as a bare logarithm of age has it: {value}",
-        "use a law with a short-age cut-off, as srf-vsat",
-    ),
-    "log-log-coupling": ("velocity and age strengthen each other: {value}", 'use law = "log-log"'),
-    "slip-evolution": (
-        "contacts change with slip more than with time: {value}",
-        'use ageing = "ruina" where the share is 1, the augmented model where it is less',
-    ),
-    "second-state": ("friction has a second state: {value}", 'use law = "two-state"'),
-    "viscous-drag": (
-        "a drag grows with velocity: {value}",
-        "add it to the law, and look for a fluid or a guide that rubs",
-    ),
-    "adhesion-offset": (
-        "friction does not vanish with the load: {value}",
-        "zero the load cell, weigh what rests on the slider, or use the augmented model",
-    ),
-    "load-transmission": (
-        "asperities feel only a part of the imposed modulation: {value} times it",
-        "record the load at the interface, or multiply the modulation by {number}",
-    ),
-    "load-distortion": (
-        "a second harmonic of the load reaches the interface and not the load cell: {value}",
-        "look at the load beside the interface, and use the augmented model until then",
-    ),
-    "tangential-crosstalk": (
-        "the load pushes along the sliding direction: {value}",
-        "realign the load, or subtract {number} times (W - W0) from the force",
-    ),
-    "track-topography": (
-        "friction repeats along the track: {value}",
-        "use another track, or the augmented model, which has it",
-    ),
-    "friction-drift": (
-        "friction drifts in time: {value}",
-        "run in longer, or take a window before it sets in",
-    ),
-    "friction-drift-slip": ("friction drifts with slip: {value}", "run in longer, or fit with --trend slip"),
-    "drive-ripple": (
-        "the stage's velocity ripples with its position: {value}",
-        "measure the stage's own motion, and give it as load_point_displacement",
-    ),
-    "slip-hardening": (
-        "friction rises or falls with slip, and levels off: {value}",
-        "slide further before the first step",
-    ),
-    "frictional-heating": (
-        "friction changes with the heat that sliding makes: {value}",
-        "slide slower, or use the augmented model, which has the heat",
-    ),
-    "rate-cutoff": ("friction depends on velocity within limits only: {value}", "use a law with cut-off velocities"),
-    "load-lag": (
-        "the load reaches the interface late: {value}",
-        "record the load at the interface, or use the augmented model",
-    ),
-    "dilatancy": (
-        "the layer widens and narrows with its age: {value}",
-        "record the layer's thickness, or use the augmented model",
-    ),
-    "poisson-coupling": (
-        "blocks bulge under the load and carry the contact along: {value}",
-        "give the load point's displacement at the contact, or use the augmented model",
-    ),
-    "load-stiffening": (
-        "the apparatus is stiffer under more load: {value}",
-        "measure the stiffness under each load, or use the augmented model, which has it",
-    ),
-    "load-servo": (
-        "the load follows its command late, and overshoots: {value}",
-        "give the load that was measured, not its command",
-    ),
-    "gauge-creep": (
-        "the gauge creeps: {value}",
-        "calibrate it over the times of the experiment, or use the augmented model",
-    ),
-    "pore-pressure": (
-        "a pore pressure carries a part of the load: {value}",
-        "record the pressure, and give the effective load",
-    ),
-    "sensor-lag": (
-        "the gauge lags behind: {value}",
-        "undo its filter of first order in the recording, or take a faster gauge",
-    ),
-}
-
-
 def verdict_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     """Return what is wrong and how much, in one sentence that needs no other."""
     effects = [str(e) for e in answer.get("effects", ())]
@@ -214,7 +107,7 @@ def verdict_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> 
         return "Nothing is missing: the model explains the recordings down to the noise."
     if verdict == "identified":
         alone = answer.get("acts_in") or {}
-        told = [_wrong(e, answer, material) + (f", in the run {alone[e]} alone" if e in alone else "") for e in effects]
+        told = [_wrong(e, material) + (f", in the run {alone[e]} alone" if e in alone else "") for e in effects]
         return " ".join(_capital(text) + "." for text in told)
     if verdict == "ambiguous":
         return f"Something is missing, and these recordings cannot tell which of {joined(effects, 'or')} it is."
@@ -231,7 +124,7 @@ def remedy(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     if verdict == "none":
         return "Go on with the parameters below; a fit with held-out runs shows how far they carry."
     if verdict == "identified":
-        told = [_filled(REMEDIES[e][1], e, answer, material) for e in effects if e in REMEDIES]
+        told = [text for e in effects if (text := _filled("remedy", e, material))]
         rest = "go on with the augmented model in the folder beside this page, which has it"
         return _capital("; ".join([*told, rest])) + "."
     if verdict == "ambiguous":
@@ -273,24 +166,26 @@ def gain_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str
     return _capital("; ".join(parts)) + "." + (f" {rests}." if rests else "")
 
 
-def _wrong(effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
-    if effect in REMEDIES:
-        return _filled(REMEDIES[effect][0], effect, answer, material)
+def _wrong(effect: str, material: Mapping[str, Any]) -> str:
+    if told := _filled("wrong", effect, material):
+        return told
     sizes = joined([f"{p['name']} = {_size(p)}" for p in _rows(effect, material)])
     about = _about(effect, material)
     return f"the model lacks {effect}{f' ({about})' if about else ''}" + (f": {sizes}" if sizes else "")
 
 
-def _filled(text: str, effect: str, answer: Mapping[str, Any], material: Mapping[str, Any]) -> str:
-    """Return a text of REMEDIES with the sizes that an effect was found to have."""
-    row = next(iter(_rows(effect, material)), {})
-    # the sentence itself says what the size is of
-    nameless = effect in ("stiffness-error", "inertia", "load-transmission")
-    sizes = _size(row) if nameless else joined([f"{p['name']} = {_size(p)}" for p in _rows(effect, material)])
-    plain = with_unit(number(row.get("augmented"), 4), row.get("unit"))
-    return text.format(
-        value=sizes or "its size is below", number=plain, stated=material.get("stated", {}).get("stiffness", "–")
-    )
+def _filled(key: str, effect: str, material: Mapping[str, Any]) -> str:
+    """Return what an effect's file says is wrong, or to do, with the sizes that were found; "" where it says nothing."""
+    rows = _rows(effect, material)
+    first = rows[0] if rows else {}
+    said = {
+        "value": joined([f"{p['name']} = {_size(p)}" for p in rows]) or "its size is below",
+        "size": _size(first) if rows else "its size is below",
+        "number": with_unit(number(first.get("augmented"), 4), first.get("unit")),
+        "stated": str(material.get("stated", {}).get("stiffness", "–")),
+    }
+    text = str(((material.get("texts") or {}).get(effect) or {}).get(key, ""))
+    return re.sub(r"\{(\w+)\}", lambda m: said.get(m[1], m[0]), text)
 
 
 def _size(row: Mapping[str, Any]) -> str:
@@ -302,9 +197,7 @@ def _rows(effect: str, material: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Return the parameters that an effect has and the baseline has not."""
     names = [str(n) for n in (material.get("own") or {}).get(effect, ())]
     rows = [p for p in material.get("parameters", ()) if p.get("name") in names] if names else []
-    return rows or [
-        p for p in material.get("parameters", ()) if p.get("baseline") is None and finite(p.get("augmented"))
-    ]
+    return rows or [p for p in material.get("parameters", ()) if p.get("baseline") is None and finite(p.get("augmented"))]
 
 
 def bracketed(value: Any, error: Any) -> str:

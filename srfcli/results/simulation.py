@@ -204,9 +204,7 @@ class SimulationResult(Result):
         blocks = [_block(r, ages, [c.name for c in beside], named=named, gauge=gauge) for r in self.records]
         notes = (*self.work.notes, *(note for r in self.records for note in summary(r, named=named)))
         meta = {"samples": {r.job.name: r.done for r in self.records}, **self.work.meta}
-        return Table(
-            "srf.simulate/1", columns, Rows(blocks), model.title, notes, self.work.parameters, meta, self.worst.value
-        )
+        return Table("srf.simulate/1", columns, Rows(blocks), model.title, notes, self.work.parameters, meta, self.worst.value)
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the records over time: observable, friction, velocities and load, a panel for each."""
@@ -255,9 +253,7 @@ class Rows(Sequence[tuple[Any, ...]]):
         raise IndexError(index)
 
 
-def _block(
-    r: Record, ages: list[str], beside: list[str], *, named: bool, gauge: bool
-) -> tuple[tuple[Any, ...], Sequence[Array]]:
+def _block(r: Record, ages: list[str], beside: list[str], *, named: bool, gauge: bool) -> tuple[tuple[Any, ...], Sequence[Array]]:
     """Return the cells that lead each row of a record, and the columns that follow."""
     import numpy as np
 
@@ -293,9 +289,7 @@ def summary(r: Record, *, named: bool) -> list[str]:
     if r.job.run is not None and (good := r.job.run.used[:n] & np.isfinite(r.job.run.observed[:n])).any():
         rms = float(np.sqrt(np.mean((r.observed[:n] - r.job.run.observed[:n])[good] ** 2)))
         unit = OBSERVABLES[r.job.observable]
-        sentences.append(
-            f"{lead}root mean square distance from the recording {rms:.4g}{'' if unit == '1' else f' {unit}'}"
-        )
+        sentences.append(f"{lead}root mean square distance from the recording {rms:.4g}{'' if unit == '1' else f' {unit}'}")
     return sentences
 
 

@@ -207,9 +207,7 @@ class MeanFrictionResult(Result):
         rows = []
         for eps, found in self.means.items():
             cells = (found.steady, found.force, found.drop, found.friction, found.growth, found.error)
-            rows += [
-                (eps, x, *(float(c[i]) for c in cells), found.status[i].value) for i, x in enumerate(self.values)
-            ]
+            rows += [(eps, x, *(float(c[i]) for c in cells), found.status[i].value) for i, x in enumerate(self.values)]
         about = "ln of the leading multiplier's modulus; the forced state is stable where negative"
         columns = (
             Column("eps", "1", "modulation amplitude"),
@@ -301,12 +299,8 @@ class PeriodicResult(Result):
             "stable": r.stable,
             "mean_friction": r.mean_friction,
             "friction_shift": r.friction_shift,
-            "u_harmonics": [
-                {"k": k, "amplitude_um": abs(c), "phase": float(np.angle(c))} for k, c in enumerate(r.u_harmonics)
-            ],
-            "mu_harmonics": [
-                {"k": k, "amplitude": abs(c), "phase": float(np.angle(c))} for k, c in enumerate(r.mu_harmonics)
-            ],
+            "u_harmonics": [{"k": k, "amplitude_um": abs(c), "phase": float(np.angle(c))} for k, c in enumerate(r.u_harmonics)],
+            "mu_harmonics": [{"k": k, "amplitude": abs(c), "phase": float(np.angle(c))} for k, c in enumerate(r.mu_harmonics)],
             "intervals": intervals,
             "liouville": r.liouville,
         }
@@ -376,11 +370,7 @@ def boundary_columns(model: GeneratedModel, extra: tuple[str, ...] = ()) -> tupl
 
 
 def boundary_row(
-    model: GeneratedModel,
-    point: BoundaryPoint,
-    component: int | None,
-    crossing: int | None,
-    extra: tuple[str, ...] = (),
+    model: GeneratedModel, point: BoundaryPoint, component: int | None, crossing: int | None, extra: tuple[str, ...] = ()
 ) -> tuple[Any, ...]:
     """Return one boundary point under `boundary_columns`, the parameters `extra` in their declared units."""
     value = {n: point.value(model, n) for n in ("eps", "V", "K", "W0")}
@@ -436,9 +426,7 @@ class CriticalResult(Result):
         model = self.system.model
         rows = [boundary_row(model, q, None, k) for q, k in zip(self.points, self.crossings, strict=True)]
         described = self.system.described(without=("W0", "V", "eps"))
-        return Table(
-            "srf.critical/1", BOUNDARY_COLUMNS, rows, model.title, self.said, described, status=self.worst.value
-        )
+        return Table("srf.critical/1", BOUNDARY_COLUMNS, rows, model.title, self.said, described, status=self.worst.value)
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the critical K/W0 (1/um) against V (um/s), a mark for each crossing."""

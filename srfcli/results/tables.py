@@ -118,10 +118,7 @@ def format_number(value: float, format: str) -> str:
 
 def to_text(table: Table, *, full: bool = True) -> str:
     """Return the table as aligned plain text, as wide as it is; `full` shows twelve digits, else the columns' formats."""
-    cells = [
-        [cell_text(v, None if full else c.format) for v, c in zip(row, table.columns, strict=True)]
-        for row in table.rows
-    ]
+    cells = [[cell_text(v, None if full else c.format) for v, c in zip(row, table.columns, strict=True)] for row in table.rows]
     headings = [c.heading for c in table.columns]
     widths = [max(len(line[i]) for line in [headings, *cells]) for i in range(len(headings))]
     right = [is_numeric(table, i) for i in range(len(headings))]
@@ -293,9 +290,7 @@ class Result(ABC):
         try:
             import pandas
         except ImportError as error:
-            raise SrfError(
-                "to_dataframe needs pandas, which is not installed", 'pip install "srfcli[frames]"'
-            ) from error
+            raise SrfError("to_dataframe needs pandas, which is not installed", 'pip install "srfcli[frames]"') from error
         table = self.table
         rows = [[plain_value(v) for v in row] for row in table.rows]
         frame = pandas.DataFrame(rows, columns=[c.name for c in table.columns])

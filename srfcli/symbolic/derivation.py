@@ -82,9 +82,7 @@ def _steady(system: System) -> Section:
     V = symbol("V")
     mu_ss = friction_slopes(system)[2]
     formulas = [_one("v", V)]
-    formulas += [
-        _one(s.name, e.subs(symbol("v"), V)) for s, e in zip(system.friction.states, steady_states(system), strict=True)
-    ]
+    formulas += [_one(s.name, e.subs(symbol("v"), V)) for s, e in zip(system.friction.states, steady_states(system), strict=True)]
     formulas += [_one("mu_ss", mu_ss), _one("u", symbol("W0") * symbol("mu_ss") / symbol("K"))]
     return Section("steady", "Steady sliding at V under W0", tuple(formulas))
 
@@ -127,9 +125,7 @@ def _jacobian(system: System) -> Section:
             value = eq.derivative(rate, j)
             text, latex = _partial(name, other)
             formulas.append(Formula(text, latex, sp.factor_terms(value)))
-    return Section(
-        "jacobian", "Jacobian", tuple(formulas), ("derivatives that are not listed are zero",)
-    ).without_zeros()
+    return Section("jacobian", "Jacobian", tuple(formulas), ("derivatives that are not listed are zero",)).without_zeros()
 
 
 def _parameters(system: System) -> Section:
@@ -156,9 +152,7 @@ def _partial(name: str, other: str) -> tuple[str, str]:
 def _dispersion(system: System) -> Section:
     coefficients = dispersion_coefficients(system)
     formulas = [Formula(f"C{k}", f"C_{{{k}}}", c) for k, c in enumerate(coefficients)]
-    notes = [
-        f"perturbations as exp(i Omega t): C0 + C1 Omega + ... + C{len(coefficients) - 1} Omega^{len(coefficients) - 1} = 0"
-    ]
+    notes = [f"perturbations as exp(i Omega t): C0 + C1 Omega + ... + C{len(coefficients) - 1} Omega^{len(coefficients) - 1} = 0"]
     known = dict(interface_meaning(system))
     if known and any(c.has(symbol("eta")) for c in coefficients):
         formulas.append(_one("eta", 1 + symbol("K") / symbol("kappa")))
@@ -195,9 +189,7 @@ def _as_printed(k: int, a: sp.Expr, system: System) -> sp.Expr:
 def _limits(system: System) -> Section:
     found = closed_limits(system)
     if found is None:
-        return Section(
-            "limits", "Closed forms of the critical load", (), ("none: more than one state variable, or no factor",)
-        )
+        return Section("limits", "Closed forms of the critical load", (), ("none: more than one state variable, or no factor",))
     formulas = list(_limit_formulas(system, found))
     notes = [_validity(system, found)]
     if found.load is not None and found.limit_load is not None and system.elastic:
@@ -340,10 +332,7 @@ def to_python(system: System) -> str:
     if any("lambertw(" in line for line in [*body, *rows]):
         head.append("from scipy.special import lambertw")
     signature = ", ".join(python_name(a) for a in arguments)
-    code = [
-        f"def dispersion({signature}):",
-        f'    """C0..C{len(coefficients) - 1} in um, s, N; mass in N s^2/um (1e-6 kg)."""',
-    ]
+    code = [f"def dispersion({signature}):", f'    """C0..C{len(coefficients) - 1} in um, s, N; mass in N s^2/um (1e-6 kg)."""']
     code += [*body, "    return array([", *(f"        {line}," for line in rows), "    ])"]
     return "\n".join([*head, "", "", *code]) + "\n"
 
@@ -364,14 +353,10 @@ def paper_text(findings: Sequence[Finding]) -> str:
     """Return the comparison with the paper as text: the equations, its claims, and its wording apart."""
     equations = [f for f in findings if f.kind == "equation"]
     wrong = sum(f.verdict == "misprint" for f in equations)
-    blocks = [
-        f"Printed equations: {len(equations) - wrong} agree, {wrong} misprinted (line numbers of the manuscript's source)"
-    ]
+    blocks = [f"Printed equations: {len(equations) - wrong} agree, {wrong} misprinted (line numbers of the manuscript's source)"]
     blocks[0] += "\n" + "\n".join(_paper_line(f) for f in equations)
     claims = [f for f in findings if f.kind == "claim"]
-    blocks.append(
-        "Claims, computed with the optimised parameters of Table I\n" + "\n".join(_paper_line(f) for f in claims)
-    )
+    blocks.append("Claims, computed with the optimised parameters of Table I\n" + "\n".join(_paper_line(f) for f in claims))
     words = [f for f in findings if f.kind == "words"]
     blocks.append("In words\n" + "\n".join(_paper_line(f) for f in words))
     blocks.append("x_1 is x', x_3 is x'''; coswt is cos(omega t); K_par is K || kappa")

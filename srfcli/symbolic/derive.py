@@ -177,9 +177,7 @@ def hurwitz_determinant(a: tuple[sp.Expr, ...]) -> sp.Expr:
     return sp.Matrix(n - 1, n - 1, lambda i, j: coefficient(2 * (j + 1) - (i + 1))).det(method="berkowitz")
 
 
-def _hurwitz_in_load(
-    coefficients: tuple[sp.Expr, ...], stiffness: list[tuple[sp.Expr, sp.Expr]]
-) -> tuple[sp.Expr, ...] | None:
+def _hurwitz_in_load(coefficients: tuple[sp.Expr, ...], stiffness: list[tuple[sp.Expr, sp.Expr]]) -> tuple[sp.Expr, ...] | None:
     """Return the coefficients in W0 of the Hurwitz determinant over a power of W0, lowest first, or None."""
     W0 = symbol("W0")
     fractions = [sp.fraction(sp.cancel(a.subs(stiffness))) for a in coefficients]

@@ -224,9 +224,7 @@ def check_slots(system: System, parts: Parts) -> None:
         formula = getattr(parts, slot)
         found = sorted(names & {str(x) for x in formula.free_symbols}) if formula is not None else []
         if found:
-            raise SrfError(
-                f"{slot} of {system.title} depends on {found[0]}", f"{slot} may not hold {', '.join(sorted(names))}"
-            )
+            raise SrfError(f"{slot} of {system.title} depends on {found[0]}", f"{slot} may not hold {', '.join(sorted(names))}")
 
 
 def _modulated(formula: sp.Expr, *, cyclic: bool) -> sp.Expr:
@@ -278,9 +276,7 @@ class _Builder:
         self.m_phi = sp.symbols(f"mu_phi0:{len(self.phis)}")
         self.slip, self.slip_W, self.slip_t = sp.Symbol("S_"), sp.Symbol("S_W_"), sp.S.Zero
         self.imposed = sp.Symbol("Wi_")
-        if self.parts.kappa is not None and {str(x) for x in self.parts.kappa.free_symbols} & {
-            str(n) for n, _ in self.along()
-        }:
+        if self.parts.kappa is not None and {str(x) for x in self.parts.kappa.free_symbols} & {str(n) for n, _ in self.along()}:
             self.slip_t = sp.Symbol("S_t_")
         self.force, self.force_dot, self.W_dot = sp.symbols("F_ F_dot_ We_dot_")
         plain = symbol("K") == self.parts.K
@@ -341,13 +337,7 @@ class _Builder:
         """Return the value of a formula where a run begins: in steady sliding at V under W0, with elongation `u_rest`."""
         s = symbol
         own = {s(e.name): e.steady for e in self.extras}
-        at_rest = {
-            s("W"): s("W0"),
-            s("W_dot"): sp.S.Zero,
-            s("slip"): s("start"),
-            s("time"): s("begin"),
-            s("stage"): sp.S.Zero,
-        }
+        at_rest = {s("W"): s("W0"), s("W_dot"): sp.S.Zero, s("slip"): s("start"), s("time"): s("begin"), s("stage"): sp.S.Zero}
         found = formula.subs(own).subs(s("u"), u_rest).subs(own).subs(s("mu"), mu_ss)
         return found.subs(s("v"), s("V")).subs(at_rest)
 
@@ -478,9 +468,7 @@ def solve_linear(balance: list[sp.Expr], wanted: list[sp.Symbol], system: System
         ) from error
     solved = _eliminated(matrix, right, system)
     if solved is None:
-        raise SrfError(
-            f"the equations of {system.title} do not determine the motion", "check the laws with `srf law check`"
-        )
+        raise SrfError(f"the equations of {system.title} do not determine the motion", "check the laws with `srf law check`")
     return dict(zip(wanted, [tidy(e) for e in solved], strict=True))
 
 

@@ -77,9 +77,7 @@ def check_equation(system: System, entry: dict[str, object]) -> Finding:
     shown = _t(entry, "printed") if verdict == "agrees" else str(_like(right / factor, printed))
     sign = "i*(" if factor == sp.I else ""
     texts = [f"{_t(entry, 'left')} = {sign}{body}{')' if sign else ''}" for body in (_t(entry, "printed"), shown)]
-    return Finding(
-        "equation", _t(entry, "label"), int(str(entry["line"])), verdict, texts[0], texts[1], _t(entry, "note")
-    )
+    return Finding("equation", _t(entry, "label"), int(str(entry["line"])), verdict, texts[0], texts[1], _t(entry, "note"))
 
 
 def _equal(first: sp.Expr, second: sp.Expr) -> bool:
@@ -172,9 +170,7 @@ def _frequency_real(system: System) -> tuple[str, str]:
     c = paper_coefficients(characteristic_polynomial(system))
     Omega = symbol("Omega")
     polynomial = sum((x * Omega**k for k, x in enumerate(c)), sp.S.Zero)
-    rest = [
-        _at_onset(system, polynomial.subs(Omega, math.sqrt(q)), V=v) for q, v in zip(squares, VELOCITIES, strict=True)
-    ]
+    rest = [_at_onset(system, polynomial.subs(Omega, math.sqrt(q)), V=v) for q, v in zip(squares, VELOCITIES, strict=True)]
     residual = max(map(abs, rest))
     real = min(squares) > 0 and residual < 1e-9
     value = f"Omega_c = {math.sqrt(squares[0]):.4f} rad/s at 1 um/s"

@@ -65,11 +65,7 @@ RANDOM_FIELD = Effect(  # correlation (1 + r) exp(-r), r = sqrt(3) d/length (Mat
     neutral=(("field_amplitude", 0.0),),
 )  # fmt: skip
 EFFECT_INPUTS = ("slip", "stage", "time", "theta", "envelope", "u", "gauge", "kappa", "force", "rate", "V")
-PASSING = {
-    "slip": "slip",
-    "stage": "the stage's position",
-    "time": "time",
-}  # what an effect may name that never comes back
+PASSING = {"slip": "slip", "stage": "the stage's position", "time": "time"}  # what an effect may name that never comes back
 LOADINGS = ("vertical", "inclined")
 
 
@@ -84,9 +80,7 @@ class System:
     loading: str = "vertical"
     inertia: bool = True
     effects: tuple[Effect, ...] = ()
-    tables: tuple[
-        tuple[str, str], ...
-    ] = ()  # (mu, force or V, an unknown): a function of it, given by numbers, is added
+    tables: tuple[tuple[str, str], ...] = ()  # (mu, force or V, an unknown): a function of it, given by numbers, is added
 
     @property
     def laws(self) -> tuple[Law, ...]:
@@ -210,9 +204,7 @@ def _renamed(effect: Effect, names: Mapping[str, str]) -> Effect:
     return replace(
         effect,
         parameters=tuple(replace(p, name=names.get(p.name, p.name)) for p in effect.parameters),
-        changes=tuple(
-            (slot, f.xreplace({k: v for k, v in swap.items() if str(k) != slot})) for slot, f in effect.changes
-        ),
+        changes=tuple((slot, f.xreplace({k: v for k, v in swap.items() if str(k) != slot})) for slot, f in effect.changes),
         states=tuple(replace(s, rate=s.rate.xreplace(swap), steady=s.steady.xreplace(swap)) for s in effect.states),
         neutral=tuple((names.get(n, n), v) for n, v in effect.neutral),
         scans=tuple((names.get(n, n), v) for n, v in effect.scans),

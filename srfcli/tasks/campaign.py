@@ -71,8 +71,7 @@ def fit_campaign(
         An experiment that cannot be read or fitted has a row with its reason. Ctrl-C keeps the rows that are done.
     """
     tasks = [
-        Task(str(p), tuple(sorted((options or {}).items())), reader, tuple(map(str, plugins)), _digest(Path(p)))
-        for p in paths
+        Task(str(p), tuple(sorted((options or {}).items())), reader, tuple(map(str, plugins)), _digest(Path(p))) for p in paths
     ]
     rows: dict[int, dict[str, Any]] = {}
 

@@ -117,9 +117,7 @@ def check_steady_state(law: Law, registry: Registry) -> str:
     for v in VELOCITIES:
         phi = steady_age(rate, v, values["D0"], values)
         if phi is None:
-            raise SrfError(
-                f"phi has no attracting steady value at v = {v:g} um/s", "The rate must fall through 0 at one."
-            )
+            raise SrfError(f"phi has no attracting steady value at v = {v:g} um/s", "The rate must fall through 0 at one.")
         found.append(phi * v / values["D0"])
     return f"phi v/D0 = {min(found):.6g} to {max(found):.6g} from {VELOCITIES[0]:g} to {VELOCITIES[-1]:g} um/s"
 
@@ -231,9 +229,7 @@ def _steady_of(state: State, ageing: AgeingLaw, v: float, own: Mapping[str, floa
 def _expect(found: Dimension, wanted: Dimension, what: str) -> None:
     """Raise `SrfError` where a formula has another dimension than it should."""
     if found != wanted:
-        raise SrfError(
-            f"{what} is in {describe(found)}, expected {describe(wanted)}", "Look at the units under [parameters]."
-        )
+        raise SrfError(f"{what} is in {describe(found)}, expected {describe(wanted)}", "Look at the units under [parameters].")
 
 
 def _sample(law: Law, registry: Registry) -> list[dict[str, float]]:
@@ -349,9 +345,7 @@ class _Check:
         """The first of the shipped systems that has what the effect needs and lacks what it lacks."""
         effect, names = self.effect, self.registry
         own = {p.name for p in effect.parameters}
-        laws = sorted(
-            (e.name for e in names.entries("friction")), key=lambda n: (n != "srf-vsat", n != "dieterich-ruina")
-        )
+        laws = sorted((e.name for e in names.entries("friction")), key=lambda n: (n != "srf-vsat", n != "dieterich-ruina"))
         ageing = sorted((e.name for e in names.entries("ageing")), key=lambda n: n != "dieterich")
         surfaces = sorted((e.name for e in names.entries("interface")), key=lambda n: (n != "elastic", n != "rigid"))
         for rate, law, surface, inertia in product(ageing, laws, surfaces, (True, False)):
@@ -388,9 +382,7 @@ class _Check:
     def baseline_found(self) -> str:
         missing = [n for n in self.effect.frees if n not in self.model.names]
         if missing:
-            raise SrfError(
-                f"frees '{missing[0]}', which the model does not have", f"It has {', '.join(self.model.names)}."
-            )
+            raise SrfError(f"frees '{missing[0]}', which the model does not have", f"It has {', '.join(self.model.names)}.")
         added = self.model.states[len(self.plain.states) :] if not self.effect.settings else ()
         return self.base.title + (f"; unknowns added: {', '.join(added)}" if added else "")
 
@@ -406,8 +398,7 @@ class _Check:
         if not max(worst, start) < RTOL:
             where, size = ("the rates", worst) if not worst < RTOL else ("steady sliding", start)
             raise SrfError(
-                f"at {told} {where} differ from the baseline's by {size:.2g} of their size",
-                "The effect must vanish there.",
+                f"at {told} {where} differ from the baseline's by {size:.2g} of their size", "The effect must vanish there."
             )
         return f"at {told} rates and steady sliding are the baseline's{_to(max(worst, start))}"
 
@@ -424,9 +415,7 @@ class _Check:
         if not np.isfinite(away).all():
             raise SrfError("the rates are not finite at the default values", "Look at the formula and the defaults.")
         if moved < 1e-12:
-            raise SrfError(
-                "at the default values the effect changes nothing", "Give the size a default off its neutral value."
-            )
+            raise SrfError("at the default values the effect changes nothing", "Give the size a default off its neutral value.")
         return f"at the default values a rate moves by up to {moved:.2g} of the largest"
 
     def _shown(self) -> str:
@@ -438,14 +427,10 @@ class _Check:
 
         plain = read(self.plain, self.p_plain)
         if not (off := _difference(read(self.model, self.p_neutral), plain)) < RTOL:
-            raise SrfError(
-                f"at the neutral values the reading differs by {off:.2g} of its size", "It must be gauge there."
-            )
+            raise SrfError(f"at the neutral values the reading differs by {off:.2g} of its size", "It must be gauge there.")
         moved = _difference(read(self.model, self.p_default), plain)
         if moved < 1e-12:
-            raise SrfError(
-                "at the default values the gauge shows what it did", "Give the size a default off its neutral value."
-            )
+            raise SrfError("at the default values the gauge shows what it did", "Give the size a default off its neutral value.")
         return f"at the default values the reading moves by up to {moved:.2g} of the largest"
 
     def steady_start(self) -> str:

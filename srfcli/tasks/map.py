@@ -213,9 +213,7 @@ def compare(
     """
     names, models = tuple(systems), [s.model for s in systems.values()]
     if len(names) < 2:
-        raise SrfError(
-            "one law is nothing to compare", "Name more, such as srf-vsat and log-log, or several ageing laws."
-        )
+        raise SrfError("one law is nothing to compare", "Name more, such as srf-vsat and log-log, or several ageing laws.")
     wanted = sorted({float(e) for e in np.atleast_1d(np.asarray(eps, float)) if e > 0})
     if not wanted:
         raise SrfError("`eps` 0 leaves nothing to compare", "Give an amplitude above 0, such as 0.18.")
@@ -250,9 +248,7 @@ def compare(
             raise
         left = [k for k in usable if k not in studies]
         matches = [replace(m, status=Status.INTERRUPTED) if k in left else m for k, m in enumerate(matches)]
-    return ComparisonResult(
-        names, tuple(systems.values()), goal, tuple(matches), studies, amplitudes, tuple(wanted), window
-    )
+    return ComparisonResult(names, tuple(systems.values()), goal, tuple(matches), studies, amplitudes, tuple(wanted), window)
 
 
 def _matches(

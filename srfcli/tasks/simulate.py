@@ -246,9 +246,7 @@ def _start_velocity(text: str) -> float:
     except SrfError as error:
         raise SrfError(f"`start` {text!r} is neither steady, nor a velocity, nor values", error.hint) from error
     if not 1e-12 <= V <= LARGEST_VELOCITY:
-        raise SrfError(
-            f"`start` {text}: sliding is steady from 1e-12 to {LARGEST_VELOCITY:g} um/s", "Write `start` 10."
-        )
+        raise SrfError(f"`start` {text}: sliding is steady from 1e-12 to {LARGEST_VELOCITY:g} um/s", "Write `start` 10.")
     return V
 
 
@@ -282,9 +280,7 @@ def new_experiment(
     ]
     mass = values.get("M") if choice.inertia else None
     listed = perturbed(parameters, spread, seed)
-    return Experiment(
-        folder, f"simulated with {model.title}", choice, mass, stiffness_text(values["K"]), listed, (), ()
-    )
+    return Experiment(folder, f"simulated with {model.title}", choice, mass, stiffness_text(values["K"]), listed, (), ())
 
 
 def free_names(model: GeneratedModel, names: str | None) -> set[str]:
@@ -455,9 +451,7 @@ def _of_the_laws(experiment: Experiment) -> dict[str, float]:
     return {p.name: p.value for p in experiment.parameters if p.name not in OF_THE_APPARATUS}
 
 
-def _job(
-    model: GeneratedModel, experiment: Experiment, run: Run, values: Mapping[str, float], start: ArrayLike | str
-) -> Job:
+def _job(model: GeneratedModel, experiment: Experiment, run: Run, values: Mapping[str, float], start: ArrayLike | str) -> Job:
     begin = float(run.t[0])
     listed = {**_of_the_laws(experiment), "K": run.stiffness}
     if experiment.mass:
@@ -472,14 +466,10 @@ def _job(
         raise SrfError(f"run {run.name!r}: {error.message}", error.hint) from error
     ripple = run.modulation[0] if run.modulation else None
     beside = tuple(signal.observable for signal in run.others)
-    return Job(
-        run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run, beside=beside
-    )
+    return Job(run.name, p, run.drive, run.load, run.t, state, run.observable, ripple, run.modulation, run, beside=beside)
 
 
-def _described(
-    model: GeneratedModel, experiment: Experiment, values: Mapping[str, float]
-) -> dict[str, dict[str, Any]]:
+def _described(model: GeneratedModel, experiment: Experiment, values: Mapping[str, float]) -> dict[str, dict[str, Any]]:
     """Return name -> {value, unit, origin} of what does not change from run to run."""
     listed, described = _of_the_laws(experiment), {}
     if experiment.mass:
@@ -538,9 +528,7 @@ TABLES = (("mu", "slip"),)  # a table over slip is added to the friction coeffic
 LARGEST_ROUGHNESS = 0.5  # of mu0: above it the friction coefficient may become negative
 
 
-def on_track(
-    plain: GeneratedModel, rough: GeneratedModel, track: RoughTrack, job: Job, *, start: ArrayLike | str | None
-) -> Job:
+def on_track(plain: GeneratedModel, rough: GeneratedModel, track: RoughTrack, job: Job, *, start: ArrayLike | str | None) -> Job:
     """Return the job of the model `plain` as one of `rough`, the same with TABLES, on the part of the track that it covers.
 
     Positions are slip from where the run begins; runs that begin at the same place find the same track there. `start` is as in

@@ -425,11 +425,7 @@ def continue_boundary(
 
 
 def _grown(
-    system: SlidingSystem,
-    axes: list[Axis],
-    amplitudes: Sequence[float | None],
-    settings: AtlasSettings,
-    progress: Said,
+    system: SlidingSystem, axes: list[Axis], amplitudes: Sequence[float | None], settings: AtlasSettings, progress: Said
 ) -> Iterator[BoundaryResult]:
     from srfcli.numerics.continuation import find_components
 
@@ -438,9 +434,7 @@ def _grown(
     try:
         for amplitude in amplitudes:
             plane, window = _plane(system, axes, amplitude)
-            dense = (
-                settings if window is None else replace(settings, samples=math.ceil(settings.samples * window.widening))
-            )
+            dense = settings if window is None else replace(settings, samples=math.ceil(settings.samples * window.widening))
             atlas: Atlas | None = None
             for atlas in find_components(model, plane, dense, progress=progress):
                 yield BoundaryResult(system, (*done, atlas), worst([*(a.status for a in done), atlas.status]))
@@ -467,9 +461,7 @@ def _axes(
     for name, ends in over.items():
         values = checked(model, name, ends)
         if len(values) != 2 or not values[0] < values[1]:
-            raise SrfError(
-                f"{name} = {ends} is no axis", f'An axis runs from a low to a high end: {{"{name}": (1, 100)}}.'
-            )
+            raise SrfError(f"{name} = {ends} is no axis", f'An axis runs from a low to a high end: {{"{name}": (1, 100)}}.')
         unit = model.parameters[model.index(name)].unit
         log = name in logs if logs is not None else values[1] >= 10 * values[0] > 0
         axes.append(Axis(name, to_base(values[0], unit), to_base(values[1], unit), log))
@@ -506,9 +498,7 @@ def _judge_window(model: GeneratedModel, atlas: Atlas, window: LoadWindow) -> No
             side = "above" if 0.999 * window.hi < W0 else "below" if 1.001 * window.lo > W0 else ""
             if side:
                 at = f"{x} = {model.declared(x, point.value(model, x)):.4g}"
-                atlas.notes.append(
-                    f"component {number} goes on {side} W0 = {W0:.4g} N at {at} (--over W0=LOW:HIGH for more)"
-                )
+                atlas.notes.append(f"component {number} goes on {side} W0 = {W0:.4g} N at {at} (--over W0=LOW:HIGH for more)")
     if not window.certain:
         atlas.notes.append(f"crossings below {window.lo:.4g} or above {window.hi:.4g} N are not ruled out")
         if atlas.status is Status.OK:

@@ -188,10 +188,7 @@ def told(diagnosis: Diagnosis, registry: Registry, *, case: str) -> Answer:
         tuple(tuple(names) for names in diagnosis.equivalent),
         tuple(dict.fromkeys(x.effect for x in diagnosis.not_identifiable)),
         {name: {k: _finite(v) for k, v in value.items()} for name, value in brought(diagnosis).items()},
-        {
-            "baseline": _finite(diagnosis.shown.fit.maximum.point.rms),
-            "augmented": _finite(diagnosis.final.fit.maximum.point.rms),
-        },
+        {"baseline": _finite(diagnosis.shown.fit.maximum.point.rms), "augmented": _finite(diagnosis.final.fit.maximum.point.rms)},
         {view.run.name: _errors(view) for view in views if view.holdout},
         {_plain(f.name): _evidence(f) for f in reversed(diagnosis.ranked)},
         diagnosis.ungated,

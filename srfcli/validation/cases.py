@@ -161,14 +161,7 @@ WIDE_SHARES = (0.25, 0.3, 0.1, 0.13, 0.14, 0.08)
 SPREAD = {"A": 0.05, "B": 0.05, "D0": 0.05, "lam": 0.05, "Vsat": 0.13, "mu0": 0.01}  # relative standard deviations
 ODD = ("rigid", "massless", "bare")  # baselines other than the usual one
 ODD_SHARE = 0.15  # of the cases where no effect decides it: else an odd baseline would give the answer away
-USUAL_ONLY = {
-    "stiffness-exponent",
-    "log-log-coupling",
-    "interface-damping",
-    "interface-compliance",
-    "inertia",
-    "age-saturation",
-}
+USUAL_ONLY = {"stiffness-exponent", "log-log-coupling", "interface-damping", "interface-compliance", "inertia", "age-saturation"}
 ROUGH_SHARE, WHITE_SHARE = 0.4, 0.6
 OWN_SHARE = 0.5  # of rough tracks: each run has its own
 ROUGHNESS, CORRELATION = (5e-5, 4e-4), (3.0, 30.0)  # of mu0; um
@@ -285,9 +278,7 @@ def draw_wide(
     rig = str(rng.choice([name for name in RIGS if name.partition("-")[0] == setting.apparatus]))
     gauge = draw_gauge(rng, rig, physics, noise)
     only = str(rng.choice(_runs_of(forms[0], plans))) if kind == "one-run" else ""
-    return Recipe(
-        forms, sizes, physics, without(physics, forms), plans, gauge, kind, rig, setting.protocol, noise, only
-    )
+    return Recipe(forms, sizes, physics, without(physics, forms), plans, gauge, kind, rig, setting.protocol, noise, only)
 
 
 def wide_names(rng: np.random.Generator, kind: str) -> tuple[str, ...]:
@@ -325,11 +316,7 @@ def _sized(effect: Effect, sizes: tuple[float, float, Mapping[str, tuple[float, 
 def _may_be_odd(forms: Sequence[Effect], setting: Setting) -> bool:
     """Return whether a rigid or quasi-static baseline can be followed, and gives nothing away."""
     decided = any(e.name in USUAL_ONLY for e in forms)
-    return (
-        not decided
-        and setting.protocol not in ("mixed", "stick-slip")
-        and "nagata" not in (setting.ageing, setting.stated)
-    )
+    return not decided and setting.protocol not in ("mixed", "stick-slip") and "nagata" not in (setting.ageing, setting.stated)
 
 
 def _runs_of(effect: Effect, plans: Sequence[Plan]) -> list[str]:
@@ -396,9 +383,7 @@ def _track(rng: np.random.Generator, rough: bool | float | None) -> Track:
     if rough is not None and not isinstance(rough, bool):
         size = float(rough)
         if not 0 <= size < 0.1:
-            raise SrfError(
-                f"rough = {size:g} is no roughness of a track", "give the standard deviation of mu0, say 3e-4"
-            )
+            raise SrfError(f"rough = {size:g} is no roughness of a track", "give the standard deviation of mu0, say 3e-4")
         is_rough = size > 0
     elif rough is not None:
         is_rough = rough
@@ -439,9 +424,7 @@ def draw_protocol(rng: np.random.Generator) -> tuple[Plan, ...]:
 DESCRIPTION = "experiment.toml"
 
 
-def description(
-    baseline: Physics, plans: tuple[Plan, ...], *, title: str, rig: Rig = PAPER, spikes: bool = False
-) -> str:
+def description(baseline: Physics, plans: tuple[Plan, ...], *, title: str, rig: Rig = PAPER, spikes: bool = False) -> str:
     """Return the text of experiment.toml: apparatus and model as the baseline has them, nothing of what is concealed."""
     mass = "" if baseline.massless else f'mass = "{baseline.M * 1e6:.3g} kg"\n'
     reference = [] if baseline.law == "dieterich-cutoff" else ["V0 = { value = 1.0, fixed = true }"]
@@ -477,10 +460,7 @@ def table(plan: Plan, observed: Array, rig: Rig = PAPER) -> str:
     velocities = np.array([v for _, v in plan.drive])
     V = velocities[np.minimum(np.searchsorted(ends, t + 1e-9, side="right"), velocities.size - 1)]
     W = [load(s)[0] / rig.factor for s in t.tolist()]
-    rows = (
-        f"{s:.4f},{v:g},{w:.{rig.load_digits}f},{u:.{rig.digits}f}"
-        for s, v, w, u in zip(t, V, W, observed, strict=True)
-    )
+    rows = (f"{s:.4f},{v:g},{w:.{rig.load_digits}f},{u:.{rig.digits}f}" for s, v, w, u in zip(t, V, W, observed, strict=True))
     header = f"time [s],load_point_velocity [um/s],{rig.load},{rig.heading}"
     return "\n".join([header, *rows]) + "\n"
 
@@ -529,9 +509,7 @@ def make_case(
     asked = {"kind": kind, "effects": effects, "size": size, "rough": rough, "own": own}
     recipe, motions, attempt = _moving(seed, draw_wide if bank == "wide" else draw_recipe, asked)
     rng, rig = np.random.default_rng([*_whole(seed), attempt, 1]), RIGS[recipe.rig]
-    readings = {
-        plan: read_gauge(recorded(rig, recipe.acting(plan), plan, u), recipe.gauge, rng) for plan, u in motions.items()
-    }
+    readings = {plan: read_gauge(recorded(rig, recipe.acting(plan), plan, u), recipe.gauge, rng) for plan, u in motions.items()}
     truth = _truth(recipe, attempt, seed)
     if strengths:
         truth["strength"] = {e.name: strength_of(e, recipe, motions) for e in recipe.effects}
@@ -561,8 +539,7 @@ def _moving(
         else:
             return recipe, motions, attempt
     raise SrfError(
-        f"none of {ATTEMPTS} sliders drawn from seed {seed} could be followed to the end of its runs",
-        "Take another seed.",
+        f"none of {ATTEMPTS} sliders drawn from seed {seed} could be followed to the end of its runs", "Take another seed."
     )
 
 
@@ -634,9 +611,7 @@ def known_physics(truth: Mapping[str, Any], *, baseline: bool = False) -> Physic
 
 def known_plans(truth: Mapping[str, Any]) -> tuple[Plan, ...]:
     """Return the runs of a case from the truth about it."""
-    return tuple(
-        Plan(**{**r, **{n: tuple(map(tuple, r.get(n, ()))) for n in ("drive", "steps", "gaps")}}) for r in truth["runs"]
-    )
+    return tuple(Plan(**{**r, **{n: tuple(map(tuple, r.get(n, ()))) for n in ("drive", "steps", "gaps")}}) for r in truth["runs"])
 
 
 def concealed(truth: Mapping[str, Any]) -> list[Effect]:
@@ -704,9 +679,7 @@ def unseal(bank: Path, apart: Path) -> Truths:
     """Return the truths, case -> truth; SrfError where they, or the files of a case, are not those that were sealed."""
     public = _read(bank / SEAL)
     if public.get("schema") != SCHEMA:
-        raise SrfError(
-            f"{bank / SEAL}: schema {public.get('schema')!r}, expected {SCHEMA!r}", "Is this a bank of cases?"
-        )
+        raise SrfError(f"{bank / SEAL}: schema {public.get('schema')!r}, expected {SCHEMA!r}", "Is this a bank of cases?")
     data = _bytes(apart)
     found = hashlib.sha256(data).hexdigest()
     if not hmac.compare_digest(found, str(public.get("truths"))):
@@ -717,9 +690,7 @@ def unseal(bank: Path, apart: Path) -> Truths:
     check_cases(bank)
     truths: Truths = json.loads(data)["truths"]
     if set(truths) != set(public["cases"]):
-        raise SrfError(
-            f"{bank / SEAL}: its cases are not those of {apart.name}", "The seal was changed; make the bank anew."
-        )
+        raise SrfError(f"{bank / SEAL}: its cases are not those of {apart.name}", "The seal was changed; make the bank anew.")
     return truths
 
 
@@ -749,9 +720,7 @@ def _bytes(path: Path) -> bytes:
     try:
         return read_plain(path, limit=LARGEST)
     except OSError as error:
-        raise SrfError(
-            f"{path}: {error.strerror}", "Name the bank, and the file of its truths.", exit_code=1
-        ) from error
+        raise SrfError(f"{path}: {error.strerror}", "Name the bank, and the file of its truths.", exit_code=1) from error
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -859,9 +828,7 @@ def check_kinds(kinds: Sequence[str], bank: str) -> None:
     every = WIDE_KINDS if bank == "wide" else KINDS
     strange = [k for k in kinds if k not in every]
     if strange and strange[0] in WIDE_KINDS:
-        raise SrfError(
-            f"the bank of the paper has no cases of the kind '{strange[0]}'", "srf prove --bank wide has them."
-        )
+        raise SrfError(f"the bank of the paper has no cases of the kind '{strange[0]}'", "srf prove --bank wide has them.")
     if strange:
         raise SrfError(f"unknown kind of case '{strange[0]}'", did_you_mean(strange[0], every))
 

@@ -53,9 +53,7 @@ class Track:
             i = min(max(int(at), 0), last)
             r = min(max(at - i, 0.0), 1.0)
             s = 1.0 - r
-            return s * s * ((1 + 2 * r) * heights[i] + r * slopes[i]) + r * r * (
-                (3 - 2 * r) * heights[i + 1] - s * slopes[i + 1]
-            )
+            return s * s * ((1 + 2 * r) * heights[i] + r * slopes[i]) + r * r * ((3 - 2 * r) * heights[i + 1] - s * slopes[i + 1])
 
         return deviation
 
@@ -657,16 +655,7 @@ class Slider:
         ln_phi, ln_phi2 = steady_ages(p, V)
         m, a = self._terms(0.0, 0.0, ln_phi, ln_phi2, W)
         F = (W + p.Wa) * self._resistance(math.log(V / p.V0), m, a, p.drag)
-        extra = {
-            "ln_phi2": ln_phi2,
-            "Wm": W,
-            "gauge": F / K,
-            "stage": V,
-            "X": 0.0,
-            "Ws": W,
-            "Ws_dot": 0.0,
-            "late": F / K,
-        }
+        extra = {"ln_phi2": ln_phi2, "Wm": W, "gauge": F / K, "stage": V, "X": 0.0, "Ws": W, "Ws_dot": 0.0, "late": F / K}
         mechanical = self.contact.steady(V, F, W, K)
         return [*mechanical, ln_phi, 0.0, *(extra[name] for name in self.names[len(mechanical) + 2 :])]
 

@@ -15,16 +15,7 @@ from typing import Any
 from srfcli.core.errors import SrfError
 from srfcli.core.files import clear, parse_json, read_plain, write_atomic
 from srfcli.core.parallel import run_processes
-from srfcli.validation.blind import (
-    Answer,
-    Diagnose,
-    Task,
-    answer_case,
-    diagnose_case,
-    failed,
-    read_answers,
-    write_answers,
-)
+from srfcli.validation.blind import Answer, Diagnose, Task, answer_case, diagnose_case, failed, read_answers, write_answers
 from srfcli.validation.cases import SEAL, Truths, check_cases, check_kinds, make_bank, unseal
 
 SCHEMA = "srf.trial/1"
