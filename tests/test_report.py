@@ -232,15 +232,18 @@ SENTENCES: dict[str, list[str]] = {  # in their order: what is wrong, what to do
 }
 
 
+def texts_of(name: str) -> dict[str, dict[str, str]]:
+    effect = bundled_registry().get("effect", name)
+    assert isinstance(effect, Effect)
+    return {name: {"wrong": effect.wrong, "remedy": effect.remedy}}
+
+
 def test_a_wrong_stiffness_is_told_with_what_was_stated_and_what_to_set(tmp_path: Path) -> None:
     answer, material = made_answer("identified"), made_material("identified")
     answer["effects"] = ["stiffness-error"]
     wanted = {"name": "K", "unit": "1/um", "baseline": None, "augmented": 0.006531, "augmented_stderr": 5e-5}
     material["parameters"] = [*material["parameters"], wanted]
-    effect = bundled_registry().get("effect", "stiffness-error")
-    assert isinstance(effect, Effect)
-    texts = {"stiffness-error": {"wrong": effect.wrong, "remedy": effect.remedy}}
-    material |= {"stated": {"stiffness": "0.0050 1/µm"}, "own": {"stiffness-error": ["K"]}, "texts": texts}
+    material |= {"stated": {"stiffness": "0.0050 1/µm"}, "own": {"stiffness-error": ["K"]}, "texts": texts_of("stiffness-error")}
     text = report_text.verdict_sentence(answer, material)
     assert text == "Stated stiffness 0.0050 1/µm; the recordings want 0.00653(5)\u00a01/µm."
     assert report_text.remedy(answer, material).startswith('Set stiffness = "0.006531\u00a01/µm" in [apparatus], and calibrate')
@@ -266,7 +269,7 @@ def test_errors_in_brackets(value: float | None, error: float, text: str) -> Non
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_every_verdict_opens_the_page_in_plain_words(verdict: str, tmp_path: Path) -> None:
     material = made_material(verdict)
-    material["about"] = {"linker-dieterich": "Contacts lose age when the load rises"}
+    material |= {"about": {"linker-dieterich": "Contacts lose age when the load rises"}, "texts": texts_of("linker-dieterich")}
     write_report(tmp_path, made_answer(verdict), material)
     page = read(tmp_path)
     first = page.text.partition("PMMA <on> PMMA: " + verdict)[2]
