@@ -1343,13 +1343,13 @@ def _with_colour(
     the physics lack leaves a few.
     """
     while len(known := best.likelihood.processes) < GAUGE_PROCESSES and correlated(best.maximum.point) > DEVIATION:
-        if cautious and known and not steadily_coloured(best):
+        if cautious and known and not steadily_coloured(best, cautious):
             break
         found = best
         for kind in PROCESSES:
             wider = _coloured(best, likelihood(best.smooth, (*known, kind)), progress)
             found = max(found, wider, key=lambda f: f.criterion)
-            if not steadily_coloured(wider):
+            if not steadily_coloured(wider, cautious):
                 break
         if found is best:
             break
@@ -1406,16 +1406,36 @@ def _faded(white: Array, carry: float) -> Array:
     return np.asarray(dtbtrs(band, before[:, None], uplo="L")[0][:, 0])
 
 
-def steadily_coloured(found: StateSpaceFit) -> bool:
+def steadily_coloured(found: StateSpaceFit, cautious: bool = False) -> bool:
     """Return whether the innovations are correlated all along, as a gauge's noise is, and not in a few stretches.
 
-    Most stretches are, or most have the same line in their spectra.
+    Most stretches are, or most have the same line in their spectra. If `cautious`, the recordings must show that line without a
+    model, where they are calm: what a model lacks may leave one at the frequency of a modulation, or of stick-slip.
     """
     point = found.maximum.point
     if correlated(point) < DEVIATION:
         return False
     judged = [portmanteau(piece) > SYSTEMATIC for f in point.runs for white in f.parts for piece in cut(white)]
-    return 2 * sum(judged) > len(judged) or any(line(spectra) > DEVIATION for spectra in _spectra(found).values())
+    if 2 * sum(judged) > len(judged):
+        return True
+    lines = [(kind, spectra) for kind, spectra in _spectra(found).items() if line(spectra) > DEVIATION]
+    return any(not cautious or _shown(found, kind, spectra) for kind, spectra in lines)
+
+
+def _shown(found: StateSpaceFit, kind: Kind, spectra: Array) -> bool:
+    """Return whether most runs have an oscillation about the line in these spectra that `srf check` finds."""
+    from srfcli.data.experiment import check_run
+
+    width = 1 / (PERIODOGRAM * kind[1])
+    at = _highest(spectra) * width
+    own = [f.run for f in found.maximum.point.runs if kind in found.likelihood.kinds_of(f.run)]
+    seen = [[c for noise in check_run(run).noises for c in noise.colours if len(c) == 3] for run in own]
+    return 2 * sum(any(abs(c[0] - at) < max(SAME_RATE * at, width) for c in colours) for colours in seen) > len(seen)
+
+
+def _highest(spectra: Array) -> int:
+    """Return at which multiple of the lowest frequency the median of periodograms (q, m) is highest."""
+    return 1 + int(np.argmax(np.median(spectra, axis=0)))
 
 
 def _spectra(found: StateSpaceFit) -> dict[Kind, Array]:
@@ -1589,7 +1609,7 @@ def _peaks(fitted: StateSpaceFit, kinds: Sequence[Kind]) -> list[list[float]]:
     spectra = _spectra(fitted)
     for of in kinds:
         own = spectra[of]
-        peak = (1 + int(np.argmax(np.median(own, axis=0)))) / (PERIODOGRAM * of[1]) if own.size else 0.05 / of[1]
+        peak = _highest(own) / (PERIODOGRAM * of[1]) if own.size else 0.05 / of[1]
         found.append([peak, 0.03 / of[1], 0.15 / of[1]])
     return found
 
