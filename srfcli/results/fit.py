@@ -367,13 +367,15 @@ def unit_of(problem: Problem, name: str) -> str:
 
 
 def flag(fit: Fit, k: int) -> str:
-    """Return what stands against an estimate: at a bound, not determined, or tied to another parameter."""
+    """Return what stands against an estimate: at a bound, sought no further, not determined, or tied to another parameter."""
     import numpy as np
 
     name = fit.names[k]
     width = fit.upper[k] - fit.lower[k]
     if min(fit.values[name] - fit.lower[k], fit.upper[k] - fit.values[name]) < CLOSE * width:
         return "at its lower bound" if fit.values[name] - fit.lower[k] < CLOSE * width else "at its upper bound"
+    if fit.status is Status.INTERRUPTED:
+        return "not at the maximum: the fit was interrupted"
     if fit.stderr[name] > WIDE * width / 4:
         return "not identifiable: its error is as wide as its bounds"
     tied = np.abs(fit.correlation[k]).copy()
