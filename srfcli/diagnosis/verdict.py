@@ -325,11 +325,10 @@ def _confidence(ranked: Sequence[Fitted], joint: Mapping[str, float], verdict: s
 def parameters_of(fitted: Fitted) -> dict[str, dict[str, Any]]:
     """Return the free parameters in their declared units with standard errors; a stiffness also as a ratio to the stated one."""
     problem, values, k = fitted.fit.likelihood.problem, fitted.fit.values, len(fitted.fit.likelihood.problem.names)
-    units = {q.name: q.unit for q in problem.experiment.parameters}
     errors = np.sqrt(np.maximum(np.diag(fitted.fit.covariance)[:k], 0.0))
     found: dict[str, dict[str, Any]] = {}
     for name, error in zip(problem.names, errors.tolist(), strict=True):
-        unit = units.get(name, units.get(name.partition("[")[0], "1"))
+        unit = problem.unit_of(name)
         found[name] = {"value": from_base(values[name], unit), "stderr": from_base(error, unit), "unit": unit}
     if "K" in found:
         stated = from_base(problem.experiment.stiffness, found["K"]["unit"])

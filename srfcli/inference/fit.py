@@ -11,7 +11,7 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
 from srfcli.data.groups import NOISE, labels
-from srfcli.data.values import CriticalLoads, Experiment, Run
+from srfcli.data.values import OBSERVABLES, CriticalLoads, Experiment, Run
 from srfcli.inference.critical_loads import Matched, chance_of
 from srfcli.inference.noise import Noise
 from srfcli.inference.prediction import Prediction, own_names, own_start, run_parameters
@@ -134,6 +134,16 @@ class Problem:
     priors: tuple[tuple[tuple[str, ...], float], ...] = ()  # names, and the scatter of their values about an unknown mean
     tables: tuple[CriticalLoads, ...] = ()
     stability: GeneratedModel | None = None
+
+    def unit_of(self, name: str) -> str:
+        """Return the unit that a parameter is declared in; K that of the stated stiffness, what belongs to a run 1, um or s."""
+        listed = {q.name: q.unit for q in self.experiment.parameters}
+        run = next((r for r in self.experiment.runs if name.startswith(f"{r.name}.")), None)
+        if run is not None and name not in listed:
+            along = {"slip": "um", "time": "s"}.get(self.trend or "", "")
+            unit = OBSERVABLES[run.observable]
+            return {f"{run.name}.slip": "um", f"{run.name}.trend": f"{unit}/{along}"}.get(name, "1")
+        return listed.get(name, listed.get(name.partition("[")[0], "1"))
 
     @property
     def groups(self) -> dict[str, tuple[str, ...]]:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
-from srfcli.data.values import OBSERVABLES
 from srfcli.results.tables import STATUS, Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
     from srfcli.data.thresholds import Thresholds
     from srfcli.data.values import Experiment
-    from srfcli.inference.fit import Fit, Problem, RunFit
+    from srfcli.inference.fit import Fit, RunFit
     from srfcli.inference.posterior import Interval, Posterior
     from srfcli.inference.recordings import RecordingFit
     from srfcli.inference.thresholds import Match, MethodFit, ThresholdFit
@@ -138,7 +137,7 @@ class FitResult(Result):
 
     def _shown(self, name: str, *values: float | None) -> tuple[str, list[Any]]:
         """Return the unit in which a parameter is shown, and its values (um, s, N) in that unit."""
-        declared = unit_of(self.found.problem, name)
+        declared = self.found.problem.unit_of(name)
         unit, factor = self.experiment.shown(declared)
         return unit, [None if x is None else from_base(x, declared) * factor for x in values]
 
@@ -353,17 +352,6 @@ def _posterior_notes(posterior: Posterior) -> list[str]:
             f"posterior: intervals should rest on {ENOUGH:.0f} independent draws with R-hat up to {MIXED}: --sample {more}"
         )
     return notes
-
-
-def unit_of(problem: Problem, name: str) -> str:
-    """Return the unit that a parameter is declared in; K that of the stated stiffness, what belongs to a run 1, um or s."""
-    listed = {q.name: q.unit for q in problem.experiment.parameters}
-    run = next((r for r in problem.experiment.runs if name.startswith(f"{r.name}.")), None)
-    if run is not None and name not in listed:
-        along = {"slip": "um", "time": "s"}.get(problem.trend or "", "")
-        unit = OBSERVABLES[run.observable]
-        return {f"{run.name}.slip": "um", f"{run.name}.trend": f"{unit}/{along}"}.get(name, "1")
-    return listed.get(name, listed.get(name.partition("[")[0], "1"))
 
 
 def flag(fit: Fit, k: int) -> str:

@@ -18,7 +18,7 @@ from srfcli.core.units import from_base
 from srfcli.data.values import Run
 from srfcli.inference.noise import lag_one
 from srfcli.laws.registry import load_registry
-from srfcli.results.fit import PAIRS, CampaignResult, FitResult, unit_of
+from srfcli.results.fit import PAIRS, CampaignResult, FitResult
 from srfcli.tasks.recordings import fit, read_experiment
 
 TAIL = 1 / 3  # of a segment, at its end, that is checked for steady sliding
@@ -138,7 +138,7 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     def shared(a: str, b: str) -> float | None:
         if not {a, b} <= place.keys():
             return None
-        scale = from_base(1.0, unit_of(problem, a)) * from_base(1.0, unit_of(problem, b))
+        scale = from_base(1.0, problem.unit_of(a)) * from_base(1.0, problem.unit_of(b))
         return _number(float(covariance[place[a], place[b]]) * scale)
 
     row: dict[str, Any] = {
