@@ -159,7 +159,8 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         done = "taken out as a transducer's" if correct else 'left as it is; corrections = ["reset"] takes it out'
         what = f"the displacement jumps by {size:.4g} um after t = {t[known][at]:.7g} s: {done}"
         notices.append(Notice("reset", where, what))
-    slopes = np.diff(line.heights) / np.diff(line.knots)
+    way = np.diff(line.heights)
+    slopes = way / np.diff(line.knots)
     drive = Drive.steps(list(zip([float(t[0]), *line.knots[1:-1].tolist()], slopes.tolist(), strict=True)))
     pieces = "straight piece" if slopes.size == 1 else "straight pieces"
     told = ", ".join(f"{v:.5g}" for v in slopes[:12]) + (", ..." if slopes.size > 12 else "")
@@ -167,12 +168,10 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         f"a continuous line of {slopes.size} {pieces}, {told} um/s, fitted through the displacements, "
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
-    most_back = int(np.argmin(np.diff(line.heights)))
-    if -np.diff(line.heights)[most_back] > line.misfit:
-        what += (
-            f"; it goes back by {-np.diff(line.heights)[most_back]:.3g} um at t = {line.knots[most_back]:.7g} s: state the run's "
-            "drive if the stage did not"
-        )
+    back = int(np.argmin(way))
+    if -way[back] > line.misfit:
+        told = f"{-way[back]:.3g} um at t = {line.knots[back]:.7g} s"
+        what += f"; it goes back by {told}: state the run's drive if the stage did not"
     return drive, [*notices, Notice("drive-fitted", where, what)]
 
 

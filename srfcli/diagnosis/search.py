@@ -478,7 +478,7 @@ class ModelSearch:
             found = maximise(likelihood, x, steps=4, close=1.0, progress=self.progress)
             values = found.point.values
             self.count += 1
-            gain = _promise(found) - node.fit.log_likelihood
+            gain = found.promised - node.fit.log_likelihood
             if not gain > (WORTH if node.passes else 0.0):
                 return
             expected = gain + node.attainable + self._one_more
@@ -578,14 +578,14 @@ class ModelSearch:
                 start = self._at_the_file(likelihood, hypothesis, best.fit.values)
                 places.append(maximise(likelihood, start, steps=STRIDES, close=1.0, progress=self.progress))
             self._tried[name] = x
-            found = max(places, key=_promise, default=None)
-            if found is not None and _promise(found) > least:
-                reached.append((_promise(found), hypothesis, likelihood, found))
+            found = max(places, key=lambda m: m.promised, default=None)
+            if found is not None and found.promised > least:
+                reached.append((found.promised, hypothesis, likelihood, found))
         reached.sort(key=lambda r: -r[0])
         for number, (promise, hypothesis, likelihood, found) in enumerate(reached):
             if number == 0 and found.away > NEAR:
                 found = maximise(likelihood, found.point.x, steps=STRIDES, close=1.0, widths=(), progress=self.progress)
-                promise = _promise(found)
+                promise = found.promised
             self.count += 1
             expected = promise - node.fit.log_likelihood + node.attainable
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
@@ -702,11 +702,6 @@ class ModelSearch:
     def best(self) -> Fitted:
         """Return the model with the best evidence."""
         return self.ranked()[0]
-
-
-def _promise(found: Maximum) -> float:
-    """Return the log likelihood that the maximum is expected to have from where a few steps have led."""
-    return found.point.log_likelihood + (0.5 * found.away**2 if np.isfinite(found.away) else 0.0)
 
 
 def _colours(values: Mapping[str, float]) -> list[str]:

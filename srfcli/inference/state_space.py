@@ -696,6 +696,11 @@ class Maximum:
     covariance: Array = field(repr=False)
     spread: Array | float = field(default=0.0, repr=False)
 
+    @property
+    def promised(self) -> float:
+        """Return the log likelihood expected at the maximum; that of the point where scoring had yet to weigh all alike."""
+        return self.point.log_likelihood + (0.5 * self.away**2 if np.isfinite(self.away) else 0.0)
+
 
 def maximise(
     likelihood: Likelihood,
@@ -1418,45 +1423,38 @@ def steadily_coloured(found: StateSpaceFit, cautious: bool = False) -> bool:
     judged = [portmanteau(piece) > SYSTEMATIC for f in point.runs for white in f.parts for piece in cut(white)]
     if 2 * sum(judged) > len(judged):
         return True
-    lines = [(kind, spectra) for kind, spectra in _spectra(found).items() if line(spectra) > DEVIATION]
-    return any(not cautious or _shown(found, kind, spectra) for kind, spectra in lines)
+    lines = [(kind, at) for kind, (height, at) in _lines(found).items() if height > DEVIATION]
+    return any(not cautious or _shown(found, kind, at) for kind, at in lines)
 
 
-def _shown(found: StateSpaceFit, kind: Kind, spectra: Array) -> bool:
-    """Return whether most runs have an oscillation about the line in these spectra that `srf check` finds."""
-    from srfcli.data.experiment import check_run
+def _lines(found: StateSpaceFit) -> dict[Kind, tuple[float, float]]:
+    """Return, for each kind of gauge noise, how high the spectrum of the innovations is at most, and at which frequency.
 
-    width = 1 / (PERIODOGRAM * kind[1])
-    at = _highest(spectra) * width
-    own = [f.run for f in found.maximum.point.runs if kind in found.likelihood.kinds_of(f.run)]
-    seen = [[c for noise in check_run(run).noises for c in noise.colours if len(c) == 3] for run in own]
-    return 2 * sum(any(abs(c[0] - at) < max(SAME_RATE * at, width) for c in colours) for colours in seen) > len(seen)
-
-
-def _highest(spectra: Array) -> int:
-    """Return at which multiple of the lowest frequency the median of periodograms (q, m) is highest."""
-    return 1 + int(np.argmax(np.median(spectra, axis=0)))
-
-
-def _spectra(found: StateSpaceFit) -> dict[Kind, Array]:
-    """Return periodograms (q, PERIODOGRAM / 2) of stretches of innovations at each kind of gauge noise, without the mean."""
+    The height is that of the median of periodograms of stretches above that of white noise, in standard deviations; the frequency
+    is in Hz. A line of the gauge is at one frequency in most stretches; a drive's or a track's changes with the velocity.
+    """
     pieces: dict[Kind, list[Array]] = {}
     for white, _, kind in found.likelihood.pieces(found.maximum.point):
         count = white.size // PERIODOGRAM
         pieces.setdefault(kind, []).append(np.clip(white[: count * PERIODOGRAM], -5.0, 5.0).reshape(count, PERIODOGRAM))
-    every = {kind: np.concatenate(parts) for kind, parts in pieces.items()}
-    return {kind: np.abs(np.fft.rfft(parts, axis=1)[:, 1:]) ** 2 for kind, parts in every.items()}
+    lines = {}
+    for kind, parts in pieces.items():
+        power = np.abs(np.fft.rfft(np.concatenate(parts), axis=1)[:, 1:]) ** 2
+        if power.size:
+            middle = np.median(power, axis=0)
+            height = (float(np.max(middle) / np.mean(power)) - np.log(2)) * np.sqrt(len(power))
+            lines[kind] = float(height), (1 + int(np.argmax(middle))) / (PERIODOGRAM * kind[1])
+    return lines
 
 
-def line(spectra: Array) -> float:
-    """Return how far the median of periodograms (q, m) is above that of white noise at its highest, in standard deviations.
+def _shown(found: StateSpaceFit, kind: Kind, frequency: float) -> bool:
+    """Return whether most runs with this kind of gauge noise have an oscillation about a frequency that `srf check` finds."""
+    from srfcli.data.experiment import check_run
 
-    A line of the gauge is at one frequency in most stretches; a drive's or a track's changes with the velocity.
-    """
-    if not spectra.size:
-        return 0.0
-    highest = float(np.max(np.median(spectra, axis=0)) / np.mean(spectra))
-    return float((highest - np.log(2)) * np.sqrt(len(spectra)))
+    within = max(SAME_RATE * frequency, 1 / (PERIODOGRAM * kind[1]))
+    own = [f.run for f in found.maximum.point.runs if kind in found.likelihood.kinds_of(f.run)]
+    seen = [[c for noise in check_run(run).noises for c in noise.colours if len(c) == 3] for run in own]
+    return 2 * sum(any(abs(c[0] - frequency) < within for c in colours) for colours in seen) > len(seen)
 
 
 def portmanteau(white: Array) -> float:
@@ -1549,8 +1547,7 @@ def _small_field(rough: Likelihood, bare: Point) -> Point | None:
     x, least = _under_field(rough, x, share * FAINT, short), bare.log_likelihood + NEEDED
     for _ in range(FIELD_STEPS // 2):
         found = maximise(rough, x, steps=2, widths=())
-        promised = found.point.log_likelihood + 0.5 * found.away**2
-        if promised < least or found.away < CONVERGED or np.array_equal(found.point.x, x):
+        if found.promised < least or found.away < CONVERGED or np.array_equal(found.point.x, x):
             break
         x = found.point.x
     return found.point if found.point.log_likelihood > least else None
@@ -1605,13 +1602,8 @@ def _coloured(fitted: StateSpaceFit, wider: Likelihood, progress: Callable[[str]
 
 def _peaks(fitted: StateSpaceFit, kinds: Sequence[Kind]) -> list[list[float]]:
     """Return, for each kind, frequencies (Hz) at which an oscillation may be: where innovations are strongest, and two others."""
-    found = []
-    spectra = _spectra(fitted)
-    for of in kinds:
-        own = spectra[of]
-        peak = _highest(own) / (PERIODOGRAM * of[1]) if own.size else 0.05 / of[1]
-        found.append([peak, 0.03 / of[1], 0.15 / of[1]])
-    return found
+    lines = _lines(fitted)
+    return [[lines[of][1] if of in lines else 0.05 / of[1], 0.03 / of[1], 0.15 / of[1]] for of in kinds]
 
 
 def _slow_fields(wider: Likelihood, x: Array) -> Iterator[Array]:

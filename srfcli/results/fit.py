@@ -92,7 +92,6 @@ ADVICE = {
     Status.INTERRUPTED: "the likeliest parameters so far are above.",
 }
 CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
-BROAD = 3e-3  # of the friction: a random friction field ten times that of a polished track
 FAILED = 3  # tests that a fit fails, of which its notes tell, the worst first
 
 
@@ -253,11 +252,12 @@ class FitResult(Result):
         notes += [] if self.posterior is None else _posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
         if found.track is not None:
+            from srfcli.diagnosis.goodness_of_fit import PLAUSIBLE
             from srfcli.inference.state_space import typical_friction
 
             notes.append(str(found.track))
             share = found.track.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
-            if share > BROAD:
+            if share > PLAUSIBLE:
                 notes.append(
                     f"that field is {100 * share:.1g} % of the friction, more than a track has: it may stand in for physics that "
                     "the model lacks. Try another ageing law or friction law, or `srf diagnose`."
