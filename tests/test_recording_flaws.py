@@ -270,6 +270,21 @@ def test_a_spike_beside_a_slip_is_found_and_the_slip_is_none(place: int) -> None
     assert np.flatnonzero(spikes(x)).tolist() == [place]
 
 
+@pytest.mark.parametrize("place", [0, 1, 4, 395, 398, 399])
+def test_a_spike_among_the_first_or_last_samples_is_found(place: int) -> None:
+    noise = 1e-3 * np.random.default_rng(6).standard_normal(400)
+    for smooth in (
+        0.002 * np.arange(400),
+        np.exp(-np.arange(400) / 3),
+        np.exp(-np.arange(400)[::-1] / 3),
+        np.cos(0.2 * np.arange(400)),
+    ):
+        x = smooth + noise
+        assert not spikes(x).any()
+        x[place] -= 3.0
+        assert np.flatnonzero(spikes(x)).tolist() == [place]
+
+
 def test_a_sudden_spike_is_found_where_samples_are_few() -> None:
     """From one sample to the next the drive may raise friction by a twentieth of the spike; five samples away by more than it."""
     x = 0.6 + 1e-4 * np.random.default_rng(3).standard_normal(400)

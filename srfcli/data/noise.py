@@ -62,6 +62,7 @@ BESIDE = 5  # samples before and after that tell the level
 FACTOR = 8.0  # robust standard deviations
 SUDDEN = 4.0  # times as far off as noise is: from there on one step that outruns the drive makes a spike
 CREST = 0.5  # share of a spike's size by which it is off a cubic through its neighbours, at least
+ALONE = 4.0  # steps by which a spike among the first or last samples is off its neighbours: of those there, the third largest
 NEARBY = 101  # samples that share a level of noise
 FEW = 0.02  # share of samples off their running median, below which the channel counts as constant and without noise
 SATURATED = 10  # samples in a row at the extreme value
@@ -119,11 +120,14 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
     """
     from scipy.ndimage import median_filter
 
-    found = np.zeros(x.size, bool)
     if x.size < 4 * BESIDE:
-        return found
-    m = median_filter(x, size=BESIDE, mode="nearest")
-    scale = local_scale(x, m)
+        return np.zeros(x.size, bool)
+    scale = np.pad(local_scale(x, median_filter(x, size=BESIDE, mode="nearest")), BESIDE, mode="edge")
+    rise = None if rise is None else np.pad(rise, BESIDE, mode="edge")
+    x = np.concatenate([_before(x[: 2 * BESIDE]), x, _before(x[: -2 * BESIDE - 1 : -1])[::-1]])
+    found, m = np.zeros(x.size, bool), median_filter(x, size=BESIDE, mode="nearest")
+    steps = [np.sort(np.abs(np.diff(part)))[-3] for part in (x[BESIDE : 3 * BESIDE], x[-3 * BESIDE : -BESIDE])]
+    ends = [ALONE * step for step in steps]  # the end of a wave or of a decay is no spike
     for width in range(1, WIDEST_SPIKE + 1):
         first = np.arange(BESIDE, x.size - BESIDE - width + 1)
         before, after = m[first - 3], m[first + width + 2]
@@ -144,9 +148,19 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
             near = np.maximum(group[0] - np.maximum(last, following), np.minimum(last, following) - group[0])
             alone = near > np.maximum(threshold, 4 * np.abs(following - last))
             hit |= (size > threshold) & (apart > threshold) & alone & (off > CREST * near)
+        sign = np.where(above > below, 1.0, -1.0)
+        beside = [sign * (x[first + k] - x[first + j]) for k, j in ((0, -1), (width - 1, width))]
+        hit &= np.min(beside, axis=0) > np.select([first < 2 * BESIDE, first + width > x.size - 2 * BESIDE], ends)
         for k in range(width):
             found[first[hit] + k] = True
-    return found
+    return found[BESIDE:-BESIDE]
+
+
+def _before(x: Array) -> Array:
+    """Return BESIDE samples before the first ones x (n,), on the straight line that most of these follow."""
+    at = np.arange(-BESIDE, x.size)
+    slope = np.median(np.diff(x))
+    return np.asarray(np.median(x - slope * at[BESIDE:]) + slope * at[:BESIDE])
 
 
 def _off_neighbours(x: Array, first: NDArray[np.intp], width: int) -> Array:

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from itertools import product
 
 import numpy as np
-from scipy.special import erfcx
 
 from srfcli.codegen.model import Array
 from srfcli.inference.critical_loads import IMPROBABLE, chance_of
@@ -27,6 +26,7 @@ from srfcli.inference.state_space import (
     StateSpaceFit,
     correlated,
     cut,
+    one_sided,
     typical_friction,
 )
 
@@ -57,12 +57,9 @@ def log_evidence(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] 
 def mass_at_bounds(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None = None) -> float:
     """Return what parameters at a bound add to the log evidence: each a one-sided integral, along which the others follow it."""
     likelihood, maximum, total = found.likelihood, found.maximum, 0.0
-    x, score, I = maximum.point.x, maximum.point.score, maximum.point.information
-    free, prior = np.diag(maximum.covariance) > 0, _log_prior(found, sizes)
+    x, free, prior = maximum.point.x, np.diag(maximum.covariance) > 0, _log_prior(found, sizes)
     for j in np.flatnonzero(~free & ((x <= likelihood.lower) | (x >= likelihood.upper))):
-        bent = float(I[j, j] - I[j, free] @ maximum.covariance[np.ix_(free, free)] @ I[free, j])
-        d = 1 / np.sqrt(max(bent, (1e-3 * score[j]) ** 2, 1e-300))
-        total += min(float(np.log(np.sqrt(np.pi / 2) * d * erfcx(abs(score[j]) * d / np.sqrt(2))) + prior[j]), 0.0)
+        total += min(one_sided(maximum.point, maximum.covariance, int(j)) + float(prior[j]), 0.0)
     return total
 
 

@@ -222,7 +222,8 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
         first, last, seen = (f.fit.likelihood.held_out(run, f.fit.values) for f in models)
         before, after, loud = baseline.fit.predictive(run), best.fit.predictive(run), ""
         if best.fit.likelihood.noisy_alone(run):
-            loud = next((text for size, text in loudness(*after.alone) if size > 1.0), "")
+            own = replace(after.point, runs=after.point.runs[-1:])
+            loud = next((text for size, text in loudness(after.both, own) if size > 1.0), "")
         found.append(Held(first, last, seen, (before, after), loud))
     return tuple(found)
 

@@ -21,7 +21,9 @@ from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
+from scipy.special import erfcx
 
 from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
@@ -30,7 +32,7 @@ from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, 
 from srfcli.data.noise import calm_level
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
-from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, inverse, root
+from srfcli.inference.fit import Fit, Interrupted, Problem, RunFit, inverse
 from srfcli.inference.kalman import GAUGE, SPRING, Dual, Innovations, Kept, Signals, Smoothed, kalman_filter, smooth
 from srfcli.inference.noise import Noise, difference_level, stretches
 from srfcli.inference.prediction import (
@@ -81,6 +83,7 @@ FLAT = 1e-8  # of the scaled information: a direction that is flatter has a scor
 FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
 BEND_AT, STRAIGHT, TURN = 0.1, 0.1, 0.75  # of a step: where its bend is taken; bends that are none; the largest that is followed
 CONVERGED = 0.1  # standard errors: how far the maximum may still be, by the gradient
+TOLD = 2.0  # standard errors from the maximum to which a fit is moved for a run that it did not know: 2 in log likelihood
 CLOSER = 0.1 * CONVERGED  # standard errors from the maximum where an interval's end is to be told
 SYSTEMATIC = 2.5  # standard deviations of the portmanteau statistic of a stretch of innovations below which they are noise there
 LAGS = 5  # of that statistic
@@ -786,10 +789,37 @@ def maximise(
                 break
             slow, damping = 2, 1e-3
     away = np.inf if left[0] else away
-    at_bound = ((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0))
-    covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound)[0]
+    covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound(likelihood, point))[0]
     covariance[np.ix_(inner, inner)] = inverse(point.information[np.ix_(inner, inner)])
     return Maximum(point, away, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE, covariance)
+
+
+def at_bound(likelihood: Likelihood, point: Point) -> NDArray[np.bool_]:
+    """Return which coordinates (k,) stand at a bound beyond which the likelihood rises."""
+    return np.asarray(((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0)))
+
+
+def one_sided(point: Point, covariance: Array, j: int) -> float:
+    """Return the log of the integral of the likelihood over its maximum along coordinate j from its bound, the others following.
+
+    `covariance` (k, k) is that of the others, zero for those that stay.
+    """
+    I = point.information
+    bent, slope = float(I[j, j] - I[j] @ covariance @ I[j]), abs(float(point.score[j]))
+    d = 1 / np.sqrt(max(bent, (1e-3 * slope) ** 2, 1e-300))
+    return float(np.log(np.sqrt(np.pi / 2) * d * erfcx(slope * d / np.sqrt(2))))
+
+
+def log_volume(likelihood: Likelihood, point: Point) -> float:
+    """Return the log of the integral of the likelihood over its maximum, by Laplace's method; priors are flat within bounds."""
+    widths = likelihood.upper - likelihood.lower
+    wide = replace(point, information=point.information + np.diag(1 / widths**2))  # what nothing determines is within its bounds
+    stays, covariance = at_bound(likelihood, point), np.zeros_like(point.information)
+    inner = np.nonzero(~stays)[0]
+    covariance[np.ix_(inner, inner)] = inverse(wide.information[np.ix_(inner, inner)])
+    _, logdet = np.linalg.slogdet(2 * np.pi * covariance[np.ix_(inner, inner)])
+    one_by_one = sum(one_sided(wide, covariance, int(j)) for j in np.nonzero(stays)[0])
+    return 0.5 * float(logdet) + one_by_one - float(np.sum(np.log(widths)))
 
 
 def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Point:
@@ -906,14 +936,16 @@ def _curvature_beyond(last: Point, point: Point) -> Array:
 
 @dataclass(frozen=True)
 class Predictive:
-    """Log marginal likelihood of a run under a fit to others, and the rms of its innovations with what parameters may move.
+    """Log marginal likelihood of a run under a fit to others, and the rms of its innovations with the parameters moved for it.
 
-    `alone` is the likelihood by what belongs to the run alone, at the fit's values of the rest, and its maximum.
+    What the others lose in likelihood when the parameters move is counted in `rms`. `point` is the maximum of the likelihood of
+    `both`, the others and the run, which is the last.
     """
 
     log_likelihood: float
     rms: float
-    alone: tuple[Likelihood, Point] = field(repr=False, compare=False)
+    both: Likelihood = field(repr=False, compare=False)
+    point: Point = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -949,7 +981,7 @@ class StateSpaceFit:
     def predictive(self, run: Run) -> Predictive:
         """Return how well a run that was not fitted is predicted, with the parameters as uncertain as they are.
 
-        Laplace's method: the fit is the prior of the parameters that the run shares with others. Each run is predicted once.
+        By Laplace's method: p(new | old) = p(new, old) / p(old), of a fit to both and of this one. Each run is predicted once.
         """
         known = self._told.get(run.name)
         if known is None or known[0] is not run:
@@ -958,50 +990,27 @@ class StateSpaceFit:
 
     def _predictive(self, run: Run) -> Predictive:
         own, (alone, point) = self.likelihood, self.likelihood.alone(run, self.values)
-        by_itself = (alone, point)
-        problem, like = alone.problem, dict(zip(own.names, range(len(own.names)), strict=True))
-        if own.noisy_alone(run):
-            like = {n: place for n, place in like.items() if n not in alone.names or n in FIELD}
-        else:
-            for mine, theirs in zip(alone.gauges(problem.runs[0]), own.gauges(run), strict=True):
-                like |= {name: like[theirs[n]] for n, name in mine.items()}
-        groups = {name for names in problem.varying.values() for name in names.values()} - set(problem.varied(run).values())
-        shared = [i for i, n in enumerate(own.problem.names) if "." not in n and n not in groups and n not in problem.names]
-        both = replace(
-            problem,
-            names=(*problem.names, *(own.problem.names[i] for i in shared)),
-            start=np.append(problem.start, own.problem.start[shared]),
-            lower=np.append(problem.lower, own.problem.lower[shared]),
-            upper=np.append(problem.upper, own.problem.upper[shared]),
-        )
-        wide = own.beside(both)
-        point = wide.at(wide.coordinates(point.values))
-        if not np.isfinite(point.log_likelihood):
-            return Predictive(-np.inf, np.inf, by_itself)
-        covariance = np.diag((wide.upper - wide.lower) ** 2)  # of what belongs to the run alone
-        known = [i for i, n in enumerate(wide.names) if n in like]
-        there = [like[wide.names[i]] for i in known]
-        covariance[np.ix_(known, known)] = (self.maximum.covariance + self.maximum.spread)[np.ix_(there, there)]
-        free = np.nonzero(np.diag(covariance) > 0)[0]
-        away = root(covariance[np.ix_(free, free)])
-        z, best, damping = np.zeros(free.size), point, 0.0  # z are the coordinates by the prior's standard errors
-        for _ in range(STEPS // 2):
-            bent = np.eye(z.size) + away.T @ best.information[np.ix_(free, free)] @ away
-            steep = away.T @ best.score[free] - z
-            step = np.linalg.solve(bent + damping * np.diag(np.diag(bent)), steep)
-            x = point.x.copy()
-            x[free] += away @ (z + step)
-            moved = wide.at(np.clip(x, wide.lower, wide.upper), like=point)
-            better = moved.log_likelihood - 0.5 * float((z + step) @ (z + step)) > best.log_likelihood - 0.5 * float(z @ z)
-            if better:
-                z, best = z + step, moved
-            damping = 0.1 * damping if better else max(10 * damping, 0.01)
-            if step @ steep < CONVERGED**2:
-                break
-        bent = np.eye(z.size) + away.T @ best.information[np.ix_(free, free)] @ away
-        white, cost = best.runs[0].white, float(z @ z)
-        evidence = best.log_likelihood - 0.5 * (cost + float(np.linalg.slogdet(bent)[1]))
-        return Predictive(evidence, float(np.sqrt((white @ white + cost) / white.size)), by_itself)
+        before, after = own.problem, alone.problem
+        both = own.beside(
+            replace(
+                before, runs=(*before.runs, *after.runs), names=(*before.names, *after.names),
+                start=np.append(before.start, after.start), lower=np.append(before.lower, after.lower),
+                upper=np.append(before.upper, after.upper),
+            )
+        )  # fmt: skip
+        start = point.values | {n: self.values[n] for n in own.names}
+        for each in both.problem.runs:
+            for here, there in zip(both.gauges(each), own.gauges(each), strict=True):
+                start |= {name: self.values[there[n]] for n, name in here.items()}
+        maximum = maximise(both, both.coordinates(start), close=TOLD)
+        found = maximum.point
+        if not np.isfinite(found.log_likelihood):
+            return Predictive(-np.inf, np.inf, both, found)
+        *_, last = found.runs
+        lost = max(self.log_likelihood - (found.log_likelihood - last.log_likelihood), 0.0)  # of what was fitted
+        more = maximum.promised - found.log_likelihood + log_volume(both, found) - log_volume(own, self.maximum.point)
+        rms = float(np.sqrt((last.white @ last.white + 2 * lost) / last.white.size))
+        return Predictive(last.log_likelihood - lost + more, rms, both, found)
 
     @property
     def criterion(self) -> float:
