@@ -51,6 +51,7 @@ CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes fact
 LARGEST = 2  # effects of a model
 ALIKE = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
 SINGLES, PAIRS = 5, 3  # promises of each model that are followed
+UNDERSTATED = 2.0  # times the gain at first order that an effect may bring beside a model that is far off
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 COARSE = 1e-3  # tolerance of the integration: 0.02 in log likelihood
 BUDGET = 150.0  # s of CPU, or more
@@ -199,7 +200,7 @@ class ModelSearch:
                 values = self._sized(move, share, shifts)
                 problem = self._problem(move.hypothesis, values)
                 values = _followable(values, problem)
-                likelihood = Likelihood(problem, processes=_colours(move.values), rtol=COARSE)
+                likelihood = Likelihood(problem, processes=_colours(move.values) or (), rtol=COARSE)
                 found = likelihood.at(likelihood.coordinates(values), slopes=False).log_likelihood
                 if found > best[0]:
                     best = found, values
@@ -282,6 +283,9 @@ class ModelSearch:
             for again in (self._try_ageing_laws, self._refit_noise):
                 again(self.baseline)
                 self._search()
+        if not self.spent:
+            self._try_rivals()
+            self._search()
         self.cut_short = self.spent and bool(self.queue)
         self._where_effects_act()
         self._refit_baseline()
@@ -382,9 +386,8 @@ class ModelSearch:
         least = WORTH if node.passes else WORTH / 2
         if node.passes and not node.hypothesis.reported and (not node.fit.smooth or node.fit.likelihood.processes):
             least = HINT
-        alone = scores.alone() if not node.passes or any(s.gain > least for s in scores.singles) else []
-        promised = [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in alone]
-        self._promise(node, node, promised, least)
+        alone = not node.passes or any(s.gain > least for s in scores.singles)
+        self._promise(node, node, self._gains(scores, alone), least)
         for effect in (e for e in joining if e.settings or e.observed):
             self._try_built_in(node, effect)
         return node
@@ -395,13 +398,20 @@ class ModelSearch:
         there = {p.name for p in node.fit.likelihood.problem.model.parameters}
         return [e for e in self.candidates if e.reported not in names and there.issuperset(e.needs)]
 
-    def _promise(self, node: Fitted, at: Fitted, promised: Sequence[tuple[float, Score]], least: float) -> None:
-        """Push the effects that promise most beside those of `node`, by their gains (m,) at first order from the fit `at`."""
+    def _promise(
+        self, node: Fitted, at: Fitted, promised: Sequence[tuple[float, Score]], least: float, *, noise: bool = True
+    ) -> None:
+        """Push the effects that promise most beside those of `node`, by their gains (m,) at first order from the fit `at`.
+
+        Unless its field and gauge `noise` are kept, they are estimated anew.
+        """
         for gain, score in sorted((p for p in promised if p[0] > least), key=lambda p: -p[0])[:SINGLES]:
             hypothesis = Hypothesis((*node.hypothesis.effects, score.effect), node.hypothesis.ageing)
             sizes = (*self._sizes(at), score.values)
             own = {n: score.shifts[n] for n in at.fit.likelihood.problem.names if score.shifts.get(n)}
-            self._push(node.attainable + gain + self._one_more, hypothesis, at, sizes, direction=score.direction, shifts=own)
+            self._push(
+                node.attainable + gain + self._one_more, hypothesis, at, sizes, direction=score.direction, shifts=own, noise=noise
+            )
 
     def _expand_without_field(self, node: Fitted) -> None:
         """Push what effects promise from a fit without field and colour, where these have taken up what the model lacks.
@@ -419,7 +429,12 @@ class ModelSearch:
             return
         self.progress(f"{node.name}: scores without field and colour")
         scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, self._joining(node))
-        self._promise(node, plain, [(s.gain, s) for s in scores.singles], WORTH)
+        self._promise(node, plain, self._gains(scores, alone=True), WORTH, noise=False)
+
+    def _gains(self, scores: Scores, alone: bool) -> list[tuple[float, Score]]:
+        """Return what each effect promises, in log likelihood; in one run `alone` less, as any of them might be that run."""
+        found = [(s.gain, s) for s in scores.singles]
+        return found + [(s.gain - self._rarer, s) for s in scores.alone()] if alone else found
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""
@@ -438,12 +453,14 @@ class ModelSearch:
         sizes: tuple[dict[str, float], ...],
         direction: Array | None = None,
         shifts: Mapping[str, float] | None = None,
+        noise: bool = True,
     ) -> None:
         self.count += 1
         fresh = len(hypothesis.effects) - len(parent.hypothesis.effects)
         least = parent.fit.log_likelihood - ASTRAY
+        values = {n: v for n, v in parent.fit.values.items() if noise or not (n in FIELD or n.startswith("gauge_"))}
         move = _Move(
-            -expected, self.count, hypothesis, dict(parent.fit.values), sizes, least, fresh, direction=direction,
+            -expected, self.count, hypothesis, values, sizes, least, fresh, direction=direction,
             shifts=shifts or {},
         )  # fmt: skip
         heapq.heappush(self.queue, move)
@@ -549,6 +566,14 @@ class ModelSearch:
         for pair in node.scores.pairs(PAIRS):
             if pair.gain > node.promised[0].gain + WORTH:
                 self._push(node.attainable + pair.gain + 2 * self._one_more, Hypothesis(pair.effects), node, pair.values)
+
+    def _try_rivals(self) -> None:
+        """Push the effects that were not fitted, where UNDERSTATED times their promise comes close to the best model."""
+        base, best = self.baseline, self.best()
+        if base.scores is None or base.passes or not best.passes:
+            return
+        rivals = [s for s in base.scores.singles if Hypothesis((s.effect,)).name not in self.fitted]
+        self._promise(base, base, [(UNDERSTATED * s.gain, s) for s in rivals], WORTH)
 
     def _try_ageing_laws(self, node: Fitted, *, afresh: bool = False) -> None:
         """Push the other ageing laws, each after a few steps from where the model or the best one stands.
@@ -704,9 +729,10 @@ class ModelSearch:
         return self.ranked()[0]
 
 
-def _colours(values: Mapping[str, float]) -> list[str]:
-    """Return the processes of coloured gauge noise of the model that was fitted with these values."""
-    return processes_in({name.partition("[")[0] for name in values})
+def _colours(values: Mapping[str, float]) -> list[str] | None:
+    """Return the processes of coloured gauge noise of the model that was fitted with these values; None if they have no noise."""
+    names = {name.partition("[")[0] for name in values}
+    return processes_in(names) if "gauge_white" in names else None
 
 
 def _followable(values: Mapping[str, float], problem: Problem) -> dict[str, float]:
