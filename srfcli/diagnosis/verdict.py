@@ -13,7 +13,7 @@ from srfcli.core.units import from_base
 from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import improbability, loudness, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, typical_sizes
-from srfcli.diagnosis.scores import Score
+from srfcli.diagnosis.scores import Remainder, Score
 from srfcli.diagnosis.search import CLOSE, NEAR, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
 from srfcli.inference.state_space import Filtered, Predictive, StateSpaceFit, maximise
@@ -164,6 +164,10 @@ def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted
     least = -np.inf if ranked[0].passes else ranked[0].evidence - CLOSE
     passed = [f for f in ranked if f.passes and f.evidence > least]
     told = {f.name: predictive(f, whole) for f in passed}
+    under = [f for f in passed if f.shared is not None]
+    if 0 < len(under) < len(passed):  # what is a function of slip tells a held-out run on the same track, as a field there would
+        gain = shared_gain(max(under, key=lambda f: f.separate), whole)
+        told |= {f.name: told[f.name] + gain for f in under}
     if not any(np.isfinite(t) for t in told.values()):  # no model follows what is held out
         told = {}
     passed.sort(key=lambda f: -f.evidence - told.get(f.name, 0.0))
@@ -183,6 +187,13 @@ def predictive(fitted: Fitted, whole: Experiment) -> float:
     own = fitted.fit.likelihood
     runs = sum(fitted.fit.predictive(run).log_likelihood for run in whole.runs if run.holdout and own.problem.runs)
     return runs + sum(own.held_out_table(t, fitted.fit.values).log_likelihood for t in whole.thresholds if t.holdout)
+
+
+def shared_gain(fitted: Fitted, whole: Experiment) -> float:
+    """Return what held-out runs gain in log likelihood under a model by a field that all runs share, at first order."""
+    runs = [run for run in whole.runs if run.holdout] if fitted.fit.likelihood.problem.runs else []
+    gains = [max(Remainder(fitted.fit.predictive(run).fit).shared.gain - CLOSE, 0.0) for run in runs]
+    return sum(max(gain - (fitted.shared or 0.0), 0.0) for gain in gains)
 
 
 def _is_that_law(fitted: Fitted, other: Fitted, evidence: Mapping[str, float]) -> bool:
@@ -222,8 +233,9 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
         first, last, seen = (f.fit.likelihood.held_out(run, f.fit.values) for f in models)
         before, after, loud = baseline.fit.predictive(run), best.fit.predictive(run), ""
         if best.fit.likelihood.noisy_alone(run):
-            own = replace(after.point, runs=after.point.runs[-1:])
-            loud = next((text for size, text in loudness(after.both, own) if size > 1.0), "")
+            point = after.fit.maximum.point
+            own = loudness(after.fit.likelihood, replace(point, runs=point.runs[-1:]))
+            loud = next((text for size, text in own if size > 1.0), "")
         found.append(Held(first, last, seen, (before, after), loud))
     return tuple(found)
 

@@ -938,14 +938,13 @@ def _curvature_beyond(last: Point, point: Point) -> Array:
 class Predictive:
     """Log marginal likelihood of a run under a fit to others, and the rms of its innovations with the parameters moved for it.
 
-    What the others lose in likelihood when the parameters move is counted in `rms`. `point` is the maximum of the likelihood of
-    `both`, the others and the run, which is the last.
+    What the others lose in likelihood when the parameters move is counted in `rms`. `fit` is that to the others and the run,
+    which is the last.
     """
 
     log_likelihood: float
     rms: float
-    both: Likelihood = field(repr=False, compare=False)
-    point: Point = field(repr=False, compare=False)
+    fit: StateSpaceFit = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -1005,12 +1004,12 @@ class StateSpaceFit:
         maximum = maximise(both, both.coordinates(start), close=TOLD)
         found = maximum.point
         if not np.isfinite(found.log_likelihood):
-            return Predictive(-np.inf, np.inf, both, found)
+            return Predictive(-np.inf, np.inf, StateSpaceFit(both, maximum))
         *_, last = found.runs
         lost = max(self.log_likelihood - (found.log_likelihood - last.log_likelihood), 0.0)  # of what was fitted
         more = maximum.promised - found.log_likelihood + log_volume(both, found) - log_volume(own, self.maximum.point)
         rms = float(np.sqrt((last.white @ last.white + 2 * lost) / last.white.size))
-        return Predictive(last.log_likelihood - lost + more, rms, both, found)
+        return Predictive(last.log_likelihood - lost + more, rms, StateSpaceFit(both, maximum))
 
     @property
     def criterion(self) -> float:
