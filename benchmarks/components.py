@@ -25,9 +25,9 @@ from common import Report
 
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.laws.registry import load_registry
-from srfcli.numerics import continuation as atlas_module
+from srfcli.numerics import continuation as module
 from srfcli.numerics.collocation import Discretisation
-from srfcli.numerics.continuation import Atlas, AtlasSettings, StepSettings, find_components
+from srfcli.numerics.continuation import Boundary, ContinuationSettings, StepSettings, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.orbit import growth, interpolate, robust_orbits, uniform_mesh
 from srfcli.numerics.plane import Axis, Plane
@@ -35,7 +35,7 @@ from srfcli.numerics.plane import Axis, Plane
 AMPLITUDES = (0.13, 0.18, 0.25, 0.4)
 LO, HI = 4.0, 400.0
 REACH = 0.004
-DENSE = AtlasSettings(
+DENSE = ContinuationSettings(
     lines=60, samples=200, resolution=2e-4, tol=1e-5, steps=StepSettings(largest=0.02, correction=1e-3, mesh_error=2e-5)
 )
 DENSE_INTERVALS = 48
@@ -45,18 +45,18 @@ LOADS, INTERVALS = 4000, 96
 BINS = (0.0, 2e-3, 5e-3, 1e-2, 3e-2, np.inf)
 
 
-def search(model: GeneratedModel, plane: Plane, settings: AtlasSettings, intervals: int) -> tuple[Atlas, float]:
-    """Return the finished atlas and its CPU seconds; `intervals` are those of the scans."""
-    usual, begun = atlas_module.INTERVALS, time.process_time()
-    atlas_module.INTERVALS = intervals  # the settings do not have it
+def search(model: GeneratedModel, plane: Plane, settings: ContinuationSettings, intervals: int) -> tuple[Boundary, float]:
+    """Return the finished boundary and its CPU seconds; `intervals` are those of the scans."""
+    usual, begun = module.INTERVALS, time.process_time()
+    module.INTERVALS = intervals  # the settings do not have it
     try:
         *_, last = find_components(model, plane, settings)
     finally:
-        atlas_module.INTERVALS = usual
+        module.INTERVALS = usual
     return last, time.process_time() - begun
 
 
-def polylines(model: GeneratedModel, found: Atlas) -> list[np.ndarray]:
+def polylines(model: GeneratedModel, found: Boundary) -> list[np.ndarray]:
     """Return the components in unit coordinates."""
     return [found.plane.coordinates(model, np.stack([pt.p for pt in b.points], axis=1)) for b in found.branches]
 
@@ -78,7 +78,7 @@ def uncovered(line: np.ndarray, others: list[np.ndarray]) -> float:
     return float(np.linalg.norm(np.diff(line, axis=0), axis=1)[nearest > REACH].sum())
 
 
-def describe(model: GeneratedModel, found: Atlas, k: int) -> str:
+def describe(model: GeneratedModel, found: Boundary, k: int) -> str:
     """Say where component k lies."""
     V, W0 = (np.array([pt.value(model, name) for pt in found.branches[k].points]) for name in ("V", "W0"))
     ends = f"{found.branches[k].start.name.lower()}/{found.branches[k].end.name.lower()}"
@@ -90,7 +90,7 @@ def compare_components(report: Report, model: GeneratedModel) -> None:
     rows, said = [], []
     for eps in AMPLITUDES:
         plane = Plane(model.vector({"eps": eps}), Axis("V", 1.0, 100.0), Axis("W0", LO, HI))
-        usual, cheap = search(model, plane, AtlasSettings(), atlas_module.INTERVALS)
+        usual, cheap = search(model, plane, ContinuationSettings(), module.INTERVALS)
         dense, dear = search(model, plane, DENSE, DENSE_INTERVALS)
         a, b = polylines(model, usual), polylines(model, dense)
         gaps, extra = [uncovered(q, a) for q in b], [uncovered(q, b) for q in a]

@@ -33,13 +33,22 @@ from common import Report, interleaved
 
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.laws.registry import load_registry
-from srfcli.numerics.continuation import AtlasSettings, Branch, Curve, CurvePoint, correct, find_components, polish_curve, trace
+from srfcli.numerics.continuation import (
+    Branch,
+    ContinuationSettings,
+    Curve,
+    CurvePoint,
+    correct,
+    find_components,
+    polish_curve,
+    trace,
+)
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.plane import Axis, Plane
 
 REPEATS = 5
 TARGET = 3.0
-SETTINGS = AtlasSettings()
+SETTINGS = ContinuationSettings()
 SAMPLE = 5  # points of each curve that brute force checks
 STEEP = 0.1  # d ln|rho| / d ln(W0): below it W0 at fixed V is no measure of a point
 CURVES = {  # eps, V of the line where the curve starts, number of the crossing there, AUTO-07p's ms a point
@@ -73,8 +82,8 @@ def follow(model: GeneratedModel, plane: Plane, start: CurvePoint) -> Curve:
 
 def whole(model: GeneratedModel, plane: Plane) -> list[Branch]:
     """Return all components, as `srf continue` finds them."""
-    *_, atlas = find_components(model, plane, SETTINGS)
-    return atlas.branches
+    *_, boundary = find_components(model, plane, SETTINGS)
+    return boundary.branches
 
 
 def moved(model: GeneratedModel, plane: Plane, curve: Curve) -> np.ndarray:

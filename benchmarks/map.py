@@ -203,11 +203,11 @@ def main() -> None:
     bare = min(timed_map(model, 120, 200, depth=0)[1] for _ in range(2))
     spent = min(spent, timed_map(model, 120, 200)[1])  # the machine has other users
     begun = time.process_time()
-    *_, atlas = find_boundaries(model, found)
+    *_, boundary = find_boundaries(model, found)
     curves = time.process_time() - begun
     report.say()
     report.say(
-        f"120 x 200: {spent:.2f} s with its refinement, {bare:.2f} s without; its {len(atlas.branches)} boundaries, polished "
+        f"120 x 200: {spent:.2f} s with its refinement, {bare:.2f} s without; its {len(boundary.branches)} boundaries, polished "
         f"to 1e-6, {curves:.2f} s more"
     )
     report.say("where the time goes: " + ", ".join(f"{what} {share:.0%}" for what, share in shares(model)))

@@ -13,7 +13,7 @@ from common import arguments, paper_model, progress, save
 from scipy.optimize import brentq
 
 from srfcli.codegen.model import GeneratedModel
-from srfcli.numerics.continuation import Atlas, find_components
+from srfcli.numerics.continuation import Boundary, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.plane import Axis, Plane
@@ -24,12 +24,12 @@ V_RANGE, W0_RANGE = (1.0, 100.0), (4.0, 400.0)
 STIFFNESS_PER_LOAD = 0.026  # 1/um, the paper's example
 
 
-def boundary(model: GeneratedModel, eps: float) -> Atlas:
+def find(model: GeneratedModel, eps: float) -> Boundary:
     """Return all components of the boundary of one eps in the window."""
     plane = Plane(model.vector({"eps": eps}), Axis("V", *V_RANGE), Axis("W0", *W0_RANGE))
-    for atlas in find_components(model, plane):
-        progress(f"eps = {eps:g}: {sum(len(b.points) for b in atlas.branches)} points")
-    return atlas
+    for boundary in find_components(model, plane):
+        progress(f"eps = {eps:g}: {sum(len(b.points) for b in boundary.branches)} points")
+    return boundary
 
 
 def hopf_load(model: GeneratedModel, V: float) -> float:
@@ -78,10 +78,10 @@ def main() -> None:
     K = model.defaults()["K"]
     branches = []
     for eps in AMPLITUDES:
-        atlas = boundary(model, eps)
+        boundary = find(model, eps)
         progress()
-        print(f"eps = {eps:g}: {len(atlas.branches)} component(s), {atlas.status.value}")
-        for number, branch in enumerate(atlas.branches, 1):
+        print(f"eps = {eps:g}: {len(boundary.branches)} component(s), {boundary.status.value}")
+        for number, branch in enumerate(boundary.branches, 1):
             V, W0 = (np.array([q.value(model, name) for q in branch.points]) for name in ("V", "W0"))
             folds = int(np.sum(np.diff(np.sign(np.diff(V))) != 0))
             print(

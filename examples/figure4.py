@@ -9,7 +9,7 @@ import numpy as np
 from common import arguments, paper_model, progress, save
 
 from srfcli.codegen.model import GeneratedModel
-from srfcli.numerics.continuation import Atlas, find_components
+from srfcli.numerics.continuation import Boundary, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.plane import Axis, Plane
@@ -21,13 +21,13 @@ REDUCED = (0.8, 8.0)  # window of W0 over the load at eps = 0
 PRINTED = (0.045, 0.09, 0.13, 0.18)
 
 
-def boundary(model: GeneratedModel, V: float, still: float) -> Atlas:
+def find(model: GeneratedModel, V: float, still: float) -> Boundary:
     """Return all components of the boundary in (eps, W0) at one velocity; `still` is the critical load at eps = 0."""
     W0 = Axis("W0", REDUCED[0] * still, REDUCED[1] * still)
     plane = Plane(model.vector({"V": V}), Axis("eps", 0.0, EPS_MAX, log=False), W0)
-    for atlas in find_components(model, plane):
-        progress(f"V = {V:g} um/s: {sum(len(b.points) for b in atlas.branches)} points")
-    return atlas
+    for boundary in find_components(model, plane):
+        progress(f"V = {V:g} um/s: {sum(len(b.points) for b in boundary.branches)} points")
+    return boundary
 
 
 def main() -> None:
@@ -39,15 +39,15 @@ def main() -> None:
         for index, V in enumerate(VELOCITIES):
             hopf, _ = critical_point(model, model.vector({"V": V}))
             assert hopf is not None
-            atlas = boundary(model, V, hopf.W0)
+            boundary = find(model, V, hopf.W0)
             progress()
-            print(f"V = {V:g} um/s: W0c(0) = {hopf.W0:.6f} N, {len(atlas.branches)} component(s), {atlas.status.value}")
+            print(f"V = {V:g} um/s: W0c(0) = {hopf.W0:.6f} N, {len(boundary.branches)} component(s), {boundary.status.value}")
             for eps in PRINTED:
                 line = critical_line(model, model.vector({"V": V, "eps": eps}), lo=REDUCED[0] * hopf.W0, hi=REDUCED[1] * hopf.W0)
                 loads = ", ".join(f"{q.value(model, 'W0') / hopf.W0:.6f}" for q in line.points)
                 print(f"  eps = {eps:g}: W0c/W0c(0) = {loads}")
             style = {"color": COLOURS[index], "linestyle": DASHES[index]}
-            for number, branch in enumerate(atlas.branches):
+            for number, branch in enumerate(boundary.branches):
                 eps, W0 = (np.array([q.value(model, name) for q in branch.points]) for name in ("eps", "W0"))
                 ax.plot(eps, W0 / hopf.W0, label=None if number else f"V = {V:g} µm/s", **style)
         ax.set_xlabel("effective amplitude of modulation  ε")

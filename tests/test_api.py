@@ -79,8 +79,8 @@ def test_commands_print_what_the_functions_return(slider: srf.SlidingSystem, lin
     assert [list(r) for r in point.table.rows] == rows_of("critical", "--V", "7", "--eps", "0.13")
     *parts, boundary = srf.continue_boundary(slider, eps=0.18, over={"V": (20, 40)})
     assert [list(r) for r in boundary.table.rows] == rows_of("continue", "--eps", "0.18", "--over", "V=20:40")
-    counts = [len(part.atlases[0].branches) for part in parts]
-    assert counts == sorted(counts) and counts[-1] == len(boundary.atlases[0].branches) > 1  # it grows
+    counts = [len(part.boundaries[0].branches) for part in parts]
+    assert counts == sorted(counts) and counts[-1] == len(boundary.boundaries[0].branches) > 1  # it grows
     state = srf.floquet(slider.at(V=8, W0=9, eps=0.09))
     assert [list(r) for r in state.table.rows] == rows_of("floquet", "--V", "8", "--W0", "9", "--eps", "0.09")
     gains = srf.response(slider.at(V=10, W0=6), over={"f": (10, 20, 60)})

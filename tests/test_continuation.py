@@ -7,7 +7,7 @@ import pytest
 from brute import Slider, shoot
 
 from srfcli.core.errors import Status
-from srfcli.numerics.continuation import AtlasSettings, crossing_numbers, find_components
+from srfcli.numerics.continuation import ContinuationSettings, crossing_numbers, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.plane import Axis, Plane
 
@@ -19,7 +19,7 @@ def window(model, eps, V=(1.0, 100.0), W0=(4.0, 400.0)):
 
 
 @pytest.fixture(scope="module")
-def atlas(model):
+def boundary(model):
     """The boundary at eps = 0.18 in the window of the paper's figure 2, and more."""
     *_, last = find_components(model, window(model, 0.18))
     return last
@@ -34,9 +34,9 @@ def folds(values):
     return int(np.sum(np.diff(np.sign(np.diff(values))) != 0))
 
 
-def test_two_components_at_eps_018(model, atlas):
-    assert atlas.status is Status.OK
-    small, large = sorted(atlas.branches, key=lambda b: column(model, b, "V").max())
+def test_two_components_at_eps_018(model, boundary):
+    assert boundary.status is Status.OK
+    small, large = sorted(boundary.branches, key=lambda b: column(model, b, "V").max())
     V = column(model, small, "V")
     assert (V[0], V[-1]) == (1.0, 1.0)
     assert 27.387 * (1 - 1e-3) < V.max() < 27.388  # the point next to the fold
@@ -44,11 +44,11 @@ def test_two_components_at_eps_018(model, atlas):
     V = column(model, large, "V")
     assert sorted((V[0], V[-1])) == pytest.approx([1.0, 100.0], rel=1e-13)
     assert folds(V) == 10
-    assert atlas.notes and "looked at" in atlas.notes[0]
+    assert boundary.notes and "looked at" in boundary.notes[0]
 
 
-def test_window_edges_are_hit_exactly(model, atlas):
-    for branch in atlas.branches:
+def test_window_edges_are_hit_exactly(model, boundary):
+    for branch in boundary.branches:
         assert branch.start is Status.LEFT_WINDOW and branch.end is Status.LEFT_WINDOW
         for point in (branch.points[0], branch.points[-1]):
             V = point.value(model, "V")
@@ -76,10 +76,10 @@ def upright(model, branch, i):
     return abs(along) / np.hypot(along, up)
 
 
-def test_points_agree_with_critical_loads_at_the_same_velocity(model, atlas):
+def test_points_agree_with_critical_loads_at_the_same_velocity(model, boundary):
     """A sample of points against scans of W0, which know nothing of the curve."""
     checked = 0
-    for branch in atlas.branches:
+    for branch in boundary.branches:
         for i in [*range(0, len(branch.points), 12), len(branch.points) - 1]:
             point = branch.points[i]
             if abs(point.slope) < STEEP:
@@ -95,10 +95,10 @@ def test_points_agree_with_critical_loads_at_the_same_velocity(model, atlas):
     assert checked > 15
 
 
-def test_points_beside_folds_against_brute_force(model, atlas):
+def test_points_beside_folds_against_brute_force(model, boundary):
     """There two crossings lie close together; the growth must vanish to what 1e-6 in the parameters amounts to."""
     checked = 0
-    for branch in atlas.branches:
+    for branch in boundary.branches:
         for i in beside_folds(model, branch)[::3]:
             point = branch.points[i]
             V, W0 = (point.value(model, name) for name in ("V", "W0"))
@@ -108,9 +108,9 @@ def test_points_beside_folds_against_brute_force(model, atlas):
     assert checked >= 6
 
 
-def test_folds_are_passed(model, atlas):
+def test_folds_are_passed(model, boundary):
     """On either side of each fold in V the direction in which stability is lost is opposite, and a point lies near it."""
-    for branch in atlas.branches:
+    for branch in boundary.branches:
         V = column(model, branch, "V")
         slopes = np.array([pt.slope for pt in branch.points])
         turns = np.nonzero(np.diff(np.sign(np.diff(V))) != 0)[0] + 1
@@ -123,15 +123,15 @@ def test_folds_are_passed(model, atlas):
         assert len(changes) == len(turns)
 
 
-def test_parity_and_number_of_crossings(model, atlas):
+def test_parity_and_number_of_crossings(model, boundary):
     """Odd numbers are where stability is lost as W0 rises; the numbers at a V are 1, 2, 3... as critical_line gives them."""
-    numbers = crossing_numbers(model, atlas)
-    for branch, row in zip(atlas.branches, numbers, strict=True):
+    numbers = crossing_numbers(model, boundary)
+    for branch, row in zip(boundary.branches, numbers, strict=True):
         assert len(row) == len(branch.points)
         for point, number in zip(branch.points, row, strict=True):
             assert number is None or (number % 2 == 1) == (point.slope > 0)
     checked = 0
-    for branch, row in zip(atlas.branches, numbers, strict=True):
+    for branch, row in zip(boundary.branches, numbers, strict=True):
         for i in range(5, len(row), 20):
             V, W0 = (branch.points[i].value(model, name) for name in ("V", "W0"))
             line = critical_line(model, model.vector({"eps": 0.18, "V": V}), lo=4.0, hi=400.0, tol=1e-6)
@@ -142,9 +142,9 @@ def test_parity_and_number_of_crossings(model, atlas):
     assert checked >= 8
 
 
-def test_partial_iteration_gives_a_partial_atlas(model):
-    """Each atlas yielded can be used as it stands; the first has one component."""
-    search = find_components(model, window(model, 0.18), AtlasSettings(lines=4))
+def test_partial_iteration_gives_a_partial_boundary(model):
+    """Each boundary yielded can be used as it stands; the first has one component."""
+    search = find_components(model, window(model, 0.18), ContinuationSettings(lines=4))
     first = next(search)
     search.close()
     assert len(first.branches) == 1

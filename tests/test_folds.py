@@ -8,7 +8,7 @@ from brute import Slider, rates
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from srfcli.numerics.continuation import AtlasSettings
+from srfcli.numerics.continuation import ContinuationSettings
 from srfcli.numerics.map import KINDS, compute_map, settle
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.orbit import robust_orbits, solve_orbits, uniform_mesh
@@ -27,14 +27,14 @@ def found(model):
 
 
 @pytest.fixture(scope="module")
-def atlas(model, found):
-    *_, last = find_boundaries(model, found, AtlasSettings(tol=1e-7))
+def boundary(model, found):
+    *_, last = find_boundaries(model, found, ContinuationSettings(tol=1e-7))
     return last
 
 
 @pytest.fixture(scope="module")
-def cusp(model, atlas):
-    (one,) = (s for b in atlas.branches for s in special_points(model, atlas.plane, b) if s.what == "cusp")
+def cusp(model, boundary):
+    (one,) = (s for b in boundary.branches for s in special_points(model, boundary.plane, b) if s.what == "cusp")
     return one
 
 
@@ -65,12 +65,12 @@ def brute_states(model, point):
     return list(point.orbit.x[0, 0])
 
 
-def test_one_curve_of_folds_with_one_cusp_accounts_for_the_map(model, found, atlas, cusp):
-    (branch,) = atlas.branches
+def test_one_curve_of_folds_with_one_cusp_accounts_for_the_map(model, found, boundary, cusp):
+    (branch,) = boundary.branches
     assert {pt.kind for pt in branch.points} == {"fold"} and all(pt.status.ok for pt in branch.points)
     assert max(pt.others for pt in branch.points) < 1
     assert cusp.status.ok and 0 < cusp.place < len(branch.points) - 1
-    assert len(unexplained(model, found, atlas)) == 0
+    assert len(unexplained(model, found, boundary)) == 0
     assert not (found.kind == KINDS.index("fold")).any()  # the state between the folds is not taken
 
 
@@ -82,8 +82,8 @@ def test_beyond_the_fold_the_other_state_is_found_across_tiles(model, found):
 
 
 @pytest.mark.parametrize("which", [0.25, 0.6, 1.4, 1.75])
-def test_a_fold_is_an_extremum_of_eps_along_the_response(model, atlas, cusp, which):
-    (branch,) = atlas.branches
+def test_a_fold_is_an_extremum_of_eps_along_the_response(model, boundary, cusp, which):
+    (branch,) = boundary.branches
     last = len(branch.points) - 1
     place = which * cusp.place if which < 1 else cusp.place + (which - 1) * (last - cusp.place)
     point = branch.points[round(place)]
@@ -97,8 +97,8 @@ def test_a_fold_is_an_extremum_of_eps_along_the_response(model, atlas, cusp, whi
 
 
 @pytest.mark.slow
-def test_at_the_cusp_two_extrema_of_eps_along_the_response_meet(model, atlas, cusp):
-    (branch,) = atlas.branches
+def test_at_the_cusp_two_extrema_of_eps_along_the_response_meet(model, boundary, cusp):
+    (branch,) = boundary.branches
     point = branch.points[round(cusp.place)]
     f, eps = (float(cusp.p[model.index(name)]) for name in ("f", "eps"))
     assert (f, eps) == (pytest.approx(3.578127, rel=1e-5), pytest.approx(4.6335e-4, rel=1e-3))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from srfcli.diagnosis.residual_scan import Atlas, Location, Piece, log_tail, read_atlas
+from srfcli.diagnosis.residual_scan import Location, Piece, ResidualScan, log_tail, stands_out
 
 N, STEP, FORCING = 1024, 0.002, 40.0
 RUNS = ("one", "two", "three")
@@ -32,12 +32,12 @@ def design(n: int = N, seed: int = 5) -> list[Piece]:
 
 def located(pieces: list[Piece], signals: dict[str, np.ndarray], *, seed: int = 3, draws: int = 100) -> Location:
     """Return what is found in noise with signals, given in units of the noise's standard deviation."""
-    rng, atlas = np.random.default_rng(seed), Atlas(pieces, 4)
+    rng, scan = np.random.default_rng(seed), ResidualScan(pieces, 4)
     residuals = []
     for p in pieces:
         e = rng.standard_normal(p.white.size)
         residuals.append(e + np.asarray(signals.get(p.name, np.zeros(p.white.size))))
-    return read_atlas(atlas, atlas.projected(residuals), atlas.null(draws, seed=1), {"two": FORCING, "three": FORCING})
+    return stands_out(scan, scan.projected(residuals), scan.null(draws, seed=1), {"two": FORCING, "three": FORCING})
 
 
 def test_noise_alone_is_nowhere() -> None:
@@ -48,12 +48,12 @@ def test_noise_alone_is_nowhere() -> None:
 
 def test_false_alarms_come_as_often_as_they_should() -> None:
     pieces = design(n=256)
-    atlas = Atlas(pieces, 4)
-    null, rng = atlas.null(400, seed=7), np.random.default_rng(11)
+    scan = ResidualScan(pieces, 4)
+    null, rng = scan.null(400, seed=7), np.random.default_rng(11)
     smallest = []
     for _ in range(200):
-        M = atlas.projected([rng.standard_normal(p.white.size) for p in pieces])
-        smallest.append(min(r.p_value for r in atlas.rows(M, null)))
+        M = scan.projected([rng.standard_normal(p.white.size) for p in pieces])
+        smallest.append(min(r.p_value for r in scan.rows(M, null)))
     alarms = np.mean(np.array(smallest) < 0.05)
     assert 0.01 <= alarms <= 0.095, alarms  # 5 %, three standard errors of 200 trials
     assert abs(np.mean(np.array(smallest) < 0.5) - 0.5) < 0.12
@@ -61,9 +61,9 @@ def test_false_alarms_come_as_often_as_they_should() -> None:
 
 def test_parameters_that_are_off_raise_no_alarm() -> None:
     pieces = design()
-    atlas = Atlas(pieces, 4)
+    scan = ResidualScan(pieces, 4)
     shifted = [p.X @ np.array([30.0, -2.0, 8.0, 5.0]) for p in pieces]
-    assert max(np.abs(m).max() for m in atlas.projected(shifted)) < 1e-8
+    assert max(np.abs(m).max() for m in scan.projected(shifted)) < 1e-8
 
 
 def test_a_window_is_found() -> None:
@@ -101,7 +101,7 @@ def test_a_phase_of_stick_slip_is_found() -> None:
     cycle = np.where(t > 0.3, np.mod(3.1 * t, 1.0), np.nan)
     pieces = [replace(p, cycle=cycle) if p.name == "one" else p for p in design()]
     found = located(pieces, {"one": 1.5 * np.nan_to_num((cycle > 0.84) & (cycle < 0.91))})
-    rows = [r for r in found.atlas if r.axis == "cycle" and r.kind == "mean" and r.run == "one"]
+    rows = [r for r in found.rows if r.axis == "cycle" and r.kind == "mean" and r.run == "one"]
     best = min(rows, key=lambda r: r.log_p)
     assert (best.low, best.high) == (pytest.approx(10 / 12), pytest.approx(11 / 12))
     assert best.p_value < 0.01 and sum(r.p_value < 0.01 for r in rows) <= 2
@@ -139,11 +139,11 @@ def test_a_line_in_one_run_is_no_function_of_phi() -> None:
 
 def test_a_p_value_beyond_the_simulations_is_bonferronis() -> None:
     pieces = design()
-    atlas = Atlas(pieces, 4)
-    null = atlas.null(50, seed=2)
+    scan = ResidualScan(pieces, 4)
+    null = scan.null(50, seed=2)
     tail = float(log_tail(np.array([140.0]), 1.0)[0])
-    assert atlas.adjusted(np.array([tail]), null)[0] == pytest.approx(atlas.count * np.exp(tail))
-    assert atlas.adjusted(np.array([0.0]), null)[0] == 1.0
+    assert scan.adjusted(np.array([tail]), null)[0] == pytest.approx(scan.count * np.exp(tail))
+    assert scan.adjusted(np.array([0.0]), null)[0] == 1.0
 
 
 def test_tails_go_on_where_probabilities_vanish() -> None:
@@ -157,25 +157,25 @@ def test_a_parameter_that_moves_nothing_is_none() -> None:
     """Such as the length of a field that is not there: its error is infinite, and no recording is drawn with it."""
     pieces, rng = design(n=256), np.random.default_rng(3)
     wider = [replace(p, X=np.column_stack([p.X, 1e-17 * rng.standard_normal(256)]), places=np.arange(5)) for p in pieces]
-    nulls = [Atlas(some, k, kept=True).null(40, seed=1) for some, k in ((pieces, 4), (wider, 5))]
+    nulls = [ResidualScan(some, k, kept=True).null(40, seed=1) for some, k in ((pieces, 4), (wider, 5))]
     assert nulls[0] == pytest.approx(nulls[1], rel=1e-9)
 
 
 def test_residuals_that_are_kept_are_judged_with_their_parameters_errors() -> None:
     pieces, rng = design(n=256), np.random.default_rng(3)
-    atlas = Atlas(pieces, 4, kept=True)
-    null = atlas.null(200, seed=1)
-    values, vectors = np.linalg.eigh(-atlas.inverse)
+    scan = ResidualScan(pieces, 4, kept=True)
+    null = scan.null(200, seed=1)
+    values, vectors = np.linalg.eigh(-scan.inverse)
     assert values.min() > -1e-9 * values.max()  # a covariance, singular to rounding
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     low = []
     for _ in range(60):
         off = root @ rng.standard_normal(4)
-        M = atlas.projected([rng.standard_normal(p.white.size) + p.X @ off for p in pieces])
-        low.append(min(r.p_value for r in atlas.rows(M, null)) < 0.05)
+        M = scan.projected([rng.standard_normal(p.white.size) + p.X @ off for p in pieces])
+        low.append(min(r.p_value for r in scan.rows(M, null)) < 0.05)
     assert np.mean(low) < 0.15
-    assert atlas.projected([p.X[:, 0] * 5 for p in pieces])[0].std() >= 0  # nothing is projected
-    assert np.abs(atlas.projected([p.X @ np.ones(4) for p in pieces])[0]).max() > 1
+    assert scan.projected([p.X[:, 0] * 5 for p in pieces])[0].std() >= 0  # nothing is projected
+    assert np.abs(scan.projected([p.X @ np.ones(4) for p in pieces])[0]).max() > 1
 
 
 def test_a_run_that_is_lost_is_followed_until_then() -> None:

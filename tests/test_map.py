@@ -10,7 +10,7 @@ from brute import Slider, shoot, steady
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.numerics.collocation import solved
-from srfcli.numerics.continuation import AtlasSettings, StepSettings, find_components
+from srfcli.numerics.continuation import ContinuationSettings, StepSettings, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.map import KINDS, _suspects, compute_map, join_tiles, kinds, neighbours, per_slip, solve_tile
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
@@ -28,10 +28,10 @@ def finished(model, found, settings=None):
     return last
 
 
-def extents(model, atlas):
+def extents(model, boundary):
     """Return the ranges of V and W0 of each component, in the order of its lowest load."""
     spans = []
-    for branch in atlas.branches:
+    for branch in boundary.branches:
         V, W0 = (np.array([pt.value(model, name) for pt in branch.points]) for name in ("V", "W0"))
         spans.append((W0.min(), V.min(), V.max(), W0.max()))
     return np.array(sorted(spans))
@@ -44,7 +44,7 @@ def found(model):
 
 
 @pytest.fixture(scope="module")
-def atlas(model, found):
+def boundary(model, found):
     return finished(model, found)
 
 
@@ -71,32 +71,32 @@ def test_exponent_per_slip_is_that_of_the_linear_theory_without_modulation(model
         assert scaled[i, j] == pytest.approx(float(roots.real.max()) * D0 / V, rel=1e-3, abs=1e-6)
 
 
-def test_two_components_at_eps_018(model, found, atlas):
-    assert atlas.status is Status.OK
-    small, large = extents(model, atlas)
+def test_two_components_at_eps_018(model, found, boundary):
+    assert boundary.status is Status.OK
+    small, large = extents(model, boundary)
     assert small[1:3] == pytest.approx([1.0, 27.387], rel=1e-3)  # the point next to the fold
     assert large[1:2] == pytest.approx([1.0], rel=1e-9)
-    assert all(pt.status.ok and pt.error <= 1e-6 for b in atlas.branches for pt in b.points)
-    assert not len(unexplained(model, found, atlas))
+    assert all(pt.status.ok and pt.error <= 1e-6 for b in boundary.branches for pt in b.points)
+    assert not len(unexplained(model, found, boundary))
 
 
-def test_a_missing_component_is_noticed(model, found, atlas):
-    without = dataclasses.replace(atlas, branches=atlas.branches[:1])
+def test_a_missing_component_is_noticed(model, found, boundary):
+    without = dataclasses.replace(boundary, branches=boundary.branches[:1])
     assert len(unexplained(model, found, without)) > 10
 
 
-def test_number_of_boundaries_on_a_line_is_that_of_a_scan_of_the_line(model, atlas):
+def test_number_of_boundaries_on_a_line_is_that_of_a_scan_of_the_line(model, boundary):
     values = np.array([2.0, 20.0, 41.0])
-    for V, heights in zip(values, crossings_at(model, atlas.plane, atlas.branches, values), strict=True):
+    for V, heights in zip(values, crossings_at(model, boundary.plane, boundary.branches, values), strict=True):
         lo, hi = 0.21 / 0.03, 0.21 / 0.0021
         line = critical_line(model, model.vector({"eps": 0.18, "V": V}), lo=lo, hi=hi, tol=1e-6)
         assert len(heights) == len(line.points)
         assert heights == pytest.approx([pt.value(model, "W0") for pt in line.points], rel=5e-3)
 
 
-def test_folds_lie_where_crossings_appear(model, atlas):
+def test_folds_lie_where_crossings_appear(model, boundary):
     """Two crossings just before the fold's velocity are gone just beyond it."""
-    marks = [s for b in atlas.branches for s in special_points(model, atlas.plane, b) if s.axis == "V"]
+    marks = [s for b in boundary.branches for s in special_points(model, boundary.plane, b) if s.axis == "V"]
     assert all(s.status is Status.OK for s in marks)
     fold = min(marks, key=lambda s: s.p[model.index("W0")])
     V, W0 = (float(fold.p[model.index(name)]) for name in ("V", "W0"))
@@ -113,13 +113,13 @@ def test_folds_lie_where_crossings_appear(model, atlas):
 def test_a_second_method_finds_the_same_components(model, eps, count):
     """A map, and curves from lines on a finer mesh with other seeds and shorter steps."""
     grid = window(model, eps, 30, 40, ratio=(0.21 / 200, 0.21 / 8))
-    atlas = finished(model, compute_map(model, grid, MapSettings(depth=2)))
-    other = AtlasSettings(lines=9, samples=100, tol=1e-5, steps=StepSettings(largest=0.025, mesh_error=5e-5))
+    boundary = finished(model, compute_map(model, grid, MapSettings(depth=2)))
+    other = ContinuationSettings(lines=9, samples=100, tol=1e-5, steps=StepSettings(largest=0.025, mesh_error=5e-5))
     *_, second = find_components(model, Plane(grid.base, Axis("V", 1.0, 100.0), Axis("W0", 8.0, 200.0)), other)
-    assert len(atlas.branches) == len(second.branches) == count
-    assert extents(model, atlas)[:, :2] == pytest.approx(extents(model, second)[:, :2], rel=1e-3)
+    assert len(boundary.branches) == len(second.branches) == count
+    assert extents(model, boundary)[:, :2] == pytest.approx(extents(model, second)[:, :2], rel=1e-3)
     if count == 2:
-        assert special_folds(model, atlas) == pytest.approx(special_folds(model, second), rel=1e-5)
+        assert special_folds(model, boundary) == pytest.approx(special_folds(model, second), rel=1e-5)
 
 
 @pytest.mark.parametrize("law", ["log-log", "bowden-tabor"])
@@ -127,18 +127,18 @@ def test_the_second_method_agrees_for_other_laws(make_model, law):
     """The same, folds among it, for laws whose parameters are as shipped, around the low loads where they fold."""
     model = make_model(law=law)
     grid = window(model, 0.18, 30, 40, ratio=(0.21 / 200, 0.21 / 8))
-    atlas = finished(model, compute_map(model, grid, MapSettings(depth=2)))
-    other = AtlasSettings(lines=9, samples=100, tol=1e-5, steps=StepSettings(largest=0.025, mesh_error=5e-5))
+    boundary = finished(model, compute_map(model, grid, MapSettings(depth=2)))
+    other = ContinuationSettings(lines=9, samples=100, tol=1e-5, steps=StepSettings(largest=0.025, mesh_error=5e-5))
     *_, second = find_components(model, Plane(grid.base, Axis("V", 1.0, 100.0), Axis("W0", 8.0, 200.0)), other)
-    assert len(atlas.branches) == len(second.branches) > 0
-    assert extents(model, atlas)[:, :2] == pytest.approx(extents(model, second)[:, :2], rel=1e-3)
-    folds = special_folds(model, atlas)
+    assert len(boundary.branches) == len(second.branches) > 0
+    assert extents(model, boundary)[:, :2] == pytest.approx(extents(model, second)[:, :2], rel=1e-3)
+    folds = special_folds(model, boundary)
     assert folds and folds == pytest.approx(special_folds(model, second), rel=1e-5)
 
 
-def special_folds(model, atlas):
+def special_folds(model, boundary):
     """Return the velocities at which boundaries turn round, rising."""
-    return sorted(float(s.p[0]) for b in atlas.branches for s in special_points(model, atlas.plane, b) if s.axis == "V")
+    return sorted(float(s.p[0]) for b in boundary.branches for s in special_points(model, boundary.plane, b) if s.axis == "V")
 
 
 def test_an_island_is_found_and_closed(model):
@@ -146,12 +146,12 @@ def test_an_island_is_found_and_closed(model):
     base = model.vector({"V": 30.0, "W0": 13.0})
     grid = MapGrid(base, MapAxis("f", 140.0, 200.0, 13, False), MapAxis("eps", 0.12, 0.48, 15, False))
     found = compute_map(model, grid)
-    atlas = finished(model, found)
-    islands = [b for b in atlas.branches if b.end is Status.CLOSED]
+    boundary = finished(model, found)
+    islands = [b for b in boundary.branches if b.end is Status.CLOSED]
     assert len(islands) == 1 and islands[0].start is Status.CLOSED
     f = np.array([pt.value(model, "f") for pt in islands[0].points])
     assert (f.min(), f.max()) == pytest.approx((155.966, 182.97), rel=2e-3)
-    assert not len(unexplained(model, found, atlas))
+    assert not len(unexplained(model, found, boundary))
     assert brute_growth(model, V=30.0, W0=13.0, eps=0.3, f=168.0) * brute_growth(model, V=30.0, W0=13.0, eps=0.15, f=168.0) < 0
 
 
@@ -165,8 +165,8 @@ def brute_growth(model, **values):
 def test_resonances_lie_where_the_multiplier_is_a_root_of_one(model):
     """At low frequency the critical multiplier turns far in a period: 1:4, 1:3, and 1:2 where it meets the real axis."""
     grid = window(model, 0.05, 11, 12, V=(5.0, 20.0), ratio=(0.022, 0.03), f=15.0)
-    atlas = finished(model, compute_map(model, grid))
-    marks = {s.what: s for b in atlas.branches for s in special_points(model, atlas.plane, b)}
+    boundary = finished(model, compute_map(model, grid))
+    marks = {s.what: s for b in boundary.branches for s in special_points(model, boundary.plane, b)}
     assert marks["1:4"].theta == pytest.approx(np.pi / 2, abs=1e-7)
     assert marks["1:3"].theta == pytest.approx(2 * np.pi / 3, abs=1e-7)
     assert marks["1:4"].error < 1e-6 and marks["1:3"].error < 1e-6

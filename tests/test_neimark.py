@@ -9,7 +9,7 @@ from srfcli.core.errors import Status
 from srfcli.motion.imposed import Drive, Modulation
 from srfcli.motion.simulate import simulate
 from srfcli.numerics.collocation import Discretisation, condense
-from srfcli.numerics.continuation import AtlasSettings, find_components
+from srfcli.numerics.continuation import ContinuationSettings, find_components
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.orbit import solve_orbits
@@ -103,9 +103,9 @@ def test_a_torus_of_the_predicted_amplitude_attracts_beyond_a_direct_boundary(mo
 
 def test_criticality_changes_where_the_coefficient_vanishes(model):
     plane = Plane(model.vector({"eps": 0.18}), Axis("V", 5.0, 40.0), Axis("W0", 13.0, 17.0))
-    *_, atlas = find_components(model, plane, AtlasSettings(lines=5))
+    *_, boundary = find_components(model, plane, ContinuationSettings(lines=5))
     found = []
-    for branch in atlas.branches:
+    for branch in boundary.branches:
         d = branch_coefficients(model, branch)
         for mark in criticality_points(model, plane, branch, d):
             k = int(mark.place)

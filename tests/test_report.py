@@ -112,7 +112,7 @@ def made_material(verdict: str, name: str = "onset") -> dict[str, Any]:
     rows = [{"axis": "v", "run": "", "kind": "mean", "low": 10.0**k, "high": 10.0 ** (k + 1), "statistic": 3.0 * k, "z": 1.0,
              "freedom": 1.0, "log_p": -5.0 * k, "p_value": 10.0 ** (-2 * k)} for k in range(5)]  # fmt: skip
     material: dict[str, Any] = {
-        "title": "PMMA <on> PMMA", "runs": runs, "atlas": rows,
+        "title": "PMMA <on> PMMA", "runs": runs, "residual_scan": rows,
         "ranked": [{"name": "linker-dieterich", "evidence": -10.0, "rms_over_noise": 0.99, "p_value": 0.4},
                    {"name": "second-state", "evidence": -11.5, "rms_over_noise": 0.993, "p_value": 0.38},
                    {"name": "none", "evidence": -900.0, "rms_over_noise": 3.19, "p_value": 0.0}],
@@ -187,7 +187,7 @@ def test_pictures_are_those_of_the_folder_and_say_what_they_show(written: tuple[
         assert all(v.startswith(("#", "data:")) for v in fetched)
     names = {p.name for p in (folder / "figures").iterdir()}
     assert {p.replace(".svg", ".png") for p in names if p.endswith(".svg")} == {p for p in names if p.endswith(".png")}
-    assert {"overview.svg", "atlas.svg", "run-onset.svg"} <= names
+    assert {"overview.svg", "residual-scan.svg", "run-onset.svg"} <= names
     assert ({"run-quiet.svg", "run-later.svg"} <= names) == (verdict == "identified")
     assert "parameters.svg" in names
     assert ({"force-quiet.svg", "force-by-state.svg"} <= names) == (verdict == "unknown")
@@ -302,8 +302,8 @@ def test_no_name_breaks_out_of_the_page(tmp_path: Path) -> None:
     answer |= {"effects": [HOSTILE], "model": HOSTILE, "confidence": {HOSTILE: 1.0}}
     answer["not_identifiable"] = [{"effect": HOSTILE, "reason": HOSTILE}]
     material["ranked"][0]["name"] = material["scores"][0]["effect"] = material["parameters"][0]["name"] = HOSTILE
-    material["atlas"] += [{"axis": HOSTILE, "run": HOSTILE, "kind": "mean", "low": float(k), "high": k + 1.0, "log_p": -3.0,
-                           "p_value": 0.1} for k in range(4)]  # fmt: skip
+    row = {"axis": HOSTILE, "run": HOSTILE, "kind": "mean", "log_p": -3.0, "p_value": 0.1}
+    material["residual_scan"] += [row | {"low": float(k), "high": k + 1.0} for k in range(4)]
     material["runs"][0]["name"] = answer["location"]["runs"][0]["name"] = "../../" + HOSTILE
     write_report(tmp_path / "out", answer, material)
     page = read(tmp_path / "out")

@@ -110,7 +110,7 @@ def map_(
     points; CSV and JSON hold the grid.
     """
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.numerics.continuation import AtlasSettings, StepSettings
+    from srfcli.numerics.continuation import ContinuationSettings, StepSettings
     from srfcli.numerics.plane import MapSettings
     from srfcli.tasks import map as task
 
@@ -124,7 +124,7 @@ def map_(
     slider = system.slider(**given)
     slider.model.check_changing_load(slider.vector())
     grid = read_grid(slider.model, slider.vector(), over)
-    settings = AtlasSettings(tol=system.tolerance(tol).value, max_mesh=max_mesh, steps=StepSettings(largest=step))
+    settings = ContinuationSettings(tol=system.tolerance(tol).value, max_mesh=max_mesh, steps=StepSettings(largest=step))
     warn_uncompiled("a map takes about three times as long")
     begun, mapped = time.perf_counter(), 0.0
     with Progress("map") as progress:

@@ -283,7 +283,7 @@ def continue_(
     folds, and every point is polished until its error is met. Ctrl-C keeps what is done.
     """
     from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-    from srfcli.numerics.continuation import AtlasSettings, StepSettings
+    from srfcli.numerics.continuation import ContinuationSettings, StepSettings
     from srfcli.tasks.stability import continue_boundary
 
     if not 1e-4 <= step <= 0.5:
@@ -294,7 +294,7 @@ def continue_(
     check_axes(spanned, {"V": V, "W0": W0})
     slider = system.slider(V=V, W0=W0)
     model = slider.model
-    settings = AtlasSettings(
+    settings = ContinuationSettings(
         scan_lines, samples, tol=system.tolerance(tol).value, max_mesh=max_mesh,
         steps=StepSettings(largest=step, max_steps=max_steps),
     )  # fmt: skip

@@ -188,7 +188,7 @@ def material(diagnosis: Diagnosis, location: Location) -> dict[str, Any]:
         "texts": {e.reported: {"wrong": e.wrong, "remedy": e.remedy} for e in effects},
         "runs": runs,
         "thresholds": tables,
-        "atlas": [atlas_row(row) for row in location.atlas],
+        "residual_scan": [scan_row(row) for row in location.rows],
         "ranked": ranked_rows(diagnosis),
         "parameters": parameter_rows(diagnosis),
         "scores": score_rows(diagnosis),
@@ -202,8 +202,8 @@ def _force_of(force: RunForce | None, run: Run) -> Array | None:
     return np.zeros(run.t.size) if force is None else force.force
 
 
-def atlas_row(row: Row) -> dict[str, Any]:
-    """Return a place of the atlas, v in um/s and phi in s, by whose logarithms samples were sorted."""
+def scan_row(row: Row) -> dict[str, Any]:
+    """Return a place of the residual scan, v in um/s and phi in s, by whose logarithms samples were sorted."""
     found: dict[str, Any] = row.described()
     if row.axis in ("v", "phi"):
         found |= {"low": float(np.exp(row.low)), "high": float(np.exp(row.high))}

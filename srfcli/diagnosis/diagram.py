@@ -15,7 +15,7 @@ from srfcli.diagnosis.search import Fitted
 from srfcli.inference.prediction import stiffness_share
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
-from srfcli.numerics.continuation import AtlasSettings, find_components
+from srfcli.numerics.continuation import ContinuationSettings, find_components
 from srfcli.numerics.critical import load_window
 from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.plane import Axis, Plane
@@ -24,7 +24,7 @@ from srfcli.symbolic.system import without_part
 VELOCITIES = 61
 CORNERS = 5  # velocities at which the loads without modulation say where boundaries are looked for
 BEYOND = 3.0  # times the slowest and fastest drive of the recordings: how far the diagram goes
-DRAWN = AtlasSettings(tol=1e-4, max_mesh=256)  # as good as a line in a figure
+DRAWN = ContinuationSettings(tol=1e-4, max_mesh=256)  # as good as a line in a figure
 
 
 def stability(registry: Registry, baseline: Experiment, at: Mapping[str, float], augmented: Experiment) -> dict[str, Any]:
@@ -114,15 +114,15 @@ def _boundary(
     low, high = load_window(model, corners)
     forced = _at(model, base, f=f, eps=eps, V=float(V[0]))
     plane = Plane(forced, Axis("V", float(V[0]), float(V[-1])), Axis("W0", low, high))
-    *_, atlas = find_components(model, plane, DRAWN)
-    if not atlas.branches:
+    *_, boundary = find_components(model, plane, DRAWN)
+    if not boundary.branches:
         notes.append(f"No boundary of the {side} was found under modulation.")
         return {}
-    lost = sum(scan.lost.size for scan in atlas.scans)
+    lost = sum(scan.lost.size for scan in boundary.scans)
     if lost:
         notes.append(f"At {lost} points no forced state of the {side} was found: boundaries there may be missing.")
     x, y = [], []
-    for branch in atlas.branches:
+    for branch in boundary.branches:
         x += [*(q.value(model, "V") for q in branch.points), np.nan]
         y += [*(q.value(model, "W0") for q in branch.points), np.nan]
     return {f"V_{side}": np.array(x), f"W0_{side}": np.array(y)}

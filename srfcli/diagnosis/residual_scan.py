@@ -59,7 +59,7 @@ class Location:
     frequencies: tuple[float, ...]
     coordinate: tuple[str, float] | None
     p_value: float
-    atlas: tuple[Row, ...] = field(default=(), repr=False)
+    rows: tuple[Row, ...] = field(default=(), repr=False)
 
     def described(self) -> dict[str, object]:
         """Return the object that `srf.diagnose/1` has under location."""
@@ -88,28 +88,28 @@ def locate(fitted: Fitted, *, last: Fitted | None = None, draws: int = DRAWS, se
     forcing = {r.name: of_run(r)["f"] for r in likelihood.problem.runs if of_run(r)["modulated"]}
     if last is None:
         pieces = pieces_of(fitted, values)
-        atlas = Atlas(pieces, len(likelihood.names))
-        return read_atlas(atlas, atlas.projected([p.white for p in pieces]), atlas.null(draws, seed=seed), forcing)
+        scan = ResidualScan(pieces, len(likelihood.names))
+        return stands_out(scan, scan.projected([p.white for p in pieces]), scan.null(draws, seed=seed), forcing)
     values = {n: last.fit.values.get(n, v) for n, v in values.items()}  # on a smooth track its field is of amplitude 0
     pieces, k = pieces_of(fitted, values), len(likelihood.names)
     whole, begun = (_read_kept(some, k, forcing, draws, seed) for some in (pieces, [p.followed() for p in pieces]))
-    rows = [r for r in whole.atlas if r.axis in OWN] + [r for r in begun.atlas if r.axis not in OWN]
-    return replace(begun, runs=whole.runs, p_value=min(whole.p_value, begun.p_value), atlas=tuple(rows))
+    rows = [r for r in whole.rows if r.axis in OWN] + [r for r in begun.rows if r.axis not in OWN]
+    return replace(begun, runs=whole.runs, p_value=min(whole.p_value, begun.p_value), rows=tuple(rows))
 
 
 def _read_kept(pieces: Sequence[Piece], k: int, forcing: Mapping[str, float], draws: int, seed: int) -> Location:
     """Return what stands out of residuals as they are."""
-    atlas = Atlas(pieces, k, kept=True)
-    return read_atlas(atlas, atlas.projected([p.white for p in pieces]), atlas.null(draws, seed=seed), forcing)
+    scan = ResidualScan(pieces, k, kept=True)
+    return stands_out(scan, scan.projected([p.white for p in pieces]), scan.null(draws, seed=seed), forcing)
 
 
-def read_atlas(atlas: Atlas, M: Sequence[Array], null: Array, forcing: Mapping[str, float]) -> Location:
+def stands_out(scan: ResidualScan, M: Sequence[Array], null: Array, forcing: Mapping[str, float]) -> Location:
     """Return what stands out of projected residuals M (n,) by run; `forcing` is the modulation's frequency (Hz) by run."""
-    rows = atlas.rows(M, null)
-    excess = {p.name: float(m @ m - spare.sum()) for p, m, spare in zip(atlas.pieces, M, atlas.spare, strict=True)}
+    rows = scan.rows(M, null)
+    excess = {p.name: float(m @ m - spare.sum()) for p, m, spare in zip(scan.pieces, M, scan.spare, strict=True)}
     whole = sum(max(e, 0.0) for e in excess.values())
     runs = []
-    for piece, m, spare in zip(atlas.pieces, M, atlas.spare, strict=True):
+    for piece, m, spare in zip(scan.pieces, M, scan.spare, strict=True):
         own = [r for r in rows if r.run == piece.name and r.axis in (*OWN, "frequency")]
         best = min(own, key=lambda r: r.log_p)
         if best.p_value < LEVEL:
@@ -118,8 +118,8 @@ def read_atlas(atlas: Atlas, M: Sequence[Array], null: Array, forcing: Mapping[s
     return Location(
         tuple(sorted(runs, key=lambda r: (-r.share, r.p_value))),
         _phase([r for r in rows if r.axis == "forcing" and r.kind == "mean"]),
-        _lines(rows, atlas, forcing),
-        _coordinate(rows, atlas, M),
+        _lines(rows, scan, forcing),
+        _coordinate(rows, scan, M),
         min(r.p_value for r in rows),
         _kept(rows),
     )
@@ -179,10 +179,10 @@ def _phase(rows: Sequence[Row]) -> tuple[float, float] | None:
     return (low, high if high > low else high + turn)
 
 
-def _lines(rows: Sequence[Row], atlas: Atlas, forcing: Mapping[str, float]) -> tuple[float, ...]:
+def _lines(rows: Sequence[Row], scan: ResidualScan, forcing: Mapping[str, float]) -> tuple[float, ...]:
     """Return the frequencies of narrow peaks: the forcing's harmonics, where no other is nearer, then others, strongest first."""
     peaks: list[tuple[bool, float, float, float]] = []  # harmonic or not, statistic, frequency, width
-    for piece in atlas.pieces:
+    for piece in scan.pieces:
         own = [r for r in rows if r.run == piece.name and r.kind == "line"]
         S = np.array([r.statistic for r in own])
         base = forcing.get(piece.name)
@@ -208,10 +208,10 @@ def _peaked(S: Array, i: int) -> bool:
     return bool(S[i] >= S[max(i - 3, 0) : i + 4].max() and S[i] >= PROMINENT * np.median(beside))
 
 
-def _coordinate(rows: Sequence[Row], atlas: Atlas, M: Sequence[Array]) -> tuple[str, float] | None:
+def _coordinate(rows: Sequence[Row], scan: ResidualScan, M: Sequence[Array]) -> tuple[str, float] | None:
     """Return the quantity a smooth function of which explains most of the excess misfit, with that share."""
     smooth = [r for r in rows if r.run == "" and r.kind == "shape" and r.p_value < LEVEL]
-    left = sum(float(m @ m) for m in M) - sum(float(s.sum()) for s in atlas.spare)
+    left = sum(float(m @ m) for m in M) - sum(float(s.sum()) for s in scan.spare)
     if not smooth or left <= 0:
         return None
     best = max(smooth, key=lambda r: r.statistic - r.freedom)
@@ -219,11 +219,11 @@ def _coordinate(rows: Sequence[Row], atlas: Atlas, M: Sequence[Array]) -> tuple[
 
 
 def _kept(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Return the atlas without the lines of the spectra in which nothing is."""
+    """Return the rows without the lines of the spectra in which nothing is."""
     return tuple(r for r in rows if r.kind != "line" or r.p_value < LEVEL)
 
 
-# A fit's runs as pieces of an atlas: residuals and columns, whitened, with what their samples can be sorted by.
+# A fit's runs as pieces of a scan: residuals and columns, whitened, with what their samples can be sorted by.
 
 LEAST = 30.0  # standard deviations of an innovation: a cycle is lost
 
@@ -326,7 +326,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Row:
-    """One place of the atlas: `statistic` with its degrees of `freedom`, the signed `z` of a single column, and p-values.
+    """One place of the scan: `statistic` with its degrees of `freedom`, the signed `z` of a single column, and p-values.
 
     `axis` is what samples were sorted by, `run` a name or nothing for all together, [low, high] the place; `kind` is mean, power,
     shape or line. `p_value` is adjusted for all that was looked at, `log_p` is the natural logarithm of the unadjusted one.
@@ -374,7 +374,7 @@ def log_tail(x: Array, freedom: Array | float) -> Array:
     return np.where(np.isfinite(near), near, np.minimum(far, 0.0))
 
 
-class Atlas:
+class ResidualScan:
     """All places of some runs, and the projection that goes with them."""
 
     def __init__(self, pieces: Sequence[Piece], k: int, *, kept: bool = False) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status
-from srfcli.numerics.continuation import AtlasSettings, Branch, find_components
+from srfcli.numerics.continuation import Branch, ContinuationSettings, find_components
 from srfcli.numerics.hopf import critical_point, hopf_points, weakening
 from srfcli.numerics.map import compute_map, tile_model
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
@@ -270,12 +270,12 @@ def _boundaries(model: GeneratedModel, task: LawTask, eps: float) -> tuple[list[
     base = model.with_values(task.p, eps=eps)
     grid = MapGrid(base, MapAxis("V", *window.V, window.columns), MapAxis("W0", *window.W0, window.rows))
     found = compute_map(model, grid, MapSettings(depth=3))
-    *_, atlas = find_boundaries(model, found, AtlasSettings(tol=task.tol))
-    if not found.finished or atlas.status is Status.INTERRUPTED:
+    *_, boundary = find_boundaries(model, found, ContinuationSettings(tol=task.tol))
+    if not found.finished or boundary.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    curves = [_curve(model, b) for b in atlas.branches]
-    odd = len(unexplained(model, found, atlas))
-    status = Status.NO_CONVERGENCE if odd or found.lost else atlas.status
+    curves = [_curve(model, b) for b in boundary.branches]
+    odd = len(unexplained(model, found, boundary))
+    status = Status.NO_CONVERGENCE if odd or found.lost else boundary.status
     return curves, sum(turns(c[:, 0]) for c in curves), odd, status
 
 
@@ -357,10 +357,10 @@ def _followed(model: GeneratedModel, task: LawTask, eps: float) -> Iterator[list
     """Yield the components at one amplitude, as they are found by a search on lines, which is quicker than a map."""
     base = model.with_values(task.p, eps=eps)
     plane = Plane(base, Axis("V", *task.window.V), Axis("W0", *task.window.W0))
-    for atlas in find_components(model, plane, AtlasSettings(lines=8, tol=1e-4)):
-        if atlas.status is Status.INTERRUPTED:
+    for boundary in find_components(model, plane, ContinuationSettings(lines=8, tol=1e-4)):
+        if boundary.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        yield [_curve(model, b) for b in atlas.branches]
+        yield [_curve(model, b) for b in boundary.branches]
 
 
 def changed_areas(crossings: Sequence[Array], window: Window) -> tuple[float, float]:

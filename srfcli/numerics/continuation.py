@@ -373,7 +373,7 @@ def trace_whole(
 
 
 @dataclass(frozen=True)
-class AtlasSettings:
+class ContinuationSettings:
     """How a window is searched: `lines` of constant x, `samples` along each before refinement, down to `resolution` in ln y."""
 
     lines: int = 10
@@ -399,7 +399,7 @@ class Branch:
 
 
 @dataclass
-class Atlas:
+class Boundary:
     """The components found in a window; `notes` say what was looked at and what was not."""
 
     plane: Plane
@@ -423,19 +423,19 @@ SAME = 1e-3  # of the window's height
 
 
 def find_components(
-    model: GeneratedModel, plane: Plane, settings: AtlasSettings | None = None, *, progress: Progress = lambda text: None
-) -> Iterator[Atlas]:
-    """Yield the atlas as it grows, after each component; the last one yielded is complete and says so in its notes.
+    model: GeneratedModel, plane: Plane, settings: ContinuationSettings | None = None, *, progress: Progress = lambda text: None
+) -> Iterator[Boundary]:
+    """Yield the boundary as it grows, after each component; the last one yielded is complete and says so in its notes.
 
     A KeyboardInterrupt ends the search: what was followed until then is polished and yielded, with status INTERRUPTED.
     """
-    settings = settings or AtlasSettings()
-    atlas = Atlas(plane, [], [], [])
+    settings = settings or ContinuationSettings()
+    boundary = Boundary(plane, [], [], [])
     curves: list[Curve] = []
     missed = 0
     try:
         for scan in _scan_lines(model, plane, settings, progress):
-            atlas.scans.append(scan)
+            boundary.scans.append(scan)
             for bracket in _unclaimed(model, plane, scan, curves):
                 start = _starting_point(model, plane, scan, bracket, settings)
                 if start is None:
@@ -446,18 +446,18 @@ def find_components(
                 curve = trace_whole(model, plane, start, settings.steps, progress, f"component {len(curves) + 1}: ")
                 if len(curve.points) > 1:
                     curves.append(curve)
-                    atlas.branches.extend(polish_curve(model, plane, curve, settings))
+                    boundary.branches.extend(polish_curve(model, plane, curve, settings))
                 if curve.end is Status.INTERRUPTED:
                     raise KeyboardInterrupt
-                yield atlas
+                yield boundary
     except KeyboardInterrupt:
-        atlas.status = Status.INTERRUPTED
-    atlas.notes = _notes(atlas, settings, missed)
-    atlas.conclude(missed)
-    yield atlas
+        boundary.status = Status.INTERRUPTED
+    boundary.notes = _notes(boundary, settings, missed)
+    boundary.conclude(missed)
+    yield boundary
 
 
-def _scan_lines(model: GeneratedModel, plane: Plane, settings: AtlasSettings, progress: Progress) -> Iterator[LineScan]:
+def _scan_lines(model: GeneratedModel, plane: Plane, settings: ContinuationSettings, progress: Progress) -> Iterator[LineScan]:
     """Yield a scan along y at each of the lines, each with the one before as its first guess."""
     values = plane.y.samples(settings.samples)
     guess: Discretisation | None = None
@@ -503,7 +503,7 @@ def _heights(curves: list[Curve], x: float) -> list[tuple[float, bool]]:
 
 
 def _starting_point(
-    model: GeneratedModel, plane: Plane, scan: LineScan, bracket: int, settings: AtlasSettings
+    model: GeneratedModel, plane: Plane, scan: LineScan, bracket: int, settings: ContinuationSettings
 ) -> CurvePoint | None:
     """Return the boundary point in a sign change of a scan, ready to be followed, or None."""
     base = scan.p[:, bracket]
@@ -524,7 +524,7 @@ def with_tangent(model: GeneratedModel, plane: Plane, point: BoundaryPoint, axis
     return correct(model, plane, q, point.orbit.part(0), point.rho, np.eye(2)[axis])
 
 
-def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: AtlasSettings) -> list[Branch]:
+def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: ContinuationSettings) -> list[Branch]:
     """Return the stability boundary along a traced curve, polished; parts where another multiplier is unstable are left out.
 
     Each point moves across the curve's tangent in parameters and state together, so that folds and cusps are as good as any
@@ -581,10 +581,10 @@ def _across(model: GeneratedModel, plane: Plane, points: Sequence[CurvePoint]) -
     return Direction(plane.names, vectors, (plane.x.log, plane.y.log), np.array(rows)[:, None, :])
 
 
-def _notes(atlas: Atlas, settings: AtlasSettings, missed: int) -> list[str]:
-    plane = atlas.plane
-    lost = sum(len(s.lost) for s in atlas.scans)
-    finest = max((s.resolution for s in atlas.scans), default=settings.resolution)
+def _notes(boundary: Boundary, settings: ContinuationSettings, missed: int) -> list[str]:
+    plane = boundary.plane
+    lost = sum(len(s.lost) for s in boundary.scans)
+    finest = max((s.resolution for s in boundary.scans), default=settings.resolution)
     notes = [
         f"looked at {settings.lines} lines of constant {plane.x.name} from {plane.x.lo:g} to {plane.x.hi:g}, along "
         f"{plane.y.name} from {plane.y.lo:.4g} to {plane.y.hi:.4g}, down to a spacing of {finest:.1g} in ln {plane.y.name}; "
@@ -597,19 +597,19 @@ def _notes(atlas: Atlas, settings: AtlasSettings, missed: int) -> list[str]:
     return notes
 
 
-def crossing_numbers(model: GeneratedModel, atlas: Atlas) -> list[list[int | None]]:
+def crossing_numbers(model: GeneratedModel, boundary: Boundary) -> list[list[int | None]]:
     """Return, for every point of every branch, its number among the crossings at its x, counted from low y.
 
     Odd numbers are those where stability is lost as y rises (the paper's footnote). Counted on the polylines of all branches
     and corrected to the parity that the point's own slope shows; None where there is no such slope: where the curve turns round,
     and where a multiplier is +1.
     """
-    plane = atlas.plane
-    lines = [plane.coordinates(model, b.p) for b in atlas.branches]
-    lowest = [bool(s.g[np.isfinite(s.g)][0] < 0) if np.isfinite(s.g).any() else True for s in atlas.scans]
+    plane = boundary.plane
+    lines = [plane.coordinates(model, b.p) for b in boundary.branches]
+    lowest = [bool(s.g[np.isfinite(s.g)][0] < 0) if np.isfinite(s.g).any() else True for s in boundary.scans]
     first = 1 if all(lowest) or not lowest else 2
     numbers: list[list[int | None]] = []
-    for b, (branch, own) in enumerate(zip(atlas.branches, lines, strict=True)):
+    for b, (branch, own) in enumerate(zip(boundary.branches, lines, strict=True)):
         row: list[int | None] = []
         for i, point in enumerate(branch.points):
             below = sum(_crossings_below(q, own[i], skip=i if k == b else None) for k, q in enumerate(lines))

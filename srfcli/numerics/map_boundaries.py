@@ -16,8 +16,8 @@ from srfcli.core.errors import Status
 from srfcli.numerics.boundary import BoundaryPoint, along, bifurcation_kind, polish
 from srfcli.numerics.collocation import stack
 from srfcli.numerics.continuation import (
-    Atlas,
-    AtlasSettings,
+    Boundary,
+    ContinuationSettings,
     Curve,
     CurvePoint,
     Progress,
@@ -54,14 +54,18 @@ class _Traced:
 
 
 def find_boundaries(
-    model: GeneratedModel, found: StabilityMap, settings: AtlasSettings | None = None, *, progress: Progress = lambda text: None
-) -> Iterator[Atlas]:
-    """Yield the atlas of a map's boundaries as it grows; the last one yielded is complete and says so in its notes.
+    model: GeneratedModel,
+    found: StabilityMap,
+    settings: ContinuationSettings | None = None,
+    *,
+    progress: Progress = lambda text: None,
+) -> Iterator[Boundary]:
+    """Yield the boundaries of a map as they grow; the last yielded are complete and say so in their notes.
 
     A KeyboardInterrupt ends the search: what was followed until then is yielded, with status INTERRUPTED.
     """
-    settings = settings or AtlasSettings()
-    atlas = Atlas(found.grid.plane(model), [], [], [])
+    settings = settings or ContinuationSettings()
+    boundary = Boundary(found.grid.plane(model), [], [], [])
     waiting = sorted(found.seeds, key=lambda s: (float(np.ptp(s.ends, axis=0).max()), -s.axis))[::-1]
     discontinuities = list(found.discontinuities)
     traced: list[_Traced] = []
@@ -71,47 +75,47 @@ def find_boundaries(
         while waiting or discontinuities:
             if waiting:
                 seed = waiting.pop(0)
-                start = starting_point(model, atlas.plane, seed, settings)
+                start = starting_point(model, boundary.plane, seed, settings)
                 missed += [seed] if start is None else []
             elif not sifted:
                 progress(f"{len(discontinuities)} places where a state may end")
-                discontinuities, sifted = not_continued(model, atlas.plane, discontinuities), True
+                discontinuities, sifted = not_continued(model, boundary.plane, discontinuities), True
                 continue
             else:
-                end = continued_end(model, atlas.plane, discontinuities.pop(len(discontinuities) // 2))
+                end = continued_end(model, boundary.plane, discontinuities.pop(len(discontinuities) // 2))
                 if end is None:
                     continue
-                start = fold_at(model, atlas.plane, end)
+                start = fold_at(model, boundary.plane, end)
                 endless = 0 if start is not None else endless + 1
                 discontinuities = discontinuities if endless < PATIENCE else []
             if start is None or any(_same_place(t, start) for t in traced):
                 continue  # met again from a seed that the map's mesh misplaced
             progress(f"boundary {len(traced) + 1}")
-            curve = follow_curve(model, atlas.plane, start, settings, progress)
+            curve = follow_curve(model, boundary.plane, start, settings, progress)
             if len(curve.points) > 1:
                 traced.append(_dense(curve))
-                atlas.branches.extend(polish_curve(model, atlas.plane, curve, settings))
+                boundary.branches.extend(polish_curve(model, boundary.plane, curve, settings))
                 waiting = [s for s in waiting if not passes(traced[-1], s)]
                 discontinuities = [b for b in discontinuities if not ends_state(traced[-1], b)]
             if curve.end is Status.INTERRUPTED:
                 raise KeyboardInterrupt
-            yield atlas
+            yield boundary
     except KeyboardInterrupt:
-        atlas.status = Status.INTERRUPTED
-    _conclude(atlas, found, sum(not any(passes(t, seed) for t in traced) for seed in missed))
-    yield atlas
+        boundary.status = Status.INTERRUPTED
+    _conclude(boundary, found, sum(not any(passes(t, seed) for t in traced) for seed in missed))
+    yield boundary
 
 
-def _conclude(atlas: Atlas, found: StabilityMap, missed: int) -> None:
+def _conclude(boundary: Boundary, found: StabilityMap, missed: int) -> None:
     """Set the notes and the status of a finished search."""
-    atlas.notes = map_notes(found)
+    boundary.notes = map_notes(found)
     if missed:
-        atlas.notes.append(f"{missed} sign changes of the map could not be polished to a point of a boundary")
-    if any(pt.kind == "fold" for b in atlas.branches for pt in b.points):
-        atlas.notes.append(
+        boundary.notes.append(f"{missed} sign changes of the map could not be polished to a point of a boundary")
+    if any(pt.kind == "fold" for b in boundary.branches for pt in b.points):
+        boundary.notes.append(
             "at a boundary of type fold a forced state ends: beyond it the map shows another one, where it finds any"
         )
-    atlas.conclude(missed)
+    boundary.conclude(missed)
 
 
 def map_notes(found: StabilityMap) -> list[str]:
@@ -132,7 +136,7 @@ def map_notes(found: StabilityMap) -> list[str]:
     return notes
 
 
-def starting_point(model: GeneratedModel, plane: Plane, seed: Seed, settings: AtlasSettings) -> CurvePoint | None:
+def starting_point(model: GeneratedModel, plane: Plane, seed: Seed, settings: ContinuationSettings) -> CurvePoint | None:
     """Return the boundary point of a seed, ready to be followed, or None where Newton's method leads elsewhere."""
     axis = (plane.x, plane.y)[seed.axis]
     tol = settings.steps.mesh_error
@@ -155,7 +159,7 @@ def _inside(model: GeneratedModel, plane: Plane, point: BoundaryPoint, seed: See
     return bool(low - margin <= plane.coordinates(model, point.p)[seed.axis] <= high + margin)
 
 
-def _searched(model: GeneratedModel, axis: Axis, seed: Seed, settings: AtlasSettings) -> list[BoundaryPoint]:
+def _searched(model: GeneratedModel, axis: Axis, seed: Seed, settings: ContinuationSettings) -> list[BoundaryPoint]:
     """Return the crossings on the seed's line that a scan on twice its mesh shows."""
     low, high = axis.value(seed.ends[:, seed.axis]).tolist()
     margin = (high / low) ** 0.5
@@ -164,7 +168,9 @@ def _searched(model: GeneratedModel, axis: Axis, seed: Seed, settings: AtlasSett
     return locate_crossings(model, seed.p, scan, tol=settings.steps.mesh_error, max_mesh=settings.max_mesh, depth=2)
 
 
-def follow_curve(model: GeneratedModel, plane: Plane, start: CurvePoint, settings: AtlasSettings, progress: Progress) -> Curve:
+def follow_curve(
+    model: GeneratedModel, plane: Plane, start: CurvePoint, settings: ContinuationSettings, progress: Progress
+) -> Curve:
     """Return the curve through `start`, both ways; after a KeyboardInterrupt as far as it was followed.
 
     A step across a narrow tongue lands on its other side, where the curve's unstable side is the other one: it is then followed
@@ -271,19 +277,19 @@ def _same_place(traced: _Traced, point: CurvePoint) -> bool:
     return bool(distance[k] < reach * CURVE_REACH)
 
 
-def unexplained(model: GeneratedModel, found: StabilityMap, atlas: Atlas) -> Array:
+def unexplained(model: GeneratedModel, found: StabilityMap, boundary: Boundary) -> Array:
     """Return the grid points (count, 2) whose stability is not what the number of boundaries below them says.
 
     Points beside a boundary, within 2 REACH of the window, are not judged. Folds do not count: a state ends there, and is stable
     on both sides of where two exist. None left over: the curves account for the map.
     """
     p = found.points(model)
-    unit = atlas.plane.coordinates(model, p)  # (nx, ny, 2)
+    unit = boundary.plane.coordinates(model, p)  # (nx, ny, 2)
     flipped = bool(unit[0, -1, 1] < unit[0, 0, 1])
-    values = p[model.index(atlas.plane.x.name), :, 0]
+    values = p[model.index(boundary.plane.x.name), :, 0]
     left = []
-    for i, heights in enumerate(crossings_at(model, atlas.plane, atlas.branches, values, folds=False)):
-        edges = atlas.plane.y.unit(heights)
+    for i, heights in enumerate(crossings_at(model, boundary.plane, boundary.branches, values, folds=False)):
+        edges = boundary.plane.y.unit(heights)
         order = np.arange(unit.shape[1])[:: -1 if flipped else 1]
         y, g = unit[i, order, 1], found.growth[i, order]
         clear = np.isfinite(g)

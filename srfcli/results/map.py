@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from srfcli.codegen.model import Array, GeneratedModel
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.compare import LawStudy, Match, Observables, Window
-    from srfcli.numerics.continuation import Atlas, Branch
+    from srfcli.numerics.continuation import Boundary, Branch
     from srfcli.numerics.map import StabilityMap
     from srfcli.numerics.plane import MapAxis
     from srfcli.numerics.special_points import SpecialPoint
@@ -45,7 +45,7 @@ class MapResult(Result):
         The laws and the parameters that were not swept.
     found : StabilityMap
         The leading multiplier and the kind of stability, (nx, ny), with the mesh at each point.
-    atlas : Atlas
+    curves : Boundary
         The boundaries, component after component.
     special : tuple of list of SpecialPoint
         Folds, resonances and changes of criticality on each component.
@@ -57,7 +57,7 @@ class MapResult(Result):
 
     system: SlidingSystem
     found: StabilityMap = field(repr=False)
-    atlas: Atlas = field(repr=False)
+    curves: Boundary = field(repr=False)
     special: tuple[list[SpecialPoint], ...] = field(repr=False)
     cubic: tuple[Array, ...] = field(repr=False)
     followed: bool = True
@@ -69,7 +69,7 @@ class MapResult(Result):
         from srfcli.numerics.map_boundaries import map_notes, unexplained
         from srfcli.numerics.special_points import crossings_at
 
-        model, found, atlas = self.system.model, self.found, self.atlas
+        model, found, boundary = self.system.model, self.found, self.curves
         count = found.kind.size
         share = {name: float((found.kind == k).sum() / count) for k, name in enumerate(KINDS)}
         meta: dict[str, Any] = {"share": share, "suspect_cells": len(found.suspect), "points_added": len(found.extra_at)}
@@ -82,10 +82,10 @@ class MapResult(Result):
         if not self.followed:
             return (*reason, *map_notes(found)), meta, status
         values = found.points(model)[model.index(found.grid.x.moved), :, 0]
-        met = [len(crossings) for crossings in crossings_at(model, atlas.plane, atlas.branches, values)]
-        odd = unexplained(model, found, atlas)
+        met = [len(crossings) for crossings in crossings_at(model, boundary.plane, boundary.branches, values)]
+        odd = unexplained(model, found, boundary)
         meta |= {"crossings": met, "unexplained_points": len(odd)}
-        number = len(atlas.branches)
+        number = len(boundary.branches)
         lines = ", ".join(f"{n} on {lines}" for n, lines in sorted(Counter(met).items()))
         notes = [
             f"{number} component{'' if number == 1 else 's'}; stable at {share['stable']:.1%} of the points",
@@ -99,8 +99,8 @@ class MapResult(Result):
         bad = sum(not s.status.ok for marks in self.special for s in marks)
         if bad:
             notes.append(f"{bad} special points could not be located; their rows say so")
-        stopped = atlas.status is Status.INTERRUPTED  # counts before what else went wrong
-        return (*notes, *reason, *atlas.notes), meta, atlas.status if stopped or status.ok else status
+        stopped = boundary.status is Status.INTERRUPTED  # counts before what else went wrong
+        return (*notes, *reason, *boundary.notes), meta, boundary.status if stopped or status.ok else status
 
     @cached_property
     def _common(self) -> dict[str, Any]:
@@ -161,7 +161,7 @@ class MapResult(Result):
         import numpy as np
 
         model, grid, rows = self.system.model, self.found.grid, []
-        for k, (branch, marks) in enumerate(zip(self.atlas.branches, self.special, strict=True), 1):
+        for k, (branch, marks) in enumerate(zip(self.curves.branches, self.special, strict=True), 1):
             p = np.stack([pt.p for pt in branch.points], axis=1)
             spans = [shown(model, axis, f(axis.quantity(model, p))) for axis in (grid.x, grid.y) for f in (np.min, np.max)]
             kinds = "+".join(sorted({pt.kind for pt in branch.points}))
@@ -214,9 +214,9 @@ class MapResult(Result):
         """Return a row for each polished point of the boundaries, with the cubic coefficient of the normal form."""
         from srfcli.numerics.continuation import crossing_numbers
 
-        model, atlas = self.system.model, self.atlas
-        extra = tuple(a.name for a in (atlas.plane.x, atlas.plane.y) if a.name not in ("V", "W0", "eps"))
-        branches = zip(atlas.branches, crossing_numbers(model, atlas), self.cubic, strict=True)
+        model, boundary = self.system.model, self.curves
+        extra = tuple(a.name for a in (boundary.plane.x, boundary.plane.y) if a.name not in ("V", "W0", "eps"))
+        branches = zip(boundary.branches, crossing_numbers(model, boundary), self.cubic, strict=True)
         rows = [
             (*boundary_row(model, q, k, number, extra), float(d))
             for k, (branch, numbers, cubic) in enumerate(branches, 1)
@@ -271,7 +271,7 @@ class MapResult(Result):
             xs,
             ys,
             growth,
-            branches=[self._curve(b, d) for b, d in zip(self.atlas.branches, self.cubic, strict=True)],
+            branches=[self._curve(b, d) for b, d in zip(self.curves.branches, self.cubic, strict=True)],
             special=marks,
             unresolved=([xs[i] for i, _ in lost], [ys[j] for _, j in lost]),
             xlabel=label(model, grid.x),

@@ -234,7 +234,7 @@ def _location_sentences(matter: Matter) -> list[str]:
 
 def _frequencies(matter: Matter, narrow: Sequence[float]) -> list[str]:
     """Return where in frequency the misfit is, the strongest place of the table and the figure first."""
-    seen = [s for s in spots(matter.tables.get("atlas") or ()) if s.axis == "frequency" and s.sure]
+    seen = [s for s in spots(matter.tables.get("residual_scan") or ()) if s.axis == "frequency" and s.sure]
     if not seen:
         return []
     low, high = seen[0].low, seen[0].high
@@ -271,14 +271,14 @@ def _run(matter: Matter, one: Trace) -> Markup:
 
 def residual_scan(matter: Matter) -> Markup:
     """Return the residual scan: phases, frequencies and quantities of state that the misfit goes with."""
-    found = spots(matter.tables.get("atlas") or ())
+    found = spots(matter.tables.get("residual_scan") or ())
     if not found:
         return Markup("")
     rows = [[axis_text(s.axis), s.place, s.run or "all", number(s.height), probability(s.p_value)] for s in foremost(found)]
     heads = ["looked at by", "place", "run", "−log10 p", "p, adjusted"]
     caption = "What stands out most; the last column allows for all that was looked at."
     figure = matter.figure(
-        "atlas",
+        "residual-scan",
         "How far the misfit stands out in bins of phase, frequency and state.",
         "How improbable each place is under noise alone; grey is what noise may do.",
     )
@@ -640,7 +640,7 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     runs: {name, holdout, label, load_unit, t, observed, used, baseline, augmented, V, W, windows} with arrays (n,), t in s, V in
     um/s, and of baseline and augmented model: white, rms, friction;
     thresholds: {name, holdout, table, baseline, augmented, chi2 (of both models)}, critical loads (n,) in N;
-    atlas, the residual scan: {axis, run, kind, low, high, log_p, p_value};
+    residual_scan: {axis, run, kind, low, high, log_p, p_value};
     ranked: {name, evidence, rms_over_noise, field, confidence, against};
     scores: {effect, gain, size, stderr, tolerance, detectable};
     parameters: {name, unit, baseline, baseline_stderr, augmented, augmented_stderr, shift_sigma};
@@ -703,7 +703,7 @@ def _drawings(traces: tuple[Trace, ...], material: Mapping[str, Any]) -> Iterato
         yield f"run {one.name}", partial(run_figure, one)
     for loads in material.get("thresholds", ()):
         yield f"loads {loads['name']}", partial(loads_figure, loads)
-    yield "atlas", partial(scan_figure, plain_value(material.get("atlas") or ()))
+    yield "residual-scan", partial(scan_figure, plain_value(material.get("residual_scan") or ()))
     changed = any(t["chi2"][0] != t["chi2"][1] for t in material.get("thresholds", ()))
     if changed or not all(one.same for one in traces):
         yield "parameters", partial(parameters_figure, plain_value(material.get("parameters") or ()))

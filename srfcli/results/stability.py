@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from srfcli.codegen.model import GeneratedModel
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.boundary import BoundaryPoint
-    from srfcli.numerics.continuation import Atlas
+    from srfcli.numerics.continuation import Boundary
     from srfcli.numerics.floquet import FloquetResult
     from srfcli.numerics.response import LinearResponse, MeanFriction
 
@@ -444,19 +444,19 @@ class BoundaryResult(Result):
     ----------
     system : SlidingSystem
         The laws and the parameters that were not swept.
-    atlases : tuple of Atlas
+    boundaries : tuple of Boundary
         The components in the plane of each amplitude: polished points, how each curve ends, notes and status.
     worst : Status
         The worst status, INTERRUPTED where the search was stopped.
     """
 
     system: SlidingSystem
-    atlases: tuple[Atlas, ...] = field(repr=False)
+    boundaries: tuple[Boundary, ...] = field(repr=False)
     worst: Status = Status.OK
 
     @property
     def _axes(self) -> tuple[str, str]:
-        plane = self.atlases[0].plane if self.atlases else None
+        plane = self.boundaries[0].plane if self.boundaries else None
         return (plane.x.name, plane.y.name) if plane else ("V", "W0")
 
     @cached_property
@@ -466,16 +466,16 @@ class BoundaryResult(Result):
 
         model, rows, notes = self.system.model, [], []
         extra = tuple(n for n in self._axes if n not in ("V", "W0", "eps"))
-        for atlas in self.atlases:
-            numbers = crossing_numbers(model, atlas)
-            for component, (branch, crossings) in enumerate(zip(atlas.branches, numbers, strict=True), 1):
+        for boundary in self.boundaries:
+            numbers = crossing_numbers(model, boundary)
+            for component, (branch, crossings) in enumerate(zip(boundary.branches, numbers, strict=True), 1):
                 pairs = zip(branch.points, crossings, strict=True)
                 rows += [boundary_row(model, q, component, k, extra) for q, k in pairs]
-            named = "" if "eps" in self._axes else f"eps = {atlas.plane.base[model.index('eps')]:g}: "
-            count = len(atlas.branches)
-            ends = "; ".join(f"{i}: {b.start.value}, {b.end.value}" for i, b in enumerate(atlas.branches, 1))
+            named = "" if "eps" in self._axes else f"eps = {boundary.plane.base[model.index('eps')]:g}: "
+            count = len(boundary.branches)
+            ends = "; ".join(f"{i}: {b.start.value}, {b.end.value}" for i, b in enumerate(boundary.branches, 1))
             notes.append(f"{named}{count} component{'' if count == 1 else 's'}" + (f" (ends {ends})" if count else ""))
-            notes += [named + note for note in atlas.notes]
+            notes += [named + note for note in boundary.notes]
         columns = boundary_columns(model, extra)
         described = self.system.described(without=(*self._axes, "eps"))
         return Table("srf.continue/1", columns, rows, model.title, tuple(notes), described, status=self.worst.value)
@@ -488,12 +488,12 @@ class BoundaryResult(Result):
         from srfcli.results import plots
 
         model, title = self.system.model, plots.titled(self.table.title, self.table.parameters)
-        if not self.atlases:
+        if not self.boundaries:
             return plots.stability_diagram([], title=title, ax=ax)
-        plane, usual = self.atlases[0].plane, self._axes == ("V", "W0")
+        plane, usual = self.boundaries[0].plane, self._axes == ("V", "W0")
         branches = [
             {
-                "eps": float(atlas.plane.base[model.index("eps")]),
+                "eps": float(boundary.plane.base[model.index("eps")]),
                 "V": [model.declared(plane.x.name, q.value(model, plane.x.name)) for q in branch.points],
                 "K_over_W0": [
                     q.value(model, "K") / q.value(model, "W0")
@@ -503,8 +503,8 @@ class BoundaryResult(Result):
                 ],
                 "label": "boundary" if "eps" in self._axes else None,
             }
-            for atlas in self.atlases
-            for branch in atlas.branches
+            for boundary in self.boundaries
+            for branch in boundary.branches
         ]
         if not usual:
             unit = {q.name: q.unit for q in model.parameters}

@@ -27,7 +27,7 @@ from srfcli.numerics.compare import (
     observe,
     study_part,
 )
-from srfcli.numerics.continuation import Atlas, AtlasSettings
+from srfcli.numerics.continuation import Boundary, ContinuationSettings
 from srfcli.numerics.map import StabilityMap, compute_map
 from srfcli.numerics.map_boundaries import find_boundaries
 from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings, check_count, check_grid
@@ -48,7 +48,7 @@ def map(  # the command's own name
     y: tuple[str, float, float, int] | MapAxis,
     log: Sequence[str] | None = None,
     grid: MapSettings | None = None,
-    curves: AtlasSettings | None = None,
+    curves: ContinuationSettings | None = None,
     boundaries: bool = True,
     criticality: bool = True,
     run: Runner = run_here,
@@ -68,7 +68,7 @@ def map(  # the command's own name
         Which of the axes are logarithmic; those whose ends are positive and a decade or more apart if left out.
     grid : MapSettings, optional
         The error that the map's mesh may shift a boundary by, and how often a cell is halved.
-    curves : AtlasSettings, optional
+    curves : ContinuationSettings, optional
         Steps, tolerance and meshes of the boundaries.
     boundaries, criticality : bool
         Whether boundaries are followed, and whether the normal form tells sub- from supercritical on them.
@@ -104,8 +104,8 @@ def map(  # the command's own name
     check_grid(model, axes)
     found = compute_map(model, axes, grid or MapSettings(), run=run, progress=tiles)
     followed = boundaries and found.finished
-    atlas, special, cubic = _boundaries(model, found, curves or AtlasSettings(), followed, criticality, progress)
-    return MapResult(system, found, atlas, tuple(special), tuple(cubic), followed)
+    boundary, special, cubic = _boundaries(model, found, curves or ContinuationSettings(), followed, criticality, progress)
+    return MapResult(system, found, boundary, tuple(special), tuple(cubic), followed)
 
 
 def _axis(model: GeneratedModel, given: tuple[str, float, float, int] | MapAxis, logs: Sequence[str] | None) -> MapAxis:
@@ -128,30 +128,30 @@ def _axis(model: GeneratedModel, given: tuple[str, float, float, int] | MapAxis,
 def _boundaries(
     model: GeneratedModel,
     found: StabilityMap,
-    settings: AtlasSettings,
+    settings: ContinuationSettings,
     followed: bool,
     criticality: bool,
     progress: Callable[[str], None],
-) -> tuple[Atlas, list[list[SpecialPoint]], list[NDArray[np.float64]]]:
+) -> tuple[Boundary, list[list[SpecialPoint]], list[NDArray[np.float64]]]:
     """Return the components, the special points of each, and the cubic coefficient at each point (NaN unless wanted)."""
     if not followed:
-        return Atlas(found.grid.plane(model), [], [], []), [], []
-    *_, atlas = find_boundaries(model, found, settings, progress=lambda said: progress(f"boundaries: {said}"))
-    special: list[list[SpecialPoint]] = [[] for _ in atlas.branches]
-    cubic = [np.full(len(b.points), np.nan) for b in atlas.branches]
+        return Boundary(found.grid.plane(model), [], [], []), [], []
+    *_, boundary = find_boundaries(model, found, settings, progress=lambda said: progress(f"boundaries: {said}"))
+    special: list[list[SpecialPoint]] = [[] for _ in boundary.branches]
+    cubic = [np.full(len(b.points), np.nan) for b in boundary.branches]
     try:
-        for k, branch in enumerate(atlas.branches):
+        for k, branch in enumerate(boundary.branches):
             progress(f"special points of boundary {k + 1}")
-            special[k] = special_points(model, atlas.plane, branch)
-        for k, branch in enumerate(atlas.branches if criticality else []):
+            special[k] = special_points(model, boundary.plane, branch)
+        for k, branch in enumerate(boundary.branches if criticality else []):
             progress(f"criticality of boundary {k + 1}")
             cubic[k] = branch_coefficients(model, branch)
-            changes = criticality_points(model, atlas.plane, branch, cubic[k])
+            changes = criticality_points(model, boundary.plane, branch, cubic[k])
             special[k] = sorted([*special[k], *changes], key=lambda s: s.place)
     except KeyboardInterrupt:
-        atlas.status = Status.INTERRUPTED
-        atlas.notes.append("interrupted: special points and criticality are not complete")
-    return atlas, special, cubic
+        boundary.status = Status.INTERRUPTED
+        boundary.notes.append("interrupted: special points and criticality are not complete")
+    return boundary, special, cubic
 
 
 # `compare`: the stability diagrams of several laws, brought to the same observables at one low velocity.

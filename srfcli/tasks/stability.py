@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from srfcli.codegen.model import Array
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.numerics.boundary import BoundaryPoint
-    from srfcli.numerics.continuation import Atlas, AtlasSettings
+    from srfcli.numerics.continuation import Boundary, ContinuationSettings
     from srfcli.numerics.critical import LoadWindow
 
 Values = Sequence[float] | float
@@ -376,7 +376,7 @@ def continue_boundary(
     eps: Values | None = None,
     over: Mapping[str, tuple[float, float]] | None = None,
     log: Sequence[str] | None = None,
-    settings: AtlasSettings | None = None,
+    settings: ContinuationSettings | None = None,
     progress: Said = lambda text: None,
 ) -> Iterator[BoundaryResult]:
     """Return an iterator of the boundary under modulation as it grows, after each component; the last one is complete.
@@ -391,7 +391,7 @@ def continue_boundary(
         One axis, against W0, or two, in declared units; V from 1 to 100 um/s if left out.
     log : sequence of str, optional
         Which of the axes are logarithmic; those whose ends are positive and a decade or more apart if left out.
-    settings : AtlasSettings, optional
+    settings : ContinuationSettings, optional
         Scan lines, samples, steps, tolerance and meshes.
     progress : callable
         Told what is being done.
@@ -410,12 +410,12 @@ def continue_boundary(
     --------
     >>> import srfcli as srf
     >>> *_, found = srf.continue_boundary(srf.system(), eps=0.09, over={"V": (5, 20)})
-    >>> found.status.value, len(found.atlases[0].branches)
+    >>> found.status.value, len(found.boundaries[0].branches)
     ('ok', 1)
     """
-    from srfcli.numerics.continuation import AtlasSettings
+    from srfcli.numerics.continuation import ContinuationSettings
 
-    model, settings = system.model, settings or AtlasSettings()
+    model, settings = system.model, settings or ContinuationSettings()
     axes = _axes(model, over or {"V": (1.0, 100.0)}, log, eps is not None)
     model.check_changing_load(system.vector())
     own = system.resolved.values["eps"]
@@ -425,24 +425,24 @@ def continue_boundary(
 
 
 def _grown(
-    system: SlidingSystem, axes: list[Axis], amplitudes: Sequence[float | None], settings: AtlasSettings, progress: Said
+    system: SlidingSystem, axes: list[Axis], amplitudes: Sequence[float | None], settings: ContinuationSettings, progress: Said
 ) -> Iterator[BoundaryResult]:
     from srfcli.numerics.continuation import find_components
 
     model = system.model
-    done: list[Atlas] = []
+    done: list[Boundary] = []
     try:
         for amplitude in amplitudes:
             plane, window = _plane(system, axes, amplitude)
             dense = settings if window is None else replace(settings, samples=math.ceil(settings.samples * window.widening))
-            atlas: Atlas | None = None
-            for atlas in find_components(model, plane, dense, progress=progress):
-                yield BoundaryResult(system, (*done, atlas), worst([*(a.status for a in done), atlas.status]))
-            assert atlas is not None
+            boundary: Boundary | None = None
+            for boundary in find_components(model, plane, dense, progress=progress):
+                yield BoundaryResult(system, (*done, boundary), worst([*(a.status for a in done), boundary.status]))
+            assert boundary is not None
             if window is not None:
-                _judge_window(model, atlas, window)
-            done.append(atlas)
-            if atlas.status is Status.INTERRUPTED:
+                _judge_window(model, boundary, window)
+            done.append(boundary)
+            if boundary.status is Status.INTERRUPTED:
                 break
     except KeyboardInterrupt:
         yield BoundaryResult(system, tuple(done), Status.INTERRUPTED)
@@ -489,17 +489,17 @@ def _plane(system: SlidingSystem, axes: list[Axis], amplitude: float | None) -> 
     return Plane(base, x, Axis("W0", window.lo, window.hi)), window
 
 
-def _judge_window(model: GeneratedModel, atlas: Atlas, window: LoadWindow) -> None:
-    """Say in `atlas` where its curves leave the loads that were found, and what of those loads is not certain."""
-    x = atlas.plane.x.name
-    for number, branch in enumerate(atlas.branches, 1):
+def _judge_window(model: GeneratedModel, boundary: Boundary, window: LoadWindow) -> None:
+    """Say in `boundary` where its curves leave the loads that were found, and what of those loads is not certain."""
+    x = boundary.plane.x.name
+    for number, branch in enumerate(boundary.branches, 1):
         for point in (branch.points[0], branch.points[-1]):
             W0 = point.value(model, "W0")
             side = "above" if 0.999 * window.hi < W0 else "below" if 1.001 * window.lo > W0 else ""
             if side:
                 at = f"{x} = {model.declared(x, point.value(model, x)):.4g}"
-                atlas.notes.append(f"component {number} goes on {side} W0 = {W0:.4g} N at {at} (--over W0=LOW:HIGH for more)")
+                boundary.notes.append(f"component {number} goes on {side} W0 = {W0:.4g} N at {at} (--over W0=LOW:HIGH for more)")
     if not window.certain:
-        atlas.notes.append(f"crossings below {window.lo:.4g} or above {window.hi:.4g} N are not ruled out")
-        if atlas.status is Status.OK:
-            atlas.status = Status.UNSETTLED
+        boundary.notes.append(f"crossings below {window.lo:.4g} or above {window.hi:.4g} N are not ruled out")
+        if boundary.status is Status.OK:
+            boundary.status = Status.UNSETTLED
