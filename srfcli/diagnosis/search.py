@@ -52,6 +52,7 @@ LARGEST = 2  # effects of a model
 ALIKE = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
 SINGLES, PAIRS = 5, 3  # promises of each model that are followed
 UNDERSTATED = 2.0  # times the gain at first order that an effect may bring beside a model that is far off
+SHARED = 2.0  # in log evidence, what a field that all runs share costs: it is one of two kinds, and has an amplitude of its own
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 COARSE = 1e-3  # tolerance of the integration: 0.02 in log likelihood
 BUDGET = 150.0  # s of CPU, or more
@@ -73,7 +74,7 @@ class Fitted:
     """A model fitted: log evidence, what speaks against it (nothing where it passes), what it leaves, what effects promise.
 
     `separate` is the log evidence where each run has a field of its own; of it `mass_at_bounds` comes from parameters at a bound.
-    `shared` is what a field that all runs share gains beyond CLOSE at first order, None where an effect says what all runs share
+    `shared` is what a field that all runs share gains beyond SHARED at first order, None where an effect says what all runs share
     along slip; `granted` is what is granted of that.
     """
 
@@ -240,7 +241,7 @@ class ModelSearch:
         random = not by_slip and found.maximum.away < LOST  # a track is a function of slip or a random one
         return Fitted(
             hypothesis, found, log_evidence(found, sizes) + self._prior(hypothesis), mass_at_bounds(found, sizes),
-            tuple(shortcomings(found)), remainder, max(remainder.shared.gain - CLOSE, 0.0) if random else None,
+            tuple(shortcomings(found)), remainder, max(remainder.shared.gain - SHARED, 0.0) if random else None,
         )  # fmt: skip
 
     def _prior(self, hypothesis: Hypothesis) -> float:
@@ -568,12 +569,18 @@ class ModelSearch:
                 self._push(node.attainable + pair.gain + 2 * self._one_more, Hypothesis(pair.effects), node, pair.values)
 
     def _try_rivals(self) -> None:
-        """Push the effects that were not fitted, where UNDERSTATED times their promise comes close to the best model."""
-        base, best = self.baseline, self.best()
-        if base.scores is None or base.passes or not best.passes:
-            return
-        rivals = [s for s in base.scores.singles if Hypothesis((s.effect,)).name not in self.fitted]
-        self._promise(base, base, [(UNDERSTATED * s.gain, s) for s in rivals], WORTH)
+        """Push what may do as well in the place of one effect of the best model: by UNDERSTATED times what it promised there."""
+        own, effects = self.best().hypothesis, self.best().hypothesis.effects
+        rests = [Hypothesis(tuple(e for e in effects if e is not left_out), own.ageing) for left_out in effects]
+        if own.ageing:
+            rests.append(Hypothesis(effects))
+        for rest in rests if self.best().passes else ():
+            node = self.fitted.get(rest.name)
+            if node is None or node.scores is None or node.passes:
+                continue
+            beside = [(s, Hypothesis((*rest.effects, s.effect), rest.ageing)) for s in node.scores.singles]
+            rivals = [(UNDERSTATED * s.gain, s) for s, hypothesis in beside if hypothesis.name not in self.fitted]
+            self._promise(node, node, rivals, WORTH)
 
     def _try_ageing_laws(self, node: Fitted, *, afresh: bool = False) -> None:
         """Push the other ageing laws, each after a few steps from where the model or the best one stands.

@@ -14,7 +14,7 @@ from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import improbability, loudness, uneven_noise
 from srfcli.diagnosis.hypotheses import Excluded, typical_sizes
 from srfcli.diagnosis.scores import Remainder, Score
-from srfcli.diagnosis.search import CLOSE, NEAR, Fitted, ModelSearch
+from srfcli.diagnosis.search import CLOSE, NEAR, SHARED, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
 from srfcli.inference.state_space import Filtered, Predictive, StateSpaceFit, maximise
 
@@ -192,7 +192,7 @@ def predictive(fitted: Fitted, whole: Experiment) -> float:
 def shared_gain(fitted: Fitted, whole: Experiment) -> float:
     """Return what held-out runs gain in log likelihood under a model by a field that all runs share, at first order."""
     runs = [run for run in whole.runs if run.holdout] if fitted.fit.likelihood.problem.runs else []
-    gains = [max(Remainder(fitted.fit.predictive(run).fit).shared.gain - CLOSE, 0.0) for run in runs]
+    gains = [max(Remainder(fitted.fit.predictive(run).fit).shared.gain - SHARED, 0.0) for run in runs]
     return sum(max(gain - (fitted.shared or 0.0), 0.0) for gain in gains)
 
 
