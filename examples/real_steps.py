@@ -122,7 +122,7 @@ def main() -> None:
         cells = [f"{n} {fit.values[n]:.5g} ({fit.stderr[n]:.2g})" for n in fit.names if n in ("A", "B", "D0", "K")]
         print(f"{case['title']}, {ageing}, k {stiffness}{' free' if K else ''}: {', '.join(cells)}")
         noise = [f"{c[1]:.2g} " + (f"about {c[0]:.3g} Hz" if c[2:] else f"over {c[0]:.2g} s") for c in fit.runs[0].colours]
-        print(f"    published {published}; {found.track}; noise {', '.join(noise)}; {found.status.value}", flush=True)
+        print(f"    published {published}; {found.friction_field}; noise {', '.join(noise)}; {found.status.value}", flush=True)
     fit = fit_recordings(load_registry(), ladder(Path(sys.argv[1])), trend="slip", vary=["mu0"]).fit
     cells = [f"{n} {fit.values[n]:.5g} ({fit.stderr[n]:.2g})" for n in fit.names if n in ("A", "B", "D0", "K")]
     print(f"p446, all steps, mu0 and a trend for each, ruina: {', '.join(cells)}")

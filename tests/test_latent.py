@@ -11,13 +11,13 @@ import pytest
 from srfcli.codegen.splines import Spline
 from srfcli.data.experiment import read_experiment
 from srfcli.inference.recordings import fit_recordings
-from srfcli.inference.shared_field import AMPLITUDES, LENGTHS, Roughness, marginal
+from srfcli.inference.shared_field import AMPLITUDES, LENGTHS, FieldPrior, marginal
 from srfcli.laws.registry import load_registry
 
 
 def test_prior_is_the_matern_covariance() -> None:
     nodes = np.linspace(0.0, 12.0, 25)
-    L = Roughness(3e-4, 2.0).root(nodes)
+    L = FieldPrior(3e-4, 2.0).root(nodes)
     d = np.sqrt(3) * np.abs(nodes[:, None] - nodes) / 2.0
     np.testing.assert_allclose(L @ L.T, 9e-8 * (1 + d) * np.exp(-d), rtol=1e-6, atol=1e-14)
 
@@ -28,11 +28,11 @@ def _linear(amplitude: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.nda
     track = Spline.over(0.0, 30.0, 0.8)
     n, m = 400, track.numbers.size
     J, C = rng.normal(size=(n, 2)), 2e4 * track.design(np.linspace(0, 30, n))
-    c = Roughness(amplitude, LENGTHS[1]).root(track.nodes) @ rng.normal(size=m) if amplitude else np.zeros(m)
+    c = FieldPrior(amplitude, LENGTHS[1]).root(track.nodes) @ rng.normal(size=m) if amplitude else np.zeros(m)
     return J @ [1.0, -2.0] + C @ c + rng.normal(size=n), J, C, track
 
 
-def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, roughness: Roughness) -> float:
+def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, roughness: FieldPrior) -> float:
     """The log likelihood with parameters and track integrated out, from the covariance of all samples."""
     L = roughness.root(track.nodes) if roughness.amplitude else np.zeros((track.numbers.size, 1))
     S = np.eye(r.size) + C @ L @ L.T @ C.T
@@ -42,7 +42,7 @@ def _whole(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, roughness
     return flat - 0.5 * float(rest @ np.linalg.solve(S, rest)) - 0.5 * np.linalg.slogdet(S)[1]
 
 
-def _marginal(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, **grid: object) -> tuple[float, Roughness]:
+def _marginal(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, **grid: object) -> tuple[float, FieldPrior]:
     A = np.column_stack([J, C])
     return marginal(A.T @ A, A.T @ r, 2, track, -0.5 * float(r @ r), **grid)
 
@@ -50,13 +50,13 @@ def _marginal(r: np.ndarray, J: np.ndarray, C: np.ndarray, track: Spline, **grid
 def test_marginal_likelihood_is_that_of_the_whole_covariance() -> None:
     problem = _linear(1e-4, 1)
     found, roughness = _marginal(*problem)
-    best = max(_whole(*problem, Roughness(a, length)) for length in LENGTHS for a in AMPLITUDES)
+    best = max(_whole(*problem, FieldPrior(a, length)) for length in LENGTHS for a in AMPLITUDES)
     assert found == pytest.approx(best, abs=1e-5)
     assert 0.3e-4 < roughness.amplitude < 3e-4
 
 
-@pytest.mark.parametrize("own", [Roughness(5e-4, 6.0), Roughness(2e-5, 0.5)], ids=["coarse", "finer than its knots"])
-def test_marginal_likelihood_of_one_roughness_is_its_own_and_not_a_better_one_s(own: Roughness) -> None:
+@pytest.mark.parametrize("own", [FieldPrior(5e-4, 6.0), FieldPrior(2e-5, 0.5)], ids=["coarse", "finer than its knots"])
+def test_marginal_likelihood_of_one_roughness_is_its_own_and_not_a_better_one_s(own: FieldPrior) -> None:
     problem = _linear(1e-4, 1)
     found = _marginal(*problem, grid=(np.array([own.length]), np.array([own.amplitude])))
     assert found == (pytest.approx(_whole(*problem, own), abs=1e-5), own)
@@ -65,7 +65,7 @@ def test_marginal_likelihood_of_one_roughness_is_its_own_and_not_a_better_one_s(
 def test_no_roughness_is_found_where_there_is_none() -> None:
     problem = _linear(0.0, 2)
     found, _ = _marginal(*problem)
-    assert found - _whole(*problem, Roughness()) < 4.0
+    assert found - _whole(*problem, FieldPrior()) < 4.0
 
 
 @pytest.mark.slow
@@ -76,7 +76,9 @@ def test_parameters_survive_a_rough_track(shared: Path) -> None:
     truth = json.loads((shared / "cases" / "truth.json").read_text())["open-07"]["parameters"]
     fitted = fit_recordings(registry, experiment)
     found = fitted.fit
-    assert fitted.track is not None and 2e-4 < fitted.track.amplitude < 5e-4 and not fitted.track.shared
+    assert (
+        fitted.friction_field is not None and 2e-4 < fitted.friction_field.amplitude < 5e-4 and not fitted.friction_field.shared
+    )
     assert found.rms_over_noise() == pytest.approx(1.0, abs=0.03)
     for name, value in found.values.items():
         assert abs(value - truth[{"lambda": "lam"}.get(name, name)]) < 4 * found.stderr[name]

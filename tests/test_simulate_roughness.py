@@ -23,7 +23,7 @@ from srfcli.codegen.c_source import compiled, compiler
 from srfcli.codegen.splines import Spline
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
-from srfcli.data.noise import FINEST_KNOTS, KNOTS, WIDEST_KNOTS, RoughTrack
+from srfcli.data.noise import FINEST_KNOTS, KNOTS, WIDEST_KNOTS, FrictionField
 from srfcli.data.values import Experiment
 from srfcli.laws.registry import load_registry
 from srfcli.validation.slider import Physics, Plan, Track, move
@@ -58,10 +58,10 @@ def matern(d: Any, length: float) -> Any:
 def test_covariance_over_many_seeds(length: float) -> None:
     """Standard deviation and correlation at every distance, at knots and between them, on both sides of 0 and across it."""
     count, size = 800, 3e-4
-    knots = RoughTrack(size, length).spacing
+    knots = FrictionField(size, length).spacing
     x = np.concatenate([length * np.array([-1.5, -0.5, 0.0, 0.13, 0.5, 1.5, 2.5]), [10 * knots, 10.5 * knots]])
     low, high = float(x.min()), float(x.max())
-    values = np.array([RoughTrack(size, length, seed).spline(low, high)(x) for seed in range(count)]) / size
+    values = np.array([FrictionField(size, length, seed).spline(low, high)(x) for seed in range(count)]) / size
     expected = matern(x[:, None] - x[None, :], length)
     assert expected[1, 4] == pytest.approx(0.4834, abs=1e-4)  # at a distance of one length
     found = values.T @ values / count
@@ -78,7 +78,7 @@ def curve(spline: Spline) -> BSpline:
 
 def test_what_lies_between_knots_is_as_rough_as_it_should_be() -> None:
     """Variance, correlation at the length and mean square slope along one long track, at knots and halfway between them."""
-    track = RoughTrack(1.0, 4.0, 5)
+    track = FrictionField(1.0, 4.0, 5)
     spline, h = curve(track.spline(0.0, 60_000.0)), track.spacing
     x = np.arange(120_000) * h
     at, halfway, lag = spline(x), spline(x + h / 2), round(4.0 / h)
@@ -100,7 +100,7 @@ def test_what_lies_between_knots_is_as_rough_as_it_should_be() -> None:
 def test_a_part_of_a_track_is_the_same_whatever_else_is_asked_for(
     start: float, span: float, more: float, length: float, seed: int
 ) -> None:
-    track = RoughTrack(1e-3, length, seed)
+    track = FrictionField(1e-3, length, seed)
     part, whole = track.spline(start, start + span), track.spline(start - more, start + span + more)
     assert part.first <= start and part.last >= start + span and part.spacing <= min(length / 4, WIDEST_KNOTS)
     offset = round((part.first - whole.first) / part.spacing)
@@ -108,7 +108,7 @@ def test_a_part_of_a_track_is_the_same_whatever_else_is_asked_for(
 
 
 def test_size_scales_and_seed_changes_a_track() -> None:
-    one, two, other = (RoughTrack(size, 5.0, seed).spline(-20, 80) for size, seed in ((1e-4, 3), (2e-4, 3), (1e-4, 4)))
+    one, two, other = (FrictionField(size, 5.0, seed).spline(-20, 80) for size, seed in ((1e-4, 3), (2e-4, 3), (1e-4, 4)))
     assert two.numbers == pytest.approx(2 * one.numbers, rel=1e-14)
     assert abs(np.corrcoef(one.numbers, other.numbers)[0, 1]) < 0.8
 
@@ -117,13 +117,13 @@ def test_size_scales_and_seed_changes_a_track() -> None:
                                           (1e-4, np.inf), (1e-4, 0.99 * FINEST_KNOTS * KNOTS)])  # fmt: skip
 def test_what_is_no_track(size: float, length: float) -> None:
     with pytest.raises(SrfError):
-        RoughTrack(size, length)
+        FrictionField(size, length)
 
 
 def test_a_track_without_end_is_refused_with_its_size() -> None:
     with pytest.raises(SrfError, match="to position 1e\\+09 um"):
-        RoughTrack(1e-4, 1.0).spline(0.0, 1e9)
-    long = RoughTrack(1e-4, 1e6, 2).spline(0.0, 100.0)  # hardly a change over what is slid
+        FrictionField(1e-4, 1.0).spline(0.0, 1e9)
+    long = FrictionField(1e-4, 1e6, 2).spline(0.0, 100.0)  # hardly a change over what is slid
     assert np.ptp(long.numbers) < 1e-6 and np.isfinite(long.numbers).all()
 
 
@@ -134,7 +134,7 @@ class Given(Track):
     """The proof's own track, with the values of a spline that scipy evaluates; positions beyond it stay at its ends."""
 
     def profile(self, longest: float) -> Any:
-        spline = RoughTrack(self.size, self.length, self.seed).spline(0.0, longest + 1.0)
+        spline = FrictionField(self.size, self.length, self.seed).spline(0.0, longest + 1.0)
         pieces = PPoly.from_spline(curve(spline))
         breaks, coefficients = pieces.x[3:-3], pieces.c[:, 3:-3].T.tolist()
         first, step, last = float(breaks[0]), spline.spacing, len(coefficients) - 1
@@ -175,7 +175,7 @@ def test_slow_sliding_follows_the_track(flags: tuple[str, ...], empty_folder: Pa
     base = ("--V", "1", "--W0", "3", "--for", "30", "--rate", "10", *flags)
     rough, smooth = columns(*base, "--roughness", "1e-3", "--roughness-length", "40", "--seed", "2"), columns(*base)
     slip = rough["t"] + rough["u"][0] - rough["u"]  # but for what the interface gives way
-    track = RoughTrack(1e-3, 40.0, 2).spline(0.0, 60.0)
+    track = FrictionField(1e-3, 40.0, 2).spline(0.0, 60.0)
     wander = rough["mu"] - smooth["mu"]
     assert np.ptp(wander) > 3e-4
     assert wander == pytest.approx(track(slip), abs=0.1 * np.ptp(wander))
@@ -205,7 +205,7 @@ def test_a_track_under_any_program(empty_folder: Path) -> None:
     rough = ("--roughness", "2e-3", "--roughness-length", "5")
     c = columns("--drive", "0.5:10, 3:0, 1:2->20", "--load", "1:5, 3:7", "--eps", "0.05", "--rate", "200", *rough)
     assert np.isfinite(c["mu"]).all()
-    here = RoughTrack(2e-3, 5.0, 0).spline(0.0, 1.0)(np.array([0.0]))[0]
+    here = FrictionField(2e-3, 5.0, 0).spline(0.0, 1.0)(np.array([0.0]))[0]
     smooth = columns("--V", "10", "--W0", "5", "--for", "0.1", "--start", "10")["mu"][0]
     for start in ("steady", "10", "v=10"):
         found = columns("--V", "10", "--W0", "5", "--for", "0.1", "--start", start, *rough)
@@ -298,7 +298,7 @@ def test_an_experiment_with_effects_is_simulated_as_it_is_fitted(
 @pytest.mark.parametrize(
     ("arguments", "message", "hint"),
     [
-        (["--roughness", "-1e-4"], "a roughness of -0.0001 is not a size", "0 or more"),
+        (["--roughness", "-1e-4"], "a roughness of -0.0001 is not an amplitude", "0 or more"),
         (["--roughness", "much"], "is not a number", "--roughness"),
         (["--roughness", "1 um"], "measures", "plain number"),
         (["--roughness", "0.17"], "more than half of mu0 = 0.33", "such as 3e-4"),

@@ -18,7 +18,7 @@ from srfcli.results.simulation import RISE, SimulationResult, Work
 
 if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
-    from srfcli.data.noise import RoughTrack
+    from srfcli.data.noise import FrictionField
     from srfcli.data.values import ModelChoice
     from srfcli.motion.imposed import Load
 
@@ -118,13 +118,13 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
 
     _check(given, experiment, output)
     warn_uncompiled("a simulation takes up to 34 times as long")
-    spread, track = parse_spread(given["start_values"]), read_track(given)
+    spread, field = parse_spread(given["start_values"]), read_field(given)
     if experiment is None:
-        work = _new_record(system, given, track, spread)
+        work = _new_record(system, given, field, spread)
     else:
-        work = _runs_again(system, experiment, given, track, spread)
-    if track is not None:
-        work = dataclasses.replace(work, parameters={**work.parameters, **_track_parameters(track, given)})
+        work = _runs_again(system, experiment, given, field, spread)
+    if field is not None:
+        work = dataclasses.replace(work, parameters={**work.parameters, **_field_parameters(field, given)})
     begun = time.perf_counter()
     with Progress("simulate", total=len(work.jobs)) as progress:
         found = simulate_work(work, rtol=given["rtol"], progress=lambda name, done: progress.advance(int(done), note=name))
@@ -196,7 +196,7 @@ def _write(found: SimulationResult, folder: Path, seed: int, output: OutputOptio
     session.say(f"Wrote {folder} ({len(files) - 1} run{'s' if len(files) != 2 else ''})")
 
 
-def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], track: RoughTrack | None, spread: float) -> Work:
+def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], field: FrictionField | None, spread: float) -> Work:
     """Return the runs of the experiment at `path`; srf.toml and the environment do not choose its laws, flags do."""
     from srfcli.data.experiment import read_experiment
     from srfcli.tasks.simulate import runs_again
@@ -208,7 +208,7 @@ def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], tra
     named = {key: getattr(system, key) for key in LAWS}
     work = runs_again(
         experiment, registry, laws={k: s.value for k, s in named.items() if s.origin == "flag"},
-        parameters=system.flags, names=given["runs"], track=track, spread=spread,
+        parameters=system.flags, names=given["runs"], field=field, spread=spread,
         **{key: given[key] for key in ("start", "noise", "lag1", "quantum", "seed", "folder")},
     )  # fmt: skip
     return dataclasses.replace(work, meta={**work.meta, "rtol": given["rtol"]})
@@ -220,7 +220,7 @@ LAWS = ("law", "ageing", "interface", "inertia")
 LAW_FILES = (".toml", ".py")
 
 
-def _new_record(system: SystemOptions, given: Mapping[str, Any], track: RoughTrack | None, spread: float) -> Work:
+def _new_record(system: SystemOptions, given: Mapping[str, Any], field: FrictionField | None, spread: float) -> Work:
     """Return the one record that the options describe; raises SrfError for what cannot be simulated or written."""
     from srfcli.data.imposed import read_load
     from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps
@@ -229,7 +229,7 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], track: RoughTra
     slider = system.slider(**{name: given[name] for name in ("V", "W0", "eps")})
     values, folder = slider.resolved.values, given["folder"]
     observables = task.check_observables([n.strip() for n in (given["observable"] or "elongation").split(",")])
-    if track is not None and system.loading.value != "vertical":
+    if field is not None and system.loading.value != "vertical":
         raise SrfError("a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined.")
     if folder is not None and system.loading.value != "vertical":
         raise SrfError("an experiment folder cannot say that the spring is inclined", "Leave out --out-dir or --loading.")
@@ -258,7 +258,7 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], track: RoughTra
         onset=_onset(given["onset"], begin, modulated=f is not None),
         start=given["start"],
         observables=observables,
-        rough=None if track is None else (system.model(tables=task.TABLES), track),
+        rough=None if field is None else (system.model(tables=task.TABLES), field),
     )
     gauges = task.read_gauges(observables, **{key: given[key] for key in ("noise", "lag1", "quantum", "seed")})
     choice, made = _laws(system), None
@@ -410,24 +410,24 @@ def parse_spread(text: str) -> float:
     return spread
 
 
-def read_track(given: Mapping[str, Any]) -> RoughTrack | None:
+def read_field(given: Mapping[str, Any]) -> FrictionField | None:
     """Return the random field that --roughness, --roughness-length and --seed describe; None without one."""
     if given["roughness"] is None:
         if given["roughness_length"] is not None:
             raise SrfError("--roughness-length is given and the track is smooth", "Give the size: --roughness 3e-4.")
         return None
-    from srfcli.data.noise import RoughTrack
+    from srfcli.data.noise import FrictionField
 
     size = parse_quantity(given["roughness"], "1", name="--roughness")
     length = parse_quantity(given["roughness_length"] or str(LENGTH), "um", name="--roughness-length")
-    track = RoughTrack(size, length, given["seed"])
-    return track if track.size else None
+    field = FrictionField(size, length, given["seed"])
+    return field if field.amplitude else None
 
 
-def _track_parameters(track: RoughTrack, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _field_parameters(field: FrictionField, given: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the field's amplitude and correlation length as described parameters."""
     origin = "default" if given["roughness_length"] is None else "flag"
     return {
-        "roughness": {"value": track.size, "unit": "1", "origin": "flag"},
-        "roughness_length": {"value": track.length, "unit": "um", "origin": origin},
+        "roughness": {"value": field.amplitude, "unit": "1", "origin": "flag"},
+        "roughness_length": {"value": field.length, "unit": "um", "origin": origin},
     }

@@ -298,7 +298,7 @@ def check_gauge(*, noise: float, lag1: float, quantum: float, seed: int) -> None
     """Raise SrfError for sizes, a correlation or a seed that a gauge cannot have."""
     for name, value in (("noise", noise), ("quantum", quantum)):
         if not (math.isfinite(value) and value >= 0):
-            raise SrfError(f"{name} = {value:g} is not a size", f"give {name} as 0 or more")
+            raise SrfError(f"{name} = {value:g} is not an amplitude", f"give {name} as 0 or more")
     if not abs(lag1) < 1:
         raise SrfError(f"lag1 = {lag1:g} is not the correlation of a stationary noise", "give -1 < lag1 < 1, as 0.8")
     if lag1 and not noise:
@@ -341,20 +341,20 @@ ECHO = 32  # knots over which a value acts on a spline's coefficients: sqrt(3) -
 
 
 @dataclass(frozen=True)
-class RoughTrack:
-    """mu0's deviation at slip position x (um): Gaussian, of standard deviation `size` and correlation length `length` (um).
+class FrictionField:
+    """mu0's deviation at slip position x (um): Gaussian, of standard deviation `amplitude` and correlation length `length` (um).
 
     Values at a distance d are correlated by (1 + r) exp(-r), r = sqrt(3) d/length (Matern, 3/2), as `srf fit --track rough` has
     it. `seed` fixes the function on the whole line: it does not depend on which part of it is asked for.
     """
 
-    size: float
+    amplitude: float
     length: float
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.size) and self.size >= 0):
-            raise SrfError(f"a roughness of {self.size:g} is not a size", "give it as 0 or more, as 3e-4")
+        if not (math.isfinite(self.amplitude) and self.amplitude >= 0):
+            raise SrfError(f"a roughness of {self.amplitude:g} is not an amplitude", "give it as 0 or more, as 3e-4")
         shortest = KNOTS * FINEST_KNOTS
         if not (math.isfinite(self.length) and self.length >= shortest * (1 - 1e-12)):
             raise SrfError(
@@ -388,7 +388,7 @@ class RoughTrack:
         pole, numbers = math.sqrt(3) - 2, np.zeros(count)
         for j in range(-ECHO, ECHO + 1):
             numbers += math.sqrt(3) * pole ** abs(j) * values[ECHO + j : ECHO + j + count]
-        return Spline(first * h, h, self.size * numbers)
+        return Spline(first * h, h, self.amplitude * numbers)
 
     def _values(self, first: int, last: int) -> Array:
         """Return the function of unit size at the knots first, ..., last, where first <= last."""

@@ -24,7 +24,7 @@ from srfcli.diagnosis.hypotheses import Excluded, Shape, along_table, inner_grid
 from srfcli.inference.critical_loads import TableLikelihood, apparatus
 from srfcli.inference.kalman import gains
 from srfcli.inference.recordings import slip_along
-from srfcli.inference.shared_field import Roughness
+from srfcli.inference.shared_field import FieldPrior
 from srfcli.inference.state_space import Filtered, StateSpaceFit, field_columns, filter_run
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
@@ -153,7 +153,7 @@ class Remainder:
         nodes = np.linspace(first, last, count)
         hat = Shape("slip", lambda s, k: np.interp(s, nodes, np.arange(count) == k), ("node",))
         columns = self.padded([_carried(f, self.fitted, [(hat, [k]) for k in range(count)]) for f in self.runs])
-        columns = self.free(columns @ Roughness(1.0, values["field_length"]).root(nodes))
+        columns = self.free(columns @ FieldPrior(1.0, values["field_length"]).root(nodes))
         power, directions = np.linalg.eigh(columns.T @ columns)
         known = power > 1e-12 * power[-1]
         size = np.sqrt(power[known])

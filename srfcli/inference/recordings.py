@@ -23,7 +23,7 @@ from srfcli.laws.registry import Registry
 
 
 @dataclass(frozen=True)
-class Track:
+class FittedField:
     """The random friction field that was found: its amplitude (1), correlation length (um), one for all runs or for each.
 
     Amplitude 0 where there is none.
@@ -48,7 +48,7 @@ class RecordingFit:
     problem: Problem
     fit: Fit
     state_space: StateSpaceFit | None
-    track: Track | None
+    friction_field: FittedField | None
     starts: tuple[tuple[float, bool], ...]
     status: Status
     scatter: Mapping[str, BetweenGroups | None] = field(default_factory=dict)
@@ -148,19 +148,19 @@ def fit_recordings(
         return replace(result, status=Status.INTERRUPTED)
     if track is None and shared.fit.log_likelihood < best.log_likelihood + SURELY:
         return result
-    return replace(result, fit=shared.fit, state_space=None, track=_shared(shared), status=shared.fit.status)
+    return replace(result, fit=shared.fit, state_space=None, friction_field=_shared(shared), status=shared.fit.status)
 
 
-def _track(found: StateSpaceFit) -> Track | None:
+def _track(found: StateSpaceFit) -> FittedField | None:
     values = found.values
     if not found.likelihood.problem.runs:
         return None
-    return Track() if found.smooth else Track(values["field_amplitude"], values["field_length"])
+    return FittedField() if found.smooth else FittedField(values["field_amplitude"], values["field_length"])
 
 
-def _shared(found: SharedFit) -> Track:
-    roughness = found.roughness
-    return Track(roughness.amplitude, roughness.length, True) if roughness.amplitude else Track()
+def _shared(found: SharedFit) -> FittedField:
+    prior = found.prior
+    return FittedField(prior.amplitude, prior.length, True) if prior.amplitude else FittedField()
 
 
 # Several starts: the file's own, and others drawn over the bounds, so that a false minimum is found out.

@@ -38,7 +38,7 @@ HUGE = 1e100  # a slope that is no slope any more: its square would overflow
 
 
 @dataclass(frozen=True)
-class Roughness:
+class FieldPrior:
     """Standard deviation of mu0 along the track and its correlation length (um); amplitude 0 is a smooth track."""
 
     amplitude: float = 0.0
@@ -51,7 +51,7 @@ class Roughness:
         return self.amplitude * np.linalg.cholesky(K)
 
 
-USUAL = Roughness(3e-4, 8.0)  # of a track until its own is estimated: polished contacts wander by so much
+USUAL = FieldPrior(3e-4, 8.0)  # of a track until its own is estimated: polished contacts wander by so much
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class SharedFit:
     """A fit in which all runs slid on one track, and what that is like."""
 
     fit: Fit
-    roughness: Roughness
+    prior: FieldPrior
 
 
 def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] = lambda text: None) -> SharedFit:
@@ -69,17 +69,17 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
     Held-out runs are judged on that track.
     """
     progress("one rough track for all runs")
-    likelihood, noise = TrackLikelihood(problem), {r.name: Noise(r.noise.level) for r in begun.runs if not r.holdout}
+    likelihood, noise = SharedLikelihood(problem), {r.name: Noise(r.noise.level) for r in begun.runs if not r.holdout}
     theta = np.array([begun.values[name] for name in problem.names])
-    point, before = likelihood.at(theta, _track(problem.runs), noise, Roughness()), -np.inf
+    point, before = likelihood.at(theta, _track(problem.runs), noise, FieldPrior()), -np.inf
     for number in range(ROUNDS):
-        point = replace(point, roughness=likelihood.roughness(point))
-        if not point.roughness.amplitude:
+        point = replace(point, prior=likelihood.prior(point))
+        if not point.prior.amplitude:
             point = replace(point, track=point.track.with_numbers(np.zeros(point.track.numbers.size)))
         point = likelihood.minimise(point, noise, settled=EARLY if number + 1 < ROUNDS else SETTLED)
         noise = likelihood.noise(point)
-        point = likelihood.at(point.theta, point.track, noise, point.roughness)
-        own = np.array([point.roughness.length]), np.array([point.roughness.amplitude])
+        point = likelihood.at(point.theta, point.track, noise, point.prior)
+        own = np.array([point.prior.length]), np.array([point.prior.amplitude])
         attained = marginal(point.N, point.g, theta.size, point.track, point.log_likelihood, grid=own)[0]
         total = min(attained, point.log_likelihood)  # no prior adds any
         if abs(total - before) < AGREED:
@@ -90,7 +90,7 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
         begun, values=problem.named(point.theta), covariance=likelihood.covariance(point), runs=runs, log_likelihood=total,
         status=Status.OK, evaluations=begun.evaluations + likelihood.evaluations,
     )  # fmt: skip
-    return SharedFit(fitted, point.roughness)
+    return SharedFit(fitted, point.prior)
 
 
 def _track(runs: Sequence[Run]) -> Spline:
@@ -99,7 +99,7 @@ def _track(runs: Sequence[Run]) -> Spline:
     return Spline.over(low - 1.0, high + 2.0, max(SPACING, (high - low) / (MOST - 3)))
 
 
-def _judged(likelihood: TrackLikelihood, point: Point, name: str) -> RunFit:
+def _judged(likelihood: SharedLikelihood, point: Point, name: str) -> RunFit:
     run = next(r for r in likelihood.problem.experiment.runs if r.name == name)
     prediction = likelihood.predicted(run, point.theta, point.track, slopes=False)
     residual = run.observed - prediction.y
@@ -118,7 +118,7 @@ class Point:
 
     theta: Array
     track: Spline
-    roughness: Roughness
+    prior: FieldPrior
     predictions: dict[str, Prediction] = field(repr=False)
     N: Array = field(repr=False)
     g: Array = field(repr=False)
@@ -128,12 +128,12 @@ class Point:
     @property
     def penalised(self) -> float:
         """Return minus twice the log posterior, but for what does not change with parameters and track."""
-        if not self.roughness.amplitude:
+        if not self.prior.amplitude:
             return self.chi2
-        return self.chi2 + float(np.sum(np.linalg.solve(self.roughness.root(self.track.nodes), self.track.numbers) ** 2))
+        return self.chi2 + float(np.sum(np.linalg.solve(self.prior.root(self.track.nodes), self.track.numbers) ** 2))
 
 
-class TrackLikelihood:
+class SharedLikelihood:
     """The likelihood of a problem whose model has the track as its first table."""
 
     def __init__(self, problem: Problem) -> None:
@@ -150,7 +150,7 @@ class TrackLikelihood:
             trend=None if run.holdout else problem.trend, tables=(track,), by_tables=(0,) if slopes else (),
         )  # fmt: skip
 
-    def at(self, theta: Array, track: Spline, noise: Mapping[str, Noise], roughness: Roughness) -> Point:
+    def at(self, theta: Array, track: Spline, noise: Mapping[str, Noise], prior: FieldPrior) -> Point:
         """Return everything at these parameters and this track."""
         n, k = theta.size, theta.size + track.numbers.size
         N, g, chi2, total, found = np.zeros((k, k)), np.zeros(k), 0.0, 0.0, {}
@@ -169,15 +169,15 @@ class TrackLikelihood:
             g += slopes.T @ r
             chi2 += float(r @ r)
             total -= 0.5 * float(r @ r) + log_determinant(own, parts) + 0.5 * r.size * np.log(2 * np.pi)
-        return Point(theta, track, roughness, found, N, g, chi2, total)
+        return Point(theta, track, prior, found, N, g, chi2, total)
 
     def minimise(self, point: Point, noise: Mapping[str, Noise], *, settled: float = SETTLED) -> Point:
         """Return the most probable parameters and numbers under this noise and roughness, by Levenberg and Marquardt."""
         problem, damping = self.problem, 0.0
         n, low, high = point.theta.size, problem.lower, problem.upper
-        point = self.at(point.theta, point.track, noise, point.roughness)
-        rough = point.roughness.amplitude > 0
-        L = point.roughness.root(point.track.nodes) if rough else np.zeros((0, 0))
+        point = self.at(point.theta, point.track, noise, point.prior)
+        rough = point.prior.amplitude > 0
+        L = point.prior.root(point.track.nodes) if rough else np.zeros((0, 0))
         for _ in range(STEPS if n or rough else 0):
             free = np.ones(n, dtype=bool)
             while True:  # parameters that a step would push out stay at their bounds
@@ -189,7 +189,7 @@ class TrackLikelihood:
                 free &= ~out
             theta = np.clip(theta, low, high)
             track = point.track.with_numbers(point.track.numbers + move[n:]) if rough else point.track
-            trial = self.at(theta, track, noise, point.roughness)
+            trial = self.at(theta, track, noise, point.prior)
             gained = point.penalised - trial.penalised
             if gained > 0:
                 point = trial
@@ -207,10 +207,10 @@ class TrackLikelihood:
         share = point.chi2 / max(self.samples, 1)
         return max(settled, next(far for most, far in FAR if share < most or most == np.inf) * point.chi2)
 
-    def roughness(self, point: Point) -> Roughness:
+    def prior(self, point: Point) -> FieldPrior:
         """Return the roughness at which the marginal likelihood is largest, the one so far where that means nothing."""
         if point.chi2 > ROUGHLY * self.samples:
-            return point.roughness if point.roughness.amplitude else USUAL
+            return point.prior if point.prior.amplitude else USUAL
         return marginal(point.N, point.g, point.theta.size, point.track, point.log_likelihood)[1]
 
     def _step(self, point: Point, L: Array, free: Array, damping: float) -> tuple[Array, float]:
@@ -242,8 +242,8 @@ class TrackLikelihood:
         """Return the covariance of the free parameters, the track's uncertainty included."""
         n = point.theta.size
         information = point.N[:n, :n]
-        if point.roughness.amplitude:
-            L = point.roughness.root(point.track.nodes)
+        if point.prior.amplitude:
+            L = point.prior.root(point.track.nodes)
             core = L.T @ point.N[n:, n:] @ L + np.eye(L.shape[1])
             cross = point.N[:n, n:] @ L
             information = information - cross @ np.linalg.solve(core, cross.T)
@@ -252,7 +252,7 @@ class TrackLikelihood:
 
 def marginal(
     N: Array, g: Array, n: int, track: Spline, log_likelihood: float, *, grid: tuple[Array, Array] = GRID
-) -> tuple[float, Roughness]:
+) -> tuple[float, FieldPrior]:
     """Return the largest marginal likelihood over amplitude and length, and where, from normal equations at `track`.
 
     The first n columns are those of flat parameters, the others those of the track; `log_likelihood` is that of the residuals.
@@ -266,10 +266,10 @@ def marginal(
     b = h + G @ now
     smooth = base - float(h @ now) - 0.5 * float(now @ G @ now)
     lengths, amplitudes = grid
-    best = (smooth if 0.0 in amplitudes else -np.inf, Roughness())
+    best = (smooth if 0.0 in amplitudes else -np.inf, FieldPrior())
     wide = lengths[lengths >= 1.2 * track.spacing]
     for length in wide if wide.size else lengths[-1:]:
-        unit = Roughness(1.0, float(length)).root(track.nodes)
+        unit = FieldPrior(1.0, float(length)).root(track.nodes)
         core, forced = unit.T @ G @ unit, unit.T @ b
         values, vectors = np.linalg.eigh(core)
         values, along = np.maximum(values, 0.0), vectors.T @ forced
@@ -277,5 +277,5 @@ def marginal(
             s2 = amplitude**2
             found = smooth + 0.5 * float(np.sum(s2 * along**2 / (1 + s2 * values)) - np.sum(np.log1p(s2 * values)))
             if found > best[0]:
-                best = (found, Roughness(float(amplitude), float(length)))
+                best = (found, FieldPrior(float(amplitude), float(length)))
     return best

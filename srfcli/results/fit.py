@@ -237,8 +237,8 @@ class FitResult(Result):
         }
         if self.tables is not None and self.loads is not None:
             meta |= {"tables": self.tables.records(), "loads": self.loads.records()}
-        if found.track is not None:
-            meta["track"] = asdict(found.track)
+        if found.friction_field is not None:
+            meta["track"] = asdict(found.friction_field)
         title = self.experiment.title
         return Table("srf.fit/2", PARAMETERS, rows, title, tuple(self._notes()), {}, meta, status=self.worst.value)
 
@@ -251,12 +251,12 @@ class FitResult(Result):
         notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind == "reset"]
         notes += [] if self.posterior is None else _posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
-        if found.track is not None:
+        if found.friction_field is not None:
             from srfcli.diagnosis.goodness_of_fit import PLAUSIBLE
             from srfcli.inference.state_space import typical_friction
 
-            notes.append(str(found.track))
-            share = found.track.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
+            notes.append(str(found.friction_field))
+            share = found.friction_field.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
             if share > PLAUSIBLE:
                 notes.append(
                     f"that field is {100 * share:.1g} % of the friction, more than a track has: it may stand in for physics that "

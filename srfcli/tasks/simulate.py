@@ -17,7 +17,7 @@ from srfcli.core.errors import SrfError, Status, did_you_mean, worst
 from srfcli.core.settings import Parameter, check_value, require_parameter
 from srfcli.core.units import from_base, parse_quantity, tidy, to_base
 from srfcli.data.description import MOST_OBSERVABLES
-from srfcli.data.noise import RoughTrack, check_gauge, generator
+from srfcli.data.noise import FrictionField, check_gauge, generator
 from srfcli.data.values import BESIDE, OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
 from srfcli.data.writing import stiffness_text
 from srfcli.inference.prediction import of_run
@@ -180,7 +180,7 @@ def record_of(
     onset: float | None = None,
     start: ArrayLike | str | None = "steady",
     observables: Sequence[str] = ("elongation",),
-    rough: tuple[GeneratedModel, RoughTrack] | None = None,
+    rough: tuple[GeneratedModel, FrictionField] | None = None,
 ) -> Work:
     """Return one record of a slider, to be simulated; arguments are those of `simulate`.
 
@@ -202,8 +202,8 @@ def record_of(
     described = system.described(without=replaced)
     if rough is None:
         return Work(model, (job,), described)
-    notes, meta = _track_told(rough[1])
-    return Work(rough[0], (on_track(model, *rough, job, start=start),), described, notes=notes, meta=meta)
+    notes, meta = _field_told(rough[1])
+    return Work(rough[0], (on_field(model, *rough, job, start=start),), described, notes=notes, meta=meta)
 
 
 def _modulated(base: Load, f: float, eps: float, onset: float) -> Load:
@@ -384,7 +384,7 @@ def runs_again(
     lag1: float = 0.0,
     quantum: str | None = None,
     seed: int = 0,
-    track: RoughTrack | None = None,
+    field: FrictionField | None = None,
     folder: Path | None = None,
     spread: float = 0.0,
 ) -> Work:
@@ -402,7 +402,7 @@ def runs_again(
         Of the gauges, as in `read_gauges`.
     seed : int
         Of the noise and of start values that are off.
-    track : RoughTrack, optional
+    field : FrictionField, optional
         Random field that the runs slide on.
     folder, spread
         Where the records are written as an experiment, if they are, and by how much its start values are off.
@@ -423,10 +423,10 @@ def runs_again(
     unknown = [run.name for run in runs if run.initial == "free"]
     notes = (f"initial state of {', '.join(unknown)} not known: begun in steady sliding",) if unknown else ()
     meta: dict[str, Any] = {"title": experiment.title}
-    if track is not None:
+    if field is not None:
         mover = open_model(registry, **asdict(choice), tables=TABLES)
-        jobs = tuple(on_track(model, mover, track, job, start=start) for job in jobs)
-        told, entry = _track_told(track)
+        jobs = tuple(on_field(model, mover, field, job, start=start) for job in jobs)
+        told, entry = _field_told(field)
         notes, meta = (*notes, *told), meta | entry
     inputs = (experiment.path, *(run.file for run in runs))
     made = None if folder is None else _experiment_again(experiment, model, choice, values, folder, spread, seed)
@@ -528,7 +528,9 @@ TABLES = (("mu", "slip"),)  # a table over slip is added to the friction coeffic
 LARGEST_ROUGHNESS = 0.5  # of mu0: above it the friction coefficient may become negative
 
 
-def on_track(plain: GeneratedModel, rough: GeneratedModel, track: RoughTrack, job: Job, *, start: ArrayLike | str | None) -> Job:
+def on_field(
+    plain: GeneratedModel, rough: GeneratedModel, field: FrictionField, job: Job, *, start: ArrayLike | str | None
+) -> Job:
     """Return the job of the model `plain` as one of `rough`, the same with TABLES, on the part of the track that it covers.
 
     Positions are slip from where the run begins; runs that begin at the same place find the same track there. `start` is as in
@@ -538,12 +540,12 @@ def on_track(plain: GeneratedModel, rough: GeneratedModel, track: RoughTrack, jo
     place = job.run.start if job.run is not None else 0.0
     p = rough.vector(dict(zip(plain.names, job.p.tolist(), strict=True)) | {"start": place, "begin": begin})
     mu0 = p[rough.index("mu0")] if "mu0" in rough.names else math.inf
-    if not track.size <= LARGEST_ROUGHNESS * mu0:
+    if not field.amplitude <= LARGEST_ROUGHNESS * mu0:
         raise SrfError(
-            f"`roughness` {track.size:g} is more than half of mu0 = {mu0:g}",
+            f"`roughness` {field.amplitude:g} is more than half of mu0 = {mu0:g}",
             "It is the standard deviation of mu0 along the track, such as 3e-4.",
         )
-    table = track.spline(place, place + _reach(plain, job))
+    table = field.spline(place, place + _reach(plain, job))
     state = start_state(rough, appended(p, [table]), start, drive=job.drive, load=job.load.rest(begin), begin=begin)
     return replace(job, p=p, start=state, tables=(table,))
 
@@ -561,7 +563,7 @@ def _reach(model: GeneratedModel, job: Job) -> float:
     return max(float(driven.max()), 0.0) + 2 * held + drawn
 
 
-def _track_told(track: RoughTrack) -> tuple[tuple[str, ...], dict[str, Any]]:
+def _field_told(field: FrictionField) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return the note on the field and its entry in `meta`, as in the result of `srf fit`."""
-    note = f"track: mu0 wanders by {track.size:g} (standard deviation) over {track.length:g} um"
-    return (note,), {"track": {"amplitude": track.size, "length_um": track.length}}
+    note = f"track: mu0 wanders by {field.amplitude:g} (standard deviation) over {field.length:g} um"
+    return (note,), {"track": {"amplitude": field.amplitude, "length_um": field.length}}
