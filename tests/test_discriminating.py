@@ -24,12 +24,12 @@ from srfcli.diagnosis.design import (
     Loss,
     Proposal,
     Side,
+    capabilities_of,
     described,
     discriminating_run,
     draw,
     foremost,
     led_in,
-    reach_of,
     run_of,
     sentences,
     vary,
@@ -234,15 +234,15 @@ def test_a_random_field_takes_its_share(diagnosis: Diagnosis, found: Discriminat
 @pytest.mark.parametrize("seed", range(4))
 def test_runs_stay_within_reach(diagnosis: Diagnosis, seed: int) -> None:
     """Velocities, loads, amplitudes and frequencies at most twice beyond what was shown; track and time no longer."""
-    reach, rng = reach_of(diagnosis.experiment), np.random.default_rng(seed)
-    drawn = draw(reach, 24, rng)
-    drawn += [v for p in drawn[:4] for v in vary(p, reach, 3, rng)]
-    drawn += [led for p in drawn[:12] if (led := led_in(p, reach)) is not None]
-    assert {p.kind for p in drawn} == set(reach.kinds) == {"velocity steps", "slide-hold-slide", "modulation"}
+    apparatus, rng = capabilities_of(diagnosis.experiment), np.random.default_rng(seed)
+    drawn = draw(apparatus, 24, rng)
+    drawn += [v for p in drawn[:4] for v in vary(p, apparatus, 3, rng)]
+    drawn += [led for p in drawn[:12] if (led := led_in(p, apparatus)) is not None]
+    assert {p.kind for p in drawn} == set(apparatus.kinds) == {"velocity steps", "slide-hold-slide", "modulation"}
     for p in drawn:
         assert all(V == 0 or 6 / FACTOR <= V <= 40 * FACTOR for _, V in p.drive) and p.drive[0][1] > 0
         assert 4 / FACTOR <= p.W0 <= 6 * FACTOR
-        assert sum(d * V for d, V in p.drive) < 1.02 * reach.travel and p.duration < 1.8
+        assert sum(d * V for d, V in p.drive) < 1.02 * apparatus.travel and p.duration < 1.8
         if p.kind == "modulation":
             assert 0.074 <= p.eps <= 0.301 and 50 <= p.f <= 125 and 0 < p.onset < p.duration
         run = run_of(p, diagnosis.experiment)
@@ -281,10 +281,10 @@ def test_steps_of_the_load_where_it_has_been_stepped(tmp_path: Path) -> None:
     readings = {plan: np.zeros(plan.times().size) + 8.0 for plan in plans}
     for name, text in case_files("load", Physics(), readings).items():
         (tmp_path / name).write_text(text)
-    reach = reach_of(read_experiment(tmp_path, registry=SHIPPED))
-    assert reach.kinds == ("velocity steps", "slide-hold-slide", "load steps") and reach.jumps == (0.3,)
-    assert reach.rise == pytest.approx(0.03, rel=0.05)
-    stepped = [p for p in draw(reach, 60, np.random.default_rng(0)) if p.steps]
+    apparatus = capabilities_of(read_experiment(tmp_path, registry=SHIPPED))
+    assert apparatus.kinds == ("velocity steps", "slide-hold-slide", "load steps") and apparatus.jumps == (0.3,)
+    assert apparatus.rise == pytest.approx(0.03, rel=0.05)
+    stepped = [p for p in draw(apparatus, 60, np.random.default_rng(0)) if p.steps]
     assert len(stepped) == 20 and {np.sign(p.steps[0][1]) for p in stepped} == {1.0, -1.0}
     for p in stepped:
         W = p.loads(p.times())
@@ -304,10 +304,10 @@ def test_a_load_that_nothing_tells_is_left_alone(diagnosis: Diagnosis) -> None:
     e = diagnosis.experiment
     ramp = Drive.ramps([(0.0, 5.0), (0.8, 20.0), (1.6, 5.0)])
     runs = [replace(r, load=ConstantLoad(1.0), observable="friction", modulation=None, drive=ramp) for r in e.runs]
-    reach = reach_of(replace(e, runs=tuple(runs), stiffness_text="0.04 1/um"))
-    assert reach.kinds == ("velocity steps", "slide-hold-slide") and 5 <= min(reach.V) < max(reach.V) <= 20
-    drawn = draw(reach, 10, np.random.default_rng(0))
-    drawn += vary(drawn[0], reach, 3, np.random.default_rng(1))
+    apparatus = capabilities_of(replace(e, runs=tuple(runs), stiffness_text="0.04 1/um"))
+    assert apparatus.kinds == ("velocity steps", "slide-hold-slide") and 5 <= min(apparatus.V) < max(apparatus.V) <= 20
+    drawn = draw(apparatus, 10, np.random.default_rng(0))
+    drawn += vary(drawn[0], apparatus, 3, np.random.default_rng(1))
     assert {p.W0 for p in drawn} == {1.0} and all(2.5 <= V <= 40 for p in drawn for _, V in p.drive if V)
 
 

@@ -199,16 +199,16 @@ class Design:
 
     def __init__(self, experiment: Experiment, sides: Sequence[Side], seed: int) -> None:
         self.experiment, self.sides = experiment, tuple(sides)
-        self.reach: Reach = reach_of(experiment)
+        self.apparatus: Capabilities = capabilities_of(experiment)
         self.rng = np.random.default_rng(seed)
         self.tried = 0
 
     def best(self) -> DiscriminatingRun | None:
         """Return the best run, None where no model can be followed through any."""
-        looked = self.look(draw(self.reach, DRAWN, self.rng), LOOKED)
+        looked = self.look(draw(self.apparatus, DRAWN, self.rng), LOOKED)
         if not looked:
             return None
-        near = vary(looked[0].proposal, self.reach, VARIED, self.rng)
+        near = vary(looked[0].proposal, self.apparatus, VARIED, self.rng)
         looked = sorted([*looked, *self.look(near, VARIED, above=looked[0].gain)], key=lambda t: -t.gain)
         best: DiscriminatingRun | None = None
         for trial in looked[:CONFIRMED]:
@@ -255,7 +255,7 @@ class Design:
 
     def begun(self, proposal: Proposal) -> tuple[Proposal, Run] | None:
         """Return a run that begins in stable sliding, whichever hypothesis is true: as it is, or led in."""
-        for tried in (proposal, led_in(proposal, self.reach)):
+        for tried in (proposal, led_in(proposal, self.apparatus)):
             if tried is not None:
                 run = run_of(tried, self.experiment)
                 if all(side.steady(run) for side in self.sides):
@@ -422,7 +422,7 @@ class Proposal:
 
 
 @dataclass(frozen=True)
-class Reach:
+class Capabilities:
     """What an experiment's runs have shown that its apparatus can do; `travel` (um) is the longest way of one run.
 
     Velocities in um/s, loads in N, `eps` and `jumps` relative to the load, frequencies in Hz, time scales in s.
@@ -446,7 +446,7 @@ class Reach:
         return (STEPS, HOLD, *((LOAD,) if self.jumps else ()), *((WAVE,) if self.eps else ()))
 
 
-def reach_of(experiment: Experiment) -> Reach:
+def capabilities_of(experiment: Experiment) -> Capabilities:
     """Return what the runs of an experiment, held-out ones too, have shown."""
     waves = {r.name: of_run(r) for r in experiment.runs}
     modulated = [r for r in experiment.runs if waves[r.name]["modulated"]]
@@ -460,7 +460,7 @@ def reach_of(experiment: Experiment) -> Reach:
     shown = [waves[r.name] for r in modulated]
     begun = [(w["onset0"] - r.t[0]) / np.ptp(r.t) for w, r in zip(shown, modulated, strict=True)]
     late = [b for b in begun if 0 < b < 1]
-    return Reach(
+    return Capabilities(
         _velocities(experiment.runs),
         tuple(r.first_load for r in experiment.runs),
         tuple(_digits(w["eps"]) for w in shown), tuple(_digits(w["f"]) for w in shown), tuple(map(_digits, jumps)),
@@ -492,74 +492,76 @@ def _typical(runs: Sequence[Run]) -> Run:
     return sorted(fitted, key=lambda r: float(np.ptp(r.t)))[len(fitted) // 2]
 
 
-def draw(reach: Reach, number: int, rng: np.random.Generator) -> list[Proposal]:
+def draw(apparatus: Capabilities, number: int, rng: np.random.Generator) -> list[Proposal]:
     """Return so many runs, every kind in turn."""
-    kinds = reach.kinds
-    return [_drawn(reach, kinds[i % len(kinds)], rng) for i in range(number)]
+    kinds = apparatus.kinds
+    return [_drawn(apparatus, kinds[i % len(kinds)], rng) for i in range(number)]
 
 
-def led_in(proposal: Proposal, reach: Reach) -> Proposal | None:
+def led_in(proposal: Proposal, apparatus: Capabilities) -> Proposal | None:
     """Return the run with a fast beginning, as sliding that is not stable has to begin; None where there is no room for it."""
     (length, V), *rest = proposal.drive
-    fastest = max(reach.V)
-    lead = _digits(LEAD * min(proposal.duration, reach.travel / fastest))
+    fastest = max(apparatus.V)
+    lead = _digits(LEAD * min(proposal.duration, apparatus.travel / fastest))
     if fastest <= V or length <= 2 * lead:
         return None
     return replace(proposal, drive=((lead, fastest), (_digits(length - lead), V), *rest))
 
 
-def vary(proposal: Proposal, reach: Reach, number: int, rng: np.random.Generator) -> list[Proposal]:
+def vary(proposal: Proposal, apparatus: Capabilities, number: int, rng: np.random.Generator) -> list[Proposal]:
     """Return so many runs near another."""
     found = []
     for _ in range(number):
-        like = reach.modulated if proposal.eps else reach.plain
+        like = apparatus.modulated if proposal.eps else apparatus.plain
         load = float(np.exp(0.3 * rng.standard_normal()))
         factors = {V: float(np.exp(0.3 * rng.standard_normal())) for _, V in proposal.drive}
-        V = [_within(V * factors[V], reach.V) if V else 0.0 for _, V in proposal.drive]
-        W0 = _within(proposal.W0 * load, reach.W0) if set(reach.W0) != {UNKNOWN} else UNKNOWN
+        V = [_within(V * factors[V], apparatus.V) if V else 0.0 for _, V in proposal.drive]
+        W0 = _within(proposal.W0 * load, apparatus.W0) if set(apparatus.W0) != {UNKNOWN} else UNKNOWN
         jump = float(np.exp(0.3 * rng.standard_normal())) * W0 / proposal.W0
         eps, f = proposal.eps, proposal.f
         if eps:
-            eps = min(_within(eps * np.exp(0.3 * rng.standard_normal()), reach.eps), MOST_EPS)
-            f = _frequency(f * np.exp(0.3 * rng.standard_normal()), reach, proposal.interval)
+            eps = min(_within(eps * np.exp(0.3 * rng.standard_normal()), apparatus.eps), MOST_EPS)
+            f = _frequency(f * np.exp(0.3 * rng.standard_normal()), apparatus, proposal.interval)
         shares = [d / proposal.duration for d, _ in proposal.drive]
-        drive = _timed(V, shares, float(np.ptp(like.t)), reach.travel)
+        drive = _timed(V, shares, float(np.ptp(like.t)), apparatus.travel)
         length = sum(d for d, _ in drive) / proposal.duration
         steps = tuple((_digits(at * length), _digits(j * jump)) for at, j in proposal.steps)
         found.append(
-            replace(proposal, drive=drive, W0=W0, steps=_allowed(W0, steps, reach), eps=eps, f=f,
+            replace(proposal, drive=drive, W0=W0, steps=_allowed(W0, steps, apparatus), eps=eps, f=f,
                     onset=_digits(proposal.onset * length))
         )  # fmt: skip
     return found
 
 
-def _drawn(reach: Reach, kind: str, rng: np.random.Generator) -> Proposal:
+def _drawn(apparatus: Capabilities, kind: str, rng: np.random.Generator) -> Proposal:
     def near(values: Sequence[float]) -> float:
         factor = float(np.exp(rng.uniform(-1, 1) * math.log(FACTOR)))
         return _within(values[int(rng.integers(len(values)))] * factor, values)
 
-    like = reach.modulated if kind == WAVE else reach.plain
+    like = apparatus.modulated if kind == WAVE else apparatus.plain
     interval, span = _digits(float(np.median(np.diff(like.t))), 9), float(np.ptp(like.t))
-    V, other, third = near(reach.V), near(reach.V), near(reach.V)
-    W0 = near(reach.W0) if set(reach.W0) != {UNKNOWN} else UNKNOWN
-    rise = reach.switch if kind == WAVE else reach.rise
+    V, other, third = near(apparatus.V), near(apparatus.V), near(apparatus.V)
+    W0 = near(apparatus.W0) if set(apparatus.W0) != {UNKNOWN} else UNKNOWN
+    rise = apparatus.switch if kind == WAVE else apparatus.rise
     if kind == STEPS:
-        drive = _timed([V, other, V, third], [0.25] * 4, span, reach.travel)
+        drive = _timed([V, other, V, third], [0.25] * 4, span, apparatus.travel)
         return Proposal(kind, drive, W0, like.name, interval, rise)
     if kind == HOLD:
-        drive = _timed([V, 0.0, V], [0.2, rng.uniform(0.3, 0.6), 0.2], span, reach.travel)
+        drive = _timed([V, 0.0, V], [0.2, rng.uniform(0.3, 0.6), 0.2], span, apparatus.travel)
         return Proposal(kind, drive, W0, like.name, interval, rise)
     if kind == LOAD:
-        drive = _timed([V], [1.0], span, reach.travel)
-        jump = _digits(near(reach.jumps) * W0 * (1 if rng.uniform() < 0.6 else -1))
+        drive = _timed([V], [1.0], span, apparatus.travel)
+        jump = _digits(near(apparatus.jumps) * W0 * (1 if rng.uniform() < 0.6 else -1))
         length = sum(d for d, _ in drive)
         steps = ((_digits(0.3 * length), jump), (_digits(0.65 * length), -jump))
-        return Proposal(kind, drive, W0, like.name, interval, rise, _allowed(W0, steps, reach))
+        return Proposal(kind, drive, W0, like.name, interval, rise, _allowed(W0, steps, apparatus))
     stepped = rng.uniform() < 0.4
-    drive = _timed([V, other], [0.6, 0.4], span, reach.travel) if stepped else _timed([V], [1.0], span, reach.travel)
-    onset = _digits(min(reach.onset, 0.5) * sum(d for d, _ in drive))
-    eps = min(near(reach.eps), MOST_EPS)
-    return Proposal(kind, drive, W0, like.name, interval, rise, (), eps, _frequency(near(reach.f), reach, interval), onset)
+    drive = _timed([V, other], [0.6, 0.4], span, apparatus.travel) if stepped else _timed([V], [1.0], span, apparatus.travel)
+    onset = _digits(min(apparatus.onset, 0.5) * sum(d for d, _ in drive))
+    eps = min(near(apparatus.eps), MOST_EPS)
+    return Proposal(
+        kind, drive, W0, like.name, interval, rise, (), eps, _frequency(near(apparatus.f), apparatus, interval), onset
+    )
 
 
 def _timed(V: Sequence[float], shares: Sequence[float], span: float, travel: float) -> tuple[tuple[float, float], ...]:
@@ -572,9 +574,9 @@ def _timed(V: Sequence[float], shares: Sequence[float], span: float, travel: flo
     return tuple((_digits(d), v) for d, v in zip(lengths, V, strict=True))
 
 
-def _allowed(W0: float, steps: tuple[tuple[float, float], ...], reach: Reach) -> tuple[tuple[float, float], ...]:
+def _allowed(W0: float, steps: tuple[tuple[float, float], ...], apparatus: Capabilities) -> tuple[tuple[float, float], ...]:
     """Return steps that keep the load within what was shown, times two."""
-    low, high = min(reach.W0) / FACTOR, FACTOR * max(reach.W0)
+    low, high = min(apparatus.W0) / FACTOR, FACTOR * max(apparatus.W0)
     size = max((abs(j) for _, j in steps), default=0.0)
     if not size:
         return steps
@@ -583,8 +585,8 @@ def _allowed(W0: float, steps: tuple[tuple[float, float], ...], reach: Reach) ->
     return tuple((at, _digits(j * shrunk)) for at, j in steps)
 
 
-def _frequency(value: float, reach: Reach, interval: float) -> float:
-    return _digits(min(_within(value, reach.f), 1 / (FINEST * interval)))
+def _frequency(value: float, apparatus: Capabilities, interval: float) -> float:
+    return _digits(min(_within(value, apparatus.f), 1 / (FINEST * interval)))
 
 
 def _within(value: float, shown: Sequence[float]) -> float:

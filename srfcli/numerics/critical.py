@@ -47,7 +47,7 @@ JUMP = 0.5  # of the growth rates at a bracket's ends: what stays of them on a q
 class CriticalLine:
     """The critical values of `name` in [lo, hi], rising, and the scan that found them.
 
-    `crossings[i]` numbers points[i] from the low end: odd where stability is lost as the parameter rises. `reach` is what was
+    `crossings[i]` numbers points[i] from the low end: odd where stability is lost as the parameter rises. `outer` is what was
     looked at beyond [lo, hi] where no window was given. `status` is not OK where a crossing may be missing.
     """
 
@@ -57,12 +57,12 @@ class CriticalLine:
     scan: LineScan
     notes: tuple[str, ...]
     status: Status = Status.OK
-    reach: Reach | None = None
+    outer: OuterScans | None = None
 
     @property
     def scans(self) -> tuple[LineScan, ...]:
         """Return all that was looked at, from low values to high."""
-        return (self.scan,) if self.reach is None else (*self.reach.below[::-1], self.scan, *self.reach.above)
+        return (self.scan,) if self.outer is None else (*self.outer.below[::-1], self.scan, *self.outer.above)
 
 
 def critical_line(
@@ -90,8 +90,8 @@ def critical_line(
     scan = scan_line(
         model, base, name, values, intervals=INTERVALS, guess=None if guess is None else guess.orbit, resolution=resolution
     )
-    reach = follow_outwards(model, base, scan, scan, resolution=resolution) if whole else None
-    line = CriticalLine(name, (), (), scan, (), reach=reach)
+    outer = follow_outwards(model, base, scan, scan, resolution=resolution) if whole else None
+    line = CriticalLine(name, (), (), scan, (), outer=outer)
     found = [locate_crossings(model, base, piece, tol=tol, max_mesh=max_mesh) for piece in line.scans]
     points = _distinct(sorted((q for part in found for q in part), key=lambda q: q.value(model, name)), model, name)
     signs = np.concatenate([piece.g for piece in line.scans])
@@ -150,8 +150,8 @@ def _distinct(points: list[BoundaryPoint], model: GeneratedModel, name: str) -> 
     for point in points:
         if kept:
             apart = point.value(model, name) / kept[-1].value(model, name) - 1
-            reach = max(1e-9, 20 * (point.error + kept[-1].error))
-            if apart < reach and (point.slope > 0) == (kept[-1].slope > 0):
+            near = max(1e-9, 20 * (point.error + kept[-1].error))
+            if apart < near and (point.slope > 0) == (kept[-1].slope > 0):
                 continue
         kept.append(point)
     return kept
@@ -206,9 +206,9 @@ def _notes(
             )
             status = Status.NO_CONVERGENCE
         expected = None if losing is None else not losing
-    if line.reach is not None and not line.reach.settled:
+    if line.outer is not None and not line.outer.settled:
         low, high = line.scans[0].values[0], line.scans[-1].values[-1]
-        ends = [f"below {low:.4g} N"] * (not line.reach.settled_below) + [f"above {high:.4g} N"] * (not line.reach.settled_above)
+        ends = [f"below {low:.4g} N"] * (not line.outer.settled_below) + [f"above {high:.4g} N"] * (not line.outer.settled_above)
         notes.append(f"the growth rate had not settled: there may be crossings {' and '.join(ends)}")
         status = Status.UNSETTLED
     return notes, status
@@ -230,7 +230,7 @@ MARGIN = 2.0  # of a window beyond the outermost crossing
 
 
 @dataclass(frozen=True)
-class Reach:
+class OuterScans:
     """Scans of a line beyond both ends of its window, inner ones first, and whether the growth rate settled in the end."""
 
     below: tuple[LineScan, ...]
@@ -269,19 +269,19 @@ def found_window(model: GeneratedModel, points: Sequence[Array]) -> LoadWindow:
     certain, lowest, highest = True, lo, hi
     for base in points:
         ends = [_piece(model, base, loads, d, 1e-2) for d, loads in ((-1, (lo, lo * DECADE)), (1, (hi / DECADE, hi)))]
-        reach = follow_outwards(model, base, ends[0], ends[1], resolution=1e-2)
-        certain &= reach.settled
-        for scan in (*reach.below, *reach.above):
+        outer = follow_outwards(model, base, ends[0], ends[1], resolution=1e-2)
+        certain &= outer.settled
+        for scan in (*outer.below, *outer.above):
             for i in scan.brackets():
                 lowest, highest = min(lowest, scan.values[i] / MARGIN), max(highest, scan.values[i + 1] * MARGIN)
     return LoadWindow(float(lowest), float(highest), float(np.log(highest / lowest) / np.log(hi / lo)), certain)
 
 
-def follow_outwards(model: GeneratedModel, base: Array, low: LineScan, high: LineScan, *, resolution: float = 1e-3) -> Reach:
+def follow_outwards(model: GeneratedModel, base: Array, low: LineScan, high: LineScan, *, resolution: float = 1e-3) -> OuterScans:
     """Return scans along W0 at `base` below the scan `low` and above `high`, as far as it takes the growth rate to settle."""
     below, settled_below = _follow(model, base, low, -1, resolution)
     above, settled_above = _follow(model, base, high, 1, resolution)
-    return Reach(below, above, settled_below, settled_above)
+    return OuterScans(below, above, settled_below, settled_above)
 
 
 def _follow(
