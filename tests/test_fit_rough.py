@@ -303,6 +303,22 @@ def test_what_a_held_out_run_adds_to_the_evidence_is_what_is_predicted_of_it(lou
     assert told.rms <= np.sqrt(np.mean(plain.white**2)) + 1e-9
 
 
+def test_a_held_out_run_moves_what_the_fitted_ones_left_undetermined(tmp_path):
+    """Steady sliding tells neither D0 nor B apart from A: with the file's values a step is not predicted, with the law it is."""
+    plans = (Plan("slide", ((2, 20),), 3.0, 0.004), Plan("step", ((0.5, 20), (0.8, 60)), 3.0, 0.004, holdout=True))
+    rng = np.random.default_rng(2)
+    readings = {q: read_gauge(move(Physics(), q).u, Gauge(), rng) for q in plans}
+    for name, text in case_files("small", Physics(), readings).items():
+        (tmp_path / name).write_text(text)
+    whole = srf.read_experiment(tmp_path)
+    found = srf.fit(whole, free=["mu0", "A", "B", "D0"], track="smooth").found.state_space
+    (step,) = (run for run in whole.runs if run.holdout)
+    plain, told = found.likelihood.held_out(step, found.values), found.predictive(step)
+    assert np.sqrt(np.mean(plain.white**2)) > 1.5 and told.rms == pytest.approx(1.0, abs=0.1)
+    alone = srf.fit(replace(whole, runs=(replace(step, holdout=False),)), free=["mu0", "A", "B", "D0"], track="smooth")
+    assert told.log_likelihood < alone.found.fit.log_likelihood  # what was not known costs
+
+
 def test_noise_that_is_far_below_the_corners_of_a_recording_is_found(tmp_path):
     """Sampled coarsely, the drive's starts and stops look like loud white noise; the gauge's is coloured and faint."""
     plan, base, rng = Plan("holds", ((1.5, 20), (1.5, 0.2)) * 2, 5.0, 0.05), Physics(), np.random.default_rng(3)
