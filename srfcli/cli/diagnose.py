@@ -31,7 +31,7 @@ srf fit found/augmented                              the augmented model is an e
     type=int,
     default=0,
     show_default=True,
-    help="Of the noise that is simulated for p-values, and of runs that are tried.",
+    help="Seed of the noise that is simulated for p-values, and of the discriminating runs that are drawn.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one object, in full precision.")
 @click.option("--out", metavar="DIR", help="Write answer, report, predictions and augmented experiment to DIR.")
@@ -39,9 +39,10 @@ srf fit found/augmented                              the augmented model is an e
 def diagnose(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], **options: Any) -> None:
     """Find where recordings, or critical loads, differ from their model, and which physics the model lacks.
 
-    The baseline of the experiment is fitted with a random friction field and coloured gauge noise. Every registered effect is
-    scored for what it could explain beyond these, and those with the highest scores are fitted. Held-out runs are read when the
-    models are final, and must be predicted. Verdicts are none, identified, ambiguous, unknown and inconclusive.
+    The baseline of the experiment is fitted with a random friction field and coloured gauge noise. Registered effects are scored
+    for what they could explain beyond these, some only if --effect names them, and those with the highest scores are fitted.
+    Held-out runs are read when the models are final, and must be predicted. Verdicts are none, identified, ambiguous, unknown and
+    inconclusive.
     """
     from srfcli.cli.emit import Progress, finish, show
     from srfcli.results.diagnosis import check_answer

@@ -60,7 +60,7 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
     "--prior/--no-prior",
     default=True,
     show_default=True,
-    help="Draw what varies between five groups or more towards its mean, as far as it scatters by chance.",
+    help="Give what varies between five groups or more a Gaussian prior, of estimated mean and scatter.",
 )
 @click.option(
     "--track",
@@ -69,12 +69,12 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
 )
 @click.option("--sample", type=click.IntRange(100, 1_000_000), metavar="N", help="Draw N points of the posterior (emcee).")
 @click.option("--draws", metavar="FILE.nc", help="Keep the draws of --sample as ArviZ's netCDF.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of further starts and of the sampler.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of further starts and of the sampler.")
 @reader_option
 @click.option("--bounds", multiple=True, metavar="NAME=LO:HI", help="Bounds of a parameter, for a table of critical loads.")
 @click.option("--method", multiple=True, help="Minimiser of the critical loads' cost; both unless named.")
 @click.option("--tol", type=float, help="Relative error of a critical load.")
-@click.option("--max-evaluations", type=click.IntRange(1), help="Of the cost over the critical loads, for each minimiser.")
+@click.option("--max-evaluations", type=click.IntRange(1), help="Most evaluations of that cost, for each minimiser.")
 @worker_options
 @stability_options
 @output_options

@@ -390,7 +390,7 @@ EFFECT_OPTION: Options = {
         "effects",
         multiple=True,
         metavar="NAME",
-        help="Have this effect besides the laws, as `srf laws --kind effect` lists them; repeatable.",
+        help="Add this effect to the laws; `srf laws --kind effect` lists all; repeatable.",
         shell_complete=names_of("effect"),
     )
 }
@@ -611,8 +611,8 @@ def listed(texts: Sequence[str]) -> list[str]:
 def vary_options(function: F) -> F:
     """Add --trend, --vary and --by, which fits of recordings have in common."""
     ways = ["run", "load", "segment", "direction"]
-    by = click.option("--by", type=click.Choice(ways), help="What --vary goes by; run if nothing says.")
-    text = "Parameters, or noise, with a value of their own in each run, or --by."
+    by = click.option("--by", type=click.Choice(ways), help="Groups of --vary; unless given, those of the experiment, else runs.")
+    text = "Parameters, or noise, with a value of their own in each group that --by names, else in each run."
     vary = click.option("--vary", multiple=True, metavar="NAMES", help=text)
     text = "Let each run's observable drift with slip or time."
     trend = click.option("--trend", type=click.Choice(["slip", "time"]), help=text)

@@ -102,7 +102,7 @@ def critical(
     """Every critical load at the given velocities, numbered from low W0.
 
     The growth rate is sampled along W0, refined where a pair of crossings could hide, and each sign change is polished on
-    meshes that are doubled until the error is met. Odd crossings lose stability as W0 rises, even ones regain it.
+    finer meshes until the error is met. Odd crossings lose stability as W0 rises, even ones regain it.
     """
     from srfcli.cli.emit import Progress, emit, finish
     from srfcli.tasks import stability
@@ -200,7 +200,7 @@ srf floquet --V 8 --W0 9 --eps 0.09 --json --tol 1e-9
 @click.option("--tol", type=float, help="Error of the multipliers; 1e-6 unless set.")
 @mesh_option(least=32, most=65536, default=1024)
 @click.option("--harmonics", type=click.IntRange(1, 200), default=5, show_default=True, help="Harmonics of u and mu to list.")
-@click.option("--fail-on", type=click.Choice(["unstable", "stable"]), help="Exit with 4 when the state is so.")
+@click.option("--fail-on", type=click.Choice(["unstable", "stable"]), help="Exit with code 4 if the state is as named.")
 @output_options
 def floquet(
     system: SystemOptions,
