@@ -319,6 +319,21 @@ def test_a_held_out_run_moves_what_the_fitted_ones_left_undetermined(tmp_path):
     assert told.log_likelihood < alone.found.fit.log_likelihood  # what was not known costs
 
 
+def test_a_held_out_run_that_is_sampled_about_as_often_has_no_noise_of_its_own(tmp_path):
+    """At 4.4 ms where the fitted runs have 4 ms: what is louder there is not explained by another noise."""
+    plans = [Plan(f"up{k}", ((0.6, 20), (0.6, 60)), 3.0, 0.0044 if k == 2 else 0.004, holdout=k == 2) for k in range(3)]
+    rng = np.random.default_rng(8)
+    readings = {q: read_gauge(move(Physics(), q).u, Gauge(sigma=0.04 if q.holdout else 0.02), rng) for q in plans}
+    for name, text in case_files("small", Physics(), readings).items():
+        (tmp_path / name).write_text(text)
+    whole = srf.read_experiment(tmp_path)
+    found = srf.fit(whole, free=["mu0", "A"], track="smooth").found.state_space
+    (louder,) = (run for run in whole.runs if run.holdout)
+    told = found.predictive(louder)
+    assert told.rms > 1.25 and set(told.fit.likelihood.names) == set(found.likelihood.names)
+    assert told.fit.log_likelihood <= told.fit.likelihood.at(told.fit.maximum.point.x).log_likelihood + 1e-6
+
+
 def test_noise_that_is_far_below_the_corners_of_a_recording_is_found(tmp_path):
     """Sampled coarsely, the drive's starts and stops look like loud white noise; the gauge's is coloured and faint."""
     plan, base, rng = Plan("holds", ((1.5, 20), (1.5, 0.2)) * 2, 5.0, 0.05), Physics(), np.random.default_rng(3)

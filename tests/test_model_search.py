@@ -12,13 +12,21 @@ from srfcli.codegen.c_source import compiler
 from srfcli.data.experiment import read_experiment
 from srfcli.data.groups import grouped
 from srfcli.data.values import FitParameter
-from srfcli.diagnosis.goodness_of_fit import log_evidence, mass_at_bounds
 from srfcli.diagnosis.hypotheses import Hypothesis, applicable, own_parameters
 from srfcli.diagnosis.scores import Remainder, Scores
-from srfcli.diagnosis.search import CLOSE, ModelSearch
+from srfcli.diagnosis.search import SHARED, ModelSearch
 from srfcli.diagnosis.verdict import conclude
 from srfcli.inference import state_space
-from srfcli.inference.state_space import DEVIATION, Likelihood, StateSpaceFit, correlated, fit_state_space, maximise
+from srfcli.inference.state_space import (
+    DEVIATION,
+    Likelihood,
+    StateSpaceFit,
+    correlated,
+    fit_state_space,
+    log_evidence,
+    mass_at_bounds,
+    maximise,
+)  # fmt: skip
 from srfcli.laws.registry import bundled_registry
 from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
@@ -164,7 +172,7 @@ def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, shared):
     experiment = read_experiment(recorded(tmp_path, Physics(), shared=shared), registry=SHIPPED, holdout=False)
     fitted = fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=())
     remainder = Remainder(fitted)
-    assert (remainder.shared.gain > CLOSE) == shared
+    assert (remainder.shared.gain > SHARED) == shared
     if shared:
         found = remainder.shared
         absorbed = (found.u * found.absorbed) @ found.u.T  # I - inverse of the covariance
@@ -181,7 +189,7 @@ def test_a_field_that_all_runs_share_counts_alike_under_every_model(tmp_path):
     random = [f for f in found.ranked if "track-topography" not in f.name]
     assert {"none", "linker-dieterich"} <= {f.name for f in random}
     assert len({f.remainder.shared.gain for f in random}) > 1  # each its own
-    gain = found.best.remainder.shared.gain - CLOSE
+    gain = found.best.remainder.shared.gain - SHARED
     assert gain > 0 and [f.evidence - f.separate for f in random] == pytest.approx([gain] * len(random))
     assert all(f.evidence == f.separate for f in found.ranked if f not in random)
 

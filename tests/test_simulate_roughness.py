@@ -298,7 +298,7 @@ def test_an_experiment_with_effects_is_simulated_as_it_is_fitted(
 @pytest.mark.parametrize(
     ("arguments", "message", "hint"),
     [
-        (["--roughness", "-1e-4"], "a roughness of -0.0001 is not an amplitude", "0 or more"),
+        (["--roughness", "-1e-4"], "a roughness of -0.0001 is not a size", "0 or more"),
         (["--roughness", "much"], "is not a number", "--roughness"),
         (["--roughness", "1 um"], "measures", "plain number"),
         (["--roughness", "0.17"], "more than half of mu0 = 0.33", "such as 3e-4"),

@@ -150,7 +150,9 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
             hit |= (size > threshold) & (apart > threshold) & alone & (off > CREST * near)
         sign = np.where(above > below, 1.0, -1.0)
         beside = [sign * (x[first + k] - x[first + j]) for k, j in ((0, -1), (width - 1, width))]
-        hit &= np.min(beside, axis=0) > np.select([first < 2 * BESIDE, first + width > x.size - 2 * BESIDE], ends)
+        near = [first < 2 * BESIDE, first + width > x.size - 2 * BESIDE]
+        hit &= np.min(beside, axis=0) > np.select(near, ends, -np.inf)
+        hit &= (first > BESIDE) & (first + width < x.size - BESIDE)  # a level at the very end may be that before a slip
         for k in range(width):
             found[first[hit] + k] = True
     return found[BESIDE:-BESIDE]
@@ -298,7 +300,7 @@ def check_gauge(*, noise: float, lag1: float, quantum: float, seed: int) -> None
     """Raise SrfError for sizes, a correlation or a seed that a gauge cannot have."""
     for name, value in (("noise", noise), ("quantum", quantum)):
         if not (math.isfinite(value) and value >= 0):
-            raise SrfError(f"{name} = {value:g} is not an amplitude", f"give {name} as 0 or more")
+            raise SrfError(f"{name} = {value:g} is not a size", f"give {name} as 0 or more")
     if not abs(lag1) < 1:
         raise SrfError(f"lag1 = {lag1:g} is not the correlation of a stationary noise", "give -1 < lag1 < 1, as 0.8")
     if lag1 and not noise:
@@ -354,7 +356,7 @@ class FrictionField:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.amplitude) and self.amplitude >= 0):
-            raise SrfError(f"a roughness of {self.amplitude:g} is not an amplitude", "give it as 0 or more, as 3e-4")
+            raise SrfError(f"a roughness of {self.amplitude:g} is not a size", "give it as 0 or more, as 3e-4")
         shortest = KNOTS * FINEST_KNOTS
         if not (math.isfinite(self.length) and self.length >= shortest * (1 - 1e-12)):
             raise SrfError(

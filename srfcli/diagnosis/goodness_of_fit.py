@@ -1,14 +1,12 @@
-"""What speaks for a fitted model and what speaks against it: its log marginal likelihood, and tests of its innovations.
+"""What speaks against a fitted model: tests of its innovations.
 
 Under the right model the standardised innovations are white noise of variance 1 in every run and every stretch, the random
 friction field has one amplitude in all runs, and one that a track may have, and the gauge is not louder than differences of its
-readings. Laplace's method: Kass and Raftery, JASA 90 (1995); Cauchy priors: Jeffreys, Theory of Probability, 1961, 5.2;
-innovations: Durbin and Koopman 2012.
+readings. Durbin and Koopman 2012.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import product
 
 import numpy as np
@@ -26,7 +24,6 @@ from srfcli.inference.state_space import (
     StateSpaceFit,
     correlated,
     cut,
-    one_sided,
     typical_friction,
 )
 
@@ -36,41 +33,6 @@ LEVELS = ("gauge_white", "gauge_colour")
 LOUD = 1.15  # gauge noise over that which differences of the recording show, beyond which it holds something else
 REPEATED = 0.72  # share of readings that repeat the one before where a step is four times white noise; at six values are off
 THIRD = 1.16  # relative variance, times n, of a level that third differences of n samples tell: (1 + 2 sum rho^2) / 2
-
-
-def log_evidence(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None = None) -> float:
-    """Return the log marginal likelihood by Laplace's method; `mass_at_bounds` is a part of it.
-
-    Priors are flat within the bounds, in the likelihood's coordinates; that of a parameter in `sizes`, by name, is a Cauchy
-    distribution (centre, scale).
-    """
-    if not np.isfinite(found.log_likelihood):
-        return found.log_likelihood
-    covariance = found.maximum.covariance
-    free = np.diag(covariance) > 0
-    d = np.sqrt(np.diag(covariance)[free])
-    _, logdet = np.linalg.slogdet(covariance[np.ix_(free, free)] / np.outer(d, d))
-    occam = np.log(np.sqrt(2 * np.pi) * d) + _log_prior(found, sizes)[free]  # a prior is never narrower than the posterior
-    return float(found.log_likelihood + 0.5 * logdet + np.sum(np.minimum(occam, 0.0)) + mass_at_bounds(found, sizes))
-
-
-def mass_at_bounds(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None = None) -> float:
-    """Return what parameters at a bound add to the log evidence: each a one-sided integral, along which the others follow it."""
-    likelihood, maximum, total = found.likelihood, found.maximum, 0.0
-    x, free, prior = maximum.point.x, np.diag(maximum.covariance) > 0, _log_prior(found, sizes)
-    for j in np.flatnonzero(~free & ((x <= likelihood.lower) | (x >= likelihood.upper))):
-        total += min(one_sided(maximum.point, maximum.covariance, int(j)) + float(prior[j]), 0.0)
-    return total
-
-
-def _log_prior(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None) -> Array:
-    """Return the log prior density (k,) of each coordinate at the maximum."""
-    likelihood, density = found.likelihood, -np.log(found.likelihood.upper - found.likelihood.lower)
-    for name, (centre, scale) in (sizes or {}).items():
-        j = likelihood.names.index(name) if name in likelihood.names else -1  # it may be held
-        if j >= 0 and not likelihood.logarithmic[j] and scale > 0:
-            density[j] = -np.log(np.pi * scale * (1 + ((found.values[name] - centre) / scale) ** 2))
-    return np.asarray(density)
 
 
 def shortcomings(found: StateSpaceFit) -> list[str]:

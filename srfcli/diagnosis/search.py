@@ -21,8 +21,8 @@ import numpy as np
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
-from srfcli.data.values import Experiment
-from srfcli.diagnosis.goodness_of_fit import field_share, log_evidence, mass_at_bounds, shortcomings, taken_up
+from srfcli.data.values import Experiment, Run
+from srfcli.diagnosis.goodness_of_fit import field_share, shortcomings, taken_up
 from srfcli.diagnosis.hypotheses import Excluded, Hypothesis, along_table, applicable, neutral_values, own_parameters
 from srfcli.diagnosis.scores import Remainder, Score, Scores, may_befall_one_run
 from srfcli.inference.fit import Problem
@@ -34,10 +34,13 @@ from srfcli.inference.state_space import (
     Likelihood,
     Maximum,
     Point,
+    Predictive,
     StateSpaceFit,
     correlated,
     fit_state_space,
     likeliest_beside,
+    log_evidence,
+    mass_at_bounds,
     maximise,
     processes_in,
     thinned,
@@ -102,6 +105,10 @@ class Fitted:
     def passes(self) -> bool:
         """Return whether the model passes every test of what a fit leaves."""
         return not self.against
+
+    def predictive(self, run: Run) -> Predictive:
+        """Return how well a run that was not fitted is predicted, with priors as in the log evidence."""
+        return self.fit.predictive(run, self.hypothesis.priors(self.fit.likelihood.problem.model))
 
     @property
     def attainable(self) -> float:
@@ -387,8 +394,9 @@ class ModelSearch:
         least = WORTH if node.passes else WORTH / 2
         if node.passes and not node.hypothesis.reported and (not node.fit.smooth or node.fit.likelihood.processes):
             least = HINT
-        alone = not node.passes or any(s.gain > least for s in scores.singles)
-        self._promise(node, node, self._gains(scores, alone), least)
+        alone = scores.alone() if not node.passes or any(s.gain > least for s in scores.singles) else []
+        promised = [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in alone]
+        self._promise(node, node, promised, least)
         for effect in (e for e in joining if e.settings or e.observed):
             self._try_built_in(node, effect)
         return node
@@ -430,12 +438,8 @@ class ModelSearch:
             return
         self.progress(f"{node.name}: scores without field and colour")
         scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, self._joining(node))
-        self._promise(node, plain, self._gains(scores, alone=True), WORTH, noise=False)
-
-    def _gains(self, scores: Scores, alone: bool) -> list[tuple[float, Score]]:
-        """Return what each effect promises, in log likelihood; in one run `alone` less, as any of them might be that run."""
-        found = [(s.gain, s) for s in scores.singles]
-        return found + [(s.gain - self._rarer, s) for s in scores.alone()] if alone else found
+        for promised in ([(s.gain, s) for s in scores.singles], [(s.gain - self._rarer, s) for s in scores.alone()]):
+            self._promise(node, plain, promised, WORTH, noise=False)
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""

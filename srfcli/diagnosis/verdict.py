@@ -22,6 +22,7 @@ NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
 HELD = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
 SAME = 0.97  # likeness of two effects' projected columns beyond which they are one class
 ABSORBED = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
+BEHIND = 50.0  # in log evidence, by how much a model may be behind and still be asked what it predicts
 TEMPER = 3.0  # by which log evidence is divided before it becomes a stated confidence
 LACKING = 40.0  # in log evidence, what a model that fails a test loses in the stated confidence
 # the likeliest shares of 150 sealed cases (benchmarks/calibration.py): of something else being concealed where a model passed, of
@@ -161,7 +162,7 @@ def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted
     the same likelihood as the best of these. Of two that come close one that holds the other gives way, and one that
     became the other; of an effect in all runs or in one, that which is worse.
     """
-    least = -np.inf if ranked[0].passes else ranked[0].evidence - CLOSE
+    least = ranked[0].evidence - (BEHIND if ranked[0].passes else CLOSE)
     passed = [f for f in ranked if f.passes and f.evidence > least]
     told = {f.name: predictive(f, whole) for f in passed}
     under = [f for f in passed if f.shared is not None]
@@ -185,15 +186,20 @@ def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted
 def predictive(fitted: Fitted, whole: Experiment) -> float:
     """Return the log likelihood of all that is held out, with the model's parameters as uncertain as its fit leaves them."""
     own = fitted.fit.likelihood
-    runs = sum(fitted.fit.predictive(run).log_likelihood for run in whole.runs if run.holdout and own.problem.runs)
+    runs = sum(fitted.predictive(run).log_likelihood for run in whole.runs if run.holdout and own.problem.runs)
     return runs + sum(own.held_out_table(t, fitted.fit.values).log_likelihood for t in whole.thresholds if t.holdout)
 
 
 def shared_gain(fitted: Fitted, whole: Experiment) -> float:
     """Return what held-out runs gain in log likelihood under a model by a field that all runs share, at first order."""
-    runs = [run for run in whole.runs if run.holdout] if fitted.fit.likelihood.problem.runs else []
-    gains = [max(Remainder(fitted.fit.predictive(run).fit).shared.gain - SHARED, 0.0) for run in runs]
-    return sum(max(gain - (fitted.shared or 0.0), 0.0) for gain in gains)
+    total = 0.0
+    for run in whole.runs if fitted.fit.likelihood.problem.runs else ():
+        fit = fitted.predictive(run).fit if run.holdout else fitted.fit
+        if run.holdout and np.isfinite(fit.log_likelihood):
+            every = replace(fit, maximum=replace(fit.maximum, point=fit.likelihood.at(fit.maximum.point.x)))
+            fit.likelihood.best = None  # derivatives of all readings take much room
+            total += max(Remainder(every).shared.gain - SHARED - (fitted.shared or 0.0), 0.0)
+    return total
 
 
 def _is_that_law(fitted: Fitted, other: Fitted, evidence: Mapping[str, float]) -> bool:
@@ -231,10 +237,9 @@ def held_out(baseline: Fitted, best: Fitted, whole: Experiment, shown: Fitted | 
     found = []
     for run in (run for run in whole.runs if run.holdout):
         first, last, seen = (f.fit.likelihood.held_out(run, f.fit.values) for f in models)
-        before, after, loud = baseline.fit.predictive(run), best.fit.predictive(run), ""
+        before, after, loud = baseline.predictive(run), best.predictive(run), ""
         if best.fit.likelihood.noisy_alone(run):
-            point = after.fit.maximum.point
-            own = loudness(after.fit.likelihood, replace(point, runs=point.runs[-1:]))
+            own = loudness(after.fit.likelihood, after.fit.maximum.point)
             loud = next((text for size, text in own if size > 1.0), "")
         found.append(Held(first, last, seen, (before, after), loud))
     return tuple(found)

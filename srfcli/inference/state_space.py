@@ -7,7 +7,8 @@ expected to be given those before it. With a = 0 that is the likelihood of the f
 The field's amplitude is a homotopy: with a wide field the filter stays with the recording whatever the parameters are, and the
 likelihood has one maximum where that of the free-running model, whose cycles fall out of step, has many. So the fit begins with
 a wide field, and then estimates it with everything else, by Fisher scoring on exact derivatives.
-Kristensen, Madsen and Jorgensen, Automatica 40 (2004); Hartikainen and Sarkka 2010; Durbin and Koopman 2012.
+Kristensen, Madsen and Jorgensen, Automatica 40 (2004); Hartikainen and Sarkka 2010; Durbin and Koopman 2012. Log marginal
+likelihoods are by Laplace's method: Kass and Raftery, JASA 90 (1995); Cauchy priors: Jeffreys, Theory of Probability, 1961, 5.2.
 """
 
 from __future__ import annotations
@@ -402,19 +403,28 @@ class Likelihood:
     within a run too; names then end in `[kind]`. Without runs there is neither field nor gauge.
     """
 
-    def __init__(self, problem: Problem, *, smooth: bool = False, processes: Sequence[str] = (), rtol: float = RTOL) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        smooth: bool = False,
+        processes: Sequence[str] = (),
+        rtol: float = RTOL,
+        kinds: Sequence[Kind] = (),
+    ) -> None:
         self.problem, self.smooth, self.processes = problem, smooth or not problem.runs, tuple(processes)
         self.base_rtol, self.rtol = rtol, FREE_RUNNING * rtol if smooth else rtol
         self.evaluations = 0
         self.best: Point | None = None  # the likeliest with slopes so far
         scales = _scales(problem.runs) if problem.runs else {}
         self._gauge = ["gauge_white", *(n for row in gauge_rows(processes) for n in row)]
-        self.kinds = list(dict.fromkeys(kind for run in problem.runs for kind in self.kinds_of(run)))
-        own = [(n, *scales[n]) for n in (() if self.smooth else FIELD)]
+        own = dict.fromkeys(kind for run in problem.runs for kind in self.kinds_of(run))
+        self.kinds = [*kinds, *(kind for kind in own if not any(_same_noise(kind, known) for known in kinds))]
+        random = [(n, *scales[n]) for n in (() if self.smooth else FIELD)]
         for kind in self.kinds:
-            own += [(name, *scales[n.rstrip("123"), kind[0]]) for n, name in self.gauge_names(kind).items()]
-        self.names = (*problem.names, *(row[0] for row in own))
-        rows = [*zip(problem.start, problem.lower, problem.upper, strict=True), *(row[1:] for row in own)]
+            random += [(name, *scales[n.rstrip("123"), kind[0]]) for n, name in self.gauge_names(kind).items()]
+        self.names = (*problem.names, *(row[0] for row in random))
+        rows = [*zip(problem.start, problem.lower, problem.upper, strict=True), *(row[1:] for row in random)]
         self.logarithmic = np.array([low > 0 for _, low, _ in rows])
         self.start, self.lower, self.upper = (
             np.array([np.log(v) if log else v for v, log in zip(column, self.logarithmic, strict=True)])
@@ -533,10 +543,7 @@ class Likelihood:
 
     def noisy_alone(self, run: Run) -> bool:
         """Return whether no run that was fitted has this one's gauge noise: none of its group, or none sampled about as often."""
-        return not all(
-            any(known[::2] == kind[::2] and abs(np.log(known[1] / kind[1])) < SAME_RATE for known in self.kinds)
-            for kind in self.kinds_of(run)
-        )
+        return not all(any(_same_noise(kind, known) for known in self.kinds) for kind in self.kinds_of(run))
 
     def alone(self, run: Run, values: Mapping[str, float]) -> tuple[Likelihood, Point]:
         """Return the likelihood of a run that was not fitted, by what belongs to it alone, and its maximum."""
@@ -636,6 +643,11 @@ class Likelihood:
         if slopes and (anew or self.best is None or total > self.best.log_likelihood):
             self.best = point
         return point
+
+
+def _same_noise(kind: Kind, known: Kind) -> bool:
+    """Return whether two kinds of gauge noise are one: of an observable, of a group, sampled about as often."""
+    return kind[::2] == known[::2] and abs(np.log(known[1] / kind[1])) < SAME_RATE
 
 
 def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
@@ -799,29 +811,6 @@ def at_bound(likelihood: Likelihood, point: Point) -> NDArray[np.bool_]:
     return np.asarray(((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0)))
 
 
-def one_sided(point: Point, covariance: Array, j: int) -> float:
-    """Return the log of the integral of the likelihood over its maximum along coordinate j from its bound, the others following.
-
-    `covariance` (k, k) is that of the others, zero for those that stay.
-    """
-    I = point.information
-    bent, slope = float(I[j, j] - I[j] @ covariance @ I[j]), abs(float(point.score[j]))
-    d = 1 / np.sqrt(max(bent, (1e-3 * slope) ** 2, 1e-300))
-    return float(np.log(np.sqrt(np.pi / 2) * d * erfcx(slope * d / np.sqrt(2))))
-
-
-def log_volume(likelihood: Likelihood, point: Point) -> float:
-    """Return the log of the integral of the likelihood over its maximum, by Laplace's method; priors are flat within bounds."""
-    widths = likelihood.upper - likelihood.lower
-    wide = replace(point, information=point.information + np.diag(1 / widths**2))  # what nothing determines is within its bounds
-    stays, covariance = at_bound(likelihood, point), np.zeros_like(point.information)
-    inner = np.nonzero(~stays)[0]
-    covariance[np.ix_(inner, inner)] = inverse(wide.information[np.ix_(inner, inner)])
-    _, logdet = np.linalg.slogdet(2 * np.pi * covariance[np.ix_(inner, inner)])
-    one_by_one = sum(one_sided(wide, covariance, int(j)) for j in np.nonzero(stays)[0])
-    return 0.5 * float(logdet) + one_by_one - float(np.sum(np.log(widths)))
-
-
 def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Point:
     """Return the likeliest point on the way from the last but one of the points before, 2, 4, 8 times as far; else the point.
 
@@ -977,44 +966,105 @@ class StateSpaceFit:
         """Return the log likelihood at the maximum."""
         return self.maximum.point.log_likelihood
 
-    def predictive(self, run: Run) -> Predictive:
+    def predictive(self, run: Run, sizes: Mapping[str, tuple[float, float]] | None = None) -> Predictive:
         """Return how well a run that was not fitted is predicted, with the parameters as uncertain as they are.
 
-        By Laplace's method: p(new | old) = p(new, old) / p(old), of a fit to both and of this one. Each run is predicted once.
+        By Laplace's method: p(new | old) = p(new, old) / p(old), of a fit to both and of this one. `sizes` are as in
+        `log_evidence`. Each run is predicted once.
         """
         known = self._told.get(run.name)
         if known is None or known[0] is not run:
-            known = self._told[run.name] = (run, self._predictive(run))
+            known = self._told[run.name] = (run, self._predictive(run, sizes))
         return known[1]
 
-    def _predictive(self, run: Run) -> Predictive:
+    def _predictive(self, run: Run, sizes: Mapping[str, tuple[float, float]] | None) -> Predictive:
+        both, start = self._with(run)
+        maximum = maximise(both, both.coordinates(start), close=TOLD)
+        if both.best is not None and both.best.log_likelihood > maximum.point.log_likelihood:
+            maximum = maximise(both, both.best.x, close=TOLD, widths=())
+        point = maximum.point
+        *_, last = point.runs
+        fit = StateSpaceFit(both, replace(maximum, point=replace(point, runs=(last,))))
+        both.best = None  # derivatives of all readings take much room
+        if not np.isfinite(point.log_likelihood):
+            return Predictive(-np.inf, np.inf, fit)
+        moved = self.log_likelihood - (point.log_likelihood - last.log_likelihood)  # of what was fitted
+        total = log_evidence(StateSpaceFit(both, maximum), sizes) - log_evidence(self, sizes)
+        total += (
+            _unfinished(maximum) - _unfinished(self.maximum) + min(moved, 0.0)
+        )  # a better maximum for the others is none of it
+        rms = float(np.sqrt((last.white @ last.white + 2 * max(moved, 0.0)) / last.white.size))
+        return Predictive(total, rms, fit)
+
+    def _with(self, run: Run) -> tuple[Likelihood, dict[str, float]]:
+        """Return the likelihood of the runs that were fitted and of another, which comes last, and where it is maximised from.
+
+        What is known has the same bounds, so that priors are the same.
+        """
         own, (alone, point) = self.likelihood, self.likelihood.alone(run, self.values)
         before, after = own.problem, alone.problem
-        both = own.beside(
-            replace(
-                before, runs=(*before.runs, *after.runs), names=(*before.names, *after.names),
-                start=np.append(before.start, after.start), lower=np.append(before.lower, after.lower),
-                upper=np.append(before.upper, after.upper),
-            )
+        joined = replace(
+            before, runs=(*before.runs, *after.runs), names=(*before.names, *after.names),
+            start=np.append(before.start, after.start), lower=np.append(before.lower, after.lower),
+            upper=np.append(before.upper, after.upper),
         )  # fmt: skip
-        start = point.values | {n: self.values[n] for n in own.names}
+        both = Likelihood(joined, smooth=own.smooth, processes=own.processes, rtol=own.base_rtol, kinds=own.kinds)
+        known = {n: n for n in own.names if n in both.names}
         for each in both.problem.runs:
             for here, there in zip(both.gauges(each), own.gauges(each), strict=True):
-                start |= {name: self.values[there[n]] for n, name in here.items()}
-        maximum = maximise(both, both.coordinates(start), close=TOLD)
-        found = maximum.point
-        if not np.isfinite(found.log_likelihood):
-            return Predictive(-np.inf, np.inf, StateSpaceFit(both, maximum))
-        *_, last = found.runs
-        lost = max(self.log_likelihood - (found.log_likelihood - last.log_likelihood), 0.0)  # of what was fitted
-        more = maximum.promised - found.log_likelihood + log_volume(both, found) - log_volume(own, self.maximum.point)
-        rms = float(np.sqrt((last.white @ last.white + 2 * lost) / last.white.size))
-        return Predictive(last.log_likelihood - lost + more, rms, StateSpaceFit(both, maximum))
+                known |= {name: there[n] for n, name in here.items()}
+        for name, like in known.items():
+            i, j = both.names.index(name), own.names.index(like)
+            both.lower[i], both.upper[i] = own.lower[j], own.upper[j]
+        return both, {**point.values, **{name: self.values[like] for name, like in known.items()}}
 
     @property
     def criterion(self) -> float:
         """Return the log likelihood less half of ln n for each parameter (Schwarz 1978)."""
         return self.log_likelihood - 0.5 * np.log(self.likelihood.samples) * len(self.likelihood.names)
+
+
+def log_evidence(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None = None) -> float:
+    """Return the log marginal likelihood by Laplace's method; `mass_at_bounds` is a part of it.
+
+    Priors are flat within the bounds, in the likelihood's coordinates; that of a parameter in `sizes`, by name, is a Cauchy
+    distribution (centre, scale).
+    """
+    if not np.isfinite(found.log_likelihood):
+        return found.log_likelihood
+    covariance = found.maximum.covariance
+    free = np.diag(covariance) > 0
+    d = np.sqrt(np.diag(covariance)[free])
+    _, logdet = np.linalg.slogdet(covariance[np.ix_(free, free)] / np.outer(d, d))
+    occam = np.log(np.sqrt(2 * np.pi) * d) + _log_prior(found, sizes)[free]  # a prior is never narrower than the posterior
+    return float(found.log_likelihood + 0.5 * logdet + np.sum(np.minimum(occam, 0.0)) + mass_at_bounds(found, sizes))
+
+
+def mass_at_bounds(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None = None) -> float:
+    """Return what parameters at a bound add to the log evidence: each a one-sided integral, along which the others follow it."""
+    likelihood, maximum, total = found.likelihood, found.maximum, 0.0
+    x, score, I = maximum.point.x, maximum.point.score, maximum.point.information
+    free, prior = np.diag(maximum.covariance) > 0, _log_prior(found, sizes)
+    for j in np.flatnonzero(~free & ((x <= likelihood.lower) | (x >= likelihood.upper))):
+        bent = float(I[j, j] - I[j, free] @ maximum.covariance[np.ix_(free, free)] @ I[free, j])
+        d = 1 / np.sqrt(max(bent, (1e-3 * score[j]) ** 2, 1e-300))
+        total += min(float(np.log(np.sqrt(np.pi / 2) * d * erfcx(abs(score[j]) * d / np.sqrt(2))) + prior[j]), 0.0)
+    return total
+
+
+def _log_prior(found: StateSpaceFit, sizes: Mapping[str, tuple[float, float]] | None) -> Array:
+    """Return the log prior density (k,) of each coordinate at the maximum."""
+    likelihood, density = found.likelihood, -np.log(found.likelihood.upper - found.likelihood.lower)
+    for name, (centre, scale) in (sizes or {}).items():
+        j = likelihood.names.index(name) if name in likelihood.names else -1  # it may be held
+        if j >= 0 and not likelihood.logarithmic[j] and scale > 0:
+            density[j] = -np.log(np.pi * scale * (1 + ((found.values[name] - centre) / scale) ** 2))
+    return np.asarray(density)
+
+
+def _unfinished(maximum: Maximum) -> float:
+    """Return what the log likelihood still gains where scoring ended within TOLD standard errors of its maximum."""
+    return 0.5 * maximum.away**2 if maximum.away < TOLD else 0.0
 
 
 def fit_state_space(
