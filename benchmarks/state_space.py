@@ -50,14 +50,14 @@ def one(task: tuple[int, float, bool, str]) -> dict[str, object]:
     from srfcli.inference.fit import fit_problem
     from srfcli.inference.state_space import fit_state_space
     from srfcli.laws.registry import load_registry
-    from srfcli.validation.cases import SPREAD, case_files
+    from srfcli.validation.cases import START_SCATTER, case_files
     from srfcli.validation.gauge import Gauge, read_gauge
     from srfcli.validation.slider import SMOOTH, Physics, Track, move
 
     seed, amplitude, shared, without = task
     rng = np.random.default_rng([seed, int(1e6 * amplitude), shared])
     usual = Physics()
-    base = replace(usual, **{n: getattr(usual, n) * float(np.exp(s * rng.standard_normal())) for n, s in SPREAD.items()})
+    base = replace(usual, **{n: getattr(usual, n) * float(np.exp(s * rng.standard_normal())) for n, s in START_SCATTER.items()})
     tracks = [int(rng.integers(2**31))] * 4 if shared else rng.integers(2**31, size=4).tolist()
     readings = {}
     for plan, track in zip(plans(), tracks, strict=True):
@@ -77,7 +77,7 @@ def one(task: tuple[int, float, bool, str]) -> dict[str, object]:
         return np.clip(np.array([values[n] for n in problem.names]), problem.lower, problem.upper)
 
     if without == "ridges":
-        state_space.REACH = 0.0
+        state_space.RIDGE_REACH = 0.0
     if without == "weights":
         state_space.WIDTHS = ()
     if without == "faint":

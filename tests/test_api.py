@@ -160,11 +160,11 @@ def test_results_are_frozen_and_have_every_form(linear) -> None:
 
 
 def test_a_notebook_shows_a_table_and_escapes_what_it_shows(linear) -> None:
-    from srfcli.results.tables import SHOWN, Column, Table, table_html
+    from srfcli.results.tables import ROWS_SHOWN, Column, Table, table_html
 
     page = linear._repr_html_()
     assert page.count("<tr>") == 4 and "W0 [N]" in page
-    rows = [("<script>",)] * (SHOWN + 3)
+    rows = [("<script>",)] * (ROWS_SHOWN + 3)
     page = table_html(Table("x/1", (Column("a<b", "", '"'),), rows, "t&t", ("n>1",)))
     assert "<script" not in page and "3 more rows" in page and "t&amp;t" in page and "n&gt;1" in page
 

@@ -197,7 +197,7 @@ def test_an_effect_of_ones_own_goes_along(experiment: Experiment, tmp_path: Path
 def test_large_recordings_are_named_where_they_are(
     experiment: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(augmenting, "LARGEST", 10)
+    monkeypatch.setattr(augmenting, "COPIED_BYTES", 10)
     again, found = written(experiment, (), fitted(experiment), tmp_path / "new")
     assert found.copies == {} and "../recorded/" in found.files["experiment.toml"]
     assert [r.t.size for r in again.runs] == [r.t.size for r in experiment.runs]

@@ -359,7 +359,7 @@ def test_options_repeat_what_the_system_says() -> None:
 
     assert options_module.LOADINGS == LOADINGS
     declared = {p.name: p for p in (*APPARATUS, MASS, ANGLE)}
-    for name, text in options_module.APPARATUS.items():
+    for name, text in options_module.APPARATUS_FLAGS.items():
         assert text.endswith(f", in {declared[name].unit}.")
 
 

@@ -16,9 +16,9 @@ from srfcli.cli.main import cli
 from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis import design as module
 from srfcli.diagnosis.design import (
-    ENOUGH,
-    FACTOR,
-    LEAST,
+    BEYOND_SHOWN,
+    TOLD_APART,
+    WORTH_MAKING,
     Design,
     DiscriminatingRun,
     Loss,
@@ -119,7 +119,7 @@ def test_the_case_is_ambiguous(diagnosis: Diagnosis) -> None:
 @pytest.mark.parametrize("true", [RIVALS[0], pytest.param(RIVALS[1], marks=pytest.mark.slow)])
 def test_the_promise_is_kept(diagnosis: Diagnosis, found: DiscriminatingRun, true: str) -> None:
     """Made by the independent generator and refitted with the old runs: the gap is what was promised, within a factor of two."""
-    assert found.gain > 2 * ENOUGH and found.gain == min(found.gains.values())
+    assert found.gain > 2 * TOLD_APART and found.gain == min(found.gains.values())
     assert 0.5 < gap(diagnosis, found.proposal, true) / found.gains[true] < 2
 
 
@@ -150,7 +150,7 @@ def test_a_part_of_the_run_is_enough(diagnosis: Diagnosis, found: Discriminating
         trial = design.predict(replace(found.proposal, drive=tuple(drive)))
         assert trial is not None
         gains.append(design.gain(trial))
-    assert gains[1] < ENOUGH * 0.9 and 0.8 * ENOUGH < gains[0] < 2 * ENOUGH
+    assert gains[1] < TOLD_APART * 0.9 and 0.8 * TOLD_APART < gains[0] < 2 * TOLD_APART
 
 
 def test_the_difference_is_where_it_is_said_to_be(diagnosis: Diagnosis, found: DiscriminatingRun) -> None:
@@ -180,7 +180,7 @@ def test_one_class_is_said_to_be_one(diagnosis: Diagnosis, monkeypatch: pytest.M
     double = replace(first, hypothesis=Hypothesis((replace(effect, name="double", answers="double"),)))
     best = discriminating_run(SHIPPED, replace(diagnosis, close=(first, double, second)))
     assert best is not None and best.names == (first.name, "double", second.name)
-    assert best.gain < 1e-3 < LEAST and not best.discriminates and best.repeats is None
+    assert best.gain < 1e-3 < WORTH_MAKING and not best.discriminates and best.repeats is None
     assert "one class" in sentences(best)[0] and first.name in sentences(best)[0]
 
 
@@ -240,8 +240,8 @@ def test_runs_stay_within_reach(diagnosis: Diagnosis, seed: int) -> None:
     drawn += [led for p in drawn[:12] if (led := led_in(p, apparatus)) is not None]
     assert {p.kind for p in drawn} == set(apparatus.kinds) == {"velocity steps", "slide-hold-slide", "modulation"}
     for p in drawn:
-        assert all(V == 0 or 6 / FACTOR <= V <= 40 * FACTOR for _, V in p.drive) and p.drive[0][1] > 0
-        assert 4 / FACTOR <= p.W0 <= 6 * FACTOR
+        assert all(V == 0 or 6 / BEYOND_SHOWN <= V <= 40 * BEYOND_SHOWN for _, V in p.drive) and p.drive[0][1] > 0
+        assert 4 / BEYOND_SHOWN <= p.W0 <= 6 * BEYOND_SHOWN
         assert sum(d * V for d, V in p.drive) < 1.02 * apparatus.travel and p.duration < 1.8
         if p.kind == "modulation":
             assert 0.074 <= p.eps <= 0.301 and 50 <= p.f <= 125 and 0 < p.onset < p.duration
@@ -323,7 +323,7 @@ def test_words_and_numbers_agree(diagnosis: Diagnosis, found: DiscriminatingRun)
     assert f"{found.gain:.3g}" in whole and f"{found.seconds:.3g} s" in whole and f"{found.at:.3g} s" in whole
     assert ("above" in whole) == (found.peak > 0) != ("below" in whole)
     assert f"amplitude = {found.proposal.eps!r}" in told["run"] and told["run"].startswith("[[runs]]\n")
-    faint = replace(found, gain=2.0 * LEAST, seconds=12.0, repeats=4)
+    faint = replace(found, gain=2.0 * WORTH_MAKING, seconds=12.0, repeats=4)
     assert "in 4 such runs, 12 s in all" in sentences(faint)[1]
     assert "No number of repeats" in sentences(replace(faint, seconds=None, repeats=None))[1]
     force = sentences(replace(found, unit="N", noise=1e-9))[2]

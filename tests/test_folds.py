@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 from srfcli.numerics.continuation import ContinuationSettings
-from srfcli.numerics.map import KINDS, compute_map, settle
+from srfcli.numerics.map import STABILITY_KINDS, compute_map, settle
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.orbit import robust_orbits, solve_orbits, uniform_mesh
 from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings
@@ -71,7 +71,7 @@ def test_one_curve_of_folds_with_one_cusp_accounts_for_the_map(model, found, bou
     assert max(pt.others for pt in branch.points) < 1
     assert cusp.status.ok and 0 < cusp.place < len(branch.points) - 1
     assert len(unexplained(model, found, boundary)) == 0
-    assert not (found.kind == KINDS.index("fold")).any()  # the state between the folds is not taken
+    assert not (found.kind == STABILITY_KINDS.index("fold")).any()  # the state between the folds is not taken
 
 
 def test_beyond_the_fold_the_other_state_is_found_across_tiles(model, found):

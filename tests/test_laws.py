@@ -18,7 +18,7 @@ from srfcli.core.errors import ExpressionError, SrfError
 from srfcli.core.units import dimension, dimension_of
 from srfcli.laws.api import Check, FrictionLaw, Parameter, State, ageing_law, exp, friction_law, interface, log
 from srfcli.laws.expression import log1p, parse_expression, symbol
-from srfcli.laws.law_file import APPARATUS, KINDS, formula_of
+from srfcli.laws.law_file import LAW_KINDS, RESERVED, formula_of
 from srfcli.laws.registry import Entry, bundled_registry, read_law
 from srfcli.laws.values import Interface
 from srfcli.tasks import law_check as checking
@@ -64,7 +64,7 @@ def test_the_shipped_laws_are_there() -> None:
     assert not SHIPPED.problems
 
 
-@pytest.mark.parametrize("entry", [e for k in KINDS for e in SHIPPED.entries(k)], ids=lambda e: e.name)
+@pytest.mark.parametrize("entry", [e for k in LAW_KINDS for e in SHIPPED.entries(k)], ids=lambda e: e.name)
 def test_every_shipped_law_passes_its_checks(entry: Entry) -> None:
     law = SHIPPED.load(entry)
     outcomes = check_law(law)
@@ -113,7 +113,7 @@ def test_steady_age(name: str, y: float) -> None:
 
 def test_apparatus_names_are_those_of_the_system() -> None:
     system = pytest.importorskip("srfcli.symbolic.system")
-    assert set(APPARATUS) == {p.name for p in (*system.APPARATUS, system.MASS, system.ANGLE)}
+    assert set(RESERVED) == {p.name for p in (*system.APPARATUS, system.MASS, system.ANGLE)}
 
 
 # --- one law in three forms
@@ -295,7 +295,7 @@ def test_a_formula_below_the_parameters_is_explained(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("python", [False, True], ids=["toml", "python"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", LAW_KINDS)
 def test_a_new_law_passes_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, python: bool) -> None:
     monkeypatch.chdir(tmp_path)
     run = CliRunner()

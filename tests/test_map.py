@@ -12,7 +12,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.numerics.collocation import solved
 from srfcli.numerics.continuation import ContinuationSettings, StepSettings, find_components
 from srfcli.numerics.critical import critical_line
-from srfcli.numerics.map import KINDS, _suspects, compute_map, join_tiles, kinds, neighbours, per_slip, solve_tile
+from srfcli.numerics.map import STABILITY_KINDS, _suspects, compute_map, join_tiles, kinds, neighbours, per_slip, solve_tile
 from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.orbit import forced_guess, robust_orbits, steady_guess, uniform_mesh
 from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane, tile_tasks
@@ -55,7 +55,7 @@ def test_points_are_the_multipliers_of_brute_force(model, found):
         V, W0 = p[model.index("V"), i, j], p[model.index("W0"), i, j]
         growth = brute_growth(model, V=float(V), W0=float(W0), eps=0.18)
         assert found.growth[i, j] == pytest.approx(growth, abs=3e-4)
-        assert (found.kind[i, j] == KINDS.index("stable")) == (growth < 0)
+        assert (found.kind[i, j] == STABILITY_KINDS.index("stable")) == (growth < 0)
 
 
 def test_exponent_per_slip_is_that_of_the_linear_theory_without_modulation(model):
@@ -182,7 +182,7 @@ def test_a_tongue_between_grid_points_is_found_by_refinement(model):
     """The tip of the tongue at V = 27.387 lies within one cell, all of whose corners are stable."""
     grid = window(model, 0.18, 5, 4, V=(27.2, 29.0), ratio=(0.21 / 17.5, 0.21 / 13.0))
     coarse = compute_map(model, grid, MapSettings(depth=0))
-    assert (coarse.kind == KINDS.index("stable")).all()
+    assert (coarse.kind == STABILITY_KINDS.index("stable")).all()
     fine = compute_map(model, grid, MapSettings(depth=4))
     assert len(fine.extra_at) and (np.abs(fine.extra_leading) > 1).any()
     assert len(finished(model, fine).branches) == 1
@@ -233,7 +233,7 @@ def test_a_point_without_an_orbit_says_so(model):
     found = compute_map(model, grid, MapSettings(finest=12, depth=0))
     lost = ~np.isfinite(found.leading)
     assert found.lost == lost.sum()
-    assert (found.kind[lost] == KINDS.index("unresolved")).all()
+    assert (found.kind[lost] == STABILITY_KINDS.index("unresolved")).all()
     if found.lost:
         assert any("no forced periodic state" in note for note in finished(model, found).notes)
 
@@ -263,7 +263,7 @@ def test_neighbours_interpolate_cubics_exactly():
 
 def test_kinds_of_multipliers():
     rho = np.array([np.nan, 0.5, 1.1 + 0.3j, -1.2, 1.3, 1e-200 + 0j])
-    assert [KINDS[k] for k in kinds(rho)] == ["unresolved", "stable", "ns", "pd", "fold", "stable"]
+    assert [STABILITY_KINDS[k] for k in kinds(rho)] == ["unresolved", "stable", "ns", "pd", "fold", "stable"]
 
 
 @pytest.mark.parametrize(

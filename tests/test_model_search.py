@@ -100,7 +100,7 @@ def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(tmp_path, monke
     """A search that takes every third reading says what one of all does; its fits are to all, at the same maximum."""
     experiment = read_experiment(recorded(tmp_path, Physics(alpha=0.03)), registry=SHIPPED, holdout=False)
     every = fit_state_space(Hypothesis().problem(SHIPPED, experiment))
-    monkeypatch.setattr(state_space, "LONG", every.likelihood.samples // 3)
+    monkeypatch.setattr(state_space, "MANY_READINGS", every.likelihood.samples // 3)
     parts = fit_state_space(Hypothesis().problem(SHIPPED, experiment))
     assert parts.likelihood.samples == every.likelihood.samples
     assert parts.log_likelihood == pytest.approx(every.log_likelihood, abs=0.1)

@@ -14,7 +14,7 @@ from srfcli.codegen.c_source import compiler
 from srfcli.core.errors import SrfError
 from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis.hypotheses import Hypothesis
-from srfcli.diagnosis.search import COARSE, ModelSearch
+from srfcli.diagnosis.search import SEARCH_RTOL, ModelSearch
 from srfcli.inference.state_space import Likelihood, StateSpaceFit, maximise
 from srfcli.laws.registry import bundled_registry
 from srfcli.validation.cases import case_files
@@ -136,7 +136,7 @@ class Stuck(ModelSearch):
             return found
         self.right = found.evidence
         problem = self._problem(Hypothesis(), {})
-        likelihood = Likelihood(problem, processes=found.fit.likelihood.processes, rtol=COARSE)
+        likelihood = Likelihood(problem, processes=found.fit.likelihood.processes, rtol=SEARCH_RTOL)
         x = likelihood.coordinates({**found.fit.values, "D0": 0.25, "field_amplitude": 2e-3, "field_length": 0.3})
         maximum = maximise(likelihood, x, held=["D0"], steps=8)
         return self._judged(Hypothesis(), StateSpaceFit(likelihood, maximum, 1))

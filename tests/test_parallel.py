@@ -383,7 +383,7 @@ def test_a_worker_of_the_cluster_killed_in_mid_run_costs_its_tile(model, cluster
 def test_a_cluster_that_is_not_there_is_told(monkeypatch):
     if not _has_distributed():
         pytest.skip("DASK.DISTRIBUTED ABSENT: pip install 'srfcli[cluster]' to test --cluster")
-    monkeypatch.setattr("srfcli.core.parallel.PATIENCE", "1s")
+    monkeypatch.setattr("srfcli.core.parallel.SCHEDULER_TIMEOUT", "1s")
     with pytest.raises(SrfError, match="no scheduler answers"):
         list(Spread(cluster="tcp://127.0.0.1:1").run(square, TASKS))
 

@@ -17,7 +17,7 @@ import pytest
 import sympy
 
 from srfcli.codegen.model import open_model
-from srfcli.core.cache import FOLDER, find_built
+from srfcli.core.cache import SHIPPED_MODELS, find_built
 from srfcli.laws.registry import Registry, bundled_registry
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,8 +35,8 @@ def tool() -> ModuleType:
 def test_every_shipped_system_is_there_under_its_present_key(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("srfcli.codegen.model.cached_source", lambda key, build: pytest.fail(f"not shipped: {REPAIR}"))
     keys = {open_model(bundled_registry(), **asked).key[:16] for asked in tool().shipped_systems()}
-    assert {path.stem for path in FOLDER.glob("*.py")} == keys, REPAIR
-    assert (FOLDER / "headers.json").read_text(encoding="utf-8") == tool().headers_text(), REPAIR
+    assert {path.stem for path in SHIPPED_MODELS.glob("*.py")} == keys, REPAIR
+    assert (SHIPPED_MODELS / "headers.json").read_text(encoding="utf-8") == tool().headers_text(), REPAIR
 
 
 @pytest.mark.parametrize(
@@ -51,11 +51,11 @@ def test_every_shipped_system_is_there_under_its_present_key(monkeypatch: pytest
     ids=str,
 )
 def test_the_text_is_what_is_derived(asked: dict[str, Any]) -> None:
-    writer = (FOLDER / "sympy.txt").read_text(encoding="utf-8").strip()
+    writer = (SHIPPED_MODELS / "sympy.txt").read_text(encoding="utf-8").strip()
     if writer != sympy.__version__:
         pytest.skip(f"the shipped modules were written with sympy {writer}, here is {sympy.__version__}")
     name, text = tool().module_file(**asked)
-    assert (FOLDER / name).read_text(encoding="utf-8") == text, REPAIR
+    assert (SHIPPED_MODELS / name).read_text(encoding="utf-8") == text, REPAIR
 
 
 def test_an_edited_law_of_a_shipped_name_is_derived_anew(tmp_path: Path) -> None:
@@ -76,8 +76,8 @@ def test_an_edited_law_of_a_shipped_name_is_derived_anew(tmp_path: Path) -> None
 def test_a_module_of_another_key_or_a_damaged_one_is_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     key = open_model(bundled_registry()).key
     place = tmp_path / f"{key[:16]}.py"
-    shutil.copy(FOLDER / place.name, place)
-    monkeypatch.setattr("srfcli.core.cache.FOLDER", tmp_path)
+    shutil.copy(SHIPPED_MODELS / place.name, place)
+    monkeypatch.setattr("srfcli.core.cache.SHIPPED_MODELS", tmp_path)
     assert find_built(key) is not None
     assert find_built(key[:16] + "0" * 48) is None
     place.write_bytes(b"\xff\xfe")

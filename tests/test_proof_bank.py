@@ -15,11 +15,11 @@ from srfcli.data.experiment import read_experiment
 from srfcli.laws.registry import load_registry
 from srfcli.validation.apparatus import (
     AGEING_SHARES,
-    APPARATUS,
     LAW_SHARES,
     NOISE_SHARES,
     PAPER,
     PROTOCOLS,
+    RIG_SHARES,
     WRONG_AGEING,
     Setting,
     critical_spring,
@@ -232,7 +232,7 @@ def test_a_case_of_the_wide_bank_reads_back(set_in, tmp_path, setting, noise):
 
 def test_every_setting_has_a_slider_that_slides_as_its_protocol_asks():
     every = settings()
-    assert {s.apparatus for s in every} == set(APPARATUS) and {s.protocol for s in every} == set(PROTOCOLS)
+    assert {s.apparatus for s in every} == set(RIG_SHARES) and {s.protocol for s in every} == set(PROTOCOLS)
     assert {s.law for s in every} == set(LAW_SHARES) and {s.ageing for s in every} == set(AGEING_SHARES)
     assert {(s.ageing, s.stated) for s in settings(wrong_ageing=True)} == set(WRONG_AGEING)
     for k, setting in enumerate(every[::5]):

@@ -686,7 +686,7 @@ def test_the_command_from_bank_to_report(stub, tmp_path, capsys):
 
 def test_the_command_on_the_wide_bank(stub, tmp_path, monkeypatch, capsys):
     """Rock in a press, steps of the load alone: from the bank to the tables by apparatus, protocol, law, noise and field."""
-    monkeypatch.setattr("srfcli.validation.apparatus.APPARATUS", {"rock": 1.0})
+    monkeypatch.setattr("srfcli.validation.apparatus.RIG_SHARES", {"rock": 1.0})
     monkeypatch.setattr("srfcli.validation.apparatus.PROTOCOLS", {"load-steps": 1.0})
     folder = tmp_path / "t"
     kinds = ("--kind", "none", "--kind", "ageing")

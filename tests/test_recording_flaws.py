@@ -17,7 +17,7 @@ import srfcli
 from srfcli.cli.main import cli
 from srfcli.core.errors import SrfError
 from srfcli.data.clock import Place
-from srfcli.data.experiment import KINDS, check_run, read_experiment
+from srfcli.data.experiment import NOTICE_KINDS, check_run, read_experiment
 from srfcli.data.gauge import GaugeNoise, find_noise, whiten
 from srfcli.data.imposed import find_modulation, load_from_column
 from srfcli.data.noise import measured, spikes
@@ -159,17 +159,17 @@ FLAWS: dict[str, tuple[Callable[[Columns], None], str]] = {
 
 
 def test_every_kind_of_notice_has_a_case() -> None:
-    """KINDS is what --fail-on takes; the package makes no notice of another kind."""
-    assert set(FLAWS) | {"sigma"} == set(KINDS)  # that of critical loads is tested with them
+    """NOTICE_KINDS is what --fail-on takes; the package makes no notice of another kind."""
+    assert set(FLAWS) | {"sigma"} == set(NOTICE_KINDS)  # that of critical loads is tested with them
     made = set()
     for path in Path(srfcli.__file__).parent.glob("data/*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             called = isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", ""))
             if called in ("Notice", "spots"):
                 made |= {a.value for a in node.args[:1] if isinstance(a, ast.Constant)}
-    assert made <= set(KINDS) and len(made) > 15
+    assert made <= set(NOTICE_KINDS) and len(made) > 15
     text = (Path(__file__).resolve().parents[1] / "docs" / "recordings.md").read_text(encoding="utf-8")
-    assert {f"`{kind}`" for kind in KINDS} <= set(re.findall(r"`[a-z-]+`", text.partition("### Notices")[2]))
+    assert {f"`{kind}`" for kind in NOTICE_KINDS} <= set(re.findall(r"`[a-z-]+`", text.partition("### Notices")[2]))
 
 
 @pytest.mark.parametrize("kind", FLAWS)
@@ -192,7 +192,7 @@ def test_fail_on_a_kind(kind: str, tmp_path: Path) -> None:
     columns = Columns()
     make(columns)
     columns.read(tmp_path)
-    other = next(k for k in KINDS if k != kind)
+    other = next(k for k in NOTICE_KINDS if k != kind)
     for asked, code in ((kind, 4), (other, 0)):
         done = CliRunner().invoke(cli, ["check", str(tmp_path), "--no-simulate", "--fail-on", asked], prog_name="srf")
         assert done.exit_code == code, done.stderr

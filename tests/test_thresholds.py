@@ -20,7 +20,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.settings import Parameter
 from srfcli.data.thresholds import read_thresholds, thresholds, thresholds_csv
 from srfcli.inference.free_parameters import FreeParameter, Scale, free_parameters, with_transmission
-from srfcli.inference.thresholds import FAR, Matcher, fit_thresholds, forced_slopes, hopf_slopes, uncertainty
+from srfcli.inference.thresholds import FAR_CROSSING, Matcher, fit_thresholds, forced_slopes, hopf_slopes, uncertainty
 from srfcli.numerics.boundary import along, polish
 from srfcli.numerics.critical import critical_line
 from srfcli.numerics.hopf import hopf_points
@@ -176,11 +176,11 @@ def test_a_missing_crossing_counts_as_the_end_it_lies_beyond(model: Any) -> None
     matcher = Matcher(model, table, values=start, scale=scale_of(model, names, start, bounds={"A": (0.001, 0.1)}))
     strengthening = np.array([np.log(0.03 / start["A"])])  # A above B: no loss of stability anywhere
     match = matcher.match(strengthening)
-    assert match.missing.all() and match.loads == pytest.approx(FAR * table.W0c)
+    assert match.missing.all() and match.loads == pytest.approx(FAR_CROSSING * table.W0c)
     assert np.isfinite(match.cost) and np.all(matcher.jacobian(match) == 0)
     back = matcher.match(np.zeros(1))
     assert back.missing.tolist() == [False, False, True, True]  # 8 and 11 N lie more than a factor 8 below 100 and 120
-    assert back.loads[2:] == pytest.approx(table.W0c[2:] / FAR)
+    assert back.loads[2:] == pytest.approx(table.W0c[2:] / FAR_CROSSING)
     assert back.loads[:2] == pytest.approx([7.8049735, 10.9852631], rel=1e-6)
 
 

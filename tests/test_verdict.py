@@ -12,7 +12,7 @@ from srfcli.core.settings import Parameter
 from srfcli.diagnosis import verdict as module
 from srfcli.diagnosis.hypotheses import Hypothesis, neutral_values
 from srfcli.diagnosis.scores import Score
-from srfcli.diagnosis.verdict import HELD, MISSED, UNEXPLAINED, conclude, interesting
+from srfcli.diagnosis.verdict import HELD_OUT_RMS, MISSED, UNEXPLAINED, conclude, interesting
 from srfcli.laws.registry import bundled_registry
 
 SHIPPED = bundled_registry()
@@ -99,7 +99,7 @@ def test_nothing_is_missing_only_where_it_could_have_been_seen(concluded, sizes,
     ("runs", "verdict"),
     [
         ([held(1.0)], "identified"),
-        ([held(1.0), held(1.5 * HELD)], "unknown"),
+        ([held(1.0), held(1.5 * HELD_OUT_RMS)], "unknown"),
         ([held(1.0, gain=-5.0)], "identified"),
         ([held(1.0, gain=-7.0)], "unknown"),
         ([held(1.0, gain=-7.0), held(1.0, gain=5.0)], "identified"),

@@ -10,7 +10,7 @@ from typing import Any
 import sympy
 
 from srfcli.codegen.model import open_model
-from srfcli.core.cache import FOLDER, MARK, header_key
+from srfcli.core.cache import MARK, SHIPPED_MODELS, header_key
 from srfcli.laws.law_file import read_header
 from srfcli.laws.registry import bundled_registry, scan_python
 
@@ -46,7 +46,7 @@ def module_file(**asked: Any) -> tuple[str, str]:
 
 def main() -> None:
     """Write all of them and remove what is no longer shipped."""
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else SHIPPED_MODELS
     folder.mkdir(exist_ok=True)
     (folder / "headers.json").write_text(headers_text(), encoding="utf-8")
     (folder / "sympy.txt").write_text(f"{sympy.__version__}\n", encoding="utf-8")

@@ -83,8 +83,8 @@ def command(
 
 def _check_kinds(fail_on: Sequence[str]) -> None:
     """Raise SrfError for a kind that no notice is of."""
-    from srfcli.data.experiment import KINDS
+    from srfcli.data.experiment import NOTICE_KINDS
 
     for kind in fail_on:
-        if kind not in KINDS and kind != "notice":
-            raise SrfError(f"--fail-on {kind}: no such kind of notice", did_you_mean(kind, (*KINDS, "notice")))
+        if kind not in NOTICE_KINDS and kind != "notice":
+            raise SrfError(f"--fail-on {kind}: no such kind of notice", did_you_mean(kind, (*NOTICE_KINDS, "notice")))

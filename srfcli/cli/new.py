@@ -116,7 +116,7 @@ def _asked(
 ) -> tuple[str | None, str | None, str]:
     """Ask for what neither the first file nor the options say; answers for columns go into `columns`."""
     from srfcli.data.columns import open_source
-    from srfcli.data.draft import OBSERVABLES, Wish, missing, name_columns
+    from srfcli.data.draft import OBSERVED, Wish, missing, name_columns
 
     drive, load, stiffness = options["drive"], options["load"], options["stiffness"]
     headings = open_source(path, registry=registry, format=options["reader"]).headings
@@ -129,7 +129,7 @@ def _asked(
         if option.startswith("--column time"):
             columns["time"] = click.prompt(f"{sentence}. Time", err=True)
         elif option.startswith("--column"):
-            role = click.prompt(f"{sentence}.\nWhat was observed", err=True, type=click.Choice(OBSERVABLES[::-1]))
+            role = click.prompt(f"{sentence}.\nWhat was observed", err=True, type=click.Choice(OBSERVED[::-1]))
             columns[role] = click.prompt("In the column", err=True)
         elif option.startswith("--drive"):
             drive = click.prompt(f"{sentence}. Velocity in um/s, or duration:velocity, ...", err=True)

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 DEFAULT_POINTS = 60
 MAX_POINTS = 1_000_000
-FORM = "Write NAME=LOW:HIGH:POINTS[:log|lin] or NAME=a,b,c, as in V=1:100:60, V=1,2,5 or 'V=1:100 um/s:60'."
+AXIS_FORM = "Write NAME=LOW:HIGH:POINTS[:log|lin] or NAME=a,b,c, as in V=1:100:60, V=1,2,5 or 'V=1:100 um/s:60'."
 
 
 @dataclass(frozen=True)
@@ -107,16 +107,16 @@ def parse_over(text: str) -> Range:
     name, equals, body = (part.strip() for part in text.partition("="))
     parts = name.split("/")  # K/W0 is a ratio, for the commands that take one
     if not (equals and body and len(parts) <= 2 and all(part.isidentifier() for part in parts)):
-        raise SrfError(f"--over {text!r} is not a range", FORM)
+        raise SrfError(f"--over {text!r} is not a range", AXIS_FORM)
     if ":" not in body:
         values, unit = _numbers(name, body.split(","), text)
         return Range(name, values=values, unit=unit)
     fields = [part.strip() for part in body.split(":")]
     if len(fields) > 4:
-        raise SrfError(f"--over {text!r} has {len(fields)} fields between colons, not 2 to 4", FORM)
+        raise SrfError(f"--over {text!r} has {len(fields)} fields between colons, not 2 to 4", AXIS_FORM)
     (lo, hi), unit = _numbers(name, fields[:2], text)
     if not lo < hi:
-        raise SrfError(f"--over {text!r}: its low end {lo:g} is not below its high end {hi:g}", FORM)
+        raise SrfError(f"--over {text!r}: its low end {lo:g} is not below its high end {hi:g}", AXIS_FORM)
     spacing = fields[3] if len(fields) == 4 else "log" if lo > 0 and hi >= 10 * lo else "lin"
     if spacing not in ("log", "lin"):
         raise SrfError(f"--over {text!r}: unknown spacing {spacing!r}", "Known: lin, log")
@@ -131,7 +131,7 @@ def _numbers(name: str, parts: Sequence[str], text: str) -> tuple[tuple[float, .
         try:
             pairs.append(split_quantity(part, name=name))
         except SrfError as error:
-            raise SrfError(f"--over {text!r}: {part.strip()!r} is not a number", FORM) from error
+            raise SrfError(f"--over {text!r}: {part.strip()!r} is not a number", AXIS_FORM) from error
     units = sorted({unit for _, unit in pairs if unit})
     if len(units) > 1:
         hint = "Write the unit once, after the last number."
@@ -232,7 +232,7 @@ def parse_values(texts: Sequence[str], parameter: Parameter) -> tuple[float, ...
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-APPARATUS = {  # the flags that have their own option; every other parameter is set with --set
+APPARATUS_FLAGS = {  # the flags that have their own option; every other parameter is set with --set
     "K": "Stiffness of the loading spring, in N/um.",
     "M": "Mass of the slider, in kg.",
     "f": "Frequency of the load modulation, in Hz.",
@@ -241,8 +241,8 @@ APPARATUS = {  # the flags that have their own option; every other parameter is 
 LOADINGS = ("vertical", "inclined")
 CHOICES = ("law", "ageing", "interface", "loading", "inertia")
 AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation amplitudes")
-FORMATS = ("text", "json", "csv")
-SUFFIXES = ("", ".txt", ".json", ".csv")
+TABLE_FORMATS = ("text", "json", "csv")
+TABLE_SUFFIXES = ("", ".txt", ".json", ".csv")
 
 
 @dataclass(frozen=True)
@@ -361,7 +361,7 @@ def _about(key: str) -> str:
 Options = dict[str, Callable[[Any], Any]]  # decorators by the name of the argument that each of them adds
 APPARATUS_OPTIONS: Options = {
     "inertia": click.option("--inertia/--no-inertia", default=None, help="Whether the slider's mass counts.  [default: it does]"),
-    **{f"set_{n}": click.option(f"--{n}", f"set_{n}", metavar="VALUE", help=about) for n, about in APPARATUS.items()},
+    **{f"set_{n}": click.option(f"--{n}", f"set_{n}", metavar="VALUE", help=about) for n, about in APPARATUS_FLAGS.items()},
 }
 SYSTEM_OPTIONS: Options = {
     "law": click.option("--law", metavar="NAME", help=_about("law"), shell_complete=names_of("friction")),
@@ -439,7 +439,7 @@ def _read_system(
 
 def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, str]:
     """Return what APPARATUS_OPTIONS, among the values `taken`, and --set say, by parameter; raises SrfError for two values."""
-    flags: dict[str, str] = {n: taken[f"set_{n}"] for n in APPARATUS if taken[f"set_{n}"] is not None}
+    flags: dict[str, str] = {n: taken[f"set_{n}"] for n in APPARATUS_FLAGS if taken[f"set_{n}"] is not None}
     for text in assignments:
         name, value = parse_assignment(text)
         if name in flags and flags[name] != value:
@@ -535,13 +535,13 @@ def read_output(
         check_plot(figure, force=force)
     if place is not None and figure is not None and place.resolve() == figure.resolve() and not is_special(place):
         raise SrfError(f"--out and --plot are the same file, {place}", "Give them different names.")
-    if place is not None and place.suffix.lower() not in SUFFIXES and not (as_json or as_csv or is_special(place)):
+    if place is not None and place.suffix.lower() not in TABLE_SUFFIXES and not (as_json or as_csv or is_special(place)):
         raise SrfError(
             f"--out {place} ends in {place.suffix!r}",
             f"End it in .txt, .json or .csv: --out {place.with_suffix('.csv')}; or name the format, --json or --csv.",
         )
     suffix = place.suffix.lower().lstrip(".") if place is not None else ""
-    format = "json" if as_json else "csv" if as_csv else suffix if suffix in FORMATS else "text"
+    format = "json" if as_json else "csv" if as_csv else suffix if suffix in TABLE_FORMATS else "text"
     return OutputOptions(format, place, figure, force, provenance)
 
 

@@ -14,7 +14,7 @@ from srfcli.cli.base import Session, SrfCommand
 from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options, value_option
 from srfcli.core.errors import SrfError
 from srfcli.core.units import convert, parse_quantity, split_quantity
-from srfcli.results.simulation import RISE, SimulationResult, Work
+from srfcli.results.simulation import STEP_RISE, SimulationResult, Work
 
 if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
@@ -51,7 +51,7 @@ EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load
 @click.option(
     "--load-rise",
     metavar="TIME",
-    default=f"{RISE:g} s",
+    default=f"{STEP_RISE:g} s",
     show_default=True,
     help="Time over which steps and corners of --load are rounded.",
 )
@@ -205,7 +205,7 @@ def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], fie
     experiment = read_experiment(path, registry=registry, format=given["reader"])
     if system.loading.origin == "flag" and system.loading.value != "vertical":
         raise SrfError("the runs of an experiment are loaded from above", "Leave out --loading inclined.")
-    named = {key: getattr(system, key) for key in LAWS}
+    named = {key: getattr(system, key) for key in LAW_OPTIONS}
     work = runs_again(
         experiment, registry, laws={k: s.value for k, s in named.items() if s.origin == "flag"},
         parameters=system.flags, names=given["runs"], field=field, spread=spread,
@@ -216,7 +216,7 @@ def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], fie
 
 # A new record: drive, load and sampling from the options.
 
-LAWS = ("law", "ageing", "interface", "inertia")
+LAW_OPTIONS = ("law", "ageing", "interface", "inertia")
 LAW_FILES = (".toml", ".py")
 
 
@@ -258,7 +258,7 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], field: Friction
         onset=_onset(given["onset"], begin, modulated=f is not None),
         start=given["start"],
         observables=observables,
-        rough=None if field is None else (system.model(tables=task.TABLES), field),
+        rough=None if field is None else (system.model(tables=task.FIELD_TABLE), field),
     )
     gauges = task.read_gauges(observables, **{key: given[key] for key in ("noise", "lag1", "quantum", "seed")})
     choice, made = _laws(system), None
@@ -341,7 +341,7 @@ def _laws(system: SystemOptions) -> ModelChoice:
     """Return the laws by name, a file by its whole path: one relative to here means nothing in an experiment's folder."""
     from srfcli.data.values import ModelChoice
 
-    names = {key: getattr(system, key).value for key in LAWS}
+    names = {key: getattr(system, key).value for key in LAW_OPTIONS}
     for key in ("law", "ageing", "interface"):
         if names[key].endswith(LAW_FILES):
             names[key] = str(Path(names[key]).resolve())

@@ -33,7 +33,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from srfcli.codegen.model import GeneratedModel
-from srfcli.core.cache import LARGEST, cache_folder, content_key, is_sealed, seal
+from srfcli.core.cache import LARGEST_ENTRY, cache_folder, content_key, is_sealed, seal
 from srfcli.core.errors import SrfError
 from srfcli.core.files import read_plain, write_atomic
 
@@ -473,7 +473,7 @@ def _kept(path: Path) -> bytes | None:
     """Return what lies there as this user built it: to load it is to run it, and half of one ends the process. Else None."""
     try:
         mark = read_plain(path.with_suffix(".sum"), limit=1000).decode("ascii", errors="replace")
-        found = read_plain(path, limit=LARGEST)
+        found = read_plain(path, limit=LARGEST_ENTRY)
         return found if is_sealed(path.name, found, mark) else None
     except (OSError, SrfError):
         return None

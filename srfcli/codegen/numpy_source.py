@@ -18,7 +18,7 @@ from srfcli.core.settings import Parameter
 from srfcli.laws.expression import NUMPY_FUNCTIONS, NumPyText, python_name, renamed, symbol
 from srfcli.symbolic.derive import Linearisation, closed_limits, in_law_parameters, linearise
 from srfcli.symbolic.equations import Equations, equations_of, lut, lut1, partial_derivative, tidy
-from srfcli.symbolic.system import RANDOM_FIELD, RUN, System
+from srfcli.symbolic.system import RANDOM_FIELD, RUN_SYMBOLS, System
 
 # Formulas in steps: named intermediate values, then outputs in them; derivatives are taken step by step.
 
@@ -186,7 +186,7 @@ def generate(system: System) -> str:
     still = _at_constant_load(eq) if system.effects else eq
     writer = Writer(system, still)
     if system.effects:
-        writer.declared = tuple(p for p in system.parameters if p not in RUN)
+        writer.declared = tuple(p for p in system.parameters if p not in RUN_SYMBOLS)
         _write_statics_by_rates(writer, still)
         polynomial, forms = -1, {}
     else:

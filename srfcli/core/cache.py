@@ -33,7 +33,7 @@ from srfcli.core.files import read_plain
 
 PREFIX = "# seal "
 SECRET = 32  # bytes
-LARGEST = 2**28  # bytes of an entry
+LARGEST_ENTRY = 2**28  # bytes of an entry
 
 _log = logging.getLogger("srfcli.core.cache")
 _memory: dict[str, str] = {}
@@ -101,7 +101,7 @@ def is_sealed(name: str, data: bytes, found: str) -> bool:
 def _read(path: Path) -> str | None:
     """Return a stored text, or None where it is absent, cut short, changed or another's."""
     try:
-        text = read_plain(path, limit=LARGEST).decode("utf-8")
+        text = read_plain(path, limit=LARGEST_ENTRY).decode("utf-8")
     except (OSError, SrfError, UnicodeDecodeError):
         return None
     first, _, body = text.partition("\n")
@@ -197,7 +197,7 @@ def _warn(text: str) -> None:
 
 # Generated modules that are shipped.
 
-FOLDER = Path(__file__).resolve().parents[1] / "codegen" / "models"
+SHIPPED_MODELS = Path(__file__).resolve().parents[1] / "codegen" / "models"
 MARK = "# built under "
 
 
@@ -211,7 +211,7 @@ class Built:
 
 def find_built(key: str) -> Built | None:
     """Return the module that was built under this key, or None where none is shipped."""
-    path = FOLDER / f"{key[:16]}.py"
+    path = SHIPPED_MODELS / f"{key[:16]}.py"
     try:
         first, _, body = path.read_text(encoding="utf-8").partition("\n")
     except (OSError, ValueError):
@@ -225,7 +225,7 @@ def find_built(key: str) -> Built | None:
 def known_headers() -> dict[str, list[tuple[str, str, str]]]:
     """Return (kind, name, about) of what the shipped law files hold, by `header_key`."""
     try:
-        table = json.loads((FOLDER / "headers.json").read_text(encoding="utf-8"))
+        table = json.loads((SHIPPED_MODELS / "headers.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return {key: [(kind, name, about) for kind, name, about in rows] for key, rows in table.items()}

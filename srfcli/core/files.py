@@ -31,8 +31,8 @@ from srfcli.core.errors import SrfError
 
 TEXT = 4 * 2**20  # bytes of a law, of settings or of an answer
 
-DEPTH = 32  # keys of one name: each costs all that stand before it
-_LONG_KEY = re.compile(rf"""(?<![\w."'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{DEPTH}}}""")
+DEEPEST_KEYS = 32  # keys of one name: each costs all that stand before it
+_LONG_KEY = re.compile(rf"""(?<![\w."'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{DEEPEST_KEYS}}}""")
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -93,7 +93,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
     """Return the table that a TOML text holds; raises SrfError, beginning with `path`, for anything else."""
     try:
         if long := next((n for n, line in enumerate(text.splitlines(), 1) if _LONG_KEY.search(line)), None):
-            raise SrfError(f"{path}, line {long}: a key of more than {DEPTH} parts", "A few levels are enough.")
+            raise SrfError(f"{path}, line {long}: a key of more than {DEEPEST_KEYS} parts", "A few levels are enough.")
         return tomli.loads(text)
     except tomli.TOMLDecodeError as error:
         raise SrfError(f"{path}: not TOML: {error}") from None

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-ATTEMPTS = 3  # a task that took this many workers with it is at fault itself
+MOST_CRASHES = 3  # a task that took this many workers with it is at fault itself
 _ENVIRONMENT = {
     **ONE_THREAD,
     "PYTHONSAFEPATH": "1",  # a worker is started by `python -c`, which would import from the current folder first
@@ -70,7 +70,7 @@ def run_processes(
     """Yield (index, result) of every task as it is finished by one of `workers` processes.
 
     `function` must be importable and tasks and results must pickle. A task whose worker died is done again; where it takes
-    ATTEMPTS workers with it, `lost` gives what stands in place of its result, and without `lost` SrfError is raised. Raises
+    MOST_CRASHES workers with it, `lost` gives what stands in place of its result, and without `lost` SrfError is raised. Raises
     what `function` itself raised.
     """
     waiting, attempts = deque(range(len(tasks))), [0] * len(tasks)
@@ -89,14 +89,14 @@ def run_processes(
                 if answer is None:
                     index, crew[place] = worker.index, _started()
                     attempts[index] += 1
-                    if attempts[index] < ATTEMPTS:
+                    if attempts[index] < MOST_CRASHES:
                         waiting.appendleft(index)
                     elif lost is not None:
                         done += 1
                         yield index, lost(index)
                     else:
                         raise SrfError(
-                            f"task {index} ended {ATTEMPTS} worker processes, the last with exit code {worker.process.exitcode}",
+                            f"task {index} ended {MOST_CRASHES} worker processes, the last with code {worker.process.exitcode}",
                             "Look whether memory is short; --workers 1 runs it in this process and shows what happens.",
                         )
                     continue
@@ -186,7 +186,7 @@ def _end_with_parent() -> None:
 
 # Tasks on a dask.distributed cluster; the scheduler gives the task of a worker that died to another one.
 
-PATIENCE = "10s"  # for the scheduler's first answer
+SCHEDULER_TIMEOUT = "10s"  # for the scheduler's first answer
 
 
 def run_cluster(function: Callable[[Task], Result], tasks: Sequence[Task], *, address: str) -> Iterator[tuple[int, Result]]:
@@ -217,7 +217,7 @@ def _connected(address: str) -> Any:
     from distributed import Client
 
     try:
-        client = Client(address, timeout=PATIENCE, set_as_default=False)
+        client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SrfError(
             f"--cluster {address}: no scheduler answers", "Start one with 'dask scheduler', and give the address it prints."
@@ -242,7 +242,7 @@ def _result(future: Any, index: int) -> Any:
 # Finished tasks kept in a folder.
 
 NOTE = "srf-run.json"
-LARGEST = 2**30  # bytes of a finished task
+LARGEST_RESULT = 2**30  # bytes of a finished task
 SEAL = 64  # hexadecimal digits at the end of a part
 _DAMAGED = (  # what reading a file of arrays raises that is not one
     OSError, SrfError, ValueError, EOFError, KeyError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error,
@@ -292,7 +292,7 @@ class Store:
         import numpy as np
 
         try:
-            whole = read_plain(self._place(index), limit=LARGEST)
+            whole = read_plain(self._place(index), limit=LARGEST_RESULT)
             content, found = whole[:-SEAL], whole[-SEAL:].decode("ascii", "replace")
             if not is_sealed(self._name(index), content, found):
                 return None

@@ -27,7 +27,7 @@ class Parameter:
 
 
 FILE_NAME = "srf.toml"
-SMALLEST = 1e-30  # of a number that is not zero, in its own unit: powers and products of it are numbers, too
+LEAST_NUMBER = 1e-30  # of a number that is not zero, in its own unit: powers and products of it are numbers, too
 
 
 @dataclass(frozen=True)
@@ -227,10 +227,10 @@ def check_value(parameter: Parameter, value: str | float, *, origin: str = "flag
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     if not math.isfinite(number):
         raise SrfError(f"{name} = {number}{unit} is not a finite number", source)
-    if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
+    if number and not LEAST_NUMBER <= abs(number) <= 1 / LEAST_NUMBER:
         raise SrfError(
             f"{name} = {number:g}{unit} is beyond what can be computed with",
-            source or f"Choose a size from {SMALLEST:g} to {1 / SMALLEST:g}{unit}.",
+            source or f"Choose a size from {LEAST_NUMBER:g} to {1 / LEAST_NUMBER:g}{unit}.",
         )
     for bound, side, outside in (
         (parameter.lower, "below its lower", number < parameter.lower),

@@ -19,9 +19,9 @@ Mask = NDArray[np.bool_]
 PASSES = 60  # stamps in a row that may be wrong before a clock is held to have been set back
 MOST_WRONG, MOST_REPEATED = 0.01, 0.2  # shares of the samples
 CHANGE = 1.25  # of the sampling interval
-GAP = 2.5  # sampling intervals
+GAP_INTERVALS = 2.5  # sampling intervals
 _BRIDGED = "drive and load are bridged, nothing is compared in it"
-SHORTEST = 8  # samples that make a rate
+SHORTEST_RATE = 8  # samples that make a rate
 TOLD_APART = 60  # samples at a rate from which its noise is estimated apart from that at others
 MOST_NOTICES = 8  # of one kind before they are told together
 
@@ -118,8 +118,8 @@ def kept_samples(place: Place, hint: str | None = None) -> tuple[Mask, list[Noti
         *place.spots("repeated-time", repeated, "with the time of the sample before, left out"),
         *place.spots("backward-time", wrong, "whose time does not fit between its neighbours', left out"),
     ]
-    if keep.sum() < SHORTEST:
-        raise SrfError(f"{place.path}: {keep.sum()} usable samples", f"A recording needs {SHORTEST} or more.")
+    if keep.sum() < SHORTEST_RATE:
+        raise SrfError(f"{place.path}: {keep.sum()} usable samples", f"A recording needs {SHORTEST_RATE} or more.")
     return keep, notices
 
 
@@ -168,7 +168,7 @@ def find_sampling(t: Array) -> Sampling:
     bounds = [0, *jumps.tolist(), steps.size]
     merged: list[list[int]] = []
     for a, b in pairwise(bounds):
-        if merged and b - a < SHORTEST:  # the median passes from one rate to the next in a few samples
+        if merged and b - a < SHORTEST_RATE:  # the median passes from one rate to the next in a few samples
             merged[-1][1] = b
         else:
             merged.append([a, b])
@@ -186,9 +186,9 @@ def find_sampling(t: Array) -> Sampling:
     edges = [r.first for r in rates[1:]]
     beside = np.zeros(steps.size, bool)
     for edge in edges:  # between two rates the slower one is no gap
-        beside[max(edge - SHORTEST, 0) : edge + SHORTEST] = True
+        beside[max(edge - SHORTEST_RATE, 0) : edge + SHORTEST_RATE] = True
     slowest = max(r.interval for r in rates)
-    gaps = steps > np.where(beside, np.maximum(allowed, slowest), allowed) * GAP
+    gaps = steps > np.where(beside, np.maximum(allowed, slowest), allowed) * GAP_INTERVALS
     return Sampling(tuple(rates), np.flatnonzero(gaps))
 
 
@@ -197,7 +197,7 @@ def _trimmed(rate: Rate, steps: Array, before: Rate | None) -> Rate:
     if before is None:
         return rate
     middle = 0.5 * np.log(rate.interval / before.interval)
-    near = np.arange(max(rate.first - SHORTEST, before.first), min(rate.first + SHORTEST, rate.last))
+    near = np.arange(max(rate.first - SHORTEST_RATE, before.first), min(rate.first + SHORTEST_RATE, rate.last))
     new = np.abs(np.log(steps[near] / before.interval)) > abs(middle)
     # the split that puts most of the intervals on their own side
     score = np.cumsum(np.concatenate([[0], np.where(new, -1, 1)]))
@@ -207,14 +207,14 @@ def _trimmed(rate: Rate, steps: Array, before: Rate | None) -> Rate:
 def _local_median(steps: Array) -> Array:
     from scipy.ndimage import median_filter
 
-    return np.asarray(median_filter(steps, size=min(2 * SHORTEST + 1, steps.size), mode="nearest"))
+    return np.asarray(median_filter(steps, size=min(2 * SHORTEST_RATE + 1, steps.size), mode="nearest"))
 
 
 def _spread(steps: Array) -> Array:
     """Return the 80th percentile of the intervals nearby, so that uneven sampling does not count as gaps."""
     from scipy.ndimage import percentile_filter
 
-    return np.asarray(percentile_filter(steps, 80, size=min(8 * SHORTEST + 1, steps.size), mode="nearest"))
+    return np.asarray(percentile_filter(steps, 80, size=min(8 * SHORTEST_RATE + 1, steps.size), mode="nearest"))
 
 
 def sampling_notices(place: Place, sampling: Sampling) -> list[Notice]:

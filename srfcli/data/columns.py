@@ -18,7 +18,7 @@ from srfcli.core.files import open_plain
 from srfcli.core.units import NO_GEOMETRY, Geometry, find_unit, split_heading
 from srfcli.data.clock import Mask, Place
 from srfcli.data.description import ROLES, ColumnSpec, RunDescription, check_unit
-from srfcli.data.values import BESIDE, OBSERVABLES
+from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Reader, Source
 
@@ -149,8 +149,8 @@ def _guarded(source: Source, columns: tuple[int, ...], reader: Reader, path: Pat
 
 # Which column plays which role, and its numbers in um, s, N, read block by block inside a window of time.
 
-LIMIT = 512 * 2**20  # bytes of needed columns that are held at a time
-HUGE = 1e30  # um, s, N: no measurement, but a gauge's word for none
+MOST_BYTES = 512 * 2**20  # bytes of needed columns that are held at a time
+NO_MEASUREMENT = 1e30  # um, s, N: no measurement, but a gauge's word for none
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,12 @@ class Columns:
 
 
 def read_columns(
-    run: RunDescription, source: Source, specs: Mapping[str, ColumnSpec], *, limit: int = LIMIT, geometry: Geometry = NO_GEOMETRY
+    run: RunDescription,
+    source: Source,
+    specs: Mapping[str, ColumnSpec],
+    *,
+    limit: int = MOST_BYTES,
+    geometry: Geometry = NO_GEOMETRY,
 ) -> Columns:
     """Return what the run needs of its file; raises SrfError for a missing column, a wrong unit or too large a recording."""
     finder = Finder(run.file, source.headings, specs, geometry)
@@ -341,7 +346,7 @@ def _wanted(run: RunDescription, finder: Finder) -> list[Channel]:
                 f"[columns] can name it. {_near([role], names)}".strip(),
             )
         found.append(channel)
-    return sorted(found, key=lambda c: c.role in BESIDE)
+    return sorted(found, key=lambda c: c.role in OTHER_OBSERVABLES)
 
 
 def _near(roles: Iterable[str], names: list[str]) -> str:
@@ -398,7 +403,7 @@ def _collect(
                 arrays[0] = _integrated(run.file, channels[0], arrays[0], clock, row)
                 clock = float(arrays[0][-1]) if arrays[0].size else clock
         for values in arrays:
-            values[~(np.abs(values) < HUGE)] = np.nan
+            values[~(np.abs(values) < NO_MEASUREMENT)] = np.nan
         if np.isnan(first) and np.isfinite(arrays[0]).any():
             first = float(arrays[0][np.isfinite(arrays[0])][0])
         with np.errstate(invalid="ignore"):

@@ -17,7 +17,7 @@ from typing import Any, NoReturn, TypeVar
 
 from srfcli.core.errors import SrfError, did_you_mean, printable, shown
 from srfcli.core.files import check_plain, parse_toml, read_text, recover
-from srfcli.core.settings import SMALLEST
+from srfcli.core.settings import LEAST_NUMBER
 from srfcli.core.units import (
     GEOMETRY_UNITS,
     NO_GEOMETRY,
@@ -28,7 +28,7 @@ from srfcli.core.units import (
     split_quantity,
     unit_factor,
 )
-from srfcli.data.values import BESIDE, OBSERVABLES
+from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES
 
 FORMAT = "srf-experiment/1"
 FILE_NAME = "experiment.toml"
@@ -40,9 +40,9 @@ ROLES = {  # what a column may be, and the unit of a number in it where neither 
     "normal_stress": "MPa",
     **OBSERVABLES,
     "shear_stress": "MPa",
-    **BESIDE,
+    **OTHER_OBSERVABLES,
 }
-READABLE = (*OBSERVABLES, "shear_stress", *BESIDE)  # what `observables` may list
+READABLE = (*OBSERVABLES, "shear_stress", *OTHER_OBSERVABLES)  # what `observables` may list
 MOST_OBSERVABLES = 3  # of a run
 CORRECTIONS = ("reset", "spike")  # of a run: what is proposed, and made only where it is asked for
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
@@ -355,7 +355,7 @@ def _observables(node: Node) -> tuple[str, ...]:
             entry.fail(f"'{name}' is the same observable as another one", "Name each once.")
     if len(names) > MOST_OBSERVABLES:
         node.fail(f"{len(names)} observables", f"A run has {MOST_OBSERVABLES} at most.")
-    if not set(names) - BESIDE.keys():
+    if not set(names) - OTHER_OBSERVABLES.keys():
         node.fail(f"{' and '.join(names)} without a force", "One of elongation, force, shear_stress, friction is needed besides.")
     return tuple(names)
 
@@ -393,7 +393,7 @@ def _modulation(node: Node) -> tuple[float, float, float]:
 
 # A value in a TOML file that knows where it stands: every breach is told with file, line, key, finding and expectation.
 
-LARGEST = 16 * 2**20  # bytes of a description
+LARGEST_DESCRIPTION = 16 * 2**20  # bytes of a description
 Value = TypeVar("Value")
 Other = TypeVar("Other")
 
@@ -535,15 +535,15 @@ class Node:
 
     def _sized(self, number: float, unit: str = "") -> float:
         """Return a number, which must be 0 or of a size that can be computed with."""
-        if number and not SMALLEST <= abs(number) <= 1 / SMALLEST:
-            self.expected(f"0 or a number of a size from {SMALLEST:g} to {1 / SMALLEST:g}{unit}")
+        if number and not LEAST_NUMBER <= abs(number) <= 1 / LEAST_NUMBER:
+            self.expected(f"0 or a number of a size from {LEAST_NUMBER:g} to {1 / LEAST_NUMBER:g}{unit}")
         return number
 
 
 def open_node(path: Path) -> Node:
     """Return the table of a TOML file with the lines of its keys; raises SrfError where it is none."""
     try:
-        text = read_text(path, limit=LARGEST).replace("\r\n", "\n")
+        text = read_text(path, limit=LARGEST_DESCRIPTION).replace("\r\n", "\n")
     except OSError as error:
         raise SrfError(f"{path}: cannot be read: {error.strerror}", "Check path and permissions.", exit_code=1) from None
     try:

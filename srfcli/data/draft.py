@@ -33,7 +33,7 @@ from srfcli.data.imposed import StartsAtRest, Stroke, find_modulation, strokes
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
 
-KINDS = ("steps", "shs", "oscillation")
+PROTOCOLS = ("steps", "shs", "oscillation")
 NAMED = {  # role -> what headings call it, in small letters without their unit; the first that a file has is taken
     "time": ("time", "t", "x_value", "elapsed_time", "elapsed", "test_time", "run_time"),
     "load_point_velocity": (
@@ -77,20 +77,20 @@ WORDS = {  # role -> words of a heading that mean it, where no heading is one of
 }  # fmt: skip
 ASIDE = {"thickness", "gap", "height", "dilation", "dilatancy", "compaction", "depth", "pore", "confining", "temperature", "temp",
          "humidity", "std", "error", "setpoint", "target", "command", "raw", "pz", "zpos"}  # fmt: skip
-SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
+UNIT_SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
     "s": "s", "sec": "s", "ms": "ms", "min": "min", "um": "um", "microns": "um", "micron": "um", "mm": "mm", "m": "m",
     "um_s": "um/s", "mm_s": "mm/s", "um/s": "um/s", "mm/s": "mm/s", "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "pa": "Pa",
     "n": "N", "kn": "kN", "un": "uN", "mn": "mN", "deg": "deg", "rad": "rad", "rpm": "rpm",
 }  # fmt: skip
 STRESSES = {"normal_load": "normal_stress", "force": "shear_stress"}
-FORCES = {stress: force for force, stress in STRESSES.items()}
-OBSERVABLES = ("elongation", "force", "shear_stress", "friction")
-STILL = 1e-3  # of the fastest velocity, below which nothing slides
-HELD = 0.05  # of the slowest sliding, below which is a hold
+FORCE_OF_STRESS = {stress: force for force, stress in STRESSES.items()}
+OBSERVED = ("elongation", "force", "shear_stress", "friction")
+NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
+HOLD_SPEED = 0.05  # of the slowest sliding, below which is a hold
 SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps
 STROKES = 40  # of a file that are written
 LETTERS = "A is a, B is b, D0 is Dc (or L), mu is tau/sigma, W is sigma, K is k; a stress in MPa counts as the force on 1 mm^2"
-ROCK = {  # start values and bounds of A, B and D0 that hold most velocity steps on rock and gouge
+ROCK_START = {  # start values and bounds of A, B and D0 that hold most velocity steps on rock and gouge
     "A": (0.01, 0.0005, 0.05),
     "B": (0.01, 0.0002, 0.05),
     "D0": (10.0, 0.5, 500.0),
@@ -100,7 +100,7 @@ RIG = {
     "thickness": "of the sheared layer: strain times it is the displacement",
     "area": "of the sheared contact: force over it is the stress",
 }
-FACTOR = 5.0  # from another law's defaults to its bounds
+BOUND_FACTOR = 5.0  # from another law's defaults to its bounds
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def name_columns(
         found[actual] = Named(actual, heading, unit or ROLES[actual], name != actual or split_heading(heading)[1] is None)
         taken.add(heading)
     _by_words(headings, found)
-    seen = [role for role in (OBSERVABLES if not per_load else OBSERVABLES[::-1]) if role in found]
+    seen = [role for role in (OBSERVED if not per_load else OBSERVED[::-1]) if role in found]
     asked = [role for role in seen if role in wish]
     left = set(seen) - set((asked or seen)[:1])
     left |= {"load_point_displacement"} if "load_point_velocity" in found else set()
@@ -214,14 +214,14 @@ def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
             continue
         heading = named[0]
         unit = units_of[heading]
-        actual = FORCES.get(role, role) if kinds[heading] in ("N", "N*um") else role
+        actual = FORCE_OF_STRESS.get(role, role) if kinds[heading] in ("N", "N*um") else role
         found[actual] = Named(actual, heading, unit or ROLES[actual], True)
         free.remove(heading)
 
 
 def _played(role: str, found: Mapping[str, Named]) -> bool:
     """Return whether a role, or another that makes it needless, is found already."""
-    same = ({"load_point_velocity", "load_point_displacement"}, {"normal_stress", "normal_load"}, set(OBSERVABLES))
+    same = ({"load_point_velocity", "load_point_displacement"}, {"normal_stress", "normal_load"}, set(OBSERVED))
     return any(role in group and group & set(found) for group in same) or role in found
 
 
@@ -255,9 +255,9 @@ def _spelled(heading: str) -> tuple[str, str | None]:
     plain = re.sub(r"[^a-z0-9/]+", "_", name.strip().lower()).strip("_")
     if unit is not None:
         return plain.replace("/", "_"), unit
-    for suffix in sorted(SUFFIXES, key=len, reverse=True):
+    for suffix in sorted(UNIT_SUFFIXES, key=len, reverse=True):
         if plain.endswith("_" + suffix):
-            return plain.removesuffix("_" + suffix), SUFFIXES[suffix]
+            return plain.removesuffix("_" + suffix), UNIT_SUFFIXES[suffix]
     return plain.replace("/", "_"), None
 
 
@@ -269,7 +269,7 @@ def _by_unit(role: str, unit: str | None) -> str | None:
         stress = is_stress(unit)
     except SrfError:
         return None
-    role = STRESSES.get(role, role) if stress else FORCES.get(role, role) if find_unit(unit).powers[2] else role
+    role = STRESSES.get(role, role) if stress else FORCE_OF_STRESS.get(role, role) if find_unit(unit).powers[2] else role
     if role == "friction" and _kind_of_unit(unit) in ("N", "N*um", "MPa"):
         return "shear_stress" if stress else "force"
     turned = {"load_point_displacement": ("rad", "1"), "load_point_velocity": ("rad/s", "1/s"), "force": ("N*um",)}
@@ -289,7 +289,7 @@ def missing(columns: Sequence[Named], wish: Wish, path: Path, headings: Sequence
     lacks = []
     if "time" not in roles:
         lacks.append(("--column time=HEADING", f"{path}: which column is the time? It has {listed}"))
-    if not roles & set(OBSERVABLES):
+    if not roles & set(OBSERVED):
         what = "friction, shear stress, force or elongation of the spring"
         lacks.append(("--column shear_stress=HEADING", f"{path}: which column is {what}? It has {listed}"))
     if wish.drive is None and not roles & {"load_point_velocity", "load_point_displacement"}:
@@ -449,7 +449,7 @@ class _Sketch:
             lines += ["", "[columns]   # what the headings of the data files mean"]
             lines += [f"{n.role} = {{ name = {toml_value(split_heading(n.heading)[0] if self._alone(n) else n.heading)}, "
                       f"unit = {toml_value(n.unit)}{', scale = -1' * (n.role in turned)} }}" for n in said]  # fmt: skip
-        if self.kind in KINDS and self.why:
+        if self.kind in PROTOCOLS and self.why:
             lines += ["", f"# The runs, of kind {self.kind}: {self.why}."]
         for path, name in zip(self.files, self.names, strict=True):
             lines += ["", "[[runs]]", *self._run(path, name, absolute=absolute)]
@@ -529,8 +529,8 @@ def _kind(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, flo
         return "oscillation", f"as the load of {name} oscillates by {100 * eps:.3g} % at {f:.4g} Hz"
     for run in runs:
         V = np.abs(run.drive(run.t))
-        sliding = STILL * float(V.max()) < V
-        held = HELD * float(V[sliding].min()) > V
+        sliding = NO_SLIDING * float(V.max()) < V
+        held = HOLD_SPEED * float(V[sliding].min()) > V
         if held[int(np.argmax(sliding)) :].any() and _levels(V[sliding]) < SEVERAL:
             return "shs", f"as the drive of {run.name} holds for {float(np.mean(held)):.0%} of the time"
     ranges = [np.abs(run.drive(run.t)) for run in runs]
@@ -573,11 +573,11 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
         elif p.name == "mu0":
             low, high = sorted((_short(0.6 * mu), _short(1.4 * mu)))
             lines.append(f"mu0 = {{ value = {_short(mu)}, lower = {low}, upper = {high} }}   # median of the recording")
-        elif p.name in ROCK and wish.law == "dieterich-ruina":
-            value, low, high = ROCK[p.name]
+        elif p.name in ROCK_START and wish.law == "dieterich-ruina":
+            value, low, high = ROCK_START[p.name]
             lines.append(f"{p.name} = {{ value = {value}, lower = {low}, upper = {high} }}{about}")
         else:
-            low, high = max(p.lower, _short(p.default / FACTOR)), min(p.upper, _short(p.default * FACTOR))
+            low, high = max(p.lower, _short(p.default / BOUND_FACTOR)), min(p.upper, _short(p.default * BOUND_FACTOR))
             held = ", fixed = true" if not low < high else f", lower = {low}, upper = {high}"
             lines.append(f"{p.name} = {{ value = {p.default!r}{held} }}{about}")
     number, unit = split_quantity(wish.stiffness, name="--stiffness")
@@ -597,4 +597,4 @@ def looks_like_recording(path: Path, *, registry: Registry) -> bool:
     except SrfError:
         return False
     roles = {n.role for n in name_columns(headings, {}, path=path, per_load=False)}
-    return "time" in roles and bool(roles & set(OBSERVABLES))
+    return "time" in roles and bool(roles & set(OBSERVED))

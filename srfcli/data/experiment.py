@@ -16,7 +16,7 @@ from srfcli.core.errors import Notice, SrfError, did_you_mean
 from srfcli.core.settings import Parameter
 from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
 from srfcli.data.clock import Mask, Place, Sampling, find_sampling, kept_samples, sampling_notices
-from srfcli.data.columns import LIMIT, Columns, open_source, read_columns
+from srfcli.data.columns import MOST_BYTES, Columns, open_source, read_columns
 from srfcli.data.description import (
     Apparatus,
     ColumnSpec,
@@ -47,8 +47,8 @@ from srfcli.data.noise import observable_jumps, quantisation, rejoined, saturati
 from srfcli.data.scales import own_bounds
 from srfcli.data.thresholds import read_thresholds
 from srfcli.data.values import (
-    BESIDE,
     OBSERVABLES,
+    OTHER_OBSERVABLES,
     CriticalLoads,
     Experiment,
     FitParameter,
@@ -63,7 +63,7 @@ from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation
 
 
 def read_experiment(
-    path: Path, *, registry: Registry, format: str | None = None, holdout: bool = True, limit: int = LIMIT
+    path: Path, *, registry: Registry, format: str | None = None, holdout: bool = True, limit: int = MOST_BYTES
 ) -> Experiment:
     """Return the experiment in the folder or TOML file `path`, every value checked, in um, s, N.
 
@@ -307,7 +307,7 @@ def _stated(node: Node, parameter: Parameter, geometry: Geometry) -> float:
 # One recording, from its description and its file to a run that can be compared with a simulation.
 
 DRIVES = ("load_point_velocity", "load_point_displacement")
-FORCES = ("force", *LOADS)
+FORCE_COLUMNS = ("force", *LOADS)
 
 
 def read_run(
@@ -317,7 +317,7 @@ def read_run(
     *,
     registry: Registry,
     format: str | None = None,
-    limit: int = LIMIT,
+    limit: int = MOST_BYTES,
 ) -> Run:
     """Return the run in a description's data file; raises SrfError for what cannot be used."""
     try:
@@ -342,7 +342,7 @@ def read_run(
     drive, told = _drive(run, columns)
     load, weighed = _load(run, columns)
     check_start(run, drive, float(t[0]))
-    role, *beside = [c.role for c in columns.channels.values() if c.role in OBSERVABLES | BESIDE]
+    role, *beside = [c.role for c in columns.channels.values() if c.role in OBSERVABLES | OTHER_OBSERVABLES]
     at_start = load.rest(float(t[0]))
     stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
     rise = np.abs(drive(t)) * per_elongation(role, stiffness, at_start)
@@ -412,7 +412,7 @@ def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[
     """Return for each force of the run, by name, whether it counts as a stress; with an area all do."""
     if apparatus.geometry.area:
         return {"all": True}
-    found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in FORCES}
+    found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in FORCE_COLUMNS}
     if run.load is not None and isinstance(text := run.node.child("load").value, str):
         found["load"] = is_stress(split_quantity(text, name="load")[1] or "N")
     if not apparatus.per_load:
@@ -458,8 +458,8 @@ def _load(run: RunDescription, columns: Columns) -> tuple[Load, list[Notice]]:
 
 # The recorded observable: which of its samples can be compared with a simulation, and what is wrong with the others.
 
-CALM = 1e-3  # relative change of the load between samples below which the load does not make the observable jump
-COARSE = 0.5  # quantisation step over white noise above which there is a notice
+STEADY_LOAD = 1e-3  # relative change of the load between samples below which the load does not make the observable jump
+COARSE_STEP = 0.5  # quantisation step over white noise above which there is a notice
 
 
 def clean_observable(
@@ -494,7 +494,7 @@ def clean_observable(
     beside = beside & ("reset" in corrections)
     spiky = spiky & ("spike" in corrections)
     white = white_level(calm)
-    if quantum > COARSE * white > 0:
+    if quantum > COARSE_STEP * white > 0:
         what = f"steps of {quantum:.4g}, {quantum / white:.2g} times the white noise, which they add to"
         notices.append(Notice("quantisation", place.column, what))
     used = known & ~clipped & ~spiky & ~beside
@@ -507,7 +507,7 @@ def _without_jumps(
     place: Place, x: Array, rise: Array, W: Array, quantum: float, *, taken_out: bool
 ) -> tuple[Array, Mask, list[Notice]]:
     change = np.abs(np.diff(W, prepend=W[0])) / W
-    jumps = observable_jumps(x, place.t, rise, change < CALM, quantum)
+    jumps = observable_jumps(x, place.t, rise, change < STEADY_LOAD, quantum)
     level, beside = rejoined(x, jumps)
     notices = []
     for jump in jumps:
@@ -524,7 +524,7 @@ def _without_jumps(
 
 # The check of a recording: sampling, flaws, noise, and the history of drive and load, as found in the data.
 
-KINDS = {  # of notices, as --fail-on takes them
+NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "gap": "samples are missing",
     "sampling-change": "the sampling rate changes",
     "nan": "empty cells or NaN",

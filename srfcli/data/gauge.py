@@ -26,19 +26,19 @@ PROCESSES = ("relaxation", "oscillation")  # of coloured noise: e' = -e/tau + w,
 CORRELATION_TIMES = (0.02, 0.3, 0.6, 0.9)
 QUALITIES = (0.5, 3.0, 30.0)  # start values of an oscillation: smooth noise, a broad line and a narrow one
 QUALITY = (0.2, 1000.0)  # of an oscillation: one of a smaller quality is a relaxation
-FASTEST = 1.0  # frequency of an oscillation times the spacing: smooth noise may end beyond half of the sampling rate
+FASTEST_OSCILLATION = 1.0  # frequency of an oscillation times the spacing: smooth noise may end beyond half of the sampling rate
 
 STRETCHES = (64, 128, 256)  # samples over which a parabola is the trend: the longest that holds no signal is taken
 SLOW = 3  # lowest frequencies of stretches, which those half as long do not resolve
-RISE = 1.5  # power at these frequencies over that predicted from shorter stretches, at most; more is signal
+SPECTRUM_RISE = 1.5  # power at these frequencies over that predicted from shorter stretches, at most; more is signal
 SLOWEST = 2.0  # periods of an oscillation in a stretch, at least
-FEWEST = 32  # samples from which coloured noise is estimated
-ENOUGH = 4  # stretches; if there are more, some may be rejected
-TAIL = 1e-3  # share of stretches of pure noise that are rejected
-ROUNDS = 4  # in which the calm stretches are chosen anew
-NEIGHBOURS = 1.94  # powers over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
+FEWEST_SAMPLES = 32  # samples from which coloured noise is estimated
+ENOUGH_STRETCHES = 4  # stretches; if there are more, some may be rejected
+REJECTED_SHARE = 1e-3  # share of stretches of pure noise that are rejected
+CALM_ROUNDS = 4  # in which the calm stretches are chosen anew
+INDEPENDENT_POWERS = 1.94  # powers over independent ones: Hann's window correlates neighbours by 4/9, the next by 1/36
 WHITE = 1e-3  # standard deviation of each part over that of the whole noise, at least
-LEAST = 1e-150  # standard deviation whose square is still a number
+LEAST_DEVIATION = 1e-150  # standard deviation whose square is still a number
 
 
 def covariance(colour: tuple[float, ...], lag: Array) -> Array:
@@ -176,8 +176,8 @@ def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0,
     longest = max(piece.size for piece in pieces)
     lengths = [n for n in STRETCHES if n <= longest] or [longest]
     # the rounding of numbers, where there is no noise
-    least = max(1e-9 * max(float(np.ptp(piece)) for piece in pieces), LEAST)
-    if lengths[0] < FEWEST:
+    least = max(1e-9 * max(float(np.ptp(piece)) for piece in pieces), LEAST_DEVIATION)
+    if lengths[0] < FEWEST_SAMPLES:
         return GaugeNoise(max(white_level(max(pieces, key=len)), least), quantum)
     found: GaugeNoise | None = None
     for n in lengths:
@@ -185,7 +185,9 @@ def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0,
         whittle = _Whittle(calm, spacing, quantum, least)
         if found is not None:
             slow = calm.mean[:SLOW] / whittle.expected(found)[:SLOW]
-            if whittle.samples < found.samples / 2 or slow.mean() > RISE * (1 + 2 * np.sqrt(NEIGHBOURS / (SLOW * calm.count))):
+            if whittle.samples < found.samples / 2 or slow.mean() > SPECTRUM_RISE * (
+                1 + 2 * np.sqrt(INDEPENDENT_POWERS / (SLOW * calm.count))
+            ):
                 break
         found = whittle.noise()
     assert found is not None
@@ -259,23 +261,23 @@ def _calm(pieces: Sequence[Array], window: _Window) -> _Calm:
 
     def of(chosen: NDArray[np.intp]) -> _Calm:
         mean = powers[chosen].mean(axis=0)
-        spread = np.sqrt(NEIGHBOURS * float(mean @ mean)) / max(float(mean.sum()), 1e-300)
+        spread = np.sqrt(INDEPENDENT_POWERS * float(mean @ mean)) / max(float(mean.sum()), 1e-300)
         return _Calm(window, mean, chosen.size, spread)
 
-    if total.size <= ENOUGH:
+    if total.size <= ENOUGH_STRETCHES:
         return of(np.arange(total.size))
     found = of(np.argsort(total)[: max(total.size // 4, 1)])
     # a stretch's power is a gamma variate, of which the lowest quarter has this mean
     shape = 1 / max(found.spread, 1e-6) ** 2
     level = float(found.mean.sum()) / max(float(gammainc(shape + 1, gammaincinv(shape, 0.25))) / 0.25, 0.1)
-    for _ in range(ROUNDS):
+    for _ in range(CALM_ROUNDS):
         shape = 1 / max(found.spread, 1e-6) ** 2
-        calm = np.flatnonzero(total <= level * float(gammainccinv(shape, TAIL)) / shape)
+        calm = np.flatnonzero(total <= level * float(gammainccinv(shape, REJECTED_SHARE)) / shape)
         found = of(calm)
         level = float(found.mean.sum())
     # what rings after a step is strong at one frequency in a few stretches: powers there are exponential variates about ln 2
     ratio = powers[calm] / (np.median(powers[calm], axis=0) / np.log(2) + 1e-300)
-    quiet = ratio.max(axis=1) <= np.log(window.bins.size / TAIL)
+    quiet = ratio.max(axis=1) <= np.log(window.bins.size / REJECTED_SHARE)
     return of(calm[quiet]) if 2 * quiet.sum() > calm.size else found
 
 
@@ -286,7 +288,7 @@ class _Whittle:
         self.calm, self.spacing, self.quantum = calm, spacing, quantum
         self.lag = spacing * np.arange(calm.window.n)
         self.samples = max(calm.count * calm.window.n // 2, calm.window.n)  # each stretch is half over the next
-        self.weight = calm.count / NEIGHBOURS  # Hann's windows, half over each other, tell together what the samples do
+        self.weight = calm.count / INDEPENDENT_POWERS  # Hann's windows, half over each other, tell together what the samples do
         self.level = max(np.sqrt(calm.level), quantum / np.sqrt(12), least)
 
     def noise(self) -> GaugeNoise:
@@ -354,7 +356,9 @@ class _Whittle:
         spacing, longest = np.log(self.spacing), np.log(self.lag[-1])
         yield level + np.log(WHITE), level + np.log(10)
         for kind in kinds:
-            yield (spacing, longest) if kind == "relaxation" else (np.log(SLOWEST) - longest, np.log(FASTEST) - spacing)
+            yield (
+                (spacing, longest) if kind == "relaxation" else (np.log(SLOWEST) - longest, np.log(FASTEST_OSCILLATION) - spacing)
+            )
             yield level + np.log(WHITE), level + np.log(100)
             if kind == "oscillation":
                 yield np.log(QUALITY[0]), np.log(QUALITY[1])

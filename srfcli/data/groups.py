@@ -13,11 +13,11 @@ from srfcli.core.errors import SrfError
 from srfcli.data.values import Experiment, Run
 
 BY = ("run", "load", "segment", "direction")
-NOISE = "noise"  # what may vary besides parameters: the gauge noise of a group of runs
+GAUGE_NOISE = "noise"  # what may vary besides parameters: the gauge noise of a group of runs
 CUT = ("segment", "direction")  # for which runs are cut
-STEP = 1.5  # factor of a step of the velocity: what is fitted through noisy displacements wavers by less
-STILL = 1e-6  # um/s, below which the drive is held: no piece of a run can begin there in steady sliding
-FEWEST = 8  # samples of a run
+VELOCITY_STEP = 1.5  # factor of a step of the velocity: what is fitted through noisy displacements wavers by less
+HELD_DRIVE = 1e-6  # um/s, below which the drive is held: no piece of a run can begin there in steady sliding
+FEWEST_OF_RUN = 8  # samples of a run
 
 
 def grouped(experiment: Experiment, vary: Sequence[str] = (), by: str | None = None) -> Experiment:
@@ -62,11 +62,11 @@ def levels(run: Run) -> list[tuple[float, float]]:
     found: list[tuple[float, float]] = []
     for begin, end in pairwise(run.edges):
         V, rate, since = run.drive.piece(begin)
-        ends = np.maximum([V + rate * (begin - since), V + rate * (end - since)], STILL)
-        if np.ptp(np.log(ends)) > np.log(STEP):
+        ends = np.maximum([V + rate * (begin - since), V + rate * (end - since)], HELD_DRIVE)
+        if np.ptp(np.log(ends)) > np.log(VELOCITY_STEP):
             continue
         own = float(np.sqrt(ends.prod()))
-        if not found or abs(np.log(own / found[-1][1])) > np.log(STEP):
+        if not found or abs(np.log(own / found[-1][1])) > np.log(VELOCITY_STEP):
             found.append((begin, own))
     return found
 
@@ -77,11 +77,11 @@ def segments(run: Run) -> list[Run]:
     Each piece begins as the run does, in steady sliding or free, and no reading is in two of them.
     """
     found = levels(run)
-    halfway = [0.5 * (a[0] + b[0]) for a, b in pairwise(found[1:]) if a[1] > STILL]
+    halfway = [0.5 * (a[0] + b[0]) for a, b in pairwise(found[1:]) if a[1] > HELD_DRIVE]
     edges = [0]
     for cut in run.segments or halfway:
         at = int(np.searchsorted(run.t, cut))
-        if min(run.used[edges[-1] : at].sum(), run.used[at:].sum()) >= FEWEST:
+        if min(run.used[edges[-1] : at].sum(), run.used[at:].sum()) >= FEWEST_OF_RUN:
             edges.append(at)
     if len(edges) == 1:
         return [run]

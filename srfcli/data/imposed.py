@@ -13,7 +13,7 @@ from scipy.linalg import solveh_banded
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError
 from srfcli.data.clock import Place, kept_samples
-from srfcli.data.columns import LIMIT, Columns, Finder, open_source
+from srfcli.data.columns import MOST_BYTES, Columns, Finder, open_source
 from srfcli.data.description import RunDescription
 from srfcli.data.noise import quantisation, saturation, spikes, white_level
 from srfcli.data.values import OBSERVABLES
@@ -177,7 +177,7 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
 
 # A drive that turns back: the laws hold for sliding in one direction, so that each stroke is a run of its own.
 
-TURN = 0.2  # of the range of displacements: a turn by less begins no stroke
+STROKE_TURN = 0.2  # of the range of displacements: a turn by less begins no stroke
 OPPOSED = 0.5  # of the median observable: above it the slider slides, or is about to
 
 
@@ -205,9 +205,9 @@ def strokes(columns: Columns) -> list[Stroke]:
         moved = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(V[:-1]), V[:-1], 0.0) * np.diff(t))])
     known = np.isfinite(moved) & np.isfinite(observed)
     t, x, y = t[known], moved[known], observed[known]
-    if t.size < 2 * FEWEST or not np.ptp(x) > 0:
+    if t.size < 2 * FEWEST_OF_PIECE or not np.ptp(x) > 0:
         return []
-    turns = _turns(x, TURN * float(np.ptp(x)))
+    turns = _turns(x, STROKE_TURN * float(np.ptp(x)))
     usual = float(np.median(np.abs(y)))
     found, slid = [], [False, False]
     for first, last in pairwise([0, *turns, t.size - 1]):
@@ -217,7 +217,7 @@ def strokes(columns: Columns) -> list[Stroke]:
         opposed = np.flatnonzero(shear <= OPPOSED * usual)
         opposed = opposed[opposed < shear.size // 2]  # after that, what falls short is stick-slip
         begin = first + (int(opposed[-1]) + 1 if first and opposed.size else 0)
-        if last - begin >= 4 * FEWEST:
+        if last - begin >= 4 * FEWEST_OF_PIECE:
             found.append(Stroke(float(f"{t[begin]:.10g}"), float(f"{t[last - 1]:.10g}"), backward))
     return found if all(slid) and turns else []
 
@@ -238,16 +238,16 @@ def _turns(x: Array, least: float) -> list[int]:
 
 # Straight pieces in a noisy record, as many as the record supports and no more (Bayesian information criterion).
 
-FEWEST = 5  # samples of a piece
-ROUNDS = 40  # of the search for the places of the corners
+FEWEST_OF_PIECE = 5  # samples of a piece
+CORNER_ROUNDS = 40  # of the search for the places of the corners
 STRETCH = 128  # samples over which noise has its colour
 BURST = STRETCH  # samples of a burst of noise, at most
 AROUND = 15  # neighbouring stretches from which the noise of one is estimated
-NEARBY = 101  # samples that share a level of white noise
+NOISE_SAMPLES = 101  # samples that share a level of white noise
 CLEAR = 8.0  # standard deviations about the lines beside it that a level jump exceeds
-NEAR = 200  # samples on each side by which a jump is told from a corner
+SAMPLES_BESIDE = 200  # samples on each side by which a jump is told from a corner
 EVEN = 1e-5  # of the largest noise, at least: smaller ones would be lost in the rounding of the running sums
-LEAST = 1e-100  # um or um/s: a noise whose square is still a number
+LEAST_NOISE = 1e-100  # um or um/s: a noise whose square is still a number
 WOBBLE = 0.02  # relative change of slope below which there is no corner
 
 
@@ -266,14 +266,14 @@ def local_noise(x: Array) -> Array:
     from scipy.ndimage import median_filter
 
     if x.size < 8:
-        return np.full(x.size, max(float(np.std(x)), LEAST) if np.ptp(x) else 1.0)
+        return np.full(x.size, max(float(np.std(x)), LEAST_NOISE) if np.ptp(x) else 1.0)
     third = np.abs(np.diff(x, 3)) / np.sqrt(20.0)  # the sum of the squared weights 1, 3, 3, 1
     # the level at an end is not that of its last sample
-    level = median_filter(third, size=min(NEARBY, third.size), mode="reflect") / 0.6745
+    level = median_filter(third, size=min(NOISE_SAMPLES, third.size), mode="reflect") / 0.6745
     padded = np.concatenate([[level[0]], level, [level[-1]] * 2])
     overall = float(np.median(third)) / 0.6745
     span = float(np.ptp(x)) or 1.0
-    return np.maximum(padded, max(0.05 * overall, 1e-9 * span, LEAST))
+    return np.maximum(padded, max(0.05 * overall, 1e-9 * span, LEAST_NOISE))
 
 
 def split(t: Array, x: Array, sigma: Array, penalty: float) -> list[int]:
@@ -310,9 +310,9 @@ class _Sums:
 
     def best(self, a: int, b: int) -> tuple[int, float]:
         """Return where samples a to b - 1 are best split, and by how much that lowers the misfit; 0 for nowhere."""
-        if b - a < 2 * FEWEST:
+        if b - a < 2 * FEWEST_OF_PIECE:
             return 0, 0.0
-        places = np.arange(a + FEWEST, b - FEWEST + 1)
+        places = np.arange(a + FEWEST_OF_PIECE, b - FEWEST_OF_PIECE + 1)
         left = self.misfit(np.full(places.size, a), places)
         right = self.misfit(places, np.full(places.size, b))
         gain = self.misfit(np.array([a]), np.array([b]))[0] - left - right
@@ -406,16 +406,16 @@ def _jumps(t: Array, x: Array, sigma: Array, breaks: list[int], penalty: float) 
     """
     groups: list[list[int]] = []
     for at in breaks:
-        if groups and at - groups[-1][-1] < 2 * FEWEST:
+        if groups and at - groups[-1][-1] < 2 * FEWEST_OF_PIECE:
             groups[-1].append(at)
         else:
             groups.append([at])
     found = []
     for k, group in enumerate(groups):
         first, last = group[0], group[-1]
-        a = max(groups[k - 1][-1] if k else 0, first - NEAR)
-        b = min(groups[k + 1][0] if k + 1 < len(groups) else t.size, last + NEAR)
-        if min(first - a, b - last) < 2 * FEWEST:
+        a = max(groups[k - 1][-1] if k else 0, first - SAMPLES_BESIDE)
+        b = min(groups[k + 1][0] if k + 1 < len(groups) else t.size, last + SAMPLES_BESIDE)
+        if min(first - a, b - last) < 2 * FEWEST_OF_PIECE:
             continue
         at = first - 1 + int(np.argmax(np.abs(np.diff(x[first - 1 : last + 1]))))
         middle = 0.5 * (t[at] + t[at + 1])
@@ -472,7 +472,7 @@ def _cost_without(t: Array, x: Array, sigma: Array, knots: Array, k: int) -> flo
     near = slice(int(a), max(int(b) + 1, int(a) + 2))
     kept = knots[low : high + 1]
     inside = np.diff(np.searchsorted(t, knots[k - 1 : k + 2]))
-    if inside.min() < FEWEST:
+    if inside.min() < FEWEST_OF_PIECE:
         return 0.0
     slopes = np.diff(_heights(t[near], x[near], sigma[near], kept)) / np.diff(kept)
     before, after = slopes[k - low - 1], slopes[k - low]
@@ -511,7 +511,7 @@ def _polished(t: Array, x: Array, sigma: Array, knots: Array) -> tuple[Array, Ar
     """Return the knots moved to their least-squares places, and the heights there: damped Gauss-Newton on both."""
     heights = _heights(t, x, sigma, knots)
     misfit, damping = _misfit(t, x, sigma, knots), 1e-3
-    for _ in range(ROUNDS if knots.size > 2 else 0):
+    for _ in range(CORNER_ROUNDS if knots.size > 2 else 0):
         move = _step(t, x, sigma, knots, heights, damping)
         gaps = np.diff(knots)
         room = 0.4 * np.minimum(gaps[:-1], gaps[1:])
@@ -561,8 +561,8 @@ def _step(t: Array, x: Array, sigma: Array, knots: Array, heights: Array, dampin
 NEGLIGIBLE = 1e-5  # of the load's range: noise below it is interpolated and not smoothed
 BLOCKS = 16  # whose means are compared to see whether a load is constant
 ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
-NOTHING = 1e-15  # N: no contact
-SMALLEST = 5e-4  # relative amplitude of a modulation, at least: a servo varies the load by less
+NO_CONTACT = 1e-15  # N: no contact
+SMALLEST_MODULATION = 5e-4  # relative amplitude of a modulation, at least: a servo varies the load by less
 
 
 def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
@@ -591,7 +591,7 @@ def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
     notices += place.spots("spike", bad, f"standing out in '{place.heading}'; the load is bridged")
     good = known & ~bad
     filled = np.interp(t, t[good], filled[good])
-    if filled.min() < NOTHING:
+    if filled.min() < NO_CONTACT:
         at = int(filled.argmin())
         raise SrfError(
             f"{place.span(at, at)}, column '{place.heading}': the load is {filled[at]:.6g} N",
@@ -663,7 +663,7 @@ def find_modulation(t: Array, W: Array) -> FoundModulation | None:
         return None
     frequency, amplitude = _refined(tail_times, tail, line)
     mean = float(tail.mean())
-    if amplitude < SMALLEST * mean:
+    if amplitude < SMALLEST_MODULATION * mean:
         return None
     return FoundModulation(frequency, amplitude / mean, _onset(even, values, frequency, amplitude))
 
@@ -755,8 +755,8 @@ def read_load(path: Path, *, registry: Registry, format: str | None = None) -> t
     for block in source.blocks((time.column, loads.column)):
         blocks.append(np.array([block[0] * time.factor, block[1] * loads.factor]))
         held += blocks[-1].nbytes
-        if held > LIMIT:
-            raise SrfError(f"{path}: more than {LIMIT / 2**20:g} MB of loads", "Cut the file to the times that are needed.")
+        if held > MOST_BYTES:
+            raise SrfError(f"{path}: more than {MOST_BYTES / 2**20:g} MB of loads", "Cut the file to the times that are needed.")
     t, W = np.concatenate(blocks, axis=1)
     rows = np.arange(1, t.size + 1)
     keep, notices = kept_samples(Place(path, time.heading, rows, t))

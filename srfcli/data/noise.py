@@ -17,7 +17,7 @@ from srfcli.data.clock import Mask
 from srfcli.motion.imposed import interpolation_error, runs_of
 
 SEGMENT = 256  # samples of a periodogram
-NEIGHBOURS = 16  # from which a sample is interpolated: to 1e-4 for sines of five samples a period or more
+INTERPOLATED_FROM = 16  # from which a sample is interpolated: to 1e-4 for sines of five samples a period or more
 JITTER = 1e-3  # sampling intervals by which times may be off and still count as even
 
 
@@ -28,8 +28,8 @@ def white_level(x: Array, t: Array | None = None) -> float:
     noise counts as signal. Where the times t (n,) are given and uneven, at which a signal looks like noise, it is the median
     error of interpolation from neighbouring samples.
     """
-    if t is not None and x.size > 4 * NEIGHBOURS and np.median(np.abs(np.diff(t, 2))) > JITTER * np.median(np.diff(t)):
-        missed, unit = interpolation_error(t, x, NEIGHBOURS // 2)
+    if t is not None and x.size > 4 * INTERPOLATED_FROM and np.median(np.abs(np.diff(t, 2))) > JITTER * np.median(np.diff(t)):
+        missed, unit = interpolation_error(t, x, INTERPOLATED_FROM // 2)
         return float(np.median(missed / unit) / 0.6745)
     length = min(SEGMENT, 2 ** int(np.log2(max(x.size, 1))))
     if length < 16:
@@ -58,15 +58,15 @@ def calm_level(x: Array) -> float:
 # Flaws of a channel: spikes, level jumps of a transducer, saturation, and the step of its quantisation.
 
 WIDEST_SPIKE = 3  # samples of a spike
-BESIDE = 5  # samples before and after that tell the level
-FACTOR = 8.0  # robust standard deviations
+SIDE = 5  # samples before and after that tell the level
+SPIKE_FACTOR = 8.0  # robust standard deviations
 SUDDEN = 4.0  # times as far off as noise is: from there on one step that outruns the drive makes a spike
 CREST = 0.5  # share of a spike's size by which it is off a cubic through its neighbours, at least
 ALONE = 4.0  # steps by which a spike among the first or last samples is off its neighbours: of those there, the third largest
-NEARBY = 101  # samples that share a level of noise
+NOISE_SAMPLES = 101  # samples that share a level of noise
 FEW = 0.02  # share of samples off their running median, below which the channel counts as constant and without noise
 SATURATED = 10  # samples in a row at the extreme value
-LARGE = 0.05  # share of the level from which a jump is certain
+CERTAIN_JUMP = 0.05  # share of the level from which a jump is certain
 MOST_RESETS = 5  # of a transducer in a recording; if there are more jumps, they are a signal
 
 
@@ -105,7 +105,7 @@ def local_scale(x: Array, m: Array) -> Array:
     from scipy.ndimage import median_filter
 
     rest = np.abs(x - m)
-    near = median_filter(rest, size=min(NEARBY, x.size), mode="nearest")
+    near = median_filter(rest, size=min(NOISE_SAMPLES, x.size), mode="nearest")
     moving = rest[rest > 0]
     overall = float(np.median(moving)) if moving.size > FEW * x.size else 0.0
     return np.asarray(2.0 * np.maximum(near, 0.5 * overall))  # the running median follows the noise by a quarter
@@ -120,22 +120,22 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
     """
     from scipy.ndimage import median_filter
 
-    if x.size < 4 * BESIDE:
+    if x.size < 4 * SIDE:
         return np.zeros(x.size, bool)
-    scale = np.pad(local_scale(x, median_filter(x, size=BESIDE, mode="nearest")), BESIDE, mode="edge")
-    rise = None if rise is None else np.pad(rise, BESIDE, mode="edge")
-    x = np.concatenate([_before(x[: 2 * BESIDE]), x, _before(x[: -2 * BESIDE - 1 : -1])[::-1]])
-    found, m = np.zeros(x.size, bool), median_filter(x, size=BESIDE, mode="nearest")
-    steps = [np.sort(np.abs(np.diff(part)))[-3] for part in (x[BESIDE : 3 * BESIDE], x[-3 * BESIDE : -BESIDE])]
+    scale = np.pad(local_scale(x, median_filter(x, size=SIDE, mode="nearest")), SIDE, mode="edge")
+    rise = None if rise is None else np.pad(rise, SIDE, mode="edge")
+    x = np.concatenate([_before(x[: 2 * SIDE]), x, _before(x[: -2 * SIDE - 1 : -1])[::-1]])
+    found, m = np.zeros(x.size, bool), median_filter(x, size=SIDE, mode="nearest")
+    steps = [np.sort(np.abs(np.diff(part)))[-3] for part in (x[SIDE : 3 * SIDE], x[-3 * SIDE : -SIDE])]
     ends = [ALONE * step for step in steps]  # the end of a wave or of a decay is no spike
     for width in range(1, WIDEST_SPIKE + 1):
-        first = np.arange(BESIDE, x.size - BESIDE - width + 1)
+        first = np.arange(SIDE, x.size - SIDE - width + 1)
         before, after = m[first - 3], m[first + width + 2]
         group = np.stack([x[first + k] for k in range(width)])
         above = group.min(axis=0) - np.maximum(before, after)
         below = np.minimum(before, after) - group.max(axis=0)
         size = np.maximum(above, below)
-        threshold = np.maximum(FACTOR * np.maximum(scale[first - 3], scale[first + width + 2]) + 2 * quantum, least)
+        threshold = np.maximum(SPIKE_FACTOR * np.maximum(scale[first - 3], scale[first + width + 2]) + 2 * quantum, least)
         if rise is not None:  # from the median before, three samples back, to the median after, or far and in one sample
             step = np.where(above > below, group.min(axis=0) - x[first - 1], x[first + width] - group.max(axis=0))
             pace = 3 * np.max([rise[first + k] for k in range(-1, width)], axis=0)
@@ -150,19 +150,19 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
             hit |= (size > threshold) & (apart > threshold) & alone & (off > CREST * near)
         sign = np.where(above > below, 1.0, -1.0)
         beside = [sign * (x[first + k] - x[first + j]) for k, j in ((0, -1), (width - 1, width))]
-        near = [first < 2 * BESIDE, first + width > x.size - 2 * BESIDE]
+        near = [first < 2 * SIDE, first + width > x.size - 2 * SIDE]
         hit &= np.min(beside, axis=0) > np.select(near, ends, -np.inf)
-        hit &= (first > BESIDE) & (first + width < x.size - BESIDE)  # a level at the very end may be that before a slip
+        hit &= (first > SIDE) & (first + width < x.size - SIDE)  # a level at the very end may be that before a slip
         for k in range(width):
             found[first[hit] + k] = True
-    return found[BESIDE:-BESIDE]
+    return found[SIDE:-SIDE]
 
 
 def _before(x: Array) -> Array:
-    """Return BESIDE samples before the first ones x (n,), on the straight line that most of these follow."""
-    at = np.arange(-BESIDE, x.size)
+    """Return SIDE samples before the first ones x (n,), on the straight line that most of these follow."""
+    at = np.arange(-SIDE, x.size)
     slope = np.median(np.diff(x))
-    return np.asarray(np.median(x - slope * at[BESIDE:]) + slope * at[:BESIDE])
+    return np.asarray(np.median(x - slope * at[SIDE:]) + slope * at[:SIDE])
 
 
 def _off_neighbours(x: Array, first: NDArray[np.intp], width: int) -> Array:
@@ -225,7 +225,7 @@ def observable_jumps(x: Array, t: Array, rate: Array, steady: Mask, quantum: flo
         if not steady[max(i - 2, 0) : i + 4].all():
             continue
         allowed = float(rate[max(i - 20, 0) : i + 22].max() * (t[i + 1] - t[i]))
-        certain = abs(jump.size) > max(20 * allowed, LARGE * float(np.median(np.abs(x))))
+        certain = abs(jump.size) > max(20 * allowed, CERTAIN_JUMP * float(np.median(np.abs(x))))
         before, after = (slice(max(i - 19, 0), i + 1), slice(i + 1, i + 21))  # twenty samples on each side
         slopes = [float(np.polyfit(t[s] - t[i], x[s], 1)[0]) for s in (before, after)]
         bend = abs(slopes[1] - slopes[0]) * float(t[after][-1] - t[i])  # of the level: none if no reloading begins
@@ -240,7 +240,7 @@ def _level_jumps(x: Array, quantum: float) -> list[Jump]:
     """Return the steps between two samples that are far larger than the noise and than all changes nearby."""
     from scipy.ndimage import median_filter
 
-    if x.size < 8 * BESIDE:
+    if x.size < 8 * SIDE:
         return []
     d = np.diff(x)
     m = median_filter(d, size=21, mode="nearest")
@@ -251,7 +251,7 @@ def _level_jumps(x: Array, quantum: float) -> list[Jump]:
     candidates = np.flatnonzero(
         (rest > 20 * scale + 4 * quantum) & (np.abs(size) > 0.7 * np.abs(d)) & (np.sign(size) == np.sign(d))
     )
-    candidates = candidates[(candidates >= BESIDE) & (candidates < x.size - BESIDE - 1)]
+    candidates = candidates[(candidates >= SIDE) & (candidates < x.size - SIDE - 1)]
     neighbours = np.stack([np.abs(np.roll(d, k)) for k in (-2, -1, 1, 2)]).max(axis=0)
     return [Jump(int(i), float(d[i] - m[i])) for i in candidates if neighbours[i] < 0.2 * abs(d[i])]
 
@@ -263,9 +263,9 @@ def _typical(rest: Array) -> float:
 
 def _levels(x: Array) -> tuple[Array, Array]:
     """Return the medians of the five samples up to each one but the last, and of the five after it."""
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, BESIDE, mode="edge"), BESIDE)
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, SIDE, mode="edge"), SIDE)
     medians = np.median(windows, axis=1)
-    return medians[1 : x.size], medians[BESIDE + 1 : x.size + BESIDE]
+    return medians[1 : x.size], medians[SIDE + 1 : x.size + SIDE]
 
 
 def rejoined(x: Array, jumps: list[Jump]) -> tuple[Array, NDArray[np.bool_]]:
@@ -338,7 +338,7 @@ def quantised(values: Array, quantum: float) -> Array:
 
 KNOTS = 8  # to a correlation length: halfway between two of them the variance falls short by 4e-4
 WIDEST_KNOTS, FINEST_KNOTS = 0.8, 0.01  # um between knots: as wide as a fit's; contacts are 0.1 um or more
-MOST = 2_000_000  # knots between position 0 and the far end of a record
+MOST_KNOTS = 2_000_000  # knots between position 0 and the far end of a record
 ECHO = 32  # knots over which a value acts on a spline's coefficients: sqrt(3) - 2 to this power is below the last bit
 
 
@@ -374,7 +374,7 @@ class FrictionField:
 
         Raises SrfError where that takes more knots than there is room for.
         """
-        h, most = self.spacing, MOST - 2 * ECHO
+        h, most = self.spacing, MOST_KNOTS - 2 * ECHO
         if not max(abs(low), abs(high)) < most * h:
             raise SrfError(
                 f"a track to position {max(abs(low), abs(high)):g} um, in steps of {h:g} um, has more than {most} knots",

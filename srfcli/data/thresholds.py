@@ -19,7 +19,7 @@ UNITS = {"V": "um/s", "eps": "1", "W0c": "N", "sigma": "N"}
 REQUIRED = ("V", "eps", "W0c")
 RELATIVE_ERROR = 0.03  # of the critical load, where the table gives none: the paper's "typically 3 %"
 PERCENT = ("eps", "sigma")  # columns that may be given in %
-LARGEST = 64 * 2**20  # bytes of a table
+LARGEST_TABLE = 64 * 2**20  # bytes of a table
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def read_thresholds(path: Path) -> Thresholds:
     be read.
     """
     try:
-        text = read_text(path, limit=LARGEST, what="a table of critical loads")
+        text = read_text(path, limit=LARGEST_TABLE, what="a table of critical loads")
     except OSError as error:
         raise SrfError(f"{path} cannot be read: {error.strerror}", exit_code=1) from error
     lines = list(_filled(text.splitlines()))

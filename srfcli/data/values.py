@@ -18,7 +18,7 @@ from srfcli.data.thresholds import Thresholds
 from srfcli.motion.imposed import Drive, Load
 
 OBSERVABLES = {"elongation": "um", "force": "N", "friction": "1"}
-BESIDE = {"slip": "um", "contact_area": "1"}  # what may be observed besides one of these
+OTHER_OBSERVABLES = {"slip": "um", "contact_area": "1"}  # what may be observed besides one of these
 AREA_GROWTH = 0.05  # of a contact area by e-fold of its age: 0.02 to 0.1 for rock, glass and polymers
 
 
@@ -115,7 +115,7 @@ class Run:
 
     def unit_of(self, observable: str) -> str:
         """Return the unit in which an observable of this run is shown: um, N, MPa or 1."""
-        return shown_unit((OBSERVABLES | BESIDE)[observable], stress=self.stress)
+        return shown_unit((OBSERVABLES | OTHER_OBSERVABLES)[observable], stress=self.stress)
 
     @cached_property
     def sampling(self) -> Sampling:

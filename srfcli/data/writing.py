@@ -13,9 +13,9 @@ import numpy as np
 from srfcli.core.errors import SrfError
 from srfcli.core.files import SIDECAR, check_folder_place, clear, parse_toml, read_text, toml_lines, unused_name, whole_folder
 from srfcli.core.units import find_unit
-from srfcli.data.description import LARGEST
+from srfcli.data.description import LARGEST_DESCRIPTION
 from srfcli.data.thresholds import thresholds_csv
-from srfcli.data.values import BESIDE, OBSERVABLES, Experiment, FitParameter, Run
+from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, Run
 from srfcli.motion.imposed import Drive
 
 DESCRIPTION = "experiment.toml"
@@ -64,7 +64,7 @@ def check_folder(folder: Path, *, force: bool) -> None:
 def _own_files(folder: Path) -> set[str]:
     """Return the names that belong to the experiment in `folder`: the description, the files of its runs, sidecars."""
     try:
-        data = parse_toml(read_text(folder / DESCRIPTION, limit=LARGEST), folder)
+        data = parse_toml(read_text(folder / DESCRIPTION, limit=LARGEST_DESCRIPTION), folder)
     except (OSError, SrfError):
         return set()
     if not str(data.get("format", "")).startswith("srf-experiment/"):
@@ -105,8 +105,8 @@ def run_csv(run: Run) -> str:
 def observables(run: Run) -> list[str]:
     """Return the names of a run's columns of observables."""
     for signal in run.signals:
-        if signal.observable not in OBSERVABLES | BESIDE:
-            known = ", ".join(OBSERVABLES | BESIDE)
+        if signal.observable not in OBSERVABLES | OTHER_OBSERVABLES:
+            known = ", ".join(OBSERVABLES | OTHER_OBSERVABLES)
             raise SrfError(f"run {run.name!r} records {signal.observable!r}", f"known: {known}")
     return ["shear_stress" if run.stress and s.observable == "force" else s.observable for s in run.signals]
 

@@ -35,8 +35,8 @@ from srfcli.symbolic.system import apart
 
 # The augmented model as an experiment that every other command accepts: fitted laws, effects, the same recordings.
 
-LARGEST = 256 * 2**20  # bytes of recordings that are copied; larger ones stay where they are, and are named from there
-LAWS = ("friction", "ageing", "interface")
+COPIED_BYTES = 256 * 2**20  # bytes of recordings that are copied; larger ones stay where they are, and are named from there
+LAW_KINDS = ("friction", "ageing", "interface")
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def augment(
     rig = {key: description["apparatus"][key] for key in GEOMETRY if key in description["apparatus"]}
     text = text.replace(" N/um", " MPa/um") if "area" in rig else text  # beside an area a force would be divided by it
     rig |= {"stiffness": text} | ({"mass": f"{shortest(mass, KILOGRAM)!r} kg"} if mass else {})
-    model: dict[str, object] = {"law" if kind == "friction" else kind: f"{kind}.toml" for kind in LAWS}
+    model: dict[str, object] = {"law" if kind == "friction" else kind: f"{kind}.toml" for kind in LAW_KINDS}
     model |= {"inertia": inertia} | ({"effects": effects} if effects else {})
     model |= {"vary": experiment.vary, "by": experiment.by} if experiment.vary else {}
     lines = toml_lines({"format": "srf-experiment/1", "title": title.strip()})
@@ -133,10 +133,10 @@ def _beside(left: Sequence[Effect]) -> tuple[tuple[str, ...], dict[str, Path]]:
 def _parts(described: Sequence[Mapping[str, Any]], home: Path, folder: Path) -> tuple[list[dict[str, Any]], dict[str, Path]]:
     """Return what is described of runs and critical loads, files named as seen from `folder`, and what is to be copied there."""
     paths = {str(run["file"]): (home / str(run["file"])).resolve() for run in described}
-    small = sum(p.stat().st_size for p in set(paths.values())) <= LARGEST
+    small = sum(p.stat().st_size for p in set(paths.values())) <= COPIED_BYTES
     copies: dict[str, Path] = {}
     names: dict[Path, str] = {}
-    taken = {DESCRIPTION, *(f"{kind}.toml" for kind in LAWS)}
+    taken = {DESCRIPTION, *(f"{kind}.toml" for kind in LAW_KINDS)}
     runs = []
     for run in described:
         path = paths[str(run["file"])]
@@ -152,7 +152,7 @@ def _parts(described: Sequence[Mapping[str, Any]], home: Path, folder: Path) -> 
 
 # Laws with effects written into them: friction, ageing and interface files that say what a fitted model says.
 
-KINDS = {"mu": "friction", "rate": "ageing", "kappa": "interface"}
+KIND_OF_SLOT = {"mu": "friction", "rate": "ageing", "kappa": "interface"}
 
 
 @dataclass(frozen=True)
@@ -209,7 +209,7 @@ def _folded(laws: Folded, effect: Effect, stays: Sequence[Effect]) -> Folded | N
     if not effect.constitutive or len(effect.changes) != 1 or effect.observed:
         return None
     ((slot, formula),) = effect.changes
-    before = laws.formula(slot) if slot in KINDS else None
+    before = laws.formula(slot) if slot in KIND_OF_SLOT else None
     if before is None or not all(_commute(slot, formula, other) for other in stays):
         return None
     states = _states(laws, effect)
@@ -219,10 +219,10 @@ def _folded(laws: Folded, effect: Effect, stays: Sequence[Effect]) -> Folded | N
     new = formula.xreplace({symbol(slot): before})
     parameters = (*law.parameters, *(p for p in effect.parameters if p.name not in {q.name for q in law.parameters}))
     every = (*laws.friction.states, *states)
-    known = known_symbols(KINDS[slot], (p.name for p in parameters), every)
+    known = known_symbols(KIND_OF_SLOT[slot], (p.name for p in parameters), every)
     if not {str(s) for s in new.free_symbols} <= set(known) or not _sayable(new, known):
         return None
-    changed = laws.changed | {KINDS[slot]}
+    changed = laws.changed | {KIND_OF_SLOT[slot]}
     common: dict[str, Any] = {"parameters": parameters, "cites": tuple(dict.fromkeys((*law.cites, *effect.cites))), "checks": ()}
     common["about"] = f"{law.about.rstrip('.')}; {effect.about[:1].lower()}{effect.about[1:]}"
     if slot == "mu":
@@ -273,7 +273,7 @@ def _sayable(formula: sp.Expr, known: Sequence[str]) -> bool:
 def law_files(laws: Folded, values: Mapping[str, float]) -> dict[str, str]:
     """Return friction.toml, ageing.toml and interface.toml; `values`, in um, s, N, are their parameters' defaults."""
     out = {}
-    for slot, kind in KINDS.items():
+    for slot, kind in KIND_OF_SLOT.items():
         law, formula = laws.law(slot), laws.formula(slot)
         suffix = "augmented" if kind in laws.changed else "fitted"
         head: dict[str, object] = {"format": FORMAT, "kind": kind, "name": _name(law.name, suffix)}

@@ -36,13 +36,13 @@ from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
 
 # The experiment that would discriminate between hypotheses which explain a recording equally well.
 
-ENOUGH = 12.0  # of log likelihood: hypotheses so far apart are told apart
-LEAST = 3.0  # below which a run is not worth making
-MOST = 3  # hypotheses between which a run is to discriminate
+TOLD_APART = 12.0  # of log likelihood: hypotheses so far apart are told apart
+WORTH_MAKING = 3.0  # below which a run is not worth making
+MOST_HYPOTHESES = 3  # hypotheses between which a run is to discriminate
 DRAWN, VARIED = 60, 16  # runs that are tried, and variations of the best of them
 LOOKED = 36  # of these, how many with derivatives, at most
 CONFIRMED = 3  # of the best, how many with the motion itself
-ROUNDS = 10  # of Gauss and Newton
+NEWTON_ROUNDS = 10  # of Gauss and Newton
 GROWS = 0.1  # e-foldings in a run that leave sliding as steady as it was
 REPEATS = 100  # of a run that nobody will go beyond
 PARTS = 60  # of a run, in which it is found how much of it suffices
@@ -77,7 +77,7 @@ class DiscriminatingRun:
     @property
     def discriminates(self) -> bool:
         """Return whether the run is worth making."""
-        return self.gain >= LEAST
+        return self.gain >= WORTH_MAKING
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def discriminating_run(registry: Registry, diagnosis: Diagnosis, *, seed: int = 
 
 def foremost(diagnosis: Diagnosis) -> tuple[Side, ...]:
     """Return the hypotheses between which a run is to discriminate, three at most."""
-    return tuple(Side.of(f) for f in diagnosis.close[:MOST])
+    return tuple(Side.of(f) for f in diagnosis.close[:MOST_HYPOTHESES])
 
 
 class Design:
@@ -308,7 +308,7 @@ class Design:
         if current is None:
             return None
         r, left, X = current
-        for _ in range(ROUNDS):
+        for _ in range(NEWTON_ROUNDS):
             A, b = X.T @ X + Q, X.T @ r - Q @ z
             A[np.diag_indices_from(A)] *= 1 + damping
             step = solve_scaled(A, b)
@@ -332,29 +332,29 @@ def _cost(r: Array, z: Array, Q: Array) -> float:
 def _enough(losses: Sequence[Loss], trial: Trial) -> tuple[float | None, int | None]:
     """Return how many seconds of a run gain enough, and how many repeats of it; None where none do."""
     n = trial.run.t.size
-    if min(x.gain() for x in losses) >= ENOUGH:
+    if min(x.gain() for x in losses) >= TOLD_APART:
         for k in np.unique(np.linspace(0, n, PARTS + 1).astype(int)[1:]).tolist():
-            if min(x.gain(samples=k) for x in losses) >= ENOUGH:
+            if min(x.gain(samples=k) for x in losses) >= TOLD_APART:
                 return float(trial.run.t[k - 1] - trial.run.t[0]), 1
     low, high = 1, REPEATS
-    if min(x.gain(times=high) for x in losses) < ENOUGH:
+    if min(x.gain(times=high) for x in losses) < TOLD_APART:
         return None, None
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if min(x.gain(times=middle) for x in losses) >= ENOUGH else (middle, high)
+        low, high = (low, middle) if min(x.gain(times=middle) for x in losses) >= TOLD_APART else (middle, high)
     return high * trial.proposal.duration, high
 
 
 # Runs that an apparatus could still make: drives and loads drawn around those that it has shown.
 
-FACTOR = 2.0  # beyond what was shown
-FINEST = 8.0  # samples of a period: a load is not known from fewer
-VARIES = 0.01  # of the load, from where on a run is one with load steps
-MANY = 12  # velocities of a recorded drive that stand for all of them
+BEYOND_SHOWN = 2.0  # beyond what was shown
+SAMPLES_PER_PERIOD = 8.0  # samples of a period: a load is not known from fewer
+LOAD_STEPS_FROM = 0.01  # of the load, from where on a run is one with load steps
+MANY_VELOCITIES = 12  # velocities of a recorded drive that stand for all of them
 MOST_EPS = 0.9
 LEAD = 0.1  # of a run, in which it begins fast; the same of its way
-UNKNOWN = 1.0  # N: what stands for a load that no recording tells
-NAME = "discriminating"
+UNKNOWN_LOAD = 1.0  # N: what stands for a load that no recording tells
+RUN_NAME = "discriminating"
 STEPS, HOLD, LOAD, WAVE = "velocity steps", "slide-hold-slide", "load steps", "modulation"
 
 
@@ -454,7 +454,7 @@ def capabilities_of(experiment: Experiment) -> Capabilities:
     jumps, rises = [], []
     for run in plain:
         W, rate = run.load(run.t)
-        if np.ptp(W) > VARIES * W.mean():
+        if np.ptp(W) > LOAD_STEPS_FROM * W.mean():
             jumps.append(float(np.ptp(W) / W[0]))
             rises.append(float(np.ptp(W) / (2 * max(np.abs(rate).max(), 1e-12))))
     shown = [waves[r.name] for r in modulated]
@@ -476,12 +476,12 @@ def _velocities(runs: Sequence[Run]) -> tuple[float, ...]:
     """Return the velocities of driving that runs have shown, in um/s."""
     found: set[float] = set()
     for run in runs:
-        if len(run.drive.velocities) <= MANY and not any(run.drive.accelerations):
+        if len(run.drive.velocities) <= MANY_VELOCITIES and not any(run.drive.accelerations):
             found |= {float(f"{V:.3g}") for V in run.drive(run.t).tolist() if V > 0}
         else:
             V = run.drive(run.t)
             V = V[V > 0]
-            shares = np.linspace(0.05, 0.95, MANY)
+            shares = np.linspace(0.05, 0.95, MANY_VELOCITIES)
             found |= {float(f"{x:.3g}") for x in np.quantile(V, shares).tolist()} if V.size else set()
     return tuple(sorted(found))
 
@@ -516,7 +516,7 @@ def vary(proposal: Proposal, apparatus: Capabilities, number: int, rng: np.rando
         load = float(np.exp(0.3 * rng.standard_normal()))
         factors = {V: float(np.exp(0.3 * rng.standard_normal())) for _, V in proposal.drive}
         V = [_within(V * factors[V], apparatus.V) if V else 0.0 for _, V in proposal.drive]
-        W0 = _within(proposal.W0 * load, apparatus.W0) if set(apparatus.W0) != {UNKNOWN} else UNKNOWN
+        W0 = _within(proposal.W0 * load, apparatus.W0) if set(apparatus.W0) != {UNKNOWN_LOAD} else UNKNOWN_LOAD
         jump = float(np.exp(0.3 * rng.standard_normal())) * W0 / proposal.W0
         eps, f = proposal.eps, proposal.f
         if eps:
@@ -535,13 +535,13 @@ def vary(proposal: Proposal, apparatus: Capabilities, number: int, rng: np.rando
 
 def _drawn(apparatus: Capabilities, kind: str, rng: np.random.Generator) -> Proposal:
     def near(values: Sequence[float]) -> float:
-        factor = float(np.exp(rng.uniform(-1, 1) * math.log(FACTOR)))
+        factor = float(np.exp(rng.uniform(-1, 1) * math.log(BEYOND_SHOWN)))
         return _within(values[int(rng.integers(len(values)))] * factor, values)
 
     like = apparatus.modulated if kind == WAVE else apparatus.plain
     interval, span = _digits(float(np.median(np.diff(like.t))), 9), float(np.ptp(like.t))
     V, other, third = near(apparatus.V), near(apparatus.V), near(apparatus.V)
-    W0 = near(apparatus.W0) if set(apparatus.W0) != {UNKNOWN} else UNKNOWN
+    W0 = near(apparatus.W0) if set(apparatus.W0) != {UNKNOWN_LOAD} else UNKNOWN_LOAD
     rise = apparatus.switch if kind == WAVE else apparatus.rise
     if kind == STEPS:
         drive = _timed([V, other, V, third], [0.25] * 4, span, apparatus.travel)
@@ -576,7 +576,7 @@ def _timed(V: Sequence[float], shares: Sequence[float], span: float, travel: flo
 
 def _allowed(W0: float, steps: tuple[tuple[float, float], ...], apparatus: Capabilities) -> tuple[tuple[float, float], ...]:
     """Return steps that keep the load within what was shown, times two."""
-    low, high = min(apparatus.W0) / FACTOR, FACTOR * max(apparatus.W0)
+    low, high = min(apparatus.W0) / BEYOND_SHOWN, BEYOND_SHOWN * max(apparatus.W0)
     size = max((abs(j) for _, j in steps), default=0.0)
     if not size:
         return steps
@@ -586,12 +586,12 @@ def _allowed(W0: float, steps: tuple[tuple[float, float], ...], apparatus: Capab
 
 
 def _frequency(value: float, apparatus: Capabilities, interval: float) -> float:
-    return _digits(min(_within(value, apparatus.f), 1 / (FINEST * interval)))
+    return _digits(min(_within(value, apparatus.f), 1 / (SAMPLES_PER_PERIOD * interval)))
 
 
 def _within(value: float, shown: Sequence[float]) -> float:
     """Return a value, with two digits, no further than a factor of two outside what was shown."""
-    return _digits(float(np.clip(_digits(float(value), 2), min(shown) / FACTOR, max(shown) * FACTOR)))
+    return _digits(float(np.clip(_digits(float(value), 2), min(shown) / BEYOND_SHOWN, max(shown) * BEYOND_SHOWN)))
 
 
 def _digits(value: float, digits: int = 3) -> float:
@@ -609,7 +609,7 @@ def run_of(proposal: Proposal, experiment: Experiment) -> Run:
         load = SampledLoad(t, proposal.loads(t))
     modulation = (proposal.f, proposal.eps, proposal.onset) if proposal.eps else None
     run = Run(
-        NAME, Path(f"{NAME}.csv"), True, like.start, "steady", t, np.zeros(t.size), like.observable,
+        RUN_NAME, Path(f"{RUN_NAME}.csv"), True, like.start, "steady", t, np.zeros(t.size), like.observable,
         np.ones(t.size, dtype=bool), drive, load, like.stiffness, modulation, 0.0, (),
     )  # fmt: skip
     share = stiffness_share(experiment, run) / stiffness_share(experiment, like)
@@ -628,7 +628,7 @@ def sentences(found: DiscriminatingRun) -> list[str]:
     if not found.discriminates:
         return [
             f"Nothing within this apparatus' reach discriminates between {names}: of {found.tried} runs tried, the best "
-            f"would gain {found.gain:.2g} in log likelihood, and {ENOUGH:g} are wanted. For this apparatus they are one class."
+            f"gains {found.gain:.2g} in log likelihood, and {TOLD_APART:g} are wanted. For this apparatus they are one class."
         ]
     return [
         f"What would discriminate between {names} is {run.kind}: {run.text()}; sampled at {1 / run.interval:.4g} Hz.",
@@ -640,10 +640,10 @@ def sentences(found: DiscriminatingRun) -> list[str]:
 
 def _long(found: DiscriminatingRun) -> str:
     if found.seconds is None or found.repeats is None:
-        return f"No number of repeats of this run gains {ENOUGH:g}: its parameters would have to be known better first."
+        return f"No number of repeats of this run gains {TOLD_APART:g}: its parameters would have to be known better first."
     if found.repeats > 1:
-        return f"{ENOUGH:g} are gained in {found.repeats} such runs, {found.seconds:.3g} s in all."
-    return f"{ENOUGH:g} are gained in the first {found.seconds:.3g} s of it."
+        return f"{TOLD_APART:g} are gained in {found.repeats} such runs, {found.seconds:.3g} s in all."
+    return f"{TOLD_APART:g} are gained in the first {found.seconds:.3g} s of it."
 
 
 def _look(found: DiscriminatingRun) -> str:

@@ -21,9 +21,9 @@ from srfcli.numerics.hopf import critical_point
 from srfcli.numerics.plane import Axis, Plane
 from srfcli.symbolic.system import without_part
 
-VELOCITIES = 61
-CORNERS = 5  # velocities at which the loads without modulation say where boundaries are looked for
-BEYOND = 3.0  # times the slowest and fastest drive of the recordings: how far the diagram goes
+DRAWN_VELOCITIES = 61
+SCANNED_VELOCITIES = 5  # velocities at which the loads without modulation say where boundaries are looked for
+VELOCITY_FACTOR = 3.0  # times the slowest and fastest drive of the recordings: how far the diagram goes
 DRAWN = ContinuationSettings(tol=1e-4, max_mesh=256)  # as good as a line in a figure
 
 
@@ -39,7 +39,7 @@ def stability(registry: Registry, baseline: Experiment, at: Mapping[str, float],
     driven = driven[driven > 0]
     if not driven.size:
         return {}
-    V = np.geomspace(driven.min() / BEYOND, driven.max() * BEYOND, VELOCITIES)
+    V = np.geomspace(driven.min() / VELOCITY_FACTOR, driven.max() * VELOCITY_FACTOR, DRAWN_VELOCITIES)
     before, after = ({q.name: q.value for q in e.parameters} for e in (baseline, augmented))
     modulations = [r.modulation[:2] for r in baseline.runs if r.modulation]
     modulations += [(t.frequency, eps) for t in baseline.thresholds if (eps := float(t.table.eps.max())) > 0]
@@ -110,7 +110,7 @@ def _boundary(
     model: GeneratedModel, base: Array, V: Array, f: float, eps: float, side: str, notes: list[str]
 ) -> dict[str, Array]:
     """Return velocities and loads of the boundary under modulation, its components one after another, NaN between them."""
-    corners = [_at(model, base, V=v) for v in np.geomspace(V[0], V[-1], CORNERS)]
+    corners = [_at(model, base, V=v) for v in np.geomspace(V[0], V[-1], SCANNED_VELOCITIES)]
     low, high = load_window(model, corners)
     forced = _at(model, base, f=f, eps=eps, V=float(V[0]))
     plane = Plane(forced, Axis("V", float(V[0]), float(V[-1])), Axis("W0", low, high))

@@ -40,7 +40,7 @@ from srfcli.symbolic.system import apart
 # The friction that is missing, along the recordings.
 
 NORMAL = 1.959963984540054  # standard deviations of a 95 % band
-STEP = 0.2  # standard errors of the differences that tell what the parameters' errors do to it
+DIFFERENCE_STEP = 0.2  # standard errors of the differences that tell what the parameters' errors do to it
 BINS = 12  # in which the force is averaged along a quantity of state
 COORDINATES = ("v", "phi", "W", "dlnWdt", "slip", "t")
 
@@ -94,9 +94,9 @@ def unexplained_friction(fitted: Fitted, *, with_parameters: bool = True) -> dic
     free = np.nonzero(np.diag(maximum.covariance) > 0)[0] if with_parameters else np.zeros(0, dtype=int)
     for direction in root(maximum.covariance[np.ix_(free, free)]).T:
         x = maximum.point.x.copy()
-        x[free] += STEP * direction
+        x[free] += DIFFERENCE_STEP * direction
         for own, s, moved in zip(variance, smoothed, field_of(x), strict=True):
-            own += np.nan_to_num((moved - s.mean[:, at]) / STEP) ** 2
+            own += np.nan_to_num((moved - s.mean[:, at]) / DIFFERENCE_STEP) ** 2
     found = {}
     for f, s, own in zip(fitted.remainder.runs, smoothed, variance, strict=True):
         x, spread = s.mean, NORMAL * np.sqrt(own)
@@ -130,7 +130,7 @@ def coordinates_of(runs: Mapping[str, RunForce]) -> dict[str, float]:
 
 # The sparsest closed form of what is missing: candidate terms chosen one after another, each fitted in full.
 
-FOLDER = Path(__file__).parent / "terms"
+TERMS = Path(__file__).parent / "terms"
 ORIGIN = "terms"
 
 
@@ -143,7 +143,7 @@ def with_terms(registry: Registry) -> Registry:
 @lru_cache(maxsize=1)
 def _entries() -> tuple[Entry, ...]:
     found = []
-    for path in sorted(FOLDER.glob("*.toml")):
+    for path in sorted(TERMS.glob("*.toml")):
         kind, name, about = read_header(path)
         found.append(Entry(name, kind, ORIGIN, path, about))
     return tuple(found)
@@ -211,8 +211,8 @@ def explain_unknown(search: ModelSearch, diagnosis: Diagnosis, *, stopped: Calla
 
 # A closed form that was found for what is missing: its text, its effect file, and how well it does.
 
-NAME = "closed-form"
-SCAN = 8  # values at which a later search tries the parameters that are seen only where the form's size is not neutral
+FORM_NAME = "closed-form"
+SCANNED_VALUES = 8  # values at which a later search tries the parameters that are seen only where the form's size is not neutral
 
 
 @dataclass(frozen=True)
@@ -296,7 +296,7 @@ class ClosedForm:
             "held_rms_over_noise": {"baseline": rms[0], "form": rms[1]},
         }
 
-    def as_toml(self, *, name: str = NAME) -> str:
+    def as_toml(self, *, name: str = FORM_NAME) -> str:
         """Return the terms as one effect file, fitted values as defaults."""
         named = self.named()
         lines = ['format = "srf-law/1"', 'kind = "effect"', f"name = {_text(name)}"]
@@ -325,7 +325,7 @@ def _parameters(effect: Effect, values: Sequence[float]) -> list[str]:
     neutral, scans, lines = dict(effect.neutral), dict(effect.scans), []
     for p, value in zip(effect.parameters, values, strict=True):
         cells = [f"default = {min(max(value, p.lower), p.upper)!r}"]
-        cells.append(f"neutral = {neutral[p.name]!r}" if p.name in neutral else f"scan = {scans.get(p.name, SCAN)}")
+        cells.append(f"neutral = {neutral[p.name]!r}" if p.name in neutral else f"scan = {scans.get(p.name, SCANNED_VALUES)}")
         cells += [f"unit = {_text(p.unit)}", f"bounds = [{p.lower!r}, {p.upper!r}]", f"about = {_text(p.about)}"]
         lines.append(f"{p.name} = {{ {', '.join(cells)} }}")
     return lines

@@ -17,7 +17,7 @@ from srfcli.inference.noise import difference_level, stretches
 from srfcli.inference.state_space import (
     DEVIATION,
     LAGS,
-    LOST,
+    NOT_CONVERGED,
     Filtered,
     Likelihood,
     Point,
@@ -38,7 +38,7 @@ THIRD = 1.16  # relative variance, times n, of a level that third differences of
 def shortcomings(found: StateSpaceFit) -> list[str]:
     """Return what speaks against a fit: sentences, the worst first; none where it passes every test."""
     point, values = found.maximum.point, found.values
-    if not np.isfinite(point.log_likelihood) or found.maximum.away > LOST:
+    if not np.isfinite(point.log_likelihood) or found.maximum.away > NOT_CONVERGED:
         return ["the fit did not converge"]
     tests: list[tuple[float, str]] = []
     for f in point.runs:

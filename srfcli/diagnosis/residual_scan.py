@@ -30,12 +30,12 @@ from srfcli.motion.simulate import stick_slip
 
 # Where recording and baseline part: runs and times, phases of forcing and stick-slip, frequencies, quantities of state.
 
-LEVEL = 0.01  # p-value, adjusted for all that was looked at, from which a place stands out
+SIGNIFICANT = 0.01  # p-value, adjusted for all that was looked at, from which a place stands out
 DRAWS = 200
-LARGE = 10.0  # standard deviations of the noise beyond which a residual counts no more, where times are told
+CLIPPED = 10.0  # standard deviations of the noise beyond which a residual counts no more, where times are told
 RUN_CELLS, HELD = 64, 0.8  # of a run, and the share of its excess that its windows must hold
 OWN = ("run", "window")  # axes along a run's time
-MOST = 5  # windows and lines that are named
+NAMED_AT_MOST = 5  # windows and lines that are named
 PROMINENT, BESIDE, FAINT = (4.0, 15, 0.01)  # of a line: times its neighbours' median, how many neighbours, share of the strongest
 EVENTS = 3  # stick-slip events from which there is a cycle
 
@@ -112,7 +112,7 @@ def stands_out(scan: ResidualScan, M: Sequence[Array], null: Array, forcing: Map
     for piece, m, spare in zip(scan.pieces, M, scan.spare, strict=True):
         own = [r for r in rows if r.run == piece.name and r.axis in (*OWN, "frequency")]
         best = min(own, key=lambda r: r.log_p)
-        if best.p_value < LEVEL:
+        if best.p_value < SIGNIFICANT:
             share = max(excess[piece.name], 0.0) / whole if whole > 0 else 0.0
             runs.append(RunPlace(piece.name, share, _windows(piece, m, spare, own), best.p_value))
     return Location(
@@ -127,20 +127,20 @@ def stands_out(scan: ResidualScan, M: Sequence[Array], null: Array, forcing: Map
 
 def _windows(piece: Piece, m: Array, spare: Array, rows: Sequence[Row]) -> tuple[tuple[float, float], ...]:
     """Return the shortest stretches that hold most of a run's excess; the slow shapes that stand out where power does not."""
-    powerful = [r for r in rows if r.kind == "power" and r.p_value < LEVEL]
+    powerful = [r for r in rows if r.kind == "power" and r.p_value < SIGNIFICANT]
     if powerful:
         return _dense(piece, m, spare)
     found: list[tuple[float, float]] = []
-    slow = [r for r in rows if r.axis in OWN and r.kind == "shape" and r.p_value < LEVEL]
+    slow = [r for r in rows if r.axis in OWN and r.kind == "shape" and r.p_value < SIGNIFICANT]
     for row in sorted(slow, key=lambda r: r.log_p):
         if all(row.high < a or row.low > b for a, b in found):
             found.append((row.low, row.high))
-    return tuple(sorted(found[:MOST]))
+    return tuple(sorted(found[:NAMED_AT_MOST]))
 
 
 def _dense(piece: Piece, m: Array, spare: Array) -> tuple[tuple[float, float], ...]:
     edges = np.linspace(0, m.size, min(RUN_CELLS, max(m.size // 16, 1)) + 1).astype(int)
-    power = np.minimum(m**2, LARGE**2)  # a lost cycle is a misfit as any other
+    power = np.minimum(m**2, CLIPPED**2)  # a lost cycle is a misfit as any other
     excess = np.array([float(np.sum(power[a:b] - spare[a:b])) for a, b in pairwise(edges.tolist())])
     order = np.argsort(-excess)
     reached = np.cumsum(excess[order])
@@ -151,20 +151,20 @@ def _dense(piece: Piece, m: Array, spare: Array) -> tuple[tuple[float, float], .
     closed[1:-1] |= taken[:-2] & taken[2:]  # a single cell between two that count is no gap
     steps = np.diff(np.concatenate([[0], closed.astype(int), [0]]))
     spans = list(zip(np.nonzero(steps > 0)[0].tolist(), np.nonzero(steps < 0)[0].tolist(), strict=True))
-    best = sorted(spans, key=lambda s: -float(excess[s[0] : s[1]].sum()))[:MOST]
+    best = sorted(spans, key=lambda s: -float(excess[s[0] : s[1]].sum()))[:NAMED_AT_MOST]
     return tuple(sorted((float(piece.t[edges[a]]), float(piece.t[edges[b] - 1])) for a, b in best))
 
 
 def _phase(rows: Sequence[Row]) -> tuple[float, float] | None:
     """Return the stretch of the forcing's period, in rad, whose bins stand out with one sign, about the strongest."""
-    if not rows or min(r.p_value for r in rows) >= LEVEL:
+    if not rows or min(r.p_value for r in rows) >= SIGNIFICANT:
         return None
     z = [r.z or 0.0 for r in rows]
     top = int(np.argmax(np.abs(z)))
 
     def alike(i: int) -> bool:
         row = rows[i % len(rows)]
-        return row.p_value < LEVEL and (row.z or 0.0) * z[top] > 0 and abs(row.z or 0.0) > 0.5 * abs(z[top])
+        return row.p_value < SIGNIFICANT and (row.z or 0.0) * z[top] > 0 and abs(row.z or 0.0) > 0.5 * abs(z[top])
 
     first = last = top
     while last - first < len(rows) - 1 and alike(first - 1):
@@ -187,7 +187,7 @@ def _lines(rows: Sequence[Row], scan: ResidualScan, forcing: Mapping[str, float]
         S = np.array([r.statistic for r in own])
         base = forcing.get(piece.name)
         for i, row in enumerate(own):
-            if i < 3 or row.p_value >= LEVEL or not _peaked(S, i):
+            if i < 3 or row.p_value >= SIGNIFICANT or not _peaked(S, i):
                 continue
             f, width = 0.5 * (row.low + row.high), row.high - row.low
             order = round(f / base) if base else 0
@@ -199,7 +199,7 @@ def _lines(rows: Sequence[Row], scan: ResidualScan, forcing: Mapping[str, float]
         seen = harmonic or strength >= FAINT * strongest
         if seen and all(abs(f - g) > 1.5 * max(width, w) for g, w in found):
             found.append((f, width))
-    return tuple(f for f, _ in found[:MOST])
+    return tuple(f for f, _ in found[:NAMED_AT_MOST])
 
 
 def _peaked(S: Array, i: int) -> bool:
@@ -210,7 +210,7 @@ def _peaked(S: Array, i: int) -> bool:
 
 def _coordinate(rows: Sequence[Row], scan: ResidualScan, M: Sequence[Array]) -> tuple[str, float] | None:
     """Return the quantity a smooth function of which explains most of the excess misfit, with that share."""
-    smooth = [r for r in rows if r.run == "" and r.kind == "shape" and r.p_value < LEVEL]
+    smooth = [r for r in rows if r.run == "" and r.kind == "shape" and r.p_value < SIGNIFICANT]
     left = sum(float(m @ m) for m in M) - sum(float(s.sum()) for s in scan.spare)
     if not smooth or left <= 0:
         return None
@@ -220,12 +220,12 @@ def _coordinate(rows: Sequence[Row], scan: ResidualScan, M: Sequence[Array]) -> 
 
 def _kept(rows: Sequence[Row]) -> tuple[Row, ...]:
     """Return the rows without the lines of the spectra in which nothing is."""
-    return tuple(r for r in rows if r.kind != "line" or r.p_value < LEVEL)
+    return tuple(r for r in rows if r.kind != "line" or r.p_value < SIGNIFICANT)
 
 
 # A fit's runs as pieces of a scan: residuals and columns, whitened, with what their samples can be sorted by.
 
-LEAST = 30.0  # standard deviations of an innovation: a cycle is lost
+LOST_CYCLE = 30.0  # standard deviations of an innovation: a cycle is lost
 
 
 def pieces_of(fitted: Fitted, values: Mapping[str, float]) -> list[Piece]:
@@ -244,7 +244,7 @@ def pieces_of(fitted: Fitted, values: Mapping[str, float]) -> list[Piece]:
         ends = np.cumsum([0, *(b - a for a, b in stretches(run.t, good))]).tolist()
         sorted_by = {name: x[index] for name, x in _coordinates(fitted, run, got).items()}
         forcing, cycle = (None if x is None else x[index] for x in (_forcing(run), _cycle(run)))
-        lost = LEAST if cycle is not None else np.inf  # steady sliding has no cycle to lose
+        lost = LOST_CYCLE if cycle is not None else np.inf  # steady sliding has no cycle to lose
         known = {k: x for k, x in sorted_by.items() if np.isfinite(x).all()}
         found.append(Piece(run.name, run.t[index], white, X, places, tuple(pairwise(ends)), known, forcing, cycle, lost))
     return found
@@ -287,9 +287,9 @@ WAVES, SHORTEST, HALVINGS = 4, 24, 5  # cosines over a window, samples of the sh
 BINS = 12
 NUMBERS_AT_ONCE = 4_000_000  # numbers of simulated residuals held at a time
 OFF = 1.08  # factor by which a run's own noise level may differ from the assumed variance and count as noise
-STILL = 1e-6  # standard deviations by which a parameter moves all innovations together: it has nothing to do with them
-ABSORBED = 1e-4  # share of a column's squares below which what is left of it is rounding
-LINES = 64  # samples from which a spectrum is looked at
+NO_LEVERAGE = 1e-6  # standard deviations by which a parameter moves all innovations together: it has nothing to do with them
+ROUNDING_SHARE = 1e-4  # share of a column's squares below which what is left of it is rounding
+SPECTRUM_SAMPLES = 64  # samples from which a spectrum is looked at
 
 
 @dataclass(frozen=True)
@@ -389,7 +389,7 @@ class ResidualScan:
         for p in self.pieces:
             A[np.ix_(p.places, p.places)] += p.X.T @ p.X
         d = np.sqrt(np.diag(A))
-        moving = np.nonzero(d > STILL)[0]
+        moving = np.nonzero(d > NO_LEVERAGE)[0]
         d = d[moving]
         values, vectors = np.linalg.eigh(A[np.ix_(moving, moving)] / np.outer(d, d))
         good = values > 1e-13 * max(float(values.max(initial=0.0)), 1e-300)
@@ -489,7 +489,7 @@ class ResidualScan:
         p = self.pieces[i]
         a, b = max(p.parts, key=lambda q: q[1] - q[0], default=(0, 0))
         n, none = b - a, np.zeros(0)
-        if n < LINES:
+        if n < SPECTRUM_SAMPLES:
             return _Item("frequency", p.name, "line", (), ()), none, slice(0, 0), (none, none, none)
         step = float(np.median(np.diff(p.t[a:b])))
         m = (n - 1) // 2
@@ -595,6 +595,6 @@ def _taper(n: int) -> Array:
 def _inverse_root(G: Array, scale: Array) -> tuple[Array, int]:
     """Return R with R'R the pseudo-inverse of G * scale * scale, and its rank; directions that are absorbed do not count."""
     values, vectors = np.linalg.eigh(G)
-    good = values > ABSORBED
-    root = np.where(good, 1 / np.sqrt(np.maximum(values, ABSORBED)), 0.0)[:, None] * vectors.T / scale
+    good = values > ROUNDING_SHARE
+    root = np.where(good, 1 / np.sqrt(np.maximum(values, ROUNDING_SHARE)), 0.0)[:, None] * vectors.T / scale
     return np.asarray(root * (np.sign(root[0, 0]) or 1.0) if G.shape[0] == 1 else root), max(int(good.sum()), 1)

@@ -30,9 +30,9 @@ from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 
 NODES, MOST_NODES = 0.4, 400  # of a shared field: correlation lengths between them; how many
-NOTHING = 1e-100  # of a column's squares: a bump beyond the ends of all runs, say
-TOGETHER = 32  # columns that are projected at a time
-FINE = 20  # points between samples at which a function of slip or stage is averaged
+NO_COLUMN = 1e-100  # of a column's squares: a bump beyond the ends of all runs, say
+COLUMNS_TOGETHER = 32  # columns that are projected at a time
+POINTS_BETWEEN = 20  # points between samples at which a function of slip or stage is averaged
 
 
 @dataclass(frozen=True)
@@ -330,9 +330,9 @@ class Scores:
         for f in runs:
             rows = slice(end, end := end + 2 * f.white.size)
             best: list[Score] = []
-            for first in range(0, len(apparatus), TOGETHER):
+            for first in range(0, len(apparatus), COLUMNS_TOGETHER):
                 parts = []
-                for c in apparatus[first : first + TOGETHER]:
+                for c in apparatus[first : first + COLUMNS_TOGETHER]:
                     columns = np.zeros_like(c.columns)
                     columns[rows] = c.columns[rows] + base[rows] @ c.taken
                     parts.append(replace(c, effect=replace(c.effect, run=f.run.name), columns=columns))
@@ -346,12 +346,12 @@ class Scores:
     def _projected(self, columns: Sequence[_Column]) -> list[_Column]:
         """Return the columns that do something here, projected off what was fitted, many at a time."""
         found: list[_Column] = []
-        for first in range(0, len(columns), TOGETHER):
-            size = [float(np.sum(c.columns**2)) for c in columns[first : first + TOGETHER]]
+        for first in range(0, len(columns), COLUMNS_TOGETHER):
+            size = [float(np.sum(c.columns**2)) for c in columns[first : first + COLUMNS_TOGETHER]]
             some = [
                 replace(c, whole=whole)
-                for c, whole in zip(columns[first : first + TOGETHER], size, strict=True)
-                if whole > NOTHING and np.isfinite(whole)
+                for c, whole in zip(columns[first : first + COLUMNS_TOGETHER], size, strict=True)
+                if whole > NO_COLUMN and np.isfinite(whole)
             ]
             if not some:
                 continue
@@ -487,10 +487,10 @@ def _carried(
     model, states = problem.model, list(problem.model.states)
     n, a = kept.mean.shape
     slip = slip_along(run, kept.mean, model.states)
-    steps = np.linspace(0.0, 1.0, FINE, endpoint=False) + 0.5 / FINE
+    steps = np.linspace(0.0, 1.0, POINTS_BETWEEN, endpoint=False) + 0.5 / POINTS_BETWEEN
     fine_t = (run.t[:-1, None] + np.diff(run.t)[:, None] * steps).ravel()
     V = run.drive(fine_t)
-    stage = np.concatenate([[0.0], np.cumsum(V * np.repeat(np.diff(run.t) / FINE, FINE))])
+    stage = np.concatenate([[0.0], np.cumsum(V * np.repeat(np.diff(run.t) / POINTS_BETWEEN, POINTS_BETWEEN))])
     inputs, shown = np.zeros((n, a, len(functions) + late)), np.zeros(n)
     if late:
         shown = -_elongation_rate(run, kept.mean, model, fitted)
@@ -510,7 +510,7 @@ def _carried(
         else:
             middle = 0.5 * (stage[1:] + stage[:-1])
             moved = V * np.broadcast_to(np.asarray(shape.g(middle, *inner), dtype=float), middle.shape)
-            total = (moved.reshape(-1, FINE) * (np.diff(run.t) / FINE)[:, None]).sum(axis=1)
+            total = (moved.reshape(-1, POINTS_BETWEEN) * (np.diff(run.t) / POINTS_BETWEEN)[:, None]).sum(axis=1)
             if by_V is None:
                 by_V = _rates_by_V(model, fitted, run, kept.mean[:, : len(states)])
             inputs[1:, : len(states), j] = 0.5 * (by_V[1:] + by_V[:-1]) * total[:, None]

@@ -29,8 +29,8 @@ from srfcli.inference.fit import Problem
 from srfcli.inference.state_space import (
     DEVIATION,
     FIELD,
-    LOST,
     NEEDED,
+    NOT_CONVERGED,
     Likelihood,
     Maximum,
     Point,
@@ -51,20 +51,20 @@ from srfcli.laws.values import Effect
 
 WORTH = 12.0  # gain in log likelihood that an effect must bring: 300 columns are looked at, each at p = 1e-6
 CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes factor of 400
-LARGEST = 2  # effects of a model
-ALIKE = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
+MOST_EFFECTS = 2  # effects of a model
+ALIKE_EFFECTS = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
 SINGLES, PAIRS = 5, 3  # promises of each model that are followed
 UNDERSTATED = 2.0  # times the gain at first order that an effect may bring beside a model that is far off
 SHARED = 2.0  # in log evidence, what a field that all runs share costs: it is one of two kinds, and has an amplitude of its own
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
-COARSE = 1e-3  # tolerance of the integration: 0.02 in log likelihood
+SEARCH_RTOL = 1e-3  # tolerance of the integration: 0.02 in log likelihood
 BUDGET = 150.0  # s of CPU, or more
 BASELINES = 5.0  # times what the baseline took, if that is more: two effects, each fitted twice, and what they leave to be scored
-SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
+SIZE_SHARES = (1.0, 0.5, 0.2, 0.05)  # of the expected sizes, from which a model is fitted: the likeliest
 ASTRAY = 1000.0  # in log likelihood below its parent, from where a model is not fitted: its score knows nothing of the maximum
-FARTHEST = 10.0  # in the logarithm of a parameter, that a score can move it: beyond any bounds
+LARGEST_SHIFT = 10.0  # in the logarithm of a parameter, that a score can move it: beyond any bounds
 BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
-FAR = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
+RESIZED_BY = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
 AGAIN = 9  # of them, about the best, whose other parameters are fitted too where the model fails a test: 26 % apart
 STRIDES = 12  # steps of another ageing law from the file's own start values, or on from where it promises to be likelier
 FIELDS = (1.0, 3.0, 10.0, 30.0)  # of the field of the model beside, under which the file's own start values are followed
@@ -191,7 +191,7 @@ class ModelSearch:
         return judged
 
     def _state_space(self, problem: Problem, **choice: Any) -> StateSpaceFit:
-        return fit_state_space(problem, close=NEAR, rtol=COARSE, progress=self.progress, **choice)
+        return fit_state_space(problem, close=NEAR, rtol=SEARCH_RTOL, progress=self.progress, **choice)
 
     def _problem(self, hypothesis: Hypothesis, at: Mapping[str, float]) -> Problem:
         return hypothesis.problem(self.registry, self.experiment, at=at, trend=self.trend)
@@ -204,11 +204,11 @@ class ModelSearch:
         best: tuple[float, dict[str, float]] = (-np.inf, {})
         for shifts in (move.shifts, {}) if move.shifts else ({},):
             last = -np.inf
-            for share in SHARES:
+            for share in SIZE_SHARES:
                 values = self._sized(move, share, shifts)
                 problem = self._problem(move.hypothesis, values)
                 values = _followable(values, problem)
-                likelihood = Likelihood(problem, processes=_colours(move.values) or (), rtol=COARSE)
+                likelihood = Likelihood(problem, processes=_colours(move.values) or (), rtol=SEARCH_RTOL)
                 found = likelihood.at(likelihood.coordinates(values), slopes=False).log_likelihood
                 if found > best[0]:
                     best = found, values
@@ -224,7 +224,7 @@ class ModelSearch:
         model, values = move.hypothesis.model(self.registry, self.experiment), dict(move.values)
         for name, shift in shifts.items():  # relative ones as powers: what is positive stays so
             value = values[name]
-            power = np.clip(share * shift / value, -FARTHEST, FARTHEST) if value > 0 else 0.0
+            power = np.clip(share * shift / value, -LARGEST_SHIFT, LARGEST_SHIFT) if value > 0 else 0.0
             values[name] = value * float(np.exp(power)) if value > 0 else value + share * shift
         for number, (effect, sizes) in enumerate(zip(move.hypothesis.effects, move.sizes, strict=True)):
             part = share if number >= len(move.sizes) - move.fresh else 1.0
@@ -245,7 +245,7 @@ class ModelSearch:
         remainder = self.remainder(found)
         sizes = hypothesis.priors(found.likelihood.problem.model)
         by_slip = any((shape := along_table(e)) and shape.argument == "slip" for e in hypothesis.effects)
-        random = not by_slip and found.maximum.away < LOST  # a track is a function of slip or a random one
+        random = not by_slip and found.maximum.away < NOT_CONVERGED  # a track is a function of slip or a random one
         return Fitted(
             hypothesis, found, log_evidence(found, sizes) + self._prior(hypothesis), mass_at_bounds(found, sizes),
             tuple(shortcomings(found)), remainder, max(remainder.shared.gain - SHARED, 0.0) if random else None,
@@ -343,7 +343,7 @@ class ModelSearch:
             if self.queue and self.experiment.thresholds and not best.passes:  # far off the first order promises too little
                 promised = promised or self.queue[0].direction is not None
             if not promised:
-                if best.scores is not None or len(best.hypothesis.effects) >= LARGEST:
+                if best.scores is not None or len(best.hypothesis.effects) >= MOST_EFFECTS:
                     break
                 self._expand(best)
                 continue
@@ -371,7 +371,7 @@ class ModelSearch:
             return
         for other in self.queue:
             own = other.direction
-            if own is not None and own.size == move.direction.size and abs(float(own @ move.direction)) > ALIKE:
+            if own is not None and own.size == move.direction.size and abs(float(own @ move.direction)) > ALIKE_EFFECTS:
                 other.expected -= surprise
         heapq.heapify(self.queue)
 
@@ -477,7 +477,7 @@ class ModelSearch:
         except SrfError as error:
             self.excluded.append(Excluded(name, error.message))
             return None
-        return Likelihood(problem, processes=node.fit.likelihood.processes, rtol=COARSE)
+        return Likelihood(problem, processes=node.fit.likelihood.processes, rtol=SEARCH_RTOL)
 
     def _try_built_in(self, node: Fitted, effect: Effect) -> None:
         """Push an effect whose model has other unknowns: from the likeliest of a few sizes, after a few steps from there."""
@@ -516,7 +516,7 @@ class ModelSearch:
         best, found = node.fit.maximum, self._resized(node)
         gain = found.log_likelihood - node.fit.log_likelihood if found else 0.0
         if not gain > NEEDED:
-            if correlated(best.point) > DEVIATION or field_share(node.fit) > 1 or best.away > LOST:
+            if correlated(best.point) > DEVIATION or field_share(node.fit) > 1 or best.away > NOT_CONVERGED:
                 return None
             found, gain = best.point, 0.0
         assert found is not None
@@ -536,7 +536,7 @@ class ModelSearch:
         if name is None:
             return None
         trials, values = [], _followable(node.fit.values, likelihood.problem)
-        for ratio in np.geomspace(1 / FAR, FAR, AGAIN):
+        for ratio in np.geomspace(1 / RESIZED_BY, RESIZED_BY, AGAIN):
             y = likelihood.coordinates({**values, name: values[name] * ratio})
             trials.append(maximise(likelihood, y, held=[name], steps=12, close=1.0, widths=(), progress=self.progress))
         likeliest = max(trials, key=lambda f: f.point.log_likelihood)

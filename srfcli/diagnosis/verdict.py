@@ -18,10 +18,10 @@ from srfcli.diagnosis.search import CLOSE, NEAR, SHARED, Fitted, ModelSearch
 from srfcli.inference.critical_loads import Matched
 from srfcli.inference.state_space import Filtered, Predictive, StateSpaceFit, maximise
 
-NOTHING = ("none", "inconclusive")  # verdicts whose final model is the baseline
-HELD = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
-SAME = 0.97  # likeness of two effects' projected columns beyond which they are one class
-ABSORBED = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
+BASELINE_VERDICTS = ("none", "inconclusive")  # verdicts whose final model is the baseline
+HELD_OUT_RMS = 1.2  # rms of the innovations of held-out runs beyond which a model does not predict them
+ONE_CLASS = 0.97  # likeness of two effects' projected columns beyond which they are one class
+ABSORBED_SHARE = 2e-3  # share of an effect's squared signal below which parameters and field leave nothing of it
 BEHIND = 50.0  # in log evidence, by how much a model may be behind and still be asked what it predicts
 TEMPER = 3.0  # by which log evidence is divided before it becomes a stated confidence
 LACKING = 40.0  # in log evidence, what a model that fails a test loses in the stated confidence
@@ -117,7 +117,7 @@ class Diagnosis:
     @property
     def final(self) -> Fitted:
         """Return the model that the answer calls augmented: the baseline itself where nothing is to be added."""
-        return self.baseline if self.verdict in NOTHING else self.best
+        return self.baseline if self.verdict in BASELINE_VERDICTS else self.best
 
 
 def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
@@ -145,10 +145,10 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     absorbed = [
         Excluded(s.effect.reported, f"the baseline's parameters and field absorb {100 * (1 - s.tolerance):.2f} % of it")
         for s in scores
-        if s.tolerance < ABSORBED and s.detectable > interesting(s) and s.effect.reported not in named
+        if s.tolerance < ABSORBED_SHARE and s.detectable > interesting(s) and s.effect.reported not in named
     ]
     return Diagnosis(
-        whole, verdict, best, baseline, baseline if verdict in NOTHING else shown, ranked, close,
+        whole, verdict, best, baseline, baseline if verdict in BASELINE_VERDICTS else shown, ranked, close,
         _confidence(ranked, joint, verdict), scores,
         (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores}, _equivalent(scores, close), held,
         tuple(reasons), ungated, held_loads,
@@ -291,7 +291,7 @@ def refusal(best: Fitted, baseline: Fitted, held: Sequence[Held], loads: Sequenc
         return f"held-out runs are not predicted: in {loud}"
     sizes, levels = [h.augmented.white.size for h in held], [h.predictive[1].rms for h in held]
     rms = float(np.sqrt(np.average(np.square(levels), weights=sizes)))
-    if not rms < HELD:
+    if not rms < HELD_OUT_RMS:
         return f"held-out runs are not predicted: innovations have an rms of {rms:.3f} with the parameters moved as they may"
     gain = sum(h.gain for h in held)
     if best is not baseline and gain < -CLOSE:
@@ -323,7 +323,7 @@ def _equivalent(scores: Sequence[Score], close: Sequence[Fitted]) -> tuple[tuple
     for i, a in enumerate(scores):
         for b in scores[i + 1 :]:
             told = {a.effect.reported, b.effect.reported}
-            if (told & names or not names) and abs(float(a.direction @ b.direction)) > SAME:
+            if (told & names or not names) and abs(float(a.direction @ b.direction)) > ONE_CLASS:
                 found.append((a.effect.reported, b.effect.reported))
     return tuple(found)
 

@@ -29,13 +29,15 @@ from srfcli.inference.prediction import own_names, own_start, predict, run_param
 from srfcli.laws.registry import Registry
 
 MODIFIER = "linker-dieterich"
-ASKED = ("alpha", "lambda", "n")
+EFFECT_PARAMETERS = ("alpha", "lambda", "n")
 SIZES = {"alpha": 0.2, "lambda": 0.1, "n": 0.1}  # that one would want to see: of rock's alpha, of lambda's own value, of n
-FAR = 3.0  # root mean square of simulation minus recording over the recording's own spread, from which it is another motion
+OTHER_MOTION = (
+    3.0  # root mean square of simulation minus recording over the recording's own spread, from which it is another motion
+)
 STIFFER = 1.5  # from half to twice the stated stiffness
 LONGEST = 20_000  # samples of a run that are simulated; of more, evenly chosen blocks stand for the others
-BLOCK = 16  # samples of one: the first half tells what the noise is like there, the second half counts
-UNKNOWN = 100.0  # an error beyond this tells nothing: alpha and n are of order 1, lambda counts relative to itself
+NOISE_BLOCK = 16  # samples of one: the first half tells what the noise is like there, the second half counts
+UNDETERMINED = 100.0  # an error beyond this tells nothing: alpha and n are of order 1, lambda counts relative to itself
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class CramerRaoBound:
     @property
     def believed(self) -> bool:
         """Return whether the simulation resembles the recording enough to speak for it."""
-        return self.misfit <= FAR
+        return self.misfit <= OTHER_MOTION
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class Forecast:
 class _Question:
     """The experiment's model with alpha and n in it, values in um, s, N, and where in it is what.
 
-    `asked` gives the model's parameter for a name of ASKED, `free` those that are unknown beside, `widths` their ranges.
+    `asked` gives the model's parameter for a name of EFFECT_PARAMETERS, `free` those unknown besides, `widths` their ranges.
     """
 
     model: GeneratedModel
@@ -216,8 +218,8 @@ def _chosen(size: int) -> tuple[NDArray[np.int64], float]:
     """Return which samples of a run are simulated, and how many each that counts stands for: all, or blocks of a long one."""
     if size <= LONGEST:
         return np.arange(size), 1.0
-    first = np.linspace(0, size - BLOCK, LONGEST // BLOCK).astype(int)
-    return (first[:, None] + np.arange(BLOCK)).ravel(), size / (first.size * BLOCK / 2)
+    first = np.linspace(0, size - NOISE_BLOCK, LONGEST // NOISE_BLOCK).astype(int)
+    return (first[:, None] + np.arange(NOISE_BLOCK)).ravel(), size / (first.size * NOISE_BLOCK / 2)
 
 
 def innovations(check: RunCheck, chosen: NDArray[np.int64], J: Array, used: Mask, *, weight: float = 1.0) -> Array:
@@ -229,8 +231,8 @@ def innovations(check: RunCheck, chosen: NDArray[np.int64], J: Array, used: Mask
     at, t = check.run.sampling.at[chosen], check.run.t[chosen]
     begins, counts = np.diff(at, prepend=at[0]) != 0, used
     if weight > 1:
-        place = np.arange(chosen.size) % BLOCK
-        begins, counts = begins | (place == 0), used & (place >= BLOCK // 2)
+        place = np.arange(chosen.size) % NOISE_BLOCK
+        begins, counts = begins | (place == 0), used & (place >= NOISE_BLOCK // 2)
     begins = np.diff(np.cumsum(begins)[used], prepend=-1) > 0  # a beginning that is not used passes to the next sample that is
     white = whiten(check.noises, at[used], begins, t[used], J[used])
     return np.asarray(math.sqrt(weight) * white[counts[used]])
@@ -244,7 +246,7 @@ def _errors(question: _Question, told: Sequence[_Told]) -> tuple[dict[str, float
         rest = [i for i, n in enumerate(question.names) if n in question.free and n != column]
         error, alone = _error(F, at, rest, np.array([question.widths[question.names[i]] for i in rest]))
         unit = _value(question, column) if asked == "lambda" else 1.0
-        errors[asked] = error / unit if error / unit < UNKNOWN else math.inf
+        errors[asked] = error / unit if error / unit < UNDETERMINED else math.inf
         peaks[asked] = SIZES[asked] * unit * max((float(np.abs(t.Z @ alone).max(initial=0.0)) for t in told), default=0.0)
     return errors, peaks
 

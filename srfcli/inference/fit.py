@@ -10,7 +10,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status, did_you_mean
-from srfcli.data.groups import NOISE, labels
+from srfcli.data.groups import GAUGE_NOISE, labels
 from srfcli.data.values import OBSERVABLES, CriticalLoads, Experiment, Run
 from srfcli.inference.critical_loads import Matched, chance_of
 from srfcli.inference.noise import Noise
@@ -166,7 +166,7 @@ class Problem:
 
     def varied(self, run: Run) -> dict[str, str]:
         """Return what the parameters that vary are called in a run, fitted or not."""
-        return {n: f"{n}[{self.group(run)}]" for n in self.experiment.vary if n != NOISE}
+        return {n: f"{n}[{self.group(run)}]" for n in self.experiment.vary if n != GAUGE_NOISE}
 
     def group(self, run: Run) -> str:
         """Return the group of a run for what varies."""
@@ -179,7 +179,7 @@ class Problem:
 
     def noise_group(self, run: Run) -> str:
         """Return the group of runs whose gauge noise a run has; nothing where all share one."""
-        return self.group(run) if NOISE in self.experiment.vary else ""
+        return self.group(run) if GAUGE_NOISE in self.experiment.vary else ""
 
     def local(self, run: Run, values: Mapping[str, float]) -> dict[str, float]:
         """Return parameters by name with those that vary under their own names, at what they are in this run."""
@@ -213,7 +213,7 @@ def fit_problem(
         raise SrfError("no parameter is free", "leave `fixed` out for those that are to be fitted")
     _check_varying(experiment, runs, names)
     label = labels(experiment)
-    groups = {n: list(dict.fromkeys(f"{n}[{label[run.name]}]" for run in runs)) for n in experiment.vary if n != NOISE}
+    groups = {n: list(dict.fromkeys(f"{n}[{label[run.name]}]" for run in runs)) for n in experiment.vary if n != GAUGE_NOISE}
     rows = [(listed[n].value, listed[n].lower, listed[n].upper) for n in names for _ in groups.get(n, [n])]
     names = [own for n in names for own in groups.get(n, [n])]
     for run in runs:
@@ -232,8 +232,8 @@ def _check_varying(experiment: Experiment, runs: Sequence[Run], names: Sequence[
     """Raise SrfError where what is to vary is not free, or the runs fitted are of one group."""
     vary, by = experiment.vary, experiment.by
     for name in vary:
-        if name not in (*names, NOISE):
-            raise SrfError(f"'{name}' is to vary, and is not free", did_you_mean(name, [*names, NOISE]))
+        if name not in (*names, GAUGE_NOISE):
+            raise SrfError(f"'{name}' is to vary, and is not free", did_you_mean(name, [*names, GAUGE_NOISE]))
     label = labels(experiment)
     if vary and len({label[run.name] for run in runs}) < 2:
         raise SrfError(f"{', '.join(vary)} cannot vary by {by}: the runs fitted have only one", "Leave `vary` out.")

@@ -17,7 +17,7 @@ RHO = Parameter(
     "rho", 1.0, "1", 0.0, 10.0, "share of the modulation that reaches the asperities: rho times eps of the table acts"
 )
 GIVEN = ("V", "eps", "W0")  # the table's own columns
-DECADE = 10.0  # start values are trusted to this factor unless bounds are given
+TRUSTED_FACTOR = 10.0  # start values are trusted to this factor unless bounds are given
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def _free(parameter: Parameter, start: float, own: tuple[float, float] | None, l
     if own is not None:
         low, high = max(low, own[0]), min(high, own[1])
     elif low >= 0 and start > 0:
-        low, high = max(low, start / DECADE), min(high, start * DECADE)
+        low, high = max(low, start / TRUSTED_FACTOR), min(high, start * TRUSTED_FACTOR)
     if not low < high or not low <= start <= high:
         shown = [f"{from_base(v, unit):.6g}" for v in (start, low, high)]
         raise SrfError(

@@ -15,7 +15,7 @@ import numpy as np
 from srfcli.codegen.model import Array
 
 ORDERS = 6
-UNEVEN = 1.5  # a spacing so much longer or shorter than its neighbours' ends an evenly sampled stretch
+UNEVEN_SPACING = 1.5  # a spacing so much longer or shorter than its neighbours' ends an evenly sampled stretch
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def stretches(t: Array, used: Array) -> list[tuple[int, int]]:
     gap = np.diff(t[keep])
     cut = np.diff(keep) > 1
     ratio = gap[1:] / gap[:-1]
-    cut[1:] |= (ratio > UNEVEN) | (ratio < 1 / UNEVEN)
+    cut[1:] |= (ratio > UNEVEN_SPACING) | (ratio < 1 / UNEVEN_SPACING)
     edges = [0, *(np.nonzero(cut)[0] + 1).tolist(), keep.size]
     return [(int(keep[a]), int(keep[b - 1]) + 1) for a, b in pairwise(edges) if b > a]
 

@@ -17,8 +17,8 @@ from srfcli.inference.state_space import CLOSER, StateSpaceFit, maximise
 
 # Profile likelihood: each parameter held at a value, the others refitted; the interval ends where the fit is worse by 3.84.
 
-LEVEL = 3.841458820694124  # of chi-squared with one degree of freedom, 95 %
-FARTHEST = 8.0  # standard errors: an interval that has not ended there is open
+CHI2_95 = 3.841458820694124  # of chi-squared with one degree of freedom, 95 %
+OPEN_INTERVAL = 8.0  # standard errors: an interval that has not ended there is open
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def profile(found: StateSpaceFit, name: str, *, progress: Callable[[str], None] 
 
 
 def _end(found: StateSpaceFit, name: str, side: float) -> float | None:
-    """Return where the profile crosses LEVEL on one side, by secant on its root, which is nearly linear in the coordinate."""
+    """Return where the profile crosses CHI2_95 on one side, by secant on its root, which is nearly linear in the coordinate."""
     likelihood, best, covariance = found.likelihood, found.maximum.point.x, found.maximum.covariance
     k = likelihood.names.index(name)
     error = float(np.sqrt(covariance[k, k]))
@@ -50,17 +50,17 @@ def _end(found: StateSpaceFit, name: str, side: float) -> float | None:
     along = covariance[:, k] / covariance[k, k]
     limit = likelihood.upper[k] if side > 0 else likelihood.lower[k]
     x = best
-    points = [(0.0, -np.sqrt(LEVEL))]
-    step = np.sqrt(LEVEL) * error
+    points = [(0.0, -np.sqrt(CHI2_95))]
+    step = np.sqrt(CHI2_95) * error
     for _ in range(8):
         value = best[k] + side * step
-        if (value - limit) * side > 0 or step > FARTHEST * error * np.sqrt(LEVEL):
+        if (value - limit) * side > 0 or step > OPEN_INTERVAL * error * np.sqrt(CHI2_95):
             return None
         start = np.clip(x + along * (value - x[k]), likelihood.lower, likelihood.upper)
         start[k] = value
         point = maximise(likelihood, start, held=(name,), close=CLOSER).point
         x, cost = point.x, 2 * (found.log_likelihood - point.log_likelihood)
-        points.append((step, np.sign(cost) * np.sqrt(abs(cost)) - np.sqrt(LEVEL)))
+        points.append((step, np.sign(cost) * np.sqrt(abs(cost)) - np.sqrt(CHI2_95)))
         if abs(points[-1][1]) < 0.01:
             break
         (a, fa), (b, fb) = points[-2:]
@@ -72,10 +72,10 @@ def _end(found: StateSpaceFit, name: str, side: float) -> float | None:
 
 # Draws from the posterior by Markov chains, under flat priors within the bounds, and what they are worth.
 
-EARLY = 250  # draws for each parameter after which the burn-in makes its proposals anew
+EARLY_DRAWS = 250  # draws for each parameter after which the burn-in makes its proposals anew
 FEWEST_STEPS = 50  # between two of these, and of those kept: of fewer nobody could say what they are worth
 LEFT_OUT = 5.0  # correlation times that are left out at the beginning
-AGREED = 1.03  # R-hat at which the burn-in may end
+BURNT_IN = 1.03  # R-hat at which the burn-in may end
 LONGEST = 1000  # steps of burn-in
 INDEPENDENT = 0.85  # share of proposals that do not depend on where a chain is; the others stretch the ensemble
 WIDER = 1.2  # than the burn-in's draws: chains get stuck where proposals are rarer than the posterior
@@ -194,7 +194,7 @@ def draw(
         raise SrfError("`sample` needs emcee, which is not installed", 'pip install "srfcli[sample]"') from error
     k, (lower, upper) = len(names), bounds
     chains = 2 * k + 4
-    every = max(FEWEST_STEPS, -(-EARLY * k // chains))
+    every = max(FEWEST_STEPS, -(-EARLY_DRAWS * k // chains))
     rng = np.random.default_rng(seed)
     width = upper - lower
     best = np.clip(best, lower + 1e-9 * width, upper - 1e-9 * width)
@@ -218,7 +218,7 @@ def draw(
             if not burnt and number % every == 0:
                 later = sampler.get_chain(discard=number // 3)
                 ridge.learn(later.reshape(-1, k))
-                mixed = number >= LEFT_OUT * _slowness(later) and r_hat(later).max() <= AGREED
+                mixed = number >= LEFT_OUT * _slowness(later) and r_hat(later).max() <= BURNT_IN
                 burnt = number if mixed or number >= LONGEST else 0
             progress(f"posterior: step {number}", number / (max(burnt, every) + steps))
             if burnt and number == burnt + steps:

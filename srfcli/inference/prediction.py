@@ -24,7 +24,7 @@ from srfcli.motion.integrators import integrate
 
 TINY = 1e-30  # imaginary step: exact to rounding, as nothing is subtracted
 GAUGES = {"slip": ("slip",), "contact_area": ("area", "area_growth")}  # of an observable: what its gauge's reading depends on
-UNLOADED = 0.1  # least distance of the bounds of a free start's friction: a run may begin without any
+FREE_START_WIDTH = 0.1  # least distance of the bounds of a free start's friction: a run may begin without any
 
 
 def own_names(model: GeneratedModel, run: Run, trend: str | None) -> list[str]:
@@ -42,7 +42,7 @@ def own_start(model: GeneratedModel, run: Run, p: Array, name: str, trend: str |
         return 0.0, -max(steepest, 1e-9), max(steepest, 1e-9)
     if kind == "mu":
         mu = first_friction(run)
-        wide = max(0.5 * abs(mu), UNLOADED)
+        wide = max(0.5 * abs(mu), FREE_START_WIDTH)
         return mu, mu - wide, mu + wide
     if kind in {n for names in GAUGES.values() for n in names}:
         return _gauge_start(run, kind)
@@ -165,7 +165,7 @@ def _ages(model: GeneratedModel) -> list[str]:
 
 # What a model with given parameters predicts for a run, and the exact derivatives of that.
 
-RTOL = 1e-6  # errors of some 1e-5 um after minutes of stick-slip, a thousandth of a good gauge's noise
+MOTION_RTOL = 1e-6  # errors of some 1e-5 um after minutes of stick-slip, a thousandth of a good gauge's noise
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def predict(
     *,
     by: Sequence[str] = (),
     until: float = np.inf,
-    rtol: float = RTOL,
+    rtol: float = MOTION_RTOL,
     trend: str | None = None,
     tables: Sequence[Spline] = (),
     by_tables: Sequence[int] = (),

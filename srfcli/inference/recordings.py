@@ -54,8 +54,8 @@ class RecordingFit:
     scatter: Mapping[str, BetweenGroups | None] = field(default_factory=dict)
 
 
-MANY = 5  # groups from which their scatter is known well enough to be a prior: to a third of itself
-NONE = 0.01  # of the errors: a scatter that stands for none at all
+MANY_GROUPS = 5  # groups from which their scatter is known well enough to be a prior: to a third of itself
+NO_SCATTER = 0.01  # of the errors: a scatter that stands for none at all
 
 
 def _with_scatter(found: RecordingFit, *, prior: bool) -> RecordingFit:
@@ -67,9 +67,9 @@ def _with_scatter(found: RecordingFit, *, prior: bool) -> RecordingFit:
     scatter = {n: scatter_of(fit, names) for n, names in groups.items()}
     priors = []
     for n, own in scatter.items():
-        if own is not None and len(groups[n]) >= MANY:
+        if own is not None and len(groups[n]) >= MANY_GROUPS:
             error = float(np.mean([fit.stderr[name] for name in groups[n]]))
-            priors.append((groups[n], max(own.scatter, NONE * error)))
+            priors.append((groups[n], max(own.scatter, NO_SCATTER * error)))
     found = replace(found, scatter=scatter)
     if not (prior and priors and found.state_space):
         return found
@@ -140,7 +140,7 @@ def fit_recordings(
         return result
     try:
         asked = ask_shared and track is None and not (experiment.vary or any(run.others for run in problem.runs))
-        if not (track == "shared" or (asked and field_correlation(found) > ALIKE)):
+        if not (track == "shared" or (asked and field_correlation(found) > ALIKE_FIELDS)):
             return result
         tabled = open_model(registry, **asdict(experiment.choice), tables=(("mu", "slip"),))
         shared = fit_shared(replace(problem, model=tabled), best, progress=progress)
@@ -165,8 +165,8 @@ def _shared(found: SharedFit) -> FittedField:
 
 # Several starts: the file's own, and others drawn over the bounds, so that a false minimum is found out.
 
-SPREAD = 0.3  # of the way from the start value to each bound, at most
-SAME = 0.5  # standard errors between two minima that count as one
+START_SPREAD = 0.3  # of the way from the start value to each bound, at most
+ONE_MINIMUM = 0.5  # standard errors between two minima that count as one
 
 
 def start_points(problem: Problem, count: int, seed: int) -> list[Array]:
@@ -177,7 +177,7 @@ def start_points(problem: Problem, count: int, seed: int) -> list[Array]:
 
         cube = 2 * qmc.LatinHypercube(d=problem.start.size, rng=np.random.default_rng(seed)).random(count - 1) - 1
         reach = np.where(cube > 0, problem.upper - problem.start, problem.start - problem.lower)
-        points += list(problem.start + SPREAD * cube * reach)
+        points += list(problem.start + START_SPREAD * cube * reach)
     return points
 
 
@@ -223,14 +223,14 @@ def fit_from_several(
     best = max(fits, key=lambda f: f.log_likelihood)
     errors = np.maximum(np.sqrt(np.diag(best.covariance)), 1e-300)
     away = [max(abs(f.values[n] - best.values[n]) / e for n, e in zip(problem.names, errors, strict=False)) for f in fits]
-    rows = [(f.log_likelihood, d < SAME) for f, d in zip(fits, away, strict=True)]
+    rows = [(f.log_likelihood, d < ONE_MINIMUM) for f, d in zip(fits, away, strict=True)]
     return Several(best, rows, interrupted)
 
 
 # Whether the runs slid on one and the same rough track.
 
 SURELY = 2.0  # in log likelihood, by which one track for all runs has to be likelier than one for each
-ALIKE = 0.5  # mean correlation of the fields of two runs from which one field for all is fitted
+ALIKE_FIELDS = 0.5  # mean correlation of the fields of two runs from which one field for all is fitted
 
 
 def field_correlation(found: StateSpaceFit) -> float:

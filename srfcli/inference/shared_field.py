@@ -21,20 +21,24 @@ from srfcli.inference.fit import Fit, Problem, RunFit, inverse, solve_scaled
 from srfcli.inference.noise import Noise, difference_level, estimate_noise, log_determinant, stretches, whiten
 from srfcli.inference.prediction import Prediction, predict
 
-SPACING = 0.8  # um between knots: contacts are renewed over half of it, and a finer track fits no better
-MOST = 300  # numbers of a track: a longer one has wider knots
+KNOT_SPACING = 0.8  # um between knots: contacts are renewed over half of it, and a finer track fits no better
+MOST_KNOTS = 300  # numbers of a track: a longer one has wider knots
 AMPLITUDES = np.array([0.0, *np.geomspace(2e-5, 3e-3, 12)])
 LENGTHS = np.geomspace(1.0, 30.0, 6)
 GRID = (LENGTHS, AMPLITUDES)  # lengths and amplitudes of the roughness that are tried
-ROUNDS = 4  # of roughness, parameters and noise in turn
-AGREED = 0.5  # in log likelihood, between two rounds that agree
-STEPS = 25
-SETTLED = 0.02  # gain of twice the log likelihood below which the minimum is reached
-EARLY = 2.0  # the same while roughness and noise still change
-FAR = ((1.5, 1e-6), (4.0, 1e-4), (np.inf, 1e-2))  # of chi-squared, the same up to so many times the samples: none there matters
+FIELD_ROUNDS = 4  # of roughness, parameters and noise in turn
+ROUNDS_AGREE = 0.5  # in log likelihood, between two rounds that agree
+MOST_STEPS = 25
+LEAST_GAIN = 0.02  # gain of twice the log likelihood below which the minimum is reached
+EARLY_GAIN = 2.0  # the same while roughness and noise still change
+FAR_GAINS = (
+    (1.5, 1e-6),
+    (4.0, 1e-4),
+    (np.inf, 1e-2),
+)  # of chi-squared, the same up to so many times the samples: none there matters
 ROUGHLY = 6.0  # chi-squared per sample within which roughness is estimated: farther off it would take up what is not its own
-BAD = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
-HUGE = 1e100  # a slope that is no slope any more: its square would overflow
+UNREACHED = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
+OVERFLOWN_SLOPE = 1e100  # a slope that is no slope any more: its square would overflow
 
 
 @dataclass(frozen=True)
@@ -72,17 +76,17 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
     likelihood, noise = SharedLikelihood(problem), {r.name: Noise(r.noise.level) for r in begun.runs if not r.holdout}
     theta = np.array([begun.values[name] for name in problem.names])
     point, before = likelihood.at(theta, _track(problem.runs), noise, FieldPrior()), -np.inf
-    for number in range(ROUNDS):
+    for number in range(FIELD_ROUNDS):
         point = replace(point, prior=likelihood.prior(point))
         if not point.prior.amplitude:
             point = replace(point, track=point.track.with_numbers(np.zeros(point.track.numbers.size)))
-        point = likelihood.minimise(point, noise, settled=EARLY if number + 1 < ROUNDS else SETTLED)
+        point = likelihood.minimise(point, noise, settled=EARLY_GAIN if number + 1 < FIELD_ROUNDS else LEAST_GAIN)
         noise = likelihood.noise(point)
         point = likelihood.at(point.theta, point.track, noise, point.prior)
         own = np.array([point.prior.length]), np.array([point.prior.amplitude])
         attained = marginal(point.N, point.g, theta.size, point.track, point.log_likelihood, grid=own)[0]
         total = min(attained, point.log_likelihood)  # no prior adds any
-        if abs(total - before) < AGREED:
+        if abs(total - before) < ROUNDS_AGREE:
             break
         before = total
     runs = tuple(_judged(likelihood, point, r.name) for r in begun.runs)
@@ -96,7 +100,7 @@ def fit_shared(problem: Problem, begun: Fit, *, progress: Callable[[str], None] 
 def _track(runs: Sequence[Run]) -> Spline:
     """Return a smooth track that covers the slip of these runs."""
     low, high = min(r.start for r in runs), max(r.start + float(trapezoid(r.drive(r.t), r.t)) for r in runs)
-    return Spline.over(low - 1.0, high + 2.0, max(SPACING, (high - low) / (MOST - 3)))
+    return Spline.over(low - 1.0, high + 2.0, max(KNOT_SPACING, (high - low) / (MOST_KNOTS - 3)))
 
 
 def _judged(likelihood: SharedLikelihood, point: Point, name: str) -> RunFit:
@@ -159,8 +163,8 @@ class SharedLikelihood:
             p = found[run.name] = self.predicted(run, theta, track)
             parts, own = stretches(run.t, run.used), noise[run.name]
             difference = run.observed - p.y
-            bad = ~((np.abs(difference) < BAD * own.innovation) & (np.abs(p.J) < HUGE).all(axis=1))
-            difference[bad] = BAD * own.innovation
+            bad = ~((np.abs(difference) < UNREACHED * own.innovation) & (np.abs(p.J) < OVERFLOWN_SLOPE).all(axis=1))
+            difference[bad] = UNREACHED * own.innovation
             J = np.where(bad[:, None], 0.0, p.J)
             J[:, :n] *= self.scale
             white = whiten(own, np.column_stack([difference, J]), parts)
@@ -171,14 +175,14 @@ class SharedLikelihood:
             total -= 0.5 * float(r @ r) + log_determinant(own, parts) + 0.5 * r.size * np.log(2 * np.pi)
         return Point(theta, track, prior, found, N, g, chi2, total)
 
-    def minimise(self, point: Point, noise: Mapping[str, Noise], *, settled: float = SETTLED) -> Point:
+    def minimise(self, point: Point, noise: Mapping[str, Noise], *, settled: float = LEAST_GAIN) -> Point:
         """Return the most probable parameters and numbers under this noise and roughness, by Levenberg and Marquardt."""
         problem, damping = self.problem, 0.0
         n, low, high = point.theta.size, problem.lower, problem.upper
         point = self.at(point.theta, point.track, noise, point.prior)
         rough = point.prior.amplitude > 0
         L = point.prior.root(point.track.nodes) if rough else np.zeros((0, 0))
-        for _ in range(STEPS if n or rough else 0):
+        for _ in range(MOST_STEPS if n or rough else 0):
             free = np.ones(n, dtype=bool)
             while True:  # parameters that a step would push out stay at their bounds
                 move, gain = self._step(point, L, free, damping)
@@ -205,7 +209,7 @@ class SharedLikelihood:
     def worth(self, point: Point, settled: float) -> float:
         """Return the gain below which a further step is not worth it."""
         share = point.chi2 / max(self.samples, 1)
-        return max(settled, next(far for most, far in FAR if share < most or most == np.inf) * point.chi2)
+        return max(settled, next(far for most, far in FAR_GAINS if share < most or most == np.inf) * point.chi2)
 
     def prior(self, point: Point) -> FieldPrior:
         """Return the roughness at which the marginal likelihood is largest, the one so far where that means nothing."""

@@ -29,7 +29,7 @@ from scipy.special import erfcx
 from srfcli.codegen.c_source import GAUGE_PROCESSES
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.data.gauge import CORRELATION_TIMES, FASTEST, PROCESSES, QUALITIES, QUALITY
+from srfcli.data.gauge import CORRELATION_TIMES, FASTEST_OSCILLATION, PROCESSES, QUALITIES, QUALITY
 from srfcli.data.noise import calm_level
 from srfcli.data.values import CriticalLoads, Experiment, Run, Signal
 from srfcli.inference.critical_loads import Matched, TableLikelihood, apparatus, joined_slopes
@@ -50,35 +50,40 @@ from srfcli.inference.prediction import (
 
 T = TypeVar("T")
 Kind: TypeAlias = tuple[str, float, str]  # of gauge noise: an observable, the spacing of its samples, a group of runs or ""
-RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
+FILTER_RTOL = 1e-4  # each reading puts right what the integration got wrong before it: the log likelihood is 1e-3 off
 FREE_RUNNING = 3e-3  # times that tolerance without a field: there errors add up over a run
 FIELD = ("field_amplitude", "field_length")
-# A fit begins with the likeliest of nine fields: amplitudes over the friction of the recordings, lengths over that of PIECES
+# A fit begins with the likeliest of nine fields: amplitudes over friction, lengths over the longest slip / LENGTHS_IN_SLIP
 WIDE, SHORT = (0.003, 0.03, 0.3), (1.0, 0.25, 0.06)
-TRIES = 3  # of these fields, from which a fit begins anew where half of its steps ended far from a maximum
-LOST = 3.0  # standard errors from its maximum at which a fit is none
+FIELD_TRIES = 3  # of these fields, from which a fit begins anew where half of its steps ended far from a maximum
+NOT_CONVERGED = 3.0  # standard errors from its maximum at which a fit is none
 SOBOL_STARTS = 16  # starts that are tried where the file's own cannot be followed; a power of two, as Sobol's points are
-SMALL = 1e-6  # the least amplitude of a field, over the friction of the recordings
-FAINT = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
-FAINT_FIELDS = (0.03, 0.1, 0.3, 1.0)  # amplitudes over FAINT, that are tried beside a fit without a field
+LEAST_FIELD = 1e-6  # the least amplitude of a field, over the friction of the recordings
+FAINT_FIELD = 1e-3  # amplitude over friction below which a fit without a field is tried: to vanish takes many steps
+FAINT_FIELDS = (0.03, 0.1, 0.3, 1.0)  # amplitudes over FAINT_FIELD, that are tried beside a fit without a field
 FIELD_STEPS = 6  # of the trial of a small field beside a fit without one: parameters that are off may hide it
 BARE_STEPS = 12  # of that trial: without a field the likelihood has one narrow maximum near, or none
-SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
+FIELD_SHRINKS = 1.0  # in ln of the amplitude, over three steps, by which a field shrinks that may vanish
 NEEDED = 2.0  # gain in log likelihood that keeps a field: without one that is there, errors are too small
 CLOSE_CALL = 50.0  # in log likelihood, by which a fit that was broken off early may be behind and still be finished
 HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters, when one is not worth a fit
-PIECES = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
-STEPS = 40  # of Fisher scoring
-LONG = 20_000  # readings, of all runs, beyond which a fit begins with a part of them: it finds the field and the first digits
-PATIENCE = 5  # times the steps of integration of the point before, after which a trial is given up
+LENGTHS_IN_SLIP = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
+SCORING_STEPS = 40  # of Fisher scoring
+MANY_READINGS = (
+    20_000  # readings, of all runs, beyond which a fit begins with a part of them: it finds the field and the first digits
+)
+MOST_WORK = 5  # times the steps of integration of the point before, after which a trial is given up
 WIDTHS = (0.1, 0.03, 0.01)  # of each parameter, within which a reading's derivatives are to hold, one after the other
-WIDEST = 1000.0  # times that width, in standard errors: what readings tell sharply together may still be uncertain
-ROUNDS = 12  # of weights and standard errors, each from the other
+WIDEST_ERRORS = 1000.0  # times that width, in standard errors: what readings tell sharply together may still be uncertain
+WEIGHT_ROUNDS = 12  # of weights and standard errors, each from the other
 PROBE = 10.0  # standard errors along a ridge, at which the likelihood is asked for
-BENT = 0.5  # share of what its curvature loses there, below which there are other maxima
-STRIDE, REACH = 0.05, 0.5  # of a parameter: strides along its ridge, and how far they go
+LOST_CURVATURE = 0.5  # share of what its curvature loses there, below which there are other maxima
+RIDGE_STRIDE, RIDGE_REACH = 0.05, 0.5  # of a parameter: strides along its ridge, and how far they go
 DOWN = 10.0  # in log likelihood, by how much less a stride may find than the best on its side, and be followed
-FINE = (16, 64)  # steps of two standard errors to either side, at least and at most, in which maxima next to one are looked for
+NEIGHBOUR_STEPS = (
+    16,
+    64,
+)  # steps of two standard errors to either side, at least and at most, in which maxima next to one are looked for
 HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
@@ -93,7 +98,7 @@ DEVIATION = 4.5  # standard deviations at which a test of what a fit leaves fail
 COLOURED = (0.5, 0.97)  # of the noise's variance, where colour begins
 PERIODOGRAM = 128  # samples of a stretch whose spectrum is taken, to see where an oscillation may be
 SURVEYS = 3  # of all lines of the tables of critical loads at a maximum, and fits from where that finds nearer crossings
-DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
+START_DIFFERENCE = 1e-5  # relative step of the central differences by which the start's covariance is differentiated
 
 
 @dataclass(frozen=True)
@@ -252,7 +257,7 @@ def filter_run(
     by: Sequence[str] = (),
     gauges: Sequence[Mapping[str, str]] = (),
     trend: str | None = None,
-    rtol: float = RTOL,
+    rtol: float = FILTER_RTOL,
     keep: bool = False,
     most: int | None = None,
 ) -> Filtered:
@@ -332,7 +337,7 @@ def _belief(
         unit = share if name == "K" else 1.0
         at, column = by.index(name), S0[:, j] * unit
         d[:, at] = column
-        step = DIFFERENCE * max(
+        step = START_DIFFERENCE * max(
             abs(values.get(name, 0.0)), abs(float(p[model.index(name)])) if name in model.names else 1e-3, 1e-12
         )
         sides = []
@@ -409,7 +414,7 @@ class Likelihood:
         *,
         smooth: bool = False,
         processes: Sequence[str] = (),
-        rtol: float = RTOL,
+        rtol: float = FILTER_RTOL,
         kinds: Sequence[Kind] = (),
     ) -> None:
         self.problem, self.smooth, self.processes = problem, smooth or not problem.runs, tuple(processes)
@@ -599,7 +604,7 @@ class Likelihood:
             return list(pool.map(work, self.problem.runs))
 
     def at(self, x: Array, *, slopes: bool = True, keep: bool = False, like: Point | None = None, anew: bool = False) -> Point:
-        """Return log likelihood, score and information at x (k,); -inf where a run takes PATIENCE times the steps of `like`.
+        """Return log likelihood, score and information at x (k,); -inf where a run takes MOST_WORK times the steps of `like`.
 
         With `anew` every line of the tables is searched in full.
         """
@@ -607,7 +612,7 @@ class Likelihood:
             return self.best
         values, k = self.values(x), len(self.names)
         self.evaluations += 1
-        most = {f.run.name: PATIENCE * f.found.steps for f in like.runs} if like else {}
+        most = {f.run.name: MOST_WORK * f.found.steps for f in like.runs} if like else {}
 
         def one(run: Run) -> Filtered:
             return self.filtered(run, values, slopes=slopes, keep=keep, most=most.get(run.name))
@@ -656,9 +661,9 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
     slid = max(float(np.sum(np.abs(r.drive(r.t[1:])) * np.diff(r.t))) for r in runs)
     spacing = min(dt for r in runs for dt in r.sampling.spacings)
     longest = max(float(r.t[-1] - r.t[0]) for r in runs)
-    length = max(slid, 1e-6) / PIECES
+    length = max(slid, 1e-6) / LENGTHS_IN_SLIP
     found: dict[Any, tuple[float, float, float]] = {
-        "field_amplitude": (WIDE[0] * friction, SMALL * friction, 0.3 * friction),
+        "field_amplitude": (WIDE[0] * friction, LEAST_FIELD * friction, 0.3 * friction),
         "field_length": (length, length / 100, 10 * length),
     }
     for what in {s.observable for r in runs for s in r.signals}:
@@ -669,7 +674,7 @@ def _scales(runs: Sequence[Run]) -> dict[Any, tuple[float, float, float]]:
             ("gauge_white", what): (level, quiet / 30, 100 * level),
             ("gauge_colour", what): (level, quiet / 100, 100 * level),
             ("gauge_time", what): (10 * spacing, spacing, longest),
-            ("gauge_frequency", what): (0.1 / spacing, 1 / longest, FASTEST / spacing),
+            ("gauge_frequency", what): (0.1 / spacing, 1 / longest, FASTEST_OSCILLATION / spacing),
             ("gauge_quality", what): (0.5, *QUALITY),
         }
     return found
@@ -722,7 +727,7 @@ def maximise(
     x: Array,
     *,
     held: Sequence[str] = (),
-    steps: int = STEPS,
+    steps: int = SCORING_STEPS,
     close: float = CONVERGED,
     widths: Sequence[float] | None = None,
     progress: Callable[[str], None] = lambda text: None,
@@ -832,12 +837,12 @@ def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Po
 def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -> tuple[Array, Array, list[Array]]:
     """Return score and information with a weight (m,) for each reading, and the weights by run: those of effective variances.
 
-    Each parameter that is `free` (k,) is taken to be uncertain by the share `width` of itself, or by WIDEST times `width` of its
-    standard errors if that is less, and the variance of a reading to be larger by what that makes of it. So a reading has no say
-    on what it tells only next to the parameters where it was differentiated: each in the fall of a stick-slip cycle would give
-    the likelihood a narrow maximum for each way in which falls meet samples. A weight rests on earlier readings alone, so that
-    the weighted score is zero on average at the true parameters. Where two crossings merge and vanish a critical load has slopes
-    without end, and no say, so that its jump is no barrier. Orear, Am. J. Phys. 50 (1982).
+    Each parameter that is `free` (k,) is taken to be uncertain by the share `width` of itself, or by WIDEST_ERRORS times
+    `width` of its standard errors if that is less, and the variance of a reading to be larger by what that makes of it. So a
+    reading has no say on what it tells only next to the parameters where it was differentiated: each in the fall of a stick-
+    slip cycle would give the likelihood a narrow maximum for each way in which falls meet samples. A weight rests on earlier
+    readings alone, so that the weighted score is zero on average at the true parameters. Where two crossings merge and vanish
+    a critical load has slopes without end, and no say, so that its jump is no barrier. Orear, Am. J. Phys. 50 (1982).
     """
     k, own = len(likelihood.names), free & np.isin(likelihood.names, likelihood.problem.names)
     whites = [f.white for f in point.runs] + [t.white for t in point.tables]
@@ -847,7 +852,7 @@ def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -
     ]
     widest = np.where(own, width * np.where(likelihood.logarithmic, 1.0, np.abs(point.x)), 0.0)
     uncertain = widest
-    for _ in range(ROUNDS):
+    for _ in range(WEIGHT_ROUNDS):
         score, information, weights = np.zeros(k), np.zeros((k, k)), []
         for at, a, b, slope in runs:
             w = 1 / (1 + (a**2 + 0.5 * b**2) @ uncertain[at] ** 2)
@@ -855,7 +860,7 @@ def _weighted(likelihood: Likelihood, point: Point, width: float, free: Array) -
             information[np.ix_(at, at)] += a.T @ (a * w[:, None]) + 0.5 * b.T @ (b * w[:, None])
             weights.append(w)
         before, errors = uncertain, 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-        uncertain = np.minimum(widest, WIDEST * width * errors)
+        uncertain = np.minimum(widest, WIDEST_ERRORS * width * errors)
         if np.allclose(uncertain, before, rtol=0.1):
             break
     return score, information, weights
@@ -1078,13 +1083,13 @@ def fit_state_space(
     thorough: bool = True,
     beside: bool = True,
     close: float = CONVERGED,
-    rtol: float = RTOL,
+    rtol: float = FILTER_RTOL,
     progress: Callable[[str], None] = lambda text: None,
 ) -> StateSpaceFit:
     """Return the maximum-likelihood fit of parameters, random friction field and gauge noise, `close` standard errors or nearer.
 
     From `start`, the problem's own start values if left out; where it holds field_amplitude, the field is not looked for first.
-    More than LONG readings are fitted in two steps: every so-many-th of them, then all from there; `part` is the first step's fit
+    More than MANY_READINGS are fitted in two steps: every so-many-th of them, then all from there; `part` is the first step's fit
     where it is known.
     `smooth` says whether there is no field; left out, there is one where it gains 2 in log likelihood. `processes` says which
     of coloured noise the gauge has, words of PROCESSES; left out, Schwarz's criterion decides, early and, if the fit is to be
@@ -1150,10 +1155,10 @@ def stopped(problem: Problem, values: Mapping[str, float]) -> StateSpaceFit:
 
 
 def thinned(runs: tuple[Run, ...]) -> tuple[Run, ...]:
-    """Return the runs with LONG readings at most; the same runs where they have no more."""
-    if sum(run.t.size for run in runs) <= LONG:
+    """Return the runs with MANY_READINGS readings at most; the same runs where they have no more."""
+    if sum(run.t.size for run in runs) <= MANY_READINGS:
         return runs
-    return tuple(run.thinned(-(-run.t.size * len(runs) // LONG)) for run in runs)
+    return tuple(run.thinned(-(-run.t.size * len(runs) // MANY_READINGS)) for run in runs)
 
 
 def _carried(found: StateSpaceFit, likelihood: Likelihood) -> dict[str, float]:
@@ -1207,11 +1212,11 @@ def _fitted(
     def from_any(starts: Sequence[Array]) -> Maximum | None:
         """Return the maximum from the first start that leads near one, or the likeliest that was reached from a few."""
         found: Maximum | None = None
-        for x in starts[:TRIES]:
-            other = maximise(wide, x, steps=STEPS // 2 if fresh else 12, close=1.0, progress=progress)
+        for x in starts[:FIELD_TRIES]:
+            other = maximise(wide, x, steps=SCORING_STEPS // 2 if fresh else 12, close=1.0, progress=progress)
             if found is None or other.point.log_likelihood > found.point.log_likelihood:
                 found = other
-            if other.away < LOST:
+            if other.away < NOT_CONVERGED:
                 break
         return found
 
@@ -1220,7 +1225,7 @@ def _fitted(
         found = from_any(_elsewhere(wide, wide.coordinates(start), progress))
     assert found is not None
     if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
-        found = maximise(wide, found.point.x, steps=STEPS // 2, close=1.0, progress=progress)
+        found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
     best = StateSpaceFit(wide, found)
     if found.status is Status.INTEGRATION:
         return best
@@ -1243,7 +1248,7 @@ def _fitted(
             if fresh and _short_field(best):  # which may have led the other parameters astray
                 k = len(instead.problem.names)
                 x = np.concatenate([instead.coordinates(start)[:k], other.maximum.point.x[k:]])
-                anew = maximise(instead, x, steps=STEPS // 2, close=1.0, progress=progress)
+                anew = maximise(instead, x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
                 other = max(other, StateSpaceFit(instead, anew), key=lambda f: f.log_likelihood)
             if other.criterion > best.criterion - CLOSE_CALL:
                 own = maximise(instead, other.maximum.point.x, close=close, progress=progress)
@@ -1260,18 +1265,19 @@ def _fitted(
 def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFit:
     """Return a fit without a field, with what fields that are too faint to be told add to its covariance.
 
-    Averaged over amplitudes, the prior even in their logarithm from SMALL on, and over lengths, each with the posterior of the
-    other parameters by Laplace's method, one step of scoring from the fit (Rue, Martino and Chopin, J. R. Stat. Soc. B 71, 2009).
+    Averaged over amplitudes, the prior even in their logarithm from LEAST_FIELD on, and over lengths, each with the posterior
+    of the other parameters by Laplace's method, one step of scoring from the fit (Rue, Martino and Chopin, J. R. Stat. Soc. B
+    71, 2009).
     """
     plain, maximum = fitted.likelihood, fitted.maximum
     inner = np.nonzero(np.diag(maximum.covariance) > 0)[0]
     at = [rough.names.index(plain.names[i]) for i in inner]
-    bare, logs = rough.coordinates(fitted.values), np.log(np.array(FAINT_FIELDS) * FAINT / SMALL)
+    bare, logs = rough.coordinates(fitted.values), np.log(np.array(FAINT_FIELDS) * FAINT_FIELD / LEAST_FIELD)
     prior = np.array([logs[0], *np.repeat(np.gradient(logs), len(SHORT)) / len(SHORT)])  # below the first it is as none
     evidence, moves, covariances = [_laplace(maximum.point, inner)[0]], [np.zeros(inner.size)], []
     covariances.append(maximum.covariance[np.ix_(inner, inner)])
     for share, short in product(FAINT_FIELDS, SHORT):
-        x = _under_field(rough, bare, share * FAINT, short)
+        x = _under_field(rough, bare, share * FAINT_FIELD, short)
         likely = rough.at(x, slopes=False).log_likelihood > fitted.log_likelihood - DOWN
         point = rough.at(x, slopes=likely)
         if not likely:
@@ -1333,9 +1339,9 @@ def _ridges(likelihood: Likelihood, maximum: Maximum) -> list[int]:
     found, point, variances = [], maximum.point, np.diag(maximum.covariance)
     for j in np.nonzero(variances[: len(likelihood.problem.names)] > 0)[0].tolist():
         d = PROBE * np.sqrt(variances[j])
-        if d < REACH * _size(likelihood, point, j):
+        if d < RIDGE_REACH * _size(likelihood, point, j):
             lost = [point.log_likelihood - _along(likelihood, maximum, j, side * d).log_likelihood for side in (1, -1)]
-            if min(lost) < BENT * PROBE**2 / 2:
+            if min(lost) < LOST_CURVATURE * PROBE**2 / 2:
                 found.append(j)
     return found
 
@@ -1359,12 +1365,12 @@ def _along_ridges(likelihood: Likelihood, maximum: Maximum, close: float, progre
 
 
 def _walked(likelihood: Likelihood, maximum: Maximum, j: int, close: float, progress: Callable[[str], None]) -> Maximum:
-    stride = STRIDE * _size(likelihood, maximum.point, j)
+    stride = RIDGE_STRIDE * _size(likelihood, maximum.point, j)
     column = maximum.covariance[:, j] / maximum.covariance[j, j]
     best = maximum.point
     for side in (1, -1):
         x, top = maximum.point.x, maximum.point.log_likelihood
-        for _ in range(int(REACH / STRIDE)):
+        for _ in range(int(RIDGE_REACH / RIDGE_STRIDE)):
             x = np.clip(x + side * stride * column, likelihood.lower, likelihood.upper)
             there = maximise(likelihood, x, held=[likelihood.names[j]], steps=2, widths=()).point
             if not there.log_likelihood > top - DOWN:
@@ -1382,7 +1388,7 @@ def _beside(likelihood: Likelihood, maximum: Maximum, j: int) -> tuple[Point, Ar
     """Return the likeliest point on the ridge of parameter j, and what the points there add to the covariance (k, k)."""
     column, s = maximum.covariance[:, j] / maximum.covariance[j, j], float(np.sqrt(maximum.covariance[j, j]))
     points, places = [maximum.point], [0.0]
-    count = int(np.clip(STRIDE * _size(likelihood, maximum.point, j) / (2 * s), *FINE))
+    count = int(np.clip(RIDGE_STRIDE * _size(likelihood, maximum.point, j) / (2 * s), *NEIGHBOUR_STEPS))
     for side in (1, -1):
         for k in range(1, count + 1):
             points.append(_along(likelihood, maximum, j, side * 2 * k * s))
@@ -1542,7 +1548,7 @@ def _with_or_without(
         return StateSpaceFit(rough, own)
     plain = likelihood(True, rough.processes)
     at, before, found = rough.names.index("field_amplitude"), rough.evaluations, begun.maximum
-    faint = rough.lower[at] + np.log(FAINT / SMALL)
+    faint = rough.lower[at] + np.log(FAINT_FIELD / LEAST_FIELD)
 
     def bare(steps: int) -> StateSpaceFit:
         progress("without a field")
@@ -1554,7 +1560,7 @@ def _with_or_without(
     if not np.isfinite(found.away):
         found = maximise(rough, found.point.x, close=close, progress=progress)
     elsewhere = False  # a field finer than the samples, or one that is slow, may be a maximum of its own
-    while rough.evaluations - before < STEPS:
+    while rough.evaluations - before < SCORING_STEPS:
         last = found.point.x
         found = maximise(rough, last, steps=3, close=close, widths=(), progress=progress)
         if found.away < close or np.array_equal(found.point.x, last):
@@ -1563,7 +1569,7 @@ def _with_or_without(
                 break
             elsewhere, found = True, replace(found, point=other)
             continue
-        if found.point.x[at] < last[at] - SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
+        if found.point.x[at] < last[at] - FIELD_SHRINKS:  # a field that vanishes takes many steps: how far is asked at once
             found = replace(found, point=_shrunk(rough, found.point, at))
         if last[at] > found.point.x[at] and found.point.x[at] < faint and tried is None and smooth is None:
             tried = bare(BARE_STEPS)
@@ -1579,7 +1585,7 @@ def _with_or_without(
         return best
     lost = found.point.log_likelihood - HOPELESS
     if smooth or (tried is None and plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood > lost):
-        tried = bare(STEPS)
+        tried = bare(SCORING_STEPS)
     if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
         return best
     if tried.maximum.away < close:
@@ -1596,13 +1602,13 @@ def _small_field(rough: Likelihood, bare: Point) -> Point | None:
     x, middle = rough.coordinates(bare.values), len(SHORT) // 2
 
     def tried(share: float, short: float) -> tuple[float, float, float]:
-        return rough.at(_under_field(rough, x, share * FAINT, short), slopes=False).log_likelihood, share, short
+        return rough.at(_under_field(rough, x, share * FAINT_FIELD, short), slopes=False).log_likelihood, share, short
 
     likeliest = max(tried(share, SHORT[middle]) for share in FAINT_FIELDS)
     height, share, short = max(likeliest, *(tried(likeliest[1], s) for s in (*SHORT[:middle], *SHORT[middle + 1 :])))
     if not np.isfinite(height):
         return None
-    x, least = _under_field(rough, x, share * FAINT, short), bare.log_likelihood + NEEDED
+    x, least = _under_field(rough, x, share * FAINT_FIELD, short), bare.log_likelihood + NEEDED
     for _ in range(FIELD_STEPS // 2):
         found = maximise(rough, x, steps=2, widths=())
         if found.promised < least or found.away < CONVERGED or np.array_equal(found.point.x, x):
@@ -1615,7 +1621,7 @@ def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
     """Return the point with the likeliest of ever smaller amplitudes of the field, the other parameters as they are."""
     best, x = (point.log_likelihood, point.x), point.x.copy()
     while x[at] > rough.lower[at]:
-        x[at] = max(x[at] - SHRINKS, rough.lower[at])
+        x[at] = max(x[at] - FIELD_SHRINKS, rough.lower[at])
         found = rough.at(x, slopes=False).log_likelihood
         if found < best[0]:
             break
@@ -1670,14 +1676,14 @@ def _slow_fields(wider: Likelihood, x: Array) -> Iterator[Array]:
     if wider.smooth:
         return
     for share in (0.1, 1.0):
-        yield _under_field(wider, x, share * FAINT, 1.0)
+        yield _under_field(wider, x, share * FAINT_FIELD, 1.0)
 
 
 def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Array:
     """Return x under a field of amplitude `wide` over the friction of the recordings, its length `short` times the start's."""
     amplitude, length = (rough.names.index(n) for n in FIELD)
     found = x.copy()
-    found[amplitude], found[length] = rough.lower[amplitude] + np.log(wide / SMALL), rough.start[length] + np.log(short)
+    found[amplitude], found[length] = rough.lower[amplitude] + np.log(wide / LEAST_FIELD), rough.start[length] + np.log(short)
     return found
 
 

@@ -37,14 +37,14 @@ from srfcli.numerics.hopf import HopfPoint, hopf_points, steady_is_stable
 #     dg/dq = g_q - g_x (M - I)^-1 x_q,   dW0c/dq = -(dg/dq) / (dg/dW0).
 # Under constant load it solves P(i Omega; W0) = 0, P the characteristic polynomial, whose derivatives are complex steps.
 
-NEAR = 1.6  # loads within this factor of the datum are surveyed first
-FAR = 8.0  # and within this one if that does not decide; a crossing further off counts as missing
+NEAR_LOADS = 1.6  # loads within this factor of the datum are surveyed first
+FAR_CROSSING = 8.0  # and within this one if that does not decide; a crossing further off counts as missing
 DENSITY = 42.0  # samples of a survey per unit of ln W0, as `srf critical` has them
 LEAST_SAMPLES = 10  # of a survey
-REACH = 0.2  # of ln W0, summed over the parameters' changes since a line's survey: further on it is surveyed again
-CLOSE = 0.1  # of the datum's load: a crossing further off than this is followed only to know how far to look
+SURVEY_REACH = 0.2  # of ln W0, summed over the parameters' changes since a line's survey: further on it is surveyed again
+CLOSE_CROSSING = 0.1  # of the datum's load: a crossing further off than this is followed only to know how far to look
 MOST_MOVED = 0.2  # in ln W0 from where a crossing was expected: it is another one then
-STALE = 0.03  # in ln W0: derivatives from further off no longer predict
+STALE_SLOPES = 0.03  # in ln W0: derivatives from further off no longer predict
 RIVAL = (2.0, 0.05)  # crossings within this many times the nearest's distance, and this share of the load, are followed too
 MAX_MESH = 512
 
@@ -62,7 +62,7 @@ class Crossing:
         """Return the load that the derivatives promise at coordinates `y`, moved by no more than a factor e^0.2."""
         if self.rates is None:
             return self.load
-        return float(self.load * np.exp(np.clip(self.rates @ (y - self.y), -REACH, REACH)))
+        return float(self.load * np.exp(np.clip(self.rates @ (y - self.y), -SURVEY_REACH, SURVEY_REACH)))
 
 
 @dataclass(frozen=True)
@@ -179,14 +179,14 @@ class Matcher:
         """Set the odd crossings of a line under constant load: all of them are roots of a polynomial."""
         datum, line = self.table.W0c[i], self._lines[i]
         points = [q for q in hopf_points(self.model, p) if q.leading and q.crossing_rate > 0]
-        line.odd = [Crossing(q.W0, q, y) for q in points if datum / FAR <= q.W0 <= datum * FAR]
+        line.odd = [Crossing(q.W0, q, y) for q in points if datum / FAR_CROSSING <= q.W0 <= datum * FAR_CROSSING]
         if not line.odd:
-            line.end = datum * FAR if steady_is_stable(self.model, p, datum / FAR) else datum / FAR
+            line.end = datum * FAR_CROSSING if steady_is_stable(self.model, p, datum / FAR_CROSSING) else datum / FAR_CROSSING
 
     def _survey(self, i: int, y: Array, p: Array, first: float | None) -> None:
         """Set the odd crossings of a line by a search of its own: near the datum, and further where that decides nothing."""
         datum, line = self.table.W0c[i], self._lines[i]
-        for reach in (NEAR, FAR) if first is None else (first, NEAR, FAR):
+        for reach in (NEAR_LOADS, FAR_CROSSING) if first is None else (first, NEAR_LOADS, FAR_CROSSING):
             samples = max(int(2 * np.log(reach) * DENSITY), LEAST_SAMPLES)
             found = critical_line(
                 self.model, p, lo=datum / reach, hi=datum * reach, tol=self.tol, samples=samples, max_mesh=MAX_MESH
@@ -197,7 +197,7 @@ class Matcher:
             if nearest <= datum * (1 - 1 / reach):
                 break  # whatever lies outside is further off
         g = found.scan.g[np.isfinite(found.scan.g)]
-        line.end = datum / FAR if g.size and g[0] > 0 else datum * FAR
+        line.end = datum / FAR_CROSSING if g.size and g[0] > 0 else datum * FAR_CROSSING
         line.surveyed = y
         self.surveys += 1
 
@@ -224,17 +224,17 @@ class Matcher:
                 continue
             reached.setdefault(i, []).append(value)
             self._lines[i].odd[j] = self._moved(self._lines[i].odd[j], value, point, y)
-        far = {i for i, values in reached.items() if min(abs(w / self.table.W0c[i] - 1) for w in values) > CLOSE}
+        far = {i for i, values in reached.items() if min(abs(w / self.table.W0c[i] - 1) for w in values) > CLOSE_CROSSING}
         return wanted | far
 
     def _far(self, line: _Line, y: Array) -> bool:
         if line.surveyed is None or line.rates is None:
             return True
-        return float(line.rates @ np.abs(y - line.surveyed)) > REACH
+        return float(line.rates @ np.abs(y - line.surveyed)) > SURVEY_REACH
 
     def _moved(self, old: Crossing, load: float, point: BoundaryPoint, y: Array) -> Crossing:
-        good = old.rates is not None and abs(np.log(load / old.expected(y))) < STALE * STALE
-        small = old.rates is not None and np.abs(old.rates) @ np.abs(y - old.y) < STALE
+        good = old.rates is not None and abs(np.log(load / old.expected(y))) < STALE_SLOPES * STALE_SLOPES
+        small = old.rates is not None and np.abs(old.rates) @ np.abs(y - old.y) < STALE_SLOPES
         return Crossing(load, point, y, old.rates if good or small else None)
 
     def _polish(self, tracked: list[tuple[int, int, float]], p: Array) -> list[BoundaryPoint]:
@@ -285,8 +285,8 @@ def wanted_reach(line: _Line, datum: float, y: Array) -> float | None:
     None where no crossing was followed there, or so far that a survey of the usual width costs no more.
     """
     near = [abs(c.load / datum - 1) for c in line.odd if c.y is y]
-    reach = 1.02 / (1 - min(near)) if near and min(near) < 0.9 else NEAR
-    return reach if reach < NEAR else None
+    reach = 1.02 / (1 - min(near)) if near and min(near) < 0.9 else NEAR_LOADS
+    return reach if reach < NEAR_LOADS else None
 
 
 # How a critical load moves with any parameter: exact derivatives, by implicit differentiation of what defines the boundary.
@@ -349,9 +349,9 @@ def _coefficients(model: GeneratedModel, p: Array, name: str | None) -> tuple[Ar
 
 METHODS = ("powell", "least-squares")
 MAX_EVALUATIONS = 2000
-ROUNDS = 3  # fits from where a survey of the solution found nearer crossings
+SURVEY_ROUNDS = 3  # fits from where a survey of the solution found nearer crossings
 FIRST_STEP = 0.05  # in a coordinate: with it Powell's method brackets the minimum on a line
-SETTLED = 1.0, 30.0  # times the loads' accuracy: changes of chi2 and of the coordinates that end the least squares
+LEAST_CHANGES = 1.0, 30.0  # times the loads' accuracy: changes of chi2 and of the coordinates that end the least squares
 POWELL_SETTLED = 1e-4  # the same for a round of Powell's method through all directions
 PERFECT = 3.0  # times the accuracy of the critical loads: residuals all below it are as good as none
 DETOURS = 3  # times that a least squares goes around a jump of the cost
@@ -519,7 +519,7 @@ def _run(matcher: Matcher, method: str, limit: int, report: Report | None) -> Me
     first = matcher.match(y, anew=True)  # the start has to be known, interrupted or not
     surveyed = first
     try:
-        for turn in range(ROUNDS):
+        for turn in range(SURVEY_ROUNDS):
             work.best = None  # costs with other crossings do not compare
             status = minimise(work, y)
             found = work.best or first
@@ -543,7 +543,7 @@ def _changed(a: Match, b: Match) -> bool:
 def _rematched(turn: int, found: Match, surveyed: Match, table: Thresholds) -> str:
     moved = np.nonzero(np.abs(np.log(found.loads / surveyed.loads)) > 1e-3)[0]
     lines = ", ".join(str(table.lines[i]) for i in moved)
-    end = "the fit went on from there" if turn + 1 < ROUNDS else "the matching did not settle"
+    end = "the fit went on from there" if turn + 1 < SURVEY_ROUNDS else "the matching did not settle"
     return f"a survey of the solution found other crossings nearer to the data of line {lines}; {end}"
 
 
@@ -629,8 +629,8 @@ def _trust_region(work: _Work, y: Array, kept: Array) -> tuple[Status, Array]:
         jac=lambda c: work.jacobian(c)[kept],
         bounds=(low, high),
         method="trf",
-        ftol=SETTLED[0] * work.matcher.tol,
-        xtol=SETTLED[1] * work.matcher.tol,
+        ftol=LEAST_CHANGES[0] * work.matcher.tol,
+        xtol=LEAST_CHANGES[1] * work.matcher.tol,
         gtol=1e-10,
         max_nfev=work.limit,
     )
@@ -666,7 +666,7 @@ def _powell(work: _Work, y: Array) -> Status:
 AT_BOUND = 1e-6  # of the distance between the bounds, in the parameter's coordinate
 BLIND = 1e-9  # eigenvalues of the information below this share of the largest are rounding
 LOOSE = 1.0  # a standard error in ln(value) from which the data say nothing of the value
-LEAST = 0.1  # a combination lists the parameters that carry at least this share
+LEAST_SHARE = 0.1  # a combination lists the parameters that carry at least this share
 
 
 @dataclass(frozen=True)
@@ -737,7 +737,7 @@ def _weakest(scale: Scale, values: Array, vectors: Array) -> str:
     direction = vectors[:, 0] / vectors[np.argmax(np.abs(vectors[:, 0])), 0]
     terms: list[str] = []
     for q, weight in sorted(zip(scale, direction, strict=True), key=lambda t: -abs(t[1])):
-        if abs(weight) >= LEAST:
+        if abs(weight) >= LEAST_SHARE:
             name = f"ln {q.name}" if q.log else f"{q.name}/{q.size:.3g}"
             sign = ("- " if weight < 0 else "+ ") if terms else ""
             size = "" if abs(abs(weight) - 1) < 5e-3 else f"{abs(weight):.2f} "

@@ -30,7 +30,7 @@ from sympy import asinh, atan, cos, cosh, exp, log, sin, sinh, sqrt, tanh
 
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
-from srfcli.laws.effect_file import SCAN, SLOTS, check_names, finished, known_names
+from srfcli.laws.effect_file import SCANNED_VALUES, SLOTS, check_names, finished, known_names
 from srfcli.laws.expression import FUNCTIONS, expm1, log1p, symbol
 from srfcli.laws.law_file import (
     AGEING_SYMBOLS,
@@ -181,7 +181,7 @@ def effect(
             Effect(
                 name=own, parameters=listed, cites=tuple(cites), **_told(function, about),
                 changes=changes, states=extra, neutral=tuple((n, float(v)) for n, v in sizes.items()),
-                scans=tuple((p.name, SCAN) for p in listed if p.name not in sizes), needs=needed, lacks=tuple(lacks),
+                scans=tuple((p.name, SCANNED_VALUES) for p in listed if p.name not in sizes), needs=needed, lacks=tuple(lacks),
                 observed=observed, constitutive=constitutive, wrong=wrong, remedy=remedy,
             )
         )  # fmt: skip

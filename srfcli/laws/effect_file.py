@@ -23,8 +23,8 @@ KEYS = (
     "format", "kind", "name", "about", "cites", "parameters", "constants", *SLOTS, "states", "settings", "frees", "needs",
     "lacks", "observed", "constitutive", "answers", "on_request", "wrong", "remedy",
 )  # fmt: skip
-MOST = 1000  # values of an inner parameter
-SCAN = 8  # values at which an inner parameter is tried where its author says nothing
+MOST_VALUES = 1000  # values of an inner parameter
+SCANNED_VALUES = 8  # values at which an inner parameter is tried where its author says nothing
 _TAKEN = {*PLACES, *RUN_NAMES, *COMMON, "mu", "W", "v", "phi", "u", "kappa", "force", "gauge", "start", "begin"}
 _OWN = ("neutral", "scan", "within", "typical", "fixed")  # keys of a parameter that an effect has and a law has not
 _PARAMETER = ("default", "unit", "lower", "upper", "bounds", "about", *_OWN)
@@ -149,9 +149,9 @@ class EffectReader(LawReader):
                 if "scan" in entry:
                     self.fail(f"{where}.scan", "given together with fixed", "What is never fitted is tried at no values.")
                 continue
-            count = self.number(f"{where}.scan", entry.get("scan", SCAN))
-            if not (count.is_integer() and 1 <= count <= MOST):
-                self.fail(f"{where}.scan", f"found {count:g}, expected a whole number of values to try, up to {MOST}")
+            count = self.number(f"{where}.scan", entry.get("scan", SCANNED_VALUES))
+            if not (count.is_integer() and 1 <= count <= MOST_VALUES):
+                self.fail(f"{where}.scan", f"found {count:g}, expected a whole number of values to try, up to {MOST_VALUES}")
             scans.append((name, int(count)))
         return tuple(neutral), tuple(scans)
 

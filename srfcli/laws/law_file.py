@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     import sympy
 
 FORMAT = "srf-law/1"
-KINDS = ("friction", "ageing", "modifier", "interface")
-PLUGIN_KINDS = (*KINDS, "effect", "reader")
+LAW_KINDS = ("friction", "ageing", "modifier", "interface")
+PLUGIN_KINDS = (*LAW_KINDS, "effect", "reader")
 FORMULA = {"friction": "mu", "ageing": "rate", "modifier": "term", "interface": "kappa"}  # also the checked quantity
 COMMON = ("mu0", "A", "B", "D0", "V0")  # friction parameters that an ageing law may name
 AGEING_SYMBOLS = ("v", "phi", "mu", "mu_dot", "W", "W_dot", "F_dot_over_W")
-APPARATUS = ("V", "W0", "eps", "f", "K", "M", "angle")  # of the system, which would take a law's parameter for its own
+RESERVED = ("V", "W0", "eps", "f", "K", "M", "angle")  # of the system, which would take a law's parameter for its own
 # names that mean something in every law or system; a parameter cannot take them
-VARIABLES = (*AGEING_SYMBOLS, *APPARATUS, "kappa", "rate", "term", "u", "z")
+VARIABLES = (*AGEING_SYMBOLS, *RESERVED, "kappa", "rate", "term", "u", "z")
 LAW_CLASSES: dict[str, type[Law]] = {
     "friction": FrictionLaw,
     "ageing": AgeingLaw,
@@ -188,7 +188,7 @@ class LawReader:
             said = "nothing" if found is None else _shown(found)
             self.fail("format", f"found {said}, expected {FORMAT!r}", f'Start the file with format = "{FORMAT}".')
         kind = self.table.get("kind")
-        known = (*KINDS, "effect")
+        known = (*LAW_KINDS, "effect")
         if kind not in known:
             said = "nothing" if kind is None else _shown(kind)
             self.fail("kind", f"found {said}, expected one of {', '.join(known)}", did_you_mean(str(kind), known))

@@ -28,7 +28,7 @@ from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, read_header, 
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Law, Reader
 
 GROUP = "srf.laws"
-ASKED = ("--plugins", "SRF_PLUGINS")
+PLUGIN_SOURCES = ("--plugins", "SRF_PLUGINS")
 CHECK_PATH = "Check path and permissions."
 
 
@@ -180,7 +180,7 @@ def load_registry(
             collect.entry_point(point)
     if user and user_folder().is_dir():
         collect.folder("user", user_folder())
-    by_option, by_environment = ASKED
+    by_option, by_environment = PLUGIN_SOURCES
     asked = [(p, by_option) for p in plugins]
     asked += [(Path(p), by_environment) for p in os.environ.get("SRF_PLUGINS", "").split(os.pathsep) if p]
     for path, origin in asked:
@@ -278,7 +278,7 @@ class _Collector:
             message = f"{folder}: cannot be read: {error.strerror}"
             self.problems.append(Problem(folder.name, origin, str(folder), message, CHECK_PATH))
             return
-        if not paths and origin in ASKED:
+        if not paths and origin in PLUGIN_SOURCES:
             message = f"{folder} holds no law: no file there ends in .toml or .py"
             self.problems.append(Problem(folder.name, origin, str(folder), message, "Name the folder that holds them."))
         for path in paths:

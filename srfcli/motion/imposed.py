@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # The imposed normal load: constant, modulated, or any other; um, s, N.
 
 LoadPiece = Callable[[float], tuple[float, float]]
-PIECES = 16  # polynomials per period of a modulation: degree 7 then errs by 4e-13 of its amplitude
+PIECES_PER_PERIOD = 16  # polynomials per period of a modulation: degree 7 then errs by 4e-13 of its amplitude
 DEGREE = 7
 
 
@@ -174,7 +174,7 @@ class Modulation(Load):
             middle = 0.5 * (a + b)
             if self.eps and middle >= self.onset:
                 length = 1 / self.f if middle >= self.full else min(1 / self.f, self.full - self.onset)
-                edges = np.linspace(a, b, math.ceil((b - a) * PIECES / length) + 1)
+                edges = np.linspace(a, b, math.ceil((b - a) * PIECES_PER_PERIOD / length) + 1)
             rows.append(fit_polynomials(partial(self._on_piece, at=middle), edges))
             knots.append(edges[1:])
         return np.concatenate(knots), np.concatenate(rows)
@@ -223,15 +223,15 @@ def _check_positive(name: str, value: float) -> None:
 
 # A measured load as piecewise polynomials; um, s, N.
 
-UNEVEN = 1.6  # ratio of an interval to its neighbours' median at which a stretch ends
+UNEVEN_INTERVAL = 1.6  # ratio of an interval to its neighbours' median at which a stretch ends
 WANDER = 10.0  # times the median of the logarithms of these ratios, if that is more: of times that are all uneven
-SHORTEST = 16  # samples of a stretch that carries the spline
-REACH = 4  # samples on each side from which a sample is interpolated
+SHORTEST_STRETCH = 16  # samples of a stretch that carries the spline
+INTERPOLATION_SAMPLES = 4  # samples on each side from which a sample is interpolated
 ROUGH = 0.02  # share of the local range by which a sample may differ from what its neighbours predict
-FAINT = 1e-4  # share of the whole range below which nothing is a corner
+LEAST_CORNER = 1e-4  # share of the whole range below which nothing is a corner
 MOSTLY = 0.3  # share of rough samples at which a load is coarsely sampled rather than cornered
 SPACINGS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # samples between the knots of a smoothing spline
-BLOCK = 32  # samples over which the smoothness may vary
+SMOOTHING_BLOCK = 32  # samples over which the smoothness may vary
 
 
 class SampledLoad(Load):
@@ -338,7 +338,7 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
     """Return first and last sample of the stretches that carry a spline: as evenly sampled as all is, without jump or corner."""
     steps = np.diff(t)
     usual = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(steps, 2, mode="edge"), 5), axis=1)
-    longer, allowed = np.log(steps / usual), float(np.log(UNEVEN))
+    longer, allowed = np.log(steps / usual), float(np.log(UNEVEN_INTERVAL))
     wander = WANDER * float(np.median(np.abs(longer)))
     if wander > allowed:  # of times that wander, a spline goes through what they are: a short interval is none to bridge
         even, change = longer < wander, np.abs(np.diff(np.log(usual))) > wander
@@ -347,7 +347,7 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
     found = []
     for a, b in runs_of(even):
         cuts = [a, *(a + 1 + np.flatnonzero(change[a:b])).tolist(), b + 1]
-        found += [(c, d) for c, d in pairwise(cuts) if d - c >= SHORTEST - 1]
+        found += [(c, d) for c, d in pairwise(cuts) if d - c >= SHORTEST_STRETCH - 1]
     total = float(np.ptp(W))
     smooth = []
     for a, b in found:
@@ -355,7 +355,7 @@ def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
         if rough.mean() > MOSTLY:
             rough[:] = False
         calm = ~(rough[1:] | rough[:-1])  # intervals between two samples that their neighbours predict
-        smooth += [(a + c, a + d + 1) for c, d in runs_of(calm) if d - c >= SHORTEST - 2]
+        smooth += [(a + c, a + d + 1) for c, d in runs_of(calm) if d - c >= SHORTEST_STRETCH - 2]
     return smooth
 
 
@@ -377,10 +377,12 @@ def _rough(t: Array, W: Array, total: float, noise: float) -> NDArray[np.bool_]:
     """Return which samples of a stretch the polynomial through their eight neighbours does not predict."""
     from numpy.lib.stride_tricks import sliding_window_view
 
-    error, unit = interpolation_error(t, W, REACH)
-    ranges = np.ptp(sliding_window_view(W, 2 * REACH + 1), axis=1)
+    error, unit = interpolation_error(t, W, INTERPOLATION_SAMPLES)
+    ranges = np.ptp(sliding_window_view(W, 2 * INTERPOLATION_SAMPLES + 1), axis=1)
     rough = np.zeros(W.size, bool)
-    rough[REACH:-REACH] = error > np.maximum(ROUGH * ranges, np.maximum(FAINT * total, 5 * noise * unit))
+    rough[INTERPOLATION_SAMPLES:-INTERPOLATION_SAMPLES] = error > np.maximum(
+        ROUGH * ranges, np.maximum(LEAST_CORNER * total, 5 * noise * unit)
+    )
     return rough
 
 
@@ -409,18 +411,18 @@ def _spline(t: Array, W: Array, noise: float) -> tuple[Array, Array]:
 def _smoothing(x: Array, y: Array, noise: float) -> BSpline:
     """Return the least-squares spline with as many knots as generalised cross-validation wants, more or fewer where need be."""
     n = x.size
-    edges = np.arange(0, n, BLOCK)
+    edges = np.arange(0, n, SMOOTHING_BLOCK)
     spacings = [m for m in SPACINGS if m <= max(n // 4, 2)]
     squares = [(y - _least_squares(x, y, x[4 * m : n - 4 * m : m])(x)) ** 2 for m in spacings]
     overall = int(np.argmin([q.sum() / (1 - 1 / m) ** 2 for q, m in zip(squares, spacings, strict=True)]))
     padded = [np.pad(np.add.reduceat(q, edges), 1) for q in squares]
     misfit = np.array([q[:-2] + q[1:-1] + q[2:] for q in padded]) / noise**2  # of a block and its neighbours
-    chosen = _spacings(misfit, np.array(spacings, float), 3.0 * BLOCK, overall)
+    chosen = _spacings(misfit, np.array(spacings, float), 3.0 * SMOOTHING_BLOCK, overall)
     places: list[int] = []
     index = 0
     while True:
-        ahead = min(index + BLOCK // 2, n - 1) // BLOCK
-        need = spacings[min(int(chosen[index // BLOCK]), int(chosen[ahead]))]
+        ahead = min(index + SMOOTHING_BLOCK // 2, n - 1) // SMOOTHING_BLOCK
+        need = spacings[min(int(chosen[index // SMOOTHING_BLOCK]), int(chosen[ahead]))]
         index += 4 * need if not places else need  # as at a not-a-knot end: more pieces there would follow the noise
         if n - 1 - index < 4 * need:
             break
@@ -494,7 +496,7 @@ def _end(fit: tuple[Array, Array]) -> tuple[float, float]:
 # Normal loads composed of pieces: steps, holds and ramps with rounded corners, and a modulation on top of any load.
 
 RAMP_DEGREE = 6  # of a rounded ramp: the integral of the fifth-degree step
-NEAR = 1e-4  # corners closer than this share of the rise are one: W is then off by 1e-11 of the step
+ONE_CORNER = 1e-4  # corners closer than this share of the rise are one: W is then off by 1e-11 of the step
 
 
 @dataclass(frozen=True)
@@ -543,7 +545,7 @@ class LoadSteps(Load):
         times = sorted({t + shift for t, _, _ in self.corners for shift in (0.0, self.rise)})
         kept: list[float] = []
         for t in times:
-            if not kept or t - kept[-1] > NEAR * self.rise:
+            if not kept or t - kept[-1] > ONE_CORNER * self.rise:
                 kept.append(t)
         return tuple(kept)
 

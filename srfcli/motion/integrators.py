@@ -30,11 +30,11 @@ from srfcli.codegen.splines import Spline, appended, tables_after
 from srfcli.core.errors import SrfError, Status
 from srfcli.motion.imposed import Drive, Load
 
-PATIENCE = 0.1  # s between looks for a signal where waiting for a thread cannot be interrupted (Windows)
+SIGNAL_INTERVAL = 0.1  # s between looks for a signal where waiting for a thread cannot be interrupted (Windows)
 MAX_STEPS = 20_000_000  # of the compiled integrator, in all; a hundred times an hour of modulation
 MAX_LSODA_STEPS = 200_000  # between two output times
 S_SHARE = 100.0  # sensitivities are solved so much less closely than states; without any control they diverge
-BEYOND = 1e100  # a rate where the formula overflows: the step is then rejected and cut
+OVERFLOWN_RATE = 1e100  # a rate where the formula overflows: the step is then rejected and cut
 
 Rates = Callable[[float, Array], object]
 
@@ -149,7 +149,7 @@ def interruptible(call: Callable[[], int], stop: ctypes.c_int) -> int:
     worker.start()
     try:
         while worker.is_alive():
-            worker.join(PATIENCE)
+            worker.join(SIGNAL_INTERVAL)
     except BaseException:
         stop.value = 1
         worker.join()  # the arrays it writes into are still its own
@@ -241,13 +241,13 @@ class _Rates:
             try:
                 return self.rates(y.tolist(), *inputs(t))
             except (ArithmeticError, ValueError):
-                return np.full(n, BEYOND)
+                return np.full(n, OVERFLOWN_RATE)
 
         def jacobian(t: float, y: Array) -> object:
             try:
                 return self.jacobian(y.tolist(), *inputs(t))
             except (ArithmeticError, ValueError):
-                return np.full((n, n), BEYOND)
+                return np.full((n, n), OVERFLOWN_RATE)
 
         def augmented(t: float, y: Array) -> object:
             x, given = y[:n].tolist(), inputs(t)
@@ -256,7 +256,7 @@ class _Rates:
                 S_rate = np.array(self.jacobian(x, *given)) @ y[n:].reshape(n, k) + direct
                 return np.concatenate([self.rates(x, *given), S_rate.ravel()])
             except (ArithmeticError, ValueError):
-                return np.full(n * (1 + k), BEYOND)
+                return np.full(n * (1 + k), OVERFLOWN_RATE)
 
         return (augmented if k else rates), jacobian
 

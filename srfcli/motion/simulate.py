@@ -117,8 +117,8 @@ def _trace(
 
 # Stick-slip in a record: where the spring lets go, by how much and how often.
 
-SHARE = 0.3  # of the typical drop: what falls by less is no event
-NOISE = 8.0  # standard deviations of the samples' scatter that an event must exceed
+EVENT_DROP = 0.3  # of the typical drop: what falls by less is no event
+EVENT_NOISE = 8.0  # standard deviations of the samples' scatter that an event must exceed
 FLOOR = 1e-5  # of the largest elongation: below it lies what integration and rounding do
 DECAY = 0.7  # the drops of the second half against those of the first, of an oscillation that lasts
 
@@ -181,10 +181,10 @@ def stick_slip(t: Array, u: Array, *, ripple: float | None = None, smallest: flo
         t, u = _averaged(t, u, ripple)
     if t.size < 5:
         return empty
-    threshold = max(NOISE * _scatter(u), FLOOR * float(np.abs(u).max()) if smallest is None else smallest)
+    threshold = max(EVENT_NOISE * _scatter(u), FLOOR * float(np.abs(u).max()) if smallest is None else smallest)
     found = _falls(u, threshold) if threshold > 0 else []
     if smallest is None and found:
-        found = _falls(u, max(threshold, SHARE * _typical(u[[a for a, _ in found]] - u[[b for _, b in found]])))
+        found = _falls(u, max(threshold, EVENT_DROP * _typical(u[[a for a, _ in found]] - u[[b for _, b in found]])))
     if not found:
         return empty
     top, bottom = np.array(found).T

@@ -190,7 +190,7 @@ def slope_in_last(linear: BoundaryLinear) -> Array:
 
 MOST_ITERATIONS = 14
 LARGEST_STEP = 0.2  # in ln(parameter): more would leave the bracket's neighbourhood
-FINE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
+FINE_TOLERANCE = 3e-8  # a tolerance below this wants the multipliers of the last iterate too
 SHALLOW = 0.02  # slopes in ln|rho| per ln(parameter) below this are computed anew
 
 
@@ -386,7 +386,7 @@ def _renew(model: GeneratedModel, r: _Polished, direction: Direction, tol: float
 
     That is everywhere at a tight tolerance, and beside folds, where the slope may have the wrong sign.
     """
-    index = np.nonzero(r.converged & ((tol < FINE) | ~(np.abs(r.slope) > SHALLOW)))[0]
+    index = np.nonzero(r.converged & ((tol < FINE_TOLERANCE) | ~(np.abs(r.slope) > SHALLOW)))[0]
     for a in range(0, len(index), CHUNK):
         here = index[a : a + CHUNK]
         q = r.p[:, here]

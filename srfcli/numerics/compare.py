@@ -21,7 +21,7 @@ from srfcli.numerics.map_boundaries import find_boundaries, unexplained
 from srfcli.numerics.plane import Axis, MapAxis, MapGrid, MapSettings, Plane, polyline_heights
 
 ADJUSTED = ("A", "B", "D0")  # what is adjusted to slope, critical load and critical period
-LEVEL = "mu0"  # adjusted to the level of friction, which is what a modulated load works on
+FRICTION_LEVEL = "mu0"  # adjusted to the level of friction, which is what a modulated load works on
 STEP, LARGEST, SMALLEST, TOLERANCE = 1e-6, 0.7, 1e-4, 1e-9
 
 
@@ -64,10 +64,10 @@ class Match:
 
 def check_adjusted(model: GeneratedModel, names: Sequence[str]) -> None:
     """Raise SrfError unless `names` are three different parameters of the model, mu0 not among them."""
-    if len(set(names)) != 3 or len(names) != 3 or LEVEL in names:
+    if len(set(names)) != 3 or len(names) != 3 or FRICTION_LEVEL in names:
         raise SrfError(
-            f"`adjust` {','.join(names)} is not three parameters other than {LEVEL}",
-            f"Three are matched to slope, critical load and period, {LEVEL} to the level: A,B,D0.",
+            f"`adjust` {','.join(names)} is not three parameters other than {FRICTION_LEVEL}",
+            f"Three are matched to slope, critical load and period, {FRICTION_LEVEL} to the level: A,B,D0.",
         )
     for name in names:
         model.index(name)
@@ -80,7 +80,7 @@ def match(model: GeneratedModel, p: Array, goal: Observables, names: Sequence[st
     """
     check_adjusted(model, names)
     adjusted = tuple(names)
-    level = LEVEL in model.names
+    level = FRICTION_LEVEL in model.names
     rows = [model.index(n) for n in adjusted]
     q = _levelled(model, p, goal) if level else p.copy()
     miss = _miss(model, q, goal)
@@ -113,7 +113,7 @@ def match(model: GeneratedModel, p: Array, goal: Observables, names: Sequence[st
     if level and miss is not None:
         reached = observe(model, q, goal.V)
         left = max(left, abs(reached.friction / goal.friction - 1)) if reached else np.inf
-    names_of_all = (*adjusted, LEVEL) if level else adjusted
+    names_of_all = (*adjusted, FRICTION_LEVEL) if level else adjusted
     return Match(q, names_of_all, left, Status.OK if left < 1e-6 else Status.NO_CONVERGENCE)
 
 
@@ -130,9 +130,9 @@ def _levelled(model: GeneratedModel, p: Array, goal: Observables) -> Array:
     q = model.with_values(p, V=goal.V, W0=goal.W0)
 
     def off(value: float) -> float:
-        return _friction(model, model.with_values(q, **{LEVEL: value})) - goal.friction
+        return _friction(model, model.with_values(q, **{FRICTION_LEVEL: value})) - goal.friction
 
-    a = float(p[model.index(LEVEL)])
+    a = float(p[model.index(FRICTION_LEVEL)])
     fa = off(a)
     for _ in range(30):
         h = 1e-6 * max(abs(a), 1e-3)
@@ -143,7 +143,7 @@ def _levelled(model: GeneratedModel, p: Array, goal: Observables) -> Array:
         fa = off(a)
         if abs(fa) < 1e-14:
             break
-    return model.with_values(p, **{LEVEL: a})
+    return model.with_values(p, **{FRICTION_LEVEL: a})
 
 
 # One law's boundaries at several amplitudes, and what two laws' boundaries say of each other.

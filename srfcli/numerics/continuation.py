@@ -25,10 +25,10 @@ from srfcli.numerics.critical import INTERVALS, LineScan, locate_crossings, scan
 from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
 from srfcli.numerics.plane import Plane, meets, passes
 
-STALE = 0.3  # of the step: a larger correction, in the same norm, spoils the tangent
+STALE_TANGENT = 0.3  # of the step: a larger correction, in the same norm, spoils the tangent
 ORBIT_SHARE = 0.1  # of the orbit's change in that norm
 ORDER = 0.3  # power of the share that a correction may grow by, which the step grows by: it goes with the fourth of the step
-FEWEST = 16  # intervals of a mesh that is followed
+FEWEST_INTERVALS = 16  # intervals of a mesh that is followed
 COARSER = 0.75  # of a mesh: one that suffices with this share of the intervals takes its place
 ORBIT_WEIGHT = 0.05  # of the orbit's change in the arclength: regular where the curve has a cusp in the plane
 
@@ -131,7 +131,7 @@ def correct(
         first = change if iteration == 0 else first
         if change > 0.5:
             return None
-        small = change < min(np.sqrt(tol), STALE * reach)
+        small = change < min(np.sqrt(tol), STALE_TANGENT * reach)
         q, orbit = q + dq, orbit + step
         rho = complex(linear.rho[0])
         if change < tol or small:  # a full Newton step leaves an error of order change^2
@@ -242,7 +242,7 @@ def follow(
         other = remeshed(model, plane, point, settings)
         if other is not None:
             before, current = _on_mesh(before, other.orbit.edges), replace(other, step=point.step)
-        wanted = min(settings.correction, 0.7 * STALE * reach)
+        wanted = min(settings.correction, 0.7 * STALE_TANGENT * reach)
         growth = min(
             0.6 * settings.turn / max(turned, 1e-9),
             (wanted / max(point.correction, 1e-9)) ** ORDER,
@@ -275,7 +275,7 @@ def _on_mesh(point: CurvePoint, edges: Array) -> CurvePoint:
 def suited_mesh(error: float, intervals: int, settings: StepSettings) -> int:
     """Return the intervals, a multiple of 4, that leave half the settings' error where `intervals` leave `error`, as N^-8."""
     ratio = float(np.clip((2 * np.nan_to_num(error, nan=np.inf) / settings.mesh_error) ** 0.125, 0.25, 4.0))
-    return min(max(4 * int(np.ceil(intervals * ratio / 4)), FEWEST), max(settings.max_mesh, intervals))
+    return min(max(4 * int(np.ceil(intervals * ratio / 4)), FEWEST_INTERVALS), max(settings.max_mesh, intervals))
 
 
 def arclength(model: GeneratedModel, a: CurvePoint, b: CurvePoint, turned: float) -> float:
@@ -419,7 +419,7 @@ class Boundary:
             self.status = next((s for s in (Status.STEP_TOO_SMALL, Status.MAX_STEPS) if s in ends), Status.OK)
 
 
-SAME = 1e-3  # of the window's height
+SAME_BOUNDARY = 1e-3  # of the window's height
 
 
 def find_components(
@@ -441,7 +441,9 @@ def find_components(
                 if start is None:
                     missed += 1
                     continue
-                if any(abs(h - start.q[1]) < SAME and up == (start.slope_y > 0) for h, up in _heights(curves, start.q[0])):
+                if any(
+                    abs(h - start.q[1]) < SAME_BOUNDARY and up == (start.slope_y > 0) for h, up in _heights(curves, start.q[0])
+                ):
                     continue  # a curve that was followed already, met again from a bracket that the scan's mesh misplaced
                 curve = trace_whole(model, plane, start, settings.steps, progress, f"component {len(curves) + 1}: ")
                 if len(curve.points) > 1:

@@ -39,8 +39,8 @@ from srfcli.numerics.orbit import (
 
 SAMPLES = 192
 INTERVALS = 16
-DEPTH = 4  # rescans of a bracket that Newton's method left
-JUMP = 0.5  # of the growth rates at a bracket's ends: what stays of them on a quarter of its width where they jump
+RESCANS = 4  # rescans of a bracket that Newton's method left
+JUMP_SHARE = 0.5  # of the growth rates at a bracket's ends: what stays of them on a quarter of its width where they jump
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def locate_crossings(
     """Return the polished boundary point of every sign change of a scan, or of those in `brackets`, rising.
 
     Newton's method may leave its bracket for a neighbour's root, and a coarse mesh may misplace a bracket; such a bracket is
-    scanned again, nine samples on twice the mesh, down to DEPTH levels; `outer` holds the growth rates' difference across the
+    scanned again, nine samples on twice the mesh, down to RESCANS levels; `outer` holds the growth rates' difference across the
     brackets around this scan. Where that stays twice though the bracket is narrower, the forced state jumps from one branch to
     another, as beyond a fold, and there is no crossing to be located.
     """
@@ -129,7 +129,7 @@ def locate_crossings(
         rising = scan.g[i] < scan.g[i + 1]
         trusted = inside and point.status is not Status.NO_CONVERGENCE and (point.slope > 0) == rising
         across = (*outer, float(abs(scan.g[i + 1] - scan.g[i])))
-        if trusted or depth == DEPTH or _jumps(across):
+        if trusted or depth == RESCANS or _jumps(across):
             found.append(point)
             continue
         values = np.geomspace(lower / margin, upper * margin, 9)
@@ -141,7 +141,7 @@ def locate_crossings(
 
 def _jumps(across: tuple[float, ...]) -> bool:
     """Return whether a difference stayed twice though its bracket was narrowed."""
-    return len(across) > 2 and across[-1] > JUMP * across[-2] > JUMP**2 * across[-3]
+    return len(across) > 2 and across[-1] > JUMP_SHARE * across[-2] > JUMP_SHARE**2 * across[-3]
 
 
 def _distinct(points: list[BoundaryPoint], model: GeneratedModel, name: str) -> list[BoundaryPoint]:
@@ -223,10 +223,10 @@ PER_DECADE = 40  # loads looked at first in each further decade
 # below and above: on a coarser mesh stiff multipliers resonate with the intervals at high loads
 WINDOW_INTERVALS = {-1: 32, 1: 64}
 OVERLAP = 3  # samples that neighbouring pieces share: a crossing at their seam is in one of them
-FARTHEST = 4  # decades followed beyond either end
-UNEVEN = 0.02  # of the growth rate: what a settled one may differ from its quadratic
-UNLOADED = 1e-6  # of a load: as good as none
-MARGIN = 2.0  # of a window beyond the outermost crossing
+DECADES = 4  # decades followed beyond either end
+UNSETTLED_SHARE = 0.02  # of the growth rate: what a settled one may differ from its quadratic
+NO_LOAD = 1e-6  # of a load: as good as none
+WINDOW_MARGIN = 2.0  # of a window beyond the outermost crossing
 
 
 @dataclass(frozen=True)
@@ -273,7 +273,7 @@ def found_window(model: GeneratedModel, points: Sequence[Array]) -> LoadWindow:
         certain &= outer.settled
         for scan in (*outer.below, *outer.above):
             for i in scan.brackets():
-                lowest, highest = min(lowest, scan.values[i] / MARGIN), max(highest, scan.values[i + 1] * MARGIN)
+                lowest, highest = min(lowest, scan.values[i] / WINDOW_MARGIN), max(highest, scan.values[i + 1] * WINDOW_MARGIN)
     return LoadWindow(float(lowest), float(highest), float(np.log(highest / lowest) / np.log(hi / lo)), certain)
 
 
@@ -289,7 +289,7 @@ def _follow(
 ) -> tuple[tuple[LineScan, ...], bool]:
     scans: list[LineScan] = []
     settled = _settled(model, last, direction)
-    while not settled and len(scans) < FARTHEST and not (scans and 2 * last.lost.size > last.values.size):
+    while not settled and len(scans) < DECADES and not (scans and 2 * last.lost.size > last.values.size):
         edge = last.values[OVERLAP - 1] if direction < 0 else last.values[-OVERLAP]
         loads = (edge / DECADE, edge) if direction < 0 else (edge, edge * DECADE)
         last = _piece(model, base, loads, direction, resolution)
@@ -319,17 +319,17 @@ def _swing_settled(model: GeneratedModel, scan: LineScan) -> bool:
     Towards high loads it meets one after another, of ever higher harmonics of the forcing, which the growth rate shows to fade.
     """
     d, psi, _ = scan.swing[0]
-    p = model.with_values(scan.p[:, 0], eps=0.0, **{scan.name: scan.values[0] * UNLOADED})
+    p = model.with_values(scan.p[:, 0], eps=0.0, **{scan.name: scan.values[0] * NO_LOAD})
     fastest = max(np.linalg.eigvals(model.cycle_jacobian(0.0, model.steady(p), p)), key=lambda value: value.imag)
     ahead = np.floor(np.array([fastest.imag, psi]) / np.pi)
     return bool(ahead[0] == ahead[1] or min(-d, -fastest.real) > DAMPED)
 
 
 def _quiet(g: Array, h: Array) -> bool:
-    """Return whether g is a quadratic in h, to UNEVEN, that has no zero between h = 0 and 1."""
+    """Return whether g is a quadratic in h, to UNSETTLED_SHARE, that has no zero between h = 0 and 1."""
     powers = h[:, None] ** np.arange(3) / np.abs(g)[:, None]
     coefficients = np.linalg.lstsq(powers, np.sign(g), rcond=None)[0]
-    if np.abs(powers @ coefficients - np.sign(g)).max() > UNEVEN:
+    if np.abs(powers @ coefficients - np.sign(g)).max() > UNSETTLED_SHARE:
         return False
     ahead = np.array([0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0])
     values = ahead[:, None] ** np.arange(3) @ coefficients
@@ -339,7 +339,7 @@ def _quiet(g: Array, h: Array) -> bool:
 # The growth rate of a forced periodic state along a line of one parameter, refined where a sign change could hide.
 
 MESH_ERROR = 1e-5  # a hump of g lower than this cannot be told from none
-FINEST = 64
+FINEST_MESH = 64
 
 
 @dataclass
@@ -393,7 +393,7 @@ def scan_line(
     scan = _samples(model, name, batch)
     for count in itertools.count():
         position = coordinate(scan.values)
-        tongues &= count < ROUNDS
+        tongues &= count < SAMPLING_ROUNDS
         close = _suspects(position, scan.g, resolution)
         halves = np.nonzero(close | _rising_inside(position, scan, resolution) if tongues else close)[0]
         left, share = _resonances(position, scan, resolution) if tongues else (halves[:0], np.zeros(0))
@@ -416,13 +416,13 @@ def _samples(model: GeneratedModel, name: str, batch: OrbitBatch) -> LineScan:
 
 
 def _on_sufficient_mesh(model: GeneratedModel, batch: OrbitBatch) -> OrbitBatch:
-    """Return the batch on a mesh that shows a growth rate as small as MESH_ERROR, up to FINEST intervals."""
+    """Return the batch on a mesh that shows a growth rate as small as MESH_ERROR, up to FINEST_MESH intervals."""
     N = batch.orbit.intervals
     if batch.converged.all():
         worst = mesh_error(model, batch.orbit).max(keepdims=True)
-        mesh = int(wanted_mesh(worst, N, MESH_ERROR, FINEST)[0])
+        mesh = int(wanted_mesh(worst, N, MESH_ERROR, FINEST_MESH)[0])
     else:  # a finer mesh may find what this one could not
-        mesh = FINEST
+        mesh = FINEST_MESH
     if mesh <= N:
         return batch
     edges = uniform_mesh(mesh)
@@ -490,10 +490,10 @@ def _with_samples(model: GeneratedModel, base: Array, scan: LineScan, left: Arra
 # at these three places the interpolation of g shows what lies between.
 
 FROZEN = 16  # phases at which the Jacobian is looked at
-BESIDE = np.array([-(3**-0.5), 0.0, 3**-0.5])  # of |d|, from a multiple of pi: where samples must be,
+TONGUE_SAMPLES = np.array([-(3**-0.5), 0.0, 3**-0.5])  # of |d|, from a multiple of pi: where samples must be,
 CENTRED = 0.25  # and how close, likewise
 DAMPED = 1.5  # a swing with |d| above it leaves no tongue that an interval could hide
-ROUNDS = 5  # in which samples are added
+SAMPLING_ROUNDS = 5  # in which samples are added
 HARMONICS = 0.5  # of the mesh's intervals: swings above that many to a period are not resolved
 
 
@@ -536,7 +536,7 @@ def _resonances(position: Array, scan: LineScan, resolution: float) -> tuple[Arr
     for i in np.nonzero(usable)[0].tolist():
         close = CENTRED * damping[i]
         turns = np.arange(max(1, int(low[i] / np.pi)), int(high[i] / np.pi) + 2)
-        places = (np.pi * turns[:, None] + damping[i] * BESIDE).ravel()
+        places = (np.pi * turns[:, None] + damping[i] * TONGUE_SAMPLES).ravel()
         places = places[(places > low[i] + close) & (places < high[i] - close)]
         if places.size:
             left.append(i)

@@ -36,7 +36,7 @@ NEWTON = 1e-10  # last step of Newton's method
 # the same where a multiplier next to 1 lets rounding grow beyond that; the error of the multipliers tells
 ROUNDED = 1e-7
 CLIMBED_ON = 64  # intervals of the first mesh that is laid where the state needs it
-CALM = 0.2  # share of the intervals that are spread evenly
+EVEN_SHARE = 0.2  # share of the intervals that are spread evenly
 SMALLEST_CLIMB, MOST_CLIMBS = 1e-4, 200  # shares of eps
 WHILE_CLIMBING = 1e-4  # estimated error from which on the mesh is made finer on the way
 RELIED_ON = 31.0  # an interval halved gains 2^8 in theory, 2^5 is relied on
@@ -161,7 +161,7 @@ def _laid(model: GeneratedModel, orbit: Discretisation, intervals: int) -> Array
     """
     density = last_coefficient(model, orbit)[0] ** (1 / STAGES) / orbit.steps
     density = np.maximum(density, np.maximum(np.roll(density, 1), np.roll(density, -1)))
-    density += CALM * float((density * orbit.steps).sum())
+    density += EVEN_SHARE * float((density * orbit.steps).sum())
     reached = np.concatenate([[0.0], np.cumsum(density * orbit.steps)])
     edges = np.interp(np.linspace(0.0, 1.0, intervals + 1), reached / reached[-1], orbit.edges)
     edges[0], edges[-1] = 0.0, 1.0

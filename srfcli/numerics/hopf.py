@@ -15,7 +15,7 @@ from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 
 WORST_RESIDUAL = 1e-9
-SCAN = np.geomspace(1e-9, 1e9, 1801)  # times K * 1 um: loads at which a non-polynomial determinant is looked at
+SCANNED_LOADS = np.geomspace(1e-9, 1e9, 1801)  # times K * 1 um: loads at which a non-polynomial determinant is looked at
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def _candidates(model: GeneratedModel, p: Array) -> list[float]:
         roots = np.roots(coefficients)
         real = roots[np.abs(roots.imag) <= 1e-6 * np.abs(roots)].real  # a double root splits by sqrt(rounding)
         return [float(r) for r in real if r > 0]
-    loads = SCAN * p[model.index("K")]
+    loads = SCANNED_LOADS * p[model.index("K")]
     with np.errstate(all="ignore"):
         values = _hurwitz(model.characteristic(_with_load(model, p, loads)))
     found = []

@@ -37,8 +37,8 @@ from srfcli.numerics.orbit import (
 from srfcli.numerics.plane import MapGrid, MapSettings, TileTask, tile_tasks
 
 # of a point: no orbit found; stable; unstable by a multiplier off the real axis, a negative, a positive one
-KINDS = ("unresolved", "stable", "ns", "pd", "fold")
-REAL = 1e-7  # a multiplier whose angle is nearer to 0 or pi is real
+STABILITY_KINDS = ("unresolved", "stable", "ns", "pd", "fold")
+REAL_ANGLE = 1e-7  # a multiplier whose angle is nearer to 0 or pi is real
 
 Tile = dict[str, Array]
 Runner = Callable[[Callable[[TileTask], Tile], Sequence[TileTask]], Iterator[tuple[int, Tile]]]
@@ -98,7 +98,7 @@ class StabilityMap:
 
     @property
     def kind(self) -> Array:
-        """Return the index in KINDS of each point, (nx, ny)."""
+        """Return the index in STABILITY_KINDS of each point, (nx, ny)."""
         return kinds(self.leading)
 
     @property
@@ -121,10 +121,10 @@ class StabilityMap:
 
 
 def kinds(leading: ComplexArray) -> Array:
-    """Return the index in KINDS of points with these leading multipliers."""
+    """Return the index in STABILITY_KINDS of points with these leading multipliers."""
     with np.errstate(invalid="ignore"):
         angle = np.abs(np.angle(leading))
-        unstable = np.where(angle < REAL, 4, np.where(angle > np.pi - REAL, 3, 2))
+        unstable = np.where(angle < REAL_ANGLE, 4, np.where(angle > np.pi - REAL_ANGLE, 3, 2))
         return np.where(~np.isfinite(leading), 0, np.where(np.abs(leading) < 1, 1, unstable))
 
 
@@ -224,12 +224,12 @@ def _tile_seeds(model: GeneratedModel, grid: MapGrid, tile: Tile) -> list[Seed]:
 # One tile of a stability map: orbits on a coarse grid, the others from their neighbours, cells refined where it matters.
 
 GRAIN = 4  # meshes are multiples of this many intervals
-STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # to the points beside a point, in columns and rows
+NEIGHBOUR_STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))  # to the points beside a point, in columns and rows
 SETTLING = 1000  # periods of a simulation: just beyond a fold the motion lingers
 SETTLINGS = 32  # simulations at most in a tile,
 IN_VAIN = 3  # and in a row without a periodic state
 GOLDEN = 0.6180339887  # a share by whose multiples a list is sampled evenly
-PATIENCE = 8  # Newton steps from a neighbour's guess before an orbit is looked for anew
+NEWTON_STEPS = 8  # Newton steps from a neighbour's guess before an orbit is looked for anew
 
 
 @dataclass
@@ -368,7 +368,9 @@ class _Block:
         orbits, converged = self.orbits, self.orbits.converged
         found = np.zeros_like(converged)
         beside = [
-            (c, r, c - dc, r - dr) for dc, dr in STEPS for c, r in np.argwhere(_moved(converged, dc, dr) & ~converged).tolist()
+            (c, r, c - dc, r - dr)
+            for dc, dr in NEIGHBOUR_STEPS
+            for c, r in np.argwhere(_moved(converged, dc, dr) & ~converged).tolist()
         ]
         if beside:
             c, r, from_c, from_r = beside[int(share * len(beside))]
@@ -383,7 +385,7 @@ class _Block:
         converged = self.orbits.converged
         while fresh.any() and not converged.all():
             added = np.zeros_like(fresh)
-            for dc, dr in STEPS:
+            for dc, dr in NEIGHBOUR_STEPS:
                 to_c, to_r = np.nonzero(_moved(fresh, dc, dr) & ~converged)
                 if not to_c.size:
                     continue
@@ -427,7 +429,7 @@ def _moved(marks: Array, dc: int, dr: int) -> Array:
 
 def regular_orbits(model: GeneratedModel, p: Array, guess: Discretisation, tol: float) -> OrbitBatch:
     """Return the orbits at `p` from `guess`, those beyond a fold marked as not found."""
-    return regular(solve_orbits(model, p, guess, tol=tol, max_iterations=PATIENCE))
+    return regular(solve_orbits(model, p, guess, tol=tol, max_iterations=NEWTON_STEPS))
 
 
 def regular(batch: OrbitBatch) -> OrbitBatch:
@@ -443,9 +445,9 @@ def regular(batch: OrbitBatch) -> OrbitBatch:
 # Cells of a map tile halved where a boundary could hide in them, and every sign change that the points then show.
 
 SAFETY = 1.5  # on an interpolation error, which is itself an estimate
-SHRINKS = 0.5  # of a cell's error that its quarters keep: 0.25 where g is smooth, more where multipliers meet
+REFINED_SHARE = 0.5  # of a cell's error that its quarters keep: 0.25 where g is smooth, more where multipliers meet
 CROSSED = 0.5  # a cell that a boundary crosses is halved, too, where its error exceeds this share of the largest |g|
-JUMP = 0.5  # of a state's logarithms between neighbours: it may be another state then,
+STATE_JUMP = 0.5  # of a state's logarithms between neighbours: it may be another state then,
 LEFT = 0.1  # if what the tangents of the two do not explain of it exceeds this
 
 # in units of half a cell: its middle and the middles of its sides, and the corners whose mean predicts each
@@ -589,7 +591,7 @@ def _halved(task: TileTask, model: GeneratedModel, points: _Points, cells: Cells
     interpolated = np.stack([old[:, list(k)].mean(axis=1) for k in PARENTS], axis=1)
     off = np.nan_to_num(np.abs(middle - interpolated))
     sides = np.maximum(off[:, 0], off[:, 1]) + np.maximum(off[:, 2], off[:, 3])
-    error = SAFETY * SHRINKS * np.maximum(sides, off[:, 4])
+    error = SAFETY * REFINED_SHARE * np.maximum(sides, off[:, 4])
     quarters = cells.at[:, None, :] + half * CORNERS
     return Cells(quarters.reshape(-1, 2), half, np.repeat(error, 4))
 
@@ -639,7 +641,7 @@ def _apart(samples: Samples, model: GeneratedModel, names: tuple[str, str]) -> B
     def apart(i: Array, j: Array) -> Array:
         one = np.fmin(g[i], g[j]) < 0
         found = one & (np.isnan(g[i]) | np.isnan(g[j]) | saddle[i] | saddle[j])
-        far = np.nonzero((g[i] < 0) & (g[j] < 0) & (np.abs(start[i] - start[j]).max(axis=-1) > JUMP))[0]
+        far = np.nonzero((g[i] < 0) & (g[j] < 0) & (np.abs(start[i] - start[j]).max(axis=-1) > STATE_JUMP))[0]
         if far.size:
             found[far] = _unlike(model, samples, names, i[far], j[far])
         return np.asarray(found)

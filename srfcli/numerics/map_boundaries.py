@@ -36,8 +36,8 @@ DENSE = 12  # points of the cubic between two points of a curve, on which seeds 
 CURVE_REACH = 1e-3  # of the window: seeds and curves are compared to this
 RETRIES = 3  # of a curve that jumped from one side of a tongue to the other
 UPRIGHT = 0.05  # of the tangent: where less points along x the slope at fixed x is not to be relied on
-PATIENCE = 24  # stable points in a row beside one without an orbit at which no fold is met: orbits were missed
-MARGIN = 0.5  # of a seed's length by which its boundary point may lie outside
+MISSED_POINTS = 24  # stable points in a row beside one without an orbit at which no fold is met: orbits were missed
+SEED_MARGIN = 0.5  # of a seed's length by which its boundary point may lie outside
 
 
 @dataclass
@@ -87,7 +87,7 @@ def find_boundaries(
                     continue
                 start = fold_at(model, boundary.plane, end)
                 endless = 0 if start is not None else endless + 1
-                discontinuities = discontinuities if endless < PATIENCE else []
+                discontinuities = discontinuities if endless < MISSED_POINTS else []
             if start is None or any(_same_place(t, start) for t in traced):
                 continue  # met again from a seed that the map's mesh misplaced
             progress(f"boundary {len(traced) + 1}")
@@ -155,7 +155,7 @@ def _inside(model: GeneratedModel, plane: Plane, point: BoundaryPoint, seed: See
     if point.status is Status.NO_CONVERGENCE or not point.others < 1 or (point.slope > 0) != seed.rising:
         return False
     low, high = seed.ends[:, seed.axis]
-    margin = MARGIN * (high - low) + CURVE_REACH
+    margin = SEED_MARGIN * (high - low) + CURVE_REACH
     return bool(low - margin <= plane.coordinates(model, point.p)[seed.axis] <= high + margin)
 
 
@@ -305,15 +305,15 @@ def unexplained(model: GeneratedModel, found: StabilityMap, boundary: Boundary) 
 
 # Folds of the forced periodic state. A map shows them only indirectly: a stable state ends, and its neighbour has none.
 
-FINEST = 2.0**-12  # of the way to the neighbour: where the halving of steps ends
-NEAR = 0.5  # in logarithms, or V, or um: a larger step of the state is not taken for the same state
+FINEST_STEP = 2.0**-12  # of the way to the neighbour: where the halving of steps ends
+SAME_STATE = 0.5  # in logarithms, or V, or um: a larger step of the state is not taken for the same state
 MEETS = 0.8  # of the leading multiplier, from where the fold itself is solved for
-STEPS = (3, 8)  # of equal length, in which most states reach their neighbour; those that do not in the first try the next
+PATH_STEPS = (3, 8)  # of equal length, in which most states reach their neighbour; those that do not in the first try the next
 FOLD_REACH = 0.01  # of the window: a fold farther from where the state was last found is another
 
 
 def not_continued(
-    model: GeneratedModel, plane: Plane, discontinuities: Sequence[Discontinuity], steps: Sequence[int] = STEPS
+    model: GeneratedModel, plane: Plane, discontinuities: Sequence[Discontinuity], steps: Sequence[int] = PATH_STEPS
 ) -> list[Discontinuity]:
     """Return the discontinuities whose stable state is not met at their neighbour after a few equal steps.
 
@@ -334,7 +334,7 @@ def not_continued(
             found = solve_orbits(model, p, guess, tol=1e-7, max_iterations=10)
             off = (np.abs(found.orbit.x - guess.x) / scales(model, p)[:, None, :]).max(axis=(-1, -2))
             with np.errstate(invalid="ignore"):
-                going &= found.converged & (off < NEAR) & (np.abs(found.multipliers[:, 0]) < 1)
+                going &= found.converged & (off < SAME_STATE) & (np.abs(found.multipliers[:, 0]) < 1)
             change, orbit, before = found.orbit - orbit - shift, found.orbit, p
         left += [discontinuity for discontinuity, reached in zip(group, going, strict=True) if not reached]
     return not_continued(model, plane, left, steps[1:]) if left and steps[1:] else left
@@ -348,7 +348,7 @@ def continued_end(model: GeneratedModel, plane: Plane, discontinuity: Discontinu
     here, way = discontinuity.ends[0], discontinuity.ends[1] - discontinuity.ends[0]
     share, step, orbit, rho = 0.0, 0.5, discontinuity.orbit, discontinuity.rho
     p, slope = plane.point(model, here), orbit.unchanged()
-    while step > FINEST:
+    while step > FINEST_STEP:
         ahead = min(share + step, 1.0)
         q = plane.point(model, here + ahead * way)
         reach = ahead - share
@@ -357,11 +357,11 @@ def continued_end(model: GeneratedModel, plane: Plane, discontinuity: Discontinu
         found = solve_orbits(model, q[:, None], guess.part(None), max_iterations=10)
         off = float((np.abs(found.orbit.x[0] - guess.x) / scales(model, q)).max())
         leading = complex(found.multipliers[0, 0])
-        if not found.converged[0] or off > NEAR or not abs(leading) < 1:
+        if not found.converged[0] or off > SAME_STATE or not abs(leading) < 1:
             step /= 2
             continue
         slope = (found.orbit.part(0) - orbit - shift) / reach
-        share, rho, p, step = ahead, leading, q, 2 * step if off < NEAR / 4 else step
+        share, rho, p, step = ahead, leading, q, 2 * step if off < SAME_STATE / 4 else step
         orbit = found.orbit.part(0)
         if share == 1.0:
             return None

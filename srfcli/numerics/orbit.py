@@ -25,7 +25,7 @@ from srfcli.numerics.collocation import (
 CHUNK = 48  # parameter points solved together: their blocks fit the cache
 LARGEST_SWING = 2.0  # of a logarithm in the linear response that is a first guess
 STRIDE = 8  # of points in order, orbits solved without neighbours are this many apart
-NEIGHBOURS = 6  # through which a first guess is interpolated
+GUESSED_FROM = 6  # through which a first guess is interpolated
 
 
 @dataclass
@@ -150,7 +150,7 @@ def levels(count: int, stride: int = STRIDE) -> list[Array]:
     return [level for level in found if level.size]
 
 
-def neighbours(known: Array, new: Array, most: int = NEIGHBOURS) -> tuple[Array, Array]:
+def neighbours(known: Array, new: Array, most: int = GUESSED_FROM) -> tuple[Array, Array]:
     """Return the indices of the `most` rising positions `known` around each position `new`, and their Lagrange weights."""
     width = min(most, len(known))
     first = np.clip(np.searchsorted(known, new) - width // 2, 0, len(known) - width)
@@ -165,7 +165,7 @@ def combined(orbits: Discretisation, weights: Array) -> Discretisation:
     )
 
 
-def between(orbit: Discretisation, known: Array, new: Array, most: int = NEIGHBOURS) -> Discretisation:
+def between(orbit: Discretisation, known: Array, new: Array, most: int = GUESSED_FROM) -> Discretisation:
     """Return guesses at positions `new` through the orbits (B, N, ...) at the rising positions `known` (B,)."""
     index, weights = neighbours(known, new, most)
     return combined(orbit.part(index), weights)
@@ -264,7 +264,7 @@ def line_orbits(model: GeneratedModel, p: Array, position: Array, guess: Discret
     A few that are spread over the line come first; the others start from what was found around them.
     """
     count, stride = p.shape[1], STRIDE
-    while stride > 1 and count < stride * NEIGHBOURS:  # fewer to start from would predict little
+    while stride > 1 and count < stride * GUESSED_FROM:  # fewer to start from would predict little
         stride //= 2
     first, *later = levels(count, stride)
     orbits = OrbitBatch.empty(p, edges, len(model.states))

@@ -17,7 +17,7 @@ from srfcli.numerics.collocation import mesh_error, stage_parameters, wanted_mes
 from srfcli.numerics.orbit import OrbitBatch, growth, interpolate, robust_orbits, uniform_mesh
 
 INTERVALS = 16
-LOST = 1e9  # the error of an orbit that was not found: the mesh grows as fast as it may
+NO_ORBIT = 1e9  # the error of an orbit that was not found: the mesh grows as fast as it may
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def mean_friction(model: GeneratedModel, p: Array, *, tol: float = 1e-6, max_mes
     while waiting:
         index, batch = waiting.pop()
         N = batch.orbit.intervals
-        error = np.where(batch.converged, mesh_error(model, batch.orbit), LOST)
+        error = np.where(batch.converged, mesh_error(model, batch.orbit), NO_ORBIT)
         exponents, finished = growth(batch)[1], (error <= tol) | (max_mesh <= N)
         for j in np.nonzero(finished & batch.converged)[0]:
             columns[:, index[j]] = *_means(model, batch, int(j)), exponents[j], error[j]

@@ -32,11 +32,11 @@ from srfcli.numerics.orbit import interpolate
 from srfcli.numerics.plane import Plane, polyline_heights
 
 EXACT = 1e-9  # a correction so small leaves the tangent as it is
-CLOSE = 1e-8  # of the chord: where the search for a zero ends
+CHORD_TOLERANCE = 1e-8  # of the chord: where the search for a zero ends
 MEETING = 0.05  # of Re(rho) from +1 or -1: a Neimark-Sacker boundary that ends so near ends in a strong resonance
 CUSPED = 1e-3  # of the tangent in the plane beside a cusp: what is left of it at the cusp
 RESONANCES = {"1:3": 2 * np.pi / 3, "1:4": np.pi / 2}
-STRONG = {"fold": "1:1", "pd": "1:2"}  # where a pair of multipliers meets on the real axis
+STRONG_RESONANCES = {"fold": "1:1", "pd": "1:2"}  # where a pair of multipliers meets on the real axis
 
 Test = Callable[[CurvePoint], float]
 
@@ -142,7 +142,7 @@ def _strong(model: GeneratedModel, plane: Plane, branch: Branch) -> Iterator[Spe
             def side(point: CurvePoint) -> float:
                 return 1.0 if bifurcation_kind(point.rho) == "ns" else -1.0
 
-            what = STRONG[next(iter(kinds - {"ns"}))]
+            what = STRONG_RESONANCES[next(iter(kinds - {"ns"}))]
             yield locate(model, plane, branch, (k, k + 1), side, what=what)
 
 
@@ -186,7 +186,7 @@ def locate(
 
     status = Status.OK
     try:
-        zero = brentq(along, 0.0, 1.0, xtol=CLOSE)
+        zero = brentq(along, 0.0, 1.0, xtol=CHORD_TOLERANCE)
         best = min(met, key=lambda m: abs(m[0] - zero))
     except ValueError:  # or its ends are of one sign
         status, best = Status.NO_CONVERGENCE, min(met, key=lambda m: abs(m[2]), default=None)
@@ -241,10 +241,10 @@ class _Chord:
 # an unstable one before it if d > 0. Second and third derivatives of the map are variational equations of higher order along
 # the orbit, solved on its own mesh; those of the field are generated second derivatives, and their complex step.
 
-STEP = 1e-25  # of a complex step
-REAL = 1e-6  # a multiplier nearer to the real axis has no normal form of this kind
+COMPLEX_STEP = 1e-25  # of a complex step
+REAL_MULTIPLIER = 1e-6  # a multiplier nearer to the real axis has no normal form of this kind
 CRITICALITY = "criticality"
-TOGETHER = 16  # points whose derivatives fit the cache
+POINTS_TOGETHER = 16  # points whose derivatives fit the cache
 
 
 def normal_form(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Array) -> tuple[Array, ComplexArray]:
@@ -260,14 +260,14 @@ def normal_form(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Arr
     chosen = pick_multiplier(values.astype(complex), rho.real + 1j * np.abs(rho.imag))[..., None]
     mu = np.take_along_axis(values, chosen, -1)[..., 0].astype(complex)
     right = np.take_along_axis(vectors, chosen[..., None], -1)[..., 0].astype(complex)
-    real = np.abs(mu.imag) < REAL * np.abs(mu)
+    real = np.abs(mu.imag) < REAL_MULTIPLIER * np.abs(mu)
     wave = _carried(c, right)
     size = np.sqrt((orbit.weights * np.abs(wave[..., model.states.index("ln_v")]) ** 2).sum(axis=(-1, -2)))
     q, wave = right / size[..., None], wave / size[..., None, None, None]
     along = wave.real, wave.imag
-    nearby = orbit.stages + 1j * STEP * np.stack(along)  # (2, ..., N, m, n)
+    nearby = orbit.stages + 1j * COMPLEX_STEP * np.stack(along)  # (2, ..., N, m, n)
     tau, ps = orbit.phases, stage_parameters(p)
-    slopes = model.cycle_jacobian(tau, nearby, ps).imag / STEP
+    slopes = model.cycle_jacobian(tau, nearby, ps).imag / COMPLEX_STEP
     F2 = slopes[0] + 1j * slopes[1]  # its product with a is the field's second derivative F2(a, wave)
     sources = [np.einsum("...ij,...j->...i", F2, a) for a in (wave.conj(), wave)]
     forced = []
@@ -281,7 +281,7 @@ def normal_form(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Arr
     third = np.zeros_like(wave)
     for part, unit in ((weights.real, 1.0), (weights.imag, 1j)):
         for a in along:
-            gradient = model.cycle_bilinear(tau, nearby, ps, part, a).imag / STEP
+            gradient = model.cycle_bilinear(tau, nearby, ps, part, a).imag / COMPLEX_STEP
             third += unit * a * (gradient[0] + 1j * gradient[1])
     total = (weights * source + third).sum(axis=(-1, -2, -3))
     return np.where(real, np.nan, (0.5 * total / mu).real), np.where(real[..., None], np.nan, q)
@@ -314,7 +314,7 @@ def branch_coefficients(model: GeneratedModel, branch: Branch) -> Array:
     """Return the first Lyapunov coefficient at every point of a branch, NaN where the critical multiplier is real."""
     d, points = np.empty(len(branch.points)), branch.points
     for index in by_mesh([pt.orbit for pt in points]):
-        for here in (index[a : a + TOGETHER] for a in range(0, len(index), TOGETHER)):
+        for here in (index[a : a + POINTS_TOGETHER] for a in range(0, len(index), POINTS_TOGETHER)):
             p = np.stack([points[i].p for i in here], axis=1)
             rho = np.array([points[i].rho for i in here])
             d[here] = normal_form(model, p, join([points[i].orbit for i in here]), rho)[0]

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from srfcli.laws.registry import Registry
 
 ANSWER = "answer.json"
-LARGEST = 2**28  # bytes of an answer
+LARGEST_ANSWER = 2**28  # bytes of an answer
 FORM = "closed-form.toml"
 SCHEMA = "srf.diagnose/"
 
@@ -74,7 +74,7 @@ SENTENCES = {
     "unknown": "unknown: something is missing that no registered effect explains",
     "inconclusive": "inconclusive: nothing is needed, and effects of interesting size could not have been seen",
 }
-MOST = 8  # hypotheses that are shown
+HYPOTHESES_SHOWN = 8  # hypotheses that are shown
 
 
 @dataclass(frozen=True, repr=False)
@@ -140,7 +140,7 @@ class DiagnosisResult(Result):
         zero = next(r["evidence"] for r in ranked if r["name"] == "none")
         rows = [
             (r["name"], r["evidence"] - zero, r["rms_over_noise"], r["field"], r["confidence"], r["against"])
-            for r in ranked[:MOST]
+            for r in ranked[:HYPOTHESES_SHOWN]
         ]
         notes = tuple(_notes(self.answer, recorded=bool(self.diagnosis.experiment.runs)))
         return Table("srf.diagnose.hypotheses/1", HYPOTHESES, rows, "hypotheses", notes, status=self.status.value)
@@ -331,7 +331,7 @@ def check_answer(folder: Path, *, force: bool) -> None:
 
 def _is_diagnosis(folder: Path) -> bool:
     try:
-        data = parse_json(read_plain(folder / ANSWER, limit=LARGEST), folder)
+        data = parse_json(read_plain(folder / ANSWER, limit=LARGEST_ANSWER), folder)
     except (OSError, SrfError):
         return False
     return isinstance(data, dict) and str(data.get("schema", "")).startswith(SCHEMA)

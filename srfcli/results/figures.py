@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 from srfcli.results.plots import (
     COLOURS,
     DASHES,
-    NAME,
+    NAME_OFFSET,
     NO_LAYOUT,
     QUANTITY,
     Values,
@@ -46,7 +46,7 @@ LOOKS: dict[str, dict[str, Any]] = {
     "subcritical": {"label": "subcritical", "color": "white", "linewidth": 0.9, "linestyle": (0, (2, 1.5))},
     "fold": {"label": "state ends (fold)", "color": "black", "linewidth": 1.6, "linestyle": (0, (4, 1.5))},
 }
-CRITICALITY = ("P", "criticality changes")
+CRITICALITY_MARK = ("P", "criticality changes")
 
 
 def stability_map(
@@ -163,7 +163,7 @@ def _draw_marks(ax: Axes, special: Sequence[Mapping[str, Any]]) -> None:
     from matplotlib.patheffects import withStroke
 
     for what in dict.fromkeys(str(s["what"]) for s in special):
-        marker, label = MARKS.get(what, CRITICALITY)
+        marker, label = MARKS.get(what, CRITICALITY_MARK)
         mine = [s for s in special if str(s["what"]) == what]
         ax.plot(
             [s["x"] for s in mine],
@@ -214,7 +214,7 @@ def gains(x: Values, parts: Mapping[str, Any], *, xlabel: str, logx: bool, title
 
 # Figures of recordings: each run with what was observed and what was imposed, and the samples that are not compared.
 
-BINS = 1500  # columns in which a long record is drawn by its extremes
+RECORD_COLUMNS = 1500  # columns in which a long record is drawn by its extremes
 # consecutive samples from which a band is drawn; most single ones that are marked with crosses
 STRETCH, CROSSES = 20, 100
 DECADES = 30.0  # ratio of velocities from which their axis is logarithmic
@@ -458,9 +458,9 @@ def envelope(t: Any, y: Any) -> tuple[Any, Any]:
     """
     import numpy as np
 
-    if t.size <= 4 * BINS:
+    if t.size <= 4 * RECORD_COLUMNS:
         return t, y
-    edges = np.searchsorted(t, np.linspace(t[0], t[-1], BINS + 1)[:-1])
+    edges = np.searchsorted(t, np.linspace(t[0], t[-1], RECORD_COLUMNS + 1)[:-1])
     keep = {0, t.size - 1}
     for a, b in zip(edges, [*edges[1:], t.size], strict=True):
         part = y[a:b]
@@ -494,7 +494,7 @@ def draw_loads(ax: Axes, table: Thresholds, computed: Mapping[str, Values]) -> N
     ax.errorbar([], [], yerr=[], color="#555555", label="measured, ± σ", **mark)
     ax.set(xscale="log", yscale="log", xlabel="V  [µm/s]", ylabel="critical W$_0$  [N]")
     decade_ticks(ax)
-    ax.legend(loc="best", fontsize=NAME, handlelength=2.8)
+    ax.legend(loc="best", fontsize=NAME_OFFSET, handlelength=2.8)
 
 
 def fit_figure(

@@ -92,7 +92,7 @@ ADVICE = {
     Status.INTERRUPTED: "the likeliest parameters so far are above.",
 }
 CLOSE, WIDE, ALIKE = 1e-3, 1.0, 0.99
-FAILED = 3  # tests that a fit fails, of which its notes tell, the worst first
+TESTS_TOLD = 3  # tests that a fit fails, of which its notes tell, the worst first
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -266,7 +266,7 @@ class FitResult(Result):
             from srfcli.diagnosis.goodness_of_fit import coarse_readings, shortcomings, uneven_noise
 
             failed = [text for text in shortcomings(found.state_space) if not text.startswith("the field's amplitude")]
-            notes += [f"the fit fails a test: {text}" for text in failed[:FAILED]]
+            notes += [f"the fit fails a test: {text}" for text in failed[:TESTS_TOLD]]
             notes += [*uneven_noise(found.state_space), *coarse_readings(found.state_space)]
         if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
             notes.append(f"interrupted: {len(found.starts)} of {self.asked} starts were done")
@@ -537,7 +537,7 @@ class ThresholdFitResult(Result):
             )
             plots.heading(figure, f"{plots.name_text(str(table.source))}: {self.laws}\nfit: {found}")
             plots.decade_ticks(below)
-            below.legend(loc="best", fontsize=plots.NAME, handlelength=2.8)
+            below.legend(loc="best", fontsize=plots.NAME_OFFSET, handlelength=2.8)
             figure.align_ylabels([above, below])
             return figure
 

@@ -65,13 +65,13 @@ class MapResult(Result):
     @cached_property
     def _summary(self) -> tuple[tuple[str, ...], dict[str, Any], Status]:
         """Return the notes, what JSON holds beside the rows, and the status of the whole."""
-        from srfcli.numerics.map import KINDS
+        from srfcli.numerics.map import STABILITY_KINDS
         from srfcli.numerics.map_boundaries import map_notes, unexplained
         from srfcli.numerics.special_points import crossings_at
 
         model, found, boundary = self.system.model, self.found, self.curves
         count = found.kind.size
-        share = {name: float((found.kind == k).sum() / count) for k, name in enumerate(KINDS)}
+        share = {name: float((found.kind == k).sum() / count) for k, name in enumerate(STABILITY_KINDS)}
         meta: dict[str, Any] = {"share": share, "suspect_cells": len(found.suspect), "points_added": len(found.extra_at)}
         status = Status.NO_CONVERGENCE if found.lost else Status.OK
         if not found.finished:
@@ -125,7 +125,7 @@ class MapResult(Result):
         """Return a row for each point of the grid; `meta` has components and special points."""
         import numpy as np
 
-        from srfcli.numerics.map import KINDS, per_slip
+        from srfcli.numerics.map import STABILITY_KINDS, per_slip
 
         model, found, grid = self.system.model, self.found, self.found.grid
         p, declared, shape = found.points(model), {q.name: q for q in model.parameters}, found.kind.shape
@@ -149,7 +149,11 @@ class MapResult(Result):
             Column("growth_per_period", "1", "ln of the leading multiplier's modulus over one forcing period"),
             Column("intervals", "1", "of the mesh"),
         )
-        cells = place | {"type": np.array(KINDS)[found.kind], "theta": np.abs(np.angle(found.leading)), "intervals": found.mesh}
+        cells = place | {
+            "type": np.array(STABILITY_KINDS)[found.kind],
+            "theta": np.abs(np.angle(found.leading)),
+            "intervals": found.mesh,
+        }
         cells |= {growth: found.growth * per_slip(model, p), "growth_per_period": found.growth}
         rows = list(zip(*(cells[c.name].ravel().tolist() for c in columns), strict=True))
         meta = self._summary[1] | {"components": self.components.records(), "special": self.special_points.records()}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from srfcli.core.errors import SrfError, printable
 from srfcli.core.files import check_target
-from srfcli.laws.law_file import APPARATUS
+from srfcli.laws.law_file import RESERVED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Values = Collection[Any]  # a list or an array of numbers; None or NaN is a gap
 
-SUFFIXES = (".png", ".svg", ".pdf")
+FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 # Okabe and Ito's palette without its yellow, dark enough on white; line styles say the same once more for print.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
@@ -37,7 +37,7 @@ SYMBOLS = {
     "lambda": "λ", "alpha": "α", "phi": "φ",
 }  # fmt: skip
 HEADING, LINE, MARGIN = 9.0, 0.155, 0.012  # points and inches of a heading's line; its margin, of the figure's width
-NAME = 9.0  # points of a curve's name below the axes
+NAME_OFFSET = 9.0  # points of a curve's name below the axes
 NAME_ROW, NAME_WIDTH, HANDLE = 0.19, 0.075, 0.65  # inches of a row of names, of a letter, and of the line beside a name
 SCREEN = 90.0  # dots per inch in a notebook
 
@@ -71,9 +71,9 @@ _METADATA: dict[str, dict[str, Any]] = {".svg": {"Date": None}, ".pdf": {"Creati
 
 def check_plot(path: Path, *, force: bool) -> None:
     """Raise SrfError where a figure could not be saved at `path`; matplotlib is looked for but not imported."""
-    if path.suffix.lower() not in SUFFIXES:
+    if path.suffix.lower() not in FIGURE_SUFFIXES:
         got = f"ends in {path.suffix!r}" if path.suffix else "has no ending"
-        raise SrfError(f"--plot {path} {got}", f"End it in {', '.join(SUFFIXES)}: --plot {path.with_suffix('.svg')}")
+        raise SrfError(f"--plot {path} {got}", f"End it in {', '.join(FIGURE_SUFFIXES)}: --plot {path.with_suffix('.svg')}")
     check_target(path, force=force, what="--plot")
     if importlib.util.find_spec("matplotlib") is None:
         raise _missing()
@@ -170,7 +170,7 @@ def titled(title: str, described: Mapping[str, Mapping[str, Any]]) -> str:
     `described` is as a table's parameters are.
     """
     known = [name for name, p in described.items() if isinstance(p.get("value"), float | int)]
-    groups = [[n for n in APPARATUS if n in known], [n for n in known if n not in APPARATUS]]  # the law's own follow
+    groups = [[n for n in RESERVED if n in known], [n for n in known if n not in RESERVED]]  # the law's own follow
     lines = [", ".join(valued(n, described[n]["value"], str(described[n].get("unit"))) for n in g) for g in groups]
     return "\n".join(line for line in [title, *lines] if line)
 
@@ -215,7 +215,7 @@ def names_below(figure: Figure, handles: Sequence[Any], names: Sequence[str], **
     columns = max(1, min(len(names), int(figure.get_figwidth() / widest)))
     figure.set_figheight(figure.get_figheight() + NAME_ROW * -(-len(names) // columns))
     figure.legend(
-        handles, names, loc="outside lower center", ncols=columns, fontsize=NAME,
+        handles, names, loc="outside lower center", ncols=columns, fontsize=NAME_OFFSET,
         **{"handlelength": 2.8, "columnspacing": 1.4, **more},
     )  # fmt: skip
 
@@ -231,7 +231,7 @@ def one_panel(ax: Axes | None, *, title: str, size: tuple[float, float] | None =
             yield cast("Figure", ax.figure), ax
             ax.set_title("\n".join(_broken(title.split("\n")[0], cast("Figure", ax.figure), ax.bbox.width)), fontsize=HEADING)
             if len(ax.get_legend_handles_labels()[1]) > 1:
-                ax.legend(loc="best", handlelength=2.8, fontsize=NAME)
+                ax.legend(loc="best", handlelength=2.8, fontsize=NAME_OFFSET)
             return
         figure, (own,) = new_figure(size=size)
         yield figure, own

@@ -21,7 +21,7 @@ from srfcli.core.files import unused_name, write_atomic
 from srfcli.results.plots import figure_bytes
 from srfcli.results.provenance import sidecar_path
 from srfcli.results.report_figures import (
-    LEVEL,
+    SIGNIFICANT,
     Trace,
     axis_text,
     diagram_figure,
@@ -61,8 +61,8 @@ if TYPE_CHECKING:
 
 # What stands in the report of a diagnosis, section by section, from the answer, its material and finished pictures.
 
-SHOWN = 12  # runs whose figures are on the page; all are in the folder
-BENT = 3.0  # standard errors from which a parameter is said to have been bent
+RUNS_SHOWN = 12  # runs whose figures are on the page; all are in the folder
+BIASED = 3.0  # standard errors from which a parameter is said to have been bent
 WIDTH = 0.05  # of a span: windows that are less apart are one in words
 SHADED = (
     "Shaded are the times at which the baseline parts from the recording, the darker the more; that its parameters may have been "
@@ -164,9 +164,9 @@ def places(matter: Matter) -> Markup:
         parts.append(tag("p", SHADED))
     if matter.fitted:
         parts.append(tag("p", f"“{matter.fitted[0].name}”, the run with the largest part, is drawn at the top of this page."))
-    parts += [_run(matter, one) for one in matter.fitted[1:SHOWN]]
-    if len(matter.fitted) > SHOWN:
-        parts.append(tag("p", f"The other {len(matter.fitted) - SHOWN} runs are drawn in the folder figures."))
+    parts += [_run(matter, one) for one in matter.fitted[1:RUNS_SHOWN]]
+    if len(matter.fitted) > RUNS_SHOWN:
+        parts.append(tag("p", f"The other {len(matter.fitted) - RUNS_SHOWN} runs are drawn in the folder figures."))
     return section("where", "Where simulation and recording part", parts, critical_loads(matter), residual_scan(matter))
 
 
@@ -209,7 +209,7 @@ def _run_table(matter: Matter) -> Markup:
 
 def _location_sentences(matter: Matter) -> list[str]:
     location, found = matter.answer.get("location") or {}, []
-    standing = [r for r in matter.located if (r.get("p_value") or 0.0) < LEVEL]
+    standing = [r for r in matter.located if (r.get("p_value") or 0.0) < SIGNIFICANT]
     if not standing:
         return ["No place stands out beyond what noise does."]
     worst = max(standing, key=lambda r: r.get("share") or 0.0)
@@ -362,7 +362,7 @@ def parameters(matter: Matter) -> Markup:
         unit = unit_text(p.get("unit"))
         before, after = (with_error(p.get(k), p.get(f"{k}_stderr")) for k in ("baseline", "augmented"))
         shift = p.get("shift_sigma")
-        if finite(shift) and abs(shift) > BENT:
+        if finite(shift) and abs(shift) > BIASED:
             bent.append((abs(shift), p["name"]))
         shown = [before] if matter.same else [before, after, number(shift, 2)]
         rows.append([f"{p['name']}" + (f"  [{unit}]" if unit else ""), *shown])
@@ -393,7 +393,7 @@ def held_out(matter: Matter) -> Markup:
         rows.append([one.name, rms(before)] + ([] if matter.same else [rms(after), word]))
     heads = ["run", "baseline"] + ([] if matter.same else ["augmented model", "predicted"])
     text = "These were opened only after the model was final."
-    shown = [_run(matter, one) for one in matter.held[:SHOWN]]
+    shown = [_run(matter, one) for one in matter.held[:RUNS_SHOWN]]
     caption = "Residual over noise."
     found = table(heads, rows, caption=caption, numeric=(1, 2))
     return section("held-out", "Runs that the fit never saw", tag("p", text), found, shown)
@@ -466,7 +466,7 @@ def whole_answer(matter: Matter) -> Markup:
 # HTML by small functions: all text is escaped unless it was built here; one page with its style and its pictures inside.
 
 VOID = frozenset({"br", "hr", "img", "meta", "source"})
-SMALL = "(max-width: 640px)"  # screens on which tables are read row by row, and figures are drawn narrow
+SMALL_SCREENS = "(max-width: 640px)"  # screens on which tables are read row by row, and figures are drawn narrow
 MIME = {".svg": "image/svg+xml", ".png": "image/png"}
 
 # No script, and nothing may be fetched, whatever a title or a name in a recording says.
@@ -595,7 +595,7 @@ def picture(
 
     shown = tag("img", src=source(content), alt=alt)
     if narrow is not None:
-        shown = tag("picture", tag("source", media=SMALL, srcset=source(narrow)), shown)
+        shown = tag("picture", tag("source", media=SMALL_SCREENS, srcset=source(narrow)), shown)
     parts = [shown] + ([tag("figcaption", caption)] if caption else [])
     return tag("figure", parts, class_="small" if small else None)
 
@@ -744,7 +744,7 @@ def _page(matter: Matter) -> str:
 # A page on the results in a folder: fits, maps, comparisons and other tables that were written as JSON, with their figures.
 
 MOST_ROWS, MOST_COLUMNS = 40, 7  # of a table on the page; the file has all
-KINDS = {
+KIND_TEXTS = {
     "fit": "Fit of recordings",
     "fit-thresholds": "Fit of critical loads",
     "campaign": "Campaign of fits",
@@ -798,13 +798,13 @@ def _anchor(path: Path) -> str:
 
 def _kind(data: Mapping[str, Any]) -> str:
     name = str(data["schema"]).removeprefix("srf.").partition("/")[0].partition(".")[0]
-    return KINDS.get(name, name)
+    return KIND_TEXTS.get(name, name)
 
 
 def _headline(data: Mapping[str, Any]) -> str:
     """Return what was found, in a sentence."""
     notes, rows = [str(n) for n in data.get("notes") or ()], list(data.get("rows") or ())
-    if _kind(data) in (KINDS["fit"], KINDS["fit-thresholds"]):
+    if _kind(data) in (KIND_TEXTS["fit"], KIND_TEXTS["fit-thresholds"]):
         # the methods are those of critical loads
         best = min((data.get("meta") or {}).get("methods") or [{}], key=lambda m: m.get("chi2", 0.0))
         told = []

@@ -25,18 +25,18 @@ Array = NDArray[np.float64]
 
 OBSERVED, BEFORE, AFTER, GUILTY = "#333333", "#D55E00", "#0072B2", "#E69F00"
 BLOCKS, LEAST = 60, 24  # pieces of a run whose residual is judged, samples that make a piece
-COLUMNS = 360  # in which a residual is drawn by its extremes
+RESIDUAL_COLUMNS = 360  # in which a residual is drawn by its extremes
 DOTS = 700  # samples that are drawn one by one
 CLOSE_UP, FEWEST = 7, 80  # periods of what is missing that a close-up shows, samples at least
 MOST, SHORT = 0.6, 0.12  # of the misfit, in a part of the run so short that it deserves a close-up
 PEAK = 0.3  # of a residual's power in one line, from which it has a period
-FAINT = 2.0  # of the noise's variance: less than that needs no close-up
+CLOSE_UP_POWER = 2.0  # of the noise's variance: less than that needs no close-up
 ZOOM = 0.3  # of a run: a close-up of more would show nothing new
-VARIES = 1e-3  # relative variation of a load from which it is worth a panel
+LOAD_PANEL = 1e-3  # relative variation of a load from which it is worth a panel
 NARROW_FIGURE = 4.3  # inches: a figure for a small screen, whose text keeps its size there
-GAP = 5.0  # usual steps in time after which a record has a gap
-BESIDE = 5  # steps before it, and after, that tell the usual one: a record may change its sampling rate
-SAME = 1e-9  # of the noise: predictions that differ by less are one
+GAP_STEPS = 5.0  # usual steps in time after which a record has a gap
+STEPS_BESIDE = 5  # steps before it, and after, that tell the usual one: a record may change its sampling rate
+SAME_PREDICTION = 1e-9  # of the noise: predictions that differ by less are one
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Trace:
     @property
     def same(self) -> bool:
         """True where the augmented model is the baseline."""
-        return bool(np.allclose(self.before, self.after, rtol=0.0, atol=SAME))
+        return bool(np.allclose(self.before, self.after, rtol=0.0, atol=SAME_PREDICTION))
 
     def sides(self, before: Array, after: Array) -> list[tuple[Array, str, Any]]:
         """Return values of baseline and augmented model, the baseline's alone where they are the same, with colour and dashes."""
@@ -179,7 +179,7 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
 
     `narrow` leaves the close-up out and gives the legend a row of its own, for a small screen.
     """
-    imposed = [k for k in ("V", "W") if np.ptp(getattr(one, k)) > VARIES * float(np.abs(getattr(one, k)).max())]
+    imposed = [k for k in ("V", "W") if np.ptp(getattr(one, k)) > LOAD_PANEL * float(np.abs(getattr(one, k)).max())]
     piece = None if narrow else close_up(one)
     friction = one.unexplained is not None
     heights = [3.0, 2.2, 1.1, *[1.3] * friction, *[0.75] * len(imposed)]
@@ -284,10 +284,10 @@ def _residual(axis: Axes, one: Trace) -> None:
     for z, colour, _ in one.sides(one.before, one.after):
         alpha = 0.75 if colour == AFTER else 0.55
         for a, b in _pieces(one.t):
-            if b - a < 4 * COLUMNS:
+            if b - a < 4 * RESIDUAL_COLUMNS:
                 axis.plot(one.t[a:b], z[a:b], color=colour, linewidth=0.6, alpha=alpha)
                 continue
-            edges = np.unique(np.linspace(a, b, COLUMNS + 1).astype(int)[:-1])
+            edges = np.unique(np.linspace(a, b, RESIDUAL_COLUMNS + 1).astype(int)[:-1])
             low, high = np.minimum.reduceat(z[:b], edges), np.maximum.reduceat(z[:b], edges)
             axis.fill_between(one.t[edges], low, high, color=colour, alpha=alpha, linewidth=0.3)
     _noise_band(axis)
@@ -340,7 +340,7 @@ def close_up(one: Trace) -> slice | None:
     if n < 2 * FEWEST:
         return None
     over = np.maximum(_smooth(one.before**2, max(n // 200, 5)) - 1.0, 0.0)
-    if float(over.max()) < FAINT or not over.any():
+    if float(over.max()) < CLOSE_UP_POWER or not over.any():
         return None
     sums = np.concatenate([[0.0], np.cumsum(over)])
     ends = np.searchsorted(sums, sums[:-1] + MOST * sums[-1])  # the shortest stretch that holds most of it
@@ -357,7 +357,7 @@ def close_up(one: Trace) -> slice | None:
     peak = int(np.argmax(spectrum[1:])) + 1
     length = max(CLOSE_UP * z.size // peak, FEWEST)
     tall = float(spectrum[max(peak - 2, 1) : peak + 3].sum()) > PEAK * float(spectrum[1:].sum())
-    return _around(middle, length, n) if tall and float(np.var(z)) > FAINT and length <= ZOOM * n else None
+    return _around(middle, length, n) if tall and float(np.var(z)) > CLOSE_UP_POWER and length <= ZOOM * n else None
 
 
 def _smooth(values: Array, size: int) -> Array:
@@ -377,18 +377,20 @@ def _pieces(t: Array) -> list[tuple[int, int]]:
     if t.size < 2:
         return [(0, t.size)]
     steps = np.diff(t)
-    usual = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(steps, BESIDE, mode="edge"), BESIDE), axis=1)
-    longer = np.maximum(usual[: steps.size], usual[BESIDE + 1 : BESIDE + 1 + steps.size])  # of those before, and after
-    borders = [0, *(np.flatnonzero(steps > GAP * longer) + 1).tolist(), t.size]
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(steps, STEPS_BESIDE, mode="edge"), STEPS_BESIDE), axis=1)
+    longer = np.maximum(
+        usual[: steps.size], usual[STEPS_BESIDE + 1 : STEPS_BESIDE + 1 + steps.size]
+    )  # of those before, and after
+    borders = [0, *(np.flatnonzero(steps > GAP_STEPS * longer) + 1).tolist(), t.size]
     return [(a, b) for a, b in itertools.pairwise(borders) if b > a]
 
 
 # The residual scan: its rows as `Spot`, the foremost of them, and a figure.
 
-BINS = 3  # of an axis, from which it has a panel of its own
-FINEST = 240  # columns in which a spectrum is drawn by its maxima
+PANEL_BINS = 3  # of an axis, from which it has a panel of its own
+SPECTRUM_COLUMNS = 240  # columns in which a spectrum is drawn by its maxima
 THIN = 0.003  # of an axis: a bin so narrow is a line, as it would hardly be seen as a bar
-LEVEL = 0.01  # of the p-value adjusted for all that was looked at
+SIGNIFICANT = 0.01  # of the p-value adjusted for all that was looked at
 WIDE_AXIS = 100.0  # ratio from which an axis is logarithmic
 APART = ("run", "window")  # axes that the figures of the runs show
 
@@ -427,8 +429,8 @@ class Spot:
 
     @property
     def sure(self) -> bool:
-        """True where the p-value, adjusted for the number of places, is below LEVEL."""
-        return self.p_value is not None and self.p_value < LEVEL
+        """True where the p-value, adjusted for the number of places, is below SIGNIFICANT."""
+        return self.p_value is not None and self.p_value < SIGNIFICANT
 
     @property
     def place(self) -> str:
@@ -471,7 +473,7 @@ def scan_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> F
     for spot in spots(rows):
         if spot.axis not in APART and spot.kind != "shape":
             by_axis.setdefault(spot.axis, []).append(spot)
-    shown = {k: v for k, v in by_axis.items() if len({(s.low, s.high) for s in v}) >= BINS}
+    shown = {k: v for k, v in by_axis.items() if len({(s.low, s.high) for s in v}) >= PANEL_BINS}
     if not shown:
         return None
     columns = 1 if narrow else min(3, len(shown))
@@ -498,7 +500,7 @@ def _bins(axis: Axes, found: Sequence[Spot]) -> None:
     bins = list(highest.values())
     positive = min(s.low for s in bins) > 0
     log = positive and max(s.high for s in bins) > WIDE_AXIS * min(s.high for s in bins)
-    if len(bins) > FINEST:
+    if len(bins) > SPECTRUM_COLUMNS:
         bins = _columns(bins, log)
     place = np.log if log else np.asarray
     width = float(place(max(s.high for s in bins)) - place(min(s.low for s in bins)))
@@ -518,17 +520,17 @@ def _bins(axis: Axes, found: Sequence[Spot]) -> None:
 def _columns(bins: Sequence[Spot], log: bool) -> list[Spot]:
     """Return many bins as few columns, each as high as the highest in it, largest first."""
     low, high = min(s.low for s in bins), max(s.high for s in bins)
-    edges = np.geomspace(low, high, FINEST + 1) if log else np.linspace(low, high, FINEST + 1)
+    edges = np.geomspace(low, high, SPECTRUM_COLUMNS + 1) if log else np.linspace(low, high, SPECTRUM_COLUMNS + 1)
     highest: dict[int, Spot] = {}
     for spot in bins:
-        k = int(np.clip(np.searchsorted(edges, 0.5 * (spot.low + spot.high), side="right") - 1, 0, FINEST - 1))
+        k = int(np.clip(np.searchsorted(edges, 0.5 * (spot.low + spot.high), side="right") - 1, 0, SPECTRUM_COLUMNS - 1))
         highest.setdefault(k, spot)
     return [replace(s, low=float(edges[k]), high=float(edges[k + 1])) for k, s in highest.items()]
 
 
 # Figures of what was found: how far parameters had been bent, a missing force, a stability diagram.
 
-PIECES = 40  # in which a force is averaged along a quantity of state
+FORCE_BINS = 40  # in which a force is averaged along a quantity of state
 STATES = (("v", "slip velocity v  [µm/s]", True), ("phi", "age φ  [s]", True), ("W", "load W  [N]", False))
 WIDE_QUANTITY = 10.0  # ratio from which a quantity has a logarithmic axis
 
@@ -622,12 +624,12 @@ def _by_state(axis: Axes, x: Any, y: Any, log: bool, label: str, index: int) -> 
     every = max(x.size // 1500, 1)
     axis.plot(x[::every], y[::every], ".", color=style["color"], markersize=1.2, alpha=0.25, rasterized=True)
     scale = np.log(x) if log else x
-    edges = np.linspace(scale.min(), scale.max(), PIECES + 1)
-    place = np.clip(np.digitize(scale, edges) - 1, 0, PIECES - 1)
-    count = np.bincount(place, minlength=PIECES)
+    edges = np.linspace(scale.min(), scale.max(), FORCE_BINS + 1)
+    place = np.clip(np.digitize(scale, edges) - 1, 0, FORCE_BINS - 1)
+    count = np.bincount(place, minlength=FORCE_BINS)
     kept = count >= max(3, x.size // 2000)
     middle = 0.5 * (edges[1:] + edges[:-1])[kept]
-    mean = np.bincount(place, weights=y, minlength=PIECES)[kept] / count[kept]
+    mean = np.bincount(place, weights=y, minlength=FORCE_BINS)[kept] / count[kept]
     axis.plot(np.exp(middle) if log else middle, mean, **style, label=label)
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     Array = NDArray
 
-RISE = 0.02  # s over which steps of the load are rounded: five times the slider's bounce on its interface
+STEP_RISE = 0.02  # s over which steps of the load are rounded: five times the slider's bounce on its interface
 MANY_BREAKS = 50  # a recorded load has knots, not changes
 FEW_SAMPLES = 20  # show no oscillation
 OTHERS = (  # what a record has beside the first observable, where it is asked for

@@ -238,7 +238,7 @@ def to_json(table: Table) -> str:
 
 # What every result can do.
 
-SHOWN = 20  # rows of a table that a notebook shows
+ROWS_SHOWN = 20  # rows of a table that a notebook shows
 
 
 class Result(ABC):
@@ -342,7 +342,7 @@ def table_html(table: Table) -> str:
     head = "".join(cell("th", i, c.heading, c.about) for i, c in enumerate(table.columns))
     body = [
         "<tr>" + "".join(cell("td", i, cell_text(v, table.columns[i].format)) for i, v in enumerate(row)) + "</tr>"
-        for row in list(table.rows[:SHOWN])
+        for row in list(table.rows[:ROWS_SHOWN])
     ]
     left = len(table.rows) - len(body)
     notes = [*([f"{left} more rows"] if left else []), *table.notes]

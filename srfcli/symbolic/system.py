@@ -32,7 +32,7 @@ APPARATUS = (
 )
 MASS = Parameter("M", 2.37, "kg", 1e-12, 1e12, "mass of the slider")
 ANGLE = Parameter("angle", 15.0, "deg", -60.0, 60.0, "inclination of the spring: W gains K (u - u_ss) tan(angle)")
-RUN = (  # of one run: what an effect may ask of the recording
+RUN_SYMBOLS = (  # of one run: what an effect may ask of the recording
     Parameter("start", 0.0, "um", about="where on the track the run begins"),
     Parameter("begin", 0.0, "s", about="the clock at the run's first sample"),
     Parameter("psi", 0.0, "1", about="phase of the load modulation at clock 0"),
@@ -101,7 +101,7 @@ class System:
         if self.loading == "inclined":
             own.append(ANGLE)
         if self.effects or self.tables:
-            own += RUN
+            own += RUN_SYMBOLS
         seen = {p.name for p in own}
         for law in self.laws:
             for parameter in law.parameters:

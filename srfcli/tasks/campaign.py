@@ -21,11 +21,11 @@ from srfcli.laws.registry import load_registry
 from srfcli.results.fit import PAIRS, CampaignResult, FitResult
 from srfcli.tasks.recordings import fit, read_experiment
 
-TAIL = 1 / 3  # of a segment, at its end, that is checked for steady sliding
-LONG = 2.0  # slip lengths that this part must be long
+STEADY_TAIL = 1 / 3  # of a segment, at its end, that is checked for steady sliding
+LONG_ENOUGH = 2.0  # slip lengths that this part must be long
 SURE = 3.0  # standard errors from which a slope is significant
 DRIFT = 0.02  # of B (A where it is larger) that friction may change by over a slip length in steady sliding
-BAD = 1.3  # residual rms over noise from which the fit is flagged
+BAD_FIT = 1.3  # residual rms over noise from which the fit is flagged
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
         yield f"friction still changes with slip at the end of {row['segments'] - row['steady']} of {row['segments']} segments"
     if not row["segments"]:
         yield "no segment is long enough to say whether it ends in steady sliding"
-    if row["rms_over_noise"] is not None and row["rms_over_noise"] > BAD:
+    if row["rms_over_noise"] is not None and row["rms_over_noise"] > BAD_FIT:
         yield f"residual {row['rms_over_noise']:.2g} times the noise"
 
 
@@ -190,8 +190,8 @@ def _slopes(run: Run, length: float) -> Iterator[tuple[float, float]]:
     mu = run.observed * run.friction_factor(run.load(run.t)[0])
     for begin, end in pairwise(run.edges):
         V, rate, _ = run.drive.piece(begin)
-        part = (run.t >= end - TAIL * (end - begin)) & (run.t <= end) & run.used
-        if rate or V <= 0 or V * TAIL * (end - begin) < LONG * length or part.sum() < 16:
+        part = (run.t >= end - STEADY_TAIL * (end - begin)) & (run.t <= end) & run.used
+        if rate or V <= 0 or V * STEADY_TAIL * (end - begin) < LONG_ENOUGH * length or part.sum() < 16:
             continue
         x = V * (run.t[part] - run.t[part].mean())
         y = mu[part] - mu[part].mean()

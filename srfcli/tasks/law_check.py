@@ -27,9 +27,9 @@ from srfcli.symbolic.system import System, build_system, with_effects
 
 # What `srf law check` asks of a law: units, steady state, mu_v > 0, derivatives, worked values.
 
-REFERENCE = "srf-vsat"  # the friction law whose parameters stand in where an ageing law is checked by itself
-VELOCITIES = np.logspace(-3, 3, 7)  # um/s
-LOADS = np.logspace(-1, 3, 9)  # N
+REFERENCE_LAW = "srf-vsat"  # the friction law whose parameters stand in where an ageing law is checked by itself
+CHECKED_VELOCITIES = np.logspace(-3, 3, 7)  # um/s
+CHECKED_LOADS = np.logspace(-1, 3, 9)  # N
 DERIVATIVE_RTOL = 1e-9
 
 
@@ -105,21 +105,21 @@ def check_steady_state(law: Law, registry: Registry) -> str:
         values = reference_values(law.parameters)
         names = []
         for ageing in _ageing_laws(registry):
-            for v in VELOCITIES:
+            for v in CHECKED_VELOCITIES:
                 mu = evaluate(law.mu, {**values, **_steady(law, ageing, v), "v": v})
                 if not np.isfinite(mu):
                     raise SrfError(f"mu = {mu} at v = {v:g} um/s in steady sliding with {ageing.name}")
             names.append(ageing.name)
-        return f"mu is finite from {VELOCITIES[0]:g} to {VELOCITIES[-1]:g} um/s with {', '.join(names)}"
+        return f"mu is finite from {CHECKED_VELOCITIES[0]:g} to {CHECKED_VELOCITIES[-1]:g} um/s with {', '.join(names)}"
     rate = law.rate if isinstance(law, AgeingLaw) else formula_of(law) + _ageing(registry, "dieterich").rate
     values = reference_values(_parameters(law, registry))
     found = []
-    for v in VELOCITIES:
+    for v in CHECKED_VELOCITIES:
         phi = steady_age(rate, v, values["D0"], values)
         if phi is None:
             raise SrfError(f"phi has no attracting steady value at v = {v:g} um/s", "The rate must fall through 0 at one.")
         found.append(phi * v / values["D0"])
-    return f"phi v/D0 = {min(found):.6g} to {max(found):.6g} from {VELOCITIES[0]:g} to {VELOCITIES[-1]:g} um/s"
+    return f"phi v/D0 = {min(found):.6g} to {max(found):.6g} from {CHECKED_VELOCITIES[0]:g} to {CHECKED_VELOCITIES[-1]:g} um/s"
 
 
 def check_direct_effect(law: Law, registry: Registry) -> str:
@@ -130,7 +130,7 @@ def check_direct_effect(law: Law, registry: Registry) -> str:
     values = reference_values(law.parameters)
     found = []
     for ageing in _ageing_laws(registry):
-        for v in VELOCITIES:
+        for v in CHECKED_VELOCITIES:
             value = v * evaluate(slope, {**values, **_steady(law, ageing, v), "v": v})
             if not value > 0:
                 raise SrfError(
@@ -184,18 +184,18 @@ def check_worked_values(law: Law, registry: Registry) -> str:
 def _check_stiffness(law: Interface) -> str:
     if law.kappa is None:
         raise Skipped("a rigid interface has no stiffness")
-    found = [float(evaluate(law.kappa, {**reference_values(law.parameters), "W": W})) for W in LOADS]
-    for W, kappa in zip(LOADS, found, strict=True):
+    found = [float(evaluate(law.kappa, {**reference_values(law.parameters), "W": W})) for W in CHECKED_LOADS]
+    for W, kappa in zip(CHECKED_LOADS, found, strict=True):
         if not (np.isfinite(kappa) and kappa > 0):
             raise SrfError(f"kappa = {kappa:g} N/um at W = {W:g} N", "A stiffness is positive and finite.")
-    return f"kappa = {min(found):.6g} to {max(found):.6g} N/um from {LOADS[0]:g} to {LOADS[-1]:g} N"
+    return f"kappa = {min(found):.6g} to {max(found):.6g} N/um from {CHECKED_LOADS[0]:g} to {CHECKED_LOADS[-1]:g} N"
 
 
 def _parameters(law: Law, registry: Registry) -> tuple[Parameter, ...]:
     """Return a law's parameters, and for an ageing law or modifier the friction parameters that it may name."""
     if not isinstance(law, AgeingLaw | AgeingModifier):
         return law.parameters
-    reference = registry.get("friction", REFERENCE).parameters
+    reference = registry.get("friction", REFERENCE_LAW).parameters
     return (*(p for p in reference if p.name in COMMON), *law.parameters)
 
 
@@ -237,7 +237,7 @@ def _sample(law: Law, registry: Registry) -> list[dict[str, float]]:
     base = reference_values(_parameters(law, registry))
     length = base.get("D0", 1.0)
     points = []
-    for number, v in enumerate(VELOCITIES):
+    for number, v in enumerate(CHECKED_VELOCITIES):
         stretch = (0.3, 1.7, 0.8)[number % 3]
         point = {**base, "v": v, "mu": 0.4, "mu_dot": 0.02, "W": 3.0 + number, "W_dot": -1.5, "F_dot_over_W": 0.03}
         states = law.states if isinstance(law, FrictionLaw) else (State(),)
@@ -260,7 +260,7 @@ SLOT_UNITS = {
 }  # fmt: skip
 PLACE_UNITS = {"slip": "um", "stage": "um", "time": "s", "theta": "1", "envelope": "1", "u": "um"}
 MOVING = {"slip", "stage", "time", "theta", "envelope"}  # an effect of these is steady nowhere
-RUN = {"V": 9.0, "W0": 6.0, "eps": 0.1, "f": 110.0, "psi": 0.4, "onset0": 0.5, "rise0": 0.3, "modulated": 1.0}
+CHECKED_RUN = {"V": 9.0, "W0": 6.0, "eps": 0.1, "f": 110.0, "psi": 0.4, "onset0": 0.5, "rise0": 0.3, "modulated": 1.0}
 POINTS = 24
 RTOL = 1e-9
 
@@ -439,7 +439,7 @@ class _Check:
         if used:
             raise Skipped(f"with {', '.join(sorted(used))} in the formula nothing is steady")
         p = self.p_default
-        rates = np.asarray(self.model.rates(np.asarray(self.model.steady(p)), RUN["V"], RUN["W0"], 0.0, p))
+        rates = np.asarray(self.model.rates(np.asarray(self.model.steady(p)), CHECKED_RUN["V"], CHECKED_RUN["W0"], 0.0, p))
         scale = np.max(np.abs(self.points.rates(self.model, p)), axis=0)
         worst = float(np.max(np.abs(rates) / np.maximum(scale, 1e-300)))
         if not worst < 1e-8:
@@ -503,8 +503,8 @@ class _Check:
 
 
 def _vector(model: GeneratedModel, values: Mapping[str, float] | None = None) -> Array:
-    """Return the parameters of a model at RUN, some of them at other values."""
-    return model.vector({n: v for n, v in RUN.items() if n in model.names} | dict(values or {}))
+    """Return the parameters of a model at CHECKED_RUN, some of them at other values."""
+    return model.vector({n: v for n, v in CHECKED_RUN.items() if n in model.names} | dict(values or {}))
 
 
 def _stepped_states(model: GeneratedModel, points: _Points, p: Array) -> Array:

@@ -18,14 +18,14 @@ from srfcli.core.settings import Parameter, check_value, require_parameter
 from srfcli.core.units import from_base, parse_quantity, tidy, to_base
 from srfcli.data.description import MOST_OBSERVABLES
 from srfcli.data.noise import FrictionField, check_gauge, generator
-from srfcli.data.values import BESIDE, OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
+from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
 from srfcli.data.writing import stiffness_text
 from srfcli.inference.prediction import of_run
-from srfcli.laws.law_file import APPARATUS
+from srfcli.laws.law_file import RESERVED
 from srfcli.laws.registry import Registry
 from srfcli.motion import simulate as integrate
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, ModulatedLoad, Modulation
-from srfcli.results.simulation import RISE, Gauge, Job, Record, SimulationResult, Work, measure, observe
+from srfcli.results.simulation import STEP_RISE, Gauge, Job, Record, SimulationResult, Work, measure, observe
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -101,7 +101,7 @@ def simulate(
     elif not isinstance(drive, Drive):
         drive = Drive.steps(drive)
     if load is not None and not isinstance(load, Load):
-        load = LoadSteps.sequence([(length, W, W) for length, W in load], start=float(times[0]), rise=RISE)
+        load = LoadSteps.sequence([(length, W, W) for length, W in load], start=float(times[0]), rise=STEP_RISE)
     work = record_of(system, t=times, drive=drive, load=load, onset=onset, start=start, observables=observables)
     return simulate_work(work, rtol=rtol)
 
@@ -130,9 +130,9 @@ def simulate_work(
 def check_observables(names: Sequence[str]) -> list[str]:
     """Return the names of observables, which must be known; the first is one of the spring."""
     for number, name in enumerate(names):
-        if name not in OBSERVABLES | BESIDE:
-            raise SrfError(f"unknown observable {name!r}", did_you_mean(name, OBSERVABLES | BESIDE))
-        if number == 0 and name in BESIDE:
+        if name not in OBSERVABLES | OTHER_OBSERVABLES:
+            raise SrfError(f"unknown observable {name!r}", did_you_mean(name, OBSERVABLES | OTHER_OBSERVABLES))
+        if number == 0 and name in OTHER_OBSERVABLES:
             raise SrfError(f"{name} needs an elongation, a force or a friction before it", f"As force,{name}.")
         if name in names[:number]:
             raise SrfError(f"the observable {name!r} is named twice", "Name each once.")
@@ -156,7 +156,7 @@ def read_gauges(
                 f"`{name}` {text}: found {len(texts)}, expected one for each of {', '.join(observables)}",
                 f"Write `{name}` {','.join(['0.01'] * len(observables))}.",
             )
-        units = [(OBSERVABLES | BESIDE)[observable] for observable in observables]
+        units = [(OBSERVABLES | OTHER_OBSERVABLES)[observable] for observable in observables]
         sizes.append([parse_quantity(text, unit, name=f"`{name}`") for text, unit in zip(texts, units, strict=True)])
     silent = any(sizes[0])  # a gauge without noise beside others; of none, a colour is told
     gauges = [Gauge(n, lag1 if n or not silent else 0.0, q, seed) for n, q in zip(*sizes, strict=True)]
@@ -167,8 +167,8 @@ def read_gauges(
 
 # A new record: one slider under a drive and a load.
 
-REFERENCE = ("V0",)  # the velocity that mu0 refers to: not identifiable beside mu0
-FACTOR = 5.0  # ratio of the bounds of a fit to the value
+REFERENCE_PARAMETERS = ("V0",)  # the velocity that mu0 refers to: not identifiable beside mu0
+BOUND_FACTOR = 5.0  # ratio of the bounds of a fit to the value
 
 
 def record_of(
@@ -184,7 +184,7 @@ def record_of(
 ) -> Work:
     """Return one record of a slider, to be simulated; arguments are those of `simulate`.
 
-    `rough` is the model with TABLES and the random field that it slides on.
+    `rough` is the model with FIELD_TABLE and the random field that it slides on.
     """
     model, values, p, begin = system.model, system.resolved.values, system.vector(), float(t[0])
     model.check_changing_load(p)
@@ -276,7 +276,7 @@ def new_experiment(
     parameters = [
         FitParameter(p.name, values[p.name], *bounds(p, values[p.name]), fixed=p.name not in chosen, unit=p.unit)
         for p in model.parameters
-        if p.name not in APPARATUS or p.name in chosen
+        if p.name not in RESERVED or p.name in chosen
     ]
     mass = values.get("M") if choice.inertia else None
     listed = perturbed(parameters, spread, seed)
@@ -285,9 +285,9 @@ def new_experiment(
 
 def free_names(model: GeneratedModel, names: str | None) -> set[str]:
     """Return which parameters a fit of the written experiment is to find."""
-    laws = [p.name for p in model.parameters if p.name not in APPARATUS]
+    laws = [p.name for p in model.parameters if p.name not in RESERVED]
     if names is None:
-        return {name for name in laws if name not in REFERENCE}
+        return {name for name in laws if name not in REFERENCE_PARAMETERS}
     chosen = [name.strip() for name in names.split(",") if name.strip()]
     known = [*laws, *(name for name in ("K", "M") if name in model.names)]
     for name in chosen:
@@ -300,8 +300,8 @@ def bounds(parameter: Parameter, value: float) -> tuple[float, float]:
     """Return the bounds of a fit around `value` (um, s, N): a factor of five, within the parameter's own."""
     lower, upper = (to_base(b, parameter.unit) for b in (parameter.lower, parameter.upper))
     if value > 0:
-        return max(lower, float(f"{value / FACTOR:.3g}")), min(upper, float(f"{value * FACTOR:.3g}"))
-    reach = FACTOR * max(abs(value), 1.0)
+        return max(lower, float(f"{value / BOUND_FACTOR:.3g}")), min(upper, float(f"{value * BOUND_FACTOR:.3g}"))
+    reach = BOUND_FACTOR * max(abs(value), 1.0)
     return (lower if math.isfinite(lower) else value - reach), (upper if math.isfinite(upper) else value + reach)
 
 
@@ -424,7 +424,7 @@ def runs_again(
     notes = (f"initial state of {', '.join(unknown)} not known: begun in steady sliding",) if unknown else ()
     meta: dict[str, Any] = {"title": experiment.title}
     if field is not None:
-        mover = open_model(registry, **asdict(choice), tables=TABLES)
+        mover = open_model(registry, **asdict(choice), tables=FIELD_TABLE)
         jobs = tuple(on_field(model, mover, field, job, start=start) for job in jobs)
         told, entry = _field_told(field)
         notes, meta = (*notes, *told), meta | entry
@@ -524,14 +524,14 @@ def _moved(p: FitParameter, value: float | None) -> FitParameter:
 
 # The random friction field along slip, and records simulated with it.
 
-TABLES = (("mu", "slip"),)  # a table over slip is added to the friction coefficient
+FIELD_TABLE = (("mu", "slip"),)  # a table over slip is added to the friction coefficient
 LARGEST_ROUGHNESS = 0.5  # of mu0: above it the friction coefficient may become negative
 
 
 def on_field(
     plain: GeneratedModel, rough: GeneratedModel, field: FrictionField, job: Job, *, start: ArrayLike | str | None
 ) -> Job:
-    """Return the job of the model `plain` as one of `rough`, the same with TABLES, on the part of the track that it covers.
+    """Return the job of the model `plain` as one of `rough`, the same with FIELD_TABLE, on the part of the track that it covers.
 
     Positions are slip from where the run begins; runs that begin at the same place find the same track there. `start` is as in
     `simulate`. Raises SrfError for a roughness that the friction coefficient does not allow.

@@ -52,8 +52,8 @@ def checked(model: GeneratedModel, name: str, values: Any) -> tuple[float, ...]:
 
 # `linear`: stability of steady sliding under constant load.
 
-LOADS = np.geomspace(1e-3, 1e5, 9)  # um, times K: where there is no Hopf point, stability is that of these
-VELOCITIES = tuple(np.geomspace(1.0, 100.0, 60).tolist())  # um/s
+LOADS_TRIED = np.geomspace(1e-3, 1e5, 9)  # um, times K: where there is no Hopf point, stability is that of these
+VELOCITIES_TRIED = tuple(np.geomspace(1.0, 100.0, 60).tolist())  # um/s
 
 
 def linear(
@@ -92,7 +92,7 @@ def linear(
     >>> [round(W0, 4) for W0 in found.to_dataframe()["W0"]]
     [7.2832, 7.805, 13.0808]
     """
-    grid = swept(system.model, over or {"V": VELOCITIES})
+    grid = swept(system.model, over or {"V": VELOCITIES_TRIED})
     for name in set(grid) & {"W0", "eps", "f"}:
         what = "is what is found" if name == "W0" else "has no part in steady sliding under constant load"
         raise SrfError(f"{name} is swept and {what}", "Sweep another parameter, or use `srf critical`.")
@@ -122,7 +122,7 @@ def _without_hopf(model: GeneratedModel, p: Array) -> str:
     slope = weakening(model, p)
     if slope <= 0:
         return "velocity strengthening: no Hopf"
-    stable = [steady_is_stable(model, p, W0) for W0 in LOADS * p[model.index("K")]]
+    stable = [steady_is_stable(model, p, W0) for W0 in LOADS_TRIED * p[model.index("K")]]
     if None in stable or not math.isfinite(slope):
         return "no value: the law's slopes overflow"
     if all(stable) or not any(stable):
@@ -262,7 +262,7 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
 
 # `critical` and `continue`: the stability boundary under modulation, point by point and as curves.
 
-LINES = 5  # that are followed outwards to find the loads to look between
+LINES_FOLLOWED = 5  # that are followed outwards to find the loads to look between
 
 
 def critical(
@@ -482,8 +482,8 @@ def _plane(system: SlidingSystem, axes: list[Axis], amplitude: float | None) -> 
     base = model.vector(system.resolved.values | ({} if amplitude is None else {"eps": amplitude}))
     if len(axes) == 2:
         return Plane(base, x, axes[1]), None
-    lines: list[Any] = [base.copy() for _ in range(LINES)]
-    for line, value in zip(lines, x.samples(LINES), strict=True):
+    lines: list[Any] = [base.copy() for _ in range(LINES_FOLLOWED)]
+    for line, value in zip(lines, x.samples(LINES_FOLLOWED), strict=True):
         line[model.index(x.name)] = value
     window = found_window(model, lines)
     return Plane(base, x, Axis("W0", window.lo, window.hi)), window

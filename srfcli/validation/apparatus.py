@@ -15,7 +15,7 @@ from srfcli.validation.slider import AGEING_LAWS, BARE, LAWS, Physics, Plan, ste
 # How an apparatus records, and what its experimenter writes into a description: the same for every case of it.
 
 Start = tuple[float, float, float]  # value, lower, upper
-PARAMETERS = {"Vsat": "Vsat", "lam": "lambda", "nagata": "c"}  # field of Physics -> name in a law's file, where they differ
+LAW_NAMES = {"Vsat": "Vsat", "lam": "lambda", "nagata": "c"}  # field of Physics -> name in a law's file, where they differ
 OF_LAW = {  # the fields of Physics that each friction law has
     "srf-vsat": ("mu0", "A", "B", "D0", "Vsat"),
     "dieterich-ruina": ("mu0", "A", "B", "D0"),
@@ -57,7 +57,7 @@ class Rig:
                 start = self.bare
             elif name == "mu0" and baseline.law == "dieterich-cutoff":
                 start = self.cut
-            written = "Vb" if name == "Vsat" and baseline.law == "dieterich-cutoff" else PARAMETERS.get(name, name)
+            written = "Vb" if name == "Vsat" and baseline.law == "dieterich-cutoff" else LAW_NAMES.get(name, name)
             found[written] = start
         return found
 
@@ -71,7 +71,7 @@ PAPER = Rig(
     },
     bare=(0.46, 0.3, 0.7), cut=(0.45, 0.3, 0.7),
 )  # fmt: skip
-ROCK = Rig(
+ROCK_PRESS = Rig(
     "rock on rock, concealed case",
     {
         "mu0": (0.58, 0.3, 0.9), "A": (0.008, 0.002, 0.03), "B": (0.009, 0.001, 0.04), "D0": (22.0, 2.0, 200.0),
@@ -91,8 +91,8 @@ MICRO = Rig(
 )  # fmt: skip
 RIGS: Mapping[str, Rig] = {
     "paper": PAPER,
-    "rock-stress": ROCK,
-    "rock-friction": replace(ROCK, observes="friction", heading="friction [1]"),
+    "rock-stress": ROCK_PRESS,
+    "rock-friction": replace(ROCK_PRESS, observes="friction", heading="friction [1]"),
     "micro-elongation": MICRO,
     "micro-force": replace(MICRO, observes="force", heading="force [mN]"),
 }
@@ -110,7 +110,7 @@ def recorded(rig: Rig, p: Physics, plan: Plan, u: np.ndarray) -> np.ndarray:
 
 # What a case is set in: apparatus, protocol, laws. Every combination that makes sense, by its share.
 
-APPARATUS = {"paper": 0.25, "rock": 0.5, "micro": 0.25}  # some effects make sense in the first alone
+RIG_SHARES = {"paper": 0.25, "rock": 0.5, "micro": 0.25}  # some effects make sense in the first alone
 PROTOCOLS = {"mixed": 0.3, "steps": 0.2, "holds": 0.12, "load-steps": 0.14, "oscillation": 0.14, "stick-slip": 0.1}
 LAW_SHARES = {law: 0.25 if law in ("srf-vsat", "dieterich-ruina") else 0.1 for law in LAWS}
 AGEING_SHARES = dict(zip(AGEING_LAWS, (0.4, 0.3, 0.1, 0.1, 0.1), strict=True))
@@ -139,7 +139,7 @@ class Setting:
     def share(self) -> float:
         """Return how often it is drawn, in proportion to others."""
         ageing = AGEING_SHARES[self.ageing] if self.ageing == self.stated else WRONG_AGEING[self.ageing, self.stated]
-        return APPARATUS[self.apparatus] * PROTOCOLS[self.protocol] * LAW_SHARES[self.law] * ageing
+        return RIG_SHARES[self.apparatus] * PROTOCOLS[self.protocol] * LAW_SHARES[self.law] * ageing
 
 
 def settings(*, wrong_ageing: bool = False) -> list[Setting]:
@@ -149,7 +149,7 @@ def settings(*, wrong_ageing: bool = False) -> list[Setting]:
     with mass has.
     """
     ageing = list(WRONG_AGEING) if wrong_ageing else [(name, name) for name in AGEING_LAWS]
-    made = [Setting(a, p, law, true, stated) for a, p, law, (true, stated) in product(APPARATUS, PROTOCOLS, LAWS, ageing)]
+    made = [Setting(a, p, law, true, stated) for a, p, law, (true, stated) in product(RIG_SHARES, PROTOCOLS, LAWS, ageing)]
     return [
         s
         for s in made
@@ -161,7 +161,7 @@ def settings(*, wrong_ageing: bool = False) -> list[Setting]:
 # Which effects make sense where, and how strong: by field of Physics, weak, strong, and bounds of what stands beside.
 
 Sizes = tuple[float, float, Mapping[str, tuple[float, float]]]
-TURN = (0.0, 2 * math.pi)
+FULL_TURN = (0.0, 2 * math.pi)
 SIZES: Mapping[str, Mapping[str, Sizes]] = {
     "rock": {
         "alpha": (0.1, 0.5, {}),
@@ -173,10 +173,10 @@ SIZES: Mapping[str, Mapping[str, Sizes]] = {
         "drag": (5e-7, 2e-5, {}),
         "Wa": (0.1, 2.0, {}),
         "cross": (1e-3, 0.03, {}),
-        "topo": (2e-4, 2e-3, {"topo_L": (60.0, 500.0), "topo_phase": TURN}),
+        "topo": (2e-4, 2e-3, {"topo_L": (60.0, 500.0), "topo_phase": FULL_TURN}),
         "drift_t": (2e-6, 1e-4, {"drift_t0": (0.0, 20.0)}),
         "drift_x": (2e-7, 1e-5, {"drift_x0": (0.0, 150.0)}),
-        "ripple": (0.01, 0.15, {"ripple_p": (40.0, 300.0), "ripple_phase": TURN}),
+        "ripple": (0.01, 0.15, {"ripple_p": (40.0, 300.0), "ripple_phase": FULL_TURN}),
         "lag": (0.02, 0.5, {}),
         "ratio": (0.03, 0.3, {}),
         "poisson": (0.05, 2.0, {}),
@@ -200,10 +200,10 @@ SIZES: Mapping[str, Mapping[str, Sizes]] = {
         "drag": (5e-6, 3e-4, {}),
         "Wa": (5e-4, 0.02, {}),
         "cross": (1e-3, 0.03, {}),
-        "topo": (2e-4, 2e-3, {"topo_L": (6.0, 40.0), "topo_phase": TURN}),
+        "topo": (2e-4, 2e-3, {"topo_L": (6.0, 40.0), "topo_phase": FULL_TURN}),
         "drift_t": (2e-5, 1e-3, {"drift_t0": (0.0, 2.0)}),
         "drift_x": (5e-6, 1e-4, {"drift_x0": (0.0, 15.0)}),
-        "ripple": (0.01, 0.15, {"ripple_p": (4.0, 25.0), "ripple_phase": TURN}),
+        "ripple": (0.01, 0.15, {"ripple_p": (4.0, 25.0), "ripple_phase": FULL_TURN}),
         "lag": (2e-3, 0.05, {}),
         "ratio": (0.03, 0.3, {}),
         "poisson": (0.3, 10.0, {}),
@@ -249,7 +249,7 @@ def possible(varies: str, setting: Setting) -> bool:
 
 # A slider and its runs, drawn together: whether it sticks depends on both.
 
-TRIES = 400
+RIG_DRAWS = 400
 STABLE = {"paper": 1.2, "rock": 2.5, "micro": 1.5}  # spring over the critical one: a quasi-static slider must be far from it
 UNSTABLE = 0.8
 
@@ -259,7 +259,7 @@ def draw_setup(rng: np.random.Generator, setting: Setting) -> tuple[Physics, tup
 
     No runs for the paper's mixed protocol, in which it does both.
     """
-    for _ in range(TRIES):
+    for _ in range(RIG_DRAWS):
         p, load = _slider(rng, setting)
         if (setting.apparatus, setting.protocol) == ("paper", "mixed"):
             return p, ()

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 # Answers: one line each of a file that grows while a trial runs, and from which it resumes.
 
-LARGEST = 64 * 2**20  # bytes of all answers
+LARGEST_ANSWERS = 64 * 2**20  # bytes of all answers
 
 FAILED = "failed"  # beside the verdicts: the diagnosis raised, ran out of time, or ended its process
 VERDICTS = ("none", "identified", "ambiguous", "unknown", "inconclusive", FAILED)
@@ -96,7 +96,7 @@ def from_line(line: str, *, where: str) -> Answer:
 def read_answers(path: Path) -> dict[str, Answer]:
     """Return the answers of a file by case, none where there is no file; SrfError for a damaged line or a case named twice."""
     try:
-        text = read_text(path, limit=LARGEST, what="answers")
+        text = read_text(path, limit=LARGEST_ANSWERS, what="answers")
     except FileNotFoundError:
         return {}
     found: dict[str, Answer] = {}

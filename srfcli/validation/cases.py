@@ -18,12 +18,12 @@ from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import parse_json, read_plain, write_atomic
 from srfcli.core.parallel import run_here, run_processes
 from srfcli.validation.apparatus import (
+    FULL_TURN,
     NOISE_SHARES,
     ONE_RUN,
     PAPER,
     RIGS,
     SIZES,
-    TURN,
     Rig,
     Setting,
     disturbed,
@@ -99,12 +99,12 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("viscous-drag", "drag", 5e-6, 3e-4),
     Effect("adhesion-offset", "Wa", 0.02, 0.6),
     Effect("load-transmission", "rho", 0.01, 0.7, (-1,), neutral=1.0),
-    Effect("load-distortion", "distortion", 0.02, 0.4, beside={"distortion_phase": TURN}),
+    Effect("load-distortion", "distortion", 0.02, 0.4, beside={"distortion_phase": FULL_TURN}),
     Effect("tangential-crosstalk", "cross", 0.001, 0.03, BOTH),
-    Effect("track-topography", "topo", 2e-4, 2e-3, beside={"topo_L": (6.0, 40.0), "topo_phase": TURN}),
+    Effect("track-topography", "topo", 2e-4, 2e-3, beside={"topo_L": (6.0, 40.0), "topo_phase": FULL_TURN}),
     Effect("friction-drift", "drift_t", 1e-4, 2.5e-3, BOTH, beside={"drift_t0": (0.0, 1.5)}),
     Effect("friction-drift", "drift_x", 1e-5, 2.5e-4, BOTH, beside={"drift_x0": (0.0, 15.0)}),
-    Effect("drive-ripple", "ripple", 0.01, 0.15, beside={"ripple_p": (4.0, 25.0), "ripple_phase": TURN}),
+    Effect("drive-ripple", "ripple", 0.01, 0.15, beside={"ripple_p": (4.0, 25.0), "ripple_phase": FULL_TURN}),
     Effect("sensor-lag", "lag", 5e-4, 0.02),
     Effect("stiffness-error", "ratio", 0.03, 0.3, BOTH, neutral=1.0),
     Effect("inertia", "M", 0.2, 4.0, scale=1e-6, absent={"massless": True}),  # kg
@@ -156,9 +156,9 @@ KINDS = ("none", "single", "pair", "outside")
 WIDE_KINDS = (*KINDS, "ageing", "one-run")  # another ageing law is stated; an effect acts in one run
 BANKS = ("paper", "wide")
 TRACKS = {"smooth": (False, False), "shared": (True, False), "own": (True, True)}  # whether rough, and each run's own
-SHARES = (0.25, 0.4, 0.15, 0.2)  # of the kinds, where none is asked for
+KIND_SHARES = (0.25, 0.4, 0.15, 0.2)  # of the kinds, where none is asked for
 WIDE_SHARES = (0.25, 0.3, 0.1, 0.13, 0.14, 0.08)
-SPREAD = {"A": 0.05, "B": 0.05, "D0": 0.05, "lam": 0.05, "Vsat": 0.13, "mu0": 0.01}  # relative standard deviations
+START_SCATTER = {"A": 0.05, "B": 0.05, "D0": 0.05, "lam": 0.05, "Vsat": 0.13, "mu0": 0.01}  # relative standard deviations
 ODD = ("rigid", "massless", "bare")  # baselines other than the usual one
 ODD_SHARE = 0.15  # of the cases where no effect decides it: else an odd baseline would give the answer away
 USUAL_ONLY = {"stiffness-exponent", "log-log-coupling", "interface-damping", "interface-compliance", "inertia", "age-saturation"}
@@ -349,7 +349,7 @@ def _within(size: float) -> float:
 
 def _chosen(rng: np.random.Generator, kind: str | None, names: Sequence[str] | None) -> tuple[Effect, ...]:
     """Return the effects by name, or as many as the kind has."""
-    drawn_kind = str(rng.choice(KINDS, p=SHARES))
+    drawn_kind = str(rng.choice(KINDS, p=KIND_SHARES))
     order = [str(n) for n in rng.permutation(NAMES)]
     outside = str(rng.choice(OUTSIDE_NAMES))
     if names is None:
@@ -366,7 +366,7 @@ def _chosen(rng: np.random.Generator, kind: str | None, names: Sequence[str] | N
 def _laws(rng: np.random.Generator, chosen: Sequence[Effect]) -> Physics:
     """Return the laws' numbers, and now and then a baseline that is rigid, quasi-static or without a cut-off of age."""
     usual = Physics()
-    numbers = {n: getattr(usual, n) * float(np.exp(s * rng.standard_normal())) for n, s in SPREAD.items()}
+    numbers = {n: getattr(usual, n) * float(np.exp(s * rng.standard_normal())) for n, s in START_SCATTER.items()}
     odd, which = rng.uniform() < ODD_SHARE, str(rng.choice(ODD))
     physics = replace(usual, **numbers)
     if not odd or any(effect.name in USUAL_ONLY for effect in chosen):
@@ -479,7 +479,7 @@ def _toml_truth(value: bool) -> str:
 
 # Concealed cases: an experiment's folder on one side, the truth about it on the other.
 
-ATTEMPTS = 8  # draws until every run of a case can be integrated
+REDRAWS = 8  # draws until every run of a case can be integrated
 Truth = dict[str, Any]
 
 
@@ -528,7 +528,7 @@ def _moving(
     seed: int | Sequence[int], draw: Callable[..., Recipe], asked: Mapping[str, Any]
 ) -> tuple[Recipe, dict[Plan, Array], int]:
     """Return the first recipe of the seed whose runs all reach their ends, what their gauges show, and how many came before."""
-    for attempt in range(ATTEMPTS):
+    for attempt in range(REDRAWS):
         recipe = draw(np.random.default_rng([*_whole(seed), attempt, 0]), **asked)
         motions: dict[Plan, Array] = {}
         for plan in recipe.plans:
@@ -539,7 +539,7 @@ def _moving(
         else:
             return recipe, motions, attempt
     raise SrfError(
-        f"none of {ATTEMPTS} sliders drawn from seed {seed} could be followed to the end of its runs", "Take another seed."
+        f"none of {REDRAWS} sliders drawn from seed {seed} could be followed to the end of its runs", "Take another seed."
     )
 
 
@@ -652,7 +652,7 @@ def known_gauge(truth: Mapping[str, Any]) -> Gauge:
 
 # Truths under seal: a salted digest is published with the cases, the truths are kept apart until the answers are in.
 
-LARGEST = 2**28  # bytes of a file of a bank
+LARGEST_FILE = 2**28  # bytes of a file of a bank
 
 SEAL, SCHEMA = "seal.json", "srf.seal/1"
 Truths = dict[str, dict[str, Any]]
@@ -707,7 +707,7 @@ def case_digest(folder: Path) -> str:
     """Return the SHA-256 over names and contents of all files of a case."""
     whole = hashlib.sha256()
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-        name, data = path.relative_to(folder).as_posix().encode(), read_plain(path, limit=LARGEST)
+        name, data = path.relative_to(folder).as_posix().encode(), read_plain(path, limit=LARGEST_FILE)
         whole.update(f"{len(name)} {len(data)} ".encode() + name + data)
     return whole.hexdigest()
 
@@ -718,7 +718,7 @@ def _canonical(value: Mapping[str, Any]) -> bytes:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return read_plain(path, limit=LARGEST)
+        return read_plain(path, limit=LARGEST_FILE)
     except OSError as error:
         raise SrfError(f"{path}: {error.strerror}", "Name the bank, and the file of its truths.", exit_code=1) from error
 
@@ -793,7 +793,7 @@ def plan_bank(n: int, seed: int, *, kinds: Sequence[str] | None = None) -> list[
     """Return what each case of a bank conceals: the kinds in their usual shares, every effect as often as any other, shuffled."""
     rng = np.random.default_rng([seed, 2])
     check_kinds(kinds or (), "paper")
-    counts = _counts(n, KINDS if kinds is None else kinds, KINDS, SHARES)
+    counts = _counts(n, KINDS if kinds is None else kinds, KINDS, KIND_SHARES)
     none, single, pair, outside = counts
     one = cycle(rng.permutation(NAMES).tolist())
     other = cycle(rng.permutation(OUTSIDE_NAMES).tolist())

@@ -207,7 +207,7 @@ def _ratio(answer: Answer, sight: Sight, model: str) -> float | None:
 
 # Visibility, from the truth of a case: the error of the true model, and the size of each effect in standard errors.
 
-STEP = 2e-4  # relative, of a parameter's difference: in stick-slip a larger one shifts the phase by more than is linear
+PARAMETER_STEP = 2e-4  # relative, of a parameter's difference: in stick-slip a larger one shifts the phase by more than is linear
 
 
 @dataclass(frozen=True)
@@ -262,9 +262,9 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
     for plan, p in sliders.items():
         less = bare[plan]
         base = _record(rig, less, plan)
-        moved = [_record(rig, replace(less, **{n: getattr(less, n) * (1 + STEP)}), plan) for n in free]
+        moved = [_record(rig, replace(less, **{n: getattr(less, n) * (1 + PARAMETER_STEP)}), plan) for n in free]
         signal = _record(rig, p, plan) - base
-        tangent = np.column_stack([(x - base) / STEP for x in moved])
+        tangent = np.column_stack([(x - base) / PARAMETER_STEP for x in moved])
         if not (np.isfinite(signal).all() and np.isfinite(tangent).all()):
             return None, None
         whitened = white(np.column_stack([signal, tangent]), gauge)
@@ -397,15 +397,15 @@ def load_errors(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float]
 
 SCHEMA = "srf.prove/1"
 STANDS_OUT = (0.0, INVISIBLE, 10.0, 20.0, 50.0, 200.0, float("inf"))
-STRONG = (0.0, 1 / 3, 2 / 3, 1.0)
+STRENGTHS = (0.0, 1 / 3, 2 / 3, 1.0)
 LONGEST_CPU = 300.0  # s of CPU: a case should take less
 WITHIN = 1.1  # of the true model's error
-SHARE = (
+SHARE_COLUMNS = (
     Column("share", "1", "of the cases", ".3f"),
     Column("low", "1", "lower end of Wilson's interval of 95 %", ".3f"),
     Column("high", "1", "its upper end", ".3f"),
 )
-COUNTED = (Column("hits", "1", "for how many cases it holds"), Column("cases", "1", "of how many"), *SHARE)
+COUNTED = (Column("hits", "1", "for how many cases it holds"), Column("cases", "1", "of how many"), *SHARE_COLUMNS)
 
 
 def tables(marks: Sequence[Mark], *, digest: str, seed: int, of: int) -> tuple[Table, list[Table]]:
@@ -540,7 +540,7 @@ def by_strength(marks: Sequence[Mark]) -> Table:
     columns = (
         Column("measure"), Column("from", format=".3g"), Column("to", format=".3g"), Column("cases"),
         Column("seen", about="the verdict says that something is missing"), Column("named", about="identified, and rightly"),
-        *SHARE,
+        *SHARE_COLUMNS,
     )  # fmt: skip
     single = [m for m in marks if m.kind == "single"]
     rows: list[tuple[Any, ...]] = []
@@ -554,7 +554,7 @@ def by_strength(marks: Sequence[Mark]) -> Table:
                 rows.append((measure, low, high, len(chosen), seen, named.hits, named.share, *named.interval))
 
     add("standard errors", STANDS_OUT, lambda m: m.sigmas)
-    add("drawn size", STRONG, lambda m: m.size)
+    add("drawn size", STRENGTHS, lambda m: m.size)
     notes = ("standard errors: of its size, with the baseline free, the effect's form and a rough track known",
              "drawn size: 0 weak to 1 strong, on a logarithmic scale")  # fmt: skip
     return Table("srf.prove.power/1", columns, rows, "Power: one effect concealed", notes if rows else ())
@@ -571,7 +571,7 @@ def calibrated(marks: Sequence[Mark]) -> Table:
     bins, error = calibration_of(marks)
     columns = (
         Column("from"), Column("to"), Column("cases"), Column("stated", about="mean", format=".3f"),
-        Column("found", about="how often it was the truth", format=".3f"), *SHARE[1:],
+        Column("found", about="how often it was the truth", format=".3f"), *SHARE_COLUMNS[1:],
     )  # fmt: skip
     rows = [(b.low, b.high, b.rate.count, b.stated, b.rate.share, *b.rate.interval) for b in bins]
     notes = () if error is None else (f"expected calibration error {error:.3f}; it should be below 0.05",)
@@ -627,7 +627,7 @@ def critical(marks: Sequence[Mark]) -> Table:
 def sizes(marks: Sequence[Mark]) -> Table:
     """Return how well the sizes of rightly named effects, and their standard errors, hold."""
     columns = (
-        Column("tracks"), Column("within_2", about="no more than 2 standard errors off"), Column("cases"), *SHARE,
+        Column("tracks"), Column("within_2", about="no more than 2 standard errors off"), Column("cases"), *SHARE_COLUMNS,
         Column("median_off", about="median of the distance, in standard errors", format=".2f"),
         Column("median_relative", about="the same, relative to the size", format=".3f"),
     )  # fmt: skip

@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 
 # Rough tracks: a friction coefficient that wanders with position, the same for all runs of a case.
 
-SPACING = 0.1  # correlation lengths between knots
+KNOT_SPACING = 0.1  # correlation lengths between knots
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Track:
         """Return mu0's deviation as a function of position (um) from 0 to `longest`; beyond it stays at its last value."""
         if not self.size:
             return lambda x: 0.0
-        step = SPACING * self.length
+        step = KNOT_SPACING * self.length
         heights, slopes = self._knots(int(np.ceil(longest / step)) + 2)
         last = len(heights) - 2
 
@@ -63,7 +63,7 @@ class Track:
         Each knot takes the next two numbers of the stream, so that a longer profile begins with the shorter one.
         """
         draws = np.random.default_rng(self.seed).standard_normal((count, 2))
-        h = SPACING
+        h = KNOT_SPACING
         carry = np.exp(-h) * np.array([[1 + h, h], [-h, 1 - h]])  # of height and slope, by correlation lengths
         spread = np.linalg.cholesky(np.eye(2) - carry @ carry.T)
         state = draws[0]
@@ -187,7 +187,7 @@ class Physics:
 MODULATION_RISE = 0.02  # s, of the tanh that switches a modulation on
 STEP_RISE = 0.03  # s, of the tanh of a load step
 SPARSE = 5  # one sample in so many is kept where a recorder is slowed down
-WIDEST = 0.4  # of the interval: how far from its place an uneven sample may be
+WIDEST_JITTER = 0.4  # of the interval: how far from its place an uneven sample may be
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ class Plan:
         t = np.arange(round(self.duration / self.interval)) * self.interval
         if self.wander:  # never as far as the next sample; the times are known as they are written
             late = np.random.default_rng(crc32(self.name.encode())).standard_normal(t.size)
-            t[1:] += self.interval * np.clip(self.wander * late[1:], -WIDEST, WIDEST)
+            t[1:] += self.interval * np.clip(self.wander * late[1:], -WIDEST_JITTER, WIDEST_JITTER)
             t = np.round(t, 4)
         keep = np.ones(t.size, dtype=bool)
         for begin, end in self.gaps:
@@ -284,7 +284,7 @@ def example_protocol() -> tuple[Plan, ...]:
 
 # The slider's equations written for the interface's elastic strain: friction is a stress that is known, v what flows under it.
 
-FASTEST = 60.0  # of ln(v/V0): what a solver's trial step may ask for is kept finite
+FASTEST_SLIP = 60.0  # of ln(v/V0): what a solver's trial step may ask for is kept finite
 
 
 @dataclass(frozen=True)
@@ -346,10 +346,10 @@ def log_velocity(R: float, a: float, c: float) -> float:
     """Return the x with a x + c e^x = R for a > 0 and c >= 0, by Newton's method from the side where it cannot overshoot."""
     x = R / a
     if c <= 0.0:
-        return min(x, FASTEST)
+        return min(x, FASTEST_SLIP)
     if R > 0:
         x = min(x, math.log1p(R / c))  # both bounds lie above the root: a convex function, approached from above
-    x = min(x, FASTEST)
+    x = min(x, FASTEST_SLIP)
     for _ in range(60):
         flow = c * math.exp(x)
         step = (a * x + flow - R) / (a + flow)
@@ -378,7 +378,7 @@ def friction(p: Physics) -> tuple[Solve, Solve]:
     cut = p.law == "dieterich-cutoff"
 
     def bent(x: float, m: float, a: float, c: float) -> float:
-        flow = c * math.exp(min(x, FASTEST)) if c else 0.0
+        flow = c * math.exp(min(x, FASTEST_SLIP)) if c else 0.0
         if cut:
             return m - a * math.log1p(math.exp(min(end - x, 700.0))) + flow
         return a * math.asinh(0.5 * math.exp(min(x + m / a, 700.0))) + flow
@@ -387,9 +387,9 @@ def friction(p: Physics) -> tuple[Solve, Solve]:
         """Return x without drag: a closed form."""
         if cut:
             R = (m - mu) / a  # ln(1 + Va/v); 0 and below at no velocity
-            return min(end - R - math.log(-math.expm1(-R)), FASTEST) if R > 0 else FASTEST
+            return min(end - R - math.log(-math.expm1(-R)), FASTEST_SLIP) if R > 0 else FASTEST_SLIP
         y = max(mu / a, 1e-12)
-        return min(y + math.log(-math.expm1(-2 * y)) - m / a, FASTEST)
+        return min(y + math.log(-math.expm1(-2 * y)) - m / a, FASTEST_SLIP)
 
     def solve(mu: float, m: float, a: float, c: float) -> float:
         high = plain(mu, m, a)
@@ -520,7 +520,7 @@ def _rigid(p: Physics) -> Contact:
     resistance, _ = friction(p)
 
     def slide(y: list[float], m: float, a: float, W: float, aside: float, K: float) -> Sliding:
-        x = min(y[1], FASTEST)
+        x = min(y[1], FASTEST_SLIP)
         v = p.V0 * math.exp(x)
         return v, y[0], (W + p.Wa) * resistance(x, m, a, p.drag)
 
@@ -557,7 +557,7 @@ def _massless(p: Physics) -> Contact:
 # The run of a slider from steady sliding: states joined, integrated by backward differentiation formulas, read by a gauge.
 
 RTOL = 1e-8
-SMALLEST = {"u": 1e-8, "z": 1e-6, "e": 1e-10, "D": 1e-9, "s": 1e-7}  # absolute tolerances, um and um/s; others 1e-8
+TOLERANCES = {"u": 1e-8, "z": 1e-6, "e": 1e-10, "D": 1e-9, "s": 1e-7}  # absolute tolerances, um and um/s; others 1e-8
 LONGEST_STEP = 0.01  # s: no step jumps over the beginning of a load step
 OVERSHOOT = 60.0  # um, of slip beyond the stage's displacement
 MOST_STEPS = 200_000  # from one sample to the next
@@ -690,7 +690,7 @@ def move(p: Physics, plan: Plan, *, rtol: float = RTOL) -> Trace:
 
 
 def _solver(slider: Slider, rtol: float) -> ode:
-    tolerance = [SMALLEST.get(name, 1e-8) * rtol / RTOL for name in slider.names]
+    tolerance = [TOLERANCES.get(name, 1e-8) * rtol / RTOL for name in slider.names]
     longest = slider.plan.rise / 3 if slider.plan.rise else LONGEST_STEP
     if slider.plan.eps:
         longest = min(longest, 0.25 / slider.plan.f)
@@ -724,8 +724,8 @@ UNSTEADY: dict[str, Any] = {
     "track": Track(), "topo": 0.0, "bump": 0.0, "drift_t": 0.0, "drift_x": 0.0, "ripple": 0.0, "drive_tau": 0.0,
 }  # fmt: skip
 UNFELT: dict[str, Any] = {"lag": 0.0, "creep": 0.0, "servo": 0.0}  # of gauge and servo: steady sliding does not feel them
-LOADS = 60  # that are tried, evenly in their logarithm
-DIFFERENCE = 1e-4  # relative, of a state: a critical load is 2e-5 off; the friction law is inverted to some 1e-10
+LOADS_TRIED = 60  # that are tried, evenly in their logarithm
+STATE_DIFFERENCE = 1e-4  # relative, of a state: a critical load is 2e-5 off; the friction law is inverted to some 1e-10
 
 
 def critical_load(p: Physics, V: float, low: float, high: float) -> float:
@@ -741,12 +741,12 @@ def critical_load(p: Physics, V: float, low: float, high: float) -> float:
         J = np.empty((len(kept), len(kept)))
         for column, i in enumerate(kept):
             step = np.zeros(y.size)
-            step[i] = DIFFERENCE * max(abs(y[i]), DIFFERENCE)
+            step[i] = STATE_DIFFERENCE * max(abs(y[i]), STATE_DIFFERENCE)
             above, below = (np.array(slider.rates(0.5, y + side * step, V))[kept] for side in (1, -1))
             J[:, column] = (above - below) / (2 * step[i])
         return float(np.linalg.eigvals(J).real.max()) if np.isfinite(J).all() else math.nan
 
-    grid = np.linspace(math.log(low), math.log(high), LOADS)
+    grid = np.linspace(math.log(low), math.log(high), LOADS_TRIED)
     found = np.array([growth(x) for x in grid])
     lost = np.flatnonzero((found[:-1] < 0) & (found[1:] >= 0))
     return math.exp(brentq(growth, grid[lost[0]], grid[lost[0] + 1], xtol=1e-9)) if lost.size else math.nan

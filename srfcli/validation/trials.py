@@ -19,7 +19,7 @@ from srfcli.validation.blind import Answer, Diagnose, Task, answer_case, diagnos
 from srfcli.validation.cases import SEAL, Truths, check_cases, check_kinds, make_bank, unseal
 
 SCHEMA = "srf.trial/1"
-LIMIT = 1800.0  # s of CPU a case may take: six times what it should
+CPU_LIMIT = 1800.0  # s of CPU a case may take: six times what it should
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def _interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def answer_all(trial: Trial, *, workers: int = 1, plugins: tuple[Path, ...] = (), limit: float = LIMIT,
+def answer_all(trial: Trial, *, workers: int = 1, plugins: tuple[Path, ...] = (), limit: float = CPU_LIMIT,
                diagnose: Diagnose = diagnose_case) -> Iterator[Answer]:  # fmt: skip
     """Yield the answer to every case that has none yet, when it has been written.
 
