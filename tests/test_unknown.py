@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from srfcli.cli.main import cli
 from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis.discrepancy import (
-    TERMS,
+    TERMS_FOLDER,
     ClosedForm,
     FittedTerm,
     best_form,
@@ -32,7 +32,7 @@ from srfcli.validation.cases import case_files
 from srfcli.validation.gauge import Gauge, read_gauge
 from srfcli.validation.slider import Physics, Plan, move
 
-TERMS = sorted(TERMS.glob("*.toml"))
+TERMS = sorted(TERMS_FOLDER.glob("*.toml"))
 SHIPPED = bundled_registry()
 PLANS = (
     Plan("steps", ((0.6, 4), (0.4, 60), (0.6, 8)), 3.0, 0.002),
@@ -167,13 +167,13 @@ def test_the_form_is_offered_as_an_effect(age):
     assert dict(effect.neutral) == {"age_power": 1.0} and effect.sizes == ("age_power",)
     (term,) = json.loads((age / "answer.json").read_text())["missing"]["terms"]
     assert effect.parameters[0].default == pytest.approx(term["parameters"]["age_power"]["value"])
-    assert formula_text(effect.changes[0][1]) == formula_text(read_law(TERMS / "age-power.toml").changes[0][1])
+    assert formula_text(effect.changes[0][1]) == formula_text(read_law(TERMS_FOLDER / "age-power.toml").changes[0][1])
 
 
 def test_terms_together_are_one_effect(tmp_path):
     """Each formula takes the place of what was there before; constants and delays go along."""
     chosen = ["age-power", "rate-load", "load-log", "load-memory", "age-velocity"]
-    effects = [read_law(TERMS / f"{n}.toml") for n in chosen]
+    effects = [read_law(TERMS_FOLDER / f"{n}.toml") for n in chosen]
     terms = tuple(FittedTerm(e, {p.name: (p.default, 0.1 * p.default) for p in e.parameters}) for e in effects)
     form = ClosedForm(terms, (), None, 0.0, ())  # type: ignore[arg-type]
     path = tmp_path / "several.toml"

@@ -130,7 +130,7 @@ def coordinates_of(runs: Mapping[str, RunForce]) -> dict[str, float]:
 
 # The sparsest closed form of what is missing: candidate terms chosen one after another, each fitted in full.
 
-TERMS = Path(__file__).parent / "terms"
+TERMS_FOLDER = Path(__file__).parent / "terms"
 ORIGIN = "terms"
 
 
@@ -143,7 +143,7 @@ def with_terms(registry: Registry) -> Registry:
 @lru_cache(maxsize=1)
 def _entries() -> tuple[Entry, ...]:
     found = []
-    for path in sorted(TERMS.glob("*.toml")):
+    for path in sorted(TERMS_FOLDER.glob("*.toml")):
         kind, name, about = read_header(path)
         found.append(Entry(name, kind, ORIGIN, path, about))
     return tuple(found)
