@@ -995,9 +995,8 @@ class StateSpaceFit:
             return Predictive(-np.inf, np.inf, fit)
         moved = self.log_likelihood - (point.log_likelihood - last.log_likelihood)  # of what was fitted
         total = log_evidence(StateSpaceFit(both, maximum), sizes) - log_evidence(self, sizes)
-        total += (
-            _unfinished(maximum) - _unfinished(self.maximum) + min(moved, 0.0)
-        )  # a better maximum for the others is none of it
+        total += _unfinished(maximum) - _unfinished(self.maximum)
+        total += min(moved, 0.0)  # that the others have a higher maximum is nothing that was predicted
         rms = float(np.sqrt((last.white @ last.white + 2 * max(moved, 0.0)) / last.white.size))
         return Predictive(total, rms, fit)
 
