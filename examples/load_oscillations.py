@@ -35,8 +35,9 @@ from srfcli.core.errors import SrfError
 from srfcli.core.units import split_quantity
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment
-from srfcli.diagnosis.goodness_of_fit import log_evidence, shortcomings
+from srfcli.diagnosis.goodness_of_fit import shortcomings
 from srfcli.inference.recordings import fit_recordings
+from srfcli.inference.state_space import log_evidence
 from srfcli.laws.registry import load_registry
 from srfcli.validation.slider import Physics, Plan, Trace, move
 
