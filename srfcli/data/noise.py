@@ -150,8 +150,8 @@ def spikes(x: Array, quantum: float = 0.0, rise: Array | None = None, *, least: 
             hit |= (size > threshold) & (apart > threshold) & alone & (off > CREST * near)
         sign = np.where(above > below, 1.0, -1.0)
         beside = [sign * (x[first + k] - x[first + j]) for k, j in ((0, -1), (width - 1, width))]
-        near = [first < 2 * SIDE, first + width > x.size - 2 * SIDE]
-        hit &= np.min(beside, axis=0) > np.select(near, ends, -np.inf)
+        at_ends = [first < 2 * SIDE, first + width > x.size - 2 * SIDE]
+        hit &= np.min(beside, axis=0) > np.select(at_ends, ends, -np.inf)
         hit &= (first > SIDE) & (first + width < x.size - SIDE)  # a level at the very end may be that before a slip
         for k in range(width):
             found[first[hit] + k] = True

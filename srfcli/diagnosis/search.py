@@ -574,11 +574,11 @@ class ModelSearch:
 
     def _try_rivals(self) -> None:
         """Push what may do as well in the place of one effect of the best model: by UNDERSTATED times what it promised there."""
-        own, effects = self.best().hypothesis, self.best().hypothesis.effects
-        rests = [Hypothesis(tuple(e for e in effects if e is not left_out), own.ageing) for left_out in effects]
-        if own.ageing:
-            rests.append(Hypothesis(effects))
-        for rest in rests if self.best().passes else ():
+        best = self.best()
+        effects, ageing = best.hypothesis.effects, best.hypothesis.ageing
+        rests = [Hypothesis(tuple(e for e in effects if e is not left_out), ageing) for left_out in effects]
+        rests += [Hypothesis(effects)] if ageing else []
+        for rest in rests if best.passes else ():
             node = self.fitted.get(rest.name)
             if node is None or node.scores is None or node.passes:
                 continue

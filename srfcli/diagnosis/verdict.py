@@ -192,10 +192,9 @@ def predictive(fitted: Fitted, whole: Experiment) -> float:
 
 def shared_gain(fitted: Fitted, whole: Experiment) -> float:
     """Return what held-out runs gain in log likelihood under a model by a field that all runs share, at first order."""
-    total = 0.0
-    for run in whole.runs if fitted.fit.likelihood.problem.runs else ():
-        fit = fitted.predictive(run).fit if run.holdout else fitted.fit
-        if run.holdout and np.isfinite(fit.log_likelihood):
+    total, known = 0.0, fitted.fit.likelihood.problem.runs
+    for fit in (fitted.predictive(run).fit for run in whole.runs if run.holdout and known):
+        if np.isfinite(fit.log_likelihood):
             every = replace(fit, maximum=replace(fit.maximum, point=fit.likelihood.at(fit.maximum.point.x)))
             fit.likelihood.best = None  # derivatives of all readings take much room
             total += max(Remainder(every).shared.gain - SHARED - (fitted.shared or 0.0), 0.0)

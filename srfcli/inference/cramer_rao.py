@@ -31,9 +31,7 @@ from srfcli.laws.registry import Registry
 MODIFIER = "linker-dieterich"
 EFFECT_PARAMETERS = ("alpha", "lambda", "n")
 SIZES = {"alpha": 0.2, "lambda": 0.1, "n": 0.1}  # that one would want to see: of rock's alpha, of lambda's own value, of n
-OTHER_MOTION = (
-    3.0  # root mean square of simulation minus recording over the recording's own spread, from which it is another motion
-)
+OTHER_MOTION = 3.0  # rms of simulation minus recording over the recording's own spread, from which it is another motion
 STIFFER = 1.5  # from half to twice the stated stiffness
 LONGEST = 20_000  # samples of a run that are simulated; of more, evenly chosen blocks stand for the others
 NOISE_BLOCK = 16  # samples of one: the first half tells what the noise is like there, the second half counts

@@ -31,11 +31,7 @@ ROUNDS_AGREE = 0.5  # in log likelihood, between two rounds that agree
 MOST_STEPS = 25
 LEAST_GAIN = 0.02  # gain of twice the log likelihood below which the minimum is reached
 EARLY_GAIN = 2.0  # the same while roughness and noise still change
-FAR_GAINS = (
-    (1.5, 1e-6),
-    (4.0, 1e-4),
-    (np.inf, 1e-2),
-)  # of chi-squared, the same up to so many times the samples: none there matters
+FAR_GAINS = ((1.5, 1e-6), (4.0, 1e-4), (np.inf, 1e-2))  # of chi-squared, the same up to so many times the samples
 ROUGHLY = 6.0  # chi-squared per sample within which roughness is estimated: farther off it would take up what is not its own
 UNREACHED = 1e6  # residual, in standard deviations, of a sample that the integration did not reach
 OVERFLOWN_SLOPE = 1e100  # a slope that is no slope any more: its square would overflow

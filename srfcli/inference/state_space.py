@@ -22,7 +22,6 @@ from itertools import product
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 from scipy.special import erfcx
 
@@ -69,9 +68,7 @@ CLOSE_CALL = 50.0  # in log likelihood, by which a fit that was broken off early
 HOPELESS = 1000.0  # in log likelihood: without a field from the same parameters, when one is not worth a fit
 LENGTHS_IN_SLIP = 20.0  # correlation lengths in the longest slip, at first; 1/100 to 10 times as many at most
 SCORING_STEPS = 40  # of Fisher scoring
-MANY_READINGS = (
-    20_000  # readings, of all runs, beyond which a fit begins with a part of them: it finds the field and the first digits
-)
+MANY_READINGS = 20_000  # of all runs, beyond which a fit begins with a part of them: it finds the field and the first digits
 MOST_WORK = 5  # times the steps of integration of the point before, after which a trial is given up
 WIDTHS = (0.1, 0.03, 0.01)  # of each parameter, within which a reading's derivatives are to hold, one after the other
 WIDEST_ERRORS = 1000.0  # times that width, in standard errors: what readings tell sharply together may still be uncertain
@@ -80,10 +77,7 @@ PROBE = 10.0  # standard errors along a ridge, at which the likelihood is asked 
 LOST_CURVATURE = 0.5  # share of what its curvature loses there, below which there are other maxima
 RIDGE_STRIDE, RIDGE_REACH = 0.05, 0.5  # of a parameter: strides along its ridge, and how far they go
 DOWN = 10.0  # in log likelihood, by how much less a stride may find than the best on its side, and be followed
-NEIGHBOUR_STEPS = (
-    16,
-    64,
-)  # steps of two standard errors to either side, at least and at most, in which maxima next to one are looked for
+NEIGHBOUR_STEPS = (16, 64)  # of two standard errors to either side, least and most, in which other maxima are looked for
 HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
 FARTHEST_STEP = 1.5  # in the logarithm of a parameter: derivatives say nothing of what lies beyond
@@ -405,7 +399,8 @@ class Likelihood:
     Coordinates x are the problem's parameters, then field_amplitude and field_length unless the track is `smooth`, gauge_white,
     and the parameters of the gauge's coloured `processes`, each a word of PROCESSES; those with a positive lower bound by
     their logarithms, in which friction laws are nearly linear. Another observable or sampling rate has a gauge noise of its own,
-    within a run too; names then end in `[kind]`. Without runs there is neither field nor gauge.
+    within a run too; names then end in `[kind]`. What is sampled about as often as one of the given `kinds` has its noise.
+    Without runs there is neither field nor gauge.
     """
 
     def __init__(
@@ -512,9 +507,13 @@ class Likelihood:
 
     def gauge_like(self, kind: Kind) -> dict[str, str]:
         """Return the names of the gauge noise of the kind that is most like this one."""
+        return self.gauge_names(self.kind_like(kind))
+
+    def kind_like(self, kind: Kind) -> Kind:
+        """Return which of the kinds of gauge noise here is most like this one."""
         near = [known for known in self.kinds if known[0] == kind[0]] or self.kinds
         near = [known for known in near if known[2] == kind[2]] or near
-        return self.gauge_names(min(near, key=lambda known: abs(np.log(known[1] / kind[1]))))
+        return min(near, key=lambda known: abs(np.log(known[1] / kind[1])))
 
     def filtered(
         self, run: Run, values: Mapping[str, float], *, slopes: bool = False, keep: bool = False, most: int | None = None
@@ -584,7 +583,7 @@ class Likelihood:
             kind = np.concatenate([i * rates + at[s.used] for i, s in enumerate(f.run.signals)])
             white, density = f.white, f.log_density
             for k, own in enumerate(self.kinds_of(f.run)):
-                yield white[kind == k], density[kind == k], own
+                yield white[kind == k], density[kind == k], self.kind_like(own)
 
     def by_kind(self, point: Point) -> list[float]:
         """Return what each kind of gauge noise has of the log likelihood."""
@@ -806,14 +805,10 @@ def maximise(
                 break
             slow, damping = 2, 1e-3
     away = np.inf if left[0] else away
-    covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound(likelihood, point))[0]
+    at_bound = ((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0))
+    covariance, inner = np.zeros((point.x.size,) * 2), np.nonzero(free & ~at_bound)[0]
     covariance[np.ix_(inner, inner)] = inverse(point.information[np.ix_(inner, inner)])
     return Maximum(point, away, Status.OK if away < CONVERGED else Status.NO_CONVERGENCE, covariance)
-
-
-def at_bound(likelihood: Likelihood, point: Point) -> NDArray[np.bool_]:
-    """Return which coordinates (k,) stand at a bound beyond which the likelihood rises."""
-    return np.asarray(((point.x <= likelihood.lower) & (point.score < 0)) | ((point.x >= likelihood.upper) & (point.score > 0)))
 
 
 def _farther(likelihood: Likelihood, point: Point, trail: Sequence[Array]) -> Point:
