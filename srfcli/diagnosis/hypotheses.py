@@ -21,6 +21,7 @@ from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.symbolic.system import without_part
 
+ABSENT = 1e-3  # of the least size of an effect: what it does in a run where it does not act is then far below any noise
 UNMODULATED = {symbol(name): 0 for name in ("modulated", "eps", "envelope")}
 
 
@@ -209,14 +210,16 @@ def typical_sizes(effect: Effect) -> dict[str, float]:
 def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment) -> list[FitParameter]:
     """Return start values and bounds of an effect's parameters in um, s, N: sizes at their neutral values, or just inside.
 
-    So they are elsewhere where the effect acts in one run alone.
+    An effect of one run alone is neutral in the others, or by ABSENT of the way: a time constant of zero divides by it.
     """
     neutral, found = neutral_values(effect), []
     for name, p in own_parameters(effect, model).items():
         low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
         value = float(np.clip(neutral.get(p.name, to_base(p.default, p.unit)), low, high))
-        runs = (effect.run,) if effect.run and p.name in neutral else ()
-        found.append(FitParameter(name, value, low, high, p.name in effect.fixed, p.unit, runs, value if runs else 0.0))
+        runs, absent = (), 0.0
+        if effect.run and p.name in neutral:
+            runs, absent = (effect.run,), neutral[p.name] + ABSENT * (value - neutral[p.name])
+        found.append(FitParameter(name, value, low, high, p.name in effect.fixed, p.unit, runs, absent))
     for name in effect.frees:
         if name == "K":
             value = experiment.stiffness

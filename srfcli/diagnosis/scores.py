@@ -316,8 +316,9 @@ class Scores:
             at += len(group)
         return found
 
+    @cached_property
     def alone(self) -> list[Score]:
-        """Return the scores of effects that act in one run alone, largest first, where that gains more than to act in all.
+        """The scores of effects that act in one run alone, largest first, where that gains more than to act in all.
 
         By more than the choice of the run costs. Laws are the same in all runs, and so is what the rig's elasticity makes of the
         load; other faults of the apparatus may befall one.

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from srfcli.codegen.model import Array
+from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import field_share, shortcomings, taken_up
@@ -54,7 +54,7 @@ CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes fact
 MOST_EFFECTS = 2  # effects of a model
 ALIKE_EFFECTS = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
 SINGLES, PAIRS = 5, 3  # promises of each model that are followed
-UNDERSTATED = 2.0  # times the gain at first order that an effect may bring beside a model that is far off
+UNDERSTATED = 3.0  # times the gain at first order that an effect may bring beside a model that is far off or has taken it up
 SHARED = 2.0  # in log evidence, what a field that all runs share costs: it is one of two kinds, and has an amplitude of its own
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 SEARCH_RTOL = 1e-3  # tolerance of the integration: 0.02 in log likelihood
@@ -68,7 +68,6 @@ RESIZED_BY = 2.5  # by what factor a size that is built in is changed, at most, 
 AGAIN = 9  # of them, about the best, whose other parameters are fitted too where the model fails a test: 26 % apart
 STRIDES = 12  # steps of another ageing law from the file's own start values, or on from where it promises to be likelier
 FIELDS = (1.0, 3.0, 10.0, 30.0)  # of the field of the model beside, under which the file's own start values are followed
-HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
 FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
 
@@ -165,6 +164,7 @@ class ModelSearch:
         self.queue: list[_Move] = []
         self.count = 0
         self._tried: dict[str, Array] = {}  # from where each other ageing law was tried last
+        self._asked_the_file = not experiment.runs  # whether effects were scored at the file's own start values
 
     # ------------------------------------------------------------------ models and their fits
 
@@ -298,6 +298,7 @@ class ModelSearch:
         self._where_effects_act()
         self._refit_baseline()
         self._eliminate()
+        self._search()  # where a simpler model is the best now, it was not asked yet what it lacks
         if self.experiment.runs is not self.whole.runs:
             self._fit_all()
         return self.best()
@@ -343,9 +344,12 @@ class ModelSearch:
             if self.queue and self.experiment.thresholds and not best.passes:  # far off the first order promises too little
                 promised = promised or self.queue[0].direction is not None
             if not promised:
-                if best.scores is not None or len(best.hypothesis.effects) >= MOST_EFFECTS:
+                if not (best.passes or self._asked_the_file):
+                    self._expand_at_the_file()
+                elif best.scores is None and len(best.hypothesis.effects) < MOST_EFFECTS:
+                    self._expand(best)
+                else:
                     break
-                self._expand(best)
                 continue
             move = heapq.heappop(self.queue)
             name = move.hypothesis.name
@@ -391,12 +395,9 @@ class ModelSearch:
         self.excluded += scores.excluded
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
-        least = WORTH if node.passes else WORTH / 2
-        if node.passes and not node.hypothesis.reported and (not node.fit.smooth or node.fit.likelihood.processes):
-            least = HINT
-        alone = scores.alone() if not node.passes or any(s.gain > least for s in scores.singles) else []
-        promised = [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in alone]
-        self._promise(node, node, promised, least)
+        hidden = not node.passes or not node.fit.smooth or node.fit.likelihood.processes  # what is random may have taken it up
+        least = WORTH / UNDERSTATED if hidden else WORTH
+        self._promise(node, node, self._gains(scores), least)
         for effect in (e for e in joining if e.settings or e.observed):
             self._try_built_in(node, effect)
         return node
@@ -406,6 +407,10 @@ class ModelSearch:
         names = {e.reported for e in node.hypothesis.effects}
         there = {p.name for p in node.fit.likelihood.problem.model.parameters}
         return [e for e in self.candidates if e.reported not in names and there.issuperset(e.needs)]
+
+    def _gains(self, scores: Scores) -> list[tuple[float, Score]]:
+        """Return the effects' gains at first order, in all runs and in one alone."""
+        return [(s.gain, s) for s in scores.singles] + [(s.gain - self._rarer, s) for s in scores.alone]
 
     def _promise(
         self, node: Fitted, at: Fitted, promised: Sequence[tuple[float, Score]], least: float, *, noise: bool = True
@@ -438,17 +443,50 @@ class ModelSearch:
             return
         self.progress(f"{node.name}: scores without field and colour")
         scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, self._joining(node))
-        for promised in ([(s.gain, s) for s in scores.singles], [(s.gain - self._rarer, s) for s in scores.alone()]):
+        for promised in ([(s.gain, s) for s in scores.singles], [(s.gain - self._rarer, s) for s in scores.alone]):
             self._promise(node, plain, promised, WORTH, noise=False)
+
+    def _expand_at_the_file(self) -> None:
+        """Push effects and pairs that promise most at the file's own start values, after a few steps from there.
+
+        A model that lacks something is fitted where it makes up for that, and there what it lacks may promise nothing.
+        """
+        self._asked_the_file, base = True, self.baseline
+        problem = self._problem(Hypothesis(), {})
+        likelihood = Likelihood(problem, processes=(), rtol=SEARCH_RTOL)
+        x = self._at_the_file(likelihood, Hypothesis(), likelihood.values(likelihood.start))
+        if not np.isfinite(likelihood.at(x, slopes=False).log_likelihood):
+            return
+        found = maximise(likelihood, x, held=problem.names, close=NEAR, widths=(), progress=self.progress)
+        if found.status is Status.INTEGRATION:
+            return
+        remainder, there = self.remainder(StateSpaceFit(likelihood, found)), dict(found.point.values)
+        self.progress("scores at the file's own start values")
+        scores = Scores(self.registry, problem.experiment, remainder, (), self._joining(base))
+        singles = sorted(self._gains(scores), key=lambda g: -g[0])[:SINGLES]
+        tries = [((s.effect,), (s.values,), {n: s.shifts[n] for n in problem.names if s.shifts.get(n)}) for _, s in singles]
+        tries += [(p.effects, p.values, {}) for p in scores.pairs(PAIRS)]
+        for effects, sizes, shifts in tries:
+            hypothesis = Hypothesis(effects)
+            known = self.fitted.get(hypothesis.name)
+            if self.spent or (known and known.passes):
+                continue
+            try:
+                start = self._started(_Move(0.0, 0, hypothesis, there, sizes, fresh=len(effects), shifts=shifts))
+            except SrfError:
+                continue
+            own = Likelihood(self._problem(hypothesis, start), processes=(), rtol=SEARCH_RTOL)
+            reached = maximise(own, own.coordinates(start), steps=STRIDES, close=1.0, widths=(), progress=self.progress)
+            values = {n: v for n, v in reached.point.values.items() if not n.startswith("gauge_")}  # that is estimated anew
+            expected = base.attainable + reached.promised - base.fit.log_likelihood + len(effects) * self._one_more
+            self.progress(f"{hypothesis.name}: promises {expected:.1f}")
+            self.count += 1
+            sizes = _sizes_of(hypothesis, own.problem.model, values)
+            heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, values, sizes))
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""
-        model, values = node.fit.likelihood.problem.model, values or node.fit.values
-        return tuple(
-            {p.name: values[long] for long, p in own_parameters(e, model).items() if long in values}
-            | {n: values[n] for n in e.frees if n in values}
-            for e in node.hypothesis.effects
-        )
+        return _sizes_of(node.hypothesis, node.fit.likelihood.problem.model, values or node.fit.values)
 
     def _push(
         self,
@@ -580,10 +618,10 @@ class ModelSearch:
         rests += [Hypothesis(effects)] if ageing else []
         for rest in rests if best.passes else ():
             node = self.fitted.get(rest.name)
-            if node is None or node.scores is None or node.passes:
+            if node is None or node.scores is None:
                 continue
-            beside = [(s, Hypothesis((*rest.effects, s.effect), rest.ageing)) for s in node.scores.singles]
-            rivals = [(UNDERSTATED * s.gain, s) for s, hypothesis in beside if hypothesis.name not in self.fitted]
+            beside = [(gain, s, Hypothesis((*rest.effects, s.effect), rest.ageing)) for gain, s in self._gains(node.scores)]
+            rivals = [(UNDERSTATED * gain, s) for gain, s, hypothesis in beside if hypothesis.name not in self.fitted]
             self._promise(node, node, rivals, WORTH)
 
     def _try_ageing_laws(self, node: Fitted, *, afresh: bool = False) -> None:
@@ -738,6 +776,15 @@ class ModelSearch:
     def best(self) -> Fitted:
         """Return the model with the best evidence."""
         return self.ranked()[0]
+
+
+def _sizes_of(hypothesis: Hypothesis, model: GeneratedModel, values: Mapping[str, float]) -> tuple[dict[str, float], ...]:
+    """Return the values of a model's effects by the effects' own names."""
+    return tuple(
+        {p.name: values[long] for long, p in own_parameters(e, model).items() if long in values}
+        | {n: values[n] for n in e.frees if n in values}
+        for e in hypothesis.effects
+    )
 
 
 def _colours(values: Mapping[str, float]) -> list[str] | None:
