@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -126,11 +127,13 @@ def test_a_figure_with_what_is_not_compared(suffix: str, small: Path) -> None:
 def test_the_axes_of_what_is_imposed() -> None:
     from srfcli.results.figures import recordings
 
-    t = np.arange(200.0)
-    run = {"name": "a", "t": t, "observed": t, "label": "x", "used": t < 150, "W": np.full(200, 5.0), "gaps": [(20, 30)]}
+    t, W = np.arange(200.0), np.full(200, 5.0)
+    run = {"name": "a", "t": t, "observed": t, "quantity": "x", "unit": "1", "used": t < 150, "load": lambda t: (W,)}
+    run |= {"load_unit": "N", "proposed": None, "holdout": False}
     scales = {}
     for name, V in (("log", np.where(t < 9, 0.1, 10)), ("symlog", np.where(t < 9, -900.0, 2)), ("linear", t + 1e3)):
-        axes = recordings([{**run, "V": V}]).axes
+        recorded = SimpleNamespace(**run, drive=lambda t, V=V: V)
+        axes = recordings([SimpleNamespace(run=recorded, sampling=SimpleNamespace(gaps=np.array([20])))]).axes
         scales[name] = axes[1].get_yscale()
         low, high = axes[2].get_ylim()
         assert low < 4 and high > 6  # a constant is not drawn as its rounding

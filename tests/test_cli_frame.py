@@ -69,7 +69,7 @@ def demo() -> None:
 @demo.command("run", epilog="srf run --over V=1:100:3   # a    b")
 @system_options
 @values_option(SPEED)
-@over_option(default=("V=1:100:3",))
+@over_option(help="Values to run over.", default=("V=1:100:3",))
 @output_options
 @click.option("--fail", default="")
 def run(system: SystemOptions, over: tuple[Range, ...], output: OutputOptions, V: Any, fail: str) -> None:

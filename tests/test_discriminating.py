@@ -350,3 +350,9 @@ def test_what_is_written_says_it(folder: Path, result: DiagnosisResult, found: D
         assert done.exit_code == 0, done.output
         distance = re.search(r"root mean square distance from the recording ([0-9.e-]+) um", done.stderr)
         assert distance is not None and float(distance[1]) < 1e-4
+
+
+def test_the_run_that_the_verdict_rests_on_is_drawn(result: DiagnosisResult) -> None:
+    pytest.importorskip("matplotlib")
+    first, *_ = result.plot().axes
+    assert first.get_title(loc="left") in {r.name for r in result.location.runs} and first.get_ylabel() == "elongation [µm]"

@@ -16,7 +16,7 @@ import pytest
 from srfcli.core.errors import SrfError
 from srfcli.laws.registry import bundled_registry
 from srfcli.laws.values import Effect
-from srfcli.results import report, report_text
+from srfcli.results import report, report_figures, report_text
 from srfcli.results.plots import figure_bytes
 from srfcli.results.report import VOID, Markup, command_lines, merged, tag, write_report
 from srfcli.results.report_figures import close_up, foremost, local_rms, run_figure, spots, trace
@@ -318,9 +318,9 @@ def test_no_name_breaks_out_of_the_page(tmp_path: Path) -> None:
 
 def test_two_runs_whose_names_make_one_file_name_keep_both_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "figure_bytes", lambda figure, suffix: f"{figure}{suffix}".encode())
-    monkeypatch.setattr(report, "overview", lambda traces, narrow=False: None)
-    monkeypatch.setattr(report, "scan_figure", lambda rows, narrow=False: None)
-    monkeypatch.setattr(report, "run_figure", lambda one, narrow=False: one.name)
+    monkeypatch.setattr(report_figures, "overview", lambda traces, narrow=False: None)
+    monkeypatch.setattr(report_figures, "scan_figure", lambda rows, narrow=False: None)
+    monkeypatch.setattr(report_figures, "run_figure", lambda one, narrow=False: one.name)
     material = made_material("none")
     empty = made_run("empty") | {"used": np.zeros(900, dtype=bool)}  # nothing to draw
     runs = (made_run("a b"), made_run("A/b"), empty)

@@ -43,5 +43,5 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     markdown = FILE_LINK.sub(lambda found: f"[{title(folder / found[1])}]({found[1]}", markdown)
     if PLACE not in markdown:
         return markdown
-    top = click.Context(cli, info_name="srf", terminal_width=WIDTH, help_option_names=CONTEXT["help_option_names"])
+    top = click.Context(cli, info_name="srf", terminal_width=WIDTH, **CONTEXT)
     return markdown.replace(PLACE, "\n".join(section(*found) for found in commands(cli, top)))

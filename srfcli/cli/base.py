@@ -23,7 +23,7 @@ from srfcli.core.errors import ExpressionError, SrfError, did_you_mean, printabl
 EXIT_OK, EXIT_UNEXPECTED, EXIT_USAGE, EXIT_PARTIAL, EXIT_CONDITION, EXIT_INTERRUPTED = 0, 1, 2, 3, 4, 130
 STDOUT, STDERR = "standard output", "standard error"
 
-CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
+CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "max_content_width": 110, "show_default": True}
 
 
 @dataclass
@@ -64,7 +64,7 @@ def switches() -> list[click.Option]:
     common: dict[str, Any] = {"expose_value": False, "callback": _switch, "is_eager": True}
     return [
         click.Option(["-q", "--quiet"], is_flag=True, help="No progress and no remarks on stderr.", **common),
-        click.Option(["-v", "--verbose"], count=True, help="Say more on stderr.", **common),
+        click.Option(["-v", "--verbose"], count=True, show_default=False, help="Say more on stderr.", **common),
         click.Option(["--debug"], is_flag=True, help="Show the traceback of an error.", **common),
         click.Option(["--trust"], is_flag=True, help="Run Python that an experiment or srf.toml names.", **common),
     ]
@@ -175,16 +175,6 @@ class Screen:
         return getattr(self.unescaped, name)
 
 
-@contextlib.contextmanager
-def _screened() -> Iterator[None]:
-    before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = (cast(TextIO, Screen(s, n)) for s, n in zip(before, (STDOUT, STDERR), strict=True))
-    try:
-        yield
-    finally:
-        sys.stdout, sys.stderr = before
-
-
 class _Told(logging.Handler):
     """A log handler that writes each warning of the package as one line on stderr."""
 
@@ -194,16 +184,6 @@ class _Told(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self.session.say(f"Warning: {record.getMessage()}")
-
-
-@contextlib.contextmanager
-def _telling(session: Session) -> Iterator[None]:
-    log, told = logging.getLogger("srfcli"), _Told(session)
-    log.addHandler(told)
-    try:
-        yield
-    finally:
-        log.removeHandler(told)
 
 
 def _open_streams() -> None:
@@ -219,9 +199,15 @@ def _run(group: click.Group, arguments: list[str], session: Session, **extra: An
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for a Greek letter, it does not fail
-    with _screened(), _telling(session), warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # NumPy warns of overflows; rows and statuses report them
-        return _ended(group, arguments, session, **extra)
+    out, err = (cast(TextIO, Screen(s, n)) for s, n in ((sys.stdout, STDOUT), (sys.stderr, STDERR)))
+    log, told = logging.getLogger("srfcli"), _Told(session)
+    log.addHandler(told)
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # NumPy warns of overflows; rows and statuses report them
+            return _ended(group, arguments, session, **extra)
+    finally:
+        log.removeHandler(told)
 
 
 def _ended(group: click.Group, arguments: list[str], session: Session, **extra: Any) -> int:

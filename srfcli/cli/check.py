@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import click
 
 from srfcli.cli.base import EXIT_CONDITION, EXIT_OK, SrfCommand
-from srfcli.cli.options import OutputOptions, open_registry, output_options, plugins_option
+from srfcli.cli.emit import Progress, emit
+from srfcli.cli.options import PATH, OutputOptions, open_registry, output_options, plugins_option
 from srfcli.core.errors import SrfError, did_you_mean
 
 EXAMPLES = """
@@ -22,31 +22,20 @@ srf check experiment/ --json | jq .meta.runs       all that was found
 
 
 @click.command("check", cls=SrfCommand, epilog=EXAMPLES)
-@click.argument("experiment", type=click.Path(path_type=Path))
+@click.argument("experiment", type=PATH)
 @click.option("--run", "runs", multiple=True, metavar="NAME", help="Report this run only; may be given several times.")
-@click.option("--format", "format", metavar="NAME", help="Reader of all data files; srf laws --kind reader lists them.")
+@click.option("--format", metavar="NAME", help="Reader of all data files; srf laws --kind reader lists them.")
 @click.option(
-    "--fail-on",
-    "fail_on",
-    multiple=True,
-    metavar="KIND",
-    help="Exit with 4 if there is a notice of this kind; `notice` is any of them.",
+    "--fail-on", multiple=True, metavar="KIND", help="Exit with 4 if there is a notice of this kind; `notice` is any of them."
 )
 @click.option(
     "--limit",
-    type=click.FloatRange(min=0, min_open=True),
+    type=click.FloatRange(0, min_open=True),
     default=512.0,
-    show_default=True,
     metavar="MB",
     help="Largest recording that is held in memory.",
 )
-@click.option(
-    "--simulate/--no-simulate",
-    "simulate",
-    default=True,
-    show_default=True,
-    help="Simulate each run to say what its load can tell.",
-)
+@click.option("--simulate/--no-simulate", default=True, help="Simulate each run to say what its load can tell.")
 @plugins_option
 @output_options
 def command(
@@ -64,11 +53,12 @@ def command(
     Every value of the description is checked against the laws and the data files. For each run: sampling, gaps, spikes, resets,
     quantisation, level and colour of the noise, drive and load as they are in the data, and what the load's variation can tell.
     """
-    from srfcli.cli.emit import Progress, emit
-    from srfcli.data.experiment import read_experiment
+    from srfcli.data.experiment import NOTICE_KINDS, read_experiment
     from srfcli.tasks.recordings import check
 
-    _check_kinds(fail_on)
+    for kind in fail_on:
+        if kind not in NOTICE_KINDS and kind != "notice":
+            raise SrfError(f"--fail-on {kind}: no such kind of notice", did_you_mean(kind, (*NOTICE_KINDS, "notice")))
     begun, registry = time.perf_counter(), open_registry(plugins)
     read = read_experiment(experiment, registry=registry, format=format, limit=int(limit * 2**20))
     with Progress("check", total=len(read.named(runs))) as progress:
@@ -79,12 +69,3 @@ def command(
     kinds = found.notice_kinds
     failed = bool(kinds) if "notice" in fail_on else bool(kinds & set(fail_on))
     return EXIT_CONDITION if failed else EXIT_OK
-
-
-def _check_kinds(fail_on: Sequence[str]) -> None:
-    """Raise SrfError for a kind that no notice is of."""
-    from srfcli.data.experiment import NOTICE_KINDS
-
-    for kind in fail_on:
-        if kind not in NOTICE_KINDS and kind != "notice":
-            raise SrfError(f"--fail-on {kind}: no such kind of notice", did_you_mean(kind, (*NOTICE_KINDS, "notice")))

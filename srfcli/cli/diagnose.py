@@ -8,8 +8,11 @@ from typing import Any
 import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
-from srfcli.cli.options import listed, open_registry, plugins_option, reader_option, vary_options
+from srfcli.cli.emit import Progress, finish, show
+from srfcli.cli.options import PATH, listed, open_registry, plugins_option, reader_option, vary_options
 from srfcli.core.errors import SrfError
+from srfcli.core.files import check_target, write_atomic
+from srfcli.results.tables import json_text
 
 DIAGNOSE = """
 srf diagnose EXPERIMENT                              a folder with experiment.toml, or that file
@@ -21,17 +24,13 @@ srf fit found/augmented                              the augmented model is an e
 
 
 @click.command("diagnose", cls=SrfCommand, epilog=DIAGNOSE)
-@click.argument("source", metavar="EXPERIMENT", type=click.Path(path_type=Path))
+@click.argument("source", metavar="EXPERIMENT", type=PATH)
 @click.option("--effect", "effects", multiple=True, metavar="NAME", help="Look for this effect or ageing law only; repeatable.")
 @vary_options
 @plugins_option
 @reader_option
 @click.option(
-    "--seed",
-    type=int,
-    default=0,
-    show_default=True,
-    help="Seed of the noise that is simulated for p-values, and of the discriminating runs that are drawn.",
+    "--seed", default=0, help="Seed of the noise that is simulated for p-values, and of the discriminating runs that are drawn."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one object, in full precision.")
 @click.option("--out", metavar="DIR", help="Write answer, report, predictions and augmented experiment to DIR.")
@@ -44,9 +43,7 @@ def diagnose(source: Path, effects: tuple[str, ...], plugins: tuple[Path, ...], 
     Held-out runs are read when the models are final, and must be predicted. Verdicts are none, identified, ambiguous, unknown and
     inconclusive.
     """
-    from srfcli.cli.emit import Progress, finish, show
     from srfcli.results.diagnosis import check_answer
-    from srfcli.results.tables import json_text
     from srfcli.tasks import diagnose as tasks
 
     folder = None if options["out"] is None else Path(options["out"]).expanduser()
@@ -102,7 +99,7 @@ srf report results --title 'PMMA, May' --force
 
 
 @click.command("report", cls=SrfCommand, epilog=REPORT)
-@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("folder", type=PATH)
 @click.option("--title", metavar="TEXT", help="Title of the page.  [default: the folder's name]")
 @click.option("--out", metavar="FILE.html", help="The page to write.  [default: report.html in the folder]")
 @click.option("--force", is_flag=True, help="Overwrite an existing page.")
@@ -112,7 +109,6 @@ def report(folder: Path, title: str | None, out: str | None, force: bool) -> Non
     Results are what `--out FILE.json` wrote; a figure of the same name beside one stands with it. A diagnosis has its own report,
     which `srf diagnose --out` writes.
     """
-    from srfcli.core.files import check_target, write_atomic
     from srfcli.results.report import read_results, results_page
 
     results = read_results(folder)

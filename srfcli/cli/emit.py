@@ -16,6 +16,7 @@ from srfcli.cli.options import OutputOptions
 from srfcli.core.errors import SrfError, Status, printable
 from srfcli.core.files import check_target, write_atomic
 from srfcli.laws.values import Law
+from srfcli.results.plots import figure_bytes
 from srfcli.results.provenance import Provenance, write_result
 from srfcli.results.tables import Table, print_terminal, to_csv, to_json, to_text
 
@@ -43,14 +44,8 @@ def emit(
     the sidecar, as do the table's parameters. A terminal gets a formatted table, a pipe plain text of twelve digits;
     beside CSV and a file the notes go to stderr.
     """
-    provenance = Provenance(
-        arguments=Session.current().arguments,
-        parameters=table.parameters,
-        laws=tuple(laws),
-        inputs=tuple(inputs),
-        seed=seed,
-        timings=timings or {},
-    )
+    arguments = Session.current().arguments
+    provenance = Provenance(arguments, table.parameters, tuple(laws), tuple(inputs), seed, timings or {})
     shown = [table, *more] if options.format == "text" else [table]
     if options.out is None:
         for index, one in enumerate(shown):
@@ -66,8 +61,6 @@ def emit(
     if options.plot is not None:
         if figure is None:
             raise SrfError(f"--plot {options.plot}: there is nothing to draw", "Leave --plot out.")
-        from srfcli.results.plots import figure_bytes
-
         drawn = figure() if callable(figure) else figure
         _write(options.plot, figure_bytes(drawn, options.plot.suffix), provenance, options)
 

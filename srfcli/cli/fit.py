@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import time
 from collections.abc import Sequence
@@ -11,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import Session, SrfCommand
+from srfcli.cli.emit import Progress, emit, finish, render
 from srfcli.cli.options import (
-    CHOICES,
+    PATH,
     OutputOptions,
     Spread,
     SystemOptions,
@@ -25,9 +27,11 @@ from srfcli.cli.options import (
     worker_options,
 )
 from srfcli.core.errors import SrfError, Status
+from srfcli.core.files import check_target, write_atomic
+from srfcli.core.settings import Parameter
+from srfcli.core.units import to_base
 
 if TYPE_CHECKING:
-    from srfcli.core.settings import Parameter
     from srfcli.inference.thresholds import Trace
     from srfcli.results.fit import CampaignResult
 
@@ -45,7 +49,7 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
 
 
 @click.command("fit", cls=SrfCommand, epilog=EXAMPLES)
-@click.argument("sources", metavar="EXPERIMENT...|THRESHOLDS.csv", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("sources", metavar="EXPERIMENT...|THRESHOLDS.csv", nargs=-1, required=True, type=PATH)
 @click.option(
     "--table",
     "place",
@@ -53,13 +57,12 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
     help="Fit each experiment by itself, and keep a row for each in this file, which is written as they are done.",
 )
 @click.option("--free", multiple=True, metavar="NAMES", help="Parameters to fit; else those that the experiment leaves free.")
-@click.option("--starts", type=click.IntRange(1, 1000), default=1, show_default=True, help="Starting points to fit from.")
+@click.option("--starts", type=click.IntRange(1, 1000), default=1, help="Starting points to fit from.")
 @click.option("--profile", is_flag=True, help="Profile-likelihood intervals.")
 @vary_options
 @click.option(
     "--prior/--no-prior",
     default=True,
-    show_default=True,
     help="Give what varies between five groups or more a Gaussian prior, of estimated mean and scatter.",
 )
 @click.option(
@@ -69,7 +72,7 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
 )
 @click.option("--sample", type=click.IntRange(100, 1_000_000), metavar="N", help="Draw N points of the posterior (emcee).")
 @click.option("--draws", metavar="FILE.nc", help="Keep the draws of --sample as ArviZ's netCDF.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of further starts and of the sampler.")
+@click.option("--seed", default=0, help="Seed of further starts and of the sampler.")
 @reader_option
 @click.option("--bounds", multiple=True, metavar="NAME=LO:HI", help="Bounds of a parameter, for a table of critical loads.")
 @click.option("--method", multiple=True, help="Minimiser of the critical loads' cost; both unless named.")
@@ -105,8 +108,8 @@ def command(
         )  # fmt: skip
         return
     _refuse(("bounds", "method", "tol", "max_evaluations"), "critical loads")
-    for name in CHOICES:
-        if getattr(system, name).origin == "flag":
+    for name, setting in system.chosen.items():
+        if setting.origin == "flag":
             raise SrfError(f"--{name} is given, and an experiment names its own", "Change [model] in experiment.toml.")
     if system.effects:
         raise SrfError("--effect is given, and an experiment names its own", "Change [model] in experiment.toml.")
@@ -129,7 +132,6 @@ def _refuse(names: tuple[str, ...], purpose: str) -> None:
 
 
 def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, **options: Any) -> None:
-    from srfcli.cli.emit import Progress, emit, finish
     from srfcli.inference.posterior import to_arviz
     from srfcli.results.fit import ADVICE
     from srfcli.tasks.recordings import fit, read_experiment
@@ -146,9 +148,8 @@ def _fit_recordings(source: Path, system: SystemOptions, output: OutputOptions, 
             progress.advance(note=text, share=done.after(text) if stage == "fit" else share)
 
         found = fit(
-            experiment, free=free, trend=options["trend"], vary=listed(options["vary"]), by=options["by"], prior=options["prior"],
-            track=options["track"], starts=options["starts"],
-            profile=options["profile"], sample=options["sample"], seed=options["seed"], registry=registry, progress=report,
+            experiment, free=free, vary=listed(options["vary"]), registry=registry, progress=report,
+            **{k: options[k] for k in ("trend", "by", "prior", "track", "starts", "profile", "sample", "seed")},
         )  # fmt: skip
     for run in experiment.runs:
         for notice in run.notices:
@@ -169,8 +170,6 @@ def _fit_campaign(
     sources: Sequence[Path], place: str | None, spread: Spread, system: SystemOptions, output: OutputOptions, **options: Any
 ) -> None:
     """Fit each experiment by itself, a row each; the table is written anew whenever one is done."""
-    from srfcli.cli.emit import Progress, emit, finish, render
-    from srfcli.core.files import check_target, write_atomic
     from srfcli.tasks.campaign import fit_campaign
 
     _refuse(("profile", "sample", "draws", "vary", "by", "prior"), "one experiment")
@@ -228,10 +227,6 @@ class FitShare:
 
 def _draws_file(name: str | None, count: int | None, output: OutputOptions) -> Path | None:
     """Return the file of the draws; raises SrfError, before the fit, where it could not be written."""
-    import importlib.util
-
-    from srfcli.core.files import check_target
-
     if name is None:
         return None
     if count is None:
@@ -264,7 +259,6 @@ def fit_thresholds(
     `bounds` are NAME=LOW:HIGH, `methods` both unless named, `tol` the relative accuracy of each critical load. Starts are
     the system's values. Exit codes: 3 where the limit of evaluations cut a method, 130 where it was interrupted.
     """
-    from srfcli.cli.emit import Progress, emit, finish
     from srfcli.data.thresholds import read_thresholds
     from srfcli.inference import thresholds as inference
     from srfcli.inference.free_parameters import GIVEN, free_parameters, with_transmission
@@ -278,28 +272,18 @@ def fit_thresholds(
         raise SrfError(f"{given} is set, and {path.name} gives it", f"Leave --set {given} out.")
     resolved = system.resolve(parameters)
     scale = free_parameters(
-        parameters,
-        listed(free),
-        start=resolved.values,
-        bounds=dict(_bounds(text, parameters) for text in bounds),
-        largest_eps=float(table.eps.max()),
-        where=model.title,
-    )
+        parameters, listed(free), start=resolved.values, bounds=dict(_bounds(text, parameters) for text in bounds),
+        largest_eps=float(table.eps.max()), where=model.title,
+    )  # fmt: skip
     with Progress("fit") as progress:
 
         def report(trace: Trace) -> None:
             progress.advance(note=f"{trace.method}, evaluation {len(trace)}: chi2 {trace.best[-1]:.6g}")
 
         fit = inference.fit_thresholds(
-            model,
-            table,
-            scale=scale,
-            values=resolved.values,
-            methods=methods or inference.METHODS,
-            tol=system.tolerance(tol).value,
-            max_evaluations=max_evaluations or inference.MAX_EVALUATIONS,
-            report=report,
-        )
+            model, table, scale=scale, values=resolved.values, methods=methods or inference.METHODS, report=report,
+            tol=system.tolerance(tol).value, max_evaluations=max_evaluations or inference.MAX_EVALUATIONS,
+        )  # fmt: skip
     found = ThresholdFitResult(fit, model.title, {k: v for k, v in resolved.described().items() if k not in GIVEN})
     emit(
         found.table, output, more=[found.methods, found.trace, found.loads], laws=model.laws, inputs=[path],
@@ -312,8 +296,6 @@ def fit_thresholds(
 
 def _bounds(text: str, parameters: Sequence[Parameter]) -> tuple[str, tuple[float, float]]:
     """Return name and bounds in base units that NAME=LOW:HIGH states; raises SrfError that shows the form."""
-    from srfcli.core.units import to_base
-
     name, _, ends = text.partition("=")
     found = parse_ends(name, ends)
     if found is None:

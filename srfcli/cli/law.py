@@ -10,19 +10,22 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from srfcli.cli import emit
 from srfcli.cli.base import EXIT_USAGE, SrfCommand, SrfGroup
 from srfcli.cli.options import open_registry, plugins_option
 from srfcli.core.errors import ExpressionError, SrfError
-from srfcli.laws.law_file import PLUGIN_KINDS
+from srfcli.core.files import recover, write_atomic
+from srfcli.laws.law_file import FORMULA, PLUGIN_KINDS, formula_of, kind_of, template, valid_name
+from srfcli.laws.values import Effect, Law
+from srfcli.results.tables import Column, Table, plain_value
 
 if TYPE_CHECKING:
     from srfcli.laws.registry import Registry
-    from srfcli.laws.values import Effect, Law
-    from srfcli.results.tables import Table
 
 # `srf laws`: what laws there are.
 
 KIND = click.Choice(PLUGIN_KINDS)
+PARAMETER_KEYS = ("default", "unit", "lower", "upper", "about")  # of `srf law show --json`
 LAW_KIND = click.Choice(PLUGIN_KINDS[:-1])  # a reader is no law
 
 EPILOG = """
@@ -39,18 +42,14 @@ srf laws --json | jq .rows          for a program
 @plugins_option
 def laws(kind: str | None, as_json: bool, plugins: tuple[Path, ...]) -> None:
     """List the laws that are found; none is imported for that."""
-    from srfcli.cli.emit import show
-
     registry = open_registry(plugins)
-    show(laws_table(registry, kind), "json" if as_json else "text")
+    emit.show(laws_table(registry, kind), "json" if as_json else "text")
     for problem in registry.problems:
         click.echo(f"Not listed ({problem.origin}): {problem.message}", err=True)
 
 
 def laws_table(registry: Registry, kind: str | None) -> Table:
     """Return the listing as a table; a law that shares its name with another says so in the column `clash`."""
-    from srfcli.results.tables import Column, Table
-
     columns = [
         Column("kind", "", "friction, ageing, modifier, interface, effect or reader"), Column("name", "", "as options take it"),
         Column("origin", "", "bundled, a folder or a package"), Column("about", "", "one sentence"),
@@ -114,13 +113,11 @@ def show(name: str, kind: str | None, as_json: bool, plugins: tuple[Path, ...]) 
 
 @law.command(cls=SrfCommand, epilog=NEW_EPILOG)
 @click.argument("name")
-@click.option("--kind", type=LAW_KIND, default="friction", show_default=True, help="What kind of law.")
+@click.option("--kind", type=LAW_KIND, default="friction", help="What kind of law.")
 @click.option("--python", is_flag=True, help="Write a Python file in place of TOML.")
 @click.option("--force", is_flag=True, help="Overwrite a file, or take a name that a law already has.")
 def new(name: str, kind: str, python: bool, force: bool) -> None:
     """Write a commented law into the current folder; it passes `srf law check` as it is."""
-    from srfcli.core.files import recover, write_atomic
-    from srfcli.laws.law_file import template, valid_name
     from srfcli.laws.registry import bundled_registry
 
     if not valid_name(name):
@@ -172,7 +169,6 @@ def check(ctx: click.Context, name: str, kind: str | None, plugins: tuple[Path, 
 
 def _find(registry: Registry, name: str, kind: str | None) -> list[Law]:
     """Return the laws in a file, or those of a name in any kind, or in one kind."""
-    from srfcli.laws.law_file import kind_of
     from srfcli.laws.registry import read_file
 
     if name.endswith((".toml", ".py")):
@@ -202,36 +198,17 @@ def _nearest(registry: Registry, name: str, kind: str | None) -> str:
 
 
 def _document(one: Law) -> dict[str, Any]:
-    from srfcli.laws.law_file import kind_of
-    from srfcli.laws.values import Effect
-
-    parameters = {
-        p.name: {
-            "default": p.default,
-            "unit": p.unit,
-            "lower": p.lower if math.isfinite(p.lower) else None,
-            "upper": p.upper if math.isfinite(p.upper) else None,
-            "about": p.about,
-        }
-        for p in one.parameters
-    }
     own = _effect_document(one) if isinstance(one, Effect) else _law_document(one)
     checks = [{"quantity": c.quantity, "at": dict(c.at), "value": c.value, "rtol": c.rtol} for c in one.checks]
-    return {
-        "name": one.name,
-        "kind": kind_of(one),
-        "about": one.about,
-        **own,
-        "parameters": parameters,
-        "cites": list(one.cites),
-        **({} if isinstance(one, Effect) else {"checks": checks}),
-        "source": one.source,
-    }
+    found = {
+        "name": one.name, "kind": kind_of(one), "about": one.about, **own,
+        "parameters": {p.name: {key: getattr(p, key) for key in PARAMETER_KEYS} for p in one.parameters},
+        "cites": list(one.cites), **({} if isinstance(one, Effect) else {"checks": checks}), "source": one.source,
+    }  # fmt: skip
+    return plain_value(found)
 
 
 def _law_document(one: Law) -> dict[str, Any]:
-    from srfcli.laws.law_file import FORMULA, formula_of, kind_of
-
     formula = formula_of(one)
     states = [{"name": s.name, "length": s.length, "weight": s.weight} for s in getattr(one, "states", ())]
     return {FORMULA[kind_of(one)]: None if formula is None else str(formula), "states": states}
@@ -259,9 +236,6 @@ def _effect_document(one: Effect) -> dict[str, Any]:
 
 
 def _text(one: Law) -> str:
-    from srfcli.laws.law_file import kind_of
-    from srfcli.laws.values import Effect
-
     lines = [
         f"{one.name}  ({kind_of(one)})",
         one.about,
@@ -276,8 +250,6 @@ def _text(one: Law) -> str:
 
 
 def _law_lines(one: Law) -> list[str]:
-    from srfcli.laws.law_file import FORMULA, formula_of, kind_of
-
     formula = formula_of(one)
     lines = [f"{FORMULA[kind_of(one)]} = {'rigid' if formula is None else formula}"]
     return lines + [f"state {s.name}: length {s.length}, weight {s.weight}" for s in getattr(one, "states", ())]

@@ -6,7 +6,8 @@ import atexit
 import gc
 import importlib
 import os
-from collections.abc import Iterator, MutableMapping, Sequence
+from collections import UserDict
+from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import click
@@ -77,33 +78,16 @@ Exit codes: 0 done, 1 unexpected or I/O, 2 usage or a bad law, 3 did not converg
 """
 
 
-class Commands(MutableMapping[str, click.Command]):
-    """The commands by name; one of COMMANDS is imported when it is asked for."""
-
-    def __init__(self) -> None:
-        self._kept: dict[str, click.Command | None] = dict.fromkeys(COMMANDS)
+class Commands(UserDict[str, Any]):
+    """The commands by name; one that is still a place, module:attribute, is imported when it is asked for."""
 
     def __getitem__(self, name: str) -> click.Command:
-        command = self._kept[name]
-        if command is None:
-            module, _, attribute = COMMANDS[name][0].partition(":")
-            command = self._kept[name] = getattr(importlib.import_module(module), attribute)
+        found = self.data[name]
+        if isinstance(found, str):
+            module, _, attribute = found.partition(":")
+            found = self.data[name] = getattr(importlib.import_module(module), attribute)
+        command: click.Command = found
         return command
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._kept
-
-    def __setitem__(self, name: str, command: click.Command) -> None:
-        self._kept[name] = command
-
-    def __delitem__(self, name: str) -> None:
-        del self._kept[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._kept)
-
-    def __len__(self) -> int:
-        return len(self._kept)
 
 
 class Srf(SrfGroup):
@@ -111,7 +95,7 @@ class Srf(SrfGroup):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.commands = Commands()
+        self.commands = Commands({name: place for name, (place, _) in COMMANDS.items()})
 
     def summaries(self) -> list[tuple[str, str]]:
         """Return the commands' names and first sentences."""

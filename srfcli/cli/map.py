@@ -10,37 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from srfcli.cli import options
 from srfcli.cli.base import SrfCommand
-from srfcli.cli.options import (
-    AMPLITUDE,
-    APPARATUS_OPTIONS,
-    DEFAULT_POINTS,
-    SYSTEM_OPTIONS,
-    Options,
-    OutputOptions,
-    Range,
-    Spread,
-    SystemOptions,
-    add_options,
-    check_axes,
-    check_origins,
-    mesh_option,
-    open_registry,
-    output_options,
-    over_option,
-    parse_over,
-    read_flags,
-    read_output,
-    stability_options,
-    step_option,
-    value_option,
-    values_option,
-    worker_options,
-)
+from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Resolved, Setting, TomlSettings, choose, find_toml, load_toml, resolve
-from srfcli.core.units import parse_quantity
-from srfcli.results.map import ratio_powers
+from srfcli.core.units import describe, find_unit, parse_quantity, to_base
 
 if TYPE_CHECKING:
     from srfcli.codegen.model import Array, GeneratedModel
@@ -58,40 +33,29 @@ srf map --eps 0.4 --workers 8 --resume parts --out map.csv
 
 
 @click.command("map", cls=SrfCommand, epilog=MAP)
-@stability_options
-@value_option("eps", "Relative modulation amplitude, where it is not an axis.")
-@value_option("V", "Driving velocity in um/s, where it is not an axis.")
-@value_option("W0", "Mean normal load in N, where it is not an axis.")
-@over_option(help="An axis, twice: NAME=LOW:HIGH:POINTS[:log|lin]; NAME may be a ratio, as K/W0, whose second part moves.")
+@options.stability_options
+@options.value_option("eps", "Relative modulation amplitude, where it is not an axis.")
+@options.value_option("V", "Driving velocity in um/s, where it is not an axis.")
+@options.value_option("W0", "Mean normal load in N, where it is not an axis.")
+@options.over_option(
+    help="An axis, twice: NAME=LOW:HIGH:POINTS[:log|lin]; NAME may be a ratio, as K/W0, whose second part moves."
+)
 @click.option("--boundary", metavar="FILE", help="Write the polished points of the boundaries to FILE (.csv or .json).")
-@click.option("--boundaries/--no-boundaries", default=True, show_default=True, help="Whether boundaries are followed.")
-@click.option(
-    "--criticality/--no-criticality",
-    default=True,
-    show_default=True,
-    help="Whether the normal form tells sub- from supercritical.",
-)
-@click.option(
-    "--depth",
-    type=click.IntRange(0, 10),
-    default=4,
-    show_default=True,
-    help="How often a cell in which a boundary could hide is halved.",
-)
-@click.option(
-    "--mesh-error", type=float, default=3e-4, show_default=True, help="What the map's mesh may shift a boundary by, relatively."
-)
-@step_option
+@click.option("--boundaries/--no-boundaries", default=True, help="Whether boundaries are followed.")
+@click.option("--criticality/--no-criticality", default=True, help="Whether the normal form tells sub- from supercritical.")
+@click.option("--depth", type=click.IntRange(0, 10), default=4, help="How often a cell in which a boundary could hide is halved.")
+@click.option("--mesh-error", default=3e-4, help="What the map's mesh may shift a boundary by, relatively.")
+@options.step_option
 @click.option("--tol", type=float, help="Relative error of each boundary point; 1e-6 unless set.")
-@mesh_option(least=64)
-@worker_options
-@output_options
+@options.mesh_option(least=64)
+@options.worker_options
+@options.output_options
 def map_(
-    system: SystemOptions,
+    system: options.SystemOptions,
     eps: str | None,
     V: str | None,
     W0: str | None,
-    over: tuple[Range, ...],
+    over: tuple[options.Range, ...],
     boundary: str | None,
     boundaries: bool,
     criticality: bool,
@@ -100,8 +64,8 @@ def map_(
     step: float,
     tol: float | None,
     max_mesh: int,
-    spread: Spread,
-    output: OutputOptions,
+    spread: options.Spread,
+    output: options.OutputOptions,
 ) -> None:
     """The stability of the forced sliding state over a plane of two parameters.
 
@@ -109,7 +73,6 @@ def map_(
     followed as a curve, islands included, and polished until its error is met. Text lists the components and their special
     points; CSV and JSON hold the grid.
     """
-    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.numerics.continuation import ContinuationSettings, StepSettings
     from srfcli.numerics.plane import MapSettings
     from srfcli.tasks import map as task
@@ -120,7 +83,7 @@ def map_(
         raise SrfError("--boundary needs the boundaries that --no-boundaries leaves out", "Drop one of the two.")
     place = None if boundary is None else _boundary_output(boundary, output)
     given = {"eps": eps, "V": V, "W0": W0}
-    check_axes({name for r in over for name in r.name.split("/")}, given)
+    options.check_axes({name for r in over for name in r.name.split("/")}, given)
     slider = system.slider(**given)
     slider.model.check_changing_load(slider.vector())
     grid = read_grid(slider.model, slider.vector(), over)
@@ -152,11 +115,11 @@ def map_(
     finish(found.status)
 
 
-def _boundary_output(boundary: str, output: OutputOptions) -> OutputOptions:
+def _boundary_output(boundary: str, output: options.OutputOptions) -> options.OutputOptions:
     """Return where the boundary's points go, checked now."""
     if boundary == "-" or Path(boundary).suffix.lower() not in (".csv", ".json"):
         raise SrfError(f"--boundary {boundary} ends in neither .csv nor .json", "--boundary boundary.csv")
-    place = read_output(out=boundary, force=output.force, provenance=output.provenance)
+    place = options.read_output(out=boundary, force=output.force, provenance=output.provenance)
     if output.out is not None and place.out is not None and output.out.resolve() == place.out.resolve():
         raise SrfError(f"--out and --boundary are the same file, {boundary}", "Give them different names.")
     return place
@@ -167,7 +130,7 @@ def _boundary_output(boundary: str, output: OutputOptions) -> OutputOptions:
 COLUMNS, ROWS = 80, 120  # points of an axis for which none were given
 
 
-def read_grid(model: GeneratedModel, base: Array, over: tuple[Range, ...]) -> MapGrid:
+def read_grid(model: GeneratedModel, base: Array, over: tuple[options.Range, ...]) -> MapGrid:
     """Return the grid that `over` spans; V from 1 to 100 um/s and a window of K/W0 stand in for an axis not given.
 
     Raises SrfError for more than two axes, for lists of values, and for what is no parameter of the model.
@@ -176,7 +139,7 @@ def read_grid(model: GeneratedModel, base: Array, over: tuple[Range, ...]) -> Ma
 
     if len(over) > 2:
         raise SrfError(f"--over is given {len(over)} times", "A map has two axes: --over V=1:100:120 --over K/W0=0.005:0.03:200.")
-    ranges = over or (replace(parse_over("V=1:100"), n=COLUMNS),)
+    ranges = over or (replace(options.parse_over("V=1:100"), n=COLUMNS),)
     axes = [read_axis(model, r) for r in ranges]
     if len(axes) == 1:
         axes.append(_load_axis(model, base, axes[0]))
@@ -185,10 +148,10 @@ def read_grid(model: GeneratedModel, base: Array, over: tuple[Range, ...]) -> Ma
     return grid
 
 
-def read_axis(model: GeneratedModel, given: Range) -> MapAxis:
+def read_axis(model: GeneratedModel, given: options.Range) -> MapAxis:
     """Return the axis that a range describes, in um, s, N."""
-    from srfcli.core.units import to_base
     from srfcli.numerics.plane import MapAxis
+    from srfcli.results.map import ratio_powers
 
     given.check_ends()
     log = given.spacing == "log"
@@ -197,23 +160,14 @@ def read_axis(model: GeneratedModel, given: Range) -> MapAxis:
         lo, hi = to_base(fitted.lo, fitted.unit), to_base(fitted.hi, fitted.unit)
         return MapAxis(given.name, lo, hi, given.n, log)
     held, moved = given.name.split("/")
-    factor = _ratio_factor(model, given, held, moved)
+    powers, factor = ratio_powers(model, held, moved), 1.0  # the numbers are in um, s, N unless a unit is written
+    if given.unit:
+        unit = find_unit(given.unit, where=f"--over {given.name}")
+        if unit.powers != powers:
+            hint = f"Write it in {describe(powers)}, or leave it out."
+            raise SrfError(f"--over {given.name}: {given.unit!r} is the wrong unit", hint)
+        factor = unit.factor
     return MapAxis(moved, given.lo * factor, given.hi * factor, given.n, log, held)
-
-
-def _ratio_factor(model: GeneratedModel, given: Range, held: str, moved: str) -> float:
-    """Return what a ratio's numbers are multiplied with: they are in um, s, N unless a unit is written."""
-    from srfcli.core.units import describe, find_unit
-
-    powers = ratio_powers(model, held, moved)
-    if not given.unit:
-        return 1.0
-    unit = find_unit(given.unit, where=f"--over {given.name}")
-    if unit.powers != powers:
-        raise SrfError(
-            f"--over {given.name}: {given.unit!r} is the wrong unit", f"Write it in {describe(powers)}, or leave it out."
-        )
-    return unit.factor
 
 
 def _load_axis(model: GeneratedModel, base: Array, x: MapAxis) -> MapAxis:
@@ -243,28 +197,28 @@ srf compare --law srf-vsat --law log-log --law bowden-tabor --eps 0.18 --plot la
 srf compare --ageing dieterich --ageing ruina --ageing dieterich+linker-dieterich --eps 0.09,0.18
 srf compare --law srf-vsat --law log-log --eps 0.18 --workers 2 --json
 """
-COMPARED_OPTIONS: Options = {  # those of `system_options`, but that several laws may be named
+COMPARED_OPTIONS: options.Options = {  # those of `system_options`, but that several laws may be named
     "laws": click.option("--law", "laws", multiple=True, metavar="NAME", help="A friction law; repeat for more."),
     "ageings": click.option("--ageing", "ageings", multiple=True, metavar="NAME", help="An ageing law; repeat: all pairs count."),
-    "interface": SYSTEM_OPTIONS["interface"],
-    "loading": SYSTEM_OPTIONS["loading"],
-    **APPARATUS_OPTIONS,
+    "interface": options.SYSTEM_OPTIONS["interface"],
+    "loading": options.SYSTEM_OPTIONS["loading"],
+    **options.APPARATUS_OPTIONS,
     "assignments": click.option(
         "--set", "assignments", multiple=True, metavar="NAME=VALUE", help="Set a parameter of every law that has it."
     ),
-    "plugins": SYSTEM_OPTIONS["plugins"],
+    "plugins": options.SYSTEM_OPTIONS["plugins"],
 }
 
 
 @click.command("compare", cls=SrfCommand, epilog=COMPARE)
-@add_options(COMPARED_OPTIONS)
-@values_option(AMPLITUDE, default=(0.18,))
-@click.option("--at", default="10", show_default=True, metavar="V", help="Velocity (um/s) at which laws are brought together.")
-@click.option("--adjust", default="A,B,D0", show_default=True, help="The three parameters adjusted, with mu0 where there is one.")
-@click.option("--match/--no-match", "matched", default=True, show_default=True, help="Whether parameters are adjusted at all.")
-@over_option(help="The window: V=LOW:HIGH[:POINTS] and K/W0=LOW:HIGH[:POINTS], each of which may be left out.")
-@worker_options
-@output_options
+@options.add_options(COMPARED_OPTIONS)
+@options.values_option(options.AMPLITUDE, default=(0.18,))
+@click.option("--at", default="10", metavar="V", help="Velocity (um/s) at which laws are brought together.")
+@click.option("--adjust", default="A,B,D0", help="The three parameters adjusted, with mu0 where there is one.")
+@click.option("--match/--no-match", "matched", default=True, help="Whether parameters are adjusted at all.")
+@options.over_option(help="The window: V=LOW:HIGH[:POINTS] and K/W0=LOW:HIGH[:POINTS], each of which may be left out.")
+@options.worker_options
+@options.output_options
 def compare(
     laws: tuple[str, ...],
     ageings: tuple[str, ...],
@@ -272,9 +226,9 @@ def compare(
     at: str,
     adjust: str,
     matched: bool,
-    over: tuple[Range, ...],
-    spread: Spread,
-    output: OutputOptions,
+    over: tuple[options.Range, ...],
+    spread: options.Spread,
+    output: options.OutputOptions,
     **system: Any,
 ) -> None:
     """Laws side by side: where re-entrance begins, what modulation destabilises, and where an experiment tells them apart.
@@ -282,7 +236,6 @@ def compare(
     The first law is the reference. Every other one is brought to its friction, slope, critical load and critical period at one
     low velocity, so that what differs is the law and not its calibration.
     """
-    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.tasks import map as tasks
 
     begun = time.perf_counter()
@@ -307,14 +260,14 @@ def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, 
     toml = load_toml(find_toml())
     chosen = {k: choose(k, system[k], toml=toml) for k in ("interface", "loading", "inertia")}
     chosen |= {k: choose(k, None, toml=toml) for k, given in (("law", laws), ("ageing", ageings)) if not given}
-    check_origins(toml, chosen)
+    options.check_origins(toml, chosen)
     shared = {k: chosen[k].value for k in ("interface", "loading", "inertia")}
     named = (*chosen.values(), *(Setting(name, "flag") for name in (*laws, *ageings)))
     laws, ageings = laws or (chosen["law"].value,), ageings or (chosen["ageing"].value,)
     pairs = list(dict.fromkeys(itertools.product(laws, ageings)))
     if len(pairs) < 2:
         raise SrfError("one law is nothing to compare", "Name more: --law srf-vsat --law log-log, or several --ageing.")
-    registry = open_registry(system["plugins"], named)
+    registry = options.open_registry(system["plugins"], named)
     models = [open_model(registry, law=law, ageing=ageing, **shared) for law, ageing in pairs]
     short = len(set(ageings)) == 1, len(set(laws)) == 1
     names = [law if short[0] else ageing if short[1] else f"{law}/{ageing}" for law, ageing in pairs]
@@ -324,7 +277,7 @@ def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, 
 
 def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSettings) -> list[Resolved]:
     """Return every model's parameters; an assignment counts for the models that have its parameter, and one must."""
-    flags = read_flags(system, system["assignments"])
+    flags = options.read_flags(system, system["assignments"])
     known = {n for m in models for n in m.names}
     for name in flags:
         if name not in known:
@@ -332,7 +285,7 @@ def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSe
     return [resolve(m.parameters, {n: v for n, v in flags.items() if n in m.names}, toml=toml, where=m.title) for m in models]
 
 
-def _window(model: GeneratedModel, over: tuple[Range, ...]) -> dict[str, Any]:
+def _window(model: GeneratedModel, over: tuple[options.Range, ...]) -> dict[str, Any]:
     """Return the window that --over describes, and how many points it has, as the task takes them."""
     parts: dict[str, Any] = {"points": {}}
     for given in over:
@@ -340,6 +293,6 @@ def _window(model: GeneratedModel, over: tuple[Range, ...]) -> dict[str, Any]:
         if axis.name not in ("V", "K/W0"):
             raise SrfError(f"--over {axis.name} is not an axis of the comparison", "Its plane is V against K/W0.")
         parts["V" if axis.name == "V" else "K_over_W0"] = (axis.lo, axis.hi)
-        if given.n != DEFAULT_POINTS:
+        if given.n != options.DEFAULT_POINTS:
             parts["points"]["columns" if axis.name == "V" else "rows"] = given.n
     return parts

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import Session, SrfCommand
-from srfcli.cli.options import plugins_option, reader_option
+from srfcli.cli.options import PATH, plugins_option, reader_option
 from srfcli.core.errors import SrfError
+from srfcli.core.files import check_target, write_atomic
+from srfcli.core.units import parse_quantity, split_quantity
 
 if TYPE_CHECKING:
     from srfcli.data.draft import Wish
@@ -27,7 +29,7 @@ KINDS = ("steps", "shs", "oscillation")
 
 
 @click.command("new", cls=SrfCommand, epilog=EXAMPLES)
-@click.argument("files", metavar="DATA...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("files", metavar="DATA...", nargs=-1, required=True, type=PATH)
 @click.option("--stiffness", metavar="K", help="Of the machine: '0.21 N/um', '55 MPa/mm', '5e-3 1/um' (friction per um).")
 @click.option(
     "--kind", type=click.Choice(KINDS), help="Velocity steps, slide-hold-slide, or a load that oscillates; else as found."
@@ -42,11 +44,11 @@ KINDS = ("steps", "shs", "oscillation")
 @click.option("--thickness", metavar="H", help="Of the layer, '4 mm', where strain is recorded.")
 @click.option("--area", metavar="A", help="Of the sliding contact, '25 cm^2': forces then become stresses.")
 @click.option("--window", metavar="FROM,TO", help="Only this part of the recordings, in s of the file's clock.")
-@click.option("--law", metavar="NAME", default="dieterich-ruina", show_default=True, help="Friction law.")
+@click.option("--law", metavar="NAME", default="dieterich-ruina", help="Friction law.")
 @click.option("--ageing", metavar="NAME", help="Ageing law; else dieterich, with Linker's term where the load oscillates.")
-@click.option("--interface", metavar="NAME", default="rigid", show_default=True, help="Elasticity of the interface.")
+@click.option("--interface", metavar="NAME", default="rigid", help="Elasticity of the interface.")
 @click.option("--holdout", multiple=True, metavar="RUN", help="Keep this run from every fit, to judge it.")
-@click.option("--title", default="", metavar="TEXT", help="Title of the experiment.")
+@click.option("--title", default="", show_default=False, metavar="TEXT", help="Title of the experiment.")
 @reader_option
 @click.option("--out", metavar="FILE", help="The file to write; - is stdout.  [default: experiment.toml in this folder]")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
@@ -57,7 +59,6 @@ def command(files: tuple[Path, ...], out: str | None, force: bool, plugins: tupl
     Columns are recognised by heading and unit; time, what was imposed and what was observed are found in the data. What no table
     says, the stiffness first of all, is asked for on a terminal and otherwise taken from the options.
     """
-    from srfcli.core.files import check_target, write_atomic
     from srfcli.data.columns import open_source
     from srfcli.data.draft import draft
     from srfcli.laws.registry import load_registry
@@ -91,30 +92,23 @@ def _wish(files: tuple[Path, ...], options: dict[str, Any], registry: Registry) 
     from srfcli.data.draft import Wish
 
     columns = dict(_column(text) for text in options["columns"])
-    drive, load, stiffness = options["drive"], options["load"], options["stiffness"]
     if sys.stdin.isatty() and sys.stderr.isatty():
-        drive, load, stiffness = _asked(files[0], columns, options, registry)
-    if stiffness is None:
+        options = options | _asked(files[0], columns, options, registry)
+    if options["stiffness"] is None:
         raise SrfError(
             "the stiffness of the machine is in no table",
             "Say it with --stiffness: '5.4e-3 1/um' (friction per micron), '55 MPa/mm' (shear stress) or '0.21 N/um' (force).",
         )
-    given = {key: options[key] for key in ("kind", "mass", "law", "ageing", "interface", "title", "reader", "holdout")}
+    given = {key: options[key] for key in ("kind", "load", "mass", "law", "ageing", "interface", "title", "reader", "holdout")}
     return Wish(
-        stiffness=_stiffness(stiffness),
-        columns=columns,
-        drive=_drive(drive),
-        load=load,
-        window=_window(options["window"]),
-        rig={key: options[key] for key in ("radius", "thickness", "area") if options[key]},
+        stiffness=_stiffness(options["stiffness"]), columns=columns, drive=_drive(options["drive"]),
+        window=_window(options["window"]), rig={key: options[key] for key in ("radius", "thickness", "area") if options[key]},
         **given,
-    )
+    )  # fmt: skip
 
 
-def _asked(
-    path: Path, columns: dict[str, str], options: dict[str, Any], registry: Registry
-) -> tuple[str | None, str | None, str]:
-    """Ask for what neither the first file nor the options say; answers for columns go into `columns`."""
+def _asked(path: Path, columns: dict[str, str], options: dict[str, Any], registry: Registry) -> dict[str, Any]:
+    """Ask for the drive, load and stiffness that neither the first file nor the options say; columns go into `columns`."""
     from srfcli.data.columns import open_source
     from srfcli.data.draft import OBSERVED, Wish, missing, name_columns
 
@@ -137,7 +131,7 @@ def _asked(
             load = click.prompt(f"{sentence}. Normal load or stress, as 5 N or 20 MPa", err=True)
     if stiffness is None:
         stiffness = click.prompt("Stiffness of the machine, as 5.4e-3 1/um, 55 MPa/mm or 0.21 N/um", err=True)
-    return drive, load, stiffness
+    return {"drive": drive, "load": load, "stiffness": stiffness}
 
 
 def _column(text: str) -> tuple[str, str]:
@@ -148,8 +142,6 @@ def _column(text: str) -> tuple[str, str]:
 
 
 def _stiffness(text: str) -> str:
-    from srfcli.core.units import split_quantity
-
     number, unit = split_quantity(text, name="--stiffness", example="5e-3 1/um")
     if not unit:
         raise SrfError(
@@ -160,8 +152,6 @@ def _stiffness(text: str) -> str:
 
 def _drive(text: str | None) -> list[tuple[float, float]] | float | None:
     """Return a drive as (duration, velocity) pairs in s and um/s, or as one velocity."""
-    from srfcli.core.units import parse_quantity
-
     if text is None:
         return None
     if ":" not in text:
@@ -174,8 +164,6 @@ def _drive(text: str | None) -> list[tuple[float, float]] | float | None:
 
 
 def _window(text: str | None) -> tuple[float, float] | None:
-    from srfcli.core.units import parse_quantity
-
     if text is None:
         return None
     parts = text.replace(":", ",").split(",")

@@ -2,7 +2,7 @@
 
 @click.command("linear", cls=SrfCommand, epilog=EXAMPLES)
 @system_options
-@over_option(default=("V=1:100:60",))
+@over_option(help="Values to run over.")
 @output_options
 def command(system: SystemOptions, over: tuple[Range, ...], output: OutputOptions) -> None: ...
 """
@@ -181,16 +181,15 @@ def names_of(kind: str) -> Callable[[click.Context, click.Parameter, str], list[
     return complete
 
 
-def over_option(*, default: Sequence[str] = (), help: str = "") -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def over_option(*, help: str, default: Sequence[str] = ()) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add --over NAME=..., repeatable; the command gets `over`, a tuple of Range, `default` parsed if none is given."""
-    text = help or "Values to run over: NAME=LOW:HIGH[:POINTS[:log|lin]] or NAME=a,b,c; repeat for a second parameter."
     return click.option(
         "--over",
         multiple=True,
         default=list(default),
         show_default=", ".join(default) if default else False,
         metavar="NAME=RANGE",
-        help=text,
+        help=help,
         callback=lambda _context, _parameter, texts: parse_overs(texts),
     )
 
@@ -238,8 +237,10 @@ APPARATUS_FLAGS = {  # the flags that have their own option; every other paramet
     "f": "Frequency of the load modulation, in Hz.",
     "angle": "Inclination of an inclined spring, in deg.",
 }
+PATH = click.Path(path_type=Path)
 LOADINGS = ("vertical", "inclined")
-CHOICES = ("law", "ageing", "interface", "loading", "inertia")
+LAW_CHOICES = ("law", "ageing", "interface")
+CHOICES = (*LAW_CHOICES, "loading", "inertia")
 AMPLITUDE = Parameter("eps", 0.0, "1", 0.0, 0.999999, "relative modulation amplitudes")
 TABLE_FORMATS = ("text", "json", "csv")
 TABLE_SUFFIXES = ("", ".txt", ".json", ".csv")
@@ -247,13 +248,9 @@ TABLE_SUFFIXES = ("", ".txt", ".json", ".csv")
 
 @dataclass(frozen=True)
 class SystemOptions:
-    """The laws that were chosen, each with its origin, and the values that flags set, still as text."""
+    """What was chosen of CHOICES, each with its origin, and the values that flags set, still as text."""
 
-    law: Setting
-    ageing: Setting
-    interface: Setting
-    loading: Setting
-    inertia: Setting
+    chosen: Mapping[str, Setting]
     flags: Mapping[str, str]
     plugins: tuple[Path, ...] = ()
     toml: TomlSettings = field(default_factory=TomlSettings)
@@ -262,17 +259,17 @@ class SystemOptions:
     def registry(self) -> Registry:
         """Return the registry of shipped and installed laws and those in --plugins."""
         named = (Setting(name, "flag") for name in self.effects)
-        return open_registry(self.plugins, (self.law, self.ageing, self.interface, *named))
+        return open_registry(self.plugins, (*(self.chosen[key] for key in LAW_CHOICES), *named))
 
-    def _chosen(self) -> dict[str, Any]:
-        check_origins(self.toml, {"law": self.law, "ageing": self.ageing, "interface": self.interface})
-        return {key: getattr(self, key).value for key in CHOICES}
+    def _names(self) -> dict[str, Any]:
+        check_origins(self.toml, {key: self.chosen[key] for key in LAW_CHOICES})
+        return {key: setting.value for key, setting in self.chosen.items()}
 
     def system(self) -> System:
         """Return the system that the options name."""
         from srfcli.symbolic.system import build_system
 
-        return build_system(self.registry(), **self._chosen())
+        return build_system(self.registry(), **self._names())
 
     def model(self, *, tables: Sequence[tuple[str, str]] = ()) -> GeneratedModel:
         """Return the numerical model of that system, with tables if asked for; sympy runs only where the cache has none."""
@@ -281,7 +278,7 @@ class SystemOptions:
 
         registry = self.registry()
         check_part(registry, self.effects)
-        return open_model(registry, **self._chosen(), tables=tables, effects=self.effects, stability=True)
+        return open_model(registry, **self._names(), tables=tables, effects=self.effects, stability=True)
 
     def resolve(self, parameters: Sequence[Parameter], **given: str | float | None) -> Resolved:
         """Return every parameter's value and origin.
@@ -293,7 +290,7 @@ class SystemOptions:
             if name in self.flags:
                 raise SrfError(f"{name} is set twice: by --{name} and by --set", "Give each parameter one value.")
         flags = {**self.flags, **own}
-        resolved = resolve(parameters, flags, toml=self.toml, where=self.law.value)
+        resolved = resolve(parameters, flags, toml=self.toml, where=self.chosen["law"].value)
         for sentence in resolved.unused:
             Session.current().say(f"Warning: {sentence}")
         return resolved
@@ -313,10 +310,6 @@ class SystemOptions:
             flags = " and ".join(f"--{p.name}" for p in taken)
             Session.current().say(f"Note: {values} by default; {flags} set{'s' if len(taken) == 1 else ''} it")
 
-    def choices(self) -> dict[str, Setting]:
-        """Return every setting of DEFAULTS by name, for listing."""
-        return {key: getattr(self, key) for key in CHOICES} | {"tol": self.tolerance()}
-
     def tolerance(self, flag: float | None = None) -> Setting:
         """Return the tolerance, between 0 and 1: `flag` if given, else SRF_TOL, srf.toml or the default."""
         chosen = choose("tol", flag, toml=self.toml)
@@ -330,14 +323,10 @@ def open_registry(plugins: Sequence[Path], settings: Sequence[Setting] = ()) -> 
     """Return the laws there are; Python files that flags or the environment name may run, those of files with --trust."""
     from srfcli.laws.registry import load_registry
 
-    words = [word.strip() for s in settings if _by_person(s) for word in str(s.value).split("+")]
+    by_person = [s for s in settings if s.origin == "flag" or s.origin.startswith("environment ")]  # and by no file
+    words = [word.strip() for s in by_person for word in str(s.value).split("+")]
     named = [Path(word) for word in words if word.endswith(".py")]
     return load_registry(plugins, named=named, trust=Session.current().trust)
-
-
-def _by_person(setting: Setting) -> bool:
-    """Return whether a flag or an environment variable set it, and no file."""
-    return setting.origin == "flag" or setting.origin.startswith("environment ")
 
 
 def check_origins(toml: TomlSettings, settings: Mapping[str, Setting]) -> None:
@@ -384,16 +373,6 @@ SYSTEM_OPTIONS: Options = {
         help="Take laws from this folder, too.",
     ),
 }
-EFFECT_OPTION: Options = {
-    "effects": click.option(
-        "--effect",
-        "effects",
-        multiple=True,
-        metavar="NAME",
-        help="Add this effect to the laws; `srf laws --kind effect` lists all; repeatable.",
-        shell_complete=names_of("effect"),
-    )
-}
 
 
 def add_options(options: Options) -> Callable[[F], F]:
@@ -425,7 +404,9 @@ def system_options(function: F) -> F:
 
 def stability_options(function: F) -> F:
     """Add what `system_options` adds, and --effect: for commands on the stability of sliding."""
-    return _as_one(function, "system", _read_system, SYSTEM_OPTIONS | EFFECT_OPTION)
+    text = "Add this effect to the laws; `srf laws --kind effect` lists all; repeatable."
+    effect = click.option("--effect", "effects", multiple=True, metavar="NAME", help=text, shell_complete=names_of("effect"))
+    return _as_one(function, "system", _read_system, {**SYSTEM_OPTIONS, "effects": effect})
 
 
 def _read_system(
@@ -434,7 +415,7 @@ def _read_system(
     toml = load_toml(find_toml())
     chosen = {key: choose(key, taken[key], toml=toml) for key in CHOICES}
     flags = read_flags(taken, assignments)
-    return SystemOptions(**chosen, flags=flags, plugins=plugins, toml=toml, effects=effects)
+    return SystemOptions(chosen, flags=flags, plugins=plugins, toml=toml, effects=effects)
 
 
 def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str, str]:
@@ -450,10 +431,9 @@ def read_flags(taken: Mapping[str, Any], assignments: Sequence[str]) -> dict[str
 
 plugins_option = click.option(
     "--plugins",
-    "plugins",
     multiple=True,
     metavar="DIR",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Folder with law files of your own; may be given several times. Also SRF_PLUGINS.",
 )
 
@@ -466,13 +446,13 @@ def value_option(name: str, help: str) -> Callable[[F], F]:
 def mesh_option(*, least: int, most: int = 8192, default: int = 512) -> Callable[[F], F]:
     """Add --max-mesh; the command gets `max_mesh`."""
     kind = click.IntRange(least, most)
-    return click.option("--max-mesh", type=kind, default=default, show_default=True, help="Intervals of the finest mesh.")
+    return click.option("--max-mesh", type=kind, default=default, help="Intervals of the finest mesh.")
 
 
 def step_option(function: F) -> F:
     """Add --step, the longest step of a continuation; the command gets `step`."""
     text = "Longest step, as a share of the window."
-    return click.option("--step", type=float, default=0.035, show_default=True, help=text)(function)
+    return click.option("--step", default=0.035, help=text)(function)
 
 
 def check_axes(swept: Container[str], given: Mapping[str, str | None]) -> None:
@@ -499,7 +479,9 @@ OUTPUT_OPTIONS: Options = {
     "out": click.option("--out", metavar="FILE", help="Write to FILE; .json and .csv choose the format, - is stdout."),
     "plot": click.option("--plot", metavar="FILE", help="Draw a figure to FILE.png, .svg or .pdf."),
     "force": click.option("--force", is_flag=True, help="Overwrite existing files."),
-    "provenance": click.option("--provenance/--no-provenance", default=True, help="Write FILE.provenance.json beside each file."),
+    "provenance": click.option(
+        "--provenance/--no-provenance", default=True, show_default=False, help="Write FILE.provenance.json beside each file."
+    ),
 }
 
 
@@ -558,28 +540,20 @@ class Spread:
 
     def run(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         """Yield (index, result) of every task, in any order."""
-        if self.resume is None:
-            yield from self._fresh(function, tasks)
-            return
         from srfcli.core.parallel import Store, stored
 
-        yield from stored(self._fresh, Store(self.resume), function, tasks)
+        return self._fresh(function, tasks) if self.resume is None else stored(self._fresh, Store(self.resume), function, tasks)
 
     def _fresh(self, function: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        from srfcli.core import parallel
+
         if not tasks:
-            return
+            return iter(())
         if self.cluster is not None:
-            from srfcli.core.parallel import run_cluster
-
-            yield from run_cluster(function, tasks, address=self.cluster)
-        elif self.workers > 1:
-            from srfcli.core.parallel import run_processes
-
-            yield from run_processes(function, tasks, workers=self.workers)
-        else:
-            from srfcli.core.parallel import run_here
-
-            yield from run_here(function, tasks)
+            return parallel.run_cluster(function, tasks, address=self.cluster)
+        if self.workers > 1:
+            return parallel.run_processes(function, tasks, workers=self.workers)
+        return parallel.run_here(function, tasks)
 
 
 WORKER_OPTIONS: Options = {

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import EXIT_INTERRUPTED, Session, SrfCommand
-from srfcli.cli.options import OutputOptions, plugins_option
+from srfcli.cli.emit import Progress, emit
+from srfcli.cli.options import PATH, OutputOptions, plugins_option
 from srfcli.core.errors import SrfError
+from srfcli.results.provenance import Provenance, write_result
+from srfcli.results.tables import Table, to_csv, to_json, to_text
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from srfcli.results.tables import Table
     from srfcli.validation.trials import Trial
 
 EXAMPLES = """
@@ -52,22 +54,15 @@ TRACKS = ("smooth", "shared", "own")
     type=click.Choice(TRACKS),
     help="Random friction field of the cases: none, one that all runs share, or one of each run's own.",
 )
-@click.option("--workers", type=click.IntRange(0, 4096), default=1, show_default=True, help="Processes, 0 for all cores.")
-@click.option("--out", metavar="DIR", type=click.Path(path_type=Path), help="New folder for bank, answers and report.")
+@click.option("--workers", type=click.IntRange(0, 4096), default=1, help="Processes, 0 for all cores.")
+@click.option("--out", metavar="DIR", type=PATH, help="New folder for bank, answers and report.")
 @click.option("--resume", is_flag=True, help="Go on with the trial in --out.")
-@click.option(
-    "--report-only",
-    "report",
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Diagnose nothing; mark the answers in DIR again.",
-)
+@click.option("--report-only", "report", metavar="DIR", type=PATH, help="Diagnose nothing; mark the answers in DIR again.")
 @click.option("--unfinished", is_flag=True, help="Give up the cases without an answer: the trial ends here.")
 @click.option(
     "--limit",
-    type=click.FloatRange(min=0, min_open=True),
+    type=click.FloatRange(0, min_open=True),
     default=30.0,
-    show_default=True,
     metavar="MINUTES",
     help="CPU time after which a case has failed.",
 )
@@ -75,20 +70,15 @@ TRACKS = ("smooth", "shared", "own")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON, in full precision.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print the marks as CSV, one case a line.")
 def command(
-    cases: int | None,
-    seed: int | None,
-    kinds: tuple[str, ...],
-    bank: str | None,
-    track: str | None,
     workers: int,
     out: Path | None,
-    resume: bool,
     report: Path | None,
     unfinished: bool,
     limit: float,
     plugins: tuple[Path, ...],
     as_json: bool,
     as_csv: bool,
+    **asked: Any,
 ) -> None:
     """Prove the diagnosis on experiments whose truth nobody has seen.
 
@@ -104,15 +94,14 @@ def command(
         said = "neither --out nor --report-only is given" if out is None else "--out and --report-only exclude each other"
         raise SrfError(said, "srf prove --out DIR makes a trial, srf prove --report-only DIR reads one.")
     count = workers or os.cpu_count() or 1
-    asked = {"cases": cases, "seed": seed, "kinds": kinds, "bank": bank, "track": track, "resume": resume}
     if out is not None:
         if unfinished:
             raise SrfError("--unfinished ends a trial that was begun", f"srf prove --report-only {out} --unfinished")
         trial = _answered(out, asked, count, limit, plugins)
     else:
         assert report is not None
-        for name, value in asked.items():
-            if value is not None and value is not False and value != ():
+        for name in ("cases", "seed", "kinds", "bank", "track", "resume"):
+            if asked[name] not in (None, ()) and asked[name] is not False:
                 raise SrfError(f"--{name.replace('kinds', 'kind')} has no meaning with --report-only", "Leave it out.")
         trial = Trial(report)
         trial.asked()
@@ -121,7 +110,6 @@ def command(
 
 def _answered(folder: Path, asked: dict[str, Any], workers: int, limit: float, plugins: tuple[Path, ...]) -> Trial:
     """Return the trial with an answer to every case; Ctrl-C ends the command, and what was answered is kept."""
-    from srfcli.cli.emit import Progress
     from srfcli.laws.registry import load_registry
     from srfcli.validation.trials import answer_all, begin
 
@@ -143,7 +131,6 @@ def _answered(folder: Path, asked: dict[str, Any], workers: int, limit: float, p
 
 def _report(trial: Trial, workers: int, unfinished: bool, format: str) -> None:
     """Unseal, mark every answer, print the tables and keep them beside the answers."""
-    from srfcli.cli.emit import Progress, emit
     from srfcli.validation.marks import cases, mark, see_all, tables
     from srfcli.validation.trials import open_truths
 
@@ -163,9 +150,6 @@ def _report(trial: Trial, workers: int, unfinished: bool, format: str) -> None:
 
 def _keep(trial: Trial, seed: int, table: Table, more: Sequence[Table], listed: Table) -> None:
     """Write the report beside the answers: for a reader in few digits, for a program in all, and one line per case."""
-    from srfcli.results.provenance import Provenance, write_result
-    from srfcli.results.tables import to_csv, to_json, to_text
-
     text = "\n".join(to_text(t, full=False) for t in [table, *more])
     provenance = Provenance(Session.current().arguments, inputs=(trial.answers, trial.apart), seed=seed)
     for name, content in (("report.txt", text), ("report.json", to_json(table)), ("cases.csv", to_csv(listed))):

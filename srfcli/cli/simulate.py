@@ -11,16 +11,19 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from srfcli.cli.base import Session, SrfCommand
-from srfcli.cli.options import OutputOptions, SystemOptions, output_options, system_options, value_option
+from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
+from srfcli.cli.options import LAW_CHOICES, PATH, OutputOptions, SystemOptions, output_options, system_options, value_option
 from srfcli.core.errors import SrfError
 from srfcli.core.units import convert, parse_quantity, split_quantity
-from srfcli.results.simulation import STEP_RISE, SimulationResult, Work
+from srfcli.motion import STEP_RISE
+from srfcli.results.provenance import Provenance, sidecar, sidecar_path
 
 if TYPE_CHECKING:
     from srfcli.codegen.slider import SlidingSystem
     from srfcli.data.noise import FrictionField
     from srfcli.data.values import ModelChoice
     from srfcli.motion.imposed import Load
+    from srfcli.results.simulation import SimulationResult, Work
 
 EXAMPLES = """
 srf simulate --V 8 --W0 9 --eps 0.09 --for 4 --rate 1000 --out run.csv
@@ -49,11 +52,7 @@ EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load
 )
 @click.option("--load", metavar="PIECES", help="Normal load as DURATION:LOAD, ... in s and N; 5->7 is a ramp.")
 @click.option(
-    "--load-rise",
-    metavar="TIME",
-    default=f"{STEP_RISE:g} s",
-    show_default=True,
-    help="Time over which steps and corners of --load are rounded.",
+    "--load-rise", metavar="TIME", default=f"{STEP_RISE:g} s", help="Time over which steps and corners of --load are rounded."
 )
 @click.option(
     "--load-file",
@@ -67,10 +66,9 @@ EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load
     "--start",
     metavar="STATE",
     default="steady",
-    show_default=True,
     help="Steady sliding at the first velocity, at another (--start 10), or values: --start 'v=1e-3, phi=100 s'.",
 )
-@click.option("--rtol", type=float, default=1e-8, show_default=True, help="Local relative error of integration.")
+@click.option("--rtol", default=1e-8, help="Local relative error of integration.")
 @click.option("--run", "runs", multiple=True, metavar="NAME", help="Only this run of EXPERIMENT; may be repeated.")
 @click.option(
     "--observe",
@@ -84,23 +82,22 @@ EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load
     metavar="SIZE",
     help="Standard deviation of the gauge's noise, in the observable's unit; of several one for each, as 0.01,0.2.",
 )
-@click.option("--lag1", type=float, default=0.0, help="Correlation of the noise from sample to sample, as 0.8.")
+@click.option("--lag1", default=0.0, show_default=False, help="Correlation of the noise from sample to sample, as 0.8.")
 @click.option("--quantum", metavar="SIZE", help="Step to which readings are rounded.")
 @click.option("--roughness", metavar="SIZE", help="Standard deviation of a random friction field along slip, as 3e-4.")
 @click.option("--roughness-length", metavar="UM", help="Correlation length of that field, in um.  [default: 10 um]")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all that is random.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of all that is random.")
 @click.option(
     "--out-dir",
     "--experiment",
     "folder",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="DIR",
     help="Write the records as an experiment folder, whole or not at all.",
 )
 @click.option(
     "--start-values",
     default="true",
-    show_default=True,
     metavar="true|perturb:10%",
     help="Start values written to DIR: the true ones, or off by up to so much.",
 )
@@ -113,7 +110,6 @@ def command(system: SystemOptions, experiment: Path | None, output: OutputOption
     Drive and load are programs of pieces, or those of the runs of EXPERIMENT, a folder or its experiment.toml. Errors are
     controlled; slip velocities may fall to 1e-12 um/s and below. The records can be written as a new experiment, with noise.
     """
-    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.tasks.simulate import simulate_work
 
     _check(given, experiment, output)
@@ -175,7 +171,6 @@ def _check_folder(given: dict[str, Any], experiment: Path | None, output: Output
 def _write(found: SimulationResult, folder: Path, seed: int, output: OutputOptions, timings: dict[str, float]) -> None:
     """Write the experiment folder and its sidecar; an unfinished one is not written, as nothing in it would say so."""
     from srfcli.data.writing import DESCRIPTION, write_experiment
-    from srfcli.results.provenance import Provenance, sidecar, sidecar_path
 
     session, work = Session.current(), found.work
     if not found.status.ok:
@@ -203,11 +198,11 @@ def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], fie
 
     registry = system.registry()
     experiment = read_experiment(path, registry=registry, format=given["reader"])
-    if system.loading.origin == "flag" and system.loading.value != "vertical":
+    if system.chosen["loading"].origin == "flag" and system.chosen["loading"].value != "vertical":
         raise SrfError("the runs of an experiment are loaded from above", "Leave out --loading inclined.")
-    named = {key: getattr(system, key) for key in LAW_OPTIONS}
+    laws = {k: s.value for k, s in system.chosen.items() if s.origin == "flag" and k != "loading"}
     work = runs_again(
-        experiment, registry, laws={k: s.value for k, s in named.items() if s.origin == "flag"},
+        experiment, registry, laws=laws,
         parameters=system.flags, names=given["runs"], field=field, spread=spread,
         **{key: given[key] for key in ("start", "noise", "lag1", "quantum", "seed", "folder")},
     )  # fmt: skip
@@ -216,7 +211,6 @@ def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], fie
 
 # A new record: drive, load and sampling from the options.
 
-LAW_OPTIONS = ("law", "ageing", "interface", "inertia")
 LAW_FILES = (".toml", ".py")
 
 
@@ -229,9 +223,9 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], field: Friction
     slider = system.slider(**{name: given[name] for name in ("V", "W0", "eps")})
     values, folder = slider.resolved.values, given["folder"]
     observables = task.check_observables([n.strip() for n in (given["observable"] or "elongation").split(",")])
-    if field is not None and system.loading.value != "vertical":
+    if field is not None and system.chosen["loading"].value != "vertical":
         raise SrfError("a rough track is for a slider loaded from above", "Leave out --roughness or --loading inclined.")
-    if folder is not None and system.loading.value != "vertical":
+    if folder is not None and system.chosen["loading"].value != "vertical":
         raise SrfError("an experiment folder cannot say that the spring is inclined", "Leave out --out-dir or --loading.")
     load: Load = ConstantLoad(values["W0"])
     begin, length = 0.0, None
@@ -341,8 +335,8 @@ def _laws(system: SystemOptions) -> ModelChoice:
     """Return the laws by name, a file by its whole path: one relative to here means nothing in an experiment's folder."""
     from srfcli.data.values import ModelChoice
 
-    names = {key: getattr(system, key).value for key in LAW_OPTIONS}
-    for key in ("law", "ageing", "interface"):
+    names = {key: setting.value for key, setting in system.chosen.items() if key != "loading"}
+    for key in LAW_CHOICES:
         if names[key].endswith(LAW_FILES):
             names[key] = str(Path(names[key]).resolve())
     return ModelChoice(**names)

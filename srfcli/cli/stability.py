@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import click
 
+from srfcli.cli import options
 from srfcli.cli.base import EXIT_CONDITION, EXIT_OK, SrfCommand
-from srfcli.cli.options import (
-    AMPLITUDE,
-    OutputOptions,
-    Range,
-    SystemOptions,
-    check_axes,
-    mesh_option,
-    output_options,
-    over_option,
-    parse_ends,
-    parse_over,
-    stability_options,
-    step_option,
-    value_option,
-    values_option,
-)
+from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
 from srfcli.core.errors import SrfError
 from srfcli.core.settings import Parameter
 
@@ -38,24 +25,25 @@ srf linear --loading inclined --ageing dieterich+linker-dieterich --over angle=-
 
 
 @click.command("linear", cls=SrfCommand, epilog=LINEAR)
-@stability_options
-@over_option(help="Values to run over, V=1:100:60 unless given; repeat for a grid of two parameters.")
+@options.stability_options
+@options.over_option(help="Values to run over, V=1:100:60 unless given; repeat for a grid of two parameters.")
 @click.option(
     "--all-roots", is_flag=True, help="List every Hopf point, also where stability returns or other roots are unstable."
 )
-@output_options
-def linear(system: SystemOptions, over: tuple[Range, ...], all_roots: bool, output: OutputOptions) -> None:
+@options.output_options
+def linear(
+    system: options.SystemOptions, over: tuple[options.Range, ...], all_roots: bool, output: options.OutputOptions
+) -> None:
     """Critical load, K/W0 and frequency of steady sliding under constant load.
 
     From the exact characteristic polynomial: all its Hopf points, with the direction of crossing checked and the first
     Lyapunov coefficient (supercritical: stick-slip grows from nothing; subcritical: it starts with a jump). Beside them stand the
     closed forms for a rigid interface, and for a rigid interface without inertia.
     """
-    from srfcli.cli.emit import emit
     from srfcli.tasks import stability
 
     slider = system.slider()
-    ranges = [r.fitted(slider.model.parameters, where=slider.model.title) for r in over or (parse_over("V=1:100:60"),)]
+    ranges = [r.fitted(slider.model.parameters, where=slider.model.title) for r in over or (options.parse_over("V=1:100:60"),)]
     found = stability.linear(slider, over={r.name: r.points() for r in ranges}, all_roots=all_roots)
     emit(found.table, output, laws=slider.model.laws, figure=found.plot)
 
@@ -71,40 +59,28 @@ VELOCITY = Parameter("V", 10.0, "um/s", 1e-12, 1e9, "driving velocities")
 
 
 @click.command("critical", cls=SrfCommand, epilog=CRITICAL)
-@stability_options
-@values_option(VELOCITY)
-@values_option(AMPLITUDE)
+@options.stability_options
+@options.values_option(VELOCITY)
+@options.values_option(options.AMPLITUDE)
 @click.option("--window", metavar="LOW:HIGH", help="Loads to look between, in N; else all at which a crossing can be.")
-@click.option("--tol", type=float, help="Relative error of a critical load.", default=1e-8, show_default=True)
-@click.option(
-    "--samples", type=click.IntRange(8, 100_000), default=192, show_default=True, help="Loads looked at first, on each line."
-)
-@click.option(
-    "--resolution",
-    type=float,
-    default=1e-3,
-    show_default=True,
-    help="Finest spacing in ln W0 where a pair of crossings could hide.",
-)
-@mesh_option(least=32)
-@output_options
+@click.option("--tol", type=float, help="Relative error of a critical load.", default=1e-8)
+@click.option("--samples", type=click.IntRange(8, 100_000), default=192, help="Loads looked at first, on each line.")
+@click.option("--resolution", default=1e-3, help="Finest spacing in ln W0 where a pair of crossings could hide.")
+@options.mesh_option(least=32)
+@options.output_options
 def critical(
-    system: SystemOptions,
+    system: options.SystemOptions,
     V: tuple[float, ...] | None,
     eps: tuple[float, ...] | None,
     window: str | None,
-    tol: float,
-    samples: int,
-    resolution: float,
-    max_mesh: int,
-    output: OutputOptions,
+    output: options.OutputOptions,
+    **search: Any,
 ) -> None:
     """Every critical load at the given velocities, numbered from low W0.
 
     The growth rate is sampled along W0, refined where a pair of crossings could hide, and each sign change is polished on
     finer meshes until the error is met. Odd crossings lose stability as W0 rises, even ones regain it.
     """
-    from srfcli.cli.emit import Progress, emit, finish
     from srfcli.tasks import stability
 
     slider = system.slider()
@@ -112,17 +88,17 @@ def critical(
     begun = time.perf_counter()
     with Progress("critical", total=len(V or (None,)) * len(eps or (None,))) as progress:
         found = stability.critical(
-            slider, V=V, eps=eps, window=None if limits is None else (limits.lo, limits.hi), tol=tol, samples=samples,
-            resolution=resolution, max_mesh=max_mesh, progress=lambda place: progress.advance(note=place),
+            slider, V=V, eps=eps, window=None if limits is None else (limits.lo, limits.hi), **search,
+            progress=lambda place: progress.advance(note=place),
         )  # fmt: skip
     timings = {"solve": time.perf_counter() - begun}
     emit(found.table, output, laws=slider.model.laws, timings=timings, figure=found.plot)
     finish(found.status)
 
 
-def _window(text: str) -> Range:
+def _window(text: str) -> options.Range:
     """Return the loads that LOW:HIGH spans, with or without a unit; raises SrfError that shows the form."""
-    found = parse_ends("W0", text)
+    found = options.parse_ends("W0", text)
     if found is None or not found.lo > 0:
         raise SrfError(f"--window {text!r} is not LOW:HIGH, two rising loads above 0", "Write --window 4:500.")
     return found
@@ -138,30 +114,31 @@ srf response --V 10 --W0 6 --mean --eps 0.05,0.1,0.2 --over f=20:400:30
 
 
 @click.command("response", cls=SrfCommand, epilog=RESPONSE)
-@stability_options
-@value_option("V", "Driving velocity in um/s.")
-@value_option("W0", "Mean normal load in N.")
-@values_option(AMPLITUDE, about="relative modulation amplitudes, for --mean")
-@over_option(default=("f=1:1000:200",), help="The frequencies (Hz), or another parameter: NAME=LOW:HIGH[:POINTS[:log|lin]].")
+@options.stability_options
+@options.value_option("V", "Driving velocity in um/s.")
+@options.value_option("W0", "Mean normal load in N.")
+@options.values_option(options.AMPLITUDE, about="relative modulation amplitudes, for --mean")
+@options.over_option(
+    default=("f=1:1000:200",), help="The frequencies (Hz), or another parameter: NAME=LOW:HIGH[:POINTS[:log|lin]]."
+)
 @click.option("--mean", is_flag=True, help="The drop of the mean friction at the amplitudes --eps, from the forced states.")
 @click.option("--tol", type=float, help="Relative error of the mean friction; 1e-6 unless set.")
-@output_options
+@options.output_options
 def response(
-    system: SystemOptions,
+    system: options.SystemOptions,
     V: str | None,
     W0: str | None,
     eps: tuple[float, ...] | None,
-    over: tuple[Range, ...],
+    over: tuple[options.Range, ...],
     mean: bool,
     tol: float | None,
-    output: OutputOptions,
+    output: options.OutputOptions,
 ) -> None:
     """How sliding follows a modulated normal load W0 (1 + eps cos 2 pi f t).
 
     To first order in eps: gain and phase of friction, position and slip velocity, and where they resonate. With --mean:
     what the modulation takes off the mean friction force, at any amplitude.
     """
-    from srfcli.cli.emit import emit, finish
     from srfcli.tasks import stability
 
     if len(over) != 1:
@@ -174,7 +151,7 @@ def response(
         raise SrfError("eps is not swept", "Give amplitudes: --mean --eps 0.05,0.1,0.2; the linear response has none.")
     slider = system.slider(V=V, W0=W0)
     swept = over[0].fitted(slider.model.parameters, where=slider.model.title)
-    check_axes({swept.name}, {"V": V, "W0": W0})
+    options.check_axes({swept.name}, {"V": V, "W0": W0})
     system.say_defaults(slider.resolved, {"V", "W0"} - {swept.name})
     tolerance, begun = system.tolerance(tol).value, time.perf_counter()
     found = stability.response(slider, over={swept.name: swept.points()}, eps=eps or None, tol=tolerance)
@@ -193,38 +170,36 @@ srf floquet --V 8 --W0 9 --eps 0.09 --json --tol 1e-9
 
 
 @click.command("floquet", cls=SrfCommand, epilog=FLOQUET)
-@stability_options
-@value_option("V", "Driving velocity, in um/s.")
-@value_option("W0", "Mean normal load, in N.")
-@value_option("eps", "Relative amplitude of the load modulation.")
+@options.stability_options
+@options.value_option("V", "Driving velocity, in um/s.")
+@options.value_option("W0", "Mean normal load, in N.")
+@options.value_option("eps", "Relative amplitude of the load modulation.")
 @click.option("--tol", type=float, help="Error of the multipliers; 1e-6 unless set.")
-@mesh_option(least=32, most=65536, default=1024)
-@click.option("--harmonics", type=click.IntRange(1, 200), default=5, show_default=True, help="Harmonics of u and mu to list.")
+@options.mesh_option(least=32, most=65536, default=1024)
+@click.option("--harmonics", type=click.IntRange(1, 200), default=5, help="Harmonics of u and mu to list.")
 @click.option("--fail-on", type=click.Choice(["unstable", "stable"]), help="Exit with code 4 if the state is as named.")
-@output_options
+@options.output_options
 def floquet(
-    system: SystemOptions,
+    system: options.SystemOptions,
     V: str | None,
     W0: str | None,
     eps: str | None,
     tol: float | None,
-    max_mesh: int,
-    harmonics: int,
     fail_on: str | None,
-    output: OutputOptions,
+    output: options.OutputOptions,
+    **settings: Any,
 ) -> int:
     """The forced periodic state at one V, W0 and eps: multipliers, mean friction, harmonics.
 
     The mesh is doubled until the estimated error of the multipliers is below --tol. The state is stable where all
     multipliers lie inside the unit circle; the mean friction is set beside that of steady sliding at eps = 0.
     """
-    from srfcli.cli.emit import emit, finish
     from srfcli.tasks import stability
 
     slider = system.slider(V=V, W0=W0, eps=eps)
     system.say_defaults(slider.resolved, ("V", "W0", "eps"))
     tolerance, begun = system.tolerance(tol).value, time.perf_counter()
-    found = stability.floquet(slider, tol=tolerance, max_mesh=max_mesh, harmonics=harmonics)
+    found = stability.floquet(slider, tol=tolerance, **settings)
     timings = {"solve": time.perf_counter() - begun}
     emit(found.table, output, laws=slider.model.laws, timings=timings, figure=found.plot)
     if not found.status.ok:
@@ -243,46 +218,37 @@ srf continue --eps 0.09 --law log-log --ageing dieterich+linker-dieterich
 
 
 @click.command("continue", cls=SrfCommand, epilog=CONTINUE)
-@stability_options
-@values_option(AMPLITUDE, about="relative modulation amplitudes, a boundary for each")
-@value_option("V", "Driving velocity in um/s, where it is not an axis.")
-@value_option("W0", "Mean normal load in N, where it is not an axis.")
-@over_option(help="The plane: NAME=LOW:HIGH once (against W0) or twice; V=1:100 unless given.")
+@options.stability_options
+@options.values_option(options.AMPLITUDE, about="relative modulation amplitudes, a boundary for each")
+@options.value_option("V", "Driving velocity in um/s, where it is not an axis.")
+@options.value_option("W0", "Mean normal load in N, where it is not an axis.")
+@options.over_option(help="The plane: NAME=LOW:HIGH once (against W0) or twice; V=1:100 unless given.")
 @click.option(
-    "--scan-lines",
-    type=click.IntRange(2, 10_000),
-    default=10,
-    show_default=True,
-    help="Lines on which components are looked for.",
+    "--scan-lines", "lines", type=click.IntRange(2, 10_000), default=10, help="Lines on which components are looked for."
 )
-@click.option(
-    "--samples", type=click.IntRange(8, 100_000), default=64, show_default=True, help="Points looked at first, on each line."
-)
-@step_option
-@click.option("--max-steps", type=click.IntRange(1, 1_000_000), default=3000, show_default=True, help="Longest curve, each way.")
+@click.option("--samples", type=click.IntRange(8, 100_000), default=64, help="Points looked at first, on each line.")
+@options.step_option
+@click.option("--max-steps", type=click.IntRange(1, 1_000_000), default=3000, help="Longest curve, each way.")
 @click.option("--tol", type=float, help="Relative error of each point; 1e-6 unless set.")
-@mesh_option(least=64)
-@output_options
+@options.mesh_option(least=64)
+@options.output_options
 def continue_(
-    system: SystemOptions,
+    system: options.SystemOptions,
     eps: tuple[float, ...] | None,
     V: str | None,
     W0: str | None,
-    over: tuple[Range, ...],
-    scan_lines: int,
-    samples: int,
+    over: tuple[options.Range, ...],
     step: float,
     max_steps: int,
     tol: float | None,
-    max_mesh: int,
-    output: OutputOptions,
+    output: options.OutputOptions,
+    **search: Any,
 ) -> None:
     """The stability boundary of the forced sliding state in a plane of two parameters.
 
     Components are looked for on lines across the window, each is followed by pseudo-arclength continuation through its
     folds, and every point is polished until its error is met. Ctrl-C keeps what is done.
     """
-    from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
     from srfcli.numerics.continuation import ContinuationSettings, StepSettings
     from srfcli.tasks.stability import continue_boundary
 
@@ -291,18 +257,16 @@ def continue_(
     spanned = {r.name for r in over} or {"V"}
     if len(spanned) < 2:
         spanned.add("W0")
-    check_axes(spanned, {"V": V, "W0": W0})
+    options.check_axes(spanned, {"V": V, "W0": W0})
     slider = system.slider(V=V, W0=W0)
     model = slider.model
-    settings = ContinuationSettings(
-        scan_lines, samples, tol=system.tolerance(tol).value, max_mesh=max_mesh,
-        steps=StepSettings(largest=step, max_steps=max_steps),
-    )  # fmt: skip
+    steps = StepSettings(largest=step, max_steps=max_steps)
+    settings = ContinuationSettings(tol=system.tolerance(tol).value, steps=steps, **search)
     if len(over) > 2:
         raise SrfError(f"--over is given {len(over)} times", "A plane has two axes: --over V=1:100 --over W0=4:400.")
     for given in over:
         given.check_ends()
-    ranges = [r.fitted(model.parameters, where=model.title) for r in over or (parse_over("V=1:100"),)]
+    ranges = [r.fitted(model.parameters, where=model.title) for r in over or (options.parse_over("V=1:100"),)]
     with Progress("continue") as progress:
         growing = continue_boundary(
             slider, eps=eps, over={r.name: (r.lo, r.hi) for r in ranges},

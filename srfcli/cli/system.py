@@ -55,7 +55,8 @@ def show(system: SystemOptions, output: OutputOptions) -> None:
     """
     built = system.system()
     resolved = system.resolve(built.parameters)
-    rows: list[tuple[object, ...]] = [(key, s.value, None, s.origin, DEFAULTS[key].about) for key, s in system.choices().items()]
+    chosen = {**system.chosen, "tol": system.tolerance()}
+    rows: list[tuple[object, ...]] = [(key, s.value, None, s.origin, DEFAULTS[key].about) for key, s in chosen.items()]
     for p in built.parameters:
         rows.append((p.name, resolved.declared[p.name], p.unit, resolved.origins[p.name], p.about or None))
     notes = (f"settings file: {system.toml.path}",) if system.toml.path else ()
@@ -81,7 +82,7 @@ EXTRAS = {"jacobian": ("jacobian",), "parameters": ("parameters",), "all": ("jac
 
 @click.command("derive", cls=SrfCommand, epilog=DERIVE)
 @system_options
-@click.option("--format", "form", type=click.Choice(FORMATS), default="text", show_default=True, help="What to write.")
+@click.option("--format", "form", type=click.Choice(FORMATS), default="text", help="What to write.")
 @click.option("--with", "extra", type=click.Choice(tuple(EXTRAS)), multiple=True, help="Add long parts; JSON has all of them.")
 @click.option("--check-paper", is_flag=True, help="Compare the paper's printed equations and claims with its own model.")
 @out_option

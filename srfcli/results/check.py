@@ -9,9 +9,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from srfcli.core.units import from_base
+from srfcli.data.gauge import GaugeNoise, colour_text
 from srfcli.data.values import Experiment, shown_unit
-from srfcli.results.report_text import joined, unit_text
+from srfcli.results.figures import recordings
+from srfcli.results.report_text import joined
 from srfcli.results.tables import Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
@@ -19,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from srfcli.data.experiment import RunCheck
-    from srfcli.data.gauge import GaugeNoise
     from srfcli.inference.cramer_rao import CramerRaoBound, Forecast
 
 
@@ -78,10 +81,23 @@ class CheckResult(Result):
     @cached_property
     def pages(self) -> tuple[Table, ...]:
         """Return the model's line, and tables no wider than a page, rounded: samples, readings, noise, what was imposed."""
-        told = report(self.table.records(), self.runs, self.forecast, load_unit="MPa" if self.experiment.stress else "N")
-        told[-1] = dataclasses.replace(told[-1], notes=self.table.notes)
-        title = f"{self.table.title}\n{_model_line(self.experiment)}"
-        return dataclasses.replace(self.table, columns=(), rows=(), notes=(), title=title), *told
+        experiment, choice = self.experiment, self.experiment.choice
+        laws = [choice.law, choice.ageing, choice.interface, f"inertia {'on' if choice.inertia else 'off'}", *choice.effects]
+        mass = "" if experiment.mass is None else f", mass {experiment.mass * 1e6:.6g} kg"
+        stiffness, unit = experiment.shown_stiffness
+        title = f"{self.table.title}\n{', '.join(laws)}; stiffness {stiffness:.6g} {unit}{mass}"
+        rows = self.table.records()
+        for cells in rows:
+            cells["observable"] += f" [{cells['unit']}]" if cells["unit"] != "1" else ""
+        tables = []
+        for heading, columns in SHOWN.items():
+            headings = [name.replace("[N]", "[MPa]") if experiment.stress else name for name in columns]
+            tables.append(_text_table(headings, [[_shown(cells, *of) for of in columns.values()] for cells in rows], heading))
+        tables.insert(2, _noise_table(self.runs))
+        if self.forecast is not None:
+            tables.append(_told(self.forecast))
+        tables[-1] = dataclasses.replace(tables[-1], notes=self.table.notes)
+        return dataclasses.replace(self.table, columns=(), rows=(), notes=(), title=title), *tables
 
     @property
     def notice_kinds(self) -> set[str]:
@@ -91,36 +107,8 @@ class CheckResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return each run's observable, drive and load over time, flagged samples marked, proposed corrections drawn."""
-        from srfcli.results.figures import recordings
-
         own_figure(ax, "a check")
-        return recordings([_drawn(check) for check in self.runs], title=self.experiment.title)
-
-
-def _model_line(experiment: Experiment) -> str:
-    choice = experiment.choice
-    mass = "" if experiment.mass is None else f", mass {experiment.mass * 1e6:.6g} kg"
-    inertia = "on" if choice.inertia else "off"
-    laws = ", ".join([choice.law, choice.ageing, choice.interface, f"inertia {inertia}", *choice.effects])
-    stiffness, unit = experiment.shown_stiffness
-    return f"{laws}; stiffness {stiffness:.6g} {unit}{mass}"
-
-
-def _drawn(check: RunCheck) -> dict[str, Any]:
-    run, t = check.run, check.run.t
-    return {
-        "name": run.name,
-        "holdout": run.holdout,
-        "t": t,
-        "observed": run.observed,
-        "label": run.quantity + (f"\n[{unit_text(run.unit)}]" if run.unit != "1" else ""),
-        "load_unit": run.load_unit,
-        "used": run.used,
-        "proposed": run.proposed,
-        "V": run.drive(t),
-        "W": run.load(t)[0],
-        "gaps": [(t[g], t[g + 1]) for g in check.sampling.gaps.tolist()],
-    }
+        return recordings(self.runs, title=self.experiment.title)
 
 
 # The tables of `srf check`: all columns for programs, rounded ones that fit a page for readers, and everything for JSON.
@@ -165,10 +153,6 @@ CHANGE_HEADINGS = {"alpha": "0.2 makes", "lambda": "10 % makes", "n": "0.1 makes
 
 def row(check: RunCheck, told: CramerRaoBound | None) -> tuple[Any, ...]:
     """Return the cells of one run under COLUMNS."""
-    import numpy as np
-
-    from srfcli.data.gauge import colour_text
-
     run, load, rates = check.run, check.load, [1 / r.interval for r in check.sampling.rates]
     read, found = run.observed[run.used], load.modulation
     found_out = {} if told is None else {"error": told.errors, "peak": told.peaks}
@@ -207,51 +191,18 @@ def _noise_table(checks: Sequence[RunCheck]) -> Table:
 # title: heading -> the column that is shown, or the two between whose values it lies, and its significant digits
 SHOWN: dict[str, dict[str, tuple[str, int] | tuple[str, str, int]]] = {
     "Samples": {
-        "run": ("run", 0),
-        "role": ("role", 0),
-        "samples": ("samples", 0),
-        "used": ("used", 0),
-        "duration [s]": ("duration", 6),
-        "rate [Hz]": ("rate_min", "rate_max", 4),
-        "gaps": ("gaps", 0),
-        "spikes": ("spikes", 0),
-        "resets": ("resets", 0),
+        "run": ("run", 0), "role": ("role", 0), "samples": ("samples", 0), "used": ("used", 0), "duration [s]": ("duration", 6),
+        "rate [Hz]": ("rate_min", "rate_max", 4), "gaps": ("gaps", 0), "spikes": ("spikes", 0), "resets": ("resets", 0),
     },
     "Readings": {
-        "run": ("run", 0),
-        "observable": ("observable", 0),
-        "lowest": ("reading_min", 5),
-        "highest": ("reading_max", 5),
-        "noise": ("noise", 3),
-        "quantum": ("quantum", 3),
+        "run": ("run", 0), "observable": ("observable", 0), "lowest": ("reading_min", 5), "highest": ("reading_max", 5),
+        "noise": ("noise", 3), "quantum": ("quantum", 3),
     },
     "Imposed": {
-        "run": ("run", 0),
-        "V [um/s]": ("V_min", "V_max", 5),
-        "W [N]": ("W_min", "W_max", 5),
-        "mean W [N]": ("W_mean", 5),
-        "W'/W [1/s]": ("W_rate", 3),
-        "f [Hz]": ("f", 6),
-        "eps": ("eps", 4),
-        "onset [s]": ("onset", 4),
+        "run": ("run", 0), "V [um/s]": ("V_min", "V_max", 5), "W [N]": ("W_min", "W_max", 5), "mean W [N]": ("W_mean", 5),
+        "W'/W [1/s]": ("W_rate", 3), "f [Hz]": ("f", 6), "eps": ("eps", 4), "onset [s]": ("onset", 4),
     },
-}
-
-
-def report(
-    rows: Sequence[dict[str, Any]], checks: Sequence[RunCheck], forecast: Forecast | None, *, load_unit: str = "N"
-) -> list[Table]:
-    """Return tables no wider than a page, rounded: samples, readings, noise, what was imposed, what the load can tell.
-
-    `rows` have a run's cells by the names of COLUMNS.
-    """
-    rows = [r | {"observable": r["observable"] + (f" [{r['unit']}]" if r["unit"] != "1" else "")} for r in rows]
-    tables = []
-    for title, columns in SHOWN.items():
-        headings = [heading.replace("[N]", f"[{load_unit}]") for heading in columns]
-        tables.append(_text_table(headings, [[_shown(r, *of) for of in columns.values()] for r in rows], title))
-    tables.insert(2, _noise_table(checks))
-    return tables if forecast is None else [*tables, _told(forecast)]
+}  # fmt: skip
 
 
 def _text_table(headings: Sequence[str], rows: Sequence[Sequence[Any]], title: str) -> Table:
@@ -308,11 +259,9 @@ def described(check: RunCheck, told: CramerRaoBound | None) -> dict[str, Any]:
         "friction_noise": check.friction_noise,
         "drive": [{"from": a, "velocity": v, "acceleration": s} for a, v, s in check.drive],
         "load": {"mean": load.mean, "low": load.lowest, "high": load.highest, "rate": load.rate},
-        "modulation": None
-        if load.modulation is None
-        else {"frequency": load.modulation.frequency, "amplitude": load.modulation.amplitude, "onset": load.modulation.onset},
+        "modulation": load.modulation and dataclasses.asdict(load.modulation),
         "declared_modulation": run.modulation,
-        "tells": None if told is None else tells(told),
+        "tells": told and tells(told),
         "notices": list(map(dataclasses.asdict, run.notices)),
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -14,16 +15,19 @@ import numpy as np
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
+from srfcli.data.experiment import read_experiment
+from srfcli.diagnosis.answer import RunView, answer, load_views, material, parameter_rows, ranked_rows, run_views
+from srfcli.diagnosis.design import DiscriminatingRun, discriminating_files
+from srfcli.results.provenance import Provenance, write_result
+from srfcli.results.report_figures import loads_figure, run_figure, trace
 from srfcli.results.report_text import unit_text
-from srfcli.results.tables import Column, Result, Table, json_text, own_figure, plain_value
+from srfcli.results.tables import Column, Result, Table, json_text, own_figure, plain_value, to_csv
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from srfcli.data.values import Run
-    from srfcli.diagnosis.answer import RunView
-    from srfcli.diagnosis.design import DiscriminatingRun
     from srfcli.diagnosis.residual_scan import Location
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.laws.registry import Registry
@@ -121,8 +125,6 @@ class DiagnosisResult(Result):
     @cached_property
     def answer(self) -> dict[str, Any]:
         """Return the answer as plain data."""
-        from srfcli.diagnosis.answer import answer
-
         found: dict[str, Any] = plain_value(answer(self.diagnosis, self.location, discriminating=self.discriminating))
         if self.missing:
             kept = {k: v for k, v in self.missing.items() if k not in ("force", "toml", "csv")}
@@ -134,8 +136,6 @@ class DiagnosisResult(Result):
     @property
     def table(self) -> Table:
         """Return the models that were fitted, best evidence first, and what is to be known."""
-        from srfcli.diagnosis.answer import ranked_rows
-
         ranked = ranked_rows(self.diagnosis)
         zero = next(r["evidence"] for r in ranked if r["name"] == "none")
         rows = [
@@ -148,8 +148,6 @@ class DiagnosisResult(Result):
     @property
     def parameter_table(self) -> Table:
         """Return each parameter under baseline and final model."""
-        from srfcli.diagnosis.answer import parameter_rows
-
         keys = ("name", "baseline", "baseline_stderr", "augmented", "augmented_stderr", "unit", "shift_sigma")
         rows = [tuple(r[k] for k in keys) for r in parameter_rows(self.diagnosis)]
         return Table("srf.diagnose.parameters/1", PARAMETERS, rows, "parameters")
@@ -157,8 +155,6 @@ class DiagnosisResult(Result):
     @property
     def run_table(self) -> Table:
         """Return what is left of each run, its part of the misfit, and where that is."""
-        from srfcli.diagnosis.answer import run_views
-
         places, rows = {r.name: r for r in self.location.runs}, []
         for v in run_views(self.diagnosis):
             place = places.get(v.run.name)
@@ -170,10 +166,27 @@ class DiagnosisResult(Result):
     @property
     def load_table(self) -> Table:
         """Return what is left of each table of critical loads."""
-        from srfcli.diagnosis.answer import load_views
-
         rows = [(v.name, "held out" if v.holdout else "fit", v.used.size, *v.chi2) for v in load_views(self.diagnosis)]
         return Table("srf.diagnose.loads/1", LOADS, rows, "critical loads")
+
+    @cached_property
+    def _material(self) -> dict[str, Any]:
+        """Return what figures and report are made of, in the units of the recordings."""
+        made, experiment = material(self.diagnosis, self.location), self.diagnosis.experiment
+        runs = {run.name: run for run in experiment.runs}
+        for shown in made["runs"]:
+            run = runs[shown["name"]]
+            unit = f"  [{unit_text(run.unit)}]" if run.unit != "1" else ""
+            shown |= {"label": f"{run.quantity}{unit}", "load_unit": run.load_unit}
+        for row in made["parameters"]:
+            row["unit"], factor = experiment.shown(str(row["unit"]))
+            for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
+                row[key] = row[key] and row[key] * factor
+        stiffness, unit = experiment.shown_stiffness
+        made["stated"] = {"stiffness": f"{stiffness:.4g} {unit_text(unit)}"}
+        effects = [effect for ranked in self.diagnosis.ranked for effect in ranked.hypothesis.effects]
+        made["own"] = {effect.reported: [*(p.name for p in effect.parameters), *effect.frees] for effect in effects}
+        return made
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the run that the verdict rests on most: recording, both models, residuals, random friction, what was imposed.
@@ -186,10 +199,7 @@ class DiagnosisResult(Result):
             Where Matplotlib is not installed, or an axes is given: the figure has several.
         """
         own_figure(ax, "a diagnosis")
-        from srfcli.diagnosis.answer import material
-        from srfcli.results.report_figures import loads_figure, run_figure, trace
-
-        made = material(self.diagnosis, self.location)
+        made = self._material
         if not made["runs"]:
             return loads_figure(made["thresholds"][0])
         shares = {r.name: r.share for r in self.location.runs}
@@ -223,11 +233,8 @@ class DiagnosisResult(Result):
         SrfError
             Where the folder holds something else, or cannot be written.
         """
-        from srfcli.data.experiment import read_experiment
-        from srfcli.diagnosis.answer import material, run_views
         from srfcli.diagnosis.augment import augment
         from srfcli.diagnosis.diagram import stability
-        from srfcli.results.provenance import Provenance, write_result
 
         folder, diagnosis, last, found = Path(folder), self.diagnosis, self.diagnosis.final, self.answer
         with whole_folder(folder, lambda: check_answer(folder, force=force)) as fresh:  # an hour may have passed
@@ -249,12 +256,16 @@ class DiagnosisResult(Result):
                 write_atomic(fresh / "augmented" / name, content)
             for name, source in augmented.copies.items():
                 shutil.copyfile(source, fresh / "augmented" / name)
-            made_of = material(diagnosis, self.location)
-            made_of["diagram"] = stability(
+            made_of = dict(self._material)
+            diagram = stability(
                 self.registry, diagnosis.experiment, diagnosis.shown.fit.values,
                 read_experiment(fresh / "augmented", registry=self.registry, format=self.reader),
             )  # fmt: skip
-            _in_shown_units(made_of, diagnosis)
+            if diagram:
+                marks = {(float(f"{V:.3g}"), float(f"{np.mean(r.load(r.t)[0]):.3g}"))
+                         for r in diagnosis.experiment.runs for V, share in _velocities(r) if share > 0.1}  # fmt: skip
+                load_unit = "MPa" if diagnosis.experiment.stress else "N"
+                made_of["diagram"] = {**diagram, "marks": sorted(marks), "load_unit": load_unit}
             if self.missing:
                 made_of["force"] = self.missing["force"]
                 names = prediction_names(list(self.missing["csv"]), "missing")
@@ -264,7 +275,16 @@ class DiagnosisResult(Result):
                     write_atomic(fresh / FORM, self.missing["toml"])
             if self.discriminating is not None:
                 made_of["discriminating"] = _proposed(fresh, folder, found, self)
-            _report(fresh, found, made_of, told, debug)
+            try:
+                from srfcli.results.report import write_report
+
+                write_report(fresh, found, made_of)
+            except ModuleNotFoundError as error:
+                told(f"Note: no report and no figures, as {error.name} is not installed")
+            except Exception as error:  # minutes of computing are not to be lost for a figure
+                if debug:
+                    raise
+                told(f"Warning: no report: {type(error).__name__}: {error}")
 
 
 def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:
@@ -323,42 +343,13 @@ def check_answer(folder: Path, *, force: bool) -> None:
     """Raise SrfError where a diagnosis could not be written to `folder`."""
     if not check_folder_place(folder, what="--out") or not any(folder.iterdir()):
         return
-    if not _is_diagnosis(folder):
+    data: Any = None
+    with contextlib.suppress(OSError, SrfError):
+        data = parse_json(read_plain(folder / ANSWER, limit=LARGEST_ANSWER), folder)
+    if not (isinstance(data, dict) and str(data.get("schema", "")).startswith(SCHEMA)):
         raise SrfError(f"--out {folder} holds something else than a diagnosis", "It is never replaced; name another.")
     if not force:
         raise SrfError(f"--out {folder} holds a diagnosis already", "Replace it with --force, or name another folder.")
-
-
-def _is_diagnosis(folder: Path) -> bool:
-    try:
-        data = parse_json(read_plain(folder / ANSWER, limit=LARGEST_ANSWER), folder)
-    except (OSError, SrfError):
-        return False
-    return isinstance(data, dict) and str(data.get("schema", "")).startswith(SCHEMA)
-
-
-def _in_shown_units(made_of: dict[str, Any], diagnosis: Diagnosis) -> None:
-    """Convert the report's material to the units of the recordings; add stated stiffness, velocities and loads."""
-    experiment = diagnosis.experiment
-    runs = {run.name: run for run in experiment.runs}
-    for shown in made_of["runs"]:
-        run = runs[shown["name"]]
-        unit = f"  [{unit_text(run.unit)}]" if run.unit != "1" else ""
-        shown |= {"label": f"{run.quantity}{unit}", "load_unit": run.load_unit}
-    for row in made_of["parameters"]:
-        row["unit"], factor = experiment.shown(str(row["unit"]))
-        for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
-            row[key] = row[key] and row[key] * factor
-    stiffness, unit = experiment.shown_stiffness
-    made_of["stated"] = {"stiffness": f"{stiffness:.4g} {unit_text(unit)}"}
-    made_of["own"] = {
-        effect.reported: [*(p.name for p in effect.parameters), *effect.frees]
-        for ranked in diagnosis.ranked for effect in ranked.hypothesis.effects
-    }  # fmt: skip
-    if made_of.get("diagram"):
-        marks = {(float(f"{V:.3g}"), float(f"{np.mean(r.load(r.t)[0]):.3g}"))
-                 for r in experiment.runs for V, share in _velocities(r) if share > 0.1}  # fmt: skip
-        made_of["diagram"] |= {"marks": sorted(marks), "load_unit": "MPa" if experiment.stress else "N"}
 
 
 def _velocities(run: Run) -> list[tuple[float, float]]:
@@ -369,8 +360,6 @@ def _velocities(run: Run) -> list[tuple[float, float]]:
 
 def _proposed(fresh: Path, folder: Path, found: Mapping[str, Any], result: DiagnosisResult) -> list[str]:
     """Write each hypothesis' prediction of the discriminating run, and return the report's sentences on it."""
-    from srfcli.diagnosis.design import discriminating_files
-
     told = found["experiment"]
     assert result.discriminating is not None
     if not told["discriminates"]:
@@ -380,19 +369,6 @@ def _proposed(fresh: Path, folder: Path, found: Mapping[str, Any], result: Diagn
         (fresh / place).parent.mkdir(parents=True, exist_ok=True)
         write_atomic(fresh / place, text)
     return [*told["sentences"], told["run"]]
-
-
-def _report(folder: Path, found: dict[str, Any], made: dict[str, Any], told: Callable[[str], None], debug: bool) -> None:
-    try:
-        from srfcli.results.report import write_report
-
-        write_report(folder, found, made)
-    except ModuleNotFoundError as error:
-        told(f"Note: no report and no figures, as {error.name} is not installed")
-    except Exception as error:  # minutes of computing are not to be lost for a figure
-        if debug:
-            raise
-        told(f"Warning: no report: {type(error).__name__}: {error}")
 
 
 def prediction_names(runs: list[str], word: str = "prediction") -> list[str]:
@@ -413,7 +389,5 @@ def prediction_csv(view: RunView) -> str:
         unit = run.unit_of(signal.observable)
         heads += [f"{signal.observable} {side} [{unit}]" for side in ("observed", "baseline", "augmented")]
         columns += [np.where(signal.used, signal.observed, np.nan), *sides]
-    lines = [",".join(heads)]
-    for row in zip(*(c.tolist() for c in columns), strict=True):
-        lines.append(",".join(repr(x) if np.isfinite(x) else "" for x in row))
-    return "\n".join(lines) + "\n"
+    rows = list(zip(*(c.tolist() for c in columns), strict=True))
+    return to_csv(Table("srf.prediction/1", tuple(map(Column, heads)), rows))

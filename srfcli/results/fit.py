@@ -9,9 +9,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.units import from_base
 from srfcli.data.gauge import colour_text
+from srfcli.inference.critical_loads import IMPROBABLE, chance_of
+from srfcli.inference.noise import lag_one
+from srfcli.inference.state_space import typical_friction
+from srfcli.inference.thresholds import Match, ThresholdFit, match_notes
+from srfcli.results import plots
+from srfcli.results.figures import draw_loads, stacked
+from srfcli.results.report_text import bracketed, unit_text, with_unit
 from srfcli.results.tables import STATUS, Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
@@ -23,8 +32,6 @@ if TYPE_CHECKING:
     from srfcli.inference.fit import Fit, RunFit
     from srfcli.inference.posterior import Interval, Posterior
     from srfcli.inference.recordings import RecordingFit
-    from srfcli.inference.thresholds import Match, MethodFit, ThresholdFit
-
 PARAMETERS = (
     Column("parameter", "", "name"),
     Column("value", "", "estimate, in the unit beside it"),
@@ -85,6 +92,7 @@ VARIED = (
     Column("unit", "", "of the three columns before"),
     Column("p_equal", "1", "that all share one value", ".3g"),
 )
+POSTERIOR_PARTS = ("names", "draws", "burn_in", "accepted", "effective", "r_hat")  # that JSON has
 ENOUGH, MIXED = 400.0, 1.01  # independent draws and R-hat that intervals should rest on (Vehtari and others 2021)
 ADVICE = {
     Status.NO_CONVERGENCE: "the likelihood's maximum was not reached. Try --starts 5, other start values or bounds, or hold a "
@@ -149,8 +157,6 @@ class FitResult(Result):
     @cached_property
     def runs(self) -> Table | None:
         """Return a row for each run, fitted or held out: residual, noise, and what is left of them; None without runs."""
-        from srfcli.inference.noise import lag_one
-
         rows, runs = [], {run.name: run for run in self.experiment.runs}
         for f in self._observables:
             observable = f.observable or runs[f.name].observable
@@ -196,8 +202,6 @@ class FitResult(Result):
     @cached_property
     def draws(self) -> Table | None:
         """Return mean, spread and quantiles of the posterior draws, and what they are worth; None where none were asked for."""
-        import numpy as np
-
         if self.posterior is None:
             return None
         rows = []
@@ -233,7 +237,7 @@ class FitResult(Result):
                 for f in fit.runs
             },
             "starts": [{"log_likelihood": ll, "same_minimum": same} for ll, same in found.starts],
-            "posterior": None if self.posterior is None else _described(self.posterior),
+            "posterior": self.posterior and {name: getattr(self.posterior, name) for name in POSTERIOR_PARTS},
         }
         if self.tables is not None and self.loads is not None:
             meta |= {"tables": self.tables.records(), "loads": self.loads.records()}
@@ -244,8 +248,22 @@ class FitResult(Result):
 
     def _notes(self) -> list[str]:
         """Return what is to be known beside the numbers, in sentences."""
-        found = self.found
-        notes = _notes(found.fit, self.intervals, found.starts)
+        found, fit = self.found, self.found.fit
+        of = "runs" if fit.runs else "critical loads"
+        notes = [f"rms over noise {fit.rms_over_noise():.3f} in the {of} fitted"]
+        if any(f.holdout for f in fit.runs) or any(t.loads.holdout for t in fit.tables):
+            notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
+        done = [i.name for i in self.intervals]
+        whose = "profile likelihood" + (f" of {', '.join(done)}, else 1.96 standard errors" if len(done) < len(fit.names) else "")
+        notes.append("intervals: " + (whose if self.intervals else "1.96 standard errors; --profile refits") + ", 95 %")
+        if len(found.starts) > 1:
+            notes.append(f"{sum(same for _, same in found.starts)} of {len(found.starts)} starts ended in this minimum")
+        for colour in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):
+            comma = "," if len(colour) == 3 else ""
+            notes.append(f"gauge noise: {colour_text(colour)}{comma} besides white noise, or physics that is missing")
+        coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
+        if coloured:
+            notes.append(f"residuals are coloured in {', '.join(coloured)}: noise of that colour, or physics that is missing")
         notes += filter(None, [self.experiment.rescaled()])
         notes += [str(n) for n in self.experiment.notices if n.kind == "start-value"]
         notes += [f"{r.name}: {n}" for r in self.experiment.runs for n in r.notices if n.kind == "reset"]
@@ -253,7 +271,6 @@ class FitResult(Result):
         notes += load_notes(found.fit) if found.fit.tables else []
         if found.friction_field is not None:
             from srfcli.diagnosis.goodness_of_fit import PLAUSIBLE
-            from srfcli.inference.state_space import typical_friction
 
             notes.append(str(found.friction_field))
             share = found.friction_field.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
@@ -274,30 +291,53 @@ class FitResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return each run's recording and prediction above its residual, and each table's measured and computed loads."""
-        import numpy as np
-
-        from srfcli.results.figures import fit_figure
-        from srfcli.results.plots import symbol_text
-        from srfcli.results.report_text import bracketed, unit_text, with_unit
-
         own_figure(ax, "a fit")
-        fit, experiment = self.found.fit, self.experiment
-        runs = {r.name: r for r in experiment.runs}
-        tables = [
-            (t.loads.name, t.loads.holdout, t.loads.table, np.where(t.match.missing, np.nan, t.match.loads)) for t in fit.tables
-        ]
-        rows, told = [], []
-        for f in self._observables:
-            run, what = runs[f.name], f.observable or runs[f.name].observable
-            unit, signal = run.unit_of(what), next(s for s in run.signals if s.observable == what)
-            label = run.quantity_of(what) + ("" if unit == "1" else f"\n[{unit_text(unit)}]")
-            rows.append((f.name, f.holdout, label, run.t, signal.observed, f.prediction.y, f.white))
+        fit, runs = self.found.fit, {run.name: run for run in self.experiment.runs}
+        count = len(self._observables) + len(fit.tables)
+        columns = min(count, 2)
+        lines = math.ceil(count / columns)
+        with plots.house_style():
+            figure = plots.bare_figure((6.0 if columns == 1 else 5.2 * columns, 2.9 * lines + 0.9))
+            grid = figure.add_gridspec(lines, columns)
+            cells = [grid[place // columns, place % columns] for place in range(count)]
+            handles: list[Any] = []
+            for cell, one in zip(cells, self._observables, strict=False):
+                run, what, noise = runs[one.name], one.observable or runs[one.name].observable, one.white
+                unit, recorded = run.unit_of(what), next(s for s in run.signals if s.observable == what).observed
+                above, below = stacked(figure, cell, (2, 1), hspace=0.05)
+                dots = above.plot(run.t, recorded, ".", color="#999999", markersize=3.0, label="recorded", rasterized=True)
+                line = above.plot(run.t, one.prediction.y, color=plots.COLOURS[0], linewidth=0.9, label="model")
+                handles = handles or [*dots, *line]
+                above.set_title(plots.name_text(one.name) + (" (held out)" if one.holdout else ""))
+                above.set_ylabel(run.quantity_of(what) + ("" if unit == "1" else f"\n[{unit_text(unit)}]"))
+                above.ticklabel_format(axis="y", useOffset=False)
+                above.tick_params(labelbottom=False)
+                off = (recorded - one.prediction.y) / (noise or 1.0)
+                below.plot(run.t, off, ".", color=plots.COLOURS[1], markersize=2.0, rasterized=True)
+                for level in (-2.0, 2.0) if noise else ():
+                    below.axhline(level, color="#000000", linewidth=0.7, linestyle=(0, (1, 1.5)))
+                below.set_ylabel("residual\n/ noise" if noise else "residual")
+                below.set_xlabel("time  [s]")
+                above.margins(x=0.01)
+                figure.align_ylabels([above, below])
+            for cell, table in zip(cells[len(self._observables) :], fit.tables, strict=True):
+                panel = figure.add_subplot(cell)
+                draw_loads(panel, table.loads.table, {"fit": np.where(table.match.missing, np.nan, table.match.loads)})
+                panel.set_title(plots.name_text(table.loads.name) + (" (held out)" if table.loads.holdout else ""))
+            plots.names_below(figure, handles, [h.get_label() for h in handles], markerscale=3)
+            plots.heading(figure, self._figure_title)
+            return figure
+
+    @property
+    def _figure_title(self) -> str:
+        """Return the laws, and the parameters with their errors."""
+        fit, choice = self.found.fit, self.experiment.choice
+        laws = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
+        told = []
         for name in fit.names:
             unit, (value, error) = self._shown(name, fit.values[name], fit.stderr[name])
-            told.append(f"{symbol_text(name)} = {with_unit(bracketed(value, error), unit)}")
-        choice = experiment.choice
-        title = ", ".join([choice.law, choice.ageing, choice.interface, *choice.effects])
-        return fit_figure(rows, title=title, found=", ".join(told), tables=tables)
+            told.append(f"{plots.symbol_text(name)} = {with_unit(bracketed(value, error), unit)}")
+        return "\n".join([laws, ", ".join(told)] if told else [laws])
 
 
 def load_rows(table: Thresholds, match: Match) -> list[tuple[Any, ...]]:
@@ -309,9 +349,6 @@ def load_rows(table: Thresholds, match: Match) -> list[tuple[Any, ...]]:
 
 def load_notes(fit: Fit) -> list[str]:
     """Return what a reader of a fit has to know of its critical loads: whether they are described, and how they were matched."""
-    from srfcli.inference.critical_loads import IMPROBABLE, chance_of
-    from srfcli.inference.thresholds import match_notes
-
     notes, fitted = [], [t for t in fit.tables if not t.loads.holdout]
     alone = not any(not r.holdout for r in fit.runs)
     size, cost = sum(t.white.size for t in fitted), sum(t.match.cost for t in fitted)
@@ -325,13 +362,6 @@ def load_notes(fit: Fit) -> list[str]:
     for t in fit.tables:
         notes += [f"{t.loads.name}: {text}" for text in (*t.loads.table.notes, *match_notes(t.loads.table, t.match))]
     return notes
-
-
-def _described(posterior: Posterior) -> dict[str, Any]:
-    return {
-        "names": posterior.names, "draws": posterior.draws, "burn_in": posterior.burn_in, "accepted": posterior.accepted,
-        "effective": posterior.effective, "r_hat": posterior.r_hat,
-    }  # fmt: skip
 
 
 def _posterior_notes(posterior: Posterior) -> list[str]:
@@ -356,8 +386,6 @@ def _posterior_notes(posterior: Posterior) -> list[str]:
 
 def flag(fit: Fit, k: int) -> str:
     """Return what stands against an estimate: at a bound, sought no further, not determined, or tied to another parameter."""
-    import numpy as np
-
     name = fit.names[k]
     width = fit.upper[k] - fit.lower[k]
     if min(fit.values[name] - fit.lower[k], fit.upper[k] - fit.values[name]) < CLOSE * width:
@@ -370,25 +398,6 @@ def flag(fit: Fit, k: int) -> str:
     tied[k] = 0
     other = int(np.argmax(tied)) if tied.size > 1 else k
     return f"tied to {fit.names[other]}: correlation {fit.correlation[k][other]:.3f}" if tied[other] > ALIKE else ""
-
-
-def _notes(fit: Fit, intervals: Sequence[Interval], starts: Sequence[tuple[float, bool]]) -> list[str]:
-    of = "runs" if fit.runs else "critical loads"
-    notes = [f"rms over noise {fit.rms_over_noise():.3f} in the {of} fitted"]
-    if any(f.holdout for f in fit.runs) or any(t.loads.holdout for t in fit.tables):
-        notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
-    done = [i.name for i in intervals]
-    whose = "profile likelihood" + (f" of {', '.join(done)}, else 1.96 standard errors" if len(done) < len(fit.names) else "")
-    notes.append("intervals: " + (whose if intervals else "1.96 standard errors; --profile refits") + ", 95 %")
-    if len(starts) > 1:
-        notes.append(f"{sum(same for _, same in starts)} of {len(starts)} starts ended in this minimum")
-    for colour in dict.fromkeys(c for f in fit.runs if not f.holdout for c in f.colours):
-        comma = "," if len(colour) == 3 else ""
-        notes.append(f"gauge noise: {colour_text(colour)}{comma} besides white noise, or physics that is missing")
-    coloured = [f.name for f in fit.runs if f.noise.order and not f.holdout]
-    if coloured:
-        notes.append(f"residuals are coloured in {', '.join(coloured)}: noise of that colour, or physics that is missing")
-    return notes
 
 
 # A fit of critical loads alone, as in the paper: each method beside the others, with its cost against evaluations.
@@ -456,26 +465,21 @@ class ThresholdFitResult(Result):
             "methods": self.methods.records(),
             "trace": self.trace.records(),
             "loads": self.loads.records(),
-            "information": {m.method: self._information(m) for m in fit.methods},
-        }
+            "information": {  # in the coordinates ln(value), or value/size
+                m.method: {
+                    "parameters": fit.scale.names, "coordinates": ["ln" if q.log else "linear" for q in fit.scale],
+                    "correlation": m.uncertainty.correlation, "eigenvalues": m.uncertainty.eigenvalues,
+                    "eigenvectors": m.uncertainty.combinations.T,
+                }
+                for m in fit.methods
+            },
+        }  # fmt: skip
         notes = (*fit.table.notes, *self._remarks())
         title = f"{fit.table.source}, {len(fit.table)} critical loads; {self.laws}"
         return Table("srf.fit-thresholds/2", ESTIMATES, rows, title, notes, self.held, meta, fit.status.value)
 
-    def _information(self, m: MethodFit) -> dict[str, Any]:
-        """Return correlations and the information matrix's eigenvalues in the coordinates ln(value), or value/size."""
-        return {
-            "parameters": self.found.scale.names,
-            "coordinates": ["ln" if q.log else "linear" for q in self.found.scale],
-            "correlation": m.uncertainty.correlation,
-            "eigenvalues": m.uncertainty.eigenvalues,
-            "eigenvectors": m.uncertainty.combinations.T,
-        }
-
     def _remarks(self) -> list[str]:
         """Return notes: the least determined combination, whether the model describes the data, how data were matched."""
-        from srfcli.inference.critical_loads import IMPROBABLE, chance_of
-
         notes = []
         for m in self.found.methods:
             if m.uncertainty.weakest:
@@ -512,11 +516,6 @@ class ThresholdFitResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the measured critical loads beside those of the best fit over V, and the lowest chi2 against evaluations."""
-        import numpy as np
-
-        from srfcli.results import plots
-        from srfcli.results.figures import draw_loads
-
         own_figure(ax, "a fit of critical loads")
         table, best = self.found.table, min(self.found.methods, key=lambda m: m.cost)
         loads = np.where(best.match.missing, np.nan, best.match.loads)
@@ -623,8 +622,6 @@ class CampaignResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return A - B with its error over the velocity of each experiment, those that have no fit left out."""
-        from srfcli.results import plots
-
         own_figure(ax, "a campaign")
         known = [row for row in self.rows if row.get("A_minus_B") is not None]
         if not known:

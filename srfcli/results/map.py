@@ -8,10 +8,18 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
 
 from srfcli.core.errors import Status
 from srfcli.core.units import describe, find_unit
+from srfcli.numerics.compare import EXPERIMENT, LawStudy, Match, Observables, Window, changed_areas, contrast
+from srfcli.numerics.continuation import Boundary, crossing_numbers
+from srfcli.numerics.map import STABILITY_KINDS, StabilityMap, per_slip
+from srfcli.numerics.map_boundaries import map_notes, unexplained
+from srfcli.numerics.special_points import SpecialPoint, crossings_at
+from srfcli.results import plots
 from srfcli.results.stability import boundary_columns, boundary_row
 from srfcli.results.tables import STATUS, Column, Result, Table, load_xarray
 
@@ -21,12 +29,7 @@ if TYPE_CHECKING:
 
     from srfcli.codegen.model import Array, GeneratedModel
     from srfcli.codegen.slider import SlidingSystem
-    from srfcli.numerics.compare import LawStudy, Match, Observables, Window
-    from srfcli.numerics.continuation import Boundary, Branch
-    from srfcli.numerics.map import StabilityMap
     from srfcli.numerics.plane import MapAxis
-    from srfcli.numerics.special_points import SpecialPoint
-
 
 PLACE = ("eps", "V", "K_over_W0", "W0")  # where a point lies; parameters along other axes stand after these
 GROWTH = {
@@ -65,10 +68,6 @@ class MapResult(Result):
     @cached_property
     def _summary(self) -> tuple[tuple[str, ...], dict[str, Any], Status]:
         """Return the notes, what JSON holds beside the rows, and the status of the whole."""
-        from srfcli.numerics.map import STABILITY_KINDS
-        from srfcli.numerics.map_boundaries import map_notes, unexplained
-        from srfcli.numerics.special_points import crossings_at
-
         model, found, boundary = self.system.model, self.found, self.curves
         count = found.kind.size
         share = {name: float((found.kind == k).sum() / count) for k, name in enumerate(STABILITY_KINDS)}
@@ -123,10 +122,6 @@ class MapResult(Result):
     @cached_property
     def table(self) -> Table:
         """Return a row for each point of the grid; `meta` has components and special points."""
-        import numpy as np
-
-        from srfcli.numerics.map import STABILITY_KINDS, per_slip
-
         model, found, grid = self.system.model, self.found, self.found.grid
         p, declared, shape = found.points(model), {q.name: q for q in model.parameters}, found.kind.shape
         place = {n: np.broadcast_to(p[model.index(n)], shape) for n in ("eps", "V", "W0")}
@@ -162,8 +157,6 @@ class MapResult(Result):
     @cached_property
     def components(self) -> Table:
         """Return a row for each connected boundary."""
-        import numpy as np
-
         model, grid, rows = self.system.model, self.found.grid, []
         for k, (branch, marks) in enumerate(zip(self.curves.branches, self.special, strict=True), 1):
             p = np.stack([pt.p for pt in branch.points], axis=1)
@@ -191,18 +184,11 @@ class MapResult(Result):
     def special_points(self) -> Table:
         """Return a row for each fold, resonance and other special point."""
         axes = {a.moved: column_name(a) for a in (self.found.grid.y, self.found.grid.x)}
-        rows = [
-            (
-                k,
-                f"fold in {axes[s.axis]}" if s.what == "fold" else s.what,
-                *self._coordinates(s.p),
-                s.theta,
-                s.error,
-                s.status.value,
-            )
-            for k, marks in enumerate(self.special, 1)
-            for s in marks
-        ]
+        rows = []
+        for k, marks in enumerate(self.special, 1):
+            for s in marks:
+                what = f"fold in {axes[s.axis]}" if s.what == "fold" else s.what
+                rows.append((k, what, *self._coordinates(s.p), s.theta, s.error, s.status.value))
         columns = (
             Column("component", "1", "number of the connected curve"),
             Column("point", "", "fold: a parameter turns round; 1:k: resonance"),
@@ -216,8 +202,6 @@ class MapResult(Result):
     @cached_property
     def boundary(self) -> Table:
         """Return a row for each polished point of the boundaries, with the cubic coefficient of the normal form."""
-        from srfcli.numerics.continuation import crossing_numbers
-
         model, boundary = self.system.model, self.curves
         extra = tuple(a.name for a in (boundary.plane.x, boundary.plane.y) if a.name not in ("V", "W0", "eps"))
         branches = zip(boundary.branches, crossing_numbers(model, boundary), self.cubic, strict=True)
@@ -238,8 +222,6 @@ class MapResult(Result):
         SrfError
             Where xarray is not installed.
         """
-        import numpy as np
-
         xarray, grid, table = load_xarray(), self.found.grid, self.table
         cells = zip(*table.rows, strict=True)
         fields = {c.name: np.array(v).reshape(grid.x.count, grid.y.count) for c, v in zip(table.columns, cells, strict=True)}
@@ -252,51 +234,39 @@ class MapResult(Result):
         return made
 
     def plot(self, ax: Axes | None = None) -> Figure:
-        """Return the map: growth as colour, boundaries as lines, special points as marks."""
-        import numpy as np
+        """Return the map: growth as colour, boundaries as lines, special points as marks.
 
-        from srfcli.numerics.map import per_slip
-        from srfcli.results.figures import stability_map
-        from srfcli.results.plots import titled
-
-        model, found, grid = self.system.model, self.found, self.found.grid
-        p = found.points(model)
-        xs = [shown(model, grid.x, v) for v in grid.x.samples()]
-        ys = [shown(model, grid.y, v) for v in grid.y.samples()]
-        growth = np.where(np.isfinite(found.leading), found.growth * per_slip(model, p), np.nan)
-        lost = np.argwhere(~np.isfinite(found.leading))
-        marks = [
-            {"what": s.what, **dict(zip("xy", self._coordinates(s.p), strict=True))}
-            for points in self.special
-            for s in points
-            if s.status.ok
-        ]
-        return stability_map(
-            xs,
-            ys,
-            growth,
-            branches=[self._curve(b, d) for b, d in zip(self.curves.branches, self.cubic, strict=True)],
-            special=marks,
-            unresolved=([xs[i] for i, _ in lost], [ys[j] for _, j in lost]),
-            xlabel=label(model, grid.x),
-            ylabel=label(model, grid.y),
-            colour_label="leading exponent × D$_0$/V" if "D0" in model.names else "leading exponent  [1/s]",
-            logx=grid.x.log,
-            logy=grid.y.log,
-            title=titled(self.table.title, self.table.parameters),
-            ax=ax,
-        )
-
-    def _curve(self, branch: Branch, cubic: Array) -> tuple[list[float], list[float], list[str]]:
-        """Return a branch's coordinates and what it is at each; a closed one ends where it begins."""
-        points = [self._coordinates(pt.p) for pt in branch.points]
-        looks = [
-            "fold" if pt.kind == "fold" else "subcritical" if d > 0 else "" for pt, d in zip(branch.points, cubic, strict=True)
-        ]
-        if branch.end is Status.CLOSED:
-            points.append(points[0])
-            looks.append(looks[0])
-        return [q[0] for q in points], [q[1] for q in points], looks
+        The stable side is hatched as well as shaded, so that it is told apart in print without colour.
+        """
+        model, grid, p = self.system.model, self.found.grid, self.found.points(self.system.model)
+        known = np.isfinite(self.found.leading)
+        growth = np.ma.masked_invalid(np.where(known, self.found.growth * per_slip(model, p), np.nan))
+        x, y = (np.array([shown(model, axis, v) for v in axis.samples()]) for axis in (grid.x, grid.y))
+        with plots.house_style():
+            own = ax is None
+            figure, (ax,) = plots.new_figure(size=(6.8, 4.8)) if ax is None else (cast("Figure", ax.figure), [ax])
+            ax.grid(False)
+            ax.set_xscale("log" if grid.x.log else "linear")
+            ax.set_yscale("log" if grid.y.log else "linear")
+            mesh = _draw_shades(ax, x, y, growth)
+            ax.set_facecolor("#BBBBBB")
+            bar = figure.colorbar(mesh, ax=ax, extend="both", pad=0.02)
+            bar.set_label("leading exponent × D$_0$/V" if "D0" in model.names else "leading exponent  [1/s]")
+            _hatch_stable(ax, x, y, growth)
+            _draw_boundaries(ax, self)
+            _draw_marks(ax, self)
+            if not known.all():
+                i, j = np.nonzero(~known)
+                ax.plot(x[i], y[j], "x", color="#D00000", markersize=3, label="unresolved")
+            xlabel, ylabel = (plots.axis_label(axis.name, axis_unit(model, axis)) for axis in (grid.x, grid.y))
+            ax.set(xlabel=xlabel, ylabel=ylabel, xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+            if own:
+                _legend(figure, ax)
+                plots.heading(figure, self._figure_title)
+            else:
+                ax.set_title(self.table.title)
+            plots.decade_ticks(ax)
+            return figure
 
 
 def ratio_powers(model: GeneratedModel, held: str, moved: str) -> tuple[int, ...]:
@@ -320,11 +290,88 @@ def column_name(axis: MapAxis) -> str:
     return f"{axis.held}_over_{axis.moved}" if axis.held else axis.moved
 
 
-def label(model: GeneratedModel, axis: MapAxis) -> str:
-    """Return an axis' label with its unit."""
-    from srfcli.results.plots import axis_label
+# Figures of stability maps: growth as colour, boundaries as lines, special points as marks.
 
-    return axis_label(axis.name, axis_unit(model, axis))
+SHADES = "PuOr_r"  # purple and orange: told apart in all common forms of colour blindness, and in grey by the curves
+MARKS = {
+    "fold": ("^", "fold"),
+    "cusp": ("*", "cusp"),
+    "1:1": ("o", "1:1"),
+    "1:2": ("D", "1:2"),
+    "1:3": ("v", "1:3"),
+    "1:4": ("s", "1:4"),
+}
+HATCH = "#5A4A7A"
+LOOKS: dict[str, dict[str, Any]] = {
+    "": {"label": "boundary", "color": "black", "linewidth": 1.6},
+    "subcritical": {"label": "subcritical", "color": "white", "linewidth": 0.9, "linestyle": (0, (2, 1.5))},
+    "fold": {"label": "state ends (fold)", "color": "black", "linewidth": 1.6, "linestyle": (0, (4, 1.5))},
+}
+CRITICALITY_MARK = ("P", "criticality changes")
+
+
+def _draw_shades(ax: Axes, x: Array, y: Array, growth: Any) -> Any:
+    """Draw growth as colour, white at 0, its scale logarithmic but for a thirtieth of it."""
+    from matplotlib.colors import SymLogNorm
+
+    size = float(np.percentile(np.abs(growth.compressed()), 98)) if growth.count() else 1.0
+    norm = SymLogNorm(linthresh=max(size / 30, 1e-12), vmin=-size, vmax=size, base=10)
+    return ax.pcolormesh(x, y, growth.T, norm=norm, cmap=SHADES, shading="nearest", rasterized=True)
+
+
+def _legend(figure: Figure, ax: Axes) -> None:
+    """Set the legend below the figure, where it covers nothing."""
+    from matplotlib.legend_handler import HandlerTuple
+    from matplotlib.patches import Patch
+
+    stable = Patch(facecolor="#B2ABD2", edgecolor=HATCH, hatch="....", linewidth=0.0, label="stable")
+    drawn, names = ax.get_legend_handles_labels()
+    handles: list[Any] = [stable, *drawn]
+    if "subcritical" in names:  # white on black in the figure, and so in the legend
+        handles[1 + names.index("subcritical")] = (drawn[names.index("boundary")], drawn[names.index("subcritical")])
+    plots.names_below(figure, handles, ["stable", *names], handlelength=2.0, handler_map={tuple: HandlerTuple(ndivide=1)})
+
+
+def _hatch_stable(ax: Axes, x: Array, y: Array, growth: Any) -> None:
+    """Hatch where growth is negative, lightly enough to leave the shade visible."""
+    if growth.count() and (growth < 0).any():
+        drawn = ax.contourf(x, y, growth.T, levels=[2 * float(growth.min()), 0.0], colors="none", hatches=["...."])
+        drawn.set_edgecolor(HATCH)
+        drawn.set_linewidth(0.0)
+
+
+def _draw_boundaries(ax: Axes, found: MapResult) -> None:
+    """Draw the curves, solid, white on black where the bifurcation is subcritical, dashed where states end in a fold."""
+    named: set[str] = set()
+    for branch, cubic in zip(found.curves.branches, found.cubic, strict=True):
+        places = np.array([found._coordinates(q.p) for q in branch.points])
+        fold = np.array([q.kind == "fold" for q in branch.points])
+        masks = {"": ~fold, "subcritical": ~fold & (cubic > 0), "fold": fold}
+        for look, style in LOOKS.items():
+            mine = masks[look]
+            if not mine.any():
+                continue
+            x, y = places[:, 0], np.where(mine, places[:, 1], np.nan)
+            if branch.end is Status.CLOSED:  # a closed curve ends where it begins
+                x, y = (np.append(values, values[0]) for values in (x, y))
+            ax.plot(x, y, **{**style, "label": None if look in named else style["label"]})
+            named.add(look)
+
+
+def _draw_marks(ax: Axes, found: MapResult) -> None:
+    """Mark the special points, one kind of mark for each, each named once."""
+    from matplotlib.patheffects import withStroke
+
+    places: dict[str, list[list[float]]] = {}
+    for point in (s for points in found.special for s in points if s.status.ok):
+        places.setdefault(str(point.what), []).append(found._coordinates(point.p))
+    for what, mine in places.items():
+        marker, label = MARKS.get(what, CRITICALITY_MARK)
+        ax.plot(
+            *zip(*mine, strict=True), linestyle="none", marker=marker, markersize=6.5 if marker == "P" else 5.5, label=label,
+            markerfacecolor="none",  # one mark does not hide another
+            markeredgecolor="black", path_effects=[withStroke(linewidth=2.4, foreground="white")],
+        )  # fmt: skip
 
 
 # Laws side by side: a row for each law and amplitude, a sentence for each pair, their boundaries over each other.
@@ -407,8 +454,6 @@ class ComparisonResult(Result):
 
     def _rows(self) -> tuple[list[tuple[Any, ...]], Status]:
         """Return a row under COMPARISON_COLUMNS for each law and wanted amplitude, and the first status that is not ok."""
-        from srfcli.numerics.compare import changed_areas
-
         rows: list[tuple[Any, ...]] = []
         statuses = []
         for k, (name, m) in enumerate(zip(self.names, self.matches, strict=True)):
@@ -436,8 +481,6 @@ class ComparisonResult(Result):
 
     def _contrasts(self) -> tuple[list[dict[str, Any]], list[str]]:
         """Return for each pair of laws where their critical loads differ most, as data and as a sentence."""
-        from srfcli.numerics.compare import EXPERIMENT, contrast
-
         pairs, said = [], []
         for a, b in itertools.combinations(sorted(self.studies), 2):
             laws = [self.names[a], self.names[b]]
@@ -464,8 +507,6 @@ class ComparisonResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the boundaries at the largest amplitude over each other, each law named with its matched parameters."""
-        from srfcli.results import plots
-
         models, studies = self._models, self.studies
         first, K = studies[min(studies)].crossings[0][:, 0], float(self.matches[0].p[models[0].index("K")])
         labels = []

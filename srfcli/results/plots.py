@@ -254,10 +254,13 @@ def stability_diagram(
         ax.set_xscale("log")
         if hopf is not None:
             ax.plot(hopf["V"], _gaps(hopf["K_over_W0"]), color="#555555", linestyle=DOTTED, label="ε = 0 (Hopf)")
-        _draw_branches(ax, branches)
+        draw_branches(ax, branches)
         amplitudes = {b["eps"] for b in branches}
         ax.set(xlabel="V  [µm/s]", ylabel="K/W$_0$  [1/µm]")
-        _frame_curves(ax)
+        ax.margins(x=0.0)  # the x axis ends where the curves end, the y axis begins at 0 and has room above the curves
+        ax.autoscale_view()
+        low, high = ax.get_ylim()
+        ax.set_ylim(min(0.0, low), high + 0.12 * (high - min(0.0, low)))
         if len(amplitudes) == 1 or (hopf is not None and not branches):
             curves = [(b["V"], b["K_over_W0"]) for b in branches] or [(hopf["V"], hopf["K_over_W0"])]  # type: ignore[index]
             _shade_stable(ax, curves, COLOURS[0] if branches else "#555555")
@@ -269,59 +272,8 @@ def stability_diagram(
         return figure
 
 
-def critical_points(points: Sequence[Mapping[str, Any]], *, title: str = "", ax: Axes | None = None) -> Figure:
-    """Return critical loads as marks, K/W0 (1/um) against V (um/s): full where stability is lost as W0 rises, else open.
-
-    A point is {eps, crossing, V, K_over_W0}. Crossings of one number and amplitude are joined by a thin line for the eye.
-    """
-    with one_panel(ax, title=title) as (figure, ax):
-        ax.set_xscale("log")
-        order = list(dict.fromkeys(p["eps"] for p in points))
-        for eps, crossing in sorted({(p["eps"], p["crossing"]) for p in points}):
-            mine = sorted((p for p in points if (p["eps"], p["crossing"]) == (eps, crossing)), key=lambda p: p["V"])
-            index, lost = order.index(eps), crossing % 2 == 1
-            style = curve_style(index)
-            ax.plot(
-                [p["V"] for p in mine],
-                [p["K_over_W0"] for p in mine],
-                **style,
-                linewidth=0.7,
-                marker="os^Dv<>"[index % 7],
-                markersize=5.5,
-                markerfacecolor=style["color"] if lost else "white",
-                label=f"ε = {eps:g}: stability is {'lost' if lost else 'regained'} as W$_0$ rises" if crossing < 3 else None,
-                clip_on=False,
-                zorder=3,
-            )
-        ax.set(xlabel="V  [µm/s]", ylabel="critical K/W$_0$  [1/µm]")
-        ax.margins(x=0.06)
-        ax.set_ylim(0.0, 1.12 * max((p["K_over_W0"] for p in points), default=1.0))
-        decade_ticks(ax)
-        return figure
-
-
-def boundaries(
-    branches: Sequence[Mapping[str, Any]],
-    *,
-    xlabel: str,
-    ylabel: str,
-    logx: bool = True,
-    logy: bool = False,
-    title: str = "",
-    ax: Axes | None = None,
-) -> Figure:
-    """Return boundaries in a plane of any two parameters; branches as in `stability_diagram`, x under V, y under K_over_W0."""
-    with one_panel(ax, title=title) as (figure, ax):
-        ax.set_xscale("log" if logx else "linear")
-        ax.set_yscale("log" if logy else "linear")
-        _draw_branches(ax, branches)
-        ax.set(xlabel=xlabel, ylabel=ylabel)
-        decade_ticks(ax)
-        return figure
-
-
-def _draw_branches(ax: Axes, branches: Sequence[Mapping[str, Any]]) -> None:
-    """Draw the branches, one colour and line style for each eps."""
+def draw_branches(ax: Axes, branches: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the branches of a `stability_diagram`, one colour and line style for each eps."""
     order = list(dict.fromkeys(b["eps"] for b in branches))
     named: set[str] = set()
     for branch in branches:
@@ -334,14 +286,6 @@ def _draw_branches(ax: Axes, branches: Sequence[Mapping[str, Any]]) -> None:
             marker="o" if len(branch["V"]) == 1 else None,
         )
         named.add(label)
-
-
-def _frame_curves(ax: Axes) -> None:
-    """Set the y axis from 0, with room above the curves; the x axis ends where the curves end."""
-    ax.margins(x=0.0)
-    ax.autoscale_view()
-    low, high = ax.get_ylim()
-    ax.set_ylim(min(0.0, low), high + 0.12 * (high - min(0.0, low)))
 
 
 def _gaps(values: Values) -> list[float]:

@@ -62,20 +62,18 @@ def sidecar(path: Path, content: bytes, provenance: Provenance) -> str:
 
 
 def describe(provenance: Provenance) -> dict[str, Any]:
-    """Return all but the timings as plain data: equal runs give equal data."""
+    """Return all but the timings as plain data: equal runs give equal data; of a file its hash."""
     return {
         "arguments": list(provenance.arguments),
         "versions": versions(),
-        "laws": [describe_law(law) for law in provenance.laws],
+        "laws": [
+            {"name": x.name, "source": x.source, "sha256": file_hash(Path(x.source)) if x.source else None}
+            for x in provenance.laws
+        ],
         "parameters": provenance.parameters,
         "inputs": {str(path): file_hash(path) for path in provenance.inputs},
         "seed": provenance.seed,
     }
-
-
-def describe_law(law: Law) -> dict[str, Any]:
-    """Return the law's name, its source and, where that is a file, the hash of the file."""
-    return {"name": law.name, "source": law.source, "sha256": file_hash(Path(law.source)) if law.source else None}
 
 
 def file_hash(path: Path) -> str | None:

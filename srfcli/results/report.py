@@ -18,24 +18,9 @@ from urllib.parse import quote
 from srfcli.core import __version__
 from srfcli.core.errors import SrfError
 from srfcli.core.files import unused_name, write_atomic
+from srfcli.results import report_figures
 from srfcli.results.plots import figure_bytes
 from srfcli.results.provenance import sidecar_path
-from srfcli.results.report_figures import (
-    SIGNIFICANT,
-    Trace,
-    axis_text,
-    diagram_figure,
-    force_by_state,
-    force_figure,
-    foremost,
-    loads_figure,
-    overview,
-    parameters_figure,
-    run_figure,
-    scan_figure,
-    spots,
-    trace,
-)
 from srfcli.results.report_text import (
     NO_BREAK,
     bracketed,
@@ -73,22 +58,26 @@ FILES = ("answer.json", "prediction-*.csv", "missing-*.csv", "augmented/**/*", "
 
 @dataclass(frozen=True)
 class Matter:
-    """All that a section may need: answer and tables as plain data, the runs, pictures by name (SVG), the folder."""
+    """All that a section may need: answer as plain data, material, runs, folder; pictures (SVG) by name, wide and narrow."""
 
     answer: Mapping[str, Any]
-    tables: Mapping[str, Any]
-    traces: tuple[Trace, ...]
-    pictures: Mapping[str, bytes] = field(repr=False)
+    material: Mapping[str, Any] = field(repr=False)
+    traces: tuple[report_figures.Trace, ...]
     folder: Path
+    pictures: dict[str, tuple[bytes, bytes | None]] = field(default_factory=dict, repr=False)
+
+    def rows(self, name: str) -> Sequence[Mapping[str, Any]]:
+        """Return a table of the material, empty where there is none."""
+        return self.material.get(name) or ()
 
     @property
-    def fitted(self) -> list[Trace]:
+    def fitted(self) -> list[report_figures.Trace]:
         """Return the fitted runs, those with the largest part of the misfit first."""
         shares = {r["name"]: r.get("share") or 0.0 for r in self.located}
         return sorted((t for t in self.traces if not t.holdout), key=lambda t: -shares.get(t.name, 0.0))
 
     @property
-    def held(self) -> list[Trace]:
+    def held(self) -> list[report_figures.Trace]:
         """Return the held-out runs."""
         return [t for t in self.traces if t.holdout]
 
@@ -100,41 +89,28 @@ class Matter:
     @property
     def same(self) -> bool:
         """True where nothing was added: one model, drawn once."""
-        return all(t.same for t in self.traces) and all(t["chi2"][0] == t["chi2"][1] for t in self.loads)
+        return all(t.same for t in self.traces) and all(t["chi2"][0] == t["chi2"][1] for t in self.rows("thresholds"))
 
-    @property
-    def loads(self) -> list[Mapping[str, Any]]:
-        """Return the tables of critical loads: name, held out or not, and chi2 under both models."""
-        return list(self.tables.get("thresholds") or ())
+    def sides(self, baseline: Any = "baseline", augmented: Any = "augmented model", *more: Any) -> list[Any]:
+        """Return what a table has of both models, or of the baseline alone where they are the same."""
+        return [baseline] if self.same else [baseline, augmented, *more]
 
     def figure(self, name: str, alt: str, caption: Any = "", *, small: bool = False) -> Markup:
         """Return a figure, or nothing where it was not drawn."""
         if name not in self.pictures:
             return Markup("")
-        near = self.pictures.get(narrow_name(name))
-        return picture(self.pictures[name], ".svg", alt=alt, caption=caption, small=small, narrow=near)
-
-
-def narrow_name(name: str) -> str:
-    """Return the name of a figure's form for small screens."""
-    return f"narrow {name}"
-
-
-def first_picture(matter: Matter) -> Markup:
-    """Return the run that the verdict rests on most, as the page's first picture."""
-    return _run(matter, matter.fitted[0]) if matter.fitted else Markup("")
+        wide, narrow = self.pictures[name]
+        return picture(wide, ".svg", alt=alt, caption=caption, small=small, narrow=narrow)
 
 
 def numbers(matter: Matter) -> Markup:
     """Return the few numbers that the verdict rests on."""
-    models = ("baseline",) if matter.same else ("baseline", "augmented")
     rows = []
     for part, label in (("fit", "fitted runs"), ("holdout", "held-out runs")):
-        values = [rms_of(matter.answer, m, part) for m in models]
+        values = [rms_of(matter.answer, m, part) for m in matter.sides("baseline", "augmented")]
         if any(v is not None for v in values):
-            rows.append([label, *(rms(v) for v in values)])
-    heads = ["residual / noise", *("baseline" if m == "baseline" else "augmented model" for m in models)]
-    parts = [table(heads, rows, numeric=(1, 2))] if rows else []
+            rows.append([label, *map(rms, values)])
+    parts = [table(["residual / noise", *matter.sides()], rows, numeric=(1, 2))] if rows else []
     confidence = sorted((matter.answer.get("confidence") or {}).items(), key=lambda kv: -(kv[1] or 0.0))
     shown = [[name, [percent(p), bar(p)]] for name, p in confidence if finite(p) and p >= 0.005][:5]
     if shown:
@@ -144,22 +120,17 @@ def numbers(matter: Matter) -> Markup:
 
 def places(matter: Matter) -> Markup:
     """Return where simulation and recording part, and computed and measured critical loads."""
-    if matter.loads and not matter.traces:
+    if matter.rows("thresholds") and not matter.traces:
         return section("where", "Critical loads, measured and computed", critical_loads(matter))
-    parts: list[Any] = [tag("p", " ".join(_location_sentences(matter)))]
-    parts.append(
-        matter.figure(
-            "overview",
-            "All runs as strips over time, dark where the residual exceeds the noise.",
-            "Every run on its own clock; light is noise, dark is what the model does not explain."
-            + (
-                " A black line marks the times that are shaded darkest in the figures of the runs."
-                if any(t.windows for t in matter.traces)
-                else ""
-            ),
-        )
-    )
-    parts.append(_run_table(matter))
+    caption = "Every run on its own clock; light is noise, dark is what the model does not explain."
+    if any(t.windows for t in matter.traces):
+        caption += " A black line marks the times that are shaded darkest in the figures of the runs."
+    alt = "All runs as strips over time, dark where the residual exceeds the noise."
+    parts: list[Any] = [
+        tag("p", " ".join(_location_sentences(matter))),
+        matter.figure("overview", alt, caption),
+        _run_table(matter),
+    ]
     if any(t.windows for t in matter.fitted):
         parts.append(tag("p", SHADED))
     if matter.fitted:
@@ -172,44 +143,43 @@ def places(matter: Matter) -> Markup:
 
 def critical_loads(matter: Matter) -> list[Any]:
     """Return each table's chi2 under both models, and its figure."""
-    if not matter.loads:
+    loads = matter.rows("thresholds")
+    if not loads:
         return []
-    rows = []
-    for one in matter.loads:
-        both = [number(one["chi2"][0], 3)] + ([] if matter.same else [number(one["chi2"][1], 3)])
-        rows.append([one["name"] + (" (held out)" if one["holdout"] else ""), str(one["size"]), *both])
-    heads = ["critical loads", "number", "baseline"] + ([] if matter.same else ["augmented model"])
-    caption = "chi2: the sum of squared residuals over their errors; about the number of loads where a model has them."
-    figures = [
-        matter.figure(f"loads {one['name']}", "Measured and computed critical loads over velocity.",
-                      "Circles: measured, with their errors. Lines: those of the model, thin: of the baseline.")
-        for one in matter.loads
+    rows = [
+        [one["name"] + (" (held out)" if one["holdout"] else ""), str(len(one["table"])),
+         *(number(chi2, 3) for chi2 in matter.sides(*one["chi2"]))]
+        for one in loads
     ]  # fmt: skip
+    heads = ["critical loads", "number", *matter.sides()]
+    caption = "chi2: the sum of squared residuals over their errors; about the number of loads where a model has them."
+    alt = "Measured and computed critical loads over velocity."
+    below = "Circles: measured, with their errors. Lines: those of the model, thin: of the baseline."
+    figures = [matter.figure(f"loads {one['name']}", alt, below) for one in loads]
     return [table(heads, rows, caption=caption, numeric=tuple(range(1, len(heads)))), *figures]
 
 
 def _run_table(matter: Matter) -> Markup:
     """Return the fitted runs with their residuals and, where any stands out, their parts of the misfit."""
     located, rows = {r["name"]: r for r in matter.located}, []
+    heads, caption = ["run", *matter.sides()], "Residual over noise of each fitted run"
+    last = len(heads)
+    if located:
+        heads += ["share of the excess", "p of noise", "stands out at"]
+        caption += ", its part of what noise does not explain, and where that is"
+        last += 2
     for one in matter.fitted:
-        place, both = located.get(one.name, {}), one.rms
-        row = [one.name, rms(both[0])] + ([] if matter.same else [rms(both[1])])
+        place, row = located.get(one.name, {}), [one.name, *map(rms, matter.sides(*one.rms))]
         if located:
             where = spans(merged(place.get("windows") or one.windows)) or "nowhere in particular"
             row += [percent(place.get("share")), probability(place.get("p_value")), where]
         rows.append(row)
-    heads = ["run", "baseline"] + ([] if matter.same else ["augmented model"])
-    caption = "Residual over noise of each fitted run"
-    if located:
-        heads += ["share of the excess", "p of noise", "stands out at"]
-        caption += ", its part of what noise does not explain, and where that is"
-    last = len(heads) - 1 if located else len(heads)
     return table(heads, rows, caption=f"{caption}.", numeric=tuple(range(1, last)))
 
 
 def _location_sentences(matter: Matter) -> list[str]:
     location, found = matter.answer.get("location") or {}, []
-    standing = [r for r in matter.located if (r.get("p_value") or 0.0) < SIGNIFICANT]
+    standing = [r for r in matter.located if (r.get("p_value") or 0.0) < report_figures.SIGNIFICANT]
     if not standing:
         return ["No place stands out beyond what noise does."]
     worst = max(standing, key=lambda r: r.get("share") or 0.0)
@@ -220,7 +190,7 @@ def _location_sentences(matter: Matter) -> list[str]:
         found.append(f"{percent(worst['share'])} of the excess misfit is in the run “{worst['name']}”{tail}.")
     coordinate = location.get("coordinate")
     if coordinate and finite(coordinate.get("r2")):
-        name = axis_text(str(coordinate.get("name")))
+        name = report_figures.axis_text(str(coordinate.get("name")))
         found.append(
             f"It goes with the {name}: a function of it alone explains {percent(coordinate['r2'])} of the misfit's power."
         )
@@ -234,7 +204,7 @@ def _location_sentences(matter: Matter) -> list[str]:
 
 def _frequencies(matter: Matter, narrow: Sequence[float]) -> list[str]:
     """Return where in frequency the misfit is, the strongest place of the table and the figure first."""
-    seen = [s for s in spots(matter.tables.get("residual_scan") or ()) if s.axis == "frequency" and s.sure]
+    seen = [s for s in report_figures.spots(matter.rows("residual_scan")) if s.axis == "frequency" and s.sure]
     if not seen:
         return []
     low, high = seen[0].low, seen[0].high
@@ -258,7 +228,7 @@ def merged(windows: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
     return found
 
 
-def _run(matter: Matter, one: Trace) -> Markup:
+def _run(matter: Matter, one: report_figures.Trace) -> Markup:
     before, after = one.rms
     fell = f"{rms(before)}" if matter.same else f"{rms(before)} before, {rms(after)} after"
     where = f"; they part at the shaded times, furthest from {spans([one.worst])}" if one.worst else ""
@@ -271,10 +241,13 @@ def _run(matter: Matter, one: Trace) -> Markup:
 
 def residual_scan(matter: Matter) -> Markup:
     """Return the residual scan: phases, frequencies and quantities of state that the misfit goes with."""
-    found = spots(matter.tables.get("residual_scan") or ())
+    found = report_figures.spots(matter.rows("residual_scan"))
     if not found:
         return Markup("")
-    rows = [[axis_text(s.axis), s.place, s.run or "all", number(s.height), probability(s.p_value)] for s in foremost(found)]
+    rows = [
+        [report_figures.axis_text(s.axis), s.place, s.run or "all", number(s.height), probability(s.p_value)]
+        for s in report_figures.foremost(found)
+    ]
     heads = ["looked at by", "place", "run", "−log10 p", "p, adjusted"]
     caption = "What stands out most; the last column allows for all that was looked at."
     figure = matter.figure(
@@ -294,7 +267,7 @@ def left_out(matter: Matter) -> Markup:
         parts.append(tag("ul", [tag("li", tag("code", x["effect"]), ": ", x["reason"]) for x in unseen]))
     for names in matter.answer.get("equivalent") or ():
         parts.append(tag("p", f"{joined(list(names))} leave the same trace in these runs: nothing here tells them apart."))
-    discriminating = matter.tables.get("discriminating")
+    discriminating = matter.material.get("discriminating")
     if discriminating:
         parts.append(tag("h3", "The experiment that discriminates between them"))
         parts += [commands([p.rstrip()]) if p.startswith("[[runs]]") else tag("p", p) for p in discriminating]
@@ -303,7 +276,7 @@ def left_out(matter: Matter) -> Markup:
 
 def hypotheses(matter: Matter) -> Markup:
     """Return the table of everything that was fitted in full."""
-    ranked = [r for r in matter.tables.get("ranked") or () if finite(r.get("evidence"))]
+    ranked = [r for r in matter.rows("ranked") if finite(r.get("evidence"))]
     if not ranked:
         return Markup("")
     top, verdict = max(r["evidence"] for r in ranked), matter.answer.get("verdict")
@@ -318,16 +291,8 @@ def hypotheses(matter: Matter) -> Markup:
             chosen.append(k)
         label = "the baseline alone" if r["name"] == "none" else r["name"]
         sure = confidence.get("+".join(sorted(names)), r.get("confidence"))
-        rows.append(
-            [
-                label,
-                number(r["evidence"] - top),
-                rms(r["rms_over_noise"]),
-                number(r.get("field") or 0.0, 2),
-                percent(sure),
-                r.get("against") or "",
-            ]
-        )
+        evidence, field = number(r["evidence"] - top), number(r.get("field") or 0.0, 2)
+        rows.append([label, evidence, rms(r["rms_over_noise"]), field, percent(sure), r.get("against") or ""])
     caption = (
         "Everything that was fitted in full, best first: log evidence against the best, innovations over noise, the amplitude of "
         "the random friction that it needs besides, and what speaks against it."
@@ -338,7 +303,7 @@ def hypotheses(matter: Matter) -> Markup:
 
 def scores(matter: Matter) -> Markup:
     """Return what each effect could still explain beyond the baseline's own parameters, and what could have been seen."""
-    found = matter.tables.get("scores") or ()
+    found = matter.rows("scores")
     if not found:
         return Markup("")
     rows = []
@@ -356,7 +321,7 @@ def scores(matter: Matter) -> Markup:
 
 def parameters(matter: Matter) -> Markup:
     """Return the parameters before and after, and how far they had been bent."""
-    found = matter.tables.get("parameters") or ()
+    found = matter.rows("parameters")
     rows, bent = [], []
     for p in found:
         unit = unit_text(p.get("unit"))
@@ -364,9 +329,9 @@ def parameters(matter: Matter) -> Markup:
         shift = p.get("shift_sigma")
         if finite(shift) and abs(shift) > BIASED:
             bent.append((abs(shift), p["name"]))
-        shown = [before] if matter.same else [before, after, number(shift, 2)]
+        shown = matter.sides(before, after, number(shift, 2))
         rows.append([f"{p['name']}" + (f"  [{unit}]" if unit else ""), *shown])
-    heads = ["parameter", "baseline"] + ([] if matter.same else ["augmented model", "shift / standard error"])
+    heads = ["parameter", *matter.sides("baseline", "augmented model", "shift / standard error")]
     parts: list[Any] = []
     if bent and not matter.same:
         told = joined([f"{name} by {number(size, 2)}" for size, name in sorted(bent, reverse=True)])
@@ -380,7 +345,7 @@ def parameters(matter: Matter) -> Markup:
 
 def held_out(matter: Matter) -> Markup:
     """Return how runs are predicted that no fit has seen."""
-    if not matter.held and any(one["holdout"] for one in matter.loads):
+    if not matter.held and any(one["holdout"] for one in matter.rows("thresholds")):
         return Markup("")  # tables of critical loads that were held out stand with the others
     if not matter.held:
         text = "No run was held out, so nothing shows that the model predicts what it has not seen; mark one with holdout = true."
@@ -390,29 +355,25 @@ def held_out(matter: Matter) -> Markup:
         before, after = one.rms
         word = "better" if after < 0.99 * before else "worse" if after > 1.01 * before else "alike"
         word = word if min(before, after) < float("inf") else "not at all"
-        rows.append([one.name, rms(before)] + ([] if matter.same else [rms(after), word]))
-    heads = ["run", "baseline"] + ([] if matter.same else ["augmented model", "predicted"])
+        rows.append([one.name, *matter.sides(rms(before), rms(after), word)])
+    heads = ["run", *matter.sides("baseline", "augmented model", "predicted")]
     text = "These were opened only after the model was final."
     shown = [_run(matter, one) for one in matter.held[:RUNS_SHOWN]]
-    caption = "Residual over noise."
-    found = table(heads, rows, caption=caption, numeric=(1, 2))
+    found = table(heads, rows, caption="Residual over noise.", numeric=(1, 2))
     return section("held-out", "Runs that the fit never saw", tag("p", text), found, shown)
 
 
 def missing_force(matter: Matter) -> Markup:
     """Return the force that is missing, against time and state, and its closed form; nothing where it was not estimated."""
-    force = matter.tables.get("force") or {}
+    force = matter.material.get("force") or {}
     if not force:
         return Markup("")
     form = force.get("form")
     parts: list[Any] = [tag("p", "Estimated along the recording without assuming its form.")]
     if form:
         parts.append(tag("p", "The best closed form found for it: ", tag("code", str(form))))
-    parts += [
-        matter.figure(name, f"The {name} over time with its band.")
-        for name in matter.pictures
-        if name.startswith("force ")  # those for small screens begin otherwise
-    ]
+    drawn = [name for name in matter.pictures if name.startswith("force ")]
+    parts += [matter.figure(name, f"The {name} over time with its band.") for name in drawn]
     parts.append(matter.figure("force-by-state", "The missing force against slip velocity, age and load.",
                                "Samples and their averages: a curve that all runs share is a law."))  # fmt: skip
     return section("force", "The missing force", parts)
@@ -420,12 +381,12 @@ def missing_force(matter: Matter) -> Markup:
 
 def diagram(matter: Matter) -> Markup:
     """Return what the model does to the stability diagram; nothing where that was not computed."""
-    note, drawn = (matter.tables.get("diagram") or {}).get("note"), "diagram" in matter.pictures
+    found = matter.material.get("diagram") or {}
+    note, drawn = found.get("note"), "diagram" in matter.pictures
     if not (note or drawn):
         return Markup("")
     caption = "Critical load against driving velocity" + ("." if matter.same else ", baseline and augmented model.")
-    marks = (matter.tables.get("diagram") or {}).get("marks") or ()
-    if marks:
+    if found.get("marks"):
         caption += " Crosses: the velocities and loads of your runs."
     figure = matter.figure("diagram", caption, caption, small=True) if drawn else ""
     title = "Your runs in the stability diagram" if matter.same else "What it does to the stability diagram"
@@ -457,12 +418,6 @@ def command_lines(answer: Mapping[str, Any], files: Sequence[str]) -> list[str]:
     return found
 
 
-def whole_answer(matter: Matter) -> Markup:
-    """Return the answer as it stands in answer.json, folded."""
-    text = json.dumps(matter.answer, indent=2, ensure_ascii=False, allow_nan=False)
-    return tag("details", tag("summary", "The answer as data"), tag("pre", tag("code", text)))
-
-
 # HTML by small functions: all text is escaped unless it was built here; one page with its style and its pictures inside.
 
 VOID = frozenset({"br", "hr", "img", "meta", "source"})
@@ -471,64 +426,6 @@ MIME = {".svg": "image/svg+xml", ".png": "image/png"}
 
 # No script, and nothing may be fetched, whatever a title or a name in a recording says.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-
-CSS = """
-:root { color-scheme: light; }
-* { box-sizing: border-box; }
-body { font: 16px/1.55 "DejaVu Sans", "Segoe UI", Helvetica, Arial, sans-serif; color: #1c1c1c; background: #fff;
-  max-width: 68rem; margin: 0 auto; padding: 2rem 1.5rem 4rem; }
-h1 { font-size: 1.3rem; line-height: 1.45; font-weight: 600; margin: 0.6rem 0 1.2rem; max-width: 52rem; }
-h2 { font-size: 1.2rem; margin: 2.8rem 0 0.6rem; padding-top: 0.9rem; border-top: 1px solid #d8d8d8; }
-h3 { font-size: 1rem; margin: 1.8rem 0 0.4rem; }
-p, ul, ol { max-width: 48rem; margin: 0.5rem 0; }
-.of { color: #555; margin: 0; }
-.verdict { display: inline-block; border: 2px solid currentColor; border-radius: 4px; padding: 0 0.55rem;
-  font-weight: 600; font-size: 0.9rem; letter-spacing: 0.03em; margin-right: 0.6rem; }
-.none { color: #00664b; } .identified { color: #00548a; } .ambiguous { color: #8a5a00; }
-.unknown { color: #a34700; } .inconclusive { color: #555; }
-nav { font-size: 0.9rem; margin: 1.2rem 0 0; } nav a { margin-right: 0.8rem; display: inline-block; }
-a { color: #00548a; }
-table { border-collapse: collapse; margin: 0.7rem 0 1.1rem; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-caption { text-align: left; color: #555; padding-bottom: 0.35rem; max-width: 48rem; }
-th, td { padding: 0.22rem 0.9rem 0.22rem 0; text-align: left; vertical-align: top; border-bottom: 1px solid #e6e6e6; }
-thead th { border-bottom: 1.5px solid #777; font-weight: 600; vertical-align: bottom; }
-tbody th { font-weight: 400; }
-.n { text-align: right; white-space: nowrap; } td.n:last-child, th.n:last-child { padding-right: 0; }
-tr.chosen th, tr.chosen td { background: #eaf2f9; font-weight: 600; }
-.bar { display: inline-block; width: 6rem; height: 0.62rem; background: #eee; margin-left: 0.6rem; vertical-align: baseline; }
-.bar span { display: block; height: 100%; background: #0072b2; }
-figure { margin: 0.8rem 0 1.6rem; break-inside: avoid; }
-figure img { width: 100%; height: auto; display: block; }
-figure.small img { width: 72%; }
-figcaption { color: #555; font-size: 0.88rem; max-width: 48rem; margin-top: 0.3rem; }
-pre { background: #f5f5f3; padding: 0.7rem 0.9rem; overflow-x: auto; font-size: 0.86rem; line-height: 1.5; max-width: 100%; }
-code { font-family: "DejaVu Sans Mono", Menlo, Consolas, monospace; font-size: 0.92em; }
-pre code { font-size: 1em; }
-details summary { cursor: pointer; color: #00548a; }
-thead th, thead th.n { white-space: normal; overflow-wrap: anywhere; }
-.wide { overflow-x: auto; } .numbers { display: flex; flex-wrap: wrap; gap: 0 4rem; align-items: flex-start; }
-.lead { max-width: 52rem; }
-@media screen and (max-width: 640px) {
-  body { padding: 1rem 0.8rem 3rem; } h1 { font-size: 1.15rem; } figure.small img { width: 100%; }
-  table, tbody, tr, th, td, caption { display: block; } thead { display: none; }
-  tbody tr { padding: 0.5rem 0; border-bottom: 1px solid #bbb; } th, td { border: 0; padding: 0.1rem 0; }
-  tbody th { font-weight: 600; overflow-wrap: anywhere; }
-  td { display: grid; grid-template-columns: 45% 1fr; gap: 0.6rem; overflow-wrap: anywhere; text-align: left; }
-  td::before { content: attr(data-label); color: #555; } td[data-label=""] { display: block; }
-  .n { text-align: left; white-space: normal; } .wide { overflow-x: visible; }
-  pre { white-space: pre-wrap; overflow-wrap: anywhere; } code, li, p { overflow-wrap: anywhere; }
-  .numbers { gap: 0; flex-direction: column; } .numbers > div { width: 100%; }
-}
-@media print {
-  body { font-size: 10pt; max-width: none; padding: 0; } nav, details { display: none; }
-  h2, h3 { break-after: avoid; } tr, figure { break-inside: avoid; } a { color: inherit; text-decoration: none; }
-  pre { white-space: pre-wrap; overflow-wrap: anywhere; } .wide { overflow: visible; } table { font-size: 8.5pt; }
-  th, td { padding-right: 0.5rem; overflow-wrap: anywhere; } .n { white-space: normal; }
-  thead th, thead th.n { overflow-wrap: break-word; } table { break-inside: avoid; } tbody th { min-width: 4.5rem; }
-  h2 + p, h3 + p { break-after: avoid; } .numbers { break-inside: avoid; }
-  thead, tbody tr:first-child, tbody tr:nth-last-child(2) { break-after: avoid; }
-}
-"""
 
 
 @final
@@ -618,7 +515,7 @@ def page(title: str, *body: Any) -> str:
         Markup(f'<meta http-equiv="Content-Security-Policy" content="{html.escape(POLICY, quote=True)}">'),
         tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
         tag("title", title),
-        tag("style", Markup(CSS)),
+        tag("style", Markup("\n" + Path(__file__).with_name("report.css").read_text(encoding="utf-8"))),
     )
     return f'<!DOCTYPE html>\n<html lang="en">\n{head}\n{tag("body", list(body))}\n</html>\n'
 
@@ -627,7 +524,6 @@ def page(title: str, *body: Any) -> str:
 
 PAGE = "report.html"
 FIGURES = "figures"
-ARRAYS = ("force", "diagram")  # parts of the material that figures take as they are
 
 Drawing = tuple[str, Callable[..., "Figure | None"]]
 
@@ -649,78 +545,50 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     Without matplotlib the page has all but the figures, and says so.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    traces = tuple(t for t in map(trace, material.get("runs", ())) if t.t.size > 1)
-    tables = _tables(material)
+    traces = tuple(t for t in map(report_figures.trace, material.get("runs", ())) if t.t.size > 1)
+    matter = Matter(plain_value(answer), material, traces, folder)
     written: list[Path] = []
-    pictures: dict[str, bytes] = {}
     if importlib.util.find_spec("matplotlib") is not None:
-        pictures = dict(_drawn(folder / FIGURES, traces, material, written))
-    matter = Matter(plain_value(answer), tables, traces, pictures, folder)
+        (folder / FIGURES).mkdir(exist_ok=True)
+        for name, draw in _drawings(matter):
+            if (figure := draw()) is None:
+                continue
+            content = {suffix: figure_bytes(figure, suffix) for suffix in (".svg", ".png")}
+            stem = (re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "figure")[:80]
+            for suffix, data in content.items():
+                written.append(folder / FIGURES / unused_name(stem, suffix, [p.name for p in written]))
+                write_atomic(written[-1], data)
+            small = draw(narrow=True)
+            matter.pictures[name] = content[".svg"], None if small is None else figure_bytes(small, ".svg")
     write_atomic(folder / PAGE, _page(matter))
     return (*written, folder / PAGE)
 
 
-def _tables(material: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the material as plain data, without the long arrays."""
-    found = {k: plain_value(v) for k, v in material.items() if k not in ("runs", "thresholds", *ARRAYS)}
-    found["thresholds"] = [
-        {"name": str(t["name"]), "holdout": bool(t["holdout"]), "chi2": plain_value(t["chi2"]), "size": len(t["table"])}
-        for t in material.get("thresholds", ())
-    ]
-    found["runs"] = [{"name": str(r["name"]), "holdout": bool(r["holdout"])} for r in material.get("runs", ())]
-    force, diagram = material.get("force") or {}, material.get("diagram") or {}
-    found["force"] = {"form": force.get("form")} if force else {}
-    found["diagram"] = {"note": diagram.get("note"), "marks": plain_value(diagram.get("marks") or ())}
-    return found
-
-
-def _drawn(
-    folder: Path, traces: tuple[Trace, ...], material: Mapping[str, Any], written: list[Path]
-) -> Iterator[tuple[str, bytes]]:
-    """Draw and write the figures one after the other, and yield each one's name and SVG, and that for small screens."""
-    folder.mkdir(exist_ok=True)
-    for name, draw in _drawings(traces, material):
-        figure = draw()
-        if figure is None:
-            continue
-        content = {suffix: figure_bytes(figure, suffix) for suffix in (".svg", ".png")}
-        stem = (re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "figure")[:80]
-        for suffix, data in content.items():
-            place = folder / unused_name(stem, suffix, [p.name for p in written])
-            write_atomic(place, data)
-            written.append(place)
-        yield name, content[".svg"]
-        small = draw(narrow=True)
-        if small is not None:
-            yield narrow_name(name), figure_bytes(small, ".svg")
-
-
-def _drawings(traces: tuple[Trace, ...], material: Mapping[str, Any]) -> Iterator[Drawing]:
+def _drawings(matter: Matter) -> Iterator[Drawing]:
     """Yield the name of each figure and what draws it."""
-    if traces:
-        yield "overview", partial(overview, traces)
-    for one in traces:
-        yield f"run {one.name}", partial(run_figure, one)
-    for loads in material.get("thresholds", ()):
-        yield f"loads {loads['name']}", partial(loads_figure, loads)
-    yield "residual-scan", partial(scan_figure, plain_value(material.get("residual_scan") or ()))
-    changed = any(t["chi2"][0] != t["chi2"][1] for t in material.get("thresholds", ()))
-    if changed or not all(one.same for one in traces):
-        yield "parameters", partial(parameters_figure, plain_value(material.get("parameters") or ()))
-    force = material.get("force") or {}
+    if matter.traces:
+        yield "overview", partial(report_figures.overview, matter.traces)
+    for one in matter.traces:
+        yield f"run {one.name}", partial(report_figures.run_figure, one)
+    for loads in matter.rows("thresholds"):
+        yield f"loads {loads['name']}", partial(report_figures.loads_figure, loads)
+    yield "residual-scan", partial(report_figures.scan_figure, matter.rows("residual_scan"))
+    if not matter.same:
+        yield "parameters", partial(report_figures.parameters_figure, matter.rows("parameters"))
+    force = matter.material.get("force") or {}
     runs = {str(k): v for k, v in force.items() if isinstance(v, Mapping) and "t" in v}
     for name, one_force in runs.items():
-        yield f"force {name}", partial(force_figure, name, one_force)
+        yield f"force {name}", partial(report_figures.force_figure, name, one_force)
     if runs:
-        yield "force-by-state", partial(force_by_state, runs)
-    if material.get("diagram"):
-        yield "diagram", partial(diagram_figure, material["diagram"])
+        yield "force-by-state", partial(report_figures.force_by_state, runs)
+    if matter.material.get("diagram"):
+        yield "diagram", partial(report_figures.diagram_figure, matter.material["diagram"])
 
 
 def _page(matter: Matter) -> str:
-    sentence = verdict_sentence(matter.answer, matter.tables)
+    sentence = verdict_sentence(matter.answer, matter.material)
     verdict = str(matter.answer.get("verdict"))
-    title = str(matter.tables.get("title") or "Diagnosis")
+    title = str(matter.material.get("title") or "Diagnosis")
     sections = (places, left_out, missing_force, parameters, held_out, diagram, onward)
     shown = [made for made in (one(matter) for one in sections) if made]
     links = [
@@ -729,15 +597,17 @@ def _page(matter: Matter) -> str:
     head = [
         tag("p", title, class_="of"),
         tag("h1", tag("span", verdict, class_=f"verdict {verdict}"), sentence),
-        tag("p", tag("strong", "What to do. "), remedy(matter.answer, matter.tables), class_="lead"),
-        tag("p", gain_sentence(matter.answer, matter.tables), class_="lead"),
-        first_picture(matter),
+        tag("p", tag("strong", "What to do. "), remedy(matter.answer, matter.material), class_="lead"),
+        tag("p", gain_sentence(matter.answer, matter.material), class_="lead"),
+        _run(matter, matter.fitted[0]) if matter.fitted else "",
         numbers(matter),
     ]
     if not matter.pictures:
         head.append(tag("p", 'The figures need matplotlib, which is not installed: pip install "srfcli[plot]"'))
+    text = json.dumps(matter.answer, indent=2, ensure_ascii=False, allow_nan=False)
+    whole = tag("details", tag("summary", "The answer as data"), tag("pre", tag("code", text)))
     foot = tag("p", f"srf {__version__}", class_="of")
-    body = [tag("header", head, tag("nav", links)), tag("main", shown), whole_answer(matter), foot]
+    body = [tag("header", head, tag("nav", links)), tag("main", shown), whole, foot]
     return page(f"{title}: {verdict}", *body)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from srfcli.results.figures import _imposed, _settle, draw_loads, envelope
+from srfcli.results.figures import draw_loads, envelope, imposed_scale, settle
 from srfcli.results.plots import DOTTED, _gaps, bare_figure, curve_style, decade_ticks, house_style, name_text, new_figure
 from srfcli.results.report_text import finite, number, with_unit
 
@@ -160,7 +160,7 @@ def overview(traces: Sequence[Trace], *, narrow: bool = False) -> Figure:
         )
         bar.set_label("residual / noise")
         _plain_log(bar.ax.xaxis if narrow else bar.ax.yaxis, max(3.0, top), most=5 if narrow else 8)
-        _settle(figure)
+        settle(figure)
         return figure
 
 
@@ -203,7 +203,7 @@ def run_figure(one: Trace, *, narrow: bool = False) -> Figure:
                 _imposed_panel(axis, one, "W", piece)
             _end_column(near)
             axes[0].axvspan(one.t[piece][0], one.t[piece][-1], ymin=0.0, ymax=0.03, color="#000000", linewidth=0)
-        _settle(figure)
+        settle(figure)
         return figure
 
 
@@ -262,18 +262,12 @@ def _whole(axes: Sequence[Axes], one: Trace, *, narrow: bool = False) -> None:
 def _models(axis: Axes, one: Trace, part: slice) -> None:
     """Draw recording and simulations over a part of the run: dots where they are few, lines by extremes where not."""
     t = one.t[part]
-    few = t.size <= DOTS
-    for a, b in _pieces(t):
-        mark = "recorded" if a == 0 else None
-        if few:
-            axis.plot(t[a:b], one.observed[part][a:b], ".", color=OBSERVED, markersize=2.6, label=mark)
-        else:
-            axis.plot(*envelope(t[a:b], one.observed[part][a:b]), color=OBSERVED, linewidth=0.9, alpha=0.75, label=mark)
+    few: dict[str, Any] = {"marker": ".", "linestyle": "none", "markersize": 2.6}
+    many: dict[str, Any] = {"linewidth": 0.9, "alpha": 0.75}
+    _line(axis, t, one.observed[part], label="recorded", color=OBSERVED, **(few if t.size <= DOTS else many))
     names = ("baseline", "augmented model")
     for label, (values, colour, dash) in zip(names, one.sides(one.baseline, one.augmented), strict=False):
-        for a, b in _pieces(t):
-            shown = label if a == 0 else None
-            axis.plot(*envelope(t[a:b], values[part][a:b]), color=colour, linewidth=1.1, linestyle=dash, label=shown)
+        _line(axis, t, values[part], label=label, color=colour, linewidth=1.1, linestyle=dash)
     axis.set_ylabel(name_text(one.label))
     axis.ticklabel_format(axis="y", useOffset=False)
     axis.margins(y=0.14)
@@ -298,11 +292,16 @@ def _unexplained(axis: Axes, one: Trace) -> None:
     """Draw the friction that each model leaves to its random field, in thousandths."""
     assert one.unexplained is not None
     for values, colour, dash in one.sides(*one.unexplained):
-        for a, b in _pieces(one.t):
-            axis.plot(*envelope(one.t[a:b], 1e3 * values[a:b]), color=colour, linewidth=1.1, linestyle=dash)
+        _line(axis, one.t, 1e3 * values, color=colour, linewidth=1.1, linestyle=dash)
     axis.axhline(0.0, color="#777777", linewidth=0.8)
     axis.set_ylabel("random\nfriction\n[10$^{-3}$]")
     axis.margins(y=0.1)
+
+
+def _line(axis: Axes, t: Array, y: Array, *, label: str | None = None, **style: Any) -> None:
+    """Draw a record by its extremes where it is long, without lines over its gaps."""
+    for a, b in _pieces(t):
+        axis.plot(*envelope(t[a:b], y[a:b]), label=label if a == 0 else None, **style)
 
 
 def _noise_band(axis: Axes) -> None:
@@ -313,7 +312,7 @@ def _noise_band(axis: Axes) -> None:
 
 def _imposed_panel(axis: Axes, one: Trace, key: str, part: slice) -> None:
     axis.plot(*envelope(one.t[part], getattr(one, key)[part]), color="#555555", linewidth=0.8)
-    _imposed(axis, getattr(one, key)[part], wide=key == "V")
+    imposed_scale(axis, getattr(one, key)[part], wide=key == "V")
     if axis.get_yscale() == "log":  # decades would fall outside so low a panel
         ends = sorted({float(f"{x:.3g}") for x in (getattr(one, key)[part].min(), getattr(one, key)[part].max())})
         axis.set_yticks(ends, [f"{x:g}" for x in ends])
@@ -488,7 +487,7 @@ def scan_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> F
             axis.set_ylabel("−log$_{10}$ p" if k % columns == 0 else "")
         for axis in panels[len(shown) :]:
             axis.set_axis_off()
-        _settle(figure)
+        settle(figure)
         return figure
 
 
@@ -559,7 +558,7 @@ def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool =
             axis.set_xlim(*(1.6 * (end if abs(end) > 3.0 else 3.0 * side) for end, side in ((min(shifts), -1), (max(shifts), 1))))
         axis.set_xlabel("baseline less augmented model  [standard errors]")
         axis.grid(axis="y", visible=False)
-        _settle(figure)
+        settle(figure)
         return figure
 
 
@@ -587,7 +586,7 @@ def force_figure(name: str, force: Mapping[str, Any], *, narrow: bool = False) -
         axes[-1].set_xlabel("t  [s]")
         axes[-1].set_xlim(t[0] - 0.01 * np.ptp(t), t[-1] + 0.01 * np.ptp(t))
         figure.align_ylabels(axes)
-        _settle(figure)
+        settle(figure)
         return figure
 
 
@@ -614,7 +613,7 @@ def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, narrow: bool = Fa
                 decade_ticks(axis)
         axes[0].set_ylabel("missing friction coefficient")
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8.5)
-        _settle(figure)
+        settle(figure)
         return figure
 
 
@@ -679,7 +678,7 @@ def diagram_figure(diagram: Mapping[str, Any], *, narrow: bool = False) -> Figur
         legend = axis.legend(loc="best", handlelength=2.8, title="sliding is steady below the first boundary", alignment="left")
         legend.get_title().set_color("#555555")
         decade_ticks(axis)
-        _settle(figure)
+        settle(figure)
         return figure
 
 

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from srfcli.core.errors import SrfError, Status
+from srfcli.data.noise import measured
+from srfcli.data.values import AREA_GROWTH, OBSERVABLES, Experiment, Run, Signal
+from srfcli.motion.simulate import Trace, stick_slip
+from srfcli.results import plots
+from srfcli.results.figures import envelope
 from srfcli.results.tables import Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
@@ -19,13 +26,10 @@ if TYPE_CHECKING:
 
     from srfcli.codegen.model import GeneratedModel
     from srfcli.codegen.splines import Spline
-    from srfcli.data.values import Experiment, Run
     from srfcli.motion.imposed import Drive, Load
-    from srfcli.motion.simulate import Trace
 
     Array = NDArray
 
-STEP_RISE = 0.02  # s over which steps of the load are rounded: five times the slider's bounce on its interface
 MANY_BREAKS = 50  # a recorded load has knots, not changes
 FEW_SAMPLES = 20  # show no oscillation
 OTHERS = (  # what a record has beside the first observable, where it is asked for
@@ -76,8 +80,6 @@ class Record:
     @property
     def done(self) -> int:
         """Return the number of samples that were reached."""
-        import numpy as np
-
         reached = np.isfinite(self.trace.x).all(axis=1)
         return int(reached.size if reached.all() else np.argmin(reached))
 
@@ -88,10 +90,6 @@ def observe(model: GeneratedModel, job: Job, trace: Trace, observable: str) -> A
     The job's own observable is what a gauge shows, where an effect stands between the two. The slip (um)
     is that of the slider since the first sample, the contact area grows by AREA_GROWTH by e-fold of its age in s.
     """
-    import numpy as np
-
-    from srfcli.data.values import AREA_GROWTH
-
     if observable == "contact_area":
         return np.asarray(trace.W / trace.W[0] * (1 + AREA_GROWTH * trace.state("ln_phi")))
     if observable == "slip":
@@ -141,8 +139,6 @@ class Work:
 
 def measure(work: Work, job: Job, observed: Array, observable: str) -> Array | None:
     """Return an observable through its gauge, None where it reads exactly; each run and each observable has its own noise."""
-    from srfcli.data.noise import measured
-
     gauge = work.gauges.get(observable, Gauge())
     if not (gauge.noise or gauge.quantum):
         return None
@@ -178,8 +174,6 @@ class SimulationResult(Result):
     @cached_property
     def table(self) -> Table:
         """Return the records one below the other, a row for each sample: what was imposed, how it slid, what was recorded."""
-        from srfcli.data.values import OBSERVABLES
-
         model, jobs = self.work.model, self.work.jobs
         named = any(job.run is not None for job in jobs)
         gauge = any(r.measured is not None for r in self.records)
@@ -207,24 +201,35 @@ class SimulationResult(Result):
         return Table("srf.simulate/1", columns, Rows(blocks), model.title, notes, self.work.parameters, meta, self.worst.value)
 
     def plot(self, ax: Axes | None = None) -> Figure:
-        """Return the records over time: observable, friction, velocities and load, a panel for each."""
-        import numpy as np
+        """Return the records over time (s): one as panels above each other, several one to a row.
 
-        from srfcli.results.figures import traces
-        from srfcli.results.plots import titled
-
+        A recording, or a gauge's readings, are drawn behind the simulated observable. Velocities are on a logarithmic axis, on
+        which a drive that stands still has no place.
+        """
         own_figure(ax, "a simulation")
-        drawn = []
-        for r in self.records:
-            n, trace = r.done, r.trace
-            record = {"name": r.job.name, "t": trace.t[:n], "observable": r.job.observable, "mu": trace.mu[:n]}
-            record |= {"observed": r.observed[:n], "v": trace.v[:n], "V": trace.V[:n], "W": trace.W[:n]}
-            if r.job.run is not None:
-                record["recorded"] = np.where(r.job.run.used, r.job.run.observed, np.nan)[:n]
-            elif r.measured is not None:
-                record["measured"] = r.measured[:n]
-            drawn.append(record)
-        return traces(drawn, title=titled(self.work.model.title, self.work.parameters))
+        alone = len(self.records) == 1
+        panels = [_observable, _velocities, _load]
+        if alone and self.records[0].job.observable != "friction":
+            panels.insert(1, _friction)
+        with plots.house_style():
+            if alone:
+                figure = plots.bare_figure((6.4, 1.55 * len(panels) + 0.7))
+                axes = figure.subplots(len(panels), 1, sharex="col", squeeze=False).T
+            else:
+                figure = plots.bare_figure((11.0, 1.7 * len(self.records) + 0.8))
+                axes = figure.subplots(len(self.records), 3, sharex="row", squeeze=False)
+            for row, record in zip(axes, self.records, strict=True):
+                for draw, ax in zip(panels, row, strict=True):
+                    draw(ax, record)
+                if not alone:
+                    row[0].set_title(plots.name_text(record.job.name))
+            columns = axes if alone else axes.T
+            for column in columns:
+                column[-1].set_xlabel("time  [s]")
+                figure.align_ylabels(column)
+            plots.heading(figure, self._figure_title)
+            _names(figure, axes.ravel())
+            return figure
 
 
 class Rows(Sequence[tuple[Any, ...]]):
@@ -255,8 +260,6 @@ class Rows(Sequence[tuple[Any, ...]]):
 
 def _block(r: Record, ages: list[str], beside: list[str], *, named: bool, gauge: bool) -> tuple[tuple[Any, ...], Sequence[Array]]:
     """Return the cells that lead each row of a record, and the columns that follow."""
-    import numpy as np
-
     n, trace = r.done, r.trace
     with np.errstate(over="ignore"):
         states = [np.exp(trace.state(name)) for name in ages]
@@ -273,10 +276,6 @@ def _block(r: Record, ages: list[str], beside: list[str], *, named: bool, gauge:
 
 def summary(r: Record, *, named: bool) -> list[str]:
     """Return sentences about one record: the range of v, stick-slip under each steady drive, distance from a recording."""
-    import numpy as np
-
-    from srfcli.data.values import OBSERVABLES
-
     n, trace, lead = r.done, r.trace, f"{r.job.name}: " if named else ""
     if n == 0:
         return [f"{lead}nothing of the record was reached: {trace.status.advice}"]
@@ -295,8 +294,6 @@ def summary(r: Record, *, named: bool) -> list[str]:
 
 def _oscillations(r: Record) -> list[str]:
     """Return a sentence for each stretch of constant drive that is long enough to tell, if any oscillates."""
-    from srfcli.motion.simulate import stick_slip
-
     n, trace = r.done, r.trace
     sentences, steady = [], 0
     for a, b, V in _stretches(r.job, trace.t[:n]):
@@ -318,8 +315,6 @@ def _oscillations(r: Record) -> list[str]:
 
 def _stretches(job: Job, t: Array) -> Iterator[tuple[int, int, float]]:
     """Yield (first, end, V) of the samples between changes of drive and load where V is constant and forward."""
-    import numpy as np
-
     changes = [*job.drive.breaks, *(job.load.breaks if len(job.load.breaks) <= MANY_BREAKS else ())]
     cuts = np.unique([0, *np.searchsorted(t, changes), t.size]).tolist()
     for a, b in pairwise(cuts):
@@ -330,10 +325,6 @@ def _stretches(job: Job, t: Array) -> Iterator[tuple[int, int, float]]:
 
 def _simulated_run(work: Work, r: Record) -> Run:
     """Return the run as a recording of the simulation; what the repeated run says beside the observable is kept."""
-    import numpy as np
-
-    from srfcli.data.values import Run, Signal
-
     observed = r.observed if r.measured is None else r.measured
     job, used = r.job, np.ones(observed.size, bool)
     quantum = {name: work.gauges.get(name, Gauge()).quantum for name in (job.observable, *job.beside)}
@@ -349,3 +340,66 @@ def _simulated_run(work: Work, r: Record) -> Run:
         job.name, Path(f"{job.name}.csv"), False, 0.0, initial, job.t, observed, job.observable, used, job.drive,
         job.load, K, job.modulation, quantum[job.observable], (), others=others,
     )  # fmt: skip
+
+
+# Figures of records over time: friction, elongation, velocities and load, simulated and recorded.
+
+RECORDED = "#8A8A8A"
+LABELS = {"elongation": "u  [µm]", "force": "force  [N]", "friction": "friction"}
+
+
+def _names(figure: Figure, axes: Iterable[Axes]) -> None:
+    """Name every kind of curve once, below the panels."""
+    found: dict[str, Any] = {}
+    for ax in axes:
+        for handle, name in zip(*ax.get_legend_handles_labels(), strict=True):
+            found.setdefault(name, handle)
+    plots.names_below(figure, list(found.values()), list(found))
+
+
+def _observable(ax: Axes, record: Record) -> None:
+    run, beside = record.job.run, {}
+    if run is not None:
+        beside = {"recorded": np.where(run.used, run.observed, np.nan)}
+    elif record.measured is not None:
+        beside = {"measured": record.measured}
+    for name, values in beside.items():
+        _line(ax, record, values, RECORDED, label=name, width=2.2)
+    _line(ax, record, record.observed, plots.QUANTITY["u"], label="simulated" if beside else None)
+    ax.set_ylabel(LABELS[record.job.observable])
+
+
+def _friction(ax: Axes, record: Record) -> None:
+    _line(ax, record, record.trace.mu, plots.QUANTITY["mu"])
+    ax.set_ylabel("µ")
+
+
+def _velocities(ax: Axes, record: Record) -> None:
+    v, V = (np.where(x > 0, x, np.nan) for x in (record.trace.v, record.trace.V))
+    _line(ax, record, v, plots.QUANTITY["v"], label="slip velocity v")
+    _line(ax, record, V, plots.QUANTITY["V"], label="driving velocity V", dash=plots.DASHES[1], width=1.1)
+    ax.set_yscale("log")
+    ax.set_ylabel("velocity  [µm/s]")
+    low, high = (f(v[: record.done], initial=end) for f, end in ((np.nanmin, np.inf), (np.nanmax, -np.inf)))
+    if high < 1.02 * low:
+        ax.set_ylim(low / 2, high * 2)  # steady sliding is a level line, not the noise of integration
+    plots.decade_ticks(ax)
+
+
+def _load(ax: Axes, record: Record) -> None:
+    W = record.trace.W[: record.done]
+    _line(ax, record, W, plots.QUANTITY["W"])
+    if np.ptp(W) < 1e-6 * W.max():
+        ax.set_ylim(0.9 * W.min(), 1.1 * W.max())
+    ax.set_ylabel("W  [N]")
+
+
+def _line(
+    ax: Axes, record: Record, values: Array, colour: str, *, label: str | None = None, dash: Any = "-", width: float = 1.4
+) -> None:
+    """Draw what was reached of a record."""
+    t, y = envelope(record.trace.t[: record.done], values[: record.done])
+    ax.plot(t, y, color=colour, label=label, linestyle=dash, linewidth=width)
+    ax.margins(x=0.0, y=0.08)
+    if ax.get_yscale() == "linear":
+        ax.ticklabel_format(axis="y", useOffset=False)

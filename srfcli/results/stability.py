@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from srfcli.core.errors import Status, worst
+from srfcli.numerics.hopf import critical_point
+from srfcli.results import plots
+from srfcli.results.figures import gains
 from srfcli.results.tables import STATUS, Column, Result, Table, own_figure
 
 if TYPE_CHECKING:
@@ -70,14 +76,11 @@ class LinearResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the critical K/W0 (1/um) over the first parameter that was swept, a curve for each value of the others."""
-        from srfcli.results import plots
-
         (x, values), *others = self.over.items()
         unit = {q.name: q.unit for q in self.system.model.parameters}
-        title = plots.titled(self.table.title, self.table.parameters)
         if x == "V" and not others:
             curve = {k: [row.get(k) for row in self.points] for k in ("V", "K_over_W0")}
-            return plots.stability_diagram([], hopf=curve, title=title, ax=ax)
+            return plots.stability_diagram([], hopf=curve, title=self._figure_title, ax=ax)
         groups: dict[str, list[Mapping[str, Any]]] = {}
         for row in self.points:
             name = ", ".join(plots.valued(n, row[n], unit[n]) for n, _ in others)
@@ -89,7 +92,7 @@ class LinearResult(Result):
             plots.axis_label(x, unit[x]),
             "critical K/W$_0$  [1/µm]",
             logx=spread(values),
-            title=title,
+            title=self._figure_title,
             ax=ax,
         )
 
@@ -138,8 +141,6 @@ class ResponseResult(Result):
     @cached_property
     def table(self) -> Table:
         """Return gain and phase of each quantity, a row for each value; notes say where they resonate."""
-        import numpy as np
-
         from srfcli.numerics.response import resonance
 
         found, status = self.response, self.response.status
@@ -170,14 +171,10 @@ class ResponseResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return gain and phase of each quantity over the parameter that was swept."""
-        from srfcli.results import plots
-        from srfcli.results.figures import gains
-
         own_figure(ax, "a response")
         drawn = {label: getattr(self.response, name) for name, (_, _, label) in QUANTITIES.items()}
-        title = plots.titled(self.table.title, self.table.parameters)
         label = plots.axis_label(self.name, _swept(self.system, self.name).unit)
-        return gains(self.values, drawn, xlabel=label, logx=spread(self.values), title=title)
+        return gains(self.values, drawn, xlabel=label, logx=spread(self.values), title=self._figure_title)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -231,14 +228,11 @@ class MeanFrictionResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the drop of the mean friction force over the parameter that was swept, a curve for each amplitude."""
-        from srfcli.results import plots
-
         curves = [found.drop.tolist() for found in self.means.values()]
         names = [f"ε = {eps:g}" for eps in self.means]
         label = plots.axis_label(self.name, _swept(self.system, self.name).unit)
         ylabel = "drop of the mean friction force / W$_0$"
-        title = plots.titled(self.table.title, self.table.parameters)
-        return plots.lines(self.values, curves, names, label, ylabel, spread(self.values), title=title, ax=ax)
+        return plots.lines(self.values, curves, names, label, ylabel, spread(self.values), title=self._figure_title, ax=ax)
 
 
 def _swept(system: SlidingSystem, name: str) -> Column:
@@ -272,8 +266,6 @@ class PeriodicResult(Result):
     @cached_property
     def table(self) -> Table:
         """Return a row for each multiplier, largest modulus first; `meta` has friction and harmonics."""
-        import numpy as np
-
         r, model, parameters = self.state, self.system.model, self.system.described()
         f = float(r.p[model.index("f")])
         columns = (
@@ -304,9 +296,11 @@ class PeriodicResult(Result):
             "intervals": intervals,
             "liouville": r.liouville,
         }
+        known = not math.isnan(r.liouville)
+        compared = f"{r.liouville:.1g}" if known else "not compared: the fastest multiplier is far below rounding"
         notes = (
             f"{'stable' if r.stable else 'unstable'}; error of the multipliers {r.error:.1g} on {intervals} intervals, "
-            f"product of the multipliers against exp(integrated trace) {_checked(r.liouville)}",
+            f"product of the multipliers against exp(integrated trace) {compared}",
             f"mean friction {r.mean_friction:.8f}, shift from eps = 0 {r.friction_shift:+.8f}",
             "harmonics of u [um]: " + ", ".join(f"{k}: {abs(c):.4g}" for k, c in enumerate(r.u_harmonics)),
             "harmonics of mu: " + ", ".join(f"{k}: {abs(c):.4g}" for k, c in enumerate(r.mu_harmonics)),
@@ -315,10 +309,7 @@ class PeriodicResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return one period of elongation, slip velocity, ages, friction and load, a panel for each."""
-        import numpy as np
-
         from srfcli.numerics.floquet import waveforms
-        from srfcli.results import plots
 
         own_figure(ax, "a periodic state")
         r, model = self.state, self.system.model
@@ -333,10 +324,6 @@ class PeriodicResult(Result):
             tau, u=closed(waves.u), v=np.exp(column["ln_v"]), states=ages, mu=closed(waves.mu), W=closed(waves.W),
             title=title,
         )  # fmt: skip
-
-
-def _checked(mismatch: float) -> str:
-    return f"{mismatch:.1g}" if mismatch == mismatch else "not compared: the fastest multiplier is far below rounding"
 
 
 # Critical loads under modulation: points at given velocities, and the boundary as curves.
@@ -375,25 +362,10 @@ def boundary_row(
     """Return one boundary point under `boundary_columns`, the parameters `extra` in their declared units."""
     value = {n: point.value(model, n) for n in ("eps", "V", "K", "W0")}
     width = point.error * value["W0"]
-    return (
-        value["eps"],
-        component,
-        crossing,
-        point.kind,
-        value["V"],
-        value["K"] / value["W0"],
-        value["W0"],
-        *(model.declared(n, point.value(model, n)) for n in extra),
-        point.theta,
-        point.status.value,
-        value["W0"] - width,
-        value["W0"] + width,
-        point.error,
-        point.residual,
-        point.slope,
-        point.others,
-        point.orbit.x.shape[-2],
-    )
+    own = (model.declared(n, point.value(model, n)) for n in extra)
+    place = (value["eps"], component, crossing, point.kind, value["V"], value["K"] / value["W0"], value["W0"], *own)
+    bracket = (point.theta, point.status.value, value["W0"] - width, value["W0"] + width)
+    return (*place, *bracket, point.error, point.residual, point.slope, point.others, point.orbit.x.shape[-2])
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -429,11 +401,29 @@ class CriticalResult(Result):
         return Table("srf.critical/1", BOUNDARY_COLUMNS, rows, model.title, self.said, described, status=self.worst.value)
 
     def plot(self, ax: Axes | None = None) -> Figure:
-        """Return the critical K/W0 (1/um) against V (um/s), a mark for each crossing."""
-        from srfcli.results import plots
+        """Return the critical K/W0 (1/um) against V (um/s): marks, full where stability is lost as W0 rises, else open.
 
+        Crossings of one number and amplitude are joined by a thin line for the eye.
+        """
         points = self.table.records()
-        return plots.critical_points(points, title=plots.titled(self.table.title, self.table.parameters), ax=ax)
+        order = list(dict.fromkeys(p["eps"] for p in points))
+        with plots.one_panel(ax, title=self._figure_title) as (figure, ax):
+            ax.set_xscale("log")
+            for eps, crossing in sorted({(p["eps"], p["crossing"]) for p in points}):
+                mine = sorted((p for p in points if (p["eps"], p["crossing"]) == (eps, crossing)), key=lambda p: p["V"])
+                index, lost = order.index(eps), crossing % 2 == 1
+                style = plots.curve_style(index)
+                name = f"ε = {eps:g}: stability is {'lost' if lost else 'regained'} as W$_0$ rises"
+                ax.plot(
+                    [p["V"] for p in mine], [p["K_over_W0"] for p in mine], **style, linewidth=0.7, marker="os^Dv<>"[index % 7],
+                    markersize=5.5, markerfacecolor=style["color"] if lost else "white", label=name if crossing < 3 else None,
+                    clip_on=False, zorder=3,
+                )  # fmt: skip
+            ax.set(xlabel="V  [µm/s]", ylabel="critical K/W$_0$  [1/µm]")
+            ax.margins(x=0.06)
+            ax.set_ylim(0.0, 1.12 * max((p["K_over_W0"] for p in points), default=1.0))
+            plots.decade_ticks(ax)
+            return figure
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -482,25 +472,21 @@ class BoundaryResult(Result):
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Return the boundary in its plane; against V and K/W0 with that under constant load, and stable sliding shaded."""
-        import numpy as np
-
-        from srfcli.numerics.hopf import critical_point
-        from srfcli.results import plots
-
-        model, title = self.system.model, plots.titled(self.table.title, self.table.parameters)
+        model, title = self.system.model, self._figure_title
         if not self.boundaries:
             return plots.stability_diagram([], title=title, ax=ax)
         plane, usual = self.boundaries[0].plane, self._axes == ("V", "W0")
+
+        def height(q: BoundaryPoint) -> float:
+            if usual:
+                return q.value(model, "K") / q.value(model, "W0")
+            return model.declared(plane.y.name, q.value(model, plane.y.name))
+
         branches = [
             {
                 "eps": float(boundary.plane.base[model.index("eps")]),
                 "V": [model.declared(plane.x.name, q.value(model, plane.x.name)) for q in branch.points],
-                "K_over_W0": [
-                    q.value(model, "K") / q.value(model, "W0")
-                    if usual
-                    else model.declared(plane.y.name, q.value(model, plane.y.name))
-                    for q in branch.points
-                ],
+                "K_over_W0": list(map(height, branch.points)),
                 "label": "boundary" if "eps" in self._axes else None,
             }
             for boundary in self.boundaries
@@ -508,10 +494,14 @@ class BoundaryResult(Result):
         ]
         if not usual:
             unit = {q.name: q.unit for q in model.parameters}
-            xlabel, ylabel = (plots.axis_label(a, unit[a]) for a in self._axes)
-            return plots.boundaries(
-                branches, xlabel=xlabel, ylabel=ylabel, logx=plane.x.log, logy=plane.y.log, title=title, ax=ax
-            )
+            with plots.one_panel(ax, title=title) as (figure, ax):
+                ax.set_xscale("log" if plane.x.log else "linear")
+                ax.set_yscale("log" if plane.y.log else "linear")
+                plots.draw_branches(ax, branches)
+                xlabel, ylabel = (plots.axis_label(a, unit[a]) for a in self._axes)
+                ax.set(xlabel=xlabel, ylabel=ylabel)
+                plots.decade_ticks(ax)
+                return figure
         velocities = np.geomspace(plane.x.lo, plane.x.hi, 80)
         hopf = []
         for velocity in velocities:

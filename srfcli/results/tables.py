@@ -21,7 +21,6 @@ from srfcli.core.errors import SrfError, Status, printable
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from rich.table import Table as RichTable
 
 STATUS = "ok, or what keeps the row from being used as it stands"
 
@@ -103,17 +102,14 @@ def cell_text(value: Any, format: str | None = None) -> str:
         return "-"
     if isinstance(simple, bool):
         return "yes" if simple else "no"
+    if isinstance(simple, float) and not format:
+        return repr(float(f"{simple:.12g}"))
     if isinstance(simple, float):
-        return format_number(simple, format) if format else repr(float(f"{simple:.12g}"))
+        try:
+            return f"{simple:{format}}"
+        except ValueError:  # a format for something else than a number
+            return repr(simple)
     return printable(" ".join(str(simple).split()))
-
-
-def format_number(value: float, format: str) -> str:
-    """Return `value` in `format`; a format for something else than a number shows it in full."""
-    try:
-        return f"{value:{format}}"
-    except ValueError:
-        return repr(value)
 
 
 def to_text(table: Table, *, full: bool = True) -> str:
@@ -137,7 +133,9 @@ def is_numeric(table: Table, index: int) -> bool:
 
 def print_terminal(table: Table, stream: TextIO) -> None:
     """Print the table with rich; as plain text where it is wider than the terminal, so that nothing is cut."""
+    from rich import box
     from rich.console import Console
+    from rich.table import Table as RichTable
     from rich.text import Text
 
     text = to_text(table, full=False)
@@ -150,24 +148,16 @@ def print_terminal(table: Table, stream: TextIO) -> None:
         return
     if table.title:
         console.print(Text(printable(table.title), style="bold"))
-    if table.columns:
-        console.print(_rich_table(table))
-    for note in table.notes:
-        console.print(Text.assemble(("Note: ", "bold"), printable(note, line=True)))
-
-
-def _rich_table(table: Table) -> RichTable:
-    from rich import box
-    from rich.table import Table as RichTable
-    from rich.text import Text
-
     made = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
     for index, column in enumerate(table.columns):
         made.add_column(Text(column.heading), justify="right" if is_numeric(table, index) else "left", no_wrap=True)
     for row in table.rows:
         # Text, not str: rich would read square brackets in a cell as markup
         made.add_row(*(Text(cell_text(v, c.format)) for v, c in zip(row, table.columns, strict=True)))
-    return made
+    if table.columns:
+        console.print(made)
+    for note in table.notes:
+        console.print(Text.assemble(("Note: ", "bold"), printable(note, line=True)))
 
 
 # A result as a record for programs: CSV by bare column names, and JSON in an envelope.
@@ -178,18 +168,11 @@ def to_csv(table: Table) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow([printable(c.name) for c in table.columns])
-    text = cache(_csv_cell)  # words recur in long tables; csv itself writes finite numbers in full
+    text, plain = cache(_csv_cell), {float, int}  # words recur in long tables; csv itself writes finite numbers in full
     for row in table.rows:
-        writer.writerow(
-            [
-                v
-                if (type(v) is float and -math.inf < v < math.inf) or type(v) is int
-                else text(v)
-                if type(v) is str
-                else _csv_cell(v)
-                for v in row
-            ]
-        )
+        # most cells of a long table are numbers: no function is called for them
+        own = [v if type(v) in plain and -math.inf < v < math.inf else text(v) if type(v) is str else _csv_cell(v) for v in row]
+        writer.writerow(own)
     return buffer.getvalue()
 
 
@@ -212,7 +195,6 @@ def json_text(data: Any, *, indent: int | None = None) -> str:
 
 def envelope(table: Table) -> dict[str, Any]:
     """Return the table as plain data, each row as name -> value, with its schema, parameters and status."""
-    names = [c.name for c in table.columns]
     return {
         "schema": table.schema,
         "version": __version__,
@@ -220,7 +202,7 @@ def envelope(table: Table) -> dict[str, Any]:
         "status": table.status,
         "parameters": plain_value(table.parameters),
         "columns": {c.name: {"unit": c.unit, "about": c.about} for c in table.columns},
-        "rows": [dict(zip(names, map(plain_value, row), strict=True)) for row in table.rows],
+        "rows": plain_value(table.records()),
         "notes": list(table.notes),
         **({"meta": plain_value(table.meta)} if table.meta else {}),
     }
@@ -278,6 +260,13 @@ class Result(ABC):
     def parameters(self) -> Mapping[str, Mapping[str, Any]]:
         """Return name -> {value, unit, origin} of every parameter that was not swept."""
         return self.table.parameters
+
+    @property
+    def _figure_title(self) -> str:
+        """Return the title, and the parameters that were not swept, as a figure shows them."""
+        from srfcli.results.plots import titled
+
+        return titled(self.table.title, self.table.parameters)
 
     def to_dataframe(self) -> Any:
         """Return the table as a pandas.DataFrame; `attrs` holds units, title, notes and status.

@@ -23,9 +23,10 @@ from srfcli.data.writing import stiffness_text
 from srfcli.inference.prediction import of_run
 from srfcli.laws.law_file import RESERVED
 from srfcli.laws.registry import Registry
+from srfcli.motion import STEP_RISE
 from srfcli.motion import simulate as integrate
 from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, ModulatedLoad, Modulation
-from srfcli.results.simulation import STEP_RISE, Gauge, Job, Record, SimulationResult, Work, measure, observe
+from srfcli.results.simulation import Gauge, Job, Record, SimulationResult, Work, measure, observe
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
