@@ -29,7 +29,7 @@ from pathlib import Path
 from types import CodeType
 
 from srfcli.core.errors import SrfError
-from srfcli.core.files import read_plain
+from srfcli.core.files import read_plain, write_atomic
 
 PREFIX = "# seal "
 SECRET = 32  # bytes
@@ -52,7 +52,7 @@ def cache_folder() -> Path | None:
     if named == "":
         return None
     try:
-        folder = Path(named) if named else _base("XDG_CACHE_HOME", ".cache") / "srf"
+        folder = Path(named) if named else user_base("XDG_CACHE_HOME", ".cache") / "srf"
         _secret()
         return _own_folder(folder)
     except _RefusedError as error:
@@ -83,8 +83,8 @@ def cached_source(key: str, build: Callable[[], str]) -> str:
     if found is not None:
         return found
     source = build()
-    with contextlib.suppress(OSError):
-        _write(path, source)
+    with contextlib.suppress(OSError, SrfError):
+        write_atomic(path, f"{PREFIX}{seal(path.name, source.encode())}\n{source}")
     return source
 
 
@@ -110,20 +110,7 @@ def _read(path: Path) -> str | None:
     return body
 
 
-def _write(path: Path, source: str) -> None:
-    """Store a text in one step: a reader sees the whole entry or none, and of two writers the later one wins."""
-    data = source.encode()
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem[:12]}-", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(f"{PREFIX}{seal(path.name, data)}\n".encode() + data)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
-def _base(variable: str, below: str) -> Path:
+def user_base(variable: str, below: str) -> Path:
     """Return a folder of the user's as the XDG specification places it: a relative one does not count."""
     named = Path(os.environ.get(variable, ""))
     return named if named.is_absolute() else Path.home() / below
@@ -152,7 +139,7 @@ def _own_folder(folder: Path) -> Path:
 
 def _secret() -> bytes:
     """Return the user's secret, made at the first call; raises _RefusedError for one that others can read or have made."""
-    folder = _base("XDG_STATE_HOME", ".local/state") / "srf"
+    folder = user_base("XDG_STATE_HOME", ".local/state") / "srf"
     path = _own_folder(folder) / "cache.key"
     if not os.path.lexists(path):
         _make_secret(path)

@@ -51,16 +51,13 @@ class SrfError(Exception):
     "no file", "unknown name", "no contact", "unit" where the hint says what unit would do.
     """
 
-    exit_code = 2
-
-    def __init__(self, message: str, hint: str | None = None, *, exit_code: int | None = None, kind: str = "") -> None:
+    def __init__(self, message: str, hint: str | None = None, *, exit_code: int = 2, kind: str = "") -> None:
         message, hint = printable(shortened(message)), hint and printable(shortened(hint))
         super().__init__(message)
         self.message = message
         self.hint = hint
+        self.exit_code = exit_code
         self.kind = kind
-        if exit_code is not None:
-            self.exit_code = exit_code
 
 
 class ExpressionError(SrfError):
@@ -110,46 +107,39 @@ class Notice:
 class Status(Enum):
     """How a numerical result ended; `advice` is a sentence with a way out."""
 
-    OK = "ok"
-    NO_CONVERGENCE = "no-convergence"
-    TOLERANCE = "tolerance-not-met"
-    MAX_STEPS = "max-steps"
-    STEP_TOO_SMALL = "step-too-small"
-    LEFT_WINDOW = "left-window"
-    CLOSED = "closed"
-    NO_HOPF = "no-hopf"
-    UNSETTLED = "window-not-settled"
-    INTEGRATION = "integration-stopped"
-    NO_VALUE = "no-value"
-    EVALUATIONS = "max-evaluations"
-    INTERRUPTED = "interrupted"
+    advice: str
 
-    @property
-    def advice(self) -> str:
-        """Return one sentence that says what happened and what to try."""
-        return _ADVICE[self]
+    OK = "ok", "Converged."
+    NO_CONVERGENCE = "no-convergence", "Newton's method did not converge; start nearer, or raise `max_mesh` or lower eps first."
+    TOLERANCE = "tolerance-not-met", "The estimated error is above the tolerance on the finest mesh allowed; raise `max_mesh`."
+    MAX_STEPS = "max-steps", "The curve was cut at the step limit; raise `max_steps`."
+    STEP_TOO_SMALL = "step-too-small", "The step along the curve fell below its minimum; a singular point is near."
+    LEFT_WINDOW = "left-window", "The curve left the window that was asked for."
+    CLOSED = "closed", "The curve returned to its start."
+    NO_HOPF = "no-hopf", "Velocity strengthening: no Hopf bifurcation."
+    UNSETTLED = (
+        "window-not-settled",
+        "Crossings may lie beyond the loads looked at; look there with another `window`, or with W0 in `over`.",
+    )
+    INTEGRATION = (
+        "integration-stopped",
+        "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
+    )
+    NO_VALUE = "no-value", "A formula has no value where a parameter is 0 or at the end of its range; leave that out."
+    EVALUATIONS = "max-evaluations", "The fit was cut at its limit of evaluations; raise `max_evaluations`, or start nearer."
+    INTERRUPTED = "interrupted", "what was finished is kept."
+
+    def __new__(cls, value: str, advice: str = "") -> Status:
+        """Return the member of this value, with its advice."""
+        member = object.__new__(cls)
+        member._value_ = value
+        member.advice = advice
+        return member
 
     @property
     def ok(self) -> bool:
         """True where the numbers can be used as they stand."""
         return self in (Status.OK, Status.LEFT_WINDOW, Status.CLOSED)
-
-
-_ADVICE = {
-    Status.OK: "Converged.",
-    Status.NO_CONVERGENCE: "Newton's method did not converge; start nearer, or raise `max_mesh` or lower eps first.",
-    Status.TOLERANCE: "The estimated error is above the tolerance on the finest mesh allowed; raise `max_mesh`.",
-    Status.MAX_STEPS: "The curve was cut at the step limit; raise `max_steps`.",
-    Status.STEP_TOO_SMALL: "The step along the curve fell below its minimum; a singular point is near.",
-    Status.LEFT_WINDOW: "The curve left the window that was asked for.",
-    Status.CLOSED: "The curve returned to its start.",
-    Status.NO_HOPF: "Velocity strengthening: no Hopf bifurcation.",
-    Status.UNSETTLED: "Crossings may lie beyond the loads looked at; look there with another `window`, or with W0 in `over`.",
-    Status.INTEGRATION: "Time integration stopped before the end of the record; look at the motion there, or loosen rtol.",
-    Status.NO_VALUE: "A formula has no value where a parameter is 0 or at the end of its range; leave that out.",
-    Status.EVALUATIONS: "The fit was cut at its limit of evaluations; raise `max_evaluations`, or start nearer.",
-    Status.INTERRUPTED: "what was finished is kept.",
-}
 
 
 def worst(statuses: Iterable[Status]) -> Status:

@@ -13,11 +13,11 @@ import io
 import json
 import os
 import re
+import secrets
 import shutil
 import signal
 import stat
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,13 +34,10 @@ TEXT = 4 * 2**20  # bytes of a law, of settings or of an answer
 DEEPEST_KEYS = 32  # keys of one name: each costs all that stand before it
 _LONG_KEY = re.compile(rf"""(?<![\w."'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{DEEPEST_KEYS}}}""")
 
-_KINDS = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a FIFO"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-    (stat.S_ISSOCK, "a socket"),
-)
+_KINDS = {
+    stat.S_IFDIR: "a folder", stat.S_IFIFO: "a FIFO", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}  # fmt: skip
 
 
 def check_plain(path: Path) -> os.stat_result:
@@ -50,7 +47,7 @@ def check_plain(path: Path) -> os.stat_result:
     """
     found = path.stat()
     if not stat.S_ISREG(found.st_mode):
-        kind = next((name for is_kind, name in _KINDS if is_kind(found.st_mode)), "no regular file")
+        kind = _KINDS.get(stat.S_IFMT(found.st_mode), "no regular file")
         hint = "Name a file in it." if kind == "a folder" else "Name a file; save first what comes through a pipe."
         raise SrfError(f"no file {path}, but {kind}", hint, kind="no file")
     # said to be files; reading may wait or fail
@@ -105,7 +102,8 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 def toml_lines(table: Mapping[str, Any]) -> list[str]:
     """Return a table as lines of TOML, one `key = value` for each entry."""
-    return [f"{_toml_key(key)} = {toml_value(value)}" for key, value in table.items()]
+    keys = [key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key) for key in table]
+    return [f"{key} = {toml_value(value)}" for key, value in zip(keys, table.values(), strict=True)]
 
 
 def toml_value(value: object) -> str:
@@ -119,10 +117,6 @@ def toml_value(value: object) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(toml_value, value))}]"
     return repr(value)
-
-
-def _toml_key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
 
 
 def parse_json(text: str | bytes, where: object) -> Any:
@@ -160,7 +154,9 @@ def write_files(contents: Mapping[Path, bytes | None]) -> None:
             with _told(target):
                 part = held.enter_context(_part(target)) if data is not None else None
                 if part is not None and data is not None:
-                    _fill(part, data, _mode(target))
+                    _fill(part, data)
+                    if target.exists():
+                        part.chmod(stat.S_IMODE(target.stat().st_mode))
                 parts.append((part, target))
         moves = {(part or target).name: target.name if part else None for part, target in parts}
         with _told(targets[0]), _uninterrupted():
@@ -168,7 +164,7 @@ def write_files(contents: Mapping[Path, bytes | None]) -> None:
                 only.replace(targets[0])
                 return
             note = held.enter_context(_part(targets[0]))
-            _fill(note, json.dumps(moves).encode(), 0o600)
+            _fill(note, json.dumps(moves).encode())
             note.replace(_note(targets[0]))
             for part, target in parts:
                 target.unlink(missing_ok=True) if part is None else part.replace(target)
@@ -245,13 +241,9 @@ def _note(target: Path) -> Path:
 
 def _parts(target: Path) -> list[Path]:
     """Return the parts of `target` and of its sidecar."""
-    names = (f".{target.name}.", f".{target.name}{SIDECAR}.")
+    part = re.compile(rf"\.{re.escape(target.name)}(?:{re.escape(SIDECAR)})?\.[^.]*\.part")
     with contextlib.suppress(OSError):
-        return [
-            p
-            for p in target.parent.iterdir()
-            if p.name.endswith(".part") and any(p.name.startswith(n) and "." not in p.name[len(n) : -5] for n in names)
-        ]
+        return [p for p in target.parent.iterdir() if part.fullmatch(p.name)]
     return []
 
 
@@ -269,12 +261,11 @@ def _move_on(target: Path, moves: Mapping[Any, Any]) -> None:
 def _part(target: Path, *, folder: bool = False) -> Iterator[Path]:
     """Give a locked part beside `target`, and remove what is left of it in the end."""
     while True:
+        part = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
         if folder:
-            part = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part"))
+            part.mkdir(0o700)
         else:
-            handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-            os.close(handle)
-            part = Path(name)
+            part.touch(0o600 if target.exists() else 0o666, exist_ok=False)
         lock = _locked(part)
         if lock is not None:  # else another process took it for that of a dead one before it was locked
             break
@@ -309,20 +300,11 @@ def _locked(place: Path) -> contextlib.ExitStack | None:
     return held
 
 
-def _fill(part: Path, data: bytes, mode: int) -> None:
+def _fill(part: Path, data: bytes) -> None:
     with part.open("r+b") as stream:
         stream.write(data)
         stream.flush()
         os.fsync(stream.fileno())
-    part.chmod(mode)  # mkstemp's 0600 would hide a result from its group
-
-
-def _mode(target: Path) -> int:
-    if target.exists():
-        return stat.S_IMODE(target.stat().st_mode)
-    mask = os.umask(0)
-    os.umask(mask)
-    return 0o666 & ~mask
 
 
 @contextmanager

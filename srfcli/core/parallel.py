@@ -80,7 +80,9 @@ def run_processes(
         while done < len(tasks):
             for worker in crew:
                 if worker.index is None and waiting:
-                    _give(worker, function, tasks, waiting.popleft())
+                    worker.index = waiting.popleft()
+                    with contextlib.suppress(OSError):  # it died while idle: its sentinel says so
+                        worker.pipe.send((function, tasks[worker.index]))
             ready = wait([end for w in crew if w.index is not None for end in (w.pipe, w.process.sentinel)])
             for place, worker in enumerate(crew):
                 if worker.index is None or not {worker.pipe, worker.process.sentinel} & set(ready):
@@ -101,23 +103,17 @@ def run_processes(
                         )
                     continue
                 index, worker.index = worker.index, None
-                if isinstance(answer, _Failure):
-                    raise answer.error
+                result, error = answer
+                if error is not None:
+                    raise error
                 done += 1
-                yield index, answer
+                yield index, result
     finally:
         for worker in crew:
             worker.process.terminate()
             worker.pipe.close()
         for worker in crew:
             worker.process.join()
-
-
-@dataclass
-class _Failure:
-    """What a task raised, sent back in place of its result."""
-
-    error: BaseException
 
 
 def _started() -> _Worker:
@@ -139,14 +135,8 @@ def _started() -> _Worker:
     return _Worker(process, ours)
 
 
-def _give(worker: _Worker, function: Callable[[Any], Any], tasks: Sequence[Any], index: int) -> None:
-    worker.index = index
-    with contextlib.suppress(OSError):  # it died while idle: its sentinel says so
-        worker.pipe.send((function, tasks[index]))
-
-
 def _answer(worker: _Worker) -> Any:
-    """Return what a worker sent, or None where it died first."""
+    """Return the result that a worker sent, or None, and what its task raised, or None; None alone where it died first."""
     with contextlib.suppress(EOFError, OSError):
         if worker.pipe.poll():
             return worker.pipe.recv()
@@ -165,11 +155,12 @@ def _work(pipe: Connection) -> None:
             function, task = pipe.recv()
         except (EOFError, OSError):
             return
+        answer: tuple[Any, Exception | None]
         try:
-            answer = function(task)
+            answer = function(task), None
         except Exception as error:
             error.add_note(traceback.format_exc())  # where in the worker it happened, for --debug
-            answer = _Failure(error)
+            answer = None, error
         try:
             pipe.send(answer)
         except OSError:
@@ -196,47 +187,31 @@ def run_cluster(function: Callable[[Task], Result], tasks: Sequence[Task], *, ad
     answers or has no workers, and where the workers at a task keep dying.
     """
     try:
-        from distributed import as_completed
+        from distributed import Client, KilledWorker, as_completed
     except ImportError as error:
         raise SrfError("--cluster needs dask.distributed, which is not installed", 'pip install "srfcli[cluster]"') from error
-    client = _connected(address)
-    try:
-        futures = {
-            client.submit(function, task, pure=False, retries=0, key=f"srf-{client.id}-{index}"): index
-            for index, task in enumerate(tasks)
-        }
-        for future in as_completed(list(futures), loop=client.loop):
-            yield futures[future], _result(future, futures[future])
-            future.release()
-    finally:
-        client.close(timeout=5)
-
-
-def _connected(address: str) -> Any:
-    """Return a client of the scheduler at `address`, which has at least one worker."""
-    from distributed import Client
-
     try:
         client = Client(address, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SrfError(
             f"--cluster {address}: no scheduler answers", "Start one with 'dask scheduler', and give the address it prints."
         ) from error
-    if not client.scheduler_info()["workers"]:
-        client.close(timeout=5)
-        raise SrfError(f"--cluster {address}: the scheduler has no workers", f"Start some: dask worker {address}")
-    return client
-
-
-def _result(future: Any, index: int) -> Any:
-    from distributed import KilledWorker
-
     try:
-        return future.result()
+        if not client.scheduler_info()["workers"]:
+            raise SrfError(f"--cluster {address}: the scheduler has no workers", f"Start some: dask worker {address}")
+        futures = {
+            client.submit(function, task, pure=False, retries=0, key=f"srf-{client.id}-{index}"): index
+            for index, task in enumerate(tasks)
+        }
+        for future in as_completed(list(futures), loop=client.loop):
+            yield futures[future], future.result()
+            future.release()
     except KilledWorker as error:
         raise SrfError(
-            f"task {index} ended one worker of the cluster after another", "Look at the workers' logs and their memory."
+            f"task {futures[future]} ended one worker of the cluster after another", "Look at the workers' logs and their memory."
         ) from error
+    finally:
+        client.close(timeout=5)
 
 
 # Finished tasks kept in a folder.

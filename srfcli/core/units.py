@@ -249,7 +249,7 @@ def _pint_registry() -> Any:
 
 # Dimensions of formulas: enough to see whether a law adds a length to a time.
 
-Dimension = tuple[Fraction, Fraction, Fraction]  # powers of um, s, N; an angle is a number
+Dimension = tuple[Fraction, ...]  # powers of um, s, N; an angle is a number
 NONE: Dimension = (Fraction(0), Fraction(0), Fraction(0))
 SYMBOL_UNITS = {"v": "um/s", "phi": "s", "mu": "1", "mu_dot": "1/s", "W": "N", "W_dot": "N/s", "F_dot_over_W": "1/s"}
 QUANTITY_UNITS = {"mu": "1", "rate": "1", "term": "1", "kappa": "N/um"}
@@ -257,13 +257,7 @@ QUANTITY_UNITS = {"mu": "1", "rate": "1", "term": "1", "kappa": "N/um"}
 
 def dimension(unit: str) -> Dimension:
     """Return the dimension of a unit in a formula; raises SrfError for no unit."""
-    um, s, newton, _ = find_unit(unit).powers
-    return Fraction(um), Fraction(s), Fraction(newton)
-
-
-def multiply(left: Dimension, right: Dimension, power: Fraction = Fraction(1)) -> Dimension:
-    """Return the dimension of left * right**power."""
-    return (left[0] + right[0] * power, left[1] + right[1] * power, left[2] + right[2] * power)
+    return tuple(map(Fraction, find_unit(unit).powers[:3]))
 
 
 def describe(powers: Sequence[int | Fraction]) -> str:
@@ -290,12 +284,10 @@ def dimension_of(expr: sympy.Expr, units: dict[str, Dimension]) -> Dimension:
                 raise SrfError(f"{first} and {term} [{describe(dimension)}] are added")
         return found[0][1]
     if isinstance(expr, sympy.Mul):
-        product = NONE
-        for term in expr.args:
-            product = multiply(product, dimension_of(term, units))
-        return product
+        factors = [dimension_of(term, units) for term in expr.args]
+        return tuple(sum(powers, Fraction(0)) for powers in zip(*factors, strict=True))
     if isinstance(expr, sympy.Pow) and expr.exp.is_Rational:
-        return multiply(NONE, dimension_of(expr.base, units), Fraction(int(expr.exp.p), int(expr.exp.q)))
+        return tuple(power * Fraction(int(expr.exp.p), int(expr.exp.q)) for power in dimension_of(expr.base, units))
     for argument in expr.args:  # functions, and powers with an exponent that varies
         dimension = dimension_of(argument, units)
         if dimension != NONE:

@@ -161,9 +161,10 @@ def _rising(place: Place, keep: Mask, hint: str | None) -> tuple[Mask, Mask, Mas
 
 def find_sampling(t: Array) -> Sampling:
     """Return the rates at which the rising times `t` (n,) were taken, and the gaps between them."""
+    from scipy.ndimage import median_filter, percentile_filter
+
     steps = np.diff(t)
-    usual = _local_median(steps)
-    level = np.log(usual)
+    level = np.log(median_filter(steps, size=min(2 * SHORTEST_RATE + 1, steps.size), mode="nearest"))
     jumps = np.flatnonzero(np.abs(np.diff(level)) > np.log(CHANGE)) + 1
     bounds = [0, *jumps.tolist(), steps.size]
     merged: list[list[int]] = []
@@ -179,11 +180,12 @@ def find_sampling(t: Array) -> Sampling:
             rates[-1] = Rate(rates[-1].first, b, float(np.median(steps[rates[-1].first : b])))
         else:
             rates.append(Rate(a, b, interval))
-    rates = [_trimmed(r, steps, rates[i - 1] if i else None) for i, r in enumerate(rates)]
-    rates = [Rate(r.first, rates[i + 1].first if i + 1 < len(rates) else r.last, r.interval) for i, r in enumerate(rates)]
+    edges = [_beginning(rate, before, steps) for before, rate in pairwise(rates)]
+    ends = pairwise([0, *edges, steps.size])
+    rates = [Rate(first, last, r.interval) for r, (first, last) in zip(rates, ends, strict=True)]
     allowed = np.repeat([r.interval for r in rates], [r.last - r.first for r in rates])
-    allowed = np.maximum(allowed, _spread(steps))
-    edges = [r.first for r in rates[1:]]
+    # with the 80th percentile of the intervals nearby uneven sampling does not count as gaps
+    allowed = np.maximum(allowed, percentile_filter(steps, 80, size=min(8 * SHORTEST_RATE + 1, steps.size), mode="nearest"))
     beside = np.zeros(steps.size, bool)
     for edge in edges:  # between two rates the slower one is no gap
         beside[max(edge - SHORTEST_RATE, 0) : edge + SHORTEST_RATE] = True
@@ -192,29 +194,14 @@ def find_sampling(t: Array) -> Sampling:
     return Sampling(tuple(rates), np.flatnonzero(gaps))
 
 
-def _trimmed(rate: Rate, steps: Array, before: Rate | None) -> Rate:
-    """Return the rate with its beginning corrected, which the running median of intervals misses by a few samples."""
-    if before is None:
-        return rate
+def _beginning(rate: Rate, before: Rate, steps: Array) -> int:
+    """Return the first sample of a rate, which the running median of intervals misses by a few samples."""
     middle = 0.5 * np.log(rate.interval / before.interval)
     near = np.arange(max(rate.first - SHORTEST_RATE, before.first), min(rate.first + SHORTEST_RATE, rate.last))
     new = np.abs(np.log(steps[near] / before.interval)) > abs(middle)
     # the split that puts most of the intervals on their own side
     score = np.cumsum(np.concatenate([[0], np.where(new, -1, 1)]))
-    return Rate(int(near[0] + int(np.argmax(score))), rate.last, rate.interval)
-
-
-def _local_median(steps: Array) -> Array:
-    from scipy.ndimage import median_filter
-
-    return np.asarray(median_filter(steps, size=min(2 * SHORTEST_RATE + 1, steps.size), mode="nearest"))
-
-
-def _spread(steps: Array) -> Array:
-    """Return the 80th percentile of the intervals nearby, so that uneven sampling does not count as gaps."""
-    from scipy.ndimage import percentile_filter
-
-    return np.asarray(percentile_filter(steps, 80, size=min(8 * SHORTEST_RATE + 1, steps.size), mode="nearest"))
+    return int(near[0]) + int(np.argmax(score))
 
 
 def sampling_notices(place: Place, sampling: Sampling) -> list[Notice]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -33,21 +33,6 @@ def open_source(path: Path, *, registry: Registry, format: str | None = None) ->
 
     Raises SrfError where the file is missing or empty, where no reader or more than one knows it, and for what readers refuse.
     """
-    head = _head(path)
-    reader = registry.reader(registry.find("reader", format)) if format else _sniffed(path, head, registry)
-    try:
-        found = reader.read(path)
-    except SrfError:
-        raise
-    except Exception as error:  # a reader is anybody's code, and the file anybody's bytes
-        raise _refusal(reader, path, error) from error
-    source = found if isinstance(found, Source) else _from_mapping(found, reader, path)
-    if not source.headings or not all(isinstance(h, str) for h in source.headings):
-        raise SrfError(f"{path}: the reader '{reader.name}' finds no columns", "Check the file, or name its kind.")
-    return replace(source, blocks=lambda columns: _guarded(source, columns, reader, path))
-
-
-def _head(path: Path) -> bytes:
     try:
         with open_plain(path) as stream:
             head = stream.read(SNIFFED)
@@ -61,14 +46,20 @@ def _head(path: Path) -> bytes:
         raise _unreadable(path, error) from None
     if not head:
         raise SrfError(f"{path}: the file is empty", "A recording has a line of headings and a line for each sample.")
-    return head
+    reader = registry.reader(registry.find("reader", format)) if format else _sniffed(path, head, registry)
+    with _reading(reader, path):
+        found = reader.read(path)
+    source = found if isinstance(found, Source) else _from_mapping(found, reader, path)
+    if not source.headings or not all(isinstance(h, str) for h in source.headings):
+        raise SrfError(f"{path}: the reader '{reader.name}' finds no columns", "Check the file, or name its kind.")
+    return replace(source, blocks=lambda columns: _guarded(source, columns, reader, path))
 
 
 def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
     """Return the reader of a file: one that goes by its ending alone, else the one whose test the first bytes pass."""
     readers = [(entry, registry.reader(entry)) for entry in registry.entries("reader")]
     by_suffix = [(e, r) for e, r in readers if r.sniff is None and path.suffix.lower() in r.suffixes]
-    found = by_suffix or [(e, r) for e, r in readers if r.sniff is not None and _passes(r, head)]
+    found = by_suffix or [(e, r) for e, r in readers if r.sniff is not None and _passes(r.sniff, head)]
     if len(found) > 1:  # content alone does not decide: the ending does
         found = [(e, r) for e, r in found if path.suffix.lower() in r.suffixes] or found
     names = ", ".join(sorted({e.name for e, _ in readers}))
@@ -82,10 +73,9 @@ def _sniffed(path: Path, head: bytes, registry: Registry) -> Reader:
     return found[0][1]
 
 
-def _passes(reader: Reader, head: bytes) -> bool:
-    assert reader.sniff is not None
+def _passes(test: Callable[[bytes], bool], head: bytes) -> bool:
     try:
-        return bool(reader.sniff(head))
+        return bool(test(head))
     except Exception:  # a test that fails on strange bytes does not know the file
         return False
 
@@ -94,14 +84,21 @@ def _unreadable(path: Path, error: OSError) -> SrfError:
     return SrfError(f"{path}: cannot be read: {error.strerror or error}", "Check path and permissions.", exit_code=1)
 
 
-def _refusal(reader: Reader, path: Path, error: Exception) -> SrfError:
-    if isinstance(error, OSError):
-        return _unreadable(path, error)
-    told = " ".join(str(error).split())[:200]
-    return SrfError(
-        f"{path}: the reader '{reader.name}' stopped: {type(error).__name__}: {told}",
-        "Check the file, or name its kind with format = ... (`srf laws --kind reader`).",
-    )
+@contextlib.contextmanager
+def _reading(reader: Reader, path: Path) -> Iterator[None]:
+    """Raise SrfError for whatever goes wrong inside: a reader is anybody's code, and the file anybody's bytes."""
+    try:
+        yield
+    except SrfError:
+        raise
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    except Exception as error:
+        told = " ".join(str(error).split())[:200]
+        raise SrfError(
+            f"{path}: the reader '{reader.name}' stopped: {type(error).__name__}: {told}",
+            "Check the file, or name its kind with format = ... (`srf laws --kind reader`).",
+        ) from error
 
 
 def _from_mapping(found: object, reader: Reader, path: Path) -> Source:
@@ -133,17 +130,13 @@ def _guarded(source: Source, columns: tuple[int, ...], reader: Reader, path: Pat
     """Yield the reader's blocks as float arrays of equal length; raises SrfError for anything else that it does."""
     blocks = iter(source.blocks(columns))
     while True:
-        try:
+        with _reading(reader, path):
             block = next(blocks, None)
             if block is None:
                 return
             arrays = [np.asarray(values, dtype=float) for values in block]
             if len(arrays) != len(columns) or len({a.shape for a in arrays}) != 1 or arrays[0].ndim != 1:
                 raise ValueError(f"shapes {[a.shape for a in arrays]} for {len(columns)} columns")
-        except SrfError:
-            raise
-        except Exception as error:
-            raise _refusal(reader, path, error) from error
         yield arrays
 
 
@@ -208,10 +201,14 @@ def read_columns(
     channels = _needed(run, finder)
     notices = list(finder.notices)
     _refuse_large(run, source, len(channels), limit)
-    wanted = tuple(channel.column for channel in channels)
-    kept, rows, first = _collect(run, source, channels, wanted, limit)
+    kept, rows, first = _collect(run, source, channels, limit)
     if not rows.size:
-        _nothing(run, first)
+        if run.window is not None and np.isfinite(first):
+            run.node.child("window").fail(
+                f"no sample of {run.file} lies in [{run.window[0]:g}, {run.window[1]:g}] s; its clock begins at {first:.10g} s",
+                "The window is in seconds of the file's own clock.",
+            )
+        raise SrfError(f"{run.file}: no samples", "A recording needs a line of numbers for each sample.")
     named = {channel.role: channel for channel in channels}
     arrays = {channel.role: values for channel, values in zip(channels[1:], kept[1:], strict=True)}
     remarks = {c.role: source.remarks[c.heading] for c in channels if c.heading in source.remarks}
@@ -230,33 +227,25 @@ class Finder:
 
     def find(self, role: str) -> Channel | None:
         """Return the channel of a role, None where neither [columns] nor a heading has it."""
-        spec = self.specs.get(role)
-        if spec is None:
-            found = [i for i, (name, unit) in enumerate(self.parts) if _heads(name, unit) == role]
-            if not found:
-                return None
-            spec = ColumnSpec(role)
-        else:
+        if (spec := self.specs.get(role)) is not None:
             found = self._named(spec)
+        elif not (found := [i for i, (name, unit) in enumerate(self.parts) if _heads(name, unit) == role]):
+            return None
         if len(found) > 1:
             full = self.headings[found[0]]
             hint = f'Name the one for {role} in full: [columns] {role} = {{ name = "{full}" }}.'
             if len({self.headings[i] for i in found}) == 1:
                 hint = f"Their headings are the same, '{full}': rename one of them in the file."
             raise SrfError(f"{self.path}: {len(found)} columns are called '{self.parts[found[0]][0]}'", hint)
-        return self._channel(role, spec, found[0])
+        return self._channel(role, spec or ColumnSpec(role), found[0])
 
     def _named(self, spec: ColumnSpec) -> list[int]:
         assert spec.node is not None
-        for test in (
-            lambda i: self.headings[i] == spec.name,
-            lambda i: self.parts[i][0] == spec.name,
-            lambda i: _plain(self.parts[i][0]) == _plain(spec.name),
-        ):
-            found = [i for i in range(len(self.headings)) if test(i)]
-            if found:
+        names, plain = [name for name, _ in self.parts], [_plain(name) for name, _ in self.parts]
+        for known, wanted in ((self.headings, spec.name), (names, spec.name), (plain, _plain(spec.name))):
+            if found := [i for i, name in enumerate(known) if name == wanted]:
                 return found
-        spec.node.fail(f"{self.path} has no column '{spec.name}'", did_you_mean(spec.name, (name for name, _ in self.parts)))
+        spec.node.fail(f"{self.path} has no column '{spec.name}'", did_you_mean(spec.name, names))
 
     def _channel(self, role: str, spec: ColumnSpec, column: int) -> Channel:
         written, heading = self.parts[column][1], self.headings[column]
@@ -265,10 +254,9 @@ class Finder:
         node = spec.node if spec.unit is not None else None
         factor = check_unit(unit, role, node, where, self.geometry)
         if spec.unit is not None and written is not None:
-            try:
+            same = False
+            with contextlib.suppress(SrfError):
                 same = check_unit(written, role, geometry=self.geometry) == factor
-            except SrfError:
-                same = False
             if not same:
                 what = f"the heading says {written!r}, [columns] says {spec.unit!r}, which counts"
                 self.notices.append(Notice("unit", where, what))
@@ -363,14 +351,14 @@ def _near(roles: Iterable[str], names: list[str]) -> str:
 def _refuse_large(run: RunDescription, source: Source, columns: int, limit: int) -> None:
     """Raise SrfError where the file says that what is needed is too large."""
     needed = (source.rows or 0) * (columns + 1) * 8
+    told = f"{source.rows} samples of {columns} needed columns are {_megabytes(needed)}"
     if needed > limit and source.whole:
         raise SrfError(
-            f"{run.file}: {source.rows} samples of {columns} needed columns are {_megabytes(needed)}, above the limit of "
-            f"{_megabytes(limit)}, and this kind of file cannot be read in parts",
+            f"{run.file}: {told}, above the limit of {_megabytes(limit)}, and this kind of file cannot be read in parts",
             "Save it as CSV or NPZ, or raise the limit.",
         )
     if needed > limit and run.window is None:
-        _too_large(run, f"{source.rows} samples of {columns} needed columns are {_megabytes(needed)}", limit)
+        _too_large(run, told, limit)
     guess = (source.about or 0) * (columns + 1) * 8
     if guess > 1.5 * limit and run.window is None:  # an estimate may be off; what is nearer is counted while it is read
         _too_large(run, f"some {source.about:.2g} samples of {columns} needed columns are {_megabytes(guess)}", limit)
@@ -389,14 +377,14 @@ def _megabytes(count: float) -> str:
 
 
 def _collect(
-    run: RunDescription, source: Source, channels: list[Channel], wanted: tuple[int, ...], limit: int
+    run: RunDescription, source: Source, channels: list[Channel], limit: int
 ) -> tuple[list[Array], NDArray[np.int64], float]:
     """Return the columns inside the window in um, s, N, the numbers of their rows, and the first time of the file."""
     pieces: list[list[Array]] = []
     numbers: list[NDArray[np.int64]] = []
     row, held, clock, first = 1, 0, 0.0, np.nan
     low, high = run.window or (-np.inf, np.inf)
-    for block in source.blocks(wanted):
+    for block in source.blocks(tuple(channel.column for channel in channels)):
         with np.errstate(over="ignore", invalid="ignore"):
             arrays = [(b * c.spec.scale + c.spec.offset) * c.factor for b, c in zip(block, channels, strict=True)]
             if channels[0].spec.integrate:
@@ -430,12 +418,3 @@ def _integrated(path: Path, channel: Channel, intervals: Array, clock: float, ro
             "A missing interval makes all later times unknown.",
         )
     return np.asarray(clock + np.cumsum(intervals))
-
-
-def _nothing(run: RunDescription, first: float) -> None:
-    if run.window is not None and np.isfinite(first):
-        run.node.child("window").fail(
-            f"no sample of {run.file} lies in [{run.window[0]:g}, {run.window[1]:g}] s; its clock begins at {first:.10g} s",
-            "The window is in seconds of the file's own clock.",
-        )
-    raise SrfError(f"{run.file}: no samples", "A recording needs a line of numbers for each sample.")

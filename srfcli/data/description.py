@@ -46,15 +46,11 @@ READABLE = (*OBSERVABLES, "shear_stress", *OTHER_OBSERVABLES)  # what `observabl
 MOST_OBSERVABLES = 3  # of a run
 CORRECTIONS = ("reset", "spike")  # of a run: what is proposed, and made only where it is asked for
 GEOMETRY = {"radius": "25 mm", "thickness": "4 mm", "area": "25 cm^2"}  # keys of [apparatus], with an example each
-_TOP = ("format", "title", "apparatus", "model", "parameters", "columns", "runs", "thresholds")
-_COLUMN = ("name", "unit", "scale", "offset", "integrate")
 _RUN = (
     "name", "file", "format", "holdout", "window", "drive", "start", "load", "modulation", "initial", "direction",
     "corrections", "observables", "segments",
 )  # fmt: skip
-_THRESHOLDS = ("name", "file", "holdout", "frequency")
 _RUNS = '[[runs]] with name = "..." and file = "....csv" for each recording.'
-_TABLES = '[[thresholds]] with file = "....csv" for each table of critical loads.'
 
 
 @dataclass(frozen=True)
@@ -148,7 +144,7 @@ def read_description(path: Path) -> Description:
         raise SrfError(f"{file}: format: missing, expected {FORMAT!r}", start)
     if declared.value != FORMAT:
         declared.expected(f'"{FORMAT}"', start)
-    root.keys(_TOP)
+    root.keys(("format", "title", "apparatus", "model", "parameters", "columns", "runs", "thresholds"))
     apparatus = root.require("apparatus", '[apparatus] with stiffness = "0.21 N/um".').table("[apparatus].")
     machine = _apparatus(apparatus)
     if root.get("thresholds") is None:
@@ -235,23 +231,17 @@ def _columns(node: Node, geometry: Geometry) -> dict[str, ColumnSpec]:
         if isinstance(entry.value, str):
             specs[role] = ColumnSpec(entry.text(), node=entry)
             continue
-        entry.table(f'{role} = {{ name = "...", unit = "{ROLES[role]}" }}.').keys(_COLUMN)
+        entry.table(f'{role} = {{ name = "...", unit = "{ROLES[role]}" }}.')
+        entry.keys(("name", "unit", "scale", "offset", "integrate"))
         name = entry.require("name", "Give the column's heading in the data file.").text()
-        unit, scale, integrate = (entry.get(key) for key in ("unit", "scale", "integrate"))
-        if unit:
-            check_unit(unit.text(), role, unit, geometry=geometry)
-        if scale and scale.number() == 0:
-            scale.expected("a number other than 0")
-        if integrate and role != "time":
+        if (unit := entry.read("unit", Node.text, None)) is not None:
+            check_unit(unit, role, entry.child("unit"), geometry=geometry)
+        if not (scale := entry.read("scale", Node.number, 1.0)):
+            entry.child("scale").expected("a number other than 0")
+        if (integrate := entry.get("integrate")) and role != "time":
             integrate.fail("only the time may be integrated, from sample intervals", "Take `integrate` away.")
-        specs[role] = ColumnSpec(
-            name,
-            entry.read("unit", Node.text, None),
-            entry.read("scale", Node.number, 1.0),
-            entry.read("offset", Node.number, 0.0),
-            entry.read("integrate", Node.boolean, False),
-            entry,
-        )
+        offset = entry.read("offset", Node.number, 0.0)
+        specs[role] = ColumnSpec(name, unit, scale, offset, integrate is not None and integrate.boolean(), entry)
     return specs
 
 
@@ -315,14 +305,14 @@ def _segments(node: Node) -> tuple[float, ...]:
 
 
 def _thresholds(node: Node, machine: Apparatus, runs: tuple[RunDescription, ...]) -> tuple[ThresholdsDescription, ...]:
-    entries = list(node.tables(_TABLES))
+    entries = list(node.tables('[[thresholds]] with file = "....csv" for each table of critical loads.'))
     stress = "counts stresses" if machine.geometry.area or is_stress(machine.stated) else ""
     if machine.per_load or stress:
         which = stress or "has a stiffness in friction per micron, which leaves no load to be critical"
         entries[0].fail(f"critical loads are in N, and [apparatus] {which}", 'Write stiffness = "0.21 N/um" and no area.')
     found: list[ThresholdsDescription] = []
     for entry in entries:
-        entry.keys(_THRESHOLDS)
+        entry.keys(("name", "file", "holdout", "frequency"))
         file = entry.require("file", 'Write file = "critical-loads.csv", relative to the experiment\'s folder.')
         place, name = file.beside("the name of a table of critical loads"), entry.get("name")
         if name and not name.text().strip():
@@ -410,12 +400,11 @@ class Node:
     @property
     def where(self) -> str:
         """Return `experiment.toml, line 12: runs[0].file`, as far as it is known."""
-        return self._where(self.place)
-
-    def _where(self, place: Place) -> str:
-        line = next((self.lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in self.lines), None)
+        ends = range(len(self.place), 0, -1)
+        line = next((self.lines[self.place[:k]] for k in ends if self.place[:k] in self.lines), None)
         at = f"{self.file}, line {line}" if line else f"{self.file}"
-        return f"{at}: {_spelled(place)}" if place else at
+        keys = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in self.place)
+        return f"{at}: {keys.removeprefix('.')}" if self.place else at
 
     def fail(self, message: str, hint: str | None = None) -> NoReturn:
         """Raise SrfError that names this place."""
@@ -449,7 +438,7 @@ class Node:
     def require(self, key: str, hint: str) -> Node:
         """Return the value under a key; raises SrfError where there is none."""
         if key not in self.value:
-            raise SrfError(printable(f"{self._where((*self.place, key))}: missing", line=True), hint)
+            Node(self.file, None, (*self.place, key), self.lines).fail("missing", hint)
         return self.child(key)
 
     def keys(self, known: Iterable[str]) -> None:
@@ -558,18 +547,12 @@ def open_node(path: Path) -> Node:
     return Node(path, table, (), key_lines(text))
 
 
-def _spelled(place: Place) -> str:
-    out = ""
-    for key in place:
-        out += f"[{key}]" if isinstance(key, int) else f".{key}" if out else key
-    return out
-
-
 # Where in a TOML text each key and each element stands: `tomli` gives values without lines.
 
 Place = tuple[str | int, ...]
 
-_KEY = re.compile(r"""[ \t]*(?:"((?:\\.|[^"\\])*)"|'([^']*)'|([A-Za-z0-9_-]+))[ \t]*(\.?)""")
+_KEY = re.compile(r"""[A-Za-z0-9_-]+|"(?:\\.|[^"\\])*"|'[^']*'""")
+_KEYS = re.compile(rf"[ \t]*(?:{_KEY.pattern})(?:[ \t]*\.[ \t]*(?:{_KEY.pattern}))*[ \t]*")
 _STRING = re.compile(
     r"""\"{3}(?:\\.|[^"\\]|"{1,2}(?!"))*"{3,5}|'{3}(?:[^']|'{1,2}(?!'))*'{3,5}|"(?:\\.|[^"\\])*"|'[^']*'""", re.DOTALL
 )
@@ -636,23 +619,15 @@ class _Scanner:
         self.at += brackets
         return place
 
-    def keys(self) -> tuple[str, ...]:
+    def keys(self) -> list[str]:
         """Pass a dotted key and return its parts; escapes in them are left as they are."""
-        found = []
-        while True:
-            match = self.skip(_KEY)
-            found.append(next(part for part in match.groups()[:3] if part is not None))
-            if not match[4]:
-                return tuple(found)
+        return [key[1:-1] if key[0] in "\"'" else key for key in _KEY.findall(self.skip(_KEYS)[0])]
 
-    def pair(self, table: Place) -> None:
-        start, place = self.at, table
-        keys = self.keys()
-        after, self.at = self.at, start
-        for key in keys:
+    def pair(self, place: Place) -> None:
+        for key in self.keys():
             place = (*place, key)
             self.note(place)
-        self.at = after + 1  # the equals sign
+        self.at += 1  # the equals sign
         self.value(place)
 
     def value(self, place: Place) -> None:

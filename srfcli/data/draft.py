@@ -27,13 +27,12 @@ from srfcli.core.units import (
     split_quantity,
 )
 from srfcli.data.columns import open_source, read_columns
-from srfcli.data.description import ROLES, check_unit, read_description
+from srfcli.data.description import FORMAT, ROLES, check_unit, read_description
 from srfcli.data.experiment import read_choice, read_experiment, read_parameters
 from srfcli.data.imposed import StartsAtRest, Stroke, find_modulation, strokes
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
 
-PROTOCOLS = ("steps", "shs", "oscillation")
 NAMED = {  # role -> what headings call it, in small letters without their unit; the first that a file has is taken
     "time": ("time", "t", "x_value", "elapsed_time", "elapsed", "test_time", "run_time"),
     "load_point_velocity": (
@@ -75,6 +74,7 @@ WORDS = {  # role -> words of a heading that mean it, where no heading is one of
     ),
     "friction": ({"friction", "mu", "cof", "coefficient", "coeff"}, {"1"}),
 }  # fmt: skip
+ALONE = {"time": {"s"}, "load_point_velocity": {"um/s", "rad/s"}, "shear_stress": {"N*um"}}  # units that tell a role alone
 ASIDE = {"thickness", "gap", "height", "dilation", "dilatancy", "compaction", "depth", "pore", "confining", "temperature", "temp",
          "humidity", "std", "error", "setpoint", "target", "command", "raw", "pz", "zpos"}  # fmt: skip
 UNIT_SUFFIXES = {  # units that a heading ends with: time_s, shear_stress_MPa
@@ -100,6 +100,7 @@ RIG = {
     "thickness": "of the sheared layer: strain times it is the displacement",
     "area": "of the sheared contact: force over it is the stress",
 }
+NO_MASS = '# mass = "2.37 kg"   # of the slider; without it the slider is quasi-static'
 BOUND_FACTOR = 5.0  # from another law's defaults to its bounds
 
 
@@ -146,7 +147,6 @@ class Draft:
 
     text: str
     columns: tuple[Named, ...]
-    kind: str
     remarks: tuple[str, ...]
 
 
@@ -207,16 +207,13 @@ def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
             score = {h: 0 if words[h] & WORDS["shear_stress"][0] else n for h, n in score.items()}
         best = max(score.values(), default=0)
         named = [h for h in fit if score[h] == best > 0]
-        if not best and role in ("time", "load_point_velocity", "shear_stress"):
-            alone = {"time": {"s"}, "load_point_velocity": {"um/s", "rad/s"}, "shear_stress": {"N*um"}}[role]
-            named = [h for h in fit if kinds[h] in alone]
-        if len(named) != 1:
-            continue
-        heading = named[0]
-        unit = units_of[heading]
-        actual = FORCE_OF_STRESS.get(role, role) if kinds[heading] in ("N", "N*um") else role
-        found[actual] = Named(actual, heading, unit or ROLES[actual], True)
-        free.remove(heading)
+        if not best and role in ALONE:
+            named = [h for h in fit if kinds[h] in ALONE[role]]
+        if len(named) == 1:
+            heading = named[0]
+            actual = FORCE_OF_STRESS.get(role, role) if kinds[heading] in ("N", "N*um") else role
+            found[actual] = Named(actual, heading, units_of[heading] or ROLES[actual], True)
+            free.remove(heading)
 
 
 def _played(role: str, found: Mapping[str, Named]) -> bool:
@@ -320,8 +317,10 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     unit = split_quantity(wish.stiffness, name="--stiffness", example="5e-3 1/um")[1]
     per_load = bool(unit) and find_unit(unit).powers == (-1, 0, 0, 0)
     named: tuple[Named, ...] = ()
+    names: list[str] = []
     remarks: list[str] = []
     for path in files:
+        names.append(unused_name(path.stem, "", names))
         headings = open_source(path, registry=registry, format=wish.reader).headings
         own = name_columns(headings, wish.columns, path=path, per_load=per_load, geometry=wish.geometry())
         lacks = missing(own, wish, path, headings)
@@ -334,8 +333,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         aside = [h for h in headings if h not in {n.heading for n in own}]
         if aside and path == files[0]:
             remarks.append(f"left aside: {', '.join(aside)}")
-    sketch = _Sketch(tuple(files), _run_names(files), folder, wish, named)
-    sketch, told = _parted(sketch, registry)
+    sketch, told = _parted(_Sketch(tuple(files), names, folder, wish, named), registry)
     remarks += told
     for name in wish.holdout:
         if name not in sketch.names:
@@ -353,8 +351,11 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
         durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
     )  # fmt: skip
     text = sketch.text(_parameters(sketch, runs, registry))
-    _check(text, registry)
-    return Draft(text, named, kind, tuple(remarks))
+    with _as_file(text) as file:  # raises SrfError where the model or its parameters are none
+        described = read_description(file)
+        choice, known = read_choice(described.model, described.apparatus, registry)
+        read_parameters(described.parameters, known, choice)
+    return Draft(text, named, tuple(remarks))
 
 
 def _parted(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[str]]:
@@ -391,13 +392,6 @@ def _as_file(text: str) -> Iterator[Path]:
         yield file
 
 
-def _run_names(files: Sequence[Path]) -> list[str]:
-    names: list[str] = []
-    for path in files:
-        names.append(unused_name(path.stem, "", names))
-    return names
-
-
 @dataclass(frozen=True)
 class _Sketch:
     """All that an experiment.toml is written from."""
@@ -423,41 +417,35 @@ class _Sketch:
     def text(self, parameters: Sequence[str], *, absolute: bool = False) -> str:
         """Return the whole file."""
         wish = self.wish
-        lines = ['format = "srf-experiment/1"', f"title = {toml_value(wish.title or ', '.join(self.names))}"]
-        lines += ["", f"# Letters: {LETTERS}.", "", "[apparatus]"]
-        lines += [f"stiffness = {toml_value(wish.stiffness)}   # of the machine: N/um, MPa/mm, or 1/um for friction per micron"]
-        lines += [f"{key} = {toml_value(value)}   # {RIG[key]}" for key, value in wish.rig.items()]
-        if wish.mass:
-            lines += [f"mass = {toml_value(wish.mass)}"]
-        else:
-            lines += ['# mass = "2.37 kg"   # of the slider; without it the slider is quasi-static']
-        lines += [
-            "",
-            "[model]   # `srf laws` lists the laws",
+        lines = [
+            f"format = {toml_value(FORMAT)}",
+            f"title = {toml_value(wish.title or ', '.join(self.names))}",
+            *("", f"# Letters: {LETTERS}.", "", "[apparatus]"),
+            f"stiffness = {toml_value(wish.stiffness)}   # of the machine: N/um, MPa/mm, or 1/um for friction per micron",
+            *(f"{key} = {toml_value(value)}   # {RIG[key]}" for key, value in wish.rig.items()),
+            f"mass = {toml_value(wish.mass)}" if wish.mass else NO_MASS,
+            *("", "[model]   # `srf laws` lists the laws"),
             f"law = {toml_value(wish.law)}",
-            f"ageing = {toml_value(self.ageing)}",
+            f"ageing = {toml_value(self.ageing)}" + ("" if wish.ageing else '   # ageing law; "ruina" is the slip law'),
+            f"interface = {toml_value(wish.interface)}",
+            f"inertia = {toml_value(bool(wish.mass))}",
         ]
-        if not wish.ageing:
-            lines[-1] += '   # ageing law; "ruina" is the slip law'
-        lines += [f"interface = {toml_value(wish.interface)}", f"inertia = {toml_value(bool(wish.mass))}"]
         if parameters:
-            lines += ["", "[parameters]   # start values and bounds of what is fitted; a wide bound costs little"]
-            lines += parameters
+            lines += ["", "[parameters]   # start values and bounds of what is fitted; a wide bound costs little", *parameters]
         turned = ("normal_stress", "normal_load") if self.negative else ()
         said = [n for n in self.columns if n.said or n.role in turned]
         if said:
             lines += ["", "[columns]   # what the headings of the data files mean"]
-            lines += [f"{n.role} = {{ name = {toml_value(split_heading(n.heading)[0] if self._alone(n) else n.heading)}, "
-                      f"unit = {toml_value(n.unit)}{', scale = -1' * (n.role in turned)} }}" for n in said]  # fmt: skip
-        if self.kind in PROTOCOLS and self.why:
+        bare = [split_heading(n.heading)[0] for n in self.columns]
+        for n in said:
+            name = split_heading(n.heading)[0]
+            named = {"name": name if bare.count(name) == 1 else n.heading, "unit": n.unit}
+            lines.append(f"{n.role} = {toml_value(named | ({'scale': -1} if n.role in turned else {}))}")
+        if self.why:
             lines += ["", f"# The runs, of kind {self.kind}: {self.why}."]
         for path, name in zip(self.files, self.names, strict=True):
             lines += ["", "[[runs]]", *self._run(path, name, absolute=absolute)]
         return "\n".join(lines) + "\n"
-
-    def _alone(self, named: Named) -> bool:
-        """Return whether a column's bare name is that of no other."""
-        return [split_heading(n.heading)[0] for n in self.columns].count(split_heading(named.heading)[0]) == 1
 
     def _run(self, path: Path, name: str, *, absolute: bool) -> list[str]:
         wish, place = self.wish, path.resolve()
@@ -512,14 +500,6 @@ def _read(sketch: _Sketch, registry: Registry) -> tuple[_Sketch, list[Run]]:
                         return _read(replace(sketch, negative=True), registry)
                 hint = "Take the part in contact: --window FROM,TO in seconds." if apart else error.hint
                 raise SrfError(re.sub(rf"{re.escape(str(file))}(, line \d+)?: ", "", error.message), hint) from None
-
-
-def _check(text: str, registry: Registry) -> None:
-    """Raise SrfError where a description, its model or its parameters are none."""
-    with _as_file(text) as file:
-        described = read_description(file)
-        choice, known = read_choice(described.model, described.apparatus, registry)
-        read_parameters(described.parameters, known, choice)
 
 
 def _kind(runs: Sequence[Run], modulations: Mapping[str, tuple[float, float, float]]) -> tuple[str, str]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,33 +16,11 @@ from srfcli.core.settings import Parameter
 from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, split_quantity, to_base
 from srfcli.data.clock import Mask, Place, Sampling, find_sampling, kept_samples, sampling_notices
 from srfcli.data.columns import MOST_BYTES, Columns, open_source, read_columns
-from srfcli.data.description import (
-    Apparatus,
-    ColumnSpec,
-    Description,
-    Node,
-    RunDescription,
-    ThresholdsDescription,
-    read_description,
-)
+from srfcli.data.description import Apparatus, Description, Node, RunDescription, ThresholdsDescription, read_description
 from srfcli.data.gauge import GaugeNoise, find_noise
 from srfcli.data.groups import BY, grouped
-from srfcli.data.imposed import (
-    ACCIDENTS,
-    DIFFERS,
-    LOADS,
-    FoundModulation,
-    check_start,
-    declared_drive,
-    drive_differs,
-    drive_from_displacement,
-    drive_from_velocity,
-    find_modulation,
-    load_from_column,
-    modulation_notices,
-    strokes,
-)
-from srfcli.data.noise import observable_jumps, quantisation, rejoined, saturation, spikes, white_level
+from srfcli.data.imposed import ACCIDENTS, LOADS, FoundModulation, check_start, drive_of, find_modulation, load_of
+from srfcli.data.noise import observable_jumps, quantisation, saturation, spikes, white_level
 from srfcli.data.scales import own_bounds
 from srfcli.data.thresholds import read_thresholds
 from srfcli.data.values import (
@@ -59,7 +36,7 @@ from srfcli.data.values import (
 )
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
-from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation
+from srfcli.motion.imposed import Load
 
 
 def read_experiment(
@@ -74,11 +51,8 @@ def read_experiment(
     described = read_description(Path(path))
     choice, known = read_choice(described.model, described.apparatus, registry)
     parameters, notices = read_parameters(described.parameters, known, choice, described.apparatus.geometry)
-
-    def read(run: RunDescription) -> Run:
-        return read_run(run, described.apparatus, described.columns, registry=registry, format=format, limit=limit)
-
-    runs = tuple(read(run) for run in described.runs if holdout or not run.holdout)
+    chosen = [run for run in described.runs if holdout or not run.holdout]
+    runs = tuple(read_run(run, described, registry=registry, format=format, limit=limit) for run in chosen)
     tables = tuple(_read_table(one) for one in described.thresholds if holdout or not one.holdout)
     notices += tuple(Notice("sigma", t.name, text) for t in tables for text in t.table.notes)
     if choice.effects and (runs or tables):
@@ -92,32 +66,20 @@ def read_experiment(
             what = f"not listed, and so fixed: {values}; list them, as in {silent[0].name} = {{}}, to fit them"
             notices += (Notice("start-value", f"{described.path.name}: [parameters]", what),)
         parameters = own_bounds(parameters, own, runs, stated, tables)
-    vary, by = read_groups(described.model)
+    apparatus, model = described.apparatus, described.model
     found = Experiment(
-        described.path,
-        described.title,
-        choice,
-        described.apparatus.mass,
-        described.apparatus.text,
-        parameters,
-        runs,
-        notices,
-        described.apparatus.stated,
+        described.path, described.title, choice, apparatus.mass, apparatus.text, parameters, runs, notices, apparatus.stated,
         thresholds=tables,
-    )
-    found = grouped(found, vary, by)
-    _check_acting(found, described)
-    return found
-
-
-def _check_acting(experiment: Experiment, described: Description) -> None:
-    """Raise SrfError where a parameter acts in a run that there is not."""
-    known = dict.fromkeys([*(run.name for run in described.runs), *(run.name for run in experiment.runs)])
-    for q in experiment.parameters:
+    )  # fmt: skip
+    vary = model.read("vary", lambda listed: listed.items("parameters", 'Write vary = ["mu0"].'), [])
+    found = grouped(found, [entry.text() for entry in vary], model.read("by", lambda by: by.choice(BY), "run"))
+    names = dict.fromkeys([*(run.name for run in described.runs), *(run.name for run in found.runs)])
+    for q in found.parameters:
         for i, name in enumerate(q.runs):
-            if name not in known and described.parameters is not None:
+            if name not in names and described.parameters is not None:
                 at = described.parameters.child(q.name).child("runs").child(i)
-                at.fail(f"there is no run '{name}'", did_you_mean(name, known))
+                at.fail(f"there is no run '{name}'", did_you_mean(name, names))
+    return found
 
 
 def _read_table(described: ThresholdsDescription) -> CriticalLoads:
@@ -136,21 +98,10 @@ def _read_table(described: ThresholdsDescription) -> CriticalLoads:
 
 # The model of an experiment and its parameters, checked against the laws.
 
-_ENTRY = ("value", "lower", "upper", "fixed", "runs", "elsewhere")
 _IMPOSED = {
-    "V": "The drive of each run says it.",
-    "W0": "The load of each run says it.",
-    "eps": "The load of each run says it.",
-    "f": "The load of each run says it.",
+    "V": "The drive of each run says it.", **dict.fromkeys(("W0", "eps", "f"), "The load of each run says it."),
     "angle": "Experiments have the load imposed vertically.",
-}
-
-
-def read_groups(node: Node) -> tuple[tuple[str, ...], str]:
-    """Return which parameters have a value of their own in each group, and what makes a group."""
-    listed = node.read("vary", lambda vary: vary.items("parameters", 'Write vary = ["mu0"].'), ())
-    names = tuple(entry.text() for entry in listed)
-    return names, node.read("by", lambda by: by.choice(BY), "run")
+}  # fmt: skip
 
 
 def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[ModelChoice, tuple[Parameter, ...]]:
@@ -228,8 +179,11 @@ def read_parameters(
     found, notices = [], []
     for name in node.value:
         entry = node.child(name)
+        if name == "M" and name not in declared:
+            entry.fail("there is no mass to fit", "Give [apparatus] a mass, and inertia = true.")
         if name not in declared:
-            _unknown(entry, name, declared, choice)
+            laws = f"{choice.law}, {choice.ageing}, {choice.interface}"
+            entry.fail(f"unknown parameter '{name}' of {laws}", _IMPOSED.get(name) or did_you_mean(name, declared))
         parameter = _parameter(entry, declared[name], geometry if name == "K" else NO_GEOMETRY)
         own = to_base(declared[name].default, declared[name].unit)
         if name in ("K", "M") and not math.isclose(parameter.value, own, rel_tol=1e-9):
@@ -239,15 +193,9 @@ def read_parameters(
     return tuple(found), tuple(notices)
 
 
-def _unknown(entry: Node, name: str, declared: dict[str, Parameter], choice: ModelChoice) -> None:
-    laws = f"{choice.law}, {choice.ageing}, {choice.interface}"
-    if name == "M":
-        entry.fail("there is no mass to fit", "Give [apparatus] a mass, and inertia = true.")
-    entry.fail(f"unknown parameter '{name}' of {laws}", _IMPOSED.get(name) or did_you_mean(name, declared))
-
-
 def _parameter(entry: Node, parameter: Parameter, geometry: Geometry) -> FitParameter:
-    entry.table(f"{parameter.name} = {{ value = {parameter.default:g}, lower = ..., upper = ... }}.").keys(_ENTRY)
+    entry.table(f"{parameter.name} = {{ value = {parameter.default:g}, lower = ..., upper = ... }}.")
+    entry.keys(("value", "lower", "upper", "fixed", "runs", "elsewhere"))
     held = entry.read("fixed", Node.boolean, False)
     numbers = {
         key: _stated(entry.child(key), parameter, geometry) if key in entry.value else default
@@ -306,19 +254,8 @@ def _stated(node: Node, parameter: Parameter, geometry: Geometry) -> float:
 
 # One recording, from its description and its file to a run that can be compared with a simulation.
 
-DRIVES = ("load_point_velocity", "load_point_displacement")
-FORCE_COLUMNS = ("force", *LOADS)
 
-
-def read_run(
-    run: RunDescription,
-    apparatus: Apparatus,
-    specs: Mapping[str, ColumnSpec],
-    *,
-    registry: Registry,
-    format: str | None = None,
-    limit: int = MOST_BYTES,
-) -> Run:
+def read_run(run: RunDescription, described: Description, *, registry: Registry, format: str | None, limit: int) -> Run:
     """Return the run in a description's data file; raises SrfError for what cannot be used."""
     try:
         source = open_source(run.file, registry=registry, format=format or run.format)
@@ -328,7 +265,8 @@ def read_run(
         if error.kind == "unknown name" and not format:
             run.node.child("format").fail(error.message, error.hint)
         raise
-    columns = read_columns(run, source, specs, limit=limit, geometry=apparatus.geometry)
+    apparatus = described.apparatus
+    columns = read_columns(run, source, described.columns, limit=limit, geometry=apparatus.geometry)
     keep, notices = kept_samples(columns.place("time"), columns.remarks.get("time"))
     columns = columns.kept(keep)
     t = columns.seconds
@@ -338,9 +276,8 @@ def read_run(
             f"{run.node.where}: friction is recorded without a load, and the stiffness is in {apparatus.stated}",
             'Give the run load = "20 MPa", or the stiffness as friction per micron, in 1/um.',
         )
-    _refuse_strokes(run, columns)
-    drive, told = _drive(run, columns)
-    load, weighed = _load(run, columns)
+    drive, told = drive_of(run, columns)
+    load, weighed = load_of(run, columns)
     check_start(run, drive, float(t[0]))
     role, *beside = [c.role for c in columns.channels.values() if c.role in OBSERVABLES | OTHER_OBSERVABLES]
     at_start = load.rest(float(t[0]))
@@ -353,35 +290,17 @@ def read_run(
     observed, used, quantum, flaws, proposed = clean_observable(
         columns.place(role), columns.arrays[role], rise=rise, load=load, corrections=run.corrections
     )
-    others = [_signal(columns, name) for name in beside]
+    others = []  # which are not searched for spikes, resets and saturation
+    for name in beside:
+        known, filled, odd = _numbers(columns.place(name), columns.arrays[name])
+        others.append(Signal(name, filled, known, quantisation(filled[known])))
+        flaws += odd
     return Run(
-        name=run.name,
-        file=run.file,
-        holdout=run.holdout,
-        start=run.start,
-        initial=run.initial,
-        t=t,
-        observed=observed,
-        observable=role,
-        used=used,
-        drive=drive,
-        load=load,
-        stiffness=stiffness,
-        modulation=run.modulation,
-        quantum=quantum,
-        notices=(*notices, *told, *weighed, *flaws, *(n for _, flaws in others for n in flaws)),
-        stress=any(units.values()),
-        proposed=proposed,
-        others=tuple(signal for signal, _ in others),
-        backward=run.backward,
-        segments=run.segments,
-    )
-
-
-def _signal(columns: Columns, role: str) -> tuple[Signal, list[Notice]]:
-    """Return an observable besides the first one, which alone is searched for spikes, resets and saturation."""
-    known, filled, notices = _numbers(columns.place(role), columns.arrays[role])
-    return Signal(role, filled, known, quantisation(filled[known])), notices
+        name=run.name, file=run.file, holdout=run.holdout, start=run.start, initial=run.initial, t=t, observed=observed,
+        observable=role, used=used, drive=drive, load=load, stiffness=stiffness, modulation=run.modulation, quantum=quantum,
+        notices=(*notices, *told, *weighed, *flaws), stress=any(units.values()), proposed=proposed, others=tuple(others),
+        backward=run.backward, segments=run.segments,
+    )  # fmt: skip
 
 
 def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
@@ -393,67 +312,16 @@ def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
     return known, np.interp(place.t, place.t[known], x[known]), notices
 
 
-def _refuse_strokes(run: RunDescription, columns: Columns) -> None:
-    """Raise SrfError for a run that slides in both directions."""
-    if run.drive is not None or not columns.role(*DRIVES):
-        return
-    found = strokes(columns)
-    if not found:
-        return
-    turn = found[1] if len(found) > 1 else found[0]
-    raise SrfError(
-        f"{run.node.where}: the drive turns back before t = {turn.begin:.6g} s and slides there; a run slides in one direction",
-        f"Make a run of each stroke: window = [{turn.begin:.6g}, {turn.end:.6g}] and, of a backward one, "
-        f'direction = "backward"; `srf new {run.file.name}` writes them.',
-    )
-
-
 def _units(run: RunDescription, columns: Columns, apparatus: Apparatus) -> dict[str, bool]:
     """Return for each force of the run, by name, whether it counts as a stress; with an area all do."""
     if apparatus.geometry.area:
         return {"all": True}
-    found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in FORCE_COLUMNS}
+    found = {f"'{c.heading}'": is_stress(c.unit) for c in columns.channels.values() if c.role in ("force", *LOADS)}
     if run.load is not None and isinstance(text := run.node.child("load").value, str):
         found["load"] = is_stress(split_quantity(text, name="load")[1] or "N")
     if not apparatus.per_load:
         found["the stiffness"] = is_stress(apparatus.stated)
     return found
-
-
-def _drive(run: RunDescription, columns: Columns) -> tuple[Drive, list[Notice]]:
-    """Return the drive that the run declares, else that of its column, and what is to be told of it."""
-    declared = None if run.drive is None else declared_drive(run, columns)
-    role = columns.role(*DRIVES)
-    if role is None:
-        assert declared is not None  # `read_columns` asks for one of the two
-        return declared, []
-    t, values, where = columns.seconds, columns.arrays[role], columns.place(role).column
-    if declared is not None:
-        return declared, drive_differs(declared, t, values, where)
-    if role == "load_point_velocity":
-        return drive_from_velocity(t, values, where)
-    return drive_from_displacement(t, values, where, correct="reset" in run.corrections)
-
-
-def _load(run: RunDescription, columns: Columns) -> tuple[Load, list[Notice]]:
-    """Return the load in the run's column, else the one that it states, and what is to be told of it."""
-    role = columns.role(*LOADS)
-    if role is None:
-        W0 = 1.0 if run.load is None else run.load
-        if run.modulation is None:
-            return ConstantLoad(W0), []
-        f, eps, onset = run.modulation
-        return Modulation(W0, eps, f, onset), []
-    place, values = columns.place(role), columns.arrays[role]
-    load, notices = load_from_column(place, values)
-    first = load.rest(float(place.t[0]))
-    if run.load is not None and abs(run.load - first) > DIFFERS * first:
-        run.node.child("load").fail(
-            f"the load is {run.load:g} N, but {place.column} begins with {first:g} N", "Take one of the two away."
-        )
-    if run.modulation is not None:
-        notices += modulation_notices(place, run.modulation, values)
-    return load, notices
 
 
 # The recorded observable: which of its samples can be compared with a simulation, and what is wrong with the others.
@@ -488,38 +356,31 @@ def clean_observable(
     left = "not compared" if "spike" in corrections else 'compared as they are; corrections = ["spike"] leaves them out'
     notices += place.spots("spike", spiky, f"standing out in '{place.heading}', {left}")
     calm = np.interp(t, t[~spiky], filled[~spiky])
-    level, beside, told_jumps = _without_jumps(place, calm, rise, W, quantum, taken_out="reset" in corrections)
+    jumps = observable_jumps(calm, t, rise, np.abs(np.diff(W, prepend=W[0])) / W < STEADY_LOAD, quantum)
+    level, beside = calm.copy(), np.zeros(x.size, bool)  # certain jumps taken out; the samples on each side of one
+    for jump in jumps:
+        level[jump.at + 1 :] -= jump.size if jump.certain else 0.0
+        beside[jump.at : jump.at + 2] = "reset" in corrections
     proposed = level if spiky.any() or (level != calm).any() else None
     observed = np.where(spiky, filled + level - calm, level) if "reset" in corrections else filled
-    beside = beside & ("reset" in corrections)
     spiky = spiky & ("spike" in corrections)
     white = white_level(calm)
     if quantum > COARSE_STEP * white > 0:
         what = f"steps of {quantum:.4g}, {quantum / white:.2g} times the white noise, which they add to"
         notices.append(Notice("quantisation", place.column, what))
-    used = known & ~clipped & ~spiky & ~beside
-    if used.sum() < 8:
-        raise SrfError(f"{place.column}: {int(used.sum())} samples can be compared", "8 are needed.")
-    return observed, used, quantum, [*notices, *told_jumps], proposed
-
-
-def _without_jumps(
-    place: Place, x: Array, rise: Array, W: Array, quantum: float, *, taken_out: bool
-) -> tuple[Array, Mask, list[Notice]]:
-    change = np.abs(np.diff(W, prepend=W[0])) / W
-    jumps = observable_jumps(x, place.t, rise, change < STEADY_LOAD, quantum)
-    level, beside = rejoined(x, jumps)
-    notices = []
     for jump in jumps:
         if not jump.certain:
             done = "faster than the drive moves, but too little to be sure of a transducer set anew; left as it is"
-        elif taken_out:
+        elif "reset" in corrections:
             done = "a transducer set anew; what follows is moved back by that much, and the two samples are not compared"
         else:
             done = 'faster than the drive moves; left as it is; corrections = ["reset"] moves what follows back by that much'
         what = f"'{place.heading}' jumps by {jump.size:.4g}: {done}"
         notices.append(Notice("reset", place.span(jump.at, jump.at + 1), what))
-    return level, beside, notices
+    used = known & ~clipped & ~spiky & ~beside
+    if used.sum() < 8:
+        raise SrfError(f"{place.column}: {int(used.sum())} samples can be compared", "8 are needed.")
+    return observed, used, quantum, notices, proposed
 
 
 # The check of a recording: sampling, flaws, noise, and the history of drive and load, as found in the data.
@@ -578,7 +439,7 @@ class RunCheck:
 
     def count(self, kind: str) -> int:
         """Return how many notices of a kind the run has."""
-        return Counter(n.kind for n in self.run.notices)[kind]
+        return sum(n.kind == kind for n in self.run.notices)
 
     @property
     def spikes(self) -> int:
@@ -589,32 +450,20 @@ class RunCheck:
 
 def check_run(run: Run) -> RunCheck:
     """Return what the data of a run show without a simulation."""
-    sampling = find_sampling(run.t)
-    load = load_history(run.load, run.t)
+    sampling, (W, W_dot) = run.sampling, run.load(run.t)
+    modulation = find_modulation(run.t, W)
     x = np.interp(run.t, run.t[run.used], run.observed[run.used])
     cut = 1 + np.union1d(np.flatnonzero(np.diff(sampling.at)), sampling.gaps)
     pieces, noises = np.split(x, cut), []
     for k, dt in enumerate(sampling.spacings):
         parts = [piece for piece, begin in zip(pieces, (0, *cut), strict=True) if sampling.at[begin] == k]
-        cycles = load.modulation.frequency * dt if load.modulation else None
-        noises.append(find_noise(parts, dt, quantum=run.quantum, cycles=cycles))
+        noises.append(find_noise(parts, dt, quantum=run.quantum, cycles=modulation.frequency * dt if modulation else None))
     noise = noises[int(np.argmax(np.bincount(sampling.at)))]
-    driven, slowest, fastest = _drive_pieces(run)
+    load = LoadHistory(float(W.mean()), float(W.min()), float(W.max()), float(np.abs(W_dot / W).max()), modulation)
     friction_noise = float(noise.total * run.friction_factor(load.mean))
-    return RunCheck(run, sampling, noise, tuple(noises), friction_noise, driven, slowest, fastest, load)
-
-
-def _drive_pieces(run: Run) -> tuple[tuple[tuple[float, float, float], ...], float, float]:
-    """Return the pieces of the drive during the run, and its smallest and largest velocity."""
-    pieces, values = [], []
+    drive, ends = [], []
     for begin, end in pairwise(run.edges):
         V, rate, since = run.drive.piece(begin)
-        pieces.append((begin, V + rate * (begin - since), rate))
-        values += [V + rate * (begin - since), V + rate * (end - since)]
-    return tuple(pieces), min(values), max(values)
-
-
-def load_history(load: Load, t: Array) -> LoadHistory:
-    """Return mean, range, rate and modulation of a load over the times `t`."""
-    W, W_dot = load(t)
-    return LoadHistory(float(W.mean()), float(W.min()), float(W.max()), float(np.abs(W_dot / W).max()), find_modulation(t, W))
+        drive.append((begin, V + rate * (begin - since), rate))
+        ends += [V + rate * (begin - since), V + rate * (end - since)]
+    return RunCheck(run, sampling, noise, tuple(noises), friction_noise, tuple(drive), min(ends), max(ends), load)

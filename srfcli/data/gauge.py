@@ -191,12 +191,10 @@ def find_noise(pieces: Sequence[Array], spacing: float, *, quantum: float = 0.0,
                 break
         found = whittle.noise()
     assert found is not None
-    return replace(found, colours=tuple(c for c in found.colours if not _slowest(c, found.stretch)))
-
-
-def _slowest(colour: tuple[float, ...], stretch: float) -> bool:
-    """Return whether a process is as slow as it may be, so that it is not told from a signal."""
-    return colour[0] > 0.9 * stretch if len(colour) == 2 else colour[0] < 1.1 * SLOWEST / stretch
+    # a process that is as slow as it may be is not told from a signal
+    longest_time, lowest_frequency = 0.9 * found.stretch, 1.1 * SLOWEST / found.stretch
+    told = [c for c in found.colours if (c[0] <= longest_time if len(c) == 2 else c[0] >= lowest_frequency)]
+    return replace(found, colours=tuple(told))
 
 
 @dataclass(frozen=True)
@@ -374,14 +372,10 @@ class _Whittle:
             over = self.calm.mean / self.expected(GaugeNoise(white, self.quantum, tuple(colours)))
             peaks = np.array([self.calm.window.bins[int(np.argmax(over))] / self.calm.window.n, 0.03, 0.15]) / self.spacing
             places = [*product(np.log(peaks), np.log(QUALITIES))]
-        levels = [0, *(2 + i for i in self.places(kinds))]
+        sizes = [2 + PROCESSES.index(kind) for kind in kinds]
+        levels = [0, *(2 + sum(sizes[:k]) for k in range(len(sizes)))]
         variance = float(np.sum(np.exp(2 * x[levels])))
         own = x.copy()
         own[levels] += 0.5 * np.log(0.5)
         begun = [np.concatenate([own, [place[0], 0.5 * np.log(0.5 * variance), *place[1:]]]) for place in places]
         return [begun] if kind == "relaxation" else [begun[: len(QUALITIES)], begun[len(QUALITIES) :]]
-
-    def places(self, kinds: Sequence[str]) -> list[int]:
-        """Return where in x each process begins, less one."""
-        size = [2 + PROCESSES.index(kind) for kind in kinds]
-        return [sum(size[:j]) for j in range(len(size))]

@@ -40,15 +40,11 @@ def labels(experiment: Experiment) -> dict[str, str]:
     """Return the group of each run, by its name."""
     if experiment.by == "load":
         return {run.name: f"{run.first_load:.3g} {run.load_unit}" for run in experiment.runs}
+    if experiment.by == "direction" and any(run.backward for run in experiment.runs):  # strokes of a reciprocating drive
+        return {run.name: "backward" if run.backward else "forward" for run in experiment.runs}
     if experiment.by == "direction":
-        strokes = any(run.backward for run in experiment.runs)
-        return {run.name: stroke(run) if strokes else step(run) for run in experiment.runs}
+        return {run.name: step(run) for run in experiment.runs}
     return {run.name: run.name for run in experiment.runs}
-
-
-def stroke(run: Run) -> str:
-    """Return which way a run of a reciprocating drive goes."""
-    return "backward" if run.backward else "forward"
 
 
 def step(run: Run) -> str:

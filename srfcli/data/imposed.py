@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -18,18 +19,41 @@ from srfcli.data.description import RunDescription
 from srfcli.data.noise import quantisation, saturation, spikes, white_level
 from srfcli.data.values import OBSERVABLES
 from srfcli.laws.registry import Registry
-from srfcli.motion.imposed import ConstantLoad, Drive, Load, SampledLoad
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, Modulation, SampledLoad
 
 # The driving velocity of a run: from its description, from a column of velocities, or from one of displacements.
 
 DIFFERS = 0.05  # relative difference from a column that is told
 
 
-def declared_drive(run: RunDescription, columns: Columns) -> Drive:
+def drive_of(run: RunDescription, columns: Columns) -> tuple[Drive, list[Notice]]:
+    """Return the drive that a run declares, else that of its column, and what is to be told of it.
+
+    Raises SrfError for a run that slides in both directions.
+    """
+    t, role = columns.seconds, columns.role("load_point_velocity", "load_point_displacement")
+    if run.drive is not None:
+        declared = declared_drive(run, columns, run.drive)
+        return declared, [] if role is None else drive_differs(declared, t, columns.arrays[role], columns.place(role).column)
+    assert role is not None  # `read_columns` asks for one of the two
+    values, where = columns.arrays[role], columns.place(role).column
+    if found := strokes(columns):
+        turn = found[1] if len(found) > 1 else found[0]
+        raise SrfError(
+            f"{run.node.where}: the drive turns back before t = {turn.begin:.6g} s and slides there; "
+            "a run slides in one direction",
+            f"Make a run of each stroke: window = [{turn.begin:.6g}, {turn.end:.6g}] and, of a backward one, "
+            f'direction = "backward"; `srf new {run.file.name}` writes them.',
+        )
+    if role == "load_point_velocity":
+        return drive_from_velocity(t, values, where)
+    return drive_from_displacement(t, values, where, correct="reset" in run.corrections)
+
+
+def declared_drive(run: RunDescription, columns: Columns, pieces: Sequence[tuple[float, float]]) -> Drive:
     """Return the drive that the description lists, which begins at the first sample of the file."""
-    assert run.drive is not None
     t = columns.seconds
-    ends = columns.first + np.cumsum([duration for duration, _ in run.drive])
+    ends = columns.first + np.cumsum([duration for duration, _ in pieces])
     interval = float(np.median(np.diff(t)))
     if ends[-1] < t[-1] - 1.5 * interval:
         run.node.child("drive").fail(
@@ -37,7 +61,7 @@ def declared_drive(run: RunDescription, columns: Columns) -> Drive:
             "Let the durations add up to the recording, or end it with window = [from, to].",
         )
     starts = [columns.first, *ends[:-1].tolist()]
-    return Drive.steps(list(zip(starts, (v for _, v in run.drive), strict=True)))
+    return Drive.steps(list(zip(starts, (v for _, v in pieces), strict=True)))
 
 
 class StartsAtRest(SrfError):
@@ -103,7 +127,7 @@ def drive_from_velocity(t: Array, V: Array, where: str) -> tuple[Drive, list[Not
 def _straight_velocities(t: Array, V: Array, rounding: float) -> Drive:
     """Return mean velocities from sample to sample as ramps where they change evenly, else one by one."""
     slopes = np.diff(V) / np.diff(t)
-    times, velocities, rates = [], [], []
+    pieces: list[tuple[float, float, float]] = []
     i, n = 0, V.size
     while i < n:
         j = i + 1
@@ -111,16 +135,13 @@ def _straight_velocities(t: Array, V: Array, rounding: float) -> Drive:
             j += 1
         if j < n and j - i >= 3:
             rate = float((V[j] - V[i]) / (t[j] - t[i]))
-            times.append(t[i])
-            velocities.append(V[i] - rate * (t[i + 1] - t[i]) / 2)  # the mean over an interval is that of its middle
-            rates.append(rate)
+            half = rate * (t[i + 1] - t[i]) / 2  # the mean over an interval is that of its middle
+            pieces.append((float(t[i]), float(V[i] - half), rate))
             i = j
         else:
-            times.append(t[i])
-            velocities.append(V[i])
-            rates.append(0.0)
+            pieces.append((float(t[i]), float(V[i]), 0.0))
             i += 1
-    return Drive(tuple(map(float, times)), tuple(map(float, velocities)), tuple(rates))
+    return Drive(*zip(*pieces, strict=True))
 
 
 def _segmented(t: Array, V: Array) -> tuple[Drive, int]:
@@ -281,43 +302,31 @@ def split(t: Array, x: Array, sigma: Array, penalty: float) -> list[int]:
 
     A piece is split where that lowers the weighted sum of squares by more than `penalty`.
     """
-    sums = _Sums(t - t[0], x - x[0], sigma)
-    found: list[int] = []
-    waiting = [(0, t.size)]
-    while waiting:
-        a, b = waiting.pop()
-        place, gain = sums.best(a, b)
-        if place and gain > penalty:
-            found.append(place)
-            waiting += [(a, place), (place, b)]
-    return sorted(found)
+    w = 1.0 / np.maximum(sigma, EVEN * float(sigma.max())) ** 2
+    t, x = t - t[0], x - x[0]
+    # running sums, from which the misfit of any piece follows at once
+    sums = [np.concatenate([[0.0], np.cumsum(c)]) for c in (w, w * t, w * t * t, w * x, w * t * x, w * x * x)]
 
-
-class _Sums:
-    """Running weighted sums, from which the misfit of any piece follows at once."""
-
-    def __init__(self, t: Array, x: Array, sigma: Array) -> None:
-        w = 1.0 / np.maximum(sigma, EVEN * float(sigma.max())) ** 2
-        columns = [w, w * t, w * t * t, w * x, w * t * x, w * x * x]
-        self.sums = [np.concatenate([[0.0], np.cumsum(c)]) for c in columns]
-
-    def misfit(self, a: NDArray[np.int64] | int, b: NDArray[np.int64] | int) -> Array:
+    def misfit(a: NDArray[np.int64] | int, b: NDArray[np.int64] | int) -> Array:
         """Return the weighted sum of squares about the best line through samples a to b - 1."""
-        w, wt, wtt, wx, wtx, wxx = (s[b] - s[a] for s in self.sums)
+        w, wt, wtt, wx, wtx, wxx = (s[b] - s[a] for s in sums)
         total, spread, cross = wxx - wx * wx / w, wtt - wt * wt / w, wtx - wt * wx / w
         total = total - np.divide(cross * cross, spread, out=np.zeros_like(total), where=spread > 0)
         return np.asarray(np.maximum(total, 0.0))
 
-    def best(self, a: int, b: int) -> tuple[int, float]:
-        """Return where samples a to b - 1 are best split, and by how much that lowers the misfit; 0 for nowhere."""
+    found: list[int] = []
+    waiting = [(0, t.size)]
+    while waiting:
+        a, b = waiting.pop()
         if b - a < 2 * FEWEST_OF_PIECE:
-            return 0, 0.0
+            continue
         places = np.arange(a + FEWEST_OF_PIECE, b - FEWEST_OF_PIECE + 1)
-        left = self.misfit(np.full(places.size, a), places)
-        right = self.misfit(places, np.full(places.size, b))
-        gain = self.misfit(np.array([a]), np.array([b]))[0] - left - right
-        at = int(np.argmax(gain))
-        return int(places[at]), float(gain[at])
+        gain = misfit(a, b) - misfit(a, places) - misfit(places, b)
+        if gain.max() > penalty:
+            place = int(places[np.argmax(gain)])
+            found.append(place)
+            waiting += [(a, place), (place, b)]
+    return sorted(found)
 
 
 def coloured_noise(t: Array, x: Array) -> Array:
@@ -556,13 +565,35 @@ def _step(t: Array, x: Array, sigma: Array, knots: Array, heights: Array, dampin
     return np.asarray((solveh_banded(band, right) / scale)[::2])
 
 
-# The normal load of a run: from its column, made as smooth as its noise demands, or the constant of its description.
+# The normal load of a run: from its column, made as smooth as its noise demands, or that of its description.
 
+LOADS = ("normal_load", "normal_stress")
 NEGLIGIBLE = 1e-5  # of the load's range: noise below it is interpolated and not smoothed
 BLOCKS = 16  # whose means are compared to see whether a load is constant
 ACCIDENTS = 5  # spikes that a channel may have, and one more in 500 samples; if there are more, they are a signal
 NO_CONTACT = 1e-15  # N: no contact
 SMALLEST_MODULATION = 5e-4  # relative amplitude of a modulation, at least: a servo varies the load by less
+
+
+def load_of(run: RunDescription, columns: Columns) -> tuple[Load, list[Notice]]:
+    """Return the load in a run's column, else the one that it states, and what is to be told of it."""
+    role = columns.role(*LOADS)
+    if role is None:
+        W0 = 1.0 if run.load is None else run.load
+        if run.modulation is None:
+            return ConstantLoad(W0), []
+        f, eps, onset = run.modulation
+        return Modulation(W0, eps, f, onset), []
+    place, values = columns.place(role), columns.arrays[role]
+    load, notices = load_from_column(place, values)
+    first = load.rest(float(place.t[0]))
+    if run.load is not None and abs(run.load - first) > DIFFERS * first:
+        run.node.child("load").fail(
+            f"the load is {run.load:g} N, but {place.column} begins with {first:g} N", "Take one of the two away."
+        )
+    if run.modulation is not None:
+        notices += modulation_notices(place, run.modulation, values)
+    return load, notices
 
 
 def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
@@ -733,8 +764,6 @@ def modulation_notices(place: Place, declared: tuple[float, float, float], W: Ar
 
 
 # A recorded normal load alone, without the rest of a recording.
-
-LOADS = ("normal_load", "normal_stress")
 
 
 def read_load(path: Path, *, registry: Registry, format: str | None = None) -> tuple[Load, Array, tuple[Notice, ...]]:

@@ -245,36 +245,17 @@ def _level_jumps(x: Array, quantum: float) -> list[Jump]:
     d = np.diff(x)
     m = median_filter(d, size=21, mode="nearest")
     rest = np.abs(d - m)
-    scale = np.maximum(median_filter(rest, size=min(201, d.size), mode="nearest") / 0.6745, 0.3 * _typical(rest))
-    before, after = _levels(x)
-    size = after - before
+    moving = rest[rest > 0]
+    typical = float(np.median(moving)) / 0.6745 if moving.size else 0.0
+    scale = np.maximum(median_filter(rest, size=min(201, d.size), mode="nearest") / 0.6745, 0.3 * typical)
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(x, SIDE, mode="edge"), SIDE), axis=1)
+    size = medians[SIDE + 1 : x.size + SIDE] - medians[1 : x.size]  # of the five samples after each one and up to it
     candidates = np.flatnonzero(
         (rest > 20 * scale + 4 * quantum) & (np.abs(size) > 0.7 * np.abs(d)) & (np.sign(size) == np.sign(d))
     )
     candidates = candidates[(candidates >= SIDE) & (candidates < x.size - SIDE - 1)]
     neighbours = np.stack([np.abs(np.roll(d, k)) for k in (-2, -1, 1, 2)]).max(axis=0)
     return [Jump(int(i), float(d[i] - m[i])) for i in candidates if neighbours[i] < 0.2 * abs(d[i])]
-
-
-def _typical(rest: Array) -> float:
-    moving = rest[rest > 0]
-    return float(np.median(moving)) / 0.6745 if moving.size else 0.0
-
-
-def _levels(x: Array) -> tuple[Array, Array]:
-    """Return the medians of the five samples up to each one but the last, and of the five after it."""
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(x, SIDE, mode="edge"), SIDE)
-    medians = np.median(windows, axis=1)
-    return medians[1 : x.size], medians[SIDE + 1 : x.size + SIDE]
-
-
-def rejoined(x: Array, jumps: list[Jump]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return x with its certain jumps taken out, and the samples on each side of one, whose level is uncertain."""
-    out, beside = x.copy(), np.zeros(x.size, bool)
-    for jump in jumps:
-        out[jump.at + 1 :] -= jump.size if jump.certain else 0.0
-        beside[max(jump.at, 0) : jump.at + 2] = True
-    return out, beside
 
 
 # The reading of a gauge in a simulation: noise of a given size and correlation, and rounding to steps.

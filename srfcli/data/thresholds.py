@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,12 +67,13 @@ def read_thresholds(path: Path) -> Thresholds:
         text = read_text(path, limit=LARGEST_TABLE, what="a table of critical loads")
     except OSError as error:
         raise SrfError(f"{path} cannot be read: {error.strerror}", exit_code=1) from error
-    lines = list(_filled(text.splitlines()))
+    numbered = enumerate(text.splitlines(), start=1)
+    lines = [(number, line) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
         raise SrfError(f"{path} is empty", "Begin it with a line of names: V [um/s],eps,W0c [N],sigma [N]")
     number, header = lines[0]
-    columns = _columns(header, f"{path.name} line {number}")
-    delimiter = _delimiter(header)
+    delimiter = "\t" if "\t" in header else ";" if ";" in header else ","
+    columns = _columns(_split(header, delimiter), f"{path.name} line {number}")
     rows, given, assumed = [], [], 0
     for number, line in lines[1:]:
         row, without = _row(_split(line, delimiter), columns, f"{path.name} line {number}")
@@ -88,29 +90,18 @@ def read_thresholds(path: Path) -> Thresholds:
     return Thresholds(path.name, V, eps, W0c, sigma, tuple(given), notes)
 
 
-def _filled(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
-    """Yield number and text of every line that is neither blank nor a comment."""
-    for number, line in enumerate(lines, start=1):
-        if line.strip() and not line.lstrip().startswith("#"):
-            yield number, line.rstrip("\r\n")
-
-
-def _delimiter(header: str) -> str:
-    return "\t" if "\t" in header else ";" if ";" in header else ","
-
-
-def _split(line: str, delimiter: str | None = None) -> list[str]:
+def _split(line: str, delimiter: str) -> list[str]:
     """Return the cells of a line; one that quotes cannot be parsed comes back in one cell, which no column takes."""
     try:
-        return next(csv.reader([line], delimiter=delimiter or _delimiter(line), strict=True), [])
+        return next(csv.reader([line], delimiter=delimiter, strict=True), [])
     except csv.Error:
         return [line]
 
 
-def _columns(header: str, where: str) -> list[tuple[str, float]]:
+def _columns(header: Sequence[str], where: str) -> list[tuple[str, float]]:
     """Return name and factor to base units of each column; the factor of a relative sigma is negative."""
     found: list[tuple[str, float]] = []
-    for cell in _split(header):
+    for cell in header:
         name, unit = split_heading(cell)
         if name not in UNITS:
             hint = f"{did_you_mean(name, UNITS)}; other columns have no place in a table of critical loads."
@@ -168,15 +159,13 @@ def _row(cells: list[str], columns: list[tuple[str, float]], where: str) -> tupl
 
 
 def _number(name: str, cell: str, where: str) -> float:
-    try:
+    with contextlib.suppress(ValueError):
         value = float(cell.strip().replace("_", "x"))  # float would take 1_0 for ten
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise SrfError(
-            f"{where}: {name} = {cell.strip()!r} is not a finite number", "Write a number as in 11.25, units in the header."
-        )
-    return value
+        if math.isfinite(value):
+            return value
+    raise SrfError(
+        f"{where}: {name} = {cell.strip()!r} is not a finite number", "Write a number as in 11.25, units in the header."
+    )
 
 
 def thresholds_csv(table: Thresholds) -> str:

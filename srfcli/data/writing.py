@@ -43,7 +43,10 @@ def experiment_files(experiment: Experiment) -> dict[str, str]:
     if not (experiment.runs or experiment.thresholds):
         raise SrfError("an experiment without runs cannot be written", "give it one run or more")
     texts = [*map(run_csv, experiment.runs), *(thresholds_csv(t.table) for t in experiment.thresholds)]
-    names = _file_names([*(run.name for run in experiment.runs), *(table.name for table in experiment.thresholds)])
+    names: list[str] = []
+    for name in (*(run.name for run in experiment.runs), *(table.name for table in experiment.thresholds)):
+        stem = re.sub(r"[^\w.-]+", "-", name, flags=re.ASCII).strip("-.") or "run"
+        names.append(unused_name(stem, ".csv", names))  # none twice even where case does not count
     return {DESCRIPTION: _description(experiment, names), **dict(zip(names, texts, strict=True))}
 
 
@@ -92,8 +95,10 @@ def run_csv(run: Run) -> str:
 
     A sample that is not to be compared becomes an empty cell.
     """
-    W, _ = run.load(run.t)
-    columns = [run.t, _velocity_column(run.drive, run.t), W]
+    V, (W, _) = run.drive(run.t), run.load(run.t)
+    if any(run.drive.accelerations):
+        V[:-1] = np.diff(run.drive.displacement(run.t)) / np.diff(run.t)
+    columns = [run.t, V, W]
     texts: list[Iterable[str]] = [map(repr, column.tolist()) for column in columns]
     header = ["time [s]", "load_point_velocity [um/s]", "normal_stress [MPa]" if run.stress else "normal_load [N]"]
     for signal, name in zip(run.signals, observables(run), strict=True):
@@ -109,14 +114,6 @@ def observables(run: Run) -> list[str]:
             known = ", ".join(OBSERVABLES | OTHER_OBSERVABLES)
             raise SrfError(f"run {run.name!r} records {signal.observable!r}", f"known: {known}")
     return ["shear_stress" if run.stress and s.observable == "force" else s.observable for s in run.signals]
-
-
-def _velocity_column(drive: Drive, t: np.ndarray) -> np.ndarray:
-    if not any(drive.accelerations):
-        return drive(t)
-    slipped = drive.displacement(t)
-    mean = np.diff(slipped) / np.diff(t)
-    return np.append(mean, drive(t[-1:]))
 
 
 def _description(experiment: Experiment, files: list[str]) -> str:
@@ -190,12 +187,3 @@ def shortest(value: float, factor: float, *, slack: float = 0.0) -> float:
         if abs(number * factor - value) <= slack * abs(value):
             return number
     return value / factor
-
-
-def _file_names(runs: list[str]) -> list[str]:
-    """Return one plain file name per run, none twice even where case does not count."""
-    names: list[str] = []
-    for run in runs:
-        stem = re.sub(r"[^\w.-]+", "-", run, flags=re.ASCII).strip("-.") or "run"
-        names.append(unused_name(stem, ".csv", names))
-    return names

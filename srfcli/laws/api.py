@@ -46,38 +46,10 @@ from srfcli.laws.law_file import (
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Check, Effect, ExtraState, FrictionLaw, Interface, Reader, Source, State
 
 __all__ = [
-    "AgeingLaw",
-    "AgeingModifier",
-    "Check",
-    "Effect",
-    "ExtraState",
-    "FrictionLaw",
-    "Interface",
-    "Parameter",
-    "Reader",
-    "Source",
-    "SrfError",
-    "State",
-    "ageing_law",
-    "asinh",
-    "atan",
-    "cos",
-    "cosh",
-    "effect",
-    "exp",
-    "expm1",
-    "friction_law",
-    "interface",
-    "lambertw",
-    "log",
-    "log1p",
-    "modifier",
-    "reader",
-    "sin",
-    "sinh",
-    "sqrt",
-    "tanh",
-]
+    "AgeingLaw", "AgeingModifier", "Check", "Effect", "ExtraState", "FrictionLaw", "Interface", "Parameter", "Reader", "Source",
+    "SrfError", "State", "ageing_law", "asinh", "atan", "cos", "cosh", "effect", "exp", "expm1", "friction_law", "interface",
+    "lambertw", "log", "log1p", "modifier", "reader", "sin", "sinh", "sqrt", "tanh",
+]  # fmt: skip
 
 Parameters = Iterable[Parameter] | Mapping[str, Parameter]
 
@@ -214,14 +186,13 @@ def _decorator(
         check_parameters(listed, kind=kind, states=states)
         check_states(states, listed)
         known = known_symbols(kind, (p.name for p in listed), states)
-        common: dict[str, Any] = {
-            "name": law_name,
-            "parameters": listed,
-            "cites": tuple(cites),
-            "checks": tuple(checks),
-            **_told(function, about),
-        }
-        law = LAW_CLASSES[kind](**common, **more, **{FORMULA[kind]: _formula(function, kind, listed, known)})
+        own = (*(COMMON if kind in ("ageing", "modifier") else ()), *(p.name for p in listed))
+        variables = [n for n in known if n not in own] if kind != "ageing" else list(AGEING_SYMBOLS)
+        formula = _called(function, variables, own)
+        if formula is not None or kind != "interface":  # None is a rigid interface
+            formula = _exact(function.__name__, formula, known)
+        told = {**_told(function, about), **more, FORMULA[kind]: formula}
+        law = LAW_CLASSES[kind](name=law_name, parameters=listed, cites=tuple(cites), checks=tuple(checks), **told)
         check_uses(law)
         return law
 
@@ -259,16 +230,6 @@ def _parameter_list(parameters: Parameters) -> tuple[Parameter, ...]:
         if key != value.name:
             raise SrfError(f"parameter '{value.name}' stands under the key '{key}'", "Use one name for both.")
     return tuple(parameters.values())
-
-
-def _formula(function: Callable[..., Any], kind: str, parameters: tuple[Parameter, ...], known: tuple[str, ...]) -> Any:
-    own = [p.name for p in parameters]
-    names = (*COMMON, *own) if kind in ("ageing", "modifier") else tuple(own)
-    variables = [n for n in known if n not in names] if kind != "ageing" else list(AGEING_SYMBOLS)
-    result = _called(function, variables, names)
-    if result is None and kind == "interface":
-        return None  # rigid
-    return _exact(function.__name__, result, known)
 
 
 def _changes(

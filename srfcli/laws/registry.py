@@ -15,13 +15,13 @@ import importlib.util
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from srfcli.core.cache import header_key, known_headers
+from srfcli.core.cache import header_key, known_headers, user_base
 from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.files import check_plain, open_plain, read_plain
 from srfcli.laws.law_file import PLUGIN_KINDS, LawReader, kind_of, read_header, read_toml, valid_name
@@ -100,7 +100,11 @@ class Registry:
         """Return the law of that kind and name, or in the file of that name where it ends in .toml or .py."""
         if name.endswith((".toml", ".py")):
             self.check_trusted(name)
-            return one_law(Path(name), kind)
+            path = Path(name)
+            found = [law for law in read_file(path) if kind_of(law) == kind]
+            if len(found) != 1:
+                raise SrfError(f"{path}: holds {len(found)} laws of kind {kind}, expected one")
+            return found[0]
         return self.load(self.find(kind, name))
 
     def check_trusted(self, name: str) -> None:
@@ -120,9 +124,7 @@ class Registry:
 
     def reader(self, entry: Entry) -> Reader:
         """Return the reader of an entry, imported at the first call."""
-        if entry not in self._loaded:
-            self._loaded[entry] = find_value(entry)
-        return self._loaded[entry]
+        return self.load(entry)  # type: ignore[return-value]
 
     def ageing(self, spelling: str) -> tuple[AgeingLaw, tuple[AgeingModifier, ...]]:
         """Return the ageing law and the modifiers of a spelling such as `dieterich+linker-dieterich`."""
@@ -214,10 +216,7 @@ def user_folder() -> Path:
     """Return the folder of the user's own laws, which need not exist."""
     if os.environ.get("SRF_DATA"):
         return Path(os.environ["SRF_DATA"])
-    base = Path(os.environ.get("XDG_DATA_HOME", ""))
-    if not base.is_absolute():  # as the specification of these folders says; it would be one in the current folder
-        base = Path.home() / ".local" / "share"
-    return base / "srf" / "plugins"
+    return user_base("XDG_DATA_HOME", ".local/share") / "srf" / "plugins"
 
 
 def read_law(path: Path) -> Law:
@@ -255,14 +254,6 @@ def read_file(path: Path) -> tuple[Law, ...]:
     return laws
 
 
-def one_law(path: Path, kind: str) -> Law:
-    """Return the single law of `kind` in a file."""
-    found = [law for law in read_file(path) if kind_of(law) == kind]
-    if len(found) != 1:
-        raise SrfError(f"{path}: holds {len(found)} laws of kind {kind}, expected one")
-    return found[0]
-
-
 class _Collector:
     """Entries and problems, gathered source by source; a file that is reached twice counts once."""
 
@@ -289,29 +280,27 @@ class _Collector:
         if place in self.seen:
             return
         self.seen.add(place)
-        self.guard(path.stem, origin, path, lambda: self.add(origin, path, module, only))
-
-    def add(self, origin: str, path: Path, module: str | None, only: str | None) -> None:
-        found = _known(path) or ([read_header(path)] if path.suffix == ".toml" else scan_python(path))
-        if only is not None:
-            found = [entry for entry in found if entry[1] == only.replace("_", "-")]
-        self.entries += [Entry(name, kind, origin, path, about, module) for kind, name, about in found]
+        with self.noting(path.stem, origin, path):
+            found = _known(path) or ([read_header(path)] if path.suffix == ".toml" else scan_python(path))
+            if only is not None:
+                found = [entry for entry in found if entry[1] == only.replace("_", "-")]
+            self.entries += [Entry(name, kind, origin, path, about, module) for kind, name, about in found]
 
     def entry_point(self, point: importlib.metadata.EntryPoint) -> None:
         origin = f"entry point {point.name}"
-        self.guard(point.name, origin, point.value, lambda: self.add_point(origin, point))
-
-    def add_point(self, origin: str, point: importlib.metadata.EntryPoint) -> None:
-        place = _without_import(point.module)
-        if place.is_dir() and (not (place / "__init__.py").is_file() or _has_laws(place)):
-            self.folder(origin, place)
-        else:
+        with self.noting(point.name, origin, point.value):
+            place = _without_import(point.module)
             source = place / "__init__.py" if place.is_dir() else place
-            self.file(origin, source, point.module, point.attr or None)
+            if place.is_dir() and (not source.is_file() or any(path.suffix == ".toml" for path in _law_files(place))):
+                self.folder(origin, place)
+            else:
+                self.file(origin, source, point.module, point.attr or None)
 
-    def guard(self, name: str, origin: str, where: object, step: Callable[[], None]) -> None:
+    @contextlib.contextmanager
+    def noting(self, name: str, origin: str, where: object) -> Iterator[None]:
+        """Note what is raised inside as a problem of the source `name`."""
         try:
-            step()
+            yield
         except SrfError as error:
             self.problems.append(Problem(name, origin, str(where), error.message, error.hint))
         except Exception as error:  # a foreign source may fail in any way; its user is told, the others go on
@@ -337,10 +326,6 @@ def _known(path: Path) -> list[tuple[str, str, str]] | None:
         return None
 
 
-def _has_laws(place: Path) -> bool:
-    return place.is_dir() and any(path.suffix == ".toml" for path in _law_files(place))
-
-
 def _without_import(module: str) -> Path:
     """Return the file or folder of a module; only the finder of its top-level package is asked, nothing is imported."""
     top, *rest = module.split(".")
@@ -361,14 +346,7 @@ def _without_import(module: str) -> Path:
 # Python plugins: found by reading the source, imported only when one of their laws is used.
 
 API = "srfcli.laws.api"  # what a plugin imports its decorators from
-DECORATORS = {
-    "friction_law": "friction",
-    "ageing_law": "ageing",
-    "modifier": "modifier",
-    "interface": "interface",
-    "effect": "effect",
-    "reader": "reader",
-}
+DECORATORS = {"friction_law": "friction", "ageing_law": "ageing"} | {n: n for n in ("modifier", "interface", "effect", "reader")}
 
 
 def scan_python(path: Path) -> list[tuple[str, str, str]]:
@@ -388,8 +366,8 @@ def scan_python(path: Path) -> list[tuple[str, str, str]]:
         if not isinstance(node, ast.FunctionDef):
             continue
         for decorator in node.decorator_list:
-            kind = aliases.get(_called(decorator))
-            if kind:
+            called = decorator.func if isinstance(decorator, ast.Call) else decorator
+            if kind := aliases.get(ast.unparse(called)):
                 found.append((kind, *_name_and_about(path, node, decorator)))
     if imports_api and not found:
         raise SrfError(f"{path}: imports {API} but no law is found", "Decorate a function at the top level.")
@@ -452,10 +430,6 @@ def _decorator_names(tree: ast.Module) -> tuple[dict[str, str], bool]:
             imports_api = imports_api or bool(prefixes)
             aliases |= {f"{prefix}.{name}": kind for prefix in prefixes for name, kind in DECORATORS.items()}
     return aliases, imports_api
-
-
-def _called(decorator: ast.expr) -> str:
-    return ast.unparse(decorator.func if isinstance(decorator, ast.Call) else decorator)
 
 
 def _name_and_about(path: Path, node: ast.FunctionDef, decorator: ast.expr) -> tuple[str, str]:

@@ -90,7 +90,12 @@ def diagnose(
     """
     begun = time.perf_counter()
     registry = registry or load_registry()
-    _check_effects(registry, effects)
+    if effects:
+        known = {e.name for e in (*registry.entries("effect"), *registry.entries("ageing"))}
+        known |= {law.reported for e in registry.entries("effect") if isinstance(law := registry.load(e), Effect)}
+        for name in effects:
+            if name not in known:
+                raise SrfError(f"unknown effect '{name}'", did_you_mean(name, sorted(known)))
 
     def read(*, holdout: bool) -> Experiment:
         if isinstance(experiment, Experiment):
@@ -137,14 +142,3 @@ def diagnose(
     return DiagnosisResult(
         diagnosis, location, registry, missing, discriminating, stopped, reader, seed, time.perf_counter() - begun
     )
-
-
-def _check_effects(registry: Registry, effects: Sequence[str]) -> None:
-    """Raise for an effect that nothing is registered under, and none is reported as."""
-    if not effects:
-        return
-    known = {e.name for e in (*registry.entries("effect"), *registry.entries("ageing"))}
-    known |= {law.reported for e in registry.entries("effect") if isinstance(law := registry.load(e), Effect)}
-    for name in effects:
-        if name not in known:
-            raise SrfError(f"unknown effect '{name}'", did_you_mean(name, sorted(known)))

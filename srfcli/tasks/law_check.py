@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import product
 from typing import Any
 
@@ -38,16 +39,17 @@ def check_law(law: Law) -> list[Outcome]:
     registry = bundled_registry()
     if isinstance(law, Effect):
         return check_effect(law, registry)
-    steps: list[tuple[str, Callable[[Law, Registry], str]]] = [
-        ("parameters", check_parameters_used),
-        ("units", check_units),
-        ("steady state", check_steady_state),
-        ("mu_v > 0", check_direct_effect),
-        ("derivatives", check_derivatives),
-        ("worked values", check_worked_values),
+    check = _LawCheck(law, registry)
+    steps = [
+        ("parameters", check.parameters_used),
+        ("units", check.units),
+        ("steady state", check.steady_state),
+        ("mu_v > 0", check.direct_effect),
+        ("derivatives", check.derivatives),
+        ("worked values", check.worked_values),
     ]
-    first = Outcome("parses", "ok", f"{kind_of(law)} law {law.name}: {FORMULA[kind_of(law)]} = {formula_of(law)}")
-    return [first, *run_checks([(name, partial(step, law, registry)) for name, step in steps])]
+    first = Outcome("parses", "ok", f"{kind_of(law)} law {law.name}: {FORMULA[kind_of(law)]} = {check.formula}")
+    return [first, *run_checks(steps)]
 
 
 def steady_age(rate: sympy.Expr, v: float, length: float, values: Values) -> float | None:
@@ -68,189 +70,149 @@ def steady_age(rate: sympy.Expr, v: float, length: float, values: Values) -> flo
     return float(np.exp(brentq(at, grid[falls[0]], grid[falls[0] + 1], xtol=1e-13)) * length / v)
 
 
-def check_parameters_used(law: Law, registry: Registry) -> str:
-    """Raise `SrfError` for a parameter that neither the formula nor a state uses."""
-    formula = formula_of(law)
-    used = {s.name for s in formula.free_symbols} if formula is not None else set()
-    if isinstance(law, FrictionLaw):
-        used |= {name for state in law.states for name in (state.length, state.weight)} | set(COMMON)
-    idle = [p.name for p in law.parameters if p.name not in used]
-    if idle:
-        raise SrfError(f"declared and not used: {', '.join(idle)}", "Remove them or mend the formula.")
-    return f"{len(law.parameters)}, all used"
-
-
-def check_units(law: Law, registry: Registry) -> str:
-    """Raise `SrfError` where a formula adds unlike things, takes log of a length or has the wrong dimension."""
-    formula, quantity = formula_of(law), FORMULA[kind_of(law)]
-    if formula is None:
-        raise Skipped("a rigid interface has no formula")
-    states = law.states if isinstance(law, FrictionLaw) else ()
-    units = {name: dimension(unit) for name, unit in SYMBOL_UNITS.items()}
-    units |= {state.name: units["phi"] for state in states}
-    units |= {p.name: dimension(p.unit) for p in _parameters(law, registry)}
-    for state in states:
-        _expect(units[state.length], dimension("um"), f"length '{state.length}' of state '{state.name}'")
-        _expect(units[state.weight], dimension("1"), f"weight '{state.weight}' of state '{state.name}'")
-    unit = QUANTITY_UNITS[quantity]
-    _expect(dimension_of(formula, units), dimension(unit), quantity)
-    return f"{quantity} is in {unit}"
-
-
-def check_steady_state(law: Law, registry: Registry) -> str:
-    """Raise `SrfError` where an age has no steady value, mu is not finite there or kappa is not positive."""
-    if isinstance(law, Interface):
-        return _check_stiffness(law)
-    if isinstance(law, FrictionLaw):
-        values = reference_values(law.parameters)
-        names = []
-        for ageing in _ageing_laws(registry):
-            for v in CHECKED_VELOCITIES:
-                mu = evaluate(law.mu, {**values, **_steady(law, ageing, v), "v": v})
-                if not np.isfinite(mu):
-                    raise SrfError(f"mu = {mu} at v = {v:g} um/s in steady sliding with {ageing.name}")
-            names.append(ageing.name)
-        return f"mu is finite from {CHECKED_VELOCITIES[0]:g} to {CHECKED_VELOCITIES[-1]:g} um/s with {', '.join(names)}"
-    rate = law.rate if isinstance(law, AgeingLaw) else formula_of(law) + _ageing(registry, "dieterich").rate
-    values = reference_values(_parameters(law, registry))
-    found = []
-    for v in CHECKED_VELOCITIES:
-        phi = steady_age(rate, v, values["D0"], values)
-        if phi is None:
-            raise SrfError(f"phi has no attracting steady value at v = {v:g} um/s", "The rate must fall through 0 at one.")
-        found.append(phi * v / values["D0"])
-    return f"phi v/D0 = {min(found):.6g} to {max(found):.6g} from {CHECKED_VELOCITIES[0]:g} to {CHECKED_VELOCITIES[-1]:g} um/s"
-
-
-def check_direct_effect(law: Law, registry: Registry) -> str:
-    """Raise `SrfError` where mu does not rise with v at fixed age, at a steady state."""
-    if not isinstance(law, FrictionLaw):
-        raise Skipped("only a friction law has mu")
-    slope = sympy.diff(law.mu, symbol("v"))
-    values = reference_values(law.parameters)
-    found = []
-    for ageing in _ageing_laws(registry):
-        for v in CHECKED_VELOCITIES:
-            value = v * evaluate(slope, {**values, **_steady(law, ageing, v), "v": v})
-            if not value > 0:
-                raise SrfError(
-                    f"v mu_v = {value:.6g} at v = {v:g} um/s in steady sliding with {ageing.name}",
-                    "Without mu_v > 0 the slip velocity is not determined; change the formula or the defaults.",
-                )
-            found.append(value)
-    return f"v mu_v = {min(found):.6g} to {max(found):.6g} in steady sliding"
-
-
-def check_derivatives(law: Law, registry: Registry) -> str:
-    """Raise `SrfError` where a first derivative by sympy differs from complex-step differentiation."""
-    formula = formula_of(law)
-    if formula is None:
-        raise Skipped("a rigid interface has no formula")
-    names = sorted(s.name for s in formula.free_symbols)
-    points = _sample(law, registry)
-    worst = 0.0
-    for name in names:
-        derivative = sympy.diff(formula, symbol(name))
-        exact = np.array([evaluate(derivative, point) for point in points], dtype=float)
-        stepped = np.array([_complex_step(formula, name, point) for point in points])
-        scale = np.max(np.abs(exact)) or 1.0
-        error = float(np.max(np.abs(exact - stepped)) / scale)
-        if not error < DERIVATIVE_RTOL:
-            raise SrfError(f"d/d{name} = {derivative} differs from the complex step by {error:.2g} of its size")
-        worst = max(worst, error)
-    return f"by {', '.join(names)}: complex step agrees to {worst:.1e} at {len(points)} points"
-
-
-def check_worked_values(law: Law, registry: Registry) -> str:
-    """Raise `SrfError` where a worked value is not met."""
-    formula = formula_of(law)
-    if not law.checks:
-        raise Skipped("the law gives none; add [[checks]]")
-    if formula is None:
-        raise SrfError("a rigid interface has no formula to check")
-    units = {p.name: p.unit for p in _parameters(law, registry)}
-    for number, check in enumerate(law.checks):
-        values = reference_values(_parameters(law, registry))
-        values |= {name: to_base(value, units.get(name, "1")) for name, value in check.at}
-        missing = sorted({s.name for s in formula.free_symbols} - set(values))
-        if missing:
-            raise SrfError(f"checks[{number}]: no value for '{missing[0]}'", "Add it to the table 'at'.")
-        found = float(evaluate(formula, values))
-        if not abs(found - check.value) <= check.rtol * abs(check.value):
-            raise SrfError(f"checks[{number}]: {check.quantity} = {found!r}, expected {check.value!r}")
-    return f"{len(law.checks)} met"
-
-
-def _check_stiffness(law: Interface) -> str:
-    if law.kappa is None:
-        raise Skipped("a rigid interface has no stiffness")
-    found = [float(evaluate(law.kappa, {**reference_values(law.parameters), "W": W})) for W in CHECKED_LOADS]
-    for W, kappa in zip(CHECKED_LOADS, found, strict=True):
-        if not (np.isfinite(kappa) and kappa > 0):
-            raise SrfError(f"kappa = {kappa:g} N/um at W = {W:g} N", "A stiffness is positive and finite.")
-    return f"kappa = {min(found):.6g} to {max(found):.6g} N/um from {CHECKED_LOADS[0]:g} to {CHECKED_LOADS[-1]:g} N"
-
-
-def _parameters(law: Law, registry: Registry) -> tuple[Parameter, ...]:
-    """Return a law's parameters, and for an ageing law or modifier the friction parameters that it may name."""
-    if not isinstance(law, AgeingLaw | AgeingModifier):
-        return law.parameters
-    reference = registry.get("friction", REFERENCE_LAW).parameters
-    return (*(p for p in reference if p.name in COMMON), *law.parameters)
-
-
-def _ageing_laws(registry: Registry) -> list[AgeingLaw]:
-    return [_ageing(registry, entry.name) for entry in registry.entries("ageing")]
-
-
-def _ageing(registry: Registry, name: str) -> AgeingLaw:
-    law = registry.get("ageing", name)
-    assert isinstance(law, AgeingLaw)
-    return law
-
-
-def _steady(law: FrictionLaw, ageing: AgeingLaw, v: float) -> dict[str, float]:
-    """Return each state of a friction law in steady sliding."""
-    own = reference_values(law.parameters)
-    return {state.name: _steady_of(state, ageing, v, own) for state in law.states}
-
-
-def _steady_of(state: State, ageing: AgeingLaw, v: float, own: Mapping[str, float]) -> float:
-    values = {**own, **reference_values(ageing.parameters), "D0": own[state.length], "B": own[state.weight]}
-    missing = sorted({s.name for s in ageing.rate.free_symbols & {symbol(n) for n in COMMON}} - set(values))
-    if missing:
-        raise SrfError(f"ageing law '{ageing.name}' needs '{missing[0]}', which the friction law lacks")
-    phi = steady_age(ageing.rate, v, own[state.length], values)
-    if phi is None:
-        raise SrfError(f"state '{state.name}' has no steady value at v = {v:g} um/s with {ageing.name}")
-    return phi
-
-
 def _expect(found: Dimension, wanted: Dimension, what: str) -> None:
     """Raise `SrfError` where a formula has another dimension than it should."""
     if found != wanted:
         raise SrfError(f"{what} is in {describe(found)}, expected {describe(wanted)}", "Look at the units under [parameters].")
 
 
-def _sample(law: Law, registry: Registry) -> list[dict[str, float]]:
-    """Return points off any steady state at which derivatives are compared."""
-    base = reference_values(_parameters(law, registry))
-    length = base.get("D0", 1.0)
-    points = []
-    for number, v in enumerate(CHECKED_VELOCITIES):
-        stretch = (0.3, 1.7, 0.8)[number % 3]
-        point = {**base, "v": v, "mu": 0.4, "mu_dot": 0.02, "W": 3.0 + number, "W_dot": -1.5, "F_dot_over_W": 0.03}
-        states = law.states if isinstance(law, FrictionLaw) else (State(),)
-        for state in states:
-            point[state.name] = stretch * base.get(state.length, length) / v
-        points.append(point)
-    return points
+class _LawCheck:
+    """One law; an ageing law or a modifier with the friction parameters that it may name."""
 
+    def __init__(self, law: Law, registry: Registry) -> None:
+        self.law, self.registry, self.formula, self.parameters = law, registry, formula_of(law), law.parameters
+        self.states = law.states if isinstance(law, FrictionLaw) else ()
+        if isinstance(law, AgeingLaw | AgeingModifier):
+            reference = registry.get("friction", REFERENCE_LAW).parameters
+            self.parameters = (*(p for p in reference if p.name in COMMON), *law.parameters)
+        self.values = reference_values(self.parameters)
 
-def _complex_step(formula: sympy.Expr, name: str, point: Mapping[str, float]) -> float:
-    size = COMPLEX_STEP * max(1.0, abs(point[name]))
-    moved = {**point, name: complex(point[name], size)}
-    return float(np.imag(evaluate(formula, moved)) / size)
+    def parameters_used(self) -> str:
+        """Raise `SrfError` for a parameter that neither the formula nor a state uses."""
+        used = {s.name for s in self.formula.free_symbols} if self.formula is not None else set()
+        if isinstance(self.law, FrictionLaw):
+            used |= {name for state in self.states for name in (state.length, state.weight)} | set(COMMON)
+        idle = [p.name for p in self.law.parameters if p.name not in used]
+        if idle:
+            raise SrfError(f"declared and not used: {', '.join(idle)}", "Remove them or mend the formula.")
+        return f"{len(self.law.parameters)}, all used"
+
+    def units(self) -> str:
+        """Raise `SrfError` where a formula adds unlike things, takes log of a length or has the wrong dimension."""
+        if self.formula is None:
+            raise Skipped("a rigid interface has no formula")
+        units = {name: dimension(unit) for name, unit in SYMBOL_UNITS.items()}
+        units |= {state.name: units["phi"] for state in self.states}
+        units |= {p.name: dimension(p.unit) for p in self.parameters}
+        for state in self.states:
+            _expect(units[state.length], dimension("um"), f"length '{state.length}' of state '{state.name}'")
+            _expect(units[state.weight], dimension("1"), f"weight '{state.weight}' of state '{state.name}'")
+        quantity = FORMULA[kind_of(self.law)]
+        _expect(dimension_of(self.formula, units), dimension(QUANTITY_UNITS[quantity]), quantity)
+        return f"{quantity} is in {QUANTITY_UNITS[quantity]}"
+
+    def steady_state(self) -> str:
+        """Raise `SrfError` where an age has no steady value, mu is not finite there or kappa is not positive."""
+        law, values, found = self.law, self.values, []
+        if isinstance(law, Interface):
+            if law.kappa is None:
+                raise Skipped("a rigid interface has no stiffness")
+            for W in CHECKED_LOADS:
+                found.append(float(evaluate(law.kappa, {**values, "W": W})))
+                if not (np.isfinite(found[-1]) and found[-1] > 0):
+                    raise SrfError(f"kappa = {found[-1]:g} N/um at W = {W:g} N", "A stiffness is positive and finite.")
+            return f"kappa = {min(found):.6g} to {max(found):.6g} N/um from {CHECKED_LOADS[0]:g} to {CHECKED_LOADS[-1]:g} N"
+        velocities = f"from {CHECKED_VELOCITIES[0]:g} to {CHECKED_VELOCITIES[-1]:g} um/s"
+        if isinstance(law, FrictionLaw):
+            for ageing, v, at in self.steady_sliding():
+                if not np.isfinite(mu := evaluate(law.mu, at)):
+                    raise SrfError(f"mu = {mu} at v = {v:g} um/s in steady sliding with {ageing}")
+            return f"mu is finite {velocities} with {', '.join(e.name for e in self.registry.entries('ageing'))}"
+        rate = law.rate if isinstance(law, AgeingLaw) else self.formula + self.registry.ageing("dieterich")[0].rate
+        for v in CHECKED_VELOCITIES:
+            phi = steady_age(rate, v, values["D0"], values)
+            if phi is None:
+                raise SrfError(f"phi has no attracting steady value at v = {v:g} um/s", "The rate must fall through 0 at one.")
+            found.append(phi * v / values["D0"])
+        return f"phi v/D0 = {min(found):.6g} to {max(found):.6g} {velocities}"
+
+    def steady_sliding(self) -> Iterator[tuple[str, float, Values]]:
+        """Yield ageing law, v and the values of a friction law's symbols in steady sliding, for each ageing law and velocity."""
+        own = self.values
+        for entry, v in product(self.registry.entries("ageing"), CHECKED_VELOCITIES):
+            ageing, _ = self.registry.ageing(entry.name)
+            found = {}
+            for state in self.states:
+                values = {**own, **reference_values(ageing.parameters), "D0": own[state.length], "B": own[state.weight]}
+                missing = sorted({s.name for s in ageing.rate.free_symbols & {symbol(n) for n in COMMON}} - set(values))
+                if missing:
+                    raise SrfError(f"ageing law '{entry.name}' needs '{missing[0]}', which the friction law lacks")
+                phi = steady_age(ageing.rate, v, own[state.length], values)
+                if phi is None:
+                    raise SrfError(f"state '{state.name}' has no steady value at v = {v:g} um/s with {entry.name}")
+                found[state.name] = phi
+            yield entry.name, v, {**own, **found, "v": v}
+
+    def direct_effect(self) -> str:
+        """Raise `SrfError` where mu does not rise with v at fixed age, at a steady state."""
+        if not isinstance(self.law, FrictionLaw):
+            raise Skipped("only a friction law has mu")
+        slope, found = sympy.diff(self.law.mu, symbol("v")), []
+        for ageing, v, at in self.steady_sliding():
+            found.append(v * evaluate(slope, at))
+            if not found[-1] > 0:
+                raise SrfError(
+                    f"v mu_v = {found[-1]:.6g} at v = {v:g} um/s in steady sliding with {ageing}",
+                    "Without mu_v > 0 the slip velocity is not determined; change the formula or the defaults.",
+                )
+        return f"v mu_v = {min(found):.6g} to {max(found):.6g} in steady sliding"
+
+    def derivatives(self) -> str:
+        """Raise `SrfError` where a first derivative by sympy differs from complex-step differentiation."""
+        if self.formula is None:
+            raise Skipped("a rigid interface has no formula")
+        names, points, worst = sorted(s.name for s in self.formula.free_symbols), self.points(), 0.0
+        for name in names:
+            derivative = sympy.diff(self.formula, symbol(name))
+            exact = np.array([evaluate(derivative, point) for point in points], dtype=float)
+            steps = [COMPLEX_STEP * max(1.0, abs(point[name])) for point in points]
+            moved = [{**point, name: complex(point[name], h)} for point, h in zip(points, steps, strict=True)]
+            stepped = np.array([np.imag(evaluate(self.formula, at)) / h for at, h in zip(moved, steps, strict=True)])
+            scale = np.max(np.abs(exact)) or 1.0
+            error = float(np.max(np.abs(exact - stepped)) / scale)
+            if not error < DERIVATIVE_RTOL:
+                raise SrfError(f"d/d{name} = {derivative} differs from the complex step by {error:.2g} of its size")
+            worst = max(worst, error)
+        return f"by {', '.join(names)}: complex step agrees to {worst:.1e} at {len(points)} points"
+
+    def points(self) -> list[dict[str, float]]:
+        """Return points off any steady state at which derivatives are compared."""
+        base, points = self.values, []
+        length = base.get("D0", 1.0)
+        for number, v in enumerate(CHECKED_VELOCITIES):
+            stretch = (0.3, 1.7, 0.8)[number % 3]
+            point = {**base, "v": v, "mu": 0.4, "mu_dot": 0.02, "W": 3.0 + number, "W_dot": -1.5, "F_dot_over_W": 0.03}
+            for state in self.states or (State(),):
+                point[state.name] = stretch * base.get(state.length, length) / v
+            points.append(point)
+        return points
+
+    def worked_values(self) -> str:
+        """Raise `SrfError` where a worked value is not met."""
+        if not self.law.checks:
+            raise Skipped("the law gives none; add [[checks]]")
+        if self.formula is None:
+            raise SrfError("a rigid interface has no formula to check")
+        units = {p.name: p.unit for p in self.parameters}
+        for number, check in enumerate(self.law.checks):
+            values = self.values | {name: to_base(value, units.get(name, "1")) for name, value in check.at}
+            missing = sorted({s.name for s in self.formula.free_symbols} - set(values))
+            if missing:
+                raise SrfError(f"checks[{number}]: no value for '{missing[0]}'", "Add it to the table 'at'.")
+            found = float(evaluate(self.formula, values))
+            if not abs(found - check.value) <= check.rtol * abs(check.value):
+                raise SrfError(f"checks[{number}]: {check.quantity} = {found!r}, expected {check.value!r}")
+        return f"{len(self.law.checks)} met"
 
 
 # What `srf law check` asks of an effect: units, a neutral value at which the model is its baseline, derivatives.
@@ -267,7 +229,7 @@ RTOL = 1e-9
 
 def check_effect(effect: Effect, registry: Registry) -> list[Outcome]:
     """Return the outcome of every check of an effect; the shipped laws are the baseline that it is nested in."""
-    check = _Check(effect, registry)
+    check = _EffectCheck(effect, registry)
     steps = [
         ("parameters", check.parameters_used),
         ("units", check.units),
@@ -280,20 +242,7 @@ def check_effect(effect: Effect, registry: Registry) -> list[Outcome]:
     return [Outcome("parses", "ok", f"effect {effect.name}: {summary(effect)}"), *run_checks(steps)]
 
 
-@dataclass(frozen=True)
-class _Points:
-    """Random states x (POINTS, n) and what is imposed on them; the same for a model with an effect and for one without."""
-
-    x: Array
-    V: Array
-    W: Array
-    W_dot: Array
-
-    def rates(self, model: GeneratedModel, p: Array) -> Array:
-        return np.asarray(model.rates(self.x[:, : len(model.states)], self.V, self.W, self.W_dot, p))
-
-
-class _Check:
+class _EffectCheck:
     """One effect with a baseline that it can be added to."""
 
     def __init__(self, effect: Effect, registry: Registry) -> None:
@@ -318,7 +267,9 @@ class _Check:
         formulas = self.effect.written or self.effect.changes
         if not (formulas or self.effect.states):
             raise Skipped("there is no formula")
-        units = self._symbol_units()
+        units = {n: dimension(u) for n, u in {**SYMBOL_UNITS, **SLOT_UNITS, **PLACE_UNITS}.items()}
+        declared = (*self.base.parameters, *self.system.parameters, *self.effect.parameters, *self.effect.constants)
+        units |= {p.name: dimension(p.unit) for p in declared}
         for state in self.effect.states:
             units[state.name] = dimension_of(state.steady, units)
         for state in self.effect.states:
@@ -331,12 +282,6 @@ class _Check:
             _expect(units[self.effect.observed], dimension("um"), f"observed '{self.effect.observed}'")
         return ", ".join([*(f"{slot} is in {SLOT_UNITS[slot]}" for slot, _ in formulas),
                           *(f"{s.name} in {describe(units[s.name])}" for s in self.effect.states)])  # fmt: skip
-
-    def _symbol_units(self) -> dict[str, Dimension]:
-        """Return the dimension of every name, those of the baseline's parameters among them."""
-        units = {n: dimension(u) for n, u in {**SYMBOL_UNITS, **SLOT_UNITS, **PLACE_UNITS}.items()}
-        declared = (*self.base.parameters, *self.system.parameters, *self.effect.parameters, *self.effect.constants)
-        return units | {p.name: dimension(p.unit) for p in declared}
 
     # ---- with a baseline
 
@@ -390,10 +335,10 @@ class _Check:
         if self.effect.settings:
             raise Skipped(f"the baseline is another system: {self.base.title}")
         own = len(self.plain.states)
-        ours = self.points.rates(self.model, self.p_neutral)[:, :own]
-        worst = _difference(ours, self.points.rates(self.plain, self.p_plain))
+        ours = self.rates(self.model, self.p_neutral)[:, :own]
+        worst = _difference(ours, self.rates(self.plain, _vector(self.plain)))
         steady = np.asarray(self.model.steady(self.p_neutral))[:own]
-        start = _difference(steady, np.asarray(self.plain.steady(self.p_plain)))
+        start = _difference(steady, np.asarray(self.plain.steady(_vector(self.plain))))
         told = ", ".join(f"{n} = {v:g}" for n, v in self.effect.neutral) or "any value"
         if not max(worst, start) < RTOL:
             where, size = ("the rates", worst) if not worst < RTOL else ("steady sliding", start)
@@ -409,8 +354,8 @@ class _Check:
         if {slot for slot, _ in self.effect.changes} == {"gauge"}:
             return self._shown()
         own = len(self.plain.states)
-        away = self.points.rates(self.model, self.p_default)[:, :own]
-        at = self.points.rates(self.model, self.p_neutral)[:, :own]
+        away = self.rates(self.model, _vector(self.model))[:, :own]
+        at = self.rates(self.model, self.p_neutral)[:, :own]
         moved = np.max(np.abs(away - at) / np.maximum(np.max(np.abs(at), axis=0), 1e-300))
         if not np.isfinite(away).all():
             raise SrfError("the rates are not finite at the default values", "Look at the formula and the defaults.")
@@ -420,15 +365,15 @@ class _Check:
 
     def _shown(self) -> str:
         """Return how far the reading moves at the default values; SrfError where it does not, or moves at the neutral ones."""
-        points = self.points
+        x, V, W, W_dot = self.points
 
         def read(model: GeneratedModel, p: Array) -> Array:
-            return np.asarray(model.reading(points.x[:, : len(model.states)], points.V, points.W, points.W_dot, p))
+            return np.asarray(model.reading(x[:, : len(model.states)], V, W, W_dot, p))
 
-        plain = read(self.plain, self.p_plain)
+        plain = read(self.plain, _vector(self.plain))
         if not (off := _difference(read(self.model, self.p_neutral), plain)) < RTOL:
             raise SrfError(f"at the neutral values the reading differs by {off:.2g} of its size", "It must be gauge there.")
-        moved = _difference(read(self.model, self.p_default), plain)
+        moved = _difference(read(self.model, _vector(self.model)), plain)
         if moved < 1e-12:
             raise SrfError("at the default values the gauge shows what it did", "Give the size a default off its neutral value.")
         return f"at the default values the reading moves by up to {moved:.2g} of the largest"
@@ -438,9 +383,9 @@ class _Check:
         used = {str(s) for f in formulas for s in f.free_symbols} & MOVING
         if used:
             raise Skipped(f"with {', '.join(sorted(used))} in the formula nothing is steady")
-        p = self.p_default
+        p = _vector(self.model)
         rates = np.asarray(self.model.rates(np.asarray(self.model.steady(p)), CHECKED_RUN["V"], CHECKED_RUN["W0"], 0.0, p))
-        scale = np.max(np.abs(self.points.rates(self.model, p)), axis=0)
+        scale = np.max(np.abs(self.rates(self.model, p)), axis=0)
         worst = float(np.max(np.abs(rates) / np.maximum(scale, 1e-300)))
         if not worst < 1e-8:
             name = self.model.states[int(np.argmax(np.abs(rates) / np.maximum(scale, 1e-300)))]
@@ -451,12 +396,9 @@ class _Check:
         return f"nothing moves at V under W0{_to(worst, ' but for', ' of the usual rates')}"
 
     def derivatives(self) -> str:
-        points, model, p = self.points, self.model, self.p_default
-        x = points.x[:, : len(model.states)]
-        given = (points.V, points.W, points.W_dot)
-        exact = (model.rates_jacobian(x, *given, p), model.rates_parameters(x, *given, p))
-        stepped = (_stepped_states(model, points, p), _stepped_parameters(model, points, p))
-        worst = 0.0
+        model, p = self.model, _vector(self.model)
+        exact = (model.rates_jacobian(*self.points, p), model.rates_parameters(*self.points, p))
+        stepped, worst = _stepped(model, *self.points, p), 0.0
         for found, expected, names in zip(exact, stepped, (model.states, model.names), strict=True):
             for j, name in enumerate(names):
                 error = _difference(np.asarray(found)[:, :, j], expected[:, :, j])
@@ -469,26 +411,16 @@ class _Check:
     # ---- numbers
 
     @cached_property
-    def p_plain(self) -> Array:
-        """The parameters of the baseline."""
-        return _vector(self.plain)
-
-    @cached_property
-    def p_default(self) -> Array:
-        """The parameters of the model with the effect at its default values."""
-        return _vector(self.model)
-
-    @cached_property
     def p_neutral(self) -> Array:
         """The parameters of the model with the effect at its neutral values."""
         units = {p.name: p.unit for p in self.effect.parameters}
         return _vector(self.model, {n: to_base(v, units[n]) for n, v in self.effect.neutral})
 
     @cached_property
-    def points(self) -> _Points:
-        """States around steady sliding; the slip, the stage's position and the time are anywhere in a run."""
+    def points(self) -> tuple[Array, Array, Array, Array]:
+        """Random states x (POINTS, n) around steady sliding, and V, W, W_dot; slip, stage and time are anywhere in a run."""
         rng = np.random.default_rng(20)
-        x = np.asarray(self.model.steady(self.p_default))
+        x = np.asarray(self.model.steady(_vector(self.model)))
         spread = {"slip": 40.0, "stage": 40.0, "time": 1.5}
         columns = []
         for name, log, at in zip(self.model.states, self.model.logarithmic, x, strict=True):
@@ -499,7 +431,12 @@ class _Check:
             else:
                 columns.append(at + 0.5 * r if log else at * (1 + 0.1 * r))
         V, W = 9.0 * np.exp(0.3 * rng.standard_normal(POINTS)), 6.0 * (1 + 0.1 * rng.standard_normal(POINTS))
-        return _Points(np.column_stack(columns), V, W, 300.0 * rng.standard_normal(POINTS))
+        return np.column_stack(columns), V, W, 300.0 * rng.standard_normal(POINTS)
+
+    def rates(self, model: GeneratedModel, p: Array) -> Array:
+        """Return the rates at the points, of a model with the effect or of one without."""
+        x, V, W, W_dot = self.points
+        return np.asarray(model.rates(x[:, : len(model.states)], V, W, W_dot, p))
 
 
 def _vector(model: GeneratedModel, values: Mapping[str, float] | None = None) -> Array:
@@ -507,29 +444,19 @@ def _vector(model: GeneratedModel, values: Mapping[str, float] | None = None) ->
     return model.vector({n: v for n, v in CHECKED_RUN.items() if n in model.names} | dict(values or {}))
 
 
-def _stepped_states(model: GeneratedModel, points: _Points, p: Array) -> Array:
-    """Return d(rates)/dx (POINTS, n, n) by complex steps."""
-    x = points.x[:, : len(model.states)].astype(complex)
-    columns = []
-    for j in range(x.shape[1]):
-        moved = x.copy()
-        moved[:, j] += 1j * COMPLEX_STEP
-        columns.append(np.asarray(model.rates(moved, points.V, points.W, points.W_dot, p)).imag / COMPLEX_STEP)
-    return np.stack(columns, axis=-1)
+def _stepped(model: GeneratedModel, x: Array, V: Array, W: Array, W_dot: Array, p: Array) -> tuple[Array, Array]:
+    """Return d(rates)/dx (POINTS, n, n) and d(rates)/dp (POINTS, n, parameters) by complex steps; V is what is imposed."""
 
+    def slopes(x: Array, V: Array, p: Array) -> Array:
+        return np.asarray(model.rates(x, V, W, W_dot, p)).imag / COMPLEX_STEP
 
-def _stepped_parameters(model: GeneratedModel, points: _Points, p: Array) -> Array:
-    """Return d(rates)/dp (POINTS, n, parameters) by complex steps; V is what is imposed, not what p says."""
-    x = points.x[:, : len(model.states)].astype(complex)
-    columns = []
-    for j, name in enumerate(model.names):
-        q, V = p.astype(complex), points.V.astype(complex)
-        if name == "V":
-            V += 1j * COMPLEX_STEP
-        else:
-            q[j] += 1j * COMPLEX_STEP
-        columns.append(np.asarray(model.rates(x, V, points.W, points.W_dot, q)).imag / COMPLEX_STEP)
-    return np.stack(columns, axis=-1)
+    h, states, drive, values = 1j * COMPLEX_STEP, x.astype(complex), V.astype(complex), p.astype(complex)
+    by_states = [slopes(states + h * one, V, p) for one in np.eye(x.shape[1])]
+    by_values = [
+        slopes(states, drive + h, values) if name == "V" else slopes(states, drive, values + h * one)
+        for name, one in zip(model.names, np.eye(p.size), strict=True)
+    ]
+    return np.stack(by_states, axis=-1), np.stack(by_values, axis=-1)
 
 
 def _difference(found: Array, expected: Array) -> float:
@@ -550,25 +477,11 @@ def _to(size: float, before: str = " to", after: str = "") -> str:
 Values = Mapping[str, Any]
 
 
-def _lambertw(value: Any) -> Any:
-    found = lambertw(value)  # complex also where the argument is real
-    return found if np.iscomplexobj(value) else found.real
-
-
 NUMPY: dict[Any, Callable[[Any], Any]] = {
-    sympy.exp: np.exp,
-    sympy.log: np.log,
-    log1p: np.log1p,
-    expm1: np.expm1,
-    sympy.sin: np.sin,
-    sympy.cos: np.cos,
-    sympy.sinh: np.sinh,
-    sympy.cosh: np.cosh,
-    sympy.tanh: np.tanh,
-    sympy.asinh: np.arcsinh,
-    sympy.atan: np.arctan,
-    sympy.LambertW: _lambertw,
-}
+    sympy.exp: np.exp, sympy.log: np.log, log1p: np.log1p, expm1: np.expm1, sympy.sin: np.sin, sympy.cos: np.cos,
+    sympy.sinh: np.sinh, sympy.cosh: np.cosh, sympy.tanh: np.tanh, sympy.asinh: np.arcsinh, sympy.atan: np.arctan,
+    sympy.LambertW: lambda x: lambertw(x) if np.iscomplexobj(x) else lambertw(x).real,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -613,10 +526,7 @@ def evaluate(expr: sympy.Expr, values: Values) -> Any:
     if isinstance(expr, sympy.Add):
         return sum(arguments[1:], start=arguments[0])
     if isinstance(expr, sympy.Mul):
-        product = arguments[0]
-        for factor in arguments[1:]:
-            product = product * factor
-        return product
+        return math.prod(arguments[1:], start=arguments[0])
     if isinstance(expr, sympy.Pow):
         return np.power(arguments[0], arguments[1])
     return NUMPY[expr.func](arguments[0])

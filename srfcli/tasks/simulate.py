@@ -193,24 +193,19 @@ def record_of(
     drive, load = drive or Drive.constant(values["V"]), load or ConstantLoad(values["W0"])
     modulation = (values["f"], values["eps"], begin if onset is None else onset) if values["eps"] else None
     if modulation is not None:
-        load = _modulated(load, *modulation)
+        f, eps, since = modulation
+        if isinstance(load, ConstantLoad):
+            load = Modulation(load.W0, eps, f, since)
+        else:
+            load = ModulatedLoad(load, Modulation(1.0, eps, f, since))
     load.check(begin, float(t[-1]))
     state = start_state(model, p, start, drive=drive, load=load.rest(begin), begin=begin)
     job = Job(
         "simulated", p, drive, load, t, state, observables[0], modulation and modulation[0], modulation,
         beside=tuple(observables[1:]),
     )  # fmt: skip
-    described = system.described(without=replaced)
-    if rough is None:
-        return Work(model, (job,), described)
-    notes, meta = _field_told(rough[1])
-    return Work(rough[0], (on_field(model, *rough, job, start=start),), described, notes=notes, meta=meta)
-
-
-def _modulated(base: Load, f: float, eps: float, onset: float) -> Load:
-    if isinstance(base, ConstantLoad):
-        return Modulation(base.W0, eps, f, onset=onset)
-    return ModulatedLoad(base, Modulation(1.0, eps, f, onset=onset))
+    work = Work(model, (job,), system.described(without=replaced))
+    return work if rough is None else on_field(work, *rough, start=start)
 
 
 def start_state(
@@ -235,20 +230,16 @@ def start_state(
     if not isinstance(start, str):
         return np.asarray(start, float)
     if "=" not in start:
-        q[model.index("V")] = _start_velocity(start)
+        try:
+            V = parse_quantity(start, "um/s", name="`start`")
+        except SrfError as error:
+            raise SrfError(f"`start` {start!r} is neither steady, nor a velocity, nor values", error.hint) from error
+        if not 1e-12 <= V <= LARGEST_VELOCITY:
+            raise SrfError(f"`start` {start}: sliding is steady from 1e-12 to {LARGEST_VELOCITY:g} um/s", "Write `start` 10.")
+        q[model.index("V")] = V
         return np.asarray(model.steady(q), dtype=float)
     q[model.index("V")] = next((v for v in (first, *drive.velocities) if v > 0), 10.0)
     return _with_values(model, np.array(model.steady(q), dtype=float), start)
-
-
-def _start_velocity(text: str) -> float:
-    try:
-        V = parse_quantity(text, "um/s", name="`start`")
-    except SrfError as error:
-        raise SrfError(f"`start` {text!r} is neither steady, nor a velocity, nor values", error.hint) from error
-    if not 1e-12 <= V <= LARGEST_VELOCITY:
-        raise SrfError(f"`start` {text}: sliding is steady from 1e-12 to {LARGEST_VELOCITY:g} um/s", "Write `start` 10.")
-    return V
 
 
 def _with_values(model: GeneratedModel, x: Array, text: str) -> Array:
@@ -273,7 +264,15 @@ def new_experiment(
     `free` names the parameters that a fit is to find, the law's but V0 if left out; `spread` is as in `perturbed`.
     """
     model, values = system.model, system.resolved.values
-    chosen = free_names(model, free)
+    laws = [p.name for p in model.parameters if p.name not in RESERVED]
+    known = [*laws, *(name for name in ("K", "M") if name in model.names)]
+    if free is None:
+        chosen = [name for name in laws if name not in REFERENCE_PARAMETERS]
+    else:
+        chosen = [name.strip() for name in free.split(",") if name.strip()]
+    for name in chosen:
+        if name not in known:
+            raise SrfError(f"`free`: {name!r} is no parameter of {model.title}", did_you_mean(name, known))
     parameters = [
         FitParameter(p.name, values[p.name], *bounds(p, values[p.name]), fixed=p.name not in chosen, unit=p.unit)
         for p in model.parameters
@@ -282,19 +281,6 @@ def new_experiment(
     mass = values.get("M") if choice.inertia else None
     listed = perturbed(parameters, spread, seed)
     return Experiment(folder, f"simulated with {model.title}", choice, mass, stiffness_text(values["K"]), listed, (), ())
-
-
-def free_names(model: GeneratedModel, names: str | None) -> set[str]:
-    """Return which parameters a fit of the written experiment is to find."""
-    laws = [p.name for p in model.parameters if p.name not in RESERVED]
-    if names is None:
-        return {name for name in laws if name not in REFERENCE_PARAMETERS}
-    chosen = [name.strip() for name in names.split(",") if name.strip()]
-    known = [*laws, *(name for name in ("K", "M") if name in model.names)]
-    for name in chosen:
-        if name not in known:
-            raise SrfError(f"`free`: {name!r} is no parameter of {model.title}", did_you_mean(name, known))
-    return set(chosen)
 
 
 def bounds(parameter: Parameter, value: float) -> tuple[float, float]:
@@ -410,7 +396,7 @@ def runs_again(
     """
     experiment.check_recorded("to simulate")
     choice = replace(experiment.choice, **laws)
-    model = mover = open_model(registry, **asdict(choice), stability=False)
+    model = open_model(registry, **asdict(choice), stability=False)
     values = _values(model, parameters)
     runs = experiment.named(names)
     observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in runs))
@@ -423,17 +409,15 @@ def runs_again(
     jobs = tuple(_job(model, experiment, run, values, start) for run in runs)
     unknown = [run.name for run in runs if run.initial == "free"]
     notes = (f"initial state of {', '.join(unknown)} not known: begun in steady sliding",) if unknown else ()
-    meta: dict[str, Any] = {"title": experiment.title}
-    if field is not None:
-        mover = open_model(registry, **asdict(choice), tables=FIELD_TABLE)
-        jobs = tuple(on_field(model, mover, field, job, start=start) for job in jobs)
-        told, entry = _field_told(field)
-        notes, meta = (*notes, *told), meta | entry
     inputs = (experiment.path, *(run.file for run in runs))
     made = None if folder is None else _experiment_again(experiment, model, choice, values, folder, spread, seed)
     dropped = [p.name for p in experiment.parameters if p.name not in model.names]
     remarks = (f"not written, as {choice.law} has no such parameter: {', '.join(dropped)}",) if dropped else ()
-    return Work(mover, jobs, _described(model, experiment, values), gauges, made, remarks, inputs, notes, meta)
+    described = _described(model, experiment, values)
+    work = Work(model, jobs, described, gauges, made, remarks, inputs, notes, {"title": experiment.title})
+    return (
+        work if field is None else on_field(work, open_model(registry, **asdict(choice), tables=FIELD_TABLE), field, start=start)
+    )
 
 
 def _values(model: GeneratedModel, parameters: Mapping[str, str]) -> dict[str, float]:
@@ -447,18 +431,16 @@ def _values(model: GeneratedModel, parameters: Mapping[str, str]) -> dict[str, f
     return values
 
 
-def _of_the_laws(experiment: Experiment) -> dict[str, float]:
-    """Return the values of [parameters]; stiffness and mass are the apparatus', whatever a fit starts from."""
-    return {p.name: p.value for p in experiment.parameters if p.name not in OF_THE_APPARATUS}
+def _listed(experiment: Experiment) -> dict[str, float]:
+    """Return the values of [parameters] and the mass; stiffness and mass are the apparatus', whatever a fit starts from."""
+    mass = {"M": experiment.mass} if experiment.mass else {}
+    return {p.name: p.value for p in experiment.parameters if p.name not in OF_THE_APPARATUS} | mass
 
 
 def _job(model: GeneratedModel, experiment: Experiment, run: Run, values: Mapping[str, float], start: ArrayLike | str) -> Job:
     begin = float(run.t[0])
-    listed = {**_of_the_laws(experiment), "K": run.stiffness}
-    if experiment.mass:
-        listed["M"] = experiment.mass
     asked = of_run(run) if "begin" in model.names else {}  # by effects
-    found = listed | asked | dict(values) | experiment.elsewhere(run)
+    found = _listed(experiment) | {"K": run.stiffness} | asked | dict(values) | experiment.elsewhere(run)
     p = model.vector({name: value for name, value in found.items() if name in model.names})
     model.check_changing_load(p)
     try:
@@ -472,9 +454,7 @@ def _job(model: GeneratedModel, experiment: Experiment, run: Run, values: Mappin
 
 def _described(model: GeneratedModel, experiment: Experiment, values: Mapping[str, float]) -> dict[str, dict[str, Any]]:
     """Return name -> {value, unit, origin} of what does not change from run to run."""
-    listed, described = _of_the_laws(experiment), {}
-    if experiment.mass:
-        listed["M"] = experiment.mass
+    listed, described = _listed(experiment), {}
     for p in model.parameters:
         if p.name in IMPOSED:
             continue
@@ -497,30 +477,20 @@ def _experiment_again(
     seed: int,
 ) -> Experiment:
     """Return the experiment as it is written, its start values those of the simulation, or off them; its runs are to come."""
-    listed = [_moved(p, values.get(p.name)) for p in experiment.parameters if p.name in model.names]
+    listed = [p for p in experiment.parameters if p.name in model.names]
+    for k, p in enumerate(listed):
+        if p.name in values:
+            value, unit = values[p.name], "N/um" if p.name == "K" else p.unit  # the unit of the stiffness that is written, too
+            listed[k] = replace(p, value=value, lower=min(p.lower, value), upper=max(p.upper, value), unit=unit)
     known = {*(p.name for p in listed), *OF_THE_APPARATUS}
-    for p in model.parameters:
-        if p.name in values and p.name not in known:
-            value = values[p.name]
-            listed.append(FitParameter(p.name, value, *bounds(p, value), fixed=True, unit=p.unit))
+    added = [p for p in model.parameters if p.name in values and p.name not in known]
+    listed += [FitParameter(p.name, value := values[p.name], *bounds(p, value), fixed=True, unit=p.unit) for p in added]
     return replace(
-        experiment,
-        path=folder,
-        title=f"{experiment.title} (simulated)".strip(),
-        choice=choice,
+        experiment, path=folder, title=f"{experiment.title} (simulated)".strip(), choice=choice,
         mass=(values.get("M", experiment.mass) if choice.inertia else None),
         stiffness_text=stiffness_text(values["K"]) if "K" in values else experiment.stiffness_text,
-        parameters=perturbed(listed, spread, seed),
-        runs=(),
-        notices=(),
-    )
-
-
-def _moved(p: FitParameter, value: float | None) -> FitParameter:
-    if value is None:
-        return p
-    unit = "N/um" if p.name == "K" else p.unit  # the unit of the stiffness that is written, too
-    return replace(p, value=value, lower=min(p.lower, value), upper=max(p.upper, value), unit=unit)
+        parameters=perturbed(listed, spread, seed), runs=(), notices=(),
+    )  # fmt: skip
 
 
 # The random friction field along slip, and records simulated with it.
@@ -529,26 +499,28 @@ FIELD_TABLE = (("mu", "slip"),)  # a table over slip is added to the friction co
 LARGEST_ROUGHNESS = 0.5  # of mu0: above it the friction coefficient may become negative
 
 
-def on_field(
-    plain: GeneratedModel, rough: GeneratedModel, field: FrictionField, job: Job, *, start: ArrayLike | str | None
-) -> Job:
-    """Return the job of the model `plain` as one of `rough`, the same with FIELD_TABLE, on the part of the track that it covers.
+def on_field(work: Work, rough: GeneratedModel, field: FrictionField, *, start: ArrayLike | str | None) -> Work:
+    """Return work with its model replaced by `rough`, the same with FIELD_TABLE, each job on the part of the track it covers.
 
     Positions are slip from where the run begins; runs that begin at the same place find the same track there. `start` is as in
     `simulate`. Raises SrfError for a roughness that the friction coefficient does not allow.
     """
-    begin = float(job.t[0])
-    place = job.run.start if job.run is not None else 0.0
-    p = rough.vector(dict(zip(plain.names, job.p.tolist(), strict=True)) | {"start": place, "begin": begin})
-    mu0 = p[rough.index("mu0")] if "mu0" in rough.names else math.inf
-    if not field.amplitude <= LARGEST_ROUGHNESS * mu0:
-        raise SrfError(
-            f"`roughness` {field.amplitude:g} is more than half of mu0 = {mu0:g}",
-            "It is the standard deviation of mu0 along the track, such as 3e-4.",
-        )
-    table = field.spline(place, place + _reach(plain, job))
-    state = start_state(rough, appended(p, [table]), start, drive=job.drive, load=job.load.rest(begin), begin=begin)
-    return replace(job, p=p, start=state, tables=(table,))
+    jobs = []
+    for job in work.jobs:
+        begin, place = float(job.t[0]), job.run.start if job.run is not None else 0.0
+        p = rough.vector(dict(zip(work.model.names, job.p.tolist(), strict=True)) | {"start": place, "begin": begin})
+        mu0 = p[rough.index("mu0")] if "mu0" in rough.names else math.inf
+        if not field.amplitude <= LARGEST_ROUGHNESS * mu0:
+            raise SrfError(
+                f"`roughness` {field.amplitude:g} is more than half of mu0 = {mu0:g}",
+                "It is the standard deviation of mu0 along the track, such as 3e-4.",
+            )
+        table = field.spline(place, place + _reach(work.model, job))
+        state = start_state(rough, appended(p, [table]), start, drive=job.drive, load=job.load.rest(begin), begin=begin)
+        jobs.append(replace(job, p=p, start=state, tables=(table,)))
+    told = f"track: mu0 wanders by {field.amplitude:g} (standard deviation) over {field.length:g} um"
+    meta = {**work.meta, "track": {"amplitude": field.amplitude, "length_um": field.length}}  # as in the result of `srf fit`
+    return replace(work, model=rough, jobs=tuple(jobs), notes=(*work.notes, told), meta=meta)
 
 
 def _reach(model: GeneratedModel, job: Job) -> float:
@@ -562,9 +534,3 @@ def _reach(model: GeneratedModel, job: Job) -> float:
     # a spring that friction holds is drawn by less than 1.5 W/K, and swings back by less than it was drawn
     drawn = 3.0 * float(job.load(job.t)[0].max()) / float(job.p[model.index("K")])
     return max(float(driven.max()), 0.0) + 2 * held + drawn
-
-
-def _field_told(field: FrictionField) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return the note on the field and its entry in `meta`, as in the result of `srf fit`."""
-    note = f"track: mu0 wanders by {field.amplitude:g} (standard deviation) over {field.length:g} um"
-    return (note,), {"track": {"amplitude": field.amplitude, "length_um": field.length}}

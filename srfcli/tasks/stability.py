@@ -28,9 +28,8 @@ from srfcli.results.stability import (
 if TYPE_CHECKING:
     from srfcli.codegen.model import Array
     from srfcli.codegen.slider import SlidingSystem
-    from srfcli.numerics.boundary import BoundaryPoint
     from srfcli.numerics.continuation import Boundary, ContinuationSettings
-    from srfcli.numerics.critical import LoadWindow
+    from srfcli.numerics.critical import CriticalLine, LoadWindow
 
 Values = Sequence[float] | float
 Said = Callable[[str], None]
@@ -327,38 +326,33 @@ def critical(
     velocities = (own["V"],) if V is None else checked(model, "V", V)
     amplitudes = (own["eps"],) if eps is None else checked(model, "eps", eps)
     lo, hi = (None, None) if window is None else checked(model, "W0", window)
-    points: list[BoundaryPoint] = []
-    crossings: list[int] = []
-    statuses: list[Status] = []
-    notes: list[str] = []
-    low: list[float] = []
-    high: list[float] = []
-    interrupted = False
+    found: list[tuple[str, CriticalLine]] = []
+    status = Status.OK
     try:
-        for amplitude in amplitudes:
-            for velocity in velocities:
-                base = model.vector({**own, "V": velocity, "eps": amplitude})
-                line = critical_line(
-                    model, base, lo=lo, hi=hi, tol=tol, samples=samples, resolution=resolution, max_mesh=max_mesh
-                )
-                points += line.points
-                crossings += line.crossings
-                statuses += [line.status, *(q.status for q in line.points)]
-                low.append(float(line.scans[0].values[0]))
-                high.append(float(line.scans[-1].values[-1]))
-                place = f"eps = {amplitude:g}, V = {velocity:g} um/s"
-                notes += [f"{place}: {note}" for note in line.notes]
-                if not line.points:
-                    side = _side([g for scan in line.scans for g in scan.g.tolist()])
-                    notes.append(f"{place}: no crossing between W0 = {low[-1]:.4g} and {high[-1]:.4g} N; {side}")
-                progress(place)
+        for amplitude, velocity in itertools.product(amplitudes, velocities):
+            base = model.vector({**own, "V": velocity, "eps": amplitude})
+            line = critical_line(model, base, lo=lo, hi=hi, tol=tol, samples=samples, resolution=resolution, max_mesh=max_mesh)
+            place = f"eps = {amplitude:g}, V = {velocity:g} um/s"
+            found.append((place, line))
+            progress(place)
     except KeyboardInterrupt:
-        interrupted = True
-    if low:
-        span = f"{min(low):.4g} to {max(high):.4g} N" + ("" if window else ", to where the growth rate settles")
+        status = Status.INTERRUPTED
+    notes: list[str] = []
+    ends = [(float(line.scans[0].values[0]), float(line.scans[-1].values[-1])) for _, line in found]
+    for (place, line), (low, high) in zip(found, ends, strict=True):
+        notes += [f"{place}: {note}" for note in line.notes]
+        if not line.points:
+            side = _side([g for scan in line.scans for g in scan.g.tolist()])
+            notes.append(f"{place}: no crossing between W0 = {low:.4g} and {high:.4g} N; {side}")
+    if ends:
+        span = f"{min(ends)[0]:.4g} to {max(high for _, high in ends):.4g} N"
+        span += "" if window else ", to where the growth rate settles"
         notes.append(f"looked from {span}; pairs of crossings closer than {resolution:g} in ln W0 are not looked for")
-    status = Status.INTERRUPTED if interrupted else worst(statuses)
-    return CriticalResult(system, tuple(points), tuple(crossings), tuple(notes), status)
+    points = tuple(q for _, line in found for q in line.points)
+    crossings = tuple(number for _, line in found for number in line.crossings)
+    if status is Status.OK:
+        status = worst([s for _, line in found for s in (line.status, *(q.status for q in line.points))])
+    return CriticalResult(system, points, crossings, tuple(notes), status)
 
 
 def _side(g: list[float]) -> str:
