@@ -76,8 +76,7 @@ def starting_point(model: GeneratedModel, eps: float, V: float, crossing: int) -
 
 def follow(model: GeneratedModel, plane: Plane, start: CurvePoint) -> Curve:
     """Return the whole curve through `start`."""
-    *_, curve = trace(model, plane, start, SETTINGS.steps)
-    return curve
+    return trace(model, plane, start, SETTINGS.steps)
 
 
 def whole(model: GeneratedModel, plane: Plane) -> list[Branch]:
@@ -107,7 +106,7 @@ def distance(model: GeneratedModel, plane: Plane, curve: Curve, start: CurvePoin
     """
     steps = SETTINGS.steps
     careful = replace(steps, first=steps.first / 8, largest=steps.largest / 8, turn=0.05, max_steps=100_000)
-    *_, fine = trace(model, plane, start, careful)
+    fine = trace(model, plane, start, careful)
     a, b = curve.q[:-1], curve.q[1:]
     along = b - a
     farthest = 0.0

@@ -110,7 +110,7 @@ def shots(model: GeneratedModel, found: StabilityMap, rng: np.random.Generator, 
 PARTS = {
     "Newton's equations, compiled": ("newton_orbits", "linearised"),
     "generated field and Jacobian in NumPy": ("cycle", "cycle_jacobian", "steady"),
-    "multipliers": ("eigvals", "ordered_eigenvalues", "det"),
+    "multipliers": ("eigvals", "multipliers", "det"),
     "first guesses": ("along_rows", "along_columns", "neighbours", "forced_guess", "put", "fill"),
 }
 

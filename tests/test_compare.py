@@ -25,10 +25,10 @@ from srfcli.numerics.compare import (
     changed_areas,
     check_adjusted,
     contrast,
+    join_study,
     law_parts,
     match,
     observe,
-    study_law,
     study_part,
     turns,
 )
@@ -89,6 +89,10 @@ def test_what_cannot_be_adjusted_is_refused(model, names):
 
 
 WINDOW = Window((5.0, 40.0), (7.0, 40.0), 14, 24)
+
+
+def study_law(task):
+    return join_study(task, {part: study_part(part) for part in law_parts(task)})
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from example_protocol import example_protocol
 
 from srfcli.codegen.model import open_model
 from srfcli.data.experiment import read_experiment
@@ -18,7 +19,7 @@ from srfcli.laws.registry import bundled_registry, load_registry
 from srfcli.motion.imposed import Modulation
 from srfcli.tasks.law_check import check_law
 from srfcli.validation.cases import EFFECTS, OUTSIDE, case_files
-from srfcli.validation.slider import Physics, example_protocol, move
+from srfcli.validation.slider import Physics, move
 
 SHIPPED = bundled_registry()
 NAMES = [e.name for e in SHIPPED.entries("effect")]

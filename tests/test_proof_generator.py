@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from example_protocol import example_protocol
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
@@ -30,7 +31,6 @@ from srfcli.validation.slider import (
     ageing,
     at_unit_velocity,
     critical_load,
-    example_protocol,
     friction,
     log_velocity,
     move,

@@ -38,21 +38,9 @@ from srfcli.validation.blind import (
     to_line,
     write_answers,
 )
-from srfcli.validation.cases import BANKS, KINDS, NAMES, WIDE_KINDS, make_case, plan_bank, plan_wide, possible_pairs, variants
+from srfcli.validation.cases import BANKS, KINDS, NAMES, WIDE_KINDS, make_case, plan_bank, possible_pairs, variants
 from srfcli.validation.gauge import Gauge
-from srfcli.validation.marks import (
-    INVISIBLE,
-    SIZES,
-    Rate,
-    Sight,
-    accepted,
-    calibration,
-    deviation,
-    mark,
-    quantile,
-    see,
-    stands_out,
-)
+from srfcli.validation.marks import INVISIBLE, Rate, Sight, accepted, calibration, deviation, mark, quantile, see, stands_out
 from srfcli.validation.slider import Physics, Plan, move
 from srfcli.validation.trials import Trial, answer_all, begin, open_truths
 
@@ -219,18 +207,16 @@ def test_held_out_error_is_over_that_of_the_truth():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_size_of_every_effect_is_known_on_both_sides(name):
-    """Each field is the one that the generator varies, each parameter one that the plugin declares, in that unit."""
-    assert set(SIZES) == set(NAMES)
-    assert {s.field for s in SIZES[name]} == {e.varies for e in variants(name)}
+    """Each parameter is one that the plugin declares, in that unit."""
     laws = [e for e in every_effect() if e.reported == name]
     declared = {(p.name, p.unit) for e in laws for p in e.parameters if p.name in e.sizes}
     declared |= {{"K": ("ratio", "1"), "M": ("M", "kg")}[freed] for e in laws for freed in e.frees}
-    assert {(s.parameter, s.unit) for s in SIZES[name]} == declared
+    assert {(e.parameter, e.unit) for e in variants(name)} == declared
 
 
 def test_deviations_by_hand():
     def off(name, value, unit="1", *, named=None, changed=None, **physics):
-        (size,) = [s for s in SIZES[name] if s.unit == unit]
+        (size,) = [e for e in variants(name) if e.unit == unit]
         truth = truth_of(name, physics=physics)
         truth["truth"] = changed if changed is not None else physics
         found = {size.parameter: {"value": value, "stderr": 0.5, "unit": unit}}
@@ -611,10 +597,10 @@ def test_a_diagnosis_is_given_the_case_and_nothing_else(quick, tmp_path):
 
 
 def test_kinds_of_a_bank():
-    names = {k: {len(p) for p in plan_bank(40, 3, kinds=[k])} for k in KINDS}
+    names = {k: {len(p) for _, p in plan_bank(40, 3, kinds=[k])} for k in KINDS}
     assert names == {"none": {0}, "single": {1}, "pair": {2}, "outside": {1}}
     mixed = plan_bank(100, 3, kinds=["none", "outside"])
-    assert (len(mixed), sum(not p for p in mixed)) == (100, 56)
+    assert (len(mixed), sum(not p for _, p in mixed)) == (100, 56)
     assert plan_bank(200, 5, kinds=KINDS) == plan_bank(200, 5)
     with pytest.raises(SrfError, match="unknown kind of case 'sngle'"):
         plan_bank(5, 1, kinds=["sngle"])
@@ -625,15 +611,15 @@ def test_kinds_of_a_bank():
 
 
 def test_kinds_of_a_wide_bank():
-    plan = plan_wide(200, 3)
+    plan = plan_bank(200, 3, bank="wide")
     counts = {kind: sum(k == kind for k, _ in plan) for kind in WIDE_KINDS}
     assert counts == {"none": 50, "single": 60, "pair": 20, "outside": 26, "ageing": 28, "one-run": 16}
     assert {names for kind, names in plan if kind in ("none", "ageing")} == {()}
     singles = [names[0] for kind, names in plan if kind == "single"]
     assert set(singles) == set(NAMES) and len({singles.count(n) for n in NAMES} | {3}) <= 2
     assert {names for kind, names in plan if kind == "pair"} <= set(possible_pairs())
-    assert {kind for kind, _ in plan_wide(30, 1, kinds=["ageing", "one-run"])} == {"ageing", "one-run"}
-    assert plan_wide(40, 3) == plan_wide(40, 3) != plan_wide(40, 4)
+    assert {kind for kind, _ in plan_bank(30, 1, bank="wide", kinds=["ageing", "one-run"])} == {"ageing", "one-run"}
+    assert plan_bank(40, 3, bank="wide") == plan_bank(40, 3, bank="wide") != plan_bank(40, 4, bank="wide")
 
 
 def deadly(task):

@@ -7,12 +7,12 @@ is W/W(t0) area (1 + area_growth ln(phi/1 s)), the growth by the logarithm of ag
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.codegen.splines import Spline, appended
 from srfcli.core.errors import Status
 from srfcli.data.imposed import find_modulation
@@ -94,7 +94,7 @@ def start_state(
         S0 = np.zeros((x0.size, len(by)))
         for k, name in enumerate(by):
             if name in places:
-                S0[:, k] = _slope(lambda q: np.asarray(model.steady(q)), p, places[name])
+                S0[:, k] = _slope(model.steady, p, places[name])
         return x0, S0
     return _balanced(model, run, p, values, by, places)
 
@@ -118,26 +118,17 @@ def _balanced(
         if abs(step) < 1e-13 * (1 + abs(x[iv])):
             break
     x = x.real
-
-    def friction_slope(place: int | None, of: int | None) -> float:
-        y, q = x.astype(complex), p.astype(complex)
-        if place is not None:
-            q[place] += 1j * TINY
-        if of is not None:
-            y[of] += 1j * TINY
-        return float(np.asarray(model.friction(y, V, W, 0.0, q)).imag / TINY)
-
-    by_ln_v = friction_slope(None, iv)
+    of_state = [float(_slope(lambda y: model.friction(y, V, W, 0.0, p.astype(complex)), x, i)) for i in range(x.size)]
     S = np.zeros((x.size, len(by)))
     for k, name in enumerate(by):
         own = name.partition(f"{run.name}.")[2]
         if own == "mu":
-            S[iv, k] = 1 / by_ln_v
+            S[iv, k] = 1 / of_state[iv]
         elif own in ages:
             S[states.index(own), k] = 1.0
-            S[iv, k] = -friction_slope(None, states.index(own)) / by_ln_v
+            S[iv, k] = -of_state[states.index(own)] / of_state[iv]
         elif name in places:
-            S[iv, k] = -friction_slope(places[name], None) / by_ln_v
+            S[iv, k] = -_slope(lambda q: model.friction(x.astype(complex), V, W, 0.0, q), p, places[name]) / of_state[iv]
     if "u" in states:
         stiffness = model.namespace.get("stiffness") or (lambda x, V, W, W_dot, p: p[model.index("K")])
         K, u = float(stiffness(x, V, W, 0.0, p)), states.index("u")
@@ -153,10 +144,11 @@ def _balanced(
     return x, S
 
 
-def _slope(function: object, p: Array, place: int) -> Array:
+def _slope(function: Callable[[ComplexArray], ComplexArray], p: Array, place: int) -> Array:
+    """Return the derivative of a function of `p` (k,) or (n, k) by the number, or the column, at `place`."""
     q = p.astype(complex)
-    q[place] += 1j * TINY
-    return np.asarray(function(q).imag / TINY)  # type: ignore[operator]
+    q[..., place] += 1j * TINY
+    return np.asarray(np.asarray(function(q)).imag / TINY)
 
 
 def _ages(model: GeneratedModel) -> list[str]:
@@ -311,14 +303,10 @@ def _observe(
         with np.errstate(all="ignore"):
             u = np.asarray(reading(x, V, W, W_dot, p))
             for j in range(x.shape[1] if places else 0):
-                moved = x.astype(complex)
-                moved[:, j] += 1j * TINY
-                J += (np.asarray(reading(moved, V, W, W_dot, p)).imag / TINY)[:, None] * S[:, j, :]
+                J += _slope(lambda y: reading(y, V, W, W_dot, p), x, j)[:, None] * S[:, j, :]
             for k, i in enumerate(places):
                 if i >= 0:
-                    q = p.astype(complex)
-                    q[i] += 1j * TINY
-                    J[:, k] += np.asarray(reading(x.astype(complex), V, W, W_dot, q)).imag / TINY
+                    J[:, k] += _slope(lambda q: reading(x.astype(complex), V, W, W_dot, q), p, i)
     if run.observable != "elongation" and model.index("K") in places:
         J[:, list(places).index(model.index("K"))] += u / K
     return factor * u, factor[:, None] * J

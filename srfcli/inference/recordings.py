@@ -15,7 +15,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.data.groups import grouped
 from srfcli.data.values import Experiment, Run
 from srfcli.inference.fit import BetweenGroups, Fit, Interrupted, Problem, fit_problem, scatter_of
-from srfcli.inference.shared_field import SharedFit, fit_shared
+from srfcli.inference.shared_field import fit_shared
 from srfcli.inference.state_space import StateSpaceFit, as_fit, fit_state_space, stopped, with_priors
 from srfcli.laws.registry import Registry
 
@@ -148,7 +148,8 @@ def fit_recordings(
         return replace(result, status=Status.INTERRUPTED)
     if track is None and shared.fit.log_likelihood < best.log_likelihood + SURELY:
         return result
-    return replace(result, fit=shared.fit, state_space=None, friction_field=_shared(shared), status=shared.fit.status)
+    common = FittedField(shared.prior.amplitude, shared.prior.length, True) if shared.prior.amplitude else FittedField()
+    return replace(result, fit=shared.fit, state_space=None, friction_field=common, status=shared.fit.status)
 
 
 def _track(found: StateSpaceFit) -> FittedField | None:
@@ -156,11 +157,6 @@ def _track(found: StateSpaceFit) -> FittedField | None:
     if not found.likelihood.problem.runs:
         return None
     return FittedField() if found.smooth else FittedField(values["field_amplitude"], values["field_length"])
-
-
-def _shared(found: SharedFit) -> FittedField:
-    prior = found.prior
-    return FittedField(prior.amplitude, prior.length, True) if prior.amplitude else FittedField()
 
 
 # Several starts: the file's own, and others drawn over the bounds, so that a false minimum is found out.

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ from srfcli.core.errors import SrfError
 
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline
+
+Number = TypeVar("Number", float, Array)
 
 # The imposed normal load: constant, modulated, or any other; um, s, N.
 
@@ -278,11 +280,7 @@ class SampledLoad(Load):
 
         def spline(s: float) -> tuple[float, float]:
             i = min(max(bisect_right(knots, s) - 1, 0), last)
-            h, W, rate = s - knots[i], 0.0, 0.0
-            for c in reversed(rows[i]):
-                rate = rate * h + W
-                W = W * h + c
-            return W, rate
+            return _horner(rows[i], s - knots[i])
 
         return spline
 
@@ -292,11 +290,7 @@ class SampledLoad(Load):
     def __call__(self, t: Array) -> tuple[Array, Array]:
         t = np.asarray(t, dtype=float)
         i = np.clip(np.searchsorted(self.knots, t, side="right") - 1, 0, len(self._rows) - 1)
-        h, W, rate = t - self.knots[i], np.zeros(t.shape), np.zeros(t.shape)
-        for c in self.coefficients.T[::-1]:
-            rate = rate * h + W
-            W = W * h + c[i]
-        return W, rate
+        return _horner([c[i] for c in self.coefficients.T], t - self.knots[i])
 
     def polynomials(self, start: float, end: float) -> tuple[Array, Array]:
         self.check(start, end)
@@ -316,22 +310,15 @@ def _build(t: Array, W: Array, noise: float) -> tuple[Array, Array, tuple[float,
     if not stretches:
         return (*_bridge(t, W, 0, t.size - 1, None, None), ())
     fits = [_spline(t[a : b + 1], W[a : b + 1], noise) for a, b in stretches]
-    knots, rows, at = [t[:1]], [], 0
-    for k, ((a, b), (fit_knots, fit_rows)) in enumerate(zip(stretches, fits, strict=True)):
-        if at < a:
-            before = fits[k - 1] if k else None
-            bridge_knots, bridge_rows = _bridge(t, W, at, a, before, fits[k])
-            knots.append(bridge_knots[1:])
-            rows.append(bridge_rows)
-        knots.append(fit_knots[1:])
-        rows.append(fit_rows)
-        at = b
-    if at < t.size - 1:
-        bridge_knots, bridge_rows = _bridge(t, W, at, t.size - 1, fits[-1], None)
-        knots.append(bridge_knots[1:])
-        rows.append(bridge_rows)
+    pieces, before, at = [], None, 0
+    for (a, b), fit in zip(stretches, fits, strict=True):
+        pieces += [_bridge(t, W, at, a, before, fit)] if at < a else []
+        pieces.append(fit)
+        before, at = fit, b
+    pieces += [_bridge(t, W, at, t.size - 1, before, None)] if at < t.size - 1 else []
+    knots, rows = np.concatenate([t[:1], *(k[1:] for k, _ in pieces)]), np.concatenate([r for _, r in pieces])
     edges = {float(t[i]) for pair in stretches for i in pair if 0 < i < t.size - 1}
-    return np.concatenate(knots), np.concatenate(rows), tuple(sorted(edges))
+    return knots, rows, tuple(sorted(edges))
 
 
 def _stretches(t: Array, W: Array, noise: float) -> list[tuple[int, int]]:
@@ -486,8 +473,13 @@ def _bridge(
 def _end(fit: tuple[Array, Array]) -> tuple[float, float]:
     """Return value and slope at the last knot."""
     knots, rows = fit
-    h, value, slope = float(knots[-1] - knots[-2]), 0.0, 0.0
-    for c in reversed(rows[-1].tolist()):
+    return _horner(rows[-1].tolist(), float(knots[-1] - knots[-2]))
+
+
+def _horner(coefficients: Sequence[Number], h: Number) -> tuple[Number, Number]:
+    """Return value and slope at `h` of a polynomial, its lowest power first."""
+    value, slope = 0.0 * h, 0.0 * h
+    for c in reversed(coefficients):
         slope = slope * h + value
         value = value * h + c
     return value, slope

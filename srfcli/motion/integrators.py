@@ -83,33 +83,10 @@ def integrate(
     own, columns = len(by), np.full(max(len(tables), 1), -1, dtype=np.intc)
     for i in by_tables:
         columns[i], own = own, own + tables[i].numbers.size
-    return _integrate_compiled(library, p, drive, load, t, start, by, columns, S0, rtol, atol)
-
-
-def pieces(t: Array, drive: Drive, load: Load) -> Iterator[tuple[float, float]]:
-    """Yield the intervals between output's ends and the breaks of drive and load."""
-    inside = (b for b in (*drive.breaks, *load.breaks) if t[0] < b < t[-1])
-    yield from pairwise(np.unique([t[0], *inside, t[-1]]).tolist())
-
-
-def _integrate_compiled(
-    library: ctypes.CDLL,
-    p: Array,
-    drive: Drive,
-    load: Load,
-    t: Array,
-    start: Array,
-    by: Sequence[int],
-    columns: NDArray[np.intc],
-    S0: Array,
-    rtol: float,
-    atol: Array,
-) -> Motion:
-    n, k = start.size, S0.shape[1]
-    x, S = np.full((t.size, n), np.nan), np.full((t.size, n, k), np.nan)
+    x, S = np.full((t.size, start.size), np.nan), np.full((t.size, *S0.shape), np.nan)
     stats, stop = np.zeros(4), ctypes.c_int(0)
     arguments = (
-        *imposed_arguments(t, drive, load), doubles(p), doubles(start), k,
+        *imposed_arguments(t, drive, load), doubles(p), doubles(start), count,
         len(by), integers(columns), integers(np.array(by or [-1], dtype=np.intc)), doubles(sensitivity_scale(p, by)), doubles(S0),
         ctypes.c_double(rtol_of_estimate(rtol)),
         doubles(np.asarray(atol) * rtol_of_estimate(rtol) / rtol),
@@ -119,6 +96,12 @@ def _integrate_compiled(
     filled = interruptible(lambda: library.srf_integrate(*arguments), stop)
     status = Status.OK if filled == t.size else Status.INTEGRATION
     return Motion(x, S, status, float(stats[3]), int(stats[0]))
+
+
+def pieces(t: Array, drive: Drive, load: Load) -> Iterator[tuple[float, float]]:
+    """Yield the intervals between output's ends and the breaks of drive and load."""
+    inside = (b for b in (*drive.breaks, *load.breaks) if t[0] < b < t[-1])
+    yield from pairwise(np.unique([t[0], *inside, t[-1]]).tolist())
 
 
 def imposed_arguments(t: Array, drive: Drive, load: Load) -> tuple[Any, ...]:

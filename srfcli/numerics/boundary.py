@@ -8,6 +8,7 @@ generated bilinear forms supply d(w . J v). The bordered system is regular at fo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ from srfcli.numerics.collocation import (
     BoundaryLinear,
     Condensed,
     Discretisation,
+    by_mesh,
     condense,
     gauss,
     kernel,
@@ -27,6 +29,7 @@ from srfcli.numerics.collocation import (
     respond,
     running_products,
     solved,
+    stack,
     stage_parameters,
     wanted_mesh,
 )
@@ -286,7 +289,7 @@ class _Polished:
 def polish(
     model: GeneratedModel,
     p: Array,
-    orbit: Discretisation,
+    orbit: Discretisation | Sequence[Discretisation],
     target: ComplexArray,
     direction: Direction,
     *,
@@ -295,11 +298,14 @@ def polish(
 ) -> list[BoundaryPoint]:
     """Return boundary points near `p` (n_parameters, B), moved along `direction`, each on a mesh whose error is below `tol`.
 
-    `orbit` (B, N, ...) and the multipliers `target` (B,) are the first guess. A point that does not converge, or whose estimated
-    error stays above `tol` on `max_mesh` intervals, says so in its status.
+    `orbit` (B, N, ...), or B of them on meshes of their own, and the multipliers `target` (B,) are the first guess. A point that
+    does not converge, or whose estimated error stays above `tol` on `max_mesh` intervals, says so in its status.
     """
     points: list[BoundaryPoint | None] = [None] * p.shape[1]
-    waiting = [(np.arange(p.shape[1]), p, orbit, target)]
+    if isinstance(orbit, Discretisation):
+        waiting = [(np.arange(p.shape[1]), p, orbit, target)]
+    else:
+        waiting = [(index, p[:, index], stack([orbit[i] for i in index]), target[index]) for index in by_mesh(orbit)]
     while waiting:
         index, p, orbit, target = waiting.pop()
         N = orbit.x.shape[-2]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
@@ -242,10 +243,11 @@ def stack(orbits: Sequence[Discretisation]) -> Discretisation:
     return join([orbit.part(None) for orbit in orbits])
 
 
-def by_mesh(orbits: Sequence[Discretisation]) -> list[Array]:
-    """Return the indices of the orbits on each mesh, the coarsest first."""
-    meshes = np.array([len(orbit.edges) for orbit in orbits])
-    return [np.nonzero(meshes == edges)[0] for edges in sorted(set(meshes.tolist()))]  # np.unique imports numpy.ma
+def by_mesh(orbits: Sequence[Discretisation], most: int = sys.maxsize) -> list[Array]:
+    """Return the indices of the orbits on each mesh, the coarsest first, in parts of `most` or fewer."""
+    meshes = np.array([orbit.intervals for orbit in orbits])
+    groups = [np.nonzero(meshes == mesh)[0] for mesh in sorted(set(meshes.tolist()))]  # np.unique imports numpy.ma
+    return [group[a : a + most] for group in groups for a in range(0, len(group), most)]
 
 
 @dataclass

@@ -82,7 +82,7 @@ def match(model: GeneratedModel, p: Array, goal: Observables, names: Sequence[st
     adjusted = tuple(names)
     level = FRICTION_LEVEL in model.names
     rows = [model.index(n) for n in adjusted]
-    q = _levelled(model, p, goal) if level else p.copy()
+    q = _levelled(model, p, goal)
     miss = _miss(model, q, goal)
     for _ in range(60):
         if miss is None or np.abs(miss).max() < TOLERANCE:
@@ -101,7 +101,7 @@ def match(model: GeneratedModel, p: Array, goal: Observables, names: Sequence[st
         while shorter > SMALLEST:  # a full step may leave the velocity-weakening regime
             trial = q.copy()
             trial[rows] *= np.exp(shorter * step)
-            trial = _levelled(model, trial, goal) if level else trial
+            trial = _levelled(model, trial, goal)
             here = _miss(model, trial, goal)
             if here is not None and np.linalg.norm(here) < (1 - 0.1 * shorter) * np.linalg.norm(miss):
                 break
@@ -126,7 +126,9 @@ def _miss(model: GeneratedModel, p: Array, goal: Observables) -> Array | None:
 
 
 def _levelled(model: GeneratedModel, p: Array, goal: Observables) -> Array:
-    """Return `p` with mu0 such that friction at the goal's velocity is the goal's, by secants: mu0 may not be additive."""
+    """Return `p` with mu0, if there is one, such that friction at the goal's velocity is the goal's: mu0 may not be additive."""
+    if FRICTION_LEVEL not in model.names:
+        return p.copy()
     q = model.with_values(p, V=goal.V, W0=goal.W0)
 
     def off(value: float) -> float:
@@ -230,11 +232,11 @@ def study_part(part: LawPart) -> dict[str, Array]:
     model = tile_model(task.source, task.key)
     if not part.mapped:
         return {"several": np.array(_there(model, task, eps))}
-    curves, folds, odd, status = _boundaries(model, task, eps) if eps > 0 else _without(model, task)
+    curves, odd, status = _boundaries(model, task, eps) if eps > 0 else (_without(model, task), 0, Status.OK)
     return {
         "several": np.array(_reentrant(curves, task.window)),
         "crossings": _padded(curves, task.window),
-        "folds": np.array(folds),
+        "folds": np.array(sum(turns(c[:, 0]) for c in curves)),
         "odd": np.array(odd),
         "status": np.array(list(Status).index(status)),
         "sizes": np.array([len(c) for c in curves], dtype=int),
@@ -259,13 +261,8 @@ def join_study(task: LawTask, found: Mapping[LawPart, dict[str, Array]]) -> LawS
     )
 
 
-def study_law(task: LawTask) -> LawStudy:
-    """Return the study of a law, its parts one after the other."""
-    return join_study(task, {part: study_part(part) for part in law_parts(task)})
-
-
-def _boundaries(model: GeneratedModel, task: LawTask, eps: float) -> tuple[list[Array], int, int, Status]:
-    """Return components, folds in V, unexplained map points and the status at one amplitude, from a map."""
+def _boundaries(model: GeneratedModel, task: LawTask, eps: float) -> tuple[list[Array], int, Status]:
+    """Return components, unexplained map points and the status at one amplitude, from a map."""
     window = task.window
     base = model.with_values(task.p, eps=eps)
     grid = MapGrid(base, MapAxis("V", *window.V, window.columns), MapAxis("W0", *window.W0, window.rows))
@@ -273,10 +270,9 @@ def _boundaries(model: GeneratedModel, task: LawTask, eps: float) -> tuple[list[
     *_, boundary = find_boundaries(model, found, ContinuationSettings(tol=task.tol))
     if not found.finished or boundary.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    curves = [_curve(model, b) for b in boundary.branches]
     odd = len(unexplained(model, found, boundary))
     status = Status.NO_CONVERGENCE if odd or found.lost else boundary.status
-    return curves, sum(turns(c[:, 0]) for c in curves), odd, status
+    return [_curve(model, b) for b in boundary.branches], odd, status
 
 
 def _curve(model: GeneratedModel, branch: Branch) -> Array:
@@ -284,7 +280,7 @@ def _curve(model: GeneratedModel, branch: Branch) -> Array:
     return branch.p[[model.index("V"), model.index("W0")]].T
 
 
-def _without(model: GeneratedModel, task: LawTask) -> tuple[list[Array], int, int, Status]:
+def _without(model: GeneratedModel, task: LawTask) -> list[Array]:
     """Return the boundary without modulation: the leading Hopf points at the window's lines, one curve for each number."""
     low, high = task.window.W0
     by_number: dict[int, list[tuple[float, float]]] = {}
@@ -292,7 +288,7 @@ def _without(model: GeneratedModel, task: LawTask) -> tuple[list[Array], int, in
         loads = [q.W0 for q in hopf_points(model, model.with_values(task.p, V=V)) if q.leading and low <= q.W0 <= high]
         for number, load in enumerate(loads):
             by_number.setdefault(number, []).append((float(V), load))
-    return [np.array(points) for points in by_number.values()], 0, 0, Status.OK
+    return [np.array(points) for points in by_number.values()]
 
 
 def turns(values: Array) -> int:
@@ -325,7 +321,7 @@ def _reentrant(curves: Sequence[Array], window: Window) -> bool:
 
 def _there(model: GeneratedModel, task: LawTask, eps: float) -> bool:
     """Return whether boundaries are re-entrant at one amplitude."""
-    found = _followed(model, task, eps) if eps > 0 else iter([_without(model, task)[0]])
+    found = _followed(model, task, eps) if eps > 0 else iter([_without(model, task)])
     return any(_reentrant(curves, task.window) for curves in found)
 
 
@@ -385,11 +381,10 @@ def changed_areas(crossings: Sequence[Array], window: Window) -> tuple[float, fl
 
 @dataclass(frozen=True)
 class Contrast:
-    """Where two laws' critical loads differ most: crossing `number` at V and eps, with both loads (N)."""
+    """Where two laws' critical loads differ most: V and eps, with both loads (N)."""
 
     eps: float
     V: float
-    number: int
     W0: tuple[float, float]
 
     @property
@@ -405,16 +400,12 @@ class Contrast:
 
 def contrast(a: LawStudy, b: LawStudy, amplitudes: Sequence[float], window: Window) -> Contrast | None:
     """Return the first crossing (the lowest critical load) in which two laws differ most, None where none is shared."""
-    best: Contrast | None = None
-    velocities = window.velocities()
-    for k, eps in enumerate(amplitudes):
-        pairs = a.crossings[k][:, 0], b.crossings[k][:, 0]
+    found, velocities = [], window.velocities()
+    for eps, one, other in zip(amplitudes, a.crossings, b.crossings, strict=True):
+        pairs = np.stack([one[:, 0], other[:, 0]])
         with np.errstate(invalid="ignore"):
             apart = np.abs(np.log(pairs[0] / pairs[1]))
-        if not np.isfinite(apart).any():
-            continue
-        i = int(np.nanargmax(apart))
-        here = Contrast(eps, float(velocities[i]), 1, (float(pairs[0][i]), float(pairs[1][i])))
-        if best is None or here.difference > best.difference:
-            best = here
-    return best
+        if np.isfinite(apart).any():
+            i = int(np.nanargmax(apart))
+            found.append(Contrast(eps, float(velocities[i]), (float(pairs[0, i]), float(pairs[1, i]))))
+    return max(found, key=lambda here: here.difference, default=None)

@@ -20,7 +20,7 @@ import numpy as np
 from srfcli.codegen.model import Array, GeneratedModel
 from srfcli.core.errors import Status
 from srfcli.numerics.boundary import BoundaryPoint, Direction, largest_other, polish, slope_in_last, solve_boundary
-from srfcli.numerics.collocation import Discretisation, by_mesh, mesh_error, stack
+from srfcli.numerics.collocation import Discretisation, mesh_error
 from srfcli.numerics.critical import INTERVALS, LineScan, locate_crossings, scan_line
 from srfcli.numerics.orbit import interpolate, scales, uniform_mesh
 from srfcli.numerics.plane import Plane, meets, passes
@@ -107,46 +107,24 @@ def correct(
     """
     n = orbit.x.shape[-1]
     across = np.concatenate([np.zeros(n) if normal_x is None else normal_x, normal_q])[None, None]
-    previous = first = np.inf
-    for iteration in range(max_iterations):
+    changes: list[float] = []
+    for _ in range(max_iterations):
         p = plane.point(model, q)
-        linear = solve_boundary(
-            model,
-            p[:, None],
-            orbit.part(None),
-            plane.names,
-            np.array([rho]),
-            np.diag(plane.rates(model, p))[None],
-            across,
-            columns=2,
-        )
+        target, rate = np.array([rho]), np.diag(plane.rates(model, p))[None]
+        linear = solve_boundary(model, p[:, None], orbit.part(None), plane.names, target, rate, across, columns=2)
         if not (linear.good[0] and np.isfinite(linear.solution).all()):
             return None
         step, tangent = (Discretisation(linear.dx[k, 0], linear.dstages[k, 0], orbit.edges) for k in (0, 1))
-        dq = linear.solution[0, 0, n:]
+        dq, tangent_q = linear.solution[:, 0, n:]
         change = change_size(model, p, dq, step.x)
-        if iteration and change > 0.7 * previous:
+        if change > 0.5 or (changes and change > 0.7 * changes[-1]):
             return None
-        previous = change
-        first = change if iteration == 0 else first
-        if change > 0.5:
-            return None
-        small = change < min(np.sqrt(tol), STALE_TANGENT * reach)
-        q, orbit = q + dq, orbit + step
-        rho = complex(linear.rho[0])
-        if change < tol or small:  # a full Newton step leaves an error of order change^2
-            point = CurvePoint(
-                q,
-                plane.point(model, q),
-                orbit,
-                rho,
-                float(largest_other(linear.multipliers, linear.rho)[0]),
-                linear.solution[1, 0, n:],
-                tangent,
-                float(slope_in_last(linear)[0]),
-                correction=first,
-            )
-            return _normalised(model, point, orientation)
+        changes.append(change)
+        q, orbit, rho = q + dq, orbit + step, complex(linear.rho[0])
+        if change < max(tol, min(np.sqrt(tol), STALE_TANGENT * reach)):  # a full Newton step leaves an error of order change^2
+            others, slope = float(largest_other(linear.multipliers, linear.rho)[0]), float(slope_in_last(linear)[0])
+            found = CurvePoint(q, plane.point(model, q), orbit, rho, others, tangent_q, tangent, slope, correction=changes[0])
+            return _normalised(model, found, orientation)
     return None
 
 
@@ -163,6 +141,11 @@ def state_size(model: GeneratedModel, p: Array, x: Array) -> Array:
 def metric(model: GeneratedModel, p: Array, x: Array, change: Array) -> Array:
     """Return the row (n,) whose product with changes of the state `x` (n,) at tau = 0 is their arclength along `change`."""
     return change * (ORBIT_WEIGHT / state_size(model, p, x)) ** 2
+
+
+def _along_orbit(model: GeneratedModel, point: CurvePoint) -> Array:
+    """Return that row along the tangent of a curve at one of its points."""
+    return metric(model, point.p, point.orbit.x[0], point.tangent_orbit.x[0])
 
 
 def _normalised(model: GeneratedModel, point: CurvePoint, orientation: CurvePoint | None) -> CurvePoint:
@@ -202,20 +185,9 @@ def follow(
     for count in range(settings.max_steps):
         q, orbit = predict(current, before, ds)
         reach = change_size(model, current.p, q - current.q, orbit.x - current.orbit.x)
-        point = correct(
-            model,
-            plane,
-            q,
-            orbit,
-            current.rho,
-            current.tangent_q,
-            metric(model, current.p, current.orbit.x[0], current.tangent_orbit.x[0]),
-            orientation=current,
-            tol=settings.tol,
-            reach=reach,
-        )
-        turned = np.inf if point is None else _angle(model, current, point)
-        bend = np.inf if point is None else _bend(current, point)
+        across = current.tangent_q, _along_orbit(model, current)
+        point = correct(model, plane, q, orbit, current.rho, *across, orientation=current, tol=settings.tol, reach=reach)
+        turned, bend = (np.inf, np.inf) if point is None else (_angle(model, current, point), _bend(current, point))
         spoilt = turned > 2 * settings.turn or bend > 2 * settings.chord
         if point is None or spoilt or abs(np.angle(point.rho / current.rho)) > 0.5:
             ds *= 0.4
@@ -258,13 +230,8 @@ def remeshed(model: GeneratedModel, plane: Plane, point: CurvePoint, settings: S
     mesh = suited_mesh(error, N, settings)
     if (error <= settings.mesh_error and mesh > COARSER * N) or mesh == N:
         return None
-    edges = uniform_mesh(mesh)
-    seen = replace(point, tangent_orbit=interpolate(point.tangent_orbit, edges))
-    normal_x = metric(model, point.p, point.orbit.x[0], point.tangent_orbit.x[0])
-    start = interpolate(point.orbit, edges)
-    return correct(
-        model, plane, point.q, start, point.rho, point.tangent_q, normal_x, orientation=seen, reach=point.step or np.inf
-    )
+    start, across = _on_mesh(point, uniform_mesh(mesh)), (point.tangent_q, _along_orbit(model, point))
+    return correct(model, plane, point.q, start.orbit, point.rho, *across, orientation=start, reach=point.step or np.inf)
 
 
 def _on_mesh(point: CurvePoint, edges: Array) -> CurvePoint:
@@ -301,15 +268,12 @@ def _angle(model: GeneratedModel, a: CurvePoint, b: CurvePoint) -> float:
 
 def _edge_crossed(a: Array, b: Array) -> tuple[int, float] | None:
     """Return (axis, coordinate) of the window's edge that the segment from a to b leaves through first, or None."""
-    best: tuple[float, int, float] | None = None
+    shares: dict[tuple[int, float], float] = {}  # of the way to b, at which it does
     for axis in (0, 1):
-        for edge in (0.0, 1.0):
-            outside = b[axis] < edge - 1e-12 if edge == 0.0 else b[axis] > edge + 1e-12
-            if outside and b[axis] != a[axis]:
-                t = (edge - a[axis]) / (b[axis] - a[axis])
-                if best is None or t < best[0]:
-                    best = (t, axis, edge)
-    return None if best is None else (best[1], best[2])
+        for edge, outwards in ((0.0, -1.0), (1.0, 1.0)):
+            if outwards * (b[axis] - edge) > 1e-12 and b[axis] != a[axis]:
+                shares[axis, edge] = (edge - a[axis]) / (b[axis] - a[axis])
+    return min(shares, key=lambda side: shares[side], default=None)
 
 
 def _land(
@@ -333,28 +297,13 @@ def reversed_tangent(point: CurvePoint) -> CurvePoint:
     return replace(point, tangent_q=-point.tangent_q, tangent_orbit=-1.0 * point.tangent_orbit)
 
 
-def trace(model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings) -> Iterator[Curve]:
-    """Yield the growing curve through `start` after each point, both ways; the last one yielded is complete."""
-    curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
-    for item in follow(model, plane, start, settings):
-        if isinstance(item, Status):
-            curve.end = item
-        else:
-            curve.points.append(item)
-        yield curve
-    if curve.end is Status.CLOSED:
-        curve.start = Status.CLOSED
-        return
-    for item in follow(model, plane, start, settings, forward=False):
-        if isinstance(item, Status):
-            curve.start = item
-        else:
-            curve.points.insert(0, reversed_tangent(item))
-        yield curve
-
-
-def trace_whole(
-    model: GeneratedModel, plane: Plane, start: CurvePoint, settings: StepSettings, progress: Progress, name: str = ""
+def trace(
+    model: GeneratedModel,
+    plane: Plane,
+    start: CurvePoint,
+    settings: StepSettings,
+    progress: Progress = lambda text: None,
+    name: str = "",
 ) -> Curve:
     """Return the curve through `start`, both ways; after a KeyboardInterrupt as far as it was followed.
 
@@ -362,7 +311,20 @@ def trace_whole(
     """
     curve = Curve([start], Status.INTERRUPTED, Status.INTERRUPTED)
     try:
-        for curve in trace(model, plane, start, settings):
+        for item in follow(model, plane, start, settings):
+            if isinstance(item, Status):
+                curve.end = item
+            else:
+                curve.points.append(item)
+            progress(f"{name}{len(curve.points)} points")
+        if curve.end is Status.CLOSED:
+            curve.start = Status.CLOSED
+            return curve
+        for item in follow(model, plane, start, settings, forward=False):
+            if isinstance(item, Status):
+                curve.start = item
+            else:
+                curve.points.insert(0, reversed_tangent(item))
             progress(f"{name}{len(curve.points)} points")
     except KeyboardInterrupt:
         curve.end = Status.INTERRUPTED
@@ -445,7 +407,7 @@ def find_components(
                     abs(h - start.q[1]) < SAME_BOUNDARY and up == (start.slope_y > 0) for h, up in _heights(curves, start.q[0])
                 ):
                     continue  # a curve that was followed already, met again from a bracket that the scan's mesh misplaced
-                curve = trace_whole(model, plane, start, settings.steps, progress, f"component {len(curves) + 1}: ")
+                curve = trace(model, plane, start, settings.steps, progress, f"component {len(curves) + 1}: ")
                 if len(curve.points) > 1:
                     curves.append(curve)
                     boundary.branches.extend(polish_curve(model, plane, curve, settings))
@@ -532,38 +494,17 @@ def polish_curve(model: GeneratedModel, plane: Plane, curve: Curve, settings: Co
     Each point moves across the curve's tangent in parameters and state together, so that folds and cusps are as good as any
     other point; end points on the window's edge move along the edge.
     """
-    pts = curve.points
-    direction = _across(model, plane, pts)
-    polished: list[BoundaryPoint | None] = [None] * len(pts)
-    for index in by_mesh([pt.orbit for pt in pts]):
-        group = [pts[i] for i in index]
-        found = polish(
-            model,
-            np.stack([pt.p for pt in group], axis=1),
-            stack([pt.orbit for pt in group]),
-            np.array([pt.rho for pt in group]),
-            direction.part(index),
-            tol=settings.tol,
-            max_mesh=settings.max_mesh,
-        )
-        for i, located in zip(index, found, strict=True):
-            polished[i] = located
-    branches, part = [], []
-    for point in polished:
-        if point is not None and point.others < 1.0:
-            part.append(point)
-        elif part:
-            branches.append(part)
-            part = []
-    branches.append(part)
-    whole = len(branches) == 1
-    return [
-        Branch(
-            tuple(b), curve.start if whole or i == 0 else Status.OK, curve.end if whole or i == len(branches) - 1 else Status.OK
-        )
-        for i, b in enumerate(branches)
-        if len(b) > 1
-    ]
+    p, rho = np.stack([pt.p for pt in curve.points], axis=1), np.array([pt.rho for pt in curve.points])
+    direction, orbits = _across(model, plane, curve.points), [pt.orbit for pt in curve.points]
+    parts: list[list[BoundaryPoint]] = [[]]
+    for point in polish(model, p, orbits, rho, direction, tol=settings.tol, max_mesh=settings.max_mesh):
+        if point.others < 1.0:
+            parts[-1].append(point)
+        elif parts[-1]:
+            parts.append([])
+    starts, ends = [Status.OK] * len(parts), [Status.OK] * len(parts)
+    starts[0], ends[-1] = curve.start, curve.end
+    return [Branch(tuple(b), *stopped) for b, *stopped in zip(parts, starts, ends, strict=True) if len(b) > 1]
 
 
 def _across(model: GeneratedModel, plane: Plane, points: Sequence[CurvePoint]) -> Direction:
@@ -574,7 +515,7 @@ def _across(model: GeneratedModel, plane: Plane, points: Sequence[CurvePoint]) -
     unit = np.array([1 / a.span if a.log else 1.0 for a in axes])
     rows = []
     for point in points:
-        along_x, along_q = metric(model, point.p, point.orbit.x[0], point.tangent_orbit.x[0]), point.tangent_q
+        along_x, along_q = _along_orbit(model, point), point.tangent_q
         edge = np.nonzero(np.minimum(np.abs(point.q), np.abs(point.q - 1)) < 1e-9)[0]
         if edge.size:
             along_x, along_q = np.zeros_like(along_x), np.eye(2)[edge[0]]

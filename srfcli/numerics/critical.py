@@ -45,13 +45,12 @@ JUMP_SHARE = 0.5  # of the growth rates at a bracket's ends: what stays of them 
 
 @dataclass(frozen=True)
 class CriticalLine:
-    """The critical values of `name` in [lo, hi], rising, and the scan that found them.
+    """The critical loads W0 in [lo, hi], rising, and the scan that found them.
 
-    `crossings[i]` numbers points[i] from the low end: odd where stability is lost as the parameter rises. `outer` is what was
+    `crossings[i]` numbers points[i] from the low end: odd where stability is lost as the load rises. `outer` is what was
     looked at beyond [lo, hi] where no window was given. `status` is not OK where a crossing may be missing.
     """
 
-    name: str
     points: tuple[BoundaryPoint, ...]
     crossings: tuple[int, ...]
     scan: LineScan
@@ -69,31 +68,26 @@ def critical_line(
     model: GeneratedModel,
     base: Array,
     *,
-    name: str = "W0",
     lo: float | None = None,
     hi: float | None = None,
     tol: float = 1e-8,
     samples: int = SAMPLES,
     resolution: float = 1e-3,
-    guess: LineScan | None = None,
     max_mesh: int = 512,
 ) -> CriticalLine:
-    """Return every crossing of the stability boundary along `name` in [lo, hi] at the parameters `base` (n_parameters,).
+    """Return every crossing of the stability boundary along W0 in [lo, hi] at the parameters `base` (n_parameters,).
 
-    Without a window the loads W0 are followed to where the growth rate settles. A pair of crossings closer
-    than the scan's resolution (in ln name) may be missed; the notes say so where it may matter.
+    Without a window the loads are followed to where the growth rate settles. A pair of crossings closer
+    than the scan's resolution (in ln W0) may be missed; the notes say so where it may matter.
     """
     whole = lo is None or hi is None
     if lo is None or hi is None:
         lo, hi = load_window(model, [base])
-    values = np.geomspace(lo, hi, samples) if guess is None else guess.values
-    scan = scan_line(
-        model, base, name, values, intervals=INTERVALS, guess=None if guess is None else guess.orbit, resolution=resolution
-    )
+    scan = scan_line(model, base, "W0", np.geomspace(lo, hi, samples), intervals=INTERVALS, resolution=resolution)
     outer = follow_outwards(model, base, scan, scan, resolution=resolution) if whole else None
-    line = CriticalLine(name, (), (), scan, (), outer=outer)
+    line = CriticalLine((), (), scan, (), outer=outer)
     found = [locate_crossings(model, base, piece, tol=tol, max_mesh=max_mesh) for piece in line.scans]
-    points = _distinct(sorted((q for part in found for q in part), key=lambda q: q.value(model, name)), model, name)
+    points = _distinct([q for part in found for q in part], model, "W0")
     signs = np.concatenate([piece.g for piece in line.scans])
     signs = signs[np.isfinite(signs)]
     stable_below = bool(signs[0] < 0) if signs.size else True
@@ -136,7 +130,7 @@ def locate_crossings(
         finer = 2 * scan.orbit.intervals
         again = scan_line(model, base, scan.name, values, intervals=finer, resolution=1e-6, tongues=False)
         found += locate_crossings(model, base, again, tol=tol, max_mesh=max_mesh, depth=depth + 1, outer=across)
-    return _distinct(sorted(found, key=lambda q: q.value(model, scan.name)), model, scan.name)
+    return _distinct(found, model, scan.name)
 
 
 def _jumps(across: tuple[float, ...]) -> bool:
@@ -145,9 +139,9 @@ def _jumps(across: tuple[float, ...]) -> bool:
 
 
 def _distinct(points: list[BoundaryPoint], model: GeneratedModel, name: str) -> list[BoundaryPoint]:
-    """Return `points` (rising) with those that neighbouring brackets found twice kept once."""
+    """Return `points` by rising values of `name`, those that neighbouring brackets found twice kept once."""
     kept: list[BoundaryPoint] = []
-    for point in points:
+    for point in sorted(points, key=lambda q: q.value(model, name)):
         if kept:
             apart = point.value(model, name) / kept[-1].value(model, name) - 1
             near = max(1e-9, 20 * (point.error + kept[-1].error))
@@ -183,9 +177,9 @@ def _notes(
     notes, status = [], Status.OK
     for scan in line.scans:
         if scan.lost.size:
-            span = f"between {scan.lost.min():.4g} and {scan.lost.max():.4g}"
             notes.append(
-                f"no forced periodic state was found at {scan.lost.size} of {len(scan.values)} samples of {scan.name} {span}"
+                f"no forced periodic state was found at {scan.lost.size} of {len(scan.values)} samples of W0 between "
+                f"{scan.lost.min():.4g} and {scan.lost.max():.4g}"
             )
             status = Status.NO_CONVERGENCE
     expected: bool | None = True  # that stability is lost as the parameter rises; None where it cannot be said
@@ -193,9 +187,9 @@ def _notes(
         if crossing == crossings[0]:
             expected = crossing % 2 == 1
         if point.status is Status.NO_CONVERGENCE:
-            place = f"{line.scan.name} = {point.value(model, line.scan.name):.4g}"
             notes.append(
-                f"crossing {crossing} near {place} was not located: where the forced state has several branches they end in folds"
+                f"crossing {crossing} near W0 = {point.value(model, 'W0'):.4g} was not located: where the forced state has "
+                "several branches they end in folds"
             )
             status, expected = Status.NO_CONVERGENCE, None
             continue

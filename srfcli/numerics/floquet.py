@@ -202,13 +202,8 @@ def waveforms(model: GeneratedModel, p: Array, orbit: Discretisation, samples: i
     """Return the orbit at `samples` equal phases of one period, by its own collocation polynomials."""
     tau = np.arange(samples) / samples
     x = interpolate(orbit, np.concatenate([tau, [1.0]])).x
-    return Waveforms(
-        tau,
-        x,
-        model.cycle_friction(tau, x, p.tolist()),
-        model.cycle_load(tau, x, p.tolist()),
-        model.cycle_elongation(tau, x, p.tolist()),
-    )
+    mu, W, u = (q(tau, x, p.tolist()) for q in (model.cycle_friction, model.cycle_load, model.cycle_elongation))
+    return Waveforms(tau, x, mu, W, u)
 
 
 def _harmonics(orbit: Discretisation, values: Array, count: int) -> ComplexArray:

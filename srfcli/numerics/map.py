@@ -94,7 +94,7 @@ class StabilityMap:
     @property
     def growth(self) -> Array:
         """Return ln |leading multiplier| over one forcing period, (nx, ny)."""
-        return log_modulus(self.leading)
+        return np.log(np.maximum(np.abs(self.leading), 1e-300))  # one that underflowed is as small as a number can be
 
     @property
     def kind(self) -> Array:
@@ -126,11 +126,6 @@ def kinds(leading: ComplexArray) -> Array:
         angle = np.abs(np.angle(leading))
         unstable = np.where(angle < REAL_ANGLE, 4, np.where(angle > np.pi - REAL_ANGLE, 3, 2))
         return np.where(~np.isfinite(leading), 0, np.where(np.abs(leading) < 1, 1, unstable))
-
-
-def log_modulus(leading: ComplexArray) -> Array:
-    """Return ln |rho|; a multiplier that underflowed is as small as a number can be."""
-    return np.log(np.maximum(np.abs(leading), 1e-300))
 
 
 def per_slip(model: GeneratedModel, p: Array) -> Array:
@@ -179,11 +174,10 @@ def join_tiles(
     seeds: list[Seed] = []
     discontinuities: list[Discontinuity] = []
     for task, tile in tiles:
-        place = (slice(task.columns[0], task.columns[1] + 1), slice(task.rows[0], task.rows[1] + 1))
-        leading[place], mesh[place] = tile["leading"], int(tile["mesh"])
+        leading[task.place], mesh[task.place] = tile["leading"], int(tile["mesh"])
         seeds += _tile_seeds(model, grid, tile)
         discontinuities += _tile_discontinuities(model, grid, tile)
-        covered += (task.columns[1] - task.columns[0]) * (task.rows[1] - task.rows[0])
+        covered += (task.shape[0] - 1) * (task.shape[1] - 1)
     extra_at = np.concatenate([t["extra_at"] for _, t in tiles])
     _, first = np.unique(extra_at, axis=0, return_index=True)  # tiles that meet refine their common side alike
     return StabilityMap(
@@ -253,19 +247,12 @@ def tile_model(source: str, key: str) -> GeneratedModel:
     return load_source(source, key=key)
 
 
-def tile_points(task: TileTask) -> tuple[GeneratedModel, Array]:
-    """Return the model and the parameters (n_parameters, columns, rows) of a tile."""
-    model, grid = tile_model(task.source, task.key), task.grid
-    xs = grid.x.samples()[task.columns[0] : task.columns[1] + 1]
-    ys = grid.y.samples()[task.rows[0] : task.rows[1] + 1]
-    return model, grid.points(model, *np.meshgrid(xs, ys, indexing="ij"))
-
-
-def solve_block(task: TileTask) -> Samples:
+def solve_block(task: TileTask, model: GeneratedModel) -> Samples:
     """Return the orbits at all grid points of a tile, columns first."""
-    model, p = tile_points(task)
-    count, tol = p.shape[1:], task.settings.tol
-    columns, rows = (levels(points) for points in count)
+    grid, tol = task.grid, task.settings.tol
+    xs, ys = (axis.samples()[part] for axis, part in zip((grid.x, grid.y), task.place, strict=True))
+    p = grid.points(model, *np.meshgrid(xs, ys, indexing="ij"))
+    columns, rows = (levels(points) for points in task.shape)
     c, r = _pairs(columns[0], rows[0])
     start = regular(_coarse(model, p[:, c, r], task))
     block = _Block(model, OrbitBatch.empty(p, start.orbit.edges, len(model.states)), tol)
@@ -275,7 +262,7 @@ def solve_block(task: TileTask) -> Samples:
     for level in range(1, len(columns)):
         block.fill_columns(np.sort(np.concatenate(columns[:level])), columns[level])
     block.spread()
-    every = _pairs(*map(np.arange, count))
+    every = _pairs(*map(np.arange, task.shape))
     found = block.orbits.part(every)
     return Samples(np.stack(every, axis=-1).astype(float), found.p, found.orbit, found.multipliers)
 
@@ -418,13 +405,9 @@ def settle(model: GeneratedModel, p: Array, start: Array, edges: Array) -> Discr
 
 
 def _moved(marks: Array, dc: int, dr: int) -> Array:
-    """Return the marks (columns, rows) moved by dc columns and dr rows, those beyond the edge dropped."""
-    moved = np.zeros_like(marks)
-    c, r = marks.shape
-    moved[max(dc, 0) : c + min(dc, 0), max(dr, 0) : r + min(dr, 0)] = marks[
-        max(-dc, 0) : c + min(-dc, 0), max(-dr, 0) : r + min(-dr, 0)
-    ]
-    return moved
+    """Return the marks (columns, rows) moved by dc columns and dr rows, one at most, those beyond the edge dropped."""
+    columns, rows = marks.shape
+    return np.pad(marks, 1)[1 - dc : 1 - dc + columns, 1 - dr : 1 - dr + rows]
 
 
 def regular_orbits(model: GeneratedModel, p: Array, guess: Discretisation, tol: float) -> OrbitBatch:
@@ -528,9 +511,8 @@ class _Points:
         )
 
 
-def refine(task: TileTask, samples: Samples) -> Refined:
+def refine(task: TileTask, model: GeneratedModel, samples: Samples) -> Refined:
     """Return the tile with its cells halved, up to the settings' depth, where a boundary could hide in them."""
-    model = tile_points(task)[0]
     unit = 2**task.settings.depth
     points, result = _Points(samples, unit), Refined(samples)
     cells = _grid_cells(task, samples, unit)
@@ -606,12 +588,13 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
     one without an orbit, or with quite another, is a discontinuity: `discontinuity_ends` (K, 2, 2), it and that neighbour,
     `discontinuity_axis` (K,), and at it `discontinuity_rho`, `discontinuity_x`, `discontinuity_stages`.
     """
-    done = refine(task, solve_block(task))
+    model = tile_model(task.source, task.key)
+    done = refine(task, model, solve_block(task, model))
     samples = done.samples
     count, corner = math.prod(task.shape), task.corner
     leading = upper_half(samples.multipliers[:, 0])
     names = task.grid.x.moved, task.grid.y.moved
-    crossed, apart = _crossed(samples), _apart(samples, tile_points(task)[0], names)
+    crossed, apart = _crossed(samples), _apart(samples, model, names)
     sides = _sides(done, 2**task.settings.depth, lambda i, j: crossed(i, j) | apart(i, j))
     suspect = done.suspect.copy()
     suspect[:, :2] += corner
@@ -621,8 +604,8 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
         "extra_at": samples.at[count:] + corner,
         "extra_leading": leading[count:],
         "suspect": suspect,
-        **_seeds(task, samples, sides[crossed(sides[:, 0], sides[:, 1])], corner),
-        **_discontinuities(samples, sides[apart(sides[:, 0], sides[:, 1])], corner),
+        **_seeds(task, model, samples, sides[crossed(sides[:, 0], sides[:, 1])]),
+        **_discontinuities(task, samples, sides[apart(sides[:, 0], sides[:, 1])]),
     }
 
 
@@ -668,31 +651,30 @@ def _unlike(model: GeneratedModel, samples: Samples, names: tuple[str, str], i: 
     return np.asarray(~(np.abs(change - told)[:, logs].max(axis=-1) < LEFT))
 
 
-def _seeds(task: TileTask, samples: Samples, sides: Array, corner: Array) -> dict[str, Array]:
+def _seeds(task: TileTask, model: GeneratedModel, samples: Samples, sides: Array) -> dict[str, Array]:
     """Return the sign changes on `sides` (E, 3), with an orbit and a multiplier between the two ends of each."""
     g, (i, j, axis) = samples.g, sides.T
     share = g[i] / np.where(g[i] == g[j], 1.0, g[i] - g[j])
     nearer = np.where(share < 0.5, i, j)
     orbit = (1 - share) * samples.orbit.part(i) + share * samples.orbit.part(j)
     at = (1 - share)[:, None] * samples.at[i] + share[:, None] * samples.at[j]
-    model = tile_points(task)[0]
     return {
-        "seed_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
+        "seed_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + task.corner,
         "seed_axis": axis,
         "seed_g": np.stack([g[i], g[j]], axis=1),
-        "seed_p": task.grid.at(model, corner + at),
+        "seed_p": task.grid.at(model, task.corner + at),
         "seed_rho": upper_half(samples.multipliers[nearer, 0]),
         "seed_x": orbit.x,
         "seed_stages": orbit.stages,
     }
 
 
-def _discontinuities(samples: Samples, sides: Array, corner: Array) -> dict[str, Array]:
+def _discontinuities(task: TileTask, samples: Samples, sides: Array) -> dict[str, Array]:
     """Return the stable ends of `sides` (E, 3), whose state may end before it reaches the other end, with that end."""
     both = np.concatenate([sides, sides[:, [1, 0, 2]]])
     i, j, axis = both[samples.g[both[:, 0]] < 0].T
     return {
-        "discontinuity_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + corner,
+        "discontinuity_ends": np.stack([samples.at[i], samples.at[j]], axis=1) + task.corner,
         "discontinuity_axis": axis,
         "discontinuity_rho": upper_half(samples.multipliers[i, 0]),
         "discontinuity_x": samples.orbit.x[i],

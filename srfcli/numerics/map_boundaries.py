@@ -23,7 +23,7 @@ from srfcli.numerics.continuation import (
     Progress,
     correct,
     polish_curve,
-    trace_whole,
+    trace,
     with_tangent,
 )
 from srfcli.numerics.critical import locate_crossings, scan_line
@@ -42,12 +42,11 @@ SEED_MARGIN = 0.5  # of a seed's length by which its boundary point may lie outs
 
 @dataclass
 class _Traced:
-    """A curve and its dense polyline (D, 2) in unit coordinates, with normals (D, 2) to its unstable side.
+    """The dense polyline (D, 2) of a curve in unit coordinates, with normals (D, 2) to its unstable side.
 
     `fold` (D,) marks where states end: there neither side is the unstable one.
     """
 
-    curve: Curve
     line: Array
     unstable: Array
     fold: Array
@@ -178,7 +177,7 @@ def follow_curve(
     """
     steps = settings.steps
     for _ in range(RETRIES + 1):
-        curve = trace_whole(model, plane, start, steps, progress)
+        curve = trace(model, plane, start, steps, progress)
         if curve.end is Status.INTERRUPTED or _in_one_piece(curve):
             break
         steps = replace(
@@ -216,7 +215,7 @@ def _fold(curve: Curve) -> Array:
 
 
 def _dense(curve: Curve) -> _Traced:
-    """Return `curve` with the cubics through its points and tangents, each sampled DENSE times."""
+    """Return the cubics through the points and tangents of a curve, each sampled DENSE times."""
     q = curve.q
     t = np.array([pt.tangent_q for pt in curve.points])
     unit = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
@@ -237,7 +236,7 @@ def _dense(curve: Curve) -> _Traced:
     side = unstable_side(curve)  # the same all along
     fold = _fold(curve)
     dense = np.append(np.repeat(fold[:-1], DENSE), fold[-1:])
-    return _Traced(curve, line, left * (np.sign(side.sum()) if side.size else 1.0), dense)
+    return _Traced(line, left * (np.sign(side.sum()) if side.size else 1.0), dense)
 
 
 def passes(traced: _Traced, seed: Seed) -> bool:

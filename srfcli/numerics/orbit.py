@@ -47,7 +47,12 @@ class OrbitBatch:
     @property
     def multipliers(self) -> ComplexArray:
         """Return the Floquet multipliers (..., n), largest modulus first; NaN where the orbit did not converge."""
-        return ordered_eigenvalues(self.monodromy, self.converged)
+        usable: Any = self.converged & np.isfinite(self.monodromy).all(axis=(-1, -2))
+        matrix = np.where(usable[..., None, None], self.monodromy, np.eye(self.monodromy.shape[-1]))
+        values = np.linalg.eigvals(matrix).astype(complex)
+        values = np.take_along_axis(values, np.argsort(-np.abs(values), axis=-1, kind="stable"), axis=-1)
+        values[~usable] = np.nan
+        return values
 
     def part(self, index: Any) -> OrbitBatch:
         """Return the orbits that `index` selects."""
@@ -58,17 +63,6 @@ class OrbitBatch:
         """Put the orbits of `other` in the place of those at `index`, whatever became of them."""
         self.orbit.x[index], self.orbit.stages[index] = other.orbit.x, other.orbit.stages
         self.monodromy[index], self.converged[index] = other.monodromy, other.converged
-
-
-def ordered_eigenvalues(matrix: Array, valid: Array) -> ComplexArray:
-    """Return eigenvalues of (..., n, n), largest modulus first, NaN where not `valid`."""
-    n = matrix.shape[-1]
-    usable = valid & np.isfinite(matrix).all(axis=(-1, -2))
-    values = np.linalg.eigvals(np.where(usable[..., None, None], matrix, np.eye(n))).astype(complex)
-    order = np.argsort(-np.abs(values), axis=-1, kind="stable")
-    values = np.take_along_axis(values, order, axis=-1)
-    values[~usable] = np.nan
-    return values
 
 
 def scales(model: GeneratedModel, p: Array) -> Array:

@@ -244,6 +244,11 @@ class TileTask:
         return np.array([self.columns[0], self.rows[0]])
 
     @property
+    def place(self) -> tuple[slice, slice]:
+        """Return which columns and rows of the grid they are."""
+        return slice(self.columns[0], self.columns[1] + 1), slice(self.rows[0], self.rows[1] + 1)
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Return the numbers of columns and rows."""
         return self.columns[1] - self.columns[0] + 1, self.rows[1] - self.rows[0] + 1

@@ -15,7 +15,7 @@ import numpy as np
 
 from srfcli.codegen.model import Array, ComplexArray, GeneratedModel
 from srfcli.core.errors import Status
-from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind, left_vector, pick_multiplier, weights_backwards
+from srfcli.numerics.boundary import BoundaryPoint, bifurcation_kind, left_vector, pick_multiplier, upper_half, weights_backwards
 from srfcli.numerics.collocation import (
     Condensed,
     Discretisation,
@@ -257,7 +257,7 @@ def normal_form(model: GeneratedModel, p: Array, orbit: Discretisation, rho: Arr
     c, rho = condense(model, p, orbit), np.asarray(rho, dtype=complex)
     M, identity = c.monodromy, np.eye(orbit.x.shape[-1])
     values, vectors = np.linalg.eig(M)
-    chosen = pick_multiplier(values.astype(complex), rho.real + 1j * np.abs(rho.imag))[..., None]
+    chosen = pick_multiplier(values.astype(complex), upper_half(rho))[..., None]
     mu = np.take_along_axis(values, chosen, -1)[..., 0].astype(complex)
     right = np.take_along_axis(vectors, chosen[..., None], -1)[..., 0].astype(complex)
     real = np.abs(mu.imag) < REAL_MULTIPLIER * np.abs(mu)
@@ -313,11 +313,10 @@ def _forced(c: Condensed, sources: Sequence[ComplexArray]) -> list[tuple[Complex
 def branch_coefficients(model: GeneratedModel, branch: Branch) -> Array:
     """Return the first Lyapunov coefficient at every point of a branch, NaN where the critical multiplier is real."""
     d, points = np.empty(len(branch.points)), branch.points
-    for index in by_mesh([pt.orbit for pt in points]):
-        for here in (index[a : a + POINTS_TOGETHER] for a in range(0, len(index), POINTS_TOGETHER)):
-            p = np.stack([points[i].p for i in here], axis=1)
-            rho = np.array([points[i].rho for i in here])
-            d[here] = normal_form(model, p, join([points[i].orbit for i in here]), rho)[0]
+    for index in by_mesh([pt.orbit for pt in points], POINTS_TOGETHER):
+        p = np.stack([points[i].p for i in index], axis=1)
+        rho = np.array([points[i].rho for i in index])
+        d[index] = normal_form(model, p, join([points[i].orbit for i in index]), rho)[0]
     return d
 
 

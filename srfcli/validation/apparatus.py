@@ -27,6 +27,12 @@ OF_LAW = {  # the fields of Physics that each friction law has
 }
 
 
+def free_fields(baseline: Physics) -> list[str]:
+    """Return the fields of a baseline that its fit has free."""
+    more = [] if baseline.rigid else ["lam"]
+    return [*OF_LAW[baseline.law_name], *more, *(["nagata"] if baseline.nagata else [])]
+
+
 @dataclass(frozen=True)
 class Rig:
     """What an apparatus records, in which columns, and where its fits start.
@@ -50,8 +56,7 @@ class Rig:
     def start(self, baseline: Physics) -> dict[str, Start]:
         """Return the start values of a baseline's parameters, by the names that its laws' files have."""
         found: dict[str, Start] = {}
-        more = (() if baseline.rigid else ("lam",)) + (("nagata",) if baseline.nagata else ())
-        for name in (*OF_LAW[baseline.law_name], *more):
+        for name in free_fields(baseline):
             start = self.starts[name]
             if name == "mu0" and baseline.bare:
                 start = self.bare

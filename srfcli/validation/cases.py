@@ -34,7 +34,7 @@ from srfcli.validation.apparatus import (
     settings,
 )
 from srfcli.validation.gauge import REDDEST, Array, Gauge, play, read_gauge
-from srfcli.validation.slider import SMOOTH, Physics, Plan, Trace, Track, move
+from srfcli.validation.slider import SMOOTH, Physics, Plan, Track, move
 
 # What can be concealed: each effect, how strong it is drawn, and what the baseline is that lacks it.
 
@@ -44,7 +44,8 @@ class Effect:
     """One concealed piece of physics: `varies`, a field of Physics, departs from `neutral` by `weak` to `strong`.
 
     The sign is drawn from `signs`, and `beside` evenly between bounds; `absent` are the fields of a baseline that has none of it.
-    `listed` says whether a diagnosis may name it, `resembles` which names come close where it may not.
+    `listed` says whether a diagnosis may name it, and tell its size as `parameter` in `unit`, `resembles` which names come close
+    where it may not.
     """
 
     name: str
@@ -58,6 +59,8 @@ class Effect:
     scale: float = 1.0  # the field is neutral + scale * sign * size
     listed: bool = True
     resembles: tuple[str, ...] = ()
+    parameter: str = ""
+    unit: str = "1"
 
     def added(self, p: Physics, rng: np.random.Generator, size: float) -> Physics:
         """Return `p` with this effect, its strength `size` of the way from weak to strong, on a logarithmic scale."""
@@ -68,6 +71,11 @@ class Effect:
         if self.varies == "Vsat":
             changes["Vsat"] = 1 / strength  # the cut-off is absent at 1/Vsat = 0
         return replace(p, **changes)
+
+    def told_size(self, p: Mapping[str, Any]) -> float:
+        """Return the size that this effect has among the fields `p` of a slider, in its unit."""
+        size = float(p[self.varies] * (1 / self.scale))
+        return 1 / size if self.varies == "Vsat" else size
 
     def present(self, p: Physics, before: Physics) -> Physics:
         """Return `p` where the baseline `before` it was drawn around lacks the effect already: with what it lacks."""
@@ -89,27 +97,31 @@ class Effect:
 
 BOTH = (1, -1)
 EFFECTS: tuple[Effect, ...] = (
-    Effect("linker-dieterich", "alpha", 0.001, 0.03),
-    Effect("interface-compliance", "lam", 0.1, 0.9, absent={"rigid": True}),
-    Effect("stiffness-exponent", "n_kappa", 0.08, 0.7, BOTH, neutral=1.0),
-    Effect("age-saturation", "Vsat", 1 / 3000, 1 / 100, absent={"bare": True}),
-    Effect("log-log-coupling", "C", 5e-5, 1.5e-3, BOTH),
-    Effect("slip-evolution", "slip_share", 0.03, 1.0),
-    Effect("second-state", "B2", 3e-4, 8e-3, beside={"D2": (2.0, 12.0)}),
-    Effect("viscous-drag", "drag", 5e-6, 3e-4),
-    Effect("adhesion-offset", "Wa", 0.02, 0.6),
-    Effect("load-transmission", "rho", 0.01, 0.7, (-1,), neutral=1.0),
-    Effect("load-distortion", "distortion", 0.02, 0.4, beside={"distortion_phase": FULL_TURN}),
-    Effect("tangential-crosstalk", "cross", 0.001, 0.03, BOTH),
-    Effect("track-topography", "topo", 2e-4, 2e-3, beside={"topo_L": (6.0, 40.0), "topo_phase": FULL_TURN}),
-    Effect("friction-drift", "drift_t", 1e-4, 2.5e-3, BOTH, beside={"drift_t0": (0.0, 1.5)}),
-    Effect("friction-drift", "drift_x", 1e-5, 2.5e-4, BOTH, beside={"drift_x0": (0.0, 15.0)}),
-    Effect("drive-ripple", "ripple", 0.01, 0.15, beside={"ripple_p": (4.0, 25.0), "ripple_phase": FULL_TURN}),
-    Effect("sensor-lag", "lag", 5e-4, 0.02),
-    Effect("stiffness-error", "ratio", 0.03, 0.3, BOTH, neutral=1.0),
-    Effect("inertia", "M", 0.2, 4.0, scale=1e-6, absent={"massless": True}),  # kg
-    Effect("load-stiffening", "K_power", 0.05, 0.6, BOTH),
-    Effect("poisson-coupling", "poisson", 0.003, 0.1, BOTH),
+    Effect("linker-dieterich", "alpha", 0.001, 0.03, parameter="alpha"),
+    Effect("interface-compliance", "lam", 0.1, 0.9, absent={"rigid": True}, parameter="lambda", unit="um"),
+    Effect("stiffness-exponent", "n_kappa", 0.08, 0.7, BOTH, neutral=1.0, parameter="n"),
+    Effect("age-saturation", "Vsat", 1 / 3000, 1 / 100, absent={"bare": True}, parameter="cutoff", unit="s/um"),
+    Effect("log-log-coupling", "C", 5e-5, 1.5e-3, BOTH, parameter="C"),
+    Effect("slip-evolution", "slip_share", 0.03, 1.0, parameter="share"),
+    Effect("second-state", "B2", 3e-4, 8e-3, beside={"D2": (2.0, 12.0)}, parameter="B2"),
+    Effect("viscous-drag", "drag", 5e-6, 3e-4, parameter="c"),
+    Effect("adhesion-offset", "Wa", 0.02, 0.6, parameter="Wa", unit="N"),
+    Effect("load-transmission", "rho", 0.01, 0.7, (-1,), neutral=1.0, parameter="rho"),
+    Effect("load-distortion", "distortion", 0.02, 0.4, beside={"distortion_phase": FULL_TURN}, parameter="amplitude"),
+    Effect("tangential-crosstalk", "cross", 0.001, 0.03, BOTH, parameter="share"),
+    Effect(
+        "track-topography", "topo", 2e-4, 2e-3, beside={"topo_L": (6.0, 40.0), "topo_phase": FULL_TURN}, parameter="amplitude"
+    ),
+    Effect("friction-drift", "drift_t", 1e-4, 2.5e-3, BOTH, beside={"drift_t0": (0.0, 1.5)}, parameter="rate", unit="1/s"),
+    Effect("friction-drift", "drift_x", 1e-5, 2.5e-4, BOTH, beside={"drift_x0": (0.0, 15.0)}, parameter="rate", unit="1/um"),
+    Effect(
+        "drive-ripple", "ripple", 0.01, 0.15, beside={"ripple_p": (4.0, 25.0), "ripple_phase": FULL_TURN}, parameter="amplitude"
+    ),
+    Effect("sensor-lag", "lag", 5e-4, 0.02, parameter="time_constant", unit="s"),
+    Effect("stiffness-error", "ratio", 0.03, 0.3, BOTH, neutral=1.0, parameter="ratio"),
+    Effect("inertia", "M", 0.2, 4.0, scale=1e-6, absent={"massless": True}, parameter="M", unit="kg"),
+    Effect("load-stiffening", "K_power", 0.05, 0.6, BOTH, parameter="m"),
+    Effect("poisson-coupling", "poisson", 0.003, 0.1, BOTH, parameter="shift", unit="um/N"),
 )
 OUTSIDE: tuple[Effect, ...] = (
     Effect("age-exponent", "p_age", 0.15, 1.0, neutral=1.0, listed=False, resembles=("slip-evolution",)),
@@ -199,25 +211,30 @@ def without(p: Physics, effects: Sequence[Effect]) -> Physics:
     return p
 
 
-def draw_recipe(
-    rng: np.random.Generator,
-    *,
-    kind: str | None = None,
-    effects: Sequence[str] | None = None,
-    size: float | None = None,
-    rough: bool | float | None = None,
-    own: bool | None = None,
-) -> Recipe:
-    """Return the case that `rng` gives; what is asked for is not drawn.
+@dataclass(frozen=True)
+class Asked:
+    """What a case is asked to be; what is None is drawn.
 
     `size` from 0 to 1 is how strong the effects are, `rough` whether the track is, or the standard deviation of its mu0, `own`
     whether each run has a rough track of its own.
     """
-    chosen = _chosen(rng, kind, effects)
-    drawn = rng.uniform(0, 1, size=len(chosen)).tolist()
-    sizes = tuple(drawn if size is None else [_within(size)] * len(chosen))
+
+    kind: str | None = None
+    effects: Sequence[str] | None = None
+    size: float | None = None
+    rough: bool | float | None = None
+    own: bool | None = None
+
+
+NOTHING = Asked()
+
+
+def draw_recipe(rng: np.random.Generator, asked: Asked = NOTHING) -> Recipe:
+    """Return the case that `rng` gives."""
+    chosen = _chosen(rng, asked)
+    sizes = _sizes(rng, len(chosen), asked.size)
     physics = _laws(rng, chosen)
-    track = _track(rng, rough)
+    track = _track(rng, asked.rough)
     for effect, strength in zip(chosen, sizes, strict=True):
         physics = effect.added(physics, rng, strength)
     physics = replace(physics, track=track)
@@ -226,7 +243,7 @@ def draw_recipe(
     lag1 = float(rng.uniform(0.3, REDDEST))
     gauge = Gauge(lag1=0.0 if rng.uniform() < WHITE_SHARE else lag1)
     drawn_own = rng.uniform() < OWN_SHARE
-    if track.size and (drawn_own if own is None else own):
+    if track.size and (drawn_own if asked.own is None else asked.own):
         physics, baseline = (replace(p, track=replace(track, own=True)) for p in (physics, baseline))
     noise = "ar1" if gauge.lag1 else "white"
     return Recipe(chosen, sizes, physics, baseline, plans, gauge, kind_of(chosen), noise=noise)
@@ -237,24 +254,17 @@ def kind_of(effects: Sequence[Effect]) -> str:
     return ("none", "single", "pair")[len(effects)] if all(e.listed for e in effects) else "outside"
 
 
-def draw_wide(
-    rng: np.random.Generator,
-    *,
-    kind: str | None = None,
-    effects: Sequence[str] | None = None,
-    size: float | None = None,
-    rough: bool | float | None = None,
-    own: bool | None = None,
-) -> Recipe:
-    """Return the case of the wide bank that `rng` gives; what is asked for is not drawn.
+def draw_wide(rng: np.random.Generator, asked: Asked = NOTHING) -> Recipe:
+    """Return the case of the wide bank that `rng` gives.
 
-    Apparatus, protocol, laws and noise are among those in which the effects make sense, `effects` those that `kind` wants.
+    Apparatus, protocol, laws and noise are among those in which the effects make sense, effects asked for those that the kind
+    wants.
     """
+    kind, effects = asked.kind, asked.effects
     if kind is None and effects is not None:
         kind = kind_of([e for name in effects for e in variants(name)[:1]])
     kind = str(rng.choice(WIDE_KINDS, p=WIDE_SHARES)) if kind is None else kind
-    if kind not in WIDE_KINDS:
-        raise SrfError(f"unknown kind of case '{kind}'", did_you_mean(kind, WIDE_KINDS))
+    check_kinds((kind,), "wide")
     names = wide_names(rng, kind) if effects is None else tuple(effects)
     forms, setting = _set(rng, kind, names)
     physics, plans = draw_setup(rng, setting)
@@ -262,15 +272,14 @@ def draw_wide(
     if setting.apparatus == "paper" and rng.uniform() < ODD_SHARE and _may_be_odd(forms, setting):
         which = str(rng.choice(("rigid", "massless")))
         physics = replace(physics, rigid=which == "rigid", massless=which == "massless")
-    drawn = rng.uniform(0, 1, size=len(forms)).tolist()
-    sizes = tuple(drawn if size is None else [_within(size)] * len(forms))
+    sizes = _sizes(rng, len(forms), asked.size)
     for effect, strength in zip(forms, sizes, strict=True):
         physics = effect.present(effect.added(physics, rng, strength), physics)
-    track = _track(rng, rough)
+    track = _track(rng, asked.rough)
     if track.size and setting.apparatus == "rock":
         track = replace(track, length=ROCK_CORRELATION * track.length)
     drawn_own = rng.uniform() < OWN_SHARE
-    physics = replace(physics, track=replace(track, own=bool(track.size) and (drawn_own if own is None else own)))
+    physics = replace(physics, track=replace(track, own=bool(track.size) and (drawn_own if asked.own is None else asked.own)))
     if kind == "ageing":
         forms, sizes = (other_ageing(setting.ageing, setting.stated),), (1.0,)
     noise = str(rng.choice(list(NOISE_SHARES), p=list(NOISE_SHARES.values())))
@@ -292,9 +301,7 @@ def wide_names(rng: np.random.Generator, kind: str) -> tuple[str, ...]:
 
 def _set(rng: np.random.Generator, kind: str, names: Sequence[str]) -> tuple[tuple[Effect, ...], Setting]:
     """Return the effects in forms and sizes of a setting in which they make sense, and the setting."""
-    if len(set(names)) < len(names):
-        raise SrfError(f"an effect is named twice: {', '.join(names)}", "name each once")
-    forms = tuple(some[int(rng.integers(len(some)))] for some in map(variants, names))
+    forms = _forms(rng, names)
     found = [s for s in settings(wrong_ageing=kind == "ageing") if all(possible(e.varies, s) for e in forms)]
     if kind == "one-run":
         found = [s for s in found if s.protocol != "steps"]  # which is one run
@@ -303,14 +310,15 @@ def _set(rng: np.random.Generator, kind: str, names: Sequence[str]) -> tuple[tup
     shares = np.array([s.share for s in found])
     setting = found[int(rng.choice(len(found), p=shares / shares.sum()))]
     sizes = SIZES.get(setting.apparatus, {})
-    return tuple(_sized(e, sizes.get(e.varies)) for e in forms), setting
+    own = [sizes.get(e.varies, (e.weak, e.strong, e.beside)) for e in forms]
+    return tuple(replace(e, weak=a, strong=b, beside=c) for e, (a, b, c) in zip(forms, own, strict=True)), setting
 
 
-def _sized(effect: Effect, sizes: tuple[float, float, Mapping[str, tuple[float, float]]] | None) -> Effect:
-    if sizes is None:
-        return effect
-    weak, strong, beside = sizes
-    return replace(effect, weak=weak, strong=strong, beside=beside)
+def _forms(rng: np.random.Generator, names: Sequence[str]) -> tuple[Effect, ...]:
+    """Return effects by name; which form of an effect that has several is drawn."""
+    if len(set(names)) < len(names):
+        raise SrfError(f"an effect is named twice: {', '.join(names)}", "name each once")
+    return tuple(forms[int(rng.integers(len(forms)))] for forms in [variants(name) for name in names])
 
 
 def _may_be_odd(forms: Sequence[Effect], setting: Setting) -> bool:
@@ -341,26 +349,25 @@ def other_ageing(true: str, stated: str) -> Effect:
     return Effect(true, "ageing", 1.0, 1.0, absent={"ageing": stated, "nagata": 0.0})
 
 
-def _within(size: float) -> float:
-    if not 0 <= size <= 1:
-        raise SrfError(f"size = {size:g} of an effect", "give a number from 0, hardly there, to 1, strong")
-    return size
+def _sizes(rng: np.random.Generator, count: int, asked: float | None) -> tuple[float, ...]:
+    """Return how strong each of the effects is."""
+    if asked is not None and not 0 <= asked <= 1:
+        raise SrfError(f"size = {asked:g} of an effect", "give a number from 0, hardly there, to 1, strong")
+    drawn = rng.uniform(0, 1, size=count).tolist()
+    return tuple(drawn if asked is None else [asked] * count)
 
 
-def _chosen(rng: np.random.Generator, kind: str | None, names: Sequence[str] | None) -> tuple[Effect, ...]:
+def _chosen(rng: np.random.Generator, asked: Asked) -> tuple[Effect, ...]:
     """Return the effects by name, or as many as the kind has."""
     drawn_kind = str(rng.choice(KINDS, p=KIND_SHARES))
     order = [str(n) for n in rng.permutation(NAMES)]
     outside = str(rng.choice(OUTSIDE_NAMES))
+    names = asked.effects
     if names is None:
-        kind = drawn_kind if kind is None else kind
-        if kind not in KINDS:
-            raise SrfError(f"unknown kind of case '{kind}'", did_you_mean(kind, KINDS))
+        kind = drawn_kind if asked.kind is None else asked.kind
+        check_kinds((kind,), "paper")
         names = {"none": [], "single": order[:1], "pair": order[:2], "outside": [outside]}[kind]
-    if len(set(names)) < len(names):
-        raise SrfError(f"an effect is named twice: {', '.join(names)}", "name each once")
-    options = [variants(name) for name in names]
-    return tuple(some[int(rng.integers(len(some)))] for some in options)
+    return _forms(rng, names)
 
 
 def _laws(rng: np.random.Generator, chosen: Sequence[Effect]) -> Physics:
@@ -433,7 +440,7 @@ def description(baseline: Physics, plans: tuple[Plan, ...], *, title: str, rig: 
         f'format = "srf-experiment/1"\ntitle = "{title}"\n',
         f'[apparatus]\nstiffness = "{baseline.K:.6g} {unit}"\n{mass}',
         f'[model]\nlaw = "{baseline.law_name}"\nageing = "{baseline.ageing_name}"',
-        f'interface = "{"rigid" if baseline.rigid else "elastic"}"\ninertia = {_toml_truth(not baseline.massless)}\n',
+        f'interface = "{"rigid" if baseline.rigid else "elastic"}"\ninertia = {str(not baseline.massless).lower()}\n',
         "[parameters]   # start values and bounds of what is to be fitted; um, s, N",
         *(f"{n} = {{ value = {v!r}, lower = {a!r}, upper = {b!r} }}" for n, (v, a, b) in rig.start(baseline).items()),
         *reference,
@@ -443,7 +450,7 @@ def description(baseline: Physics, plans: tuple[Plan, ...], *, title: str, rig: 
 
 def _run(plan: Plan, *, spikes: bool) -> str:
     drive = ", ".join(f"{{ duration = {d!r}, velocity = {v!r} }}" for d, v in plan.drive)
-    text = f'\n[[runs]]\nname = "{plan.name}"\nfile = "{plan.name}.csv"\nholdout = {_toml_truth(plan.holdout)}'
+    text = f'\n[[runs]]\nname = "{plan.name}"\nfile = "{plan.name}.csv"\nholdout = {str(plan.holdout).lower()}'
     text += f"\ndrive = [{drive}]   # s, um/s"
     if spikes:
         text += '\ncorrections = ["spike"]'
@@ -471,10 +478,6 @@ def case_files(
     """Return the files of a case, name -> text; `spikes` asks for their correction."""
     runs = {f"{plan.name}.csv": table(plan, observed, rig) for plan, observed in readings.items()}
     return {**runs, DESCRIPTION: description(baseline, tuple(readings), title=title, rig=rig, spikes=spikes)}
-
-
-def _toml_truth(value: bool) -> str:
-    return "true" if value else "false"
 
 
 # Concealed cases: an experiment's folder on one side, the truth about it on the other.
@@ -506,7 +509,7 @@ def make_case(
         raise SrfError(f"{folder} exists already", "A case is never overwritten; name another folder.")
     if bank not in BANKS:
         raise SrfError(f"unknown bank '{bank}'", did_you_mean(bank, BANKS))
-    asked = {"kind": kind, "effects": effects, "size": size, "rough": rough, "own": own}
+    asked = Asked(kind, effects, size, rough, own)
     recipe, motions, attempt = _moving(seed, draw_wide if bank == "wide" else draw_recipe, asked)
     rng, rig = np.random.default_rng([*_whole(seed), attempt, 1]), RIGS[recipe.rig]
     readings = {plan: read_gauge(recorded(rig, recipe.acting(plan), plan, u), recipe.gauge, rng) for plan, u in motions.items()}
@@ -525,11 +528,11 @@ def _whole(seed: int | Sequence[int]) -> list[int]:
 
 
 def _moving(
-    seed: int | Sequence[int], draw: Callable[..., Recipe], asked: Mapping[str, Any]
+    seed: int | Sequence[int], draw: Callable[[np.random.Generator, Asked], Recipe], asked: Asked
 ) -> tuple[Recipe, dict[Plan, Array], int]:
     """Return the first recipe of the seed whose runs all reach their ends, what their gauges show, and how many came before."""
     for attempt in range(REDRAWS):
-        recipe = draw(np.random.default_rng([*_whole(seed), attempt, 0]), **asked)
+        recipe = draw(np.random.default_rng([*_whole(seed), attempt, 0]), asked)
         motions: dict[Plan, Array] = {}
         for plan in recipe.plans:
             u = shown(recipe.acting(plan), plan)
@@ -549,6 +552,11 @@ def shown(p: Physics, plan: Plan) -> Array:
     return play(u, p.backlash) if p.backlash else u
 
 
+def unread(rig: Rig, p: Physics, plan: Plan) -> Array:
+    """Return what a rig would record (n,) without noise; NaN from where the slider cannot be followed."""
+    return recorded(rig, p, plan, shown(p, plan))
+
+
 def strength_of(effect: Effect, recipe: Recipe, motions: Mapping[Plan, Array]) -> Truth:
     """Return how far one effect moves the record: rms over noise by run, and over all samples of the fitted runs.
 
@@ -561,7 +569,7 @@ def strength_of(effect: Effect, recipe: Recipe, motions: Mapping[Plan, Array]) -
     for plan, u in motions.items():
         p = recipe.acting(plan)
         less = effect.removed(p)
-        change = (recorded(rig, p, plan, u) - recorded(rig, less, plan, shown(less, plan))) / recipe.gauge.sigma
+        change = (recorded(rig, p, plan, u) - unread(rig, less, plan)) / recipe.gauge.sigma
         followed = bool(np.isfinite(change).all())
         rms[plan.name] = round(float(np.sqrt(np.mean(change**2))), 6) if followed else None
         if not plan.holdout:
@@ -634,15 +642,6 @@ def acting(truth: Mapping[str, Any], plan: Plan) -> Physics:
     """Return what is true in one run of a case."""
     p, only = known_physics(truth), truth.get("only", "")
     return p if only in ("", plan.name) else without(p, concealed(truth))
-
-
-def known_traces(truth: Mapping[str, Any]) -> dict[str, Trace]:
-    """Return what a model that knows the truth, the track included, predicts to be recorded in every run, by the run's name."""
-    found, rig = {}, known_rig(truth)
-    for plan in known_plans(truth):
-        p = acting(truth, plan)
-        found[plan.name] = Trace(plan.times(), recorded(rig, p, plan, shown(p, plan)))
-    return found
 
 
 def known_gauge(truth: Mapping[str, Any]) -> Gauge:
@@ -772,7 +771,7 @@ def make_bank(
     apart = folder.with_name(f"{folder.name}.truths.json") if apart is None else apart
     if apart.exists():
         raise SrfError(f"{apart} exists already", "Truths are never overwritten; name another file.")
-    plan = plan_wide(n, seed, kinds=kinds) if bank == "wide" else [(None, p) for p in plan_bank(n, seed, kinds=kinds)]
+    plan = plan_bank(n, seed, bank=bank, kinds=kinds)
     folder.mkdir(parents=True)
     rough, own = TRACKS[track] if track else (None, None)
     shared: dict[str, Any] = {"rough": rough, "own": own, "strengths": strengths, "bank": bank}
@@ -789,37 +788,26 @@ def make_bank(
     return Bank(folder, apart, digest, tuple(sorted(truths)))
 
 
-def plan_bank(n: int, seed: int, *, kinds: Sequence[str] | None = None) -> list[tuple[str, ...]]:
-    """Return what each case of a bank conceals: the kinds in their usual shares, every effect as often as any other, shuffled."""
-    rng = np.random.default_rng([seed, 2])
-    check_kinds(kinds or (), "paper")
-    counts = _counts(n, KINDS if kinds is None else kinds, KINDS, KIND_SHARES)
-    none, single, pair, outside = counts
-    one = cycle(rng.permutation(NAMES).tolist())
-    other = cycle(rng.permutation(OUTSIDE_NAMES).tolist())
-    pairs = [(a, b) for i, a in enumerate(NAMES) for b in NAMES[i + 1 :]]
-    chosen = rng.permutation(len(pairs))
-    plans: list[tuple[str, ...]] = [()] * none
-    plans += [(name,) for name in islice(one, single)] + [(name,) for name in islice(other, outside)]
-    plans += [pairs[k] for k in islice(cycle(chosen.tolist()), pair)]
-    return [plans[i] for i in rng.permutation(n).tolist()]
+def plan_bank(n: int, seed: int, *, bank: str = "paper", kinds: Sequence[str] | None = None) -> list[tuple[str, tuple[str, ...]]]:
+    """Return kind and effects of each case of a bank, every effect of a kind as often as any other, shuffled.
 
-
-def plan_wide(n: int, seed: int, *, kinds: Sequence[str] | None = None) -> list[tuple[str | None, tuple[str, ...]]]:
-    """Return kind and effects of each case of a wide bank, every effect of a kind as often as any other, shuffled."""
-    rng = np.random.default_rng([seed, 2])
-    check_kinds(kinds or (), "wide")
-    counts = _counts(n, WIDE_KINDS if kinds is None else kinds, WIDE_KINDS, WIDE_SHARES)
-    pairs = possible_pairs()
-    names: dict[str, list[tuple[str, ...]]] = {
-        "single": [(name,) for name in rng.permutation(NAMES).tolist()],
-        "pair": [pairs[k] for k in rng.permutation(len(pairs)).tolist()],
-        "outside": [(name,) for name in rng.permutation(OUTSIDE_NAMES).tolist()],
-        "one-run": [(name,) for name in rng.permutation(ONE_RUN_NAMES).tolist()],
+    The kinds come in their usual shares; those of `kinds` alone where they are given.
+    """
+    check_kinds(kinds or (), bank)
+    rng, wide = np.random.default_rng([seed, 2]), bank == "wide"
+    every, shares = (WIDE_KINDS, WIDE_SHARES) if wide else (KINDS, KIND_SHARES)
+    counts = dict(zip(every, _counts(n, every if kinds is None else kinds, every, shares), strict=True))
+    effects: dict[str, list[tuple[str, ...]]] = {
+        "single": [(name,) for name in NAMES],
+        "pair": [*(possible_pairs() if wide else combinations(NAMES, 2))],
+        "outside": [(name,) for name in OUTSIDE_NAMES],
+        "one-run": [(name,) for name in ONE_RUN_NAMES],
     }
-    plans: list[tuple[str | None, tuple[str, ...]]] = []
-    for kind, count in zip(WIDE_KINDS, counts, strict=True):
-        plans += [(kind, some) for some in islice(cycle(names.get(kind, [()])), count)]
+    plans: list[tuple[str, tuple[str, ...]]] = []
+    for kind in every if wide else ("none", "single", "outside", "pair"):
+        some = effects.get(kind, [()])
+        drawn = [some[k] for k in rng.permutation(len(some))]
+        plans += [(kind, names) for names in islice(cycle(drawn), counts[kind])]
     return [plans[i] for i in rng.permutation(n).tolist()]
 
 

@@ -23,9 +23,10 @@ from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis.search import CLOSE
 from srfcli.laws.registry import load_registry
 from srfcli.results.tables import Column, Table
-from srfcli.validation.apparatus import OF_LAW, PAPER, Rig, recorded
+from srfcli.validation.apparatus import PAPER, Rig, free_fields
 from srfcli.validation.blind import FAILED, VERDICTS, Answer
 from srfcli.validation.cases import (
+    EFFECTS,
     WIDE_KINDS,
     Effect,
     acting,
@@ -34,10 +35,10 @@ from srfcli.validation.cases import (
     known_physics,
     known_plans,
     known_rig,
-    shown,
+    unread,
     without,
 )
-from srfcli.validation.gauge import Array, Gauge, white
+from srfcli.validation.gauge import Gauge, white
 from srfcli.validation.slider import Physics, Plan, critical_load
 
 # The mark of one answer: which answers are accepted, and whether it is one of them.
@@ -238,7 +239,7 @@ def see(task: Task) -> Sight:
     for plan, p in sliders.items():
         if plan.name in held:
             run = held[plan.name]
-            made = _record(rig, p, plan) * (rig.factor if rig.observes == "force" else 1.0)
+            made = unread(rig, p, plan) * (rig.factor if rig.observes == "force" else 1.0)
             known[plan.name] = float(np.sqrt(np.mean((run.observed - made)[run.used] ** 2)))
     fitted = {plan: p for plan, p in sliders.items() if not plan.holdout}
     effects = concealed(truth)
@@ -257,13 +258,13 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
     """
     signals, tangents = [], []
     bare = {plan: effect.removed(p) for plan, p in sliders.items()}
-    free = _free(next(iter(bare.values())))
+    free = free_fields(next(iter(bare.values())))
     free += [o.varies for o in others if o.varies not in free and any(getattr(p, o.varies) for p in bare.values())]
     for plan, p in sliders.items():
         less = bare[plan]
-        base = _record(rig, less, plan)
-        moved = [_record(rig, replace(less, **{n: getattr(less, n) * (1 + PARAMETER_STEP)}), plan) for n in free]
-        signal = _record(rig, p, plan) - base
+        base = unread(rig, less, plan)
+        moved = [unread(rig, replace(less, **{n: getattr(less, n) * (1 + PARAMETER_STEP)}), plan) for n in free]
+        signal = unread(rig, p, plan) - base
         tangent = np.column_stack([(x - base) / PARAMETER_STEP for x in moved])
         if not (np.isfinite(signal).all() and np.isfinite(tangent).all()):
             return None, None
@@ -277,17 +278,6 @@ def stands_out(effect: Effect, others: Sequence[Effect], sliders: Mapping[Plan, 
     tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=0), 1e-12)
     left = signal - tangent @ np.linalg.lstsq(tangent, signal, rcond=1e-10)[0]
     return float(np.linalg.norm(left)), float(np.linalg.norm(signal))
-
-
-def _free(baseline: Physics) -> list[str]:
-    """Return the fields of a baseline that its fit has free."""
-    more = [] if baseline.rigid else ["lam"]
-    return [*OF_LAW[baseline.law_name], *more, *(["nagata"] if baseline.nagata else [])]
-
-
-def _record(rig: Rig, p: Physics, plan: Plan) -> Array:
-    """Return what a rig would record (n,) without noise; NaN from where the slider cannot be followed."""
-    return recorded(rig, p, plan, shown(p, plan))
 
 
 def see_all(bank: Path, truths: Mapping[str, Mapping[str, Any]], *, workers: int, kept: Path) -> Iterator[Sight]:
@@ -314,45 +304,6 @@ def _read(kept: Path) -> dict[str, Sight]:
 # The size of an effect as it was estimated, against the size it has in the truth.
 
 
-@dataclass(frozen=True)
-class Size:
-    """Where an effect's size stands: `field` of the truth's physics, and `parameter` of the answer, in `unit`.
-
-    `factor` takes the field into that unit; `inverse`: it is one over the field; `unsigned`: its sign is a matter of the phase.
-    """
-
-    field: str
-    parameter: str
-    unit: str = "1"
-    factor: float = 1.0
-    inverse: bool = False
-    unsigned: bool = False
-
-
-SIZES: Mapping[str, tuple[Size, ...]] = {
-    "linker-dieterich": (Size("alpha", "alpha"),),
-    "interface-compliance": (Size("lam", "lambda", "um"),),
-    "stiffness-exponent": (Size("n_kappa", "n"),),
-    "age-saturation": (Size("Vsat", "cutoff", "s/um", inverse=True),),
-    "log-log-coupling": (Size("C", "C"),),
-    "slip-evolution": (Size("slip_share", "share"),),
-    "second-state": (Size("B2", "B2"),),
-    "viscous-drag": (Size("drag", "c"),),
-    "adhesion-offset": (Size("Wa", "Wa", "N"),),
-    "load-transmission": (Size("rho", "rho"),),
-    "load-distortion": (Size("distortion", "amplitude", unsigned=True),),
-    "tangential-crosstalk": (Size("cross", "share"),),
-    "track-topography": (Size("topo", "amplitude", unsigned=True),),
-    "friction-drift": (Size("drift_t", "rate", "1/s"), Size("drift_x", "rate", "1/um")),
-    "drive-ripple": (Size("ripple", "amplitude", unsigned=True),),
-    "sensor-lag": (Size("lag", "time_constant", "s"),),
-    "stiffness-error": (Size("ratio", "ratio"),),
-    "inertia": (Size("M", "M", "kg", factor=1e6),),
-    "load-stiffening": (Size("K_power", "m"),),
-    "poisson-coupling": (Size("poisson", "shift", "um/N"),),
-}
-
-
 def deviation(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] | None:
     """Return how far the estimated size is from the true one, in its standard errors and relative to the true size.
 
@@ -360,19 +311,17 @@ def deviation(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] |
     """
     if len(truth["effects"]) != 1 or answer.effects != tuple(truth["effects"]):
         return None
-    sizes = SIZES.get(truth["effects"][0], ())
-    for size in sizes:
-        found = answer.parameters.get(size.parameter)
-        other_form = len(sizes) > 1 and size.field not in truth["truth"]
-        if found is None or found["unit"] != size.unit or other_form:
-            continue
-        true, value, error = truth["physics"][size.field] * size.factor, found["value"], found["stderr"]
-        true = 1 / true if size.inverse else true
-        if value is None or not error or not true:
-            return None
-        off = abs(value) - abs(true) if size.unsigned else value - true
-        return off / error, abs(off / true)
-    return None
+    forms = [e for e in EFFECTS if e.name == truth["effects"][0]]
+    effect = next((e for e in forms if len(forms) == 1 or e.varies in truth["truth"]), None)
+    found = answer.parameters.get(effect.parameter) if effect else None
+    if effect is None or found is None or found["unit"] != effect.unit:
+        return None
+    true, value, error = effect.told_size(truth["physics"]), found["value"], found["stderr"]
+    if value is None or not error or not true:
+        return None
+    unsigned = any(name.endswith("_phase") for name in effect.beside)  # its sign is a matter of the phase
+    off = abs(value) - abs(true) if unsigned else value - true
+    return off / error, abs(off / true)
 
 
 def load_errors(truth: Mapping[str, Any], answer: Answer) -> tuple[float, float] | None:
@@ -758,7 +707,7 @@ def ungated(answer: Answer) -> tuple[str, frozenset[str]]:
     """Return what would have been said had held-out runs no say."""
     if answer.ungated in ("", answer.verdict):
         return as_it_is(answer)
-    return answer.ungated, _effects(_named(answer)) if answer.ungated == "identified" else frozenset()
+    return answer.ungated, hypothesis(_named(answer))[1] if answer.ungated == "identified" else frozenset()
 
 
 def information_criterion(answer: Answer) -> tuple[str, frozenset[str]]:
@@ -770,8 +719,7 @@ def information_criterion(answer: Answer) -> tuple[str, frozenset[str]]:
         t = answer.tried[name]
         return t["log_likelihood"] - 0.5 * t["parameters"] * log(t["samples"])
 
-    effects = _effects(max(sorted(answer.tried), key=criterion))
-    return ("identified" if effects else "none"), effects
+    return hypothesis(max(sorted(answer.tried), key=criterion))
 
 
 def _named(answer: Answer) -> str:
@@ -779,12 +727,8 @@ def _named(answer: Answer) -> str:
     evidence = {name: t["evidence"] for name, t in answer.tried.items()}
     top = max(evidence.values())
     close = [n for n in sorted(evidence) if answer.tried[n]["fine"] and top - evidence[n] < CLOSE]
-    smallest = [n for n in close if not any(_effects(other) < _effects(n) for other in close)]
+    smallest = [n for n in close if not any(hypothesis(other)[1] < hypothesis(n)[1] for other in close)]
     return max(smallest or sorted(evidence), key=evidence.__getitem__)
-
-
-def _effects(name: str) -> frozenset[str]:
-    return frozenset() if name == "none" else frozenset(name.split("+"))
 
 
 JUDGES: tuple[tuple[str, Judge], ...] = (

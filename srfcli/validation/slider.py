@@ -269,19 +269,6 @@ class Plan:
         return share
 
 
-def example_protocol() -> tuple[Plan, ...]:
-    """Return the seven runs of the worked examples."""
-    return (
-        Plan("steps", ((2, 5), (1.5, 20), (2, 5), (1, 50), (2, 10)), 5.0, 0.004),
-        Plan("stickslip", ((0.5, 12), (5, 8)), 9.0, 0.004),
-        Plan("onset", ((0.5, 12), (4, 8)), 9.0, 0.001, eps=0.09, f=120, onset=2),
-        Plan("strong", ((2.5, 20),), 7.0, 0.001, eps=0.2, f=120, onset=0.6),
-        Plan("loadstep", ((6, 10),), 5.0, 0.002, steps=((2, 1.5), (4, -1.5))),
-        Plan("holdout-mod", ((3, 15),), 8.0, 0.001, holdout=True, eps=0.13, f=80, onset=0.8),
-        Plan("holdout-shs", ((2, 10), (4, 0.1), (3, 10)), 5.0, 0.004, holdout=True),
-    )
-
-
 # The slider's equations written for the interface's elastic strain: friction is a stress that is known, v what flows under it.
 
 FASTEST_SLIP = 60.0  # of ln(v/V0): what a solver's trial step may ask for is kept finite
@@ -442,8 +429,6 @@ def second_ageing(p: Physics) -> Callable[..., float]:
 
 def steady_age(p: Physics, V: float) -> float:
     """Return ln phi in steady sliding at V um/s: where the ageing rate vanishes."""
-    from scipy.optimize import brentq
-
     rate = ageing(p)
     middle = math.log(p.D0 / V)
     return float(brentq(lambda x: rate(V, x, 1.0, 0.0) * math.exp(x), middle - 20, middle + 20, xtol=1e-14))
@@ -487,11 +472,6 @@ class Contact:
     push: Push
     steady: Callable[[float, float, float, float], list[float]]  # of velocity, friction force, load, spring's K
     pull: Pull | None = None  # the rate of the friction force, where it follows from the states
-
-
-def build_contact(p: Physics) -> Contact:
-    """Return the slider that `p` describes: without mass, rigid with mass, or elastic with mass."""
-    return _massless(p) if p.massless else _rigid(p) if p.rigid else _elastic(p)
 
 
 def _elastic(p: Physics) -> Contact:
@@ -569,7 +549,7 @@ class Slider:
 
     def __init__(self, p: Physics, plan: Plan) -> None:
         self.p, self.plan = p, plan
-        self.contact: Contact = build_contact(p)
+        self.contact = _massless(p) if p.massless else _rigid(p) if p.rigid else _elastic(p)
         if p.nagata and (self.contact.pull is None or p.Wa):
             raise ValueError("nagata: the rate of the friction force does not follow from the states")
         self._felt = felt_load(p, plan)

@@ -118,19 +118,9 @@ def _make(trial: Trial, asked: dict[str, Any], *, workers: int, told: Callable[[
         shutil.rmtree(part)  # of a run that was killed while it made the bank: nobody has answered it
     trial.apart.unlink(missing_ok=True)
     with _interruptible():
-        made = make_bank(
-            part,
-            asked["cases"],
-            asked["seed"],
-            apart=trial.apart,
-            workers=workers,
-            told=told,
-            kinds=asked["kinds"] or None,
-            track=asked["track"],
-            bank=asked["bank"],
-            strengths=False,
-        )
-    made.folder.rename(trial.bank)
+        drawn = {"kinds": asked["kinds"] or None, "track": asked["track"], "bank": asked["bank"]}
+        make_bank(part, asked["cases"], asked["seed"], **drawn, apart=trial.apart, workers=workers, told=told, strengths=False)
+    part.rename(trial.bank)
 
 
 @contextmanager
