@@ -48,9 +48,15 @@ def is_typing(node: ast.AST) -> bool:
     return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """Return what stands in a file."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imports(path: Path, *, top_only: bool = False, typing: bool = True) -> Iterator[str]:
     """Yield the dotted names that a file imports; those inside functions and those for types alone, too, unless told."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path)
     typed = {id(n) for block in ast.walk(tree) if is_typing(block) for n in ast.walk(block)}
     for node in tree.body if top_only else ast.walk(tree):
         if id(node) in typed and not typing:
@@ -155,7 +161,7 @@ def test_libraries_are_left_to_those_that_need_them() -> None:
 
 
 def test_files_say_what_they_are() -> None:
-    assert not [n for n, p in files().items() if not ast.get_docstring(ast.parse(p.read_text(encoding="utf-8")))]
+    assert not [n for n, p in files().items() if not ast.get_docstring(parsed(p))]
 
 
 def test_command_modules_are_light() -> None:
@@ -264,5 +270,5 @@ def test_the_ways_through_the_code_are_ways() -> None:
         hops = re.findall(r"^\d+\. `([\w/]+\.py)` `(\w+)`", way, re.M)
         assert 3 < len(hops) <= 10 and len(hops) == len(re.findall(r"^\d+\. ", way, re.M))
         for file, name in hops:
-            tree = ast.parse((PACKAGE / file).read_text(encoding="utf-8"))
-            assert name in {n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.ClassDef)}, (file, name)
+            defined = (n for n in ast.walk(parsed(PACKAGE / file)) if isinstance(n, ast.FunctionDef | ast.ClassDef))
+            assert name in {n.name for n in defined}, (file, name)

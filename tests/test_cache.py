@@ -274,18 +274,32 @@ def test_a_forged_library_is_never_loaded(folder: Path, tmp_path: Path, make_mod
         compiled.cache_clear(), compiler.cache_clear()
 
 
+def build(make_model) -> None:
+    """Compile the paper's system as a new process does."""
+    compiled.cache_clear(), c_source._methods.clear()
+    assert compiled(make_model()) is not None
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory, make_model) -> Path:
+    """A folder with cache and secret, in which the paper's system was compiled."""
+    folder = tmp_path_factory.mktemp("built")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SRF_CACHE", str(folder / "cache"))
+        patch.setenv("XDG_STATE_HOME", str(folder / "state"))
+        build(make_model)
+    return folder
+
+
 @pytest.mark.usefixtures("fresh")
 @pytest.mark.skipif(compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("how", ["as it was", "of another name", "not to be written"])
-def test_a_method_that_is_not_this_user_s_is_compiled_anew(folder: Path, make_model, how: str) -> None:
+def test_a_method_that_is_not_this_user_s_is_compiled_anew(
+    built: Path, folder: Path, tmp_path: Path, make_model, how: str
+) -> None:
     """What is no object would end the linker; a place that cannot be written is done without."""
-
-    def build() -> None:
-        compiled.cache_clear(), c_source._methods.clear()
-        assert compiled(make_model()) is not None
-
+    shutil.copytree(built, tmp_path, dirs_exist_ok=True)
     try:
-        build()
         (method,) = folder.glob("*.o")
         mark, whole, forged = method.with_suffix(".sum"), method.read_bytes(), b"forged"
         for library in folder.glob("*.so"):
@@ -296,7 +310,7 @@ def test_a_method_that_is_not_this_user_s_is_compiled_anew(folder: Path, make_mo
         if how == "not to be written":
             mark.unlink()
             mark.mkdir()
-        build()
+        build(make_model)
         assert method.read_bytes() == (forged if mark.is_dir() else whole)  # a compiler makes the same of the same text
     finally:
         compiled.cache_clear(), c_source._methods.clear()

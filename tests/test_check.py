@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from recording_cases import TOML, data, write
+from scipy.linalg import cho_factor, cho_solve
 
 from srfcli.cli.main import cli
 from srfcli.codegen.model import open_model
@@ -109,19 +110,17 @@ def test_wrong_usage(options: tuple[str, ...], message: str, hint: str, small: P
     assert message in stderr and hint in stderr
 
 
-@pytest.mark.parametrize("suffix", ["svg", "png", "pdf"])
-def test_a_figure_with_what_is_not_compared(suffix: str, small: Path) -> None:
+def test_a_figure_with_what_is_not_compared(small: Path) -> None:
     lines = data()
     lines[30:60] = [line.rpartition(",")[0] + "," for line in lines[30:60]]  # a band
     lines[80] = lines[80].rpartition(",")[0] + ","  # a cross
     write(small, one=lines)
-    srf("check", str(small), "--no-simulate", "--plot", f"c.{suffix}")
-    content = Path(f"c.{suffix}").read_bytes()
-    assert len(content) > 5000 and Path(f"c.{suffix}.provenance.json").exists()
-    if suffix == "svg":
-        assert b"one: 31 samples not compared" in content and b"elongation" in content
-        srf("check", str(small), "--no-simulate", "--plot", "again.svg")
-        assert Path("again.svg").read_bytes() == content
+    srf("check", str(small), "--no-simulate", "--plot", "c.svg")
+    content = Path("c.svg").read_bytes()
+    assert len(content) > 5000 and Path("c.svg.provenance.json").exists()
+    assert b"one: 31 samples not compared" in content and b"elongation" in content
+    srf("check", str(small), "--no-simulate", "--plot", "again.svg")
+    assert Path("again.svg").read_bytes() == content
 
 
 def test_the_axes_of_what_is_imposed() -> None:
@@ -215,11 +214,11 @@ def test_errors_from_differences(name: str, case: str, shared: Path) -> None:
     lam = next(p.value for p in experiment.parameters if p.name == "lambda")
     used = np.flatnonzero(run.used)
     lag = np.abs(np.subtract.outer(run.t[used], run.t[used]))
-    covariance = check.noise.covariance(lag)
+    covariance = cho_factor(check.noise.covariance(lag))
     for asked, low, high, unit in (("alpha", 0.0, 2e-5, 1.0), ("lambda", lam * (1 - 1e-5), lam * (1 + 1e-5), lam)):
         y = [predict(model, experiment, run, {"alpha": 0.0, asked: x}, rtol=1e-9).y for x in (low, high)]
         slope = ((y[1] - y[0]) / (high - low) * unit)[used]
-        assert found.errors[asked] == pytest.approx(float(slope @ np.linalg.solve(covariance, slope)) ** -0.5, rel=0.1)
+        assert found.errors[asked] == pytest.approx(float(slope @ cho_solve(covariance, slope)) ** -0.5, rel=0.1)
 
 
 def test_a_constant_load_cannot_tell_alpha(shared: Path) -> None:
@@ -245,11 +244,11 @@ def test_bounds_and_free_starts_cost_what_they_must(made: Path) -> None:
         replace(p, lower=p.value * (1 - 1e-9) - 1e-9, upper=p.value * (1 + 1e-9) + 1e-9) for p in experiment.parameters
     )
     free = replace(experiment, runs=tuple(replace(r, initial="free") for r in experiment.runs))
+    least, most = told(known).runs[0].errors, told(free).runs[0].errors
+    bounded = told(replace(experiment, parameters=narrow)).runs[0].errors
     for name in base:
-        assert told(known).runs[0].errors[name] < base[name] < told(free).runs[0].errors[name] * 1.01
-        assert told(replace(experiment, parameters=narrow)).runs[0].errors[name] == pytest.approx(
-            told(known).runs[0].errors[name], rel=1e-3
-        )
+        assert least[name] < base[name] < most[name] * 1.01
+        assert bounded[name] == pytest.approx(least[name], rel=1e-3)
 
 
 def test_a_long_run_is_thinned_without_another_answer(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -346,7 +346,7 @@ def test_ctrl_c_keeps_what_is_done(command: str, empty_folder: Path) -> None:
     amplitudes = ",".join(f"{eps:g}" for eps in (0.045, *(0.4 + 0.002 * k for k in range(50))))  # minutes of work
     more = {"continue": [], "critical": ["--V", ",".join(map(str, range(20, 70)))]}[command]
     text = ""
-    for seconds in (4.0, 15.0, 40.0):  # the first rows take one second, more on a busy machine
+    for seconds in (2.0, 6.0, 15.0, 40.0):  # the first rows take one second, more on a busy machine
         arguments = [command, "--eps", amplitudes, *more, "--out", "x.csv", "--force"]
         code, said = interrupted_after(seconds, arguments)
         assert code == 130 and "Interrupted" in said and "Traceback" not in said, said

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import signal
 import time
@@ -263,13 +261,6 @@ def test_the_command_compares(tmp_path):
     assert pair["difference"] > 0.03
     assert any("differ most at V = " in note and "times the 3%" in note for note in data["notes"])
     assert (tmp_path / "a.svg").stat().st_size > 10_000
-
-
-def test_the_command_does_not_depend_on_the_workers():
-    laws = ("--law", "srf-vsat", "--law", "bowden-tabor", *SMALL[:4], "--eps", "0.05", "--csv")
-    alone, spread = run(*laws), run(*laws, "--workers", "2")
-    assert alone[0] == 0 and alone[1] == spread[1]
-    assert len(list(csv.DictReader(io.StringIO(alone[1])))) == 2
 
 
 @pytest.mark.parametrize(

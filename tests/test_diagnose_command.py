@@ -61,7 +61,7 @@ def make(folder: Path) -> Path:
     """Write a simulated experiment in which a change of load changes the age, and whose model says nothing of it."""
     base = folder / "base"
     base.mkdir()
-    text, t = TOML, np.arange(0, 3.0, 0.005)
+    text, t = TOML, np.arange(0, 3.0, 0.01)
     for name, (drive, before, after, holdout) in RUNS.items():
         steps = ", ".join(f"{{ duration = {d}, velocity = {V} }}" for d, V in drive)
         text += f'\n[[runs]]\nname = "{name}"\nfile = "{name}.csv"\nholdout = {str(holdout).lower()}\ndrive = [{steps}]\n'
@@ -69,7 +69,7 @@ def make(folder: Path) -> Path:
         rows = [f"{a!r},{b!r},{float(0.45 * b + 1e-3 * np.sin(7 * a))!r}" for a, b in zip(t.tolist(), W.tolist(), strict=True)]
         (base / f"{name}.csv").write_text("\n".join(["time [s],normal_load [N],elongation [um]", *rows]) + "\n")
     (base / "experiment.toml").write_text(text)
-    srf("simulate", base, "--out-dir", folder / "made", "--noise", 0.004, "--quantum", 0.001, "--seed", 3)
+    srf("simulate", base, "--out-dir", folder / "made", "--noise", 0.003, "--quantum", 0.001, "--seed", 3)
     description = folder / "made" / "experiment.toml"
     lines = [x for x in description.read_text().splitlines() if not x.startswith(("effects", "alpha"))]
     description.write_text("\n".join(lines).replace("value = 0.0126,", "value = 0.0135,") + "\n")
@@ -93,7 +93,7 @@ def experiment(clean: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.fixture(scope="module")
-def found(experiment: Path) -> dict[str, Any]:
+def found(experiment: Path, without_figures: None) -> dict[str, Any]:
     """The answer, of a run that also writes the folder `found` beside the experiment."""
     done = srf("diagnose", experiment, *EFFECTS, "--json", "--out", experiment.parent / "found")
     answer: dict[str, Any] = json.loads(done.stdout)
@@ -149,9 +149,9 @@ def test_predictions_are_written_for_every_run(found: dict[str, Any], folder: Pa
     file = folder / f"prediction-{run}.csv"
     assert file.read_text().splitlines()[0] == "time [s],observed [um],baseline [um],augmented [um]"
     t, observed, baseline, augmented = np.genfromtxt(file, delimiter=",", skip_header=1).T
-    assert t.size == 600 and np.isfinite(baseline).all()
+    assert t.size == 300 and np.isfinite(baseline).all()
     better, worse = np.nanstd(observed - augmented), np.nanstd(observed - baseline)
-    assert better == pytest.approx(0.004, rel=0.12)
+    assert better == pytest.approx(0.003, rel=0.12)
     assert worse > better * (1.0 if run == "steps" else 1.05)
 
 
@@ -170,7 +170,7 @@ def test_other_commands_accept_the_augmented_experiment(found: dict[str, Any], f
     for name, value in found["augmented"]["parameters"].items():
         assert abs(rows[name]["value"] - value["value"]) < 0.5 * value["stderr"], name
     assert srf("check", folder / "augmented", "--no-simulate", "--csv").stdout.count("\n") == 4
-    assert srf("simulate", folder / "augmented", "--run", "loadstep", "--csv").stdout.count("\n") == 601
+    assert srf("simulate", folder / "augmented", "--run", "loadstep", "--csv").stdout.count("\n") == 301
 
 
 def test_the_diagram_of_the_augmented_model_is_one_command_away(folder: Path) -> None:
@@ -183,11 +183,12 @@ def test_the_diagram_of_the_augmented_model_is_one_command_away(folder: Path) ->
 
 
 def test_a_reader_gets_a_sentence_and_tables(experiment: Path, found: dict[str, Any]) -> None:
-    text = srf("diagnose", experiment, *EFFECTS).stdout
+    text = srf("diagnose", experiment, *EFFECTS, "--seed", 0).stdout
     assert text.startswith("identified: linker-dieterich\n")
     for word in ("hypotheses", "parameters", "runs", "held out", "alpha", "rms over noise"):
         assert word in text
-    assert text == srf("diagnose", experiment, *EFFECTS, "--seed", 0).stdout  # nothing random without a seed
+    for parameter in found["augmented"]["parameters"].values():
+        assert f"{parameter['value']:.12g}" in text  # nothing is random without a seed
 
 
 def test_a_diagnosis_is_replaced_on_demand_only_and_nothing_else_ever(folder: Path, experiment: Path, tmp_path: Path) -> None:
@@ -258,7 +259,8 @@ def test_where_nothing_is_missing_the_augmented_model_is_the_baseline(folder: Pa
     assert found["verdict"] in ("none", "inconclusive") and found["effects"] == []
     assert found["augmented"] == found["baseline"] and found["location"]["runs"] == []
     described = tomli.loads((out / "augmented" / "experiment.toml").read_text())
-    assert described["parameters"].keys() == found["baseline"]["parameters"].keys() or "V0" in described["parameters"]
+    free = {name for name, entry in described["parameters"].items() if not entry.get("fixed")}
+    assert free == set(found["baseline"]["parameters"])
 
 
 def test_names_of_prediction_files_do_not_clash() -> None:

@@ -38,7 +38,7 @@ def ar_noise(seed, n, coefficients, innovation):
 def rock(model, *, seed=1, lag=0.0, sd=5e-4, observable="friction", start=1.2, runs=2, **change):
     """Return an experiment of velocity steps on rock, quasi-static, its start values off by a fifth."""
     made = []
-    t = np.linspace(0, 60, 601)
+    t = np.linspace(0, 60, 301)
     parameters = tuple(FitParameter(n, v * start, v / 5, v * 5, False, "1") for n, v in ROCK_TRUE.items())
     parameters = (replace(parameters[0], value=0.59, lower=0.3, upper=0.9), *parameters[1:])
     base = Experiment(Path(), "steps", ROCK, None, "0.2 N/um", parameters, (), ())
@@ -139,10 +139,15 @@ def test_a_free_start_is_observed_where_it_should_be(rock_model):
     assert y[0] == pytest.approx(0.61, rel=1e-9)
 
 
+@pytest.fixture(scope="module")
+def recovered(rock_model):
+    """Fits to white noise and to noise of a lag-one correlation of 0.9, by this."""
+    return {lag: fit(fit_problem(rock_model, rock(rock_model, lag=lag))) for lag in (0.0, 0.9)}
+
+
 @pytest.mark.parametrize("lag", [0.0, 0.9])
-def test_recovery(rock_model, lag):
-    problem = fit_problem(rock_model, rock(rock_model, lag=lag))
-    found = fit(problem)
+def test_recovery(recovered, lag):
+    found = recovered[lag]
     assert found.status is Status.OK
     for name, value in ROCK_TRUE.items():
         assert abs(found.values[name] - value) < 4 * found.stderr[name], name
@@ -150,8 +155,8 @@ def test_recovery(rock_model, lag):
     assert all(bool(f.colours) == (lag > 0) for f in found.runs)
 
 
-def test_coloured_noise_widens_the_errors(rock_model):
-    white, coloured = (fit(fit_problem(rock_model, rock(rock_model, lag=lag))) for lag in (0.0, 0.9))
+def test_coloured_noise_widens_the_errors(recovered):
+    white, coloured = recovered[0.0], recovered[0.9]
     assert coloured.stderr["mu0"] > 2.5 * white.stderr["mu0"]  # a mean of AR(1): sqrt((1 + 0.9)/(1 - 0.9)) = 4.4
 
 

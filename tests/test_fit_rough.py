@@ -83,24 +83,22 @@ def vary(folder, *words):
 
 
 def test_what_varies_between_runs_is_told(offset):
-    done, found = vary(offset, "--vary", "mu0,D0")
-    assert done.exit_code == 0, done.stderr
-    rows = {row["parameter"]: row for row in found["rows"]}
+    result = srf.fit(srf.read_experiment(offset), free=["mu0", "A", "D0"], vary=["mu0", "D0"])
+    rows = {row["parameter"]: row for row in result.table.records()}
     assert {f"mu0[up{k}]" for k in range(3)} | {f"D0[up{k}]" for k in range(3)} | {"A"} == set(rows)
     apart = [rows[f"mu0[up{k}]"]["value"] - rows["mu0[up0]"]["value"] for k in (1, 2)]
     assert apart == pytest.approx([2e-3, -1e-3], abs=3e-4)
-    result = srf.fit(srf.read_experiment(offset), free=["mu0", "A", "D0"], vary=["mu0", "D0"])
     names = [column.name for column in result.varied.columns]
     varied = {row[0]: dict(zip(names, row, strict=True)) for row in result.varied.rows}
     assert varied["mu0"]["p_equal"] < 1e-6 and varied["mu0"]["scatter"] == pytest.approx(1.5e-3, rel=0.3)
     assert varied["D0"]["p_equal"] > 1e-3 and varied["D0"]["unit"] == "um"
-    held = next(row for row in found["meta"]["runs"] if row["role"] == "held out")
+    held = next(row for row in result.table.meta["runs"] if row["role"] == "held out")
     assert 0.8 < held["rms_over_noise"] < 1.2
 
 
 def test_what_varies_with_the_load_is_one_value_a_load(offset):
-    found = vary(offset, "--vary", "mu0", "--by", "load", "--track", "smooth")[1]
-    assert [row["parameter"] for row in found["rows"][:2]] == ["mu0[3 N]", "mu0[4 N]"]
+    found = vary(offset, "--vary", "mu0,D0", "--by", "load", "--track", "smooth")[1]
+    assert {f"{name}[{load} N]" for name in ("mu0", "D0") for load in (3, 4)} < {row["parameter"] for row in found["rows"]}
     assert vary(offset, "--vary", "B")[0].exit_code == 2  # not free
     assert vary(offset, "--vary", "mu0", "--track", "shared")[0].exit_code == 2
 
@@ -252,7 +250,7 @@ def test_the_likeliest_of_many_maxima_is_found(tmp_path):
 def loud(tmp_path_factory):
     """Three runs whose gauges have noise of 0.02, 0.06 and, held out, 0.12 um; slider and track are alike."""
     folder, rng = tmp_path_factory.mktemp("loud"), np.random.default_rng(8)
-    plans = [Plan(f"up{k}", ((0.6, 20), (0.6, 60), (0.6, 35)), 3.0, 0.004, holdout=k == 2) for k in range(3)]
+    plans = [Plan(f"up{k}", ((0.6, 20), (0.6, 60)), 3.0, 0.004, holdout=k == 2) for k in range(3)]
     noise = zip(plans, (0.02, 0.06, 0.12), strict=True)
     readings = {q: read_gauge(move(Physics(), q).u, Gauge(sigma=level), rng) for q, level in noise}
     for name, text in case_files("small", Physics(), readings).items():
@@ -305,7 +303,7 @@ def test_what_a_held_out_run_adds_to_the_evidence_is_what_is_predicted_of_it(lou
 
 def test_a_held_out_run_moves_what_the_fitted_ones_left_undetermined(tmp_path):
     """Steady sliding tells neither D0 nor B apart from A: with the file's values a step is not predicted, with the law it is."""
-    plans = (Plan("slide", ((2, 20),), 3.0, 0.004), Plan("step", ((0.5, 20), (0.8, 60)), 3.0, 0.004, holdout=True))
+    plans = (Plan("slide", ((1, 20),), 3.0, 0.004), Plan("step", ((0.5, 20), (0.8, 60)), 3.0, 0.004, holdout=True))
     rng = np.random.default_rng(2)
     readings = {q: read_gauge(move(Physics(), q).u, Gauge(), rng) for q in plans}
     for name, text in case_files("small", Physics(), readings).items():

@@ -242,7 +242,7 @@ CELLS = [
     "value = 0.33", "lower = 0.1", "upper = 1.0", "scale = 1.0", "offset = 0.0", "[0.0, 1.5", "velocity = 10.0",
     "duration = 1.0", "frequency = 12.0", "amplitude = 0.09", "onset = 2.0",
 ]  # fmt: skip
-NUMBERS = ["9" * 400, "1e-320", "nan", "inf", "-inf", "1e308", "0x" + "f" * 500, "-0.0", "5e-324", "true", "[]"]
+NUMBERS = ["9" * 400, "1e-320", "nan", "inf", "-inf", "1e308", "0x" + "f" * 500, "-0.0", "true", "[]"]
 
 
 @pytest.mark.parametrize("number", NUMBERS, ids=lambda n: n[:8])

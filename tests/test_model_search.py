@@ -34,10 +34,10 @@ from srfcli.validation.slider import Physics, Plan, Track, move
 
 SHIPPED = bundled_registry()
 PLANS = (
-    Plan("steps", ((0.6, 5), (0.5, 50), (0.8, 10)), 5.0, 0.004),
-    Plan("stickslip", ((0.4, 12), (2.2, 8)), 9.2, 0.004),
-    Plan("loadstep", ((3, 10),), 5.0, 0.004, steps=((1, 1.5), (2, -1.5))),
-    Plan("again", ((2, 15),), 6.0, 0.004, holdout=True, steps=((0.8, 1.5),)),
+    Plan("steps", ((0.6, 5), (0.5, 50), (0.8, 10)), 5.0, 0.008),
+    Plan("stickslip", ((0.4, 12), (2.2, 8)), 9.2, 0.008),
+    Plan("loadstep", ((3, 10),), 5.0, 0.008, steps=((1, 1.5), (2, -1.5))),
+    Plan("again", ((2, 15),), 6.0, 0.008, holdout=True, steps=((0.8, 1.5),)),
 )
 FEW = ("linker-dieterich", "viscous-drag", "friction-drift", "slip-evolution", "sensor-lag")
 pytestmark = pytest.mark.skipif(compiler() is None, reason="no C compiler: the filter is compiled")
@@ -47,11 +47,35 @@ def recorded(folder, physics, *, baseline=None, seed=5, shared=False, gauge=None
     """Write an experiment whose runs each slid on a rough track of their own, or all on one, and return its folder."""
     rng, readings = np.random.default_rng(seed), {}
     for number, plan in enumerate(PLANS):
-        own = replace(physics, track=Track(3e-4, 6.0, 100 * seed + (0 if shared else number)))
+        own = replace(physics, track=Track(5e-4, 6.0, 100 * seed + (0 if shared else number)))
         readings[plan] = read_gauge(move(own, plan).u, gauge or Gauge(), rng)
     for name, text in case_files("small", baseline or Physics(), readings).items():
         (folder / name).write_text(text)
     return folder
+
+
+@pytest.fixture(scope="module")
+def rough(tmp_path_factory):
+    """The folder of an experiment on rough tracks that lacks nothing."""
+    return recorded(tmp_path_factory.mktemp("rough"), Physics())
+
+
+@pytest.fixture(scope="module")
+def ageing(tmp_path_factory):
+    """The folder of one in which a change of the load changes the age."""
+    return recorded(tmp_path_factory.mktemp("ageing"), Physics(alpha=0.03))
+
+
+@pytest.fixture(scope="module")
+def experiment(rough):
+    """Its runs that are fitted."""
+    return read_experiment(rough, registry=SHIPPED, holdout=False)
+
+
+@pytest.fixture(scope="module")
+def fitted(experiment):
+    """What is fitted to them without any effect."""
+    return fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=())
 
 
 def said(folder, effects=FEW):
@@ -60,8 +84,8 @@ def said(folder, effects=FEW):
     return conclude(search, read_experiment(folder, registry=SHIPPED))
 
 
-def test_a_rough_track_is_no_missing_physics(tmp_path):
-    found = said(recorded(tmp_path, Physics()))
+def test_a_rough_track_is_no_missing_physics(rough):
+    found = said(rough)
     assert found.verdict in ("none", "inconclusive") and not found.effects
     assert found.best is found.baseline and not found.baseline.fit.smooth
     assert sum(found.confidence.values()) == pytest.approx(1.0)
@@ -87,8 +111,8 @@ def test_a_friction_of_each_runs_own_is_no_missing_physics(tmp_path):
     assert 0.8 < np.sqrt(np.mean(white**2)) < 1.2
 
 
-def test_what_is_missing_is_named_on_rough_tracks(tmp_path):
-    found = said(recorded(tmp_path, Physics(alpha=0.03)))
+def test_what_is_missing_is_named_on_rough_tracks(ageing):
+    found = said(ageing)
     assert (found.verdict, found.effects) == ("identified", ("linker-dieterich",))
     best = found.best.fit
     error = np.sqrt(np.diag(best.maximum.covariance))[best.likelihood.names.index("alpha")]
@@ -96,15 +120,15 @@ def test_what_is_missing_is_named_on_rough_tracks(tmp_path):
     assert sum(h.gain for h in found.held) > 0
 
 
-def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(tmp_path, monkeypatch):
+def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(ageing, monkeypatch):
     """A search that takes every third reading says what one of all does; its fits are to all, at the same maximum."""
-    experiment = read_experiment(recorded(tmp_path, Physics(alpha=0.03)), registry=SHIPPED, holdout=False)
+    experiment = read_experiment(ageing, registry=SHIPPED, holdout=False)
     every = fit_state_space(Hypothesis().problem(SHIPPED, experiment))
     monkeypatch.setattr(state_space, "MANY_READINGS", every.likelihood.samples // 3)
     parts = fit_state_space(Hypothesis().problem(SHIPPED, experiment))
     assert parts.likelihood.samples == every.likelihood.samples
     assert parts.log_likelihood == pytest.approx(every.log_likelihood, abs=0.1)
-    found = said(tmp_path)
+    found = said(ageing, effects=("linker-dieterich", "viscous-drag", "sensor-lag"))
     assert (found.verdict, found.effects) == ("identified", ("linker-dieterich",))
     assert {f.fit.likelihood.samples for f in found.ranked} == {every.likelihood.samples}
     assert found.best.fit.values["alpha"] == pytest.approx(0.03, abs=0.005)
@@ -112,16 +136,13 @@ def test_of_long_recordings_a_part_is_searched_and_all_is_fitted(tmp_path, monke
 
 def test_another_ageing_law_has_its_name(tmp_path):
     """Data of the slip law under a stated ageing law: the registered law, or the effect that is the same at its full size."""
-    found = said(recorded(tmp_path, Physics(slip_share=1.0)))
+    found = said(recorded(tmp_path, Physics(slip_share=1.0)), effects=("linker-dieterich", "viscous-drag", "slip-evolution"))
     assert found.verdict in ("identified", "ambiguous")
     assert set(found.effects) <= {"ruina", "slip-evolution"} and found.effects
 
 
-def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(tmp_path):
-    folder = recorded(tmp_path, Physics())
-    description = folder / "experiment.toml"
-    description.write_text(description.read_text().replace('ageing = "dieterich"', 'ageing = "perrin-rice-zheng"'))
-    experiment = read_experiment(folder, registry=SHIPPED, holdout=False)
+def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(experiment):
+    experiment = replace(experiment, choice=replace(experiment.choice, ageing="perrin-rice-zheng"))
     candidates, _ = applicable(SHIPPED, experiment, FEW)
     problem = Hypothesis().problem(SHIPPED, experiment)
     begun = Likelihood(problem)
@@ -133,11 +154,8 @@ def test_an_effect_that_cannot_join_a_law_is_left_out_with_the_reason(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["viscous-drag", "linker-dieterich", "friction-drift", "drive-ripple"])
-def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
+def test_scores_are_what_the_likelihood_gains_nearby(experiment, fitted, name):
     """The column of an effect against the likelihood of the model that has it, a little from its neutral value."""
-    experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
-    problem = Hypothesis().problem(SHIPPED, experiment)
-    fitted = fit_state_space(problem, processes=())
     effect = SHIPPED.get("effect", name)
     scores = Scores(SHIPPED, experiment, Remainder(fitted), (), [effect])
     column = scores.columns[len(scores.columns) // 2]
@@ -166,19 +184,16 @@ def test_scores_are_what_the_likelihood_gains_nearby(tmp_path, name):
         assert spared == pytest.approx(0.5 * size**2 * absorbed, rel=0.3, abs=0.02)
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, shared):
+def test_a_field_that_all_runs_share_is_seen_as_one(tmp_path, fitted):
     """The gain of a shared field against a Gaussian density with its covariance written out, and its sign."""
-    experiment = read_experiment(recorded(tmp_path, Physics(), shared=shared), registry=SHIPPED, holdout=False)
-    fitted = fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=())
-    remainder = Remainder(fitted)
-    assert (remainder.shared.gain > SHARED) == shared
-    if shared:
-        found = remainder.shared
-        absorbed = (found.u * found.absorbed) @ found.u.T  # I - inverse of the covariance
-        inverse = np.eye(remainder.left.size) - absorbed
-        gain = 0.5 * remainder.left @ absorbed @ remainder.left + 0.5 * np.linalg.slogdet(inverse)[1]
-        assert gain == pytest.approx(found.gain, rel=1e-8)
+    experiment = read_experiment(recorded(tmp_path, Physics(), shared=True), registry=SHIPPED, holdout=False)
+    remainder = Remainder(fit_state_space(Hypothesis().problem(SHIPPED, experiment), processes=()))
+    found = remainder.shared
+    assert found.gain > SHARED > Remainder(fitted).shared.gain
+    absorbed = (found.u * found.absorbed) @ found.u.T  # I - inverse of the covariance
+    inverse = np.eye(remainder.left.size) - absorbed
+    gain = 0.5 * remainder.left @ absorbed @ remainder.left + 0.5 * np.linalg.slogdet(inverse)[1]
+    assert gain == pytest.approx(found.gain, rel=1e-8)
 
 
 def test_a_field_that_all_runs_share_counts_alike_under_every_model(tmp_path):
@@ -207,16 +222,12 @@ def test_coloured_gauge_noise_is_not_taken_for_a_fine_field(tmp_path):
     assert correlated(found.maximum.point) < DEVIATION
 
 
-def test_evidence_charges_for_what_is_free(tmp_path):
-    experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
-    problem = Hypothesis().problem(SHIPPED, experiment)
-    fitted = fit_state_space(problem, processes=())
+def test_evidence_charges_for_what_is_free(fitted):
     assert log_evidence(fitted) < fitted.log_likelihood - 10.0
 
 
-def test_the_evidence_is_the_likelihood_averaged_over_the_priors(tmp_path):
+def test_the_evidence_is_the_likelihood_averaged_over_the_priors(experiment):
     """By numerical integration: of a drag that is kept out of its maximum by some standard errors, and the level of the noise."""
-    experiment = read_experiment(recorded(tmp_path, Physics()), registry=SHIPPED, holdout=False)
     drag = FitParameter("c", 0.0, -0.01, 0.01, False, "1")
     held = tuple(replace(q, fixed=True) for q in experiment.parameters)
     choice = experiment.choice.plus(["viscous-drag"])

@@ -23,9 +23,9 @@ from srfcli.validation.slider import Physics, Plan, move
 
 SHIPPED = bundled_registry()
 PLANS = (
-    Plan("up", ((0.5, 10), (0.7, 40)), 3.0, 0.002, steps=((0.3, 1.0), (0.7, -0.5))),
-    Plan("down", ((0.7, 40), (0.6, 15)), 3.0, 0.002, steps=((0.3, 1.0), (0.9, -0.5))),
-    Plan("again", ((0.4, 15), (0.4, 30)), 3.0, 0.002, steps=((0.2, 1.0),), holdout=True),
+    Plan("up", ((0.5, 10), (0.7, 40)), 3.0, 0.004, steps=((0.3, 1.0), (0.7, -0.5))),
+    Plan("down", ((0.7, 40), (0.6, 15)), 3.0, 0.004, steps=((0.3, 1.0), (0.9, -0.5))),
+    Plan("again", ((0.4, 15), (0.4, 30)), 3.0, 0.004, steps=((0.2, 1.0),), holdout=True),
 )
 SHARE, NAME = 0.05, "tangential-crosstalk"
 needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler: motion is too slow here")

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from in_workers import deadly, faulty, fragile, slow, square
 
 from srfcli.cli.main import cli
 from srfcli.cli.options import Spread
@@ -25,34 +26,8 @@ from srfcli.numerics.plane import MapAxis, MapGrid, MapSettings, tile_tasks
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def square(task):
-    return {"value": np.array(task[0]) ** 2}
-
-
 def cube(task):
     return {"value": np.array(task[0] or 0) ** 3}
-
-
-def fragile(task):
-    """Die as if killed, once: the first worker to come here leaves a mark."""
-    number, mark = task
-    if number == 3 and not Path(mark).exists():
-        Path(mark).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return {"value": np.array(number) ** 2}
-
-
-def deadly(task):
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def faulty(task):
-    raise SrfError("this task is wrong", "do another")
-
-
-def slow(task):
-    time.sleep(0.2)
-    return square(task)
 
 
 def values(results):
@@ -93,13 +68,6 @@ def test_no_worker_is_left_behind():
     assert multiprocessing.active_children() == []
 
 
-def endless(folder):
-    """Leave the process's number in the folder, then compute until killed."""
-    Path(folder, str(os.getpid())).touch()
-    while True:
-        pass
-
-
 def running(number):
     """Return whether a process computes still; one that only waits to be fetched does not."""
     state = Path(f"/proc/{number}/stat")
@@ -108,7 +76,7 @@ def running(number):
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc to see processes in")
 def test_workers_end_with_a_parent_that_is_killed(tmp_path):
-    code = f"import test_parallel as t; list(t.run_processes(t.endless, [{str(tmp_path)!r}] * 2, workers=2))"
+    code = f"from in_workers import all_endless; all_endless({str(tmp_path)!r})"
     parent = subprocess.Popen([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"})
     try:
         assert eventually(lambda: len(list(tmp_path.iterdir())) == 2)

@@ -61,11 +61,16 @@ def rms(x):
     return float(np.sqrt(np.mean(np.square(x))))
 
 
+def shorten(patch):
+    """Let cases have two short runs, one held out."""
+    plans = (SHORT[1], replace(SHORT[0], holdout=True))
+    patch.setattr("srfcli.validation.cases.draw_protocol", lambda rng: plans)
+
+
 @pytest.fixture
 def quick(monkeypatch):
     """Cases of two short runs, one held out."""
-    plans = (SHORT[1], replace(SHORT[0], holdout=True))
-    monkeypatch.setattr("srfcli.validation.cases.draw_protocol", lambda rng: plans)
+    shorten(monkeypatch)
 
 
 def contents(folder):
@@ -293,9 +298,19 @@ def test_effects_that_go_together_nowhere_are_told(tmp_path):
         make_case(tmp_path / "c", 1, bank="wid")
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A bank that is copied and left as it is."""
+    with pytest.MonkeyPatch.context() as patch:
+        shorten(patch)
+        return make_bank(tmp_path_factory.mktemp("made") / "bank", 3, 1, strengths=False)
+
+
 @pytest.fixture
-def bank(quick, tmp_path):
-    return make_bank(tmp_path / "bank", 3, 1, strengths=False)
+def bank(quick, made, tmp_path):
+    """A bank to do anything to."""
+    shutil.copytree(made.folder.parent, tmp_path, dirs_exist_ok=True)
+    return replace(made, folder=tmp_path / made.folder.name, apart=tmp_path / made.apart.name)
 
 
 def test_a_bank_is_sealed_and_opens(bank, tmp_path):

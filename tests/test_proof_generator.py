@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 from dataclasses import asdict, fields, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,9 @@ GENERATOR = ("slider", "gauge", "apparatus", "cases")
 NOISE = float(np.hypot(0.02, 0.005 / np.sqrt(12)))  # um, of a gauge and its quanta
 OPEN = [f"open-{n:02d}" for n in range(1, 9)]
 EXAMPLES = {plan.name: plan for plan in example_protocol()}
+# of runs under a modulation, which cost most to integrate, the first half; sampled as the whole is
+BRIEF = {"onset": ((0.5, 12), (2.5, 8)), "strong": ((1.2, 20),), "holdout-mod": ((1.6, 15),)}
+PROTOCOL = [replace(plan, drive=BRIEF.get(plan.name, plan.drive)) for plan in example_protocol()]
 # rms over noise that a truth without its track may leave: the track alone moves stick-slip, and what comes near it
 ROUGH = {("open-07", "stickslip"): 20, ("open-07", "onset"): 6, ("open-07", None): 1.5, ("open-08", None): 1.3}
 # short runs in which effects show: a modulation, steps of velocity, a step of load
@@ -65,9 +69,10 @@ def test_known_truth_explains_the_example_down_to_its_noise(shared, case):
     known = {f.name for f in fields(Physics)}
     values = {n: v for n, v in {**told["parameters"], **told["truth"]}.items() if n in known}
     assert set(told["truth"]) <= known
-    for plan in example_protocol():
-        recorded = np.loadtxt(shared / "cases" / case / f"{plan.name}.csv", delimiter=",", skiprows=1)
+    for plan in PROTOCOL:
         trace = move(Physics(**values), plan)
+        file = shared / "cases" / case / f"{plan.name}.csv"
+        recorded = np.loadtxt(file, delimiter=",", skiprows=1, max_rows=trace.t.size)
         assert np.allclose(recorded[:, 0], trace.t, atol=1e-9)
         W = np.array([plan.load()(t)[0] for t in trace.t.tolist()])
         assert np.abs(W - recorded[:, 2]).max() < 6e-7  # six decimals
@@ -84,7 +89,7 @@ def test_known_truth_explains_the_example_down_to_its_noise(shared, case):
 def test_without_effects_it_agrees_with_the_fitter(make_model, tmp_path, change):
     """Strain form and BDF here, slip form and Radau there, and the format in between: they meet within 1e-3 um in every run."""
     p = replace(Physics(), **change)
-    plans = example_protocol() if not change else [EXAMPLES["steps"], EXAMPLES["onset"], EXAMPLES["loadstep"]]
+    plans = PROTOCOL if not change else [EXAMPLES["steps"], EXAMPLES["onset"], EXAMPLES["loadstep"]]
     traces = {plan: move(p, plan) for plan in plans}
     assert all(trace.complete for trace in traces.values())
     for name, text in case_files("neutral", p, {plan: trace.u for plan, trace in traces.items()}).items():
@@ -225,6 +230,9 @@ def test_strain_form_is_the_slip_relation():
 # ---- effects
 
 
+moved_before = cache(move)  # without its effect the slider is the same for most
+
+
 @pytest.mark.parametrize("effect", (*EFFECTS, *OUTSIDE), ids=lambda e: f"{e.name}-{e.varies}")
 def test_each_effect_changes_the_record_and_vanishes(effect):
     strong = effect.added(Physics(), np.random.default_rng(5), 1.0)
@@ -232,7 +240,7 @@ def test_each_effect_changes_the_record_and_vanishes(effect):
     weakest = effect.added(Physics(), np.random.default_rng(5), 0.0)
     moved = []
     for plan in SHORT:
-        far, near, none = (move(p, plan).u for p in (strong, weakest, without))
+        far, near, none = move(strong, plan).u, move(weakest, plan).u, moved_before(without, plan).u
         far, near = (play(u, p.backlash) for u, p in ((far, strong), (near, weakest)))
         assert np.isfinite([far, near, none]).all()
         moved.append((rms(far - none), rms(near - none)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import contextlib
 import json
 import os
 import random
@@ -19,6 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from in_workers import careless, deadly_at_one, peeks, remembers, says_none
 
 from srfcli.cli import prove as command
 from srfcli.cli.main import main
@@ -52,43 +52,6 @@ SHORT = (
 SURE = {"none": 0.0, "unknown": 0.01}
 
 
-# ---- diagnoses that are not: they see a folder, as the real one does
-
-
-def says_none(folder, plugins):
-    return Answer("", "none", confidence={"none": 0.95, "unknown": 0.05}, held={"wave": {"augmented": 0.02, "baseline": 0.02}})
-
-
-def careless(folder, plugins):
-    """Raise at one case, end the process at another, never end at a third."""
-    number = int(folder.name[-1])
-    if number == 0:
-        raise ValueError("a matrix\nis singular")
-    if number == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    while number == 2:
-        with contextlib.suppress(Exception):  # it copes with everything
-            sum(range(1000))
-    return says_none(folder, plugins)
-
-
-def remembers(folder, plugins):
-    """Leave a mark per call, and end the process at the first call on the fourth case."""
-    marks = folder.parent.parent / "calls"
-    marks.mkdir(exist_ok=True)
-    times = len(list(marks.glob(f"{folder.name}*")))
-    (marks / f"{folder.name}.{times}").touch()
-    if folder.name.endswith("3") and not times:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return says_none(folder, plugins)
-
-
-def peeks(folder, plugins):
-    """Say what the folder and all above it up to the trial let one see of a truth."""
-    inside = sorted(p.name for p in folder.rglob("*"))
-    return Answer("", "none", not_identifiable=tuple(inside))
-
-
 @pytest.fixture
 def quick(monkeypatch):
     """Cases of two short runs, one held out."""
@@ -96,9 +59,24 @@ def quick(monkeypatch):
     monkeypatch.setattr("srfcli.validation.cases.draw_protocol", lambda rng: plans)
 
 
-def new_trial(folder, n=4, **more):
-    options = {"seed": 3, "kinds": (), "resume": False, "workers": 1, **more}
-    return begin(folder, cases=n, **options)
+@pytest.fixture(scope="module")
+def made():
+    """Trials that were made before, by their number of cases."""
+    return {}
+
+
+@pytest.fixture
+def new_trial(quick, made, tmp_path_factory):
+    """`new_trial(folder, n)`: a trial of n cases in a new folder; its cases are made once and copied."""
+
+    def copied(folder, n=4):
+        if n not in made:
+            made[n] = tmp_path_factory.mktemp("trials") / "t"
+            begin(made[n], cases=n, seed=3, kinds=(), resume=False, workers=1)
+        shutil.copytree(made[n], folder)
+        return Trial(folder)
+
+    return copied
 
 
 def every_effect():
@@ -458,11 +436,11 @@ def test_the_true_model_leaves_the_noise(quick, tmp_path):
 # ---- trials
 
 
-def test_a_case_costs_no_more_than_itself(quick, tmp_path):
+def test_a_case_costs_no_more_than_itself(new_trial, tmp_path):
     trial = new_trial(tmp_path / "t")
     found = {a.case: a for a in answer_all(trial, workers=2, diagnose=careless, limit=1.0)}
     assert [found[f"case-00{k}"].verdict for k in range(4)] == ["failed", "failed", "failed", "none"]
-    assert found["case-000"].failure.startswith("ValueError: a matrix is singular; test_prove.py, line ")
+    assert found["case-000"].failure.startswith("ValueError: a matrix is singular; in_workers.py, line ")
     assert "killed" in found["case-001"].failure
     assert found["case-002"].failure == "more than 1 s of CPU" and 0.8 < found["case-002"].cpu < 5
     assert read_answers(trial.answers) == found
@@ -480,13 +458,13 @@ def test_the_code_of_an_answer_is_that_of_the_plugins_too(tmp_path):
     assert code() != first != code_of(())
 
 
-def test_a_killed_worker_costs_nothing_the_first_time(quick, tmp_path):
+def test_a_killed_worker_costs_nothing_the_first_time(new_trial, tmp_path):
     trial = new_trial(tmp_path / "t")
     assert {a.verdict for a in answer_all(trial, workers=2, diagnose=remembers)} == {"none"}
     assert len(list((tmp_path / "t" / "calls").iterdir())) == 5
 
 
-def test_a_run_that_was_ended_goes_on_with_the_rest(quick, tmp_path):
+def test_a_run_that_was_ended_goes_on_with_the_rest(new_trial, tmp_path):
     trial = new_trial(tmp_path / "t")
     run = answer_all(trial, diagnose=remembers)
     first = [next(run).case, next(run).case]
@@ -501,7 +479,7 @@ def test_a_run_that_was_ended_goes_on_with_the_rest(quick, tmp_path):
     assert list(answer_all(again, diagnose=says_none)) == []  # nothing is left to do, even now
 
 
-def test_a_trial_ends_where_its_truths_are_read(quick, tmp_path):
+def test_a_trial_ends_where_its_truths_are_read(new_trial, tmp_path):
     trial = new_trial(tmp_path / "t")
     run = answer_all(trial, diagnose=says_none)
     next(run)
@@ -516,7 +494,7 @@ def test_a_trial_ends_where_its_truths_are_read(quick, tmp_path):
         open_truths(trial)
 
 
-def test_tampering_is_told(quick, tmp_path):
+def test_tampering_is_told(new_trial, tmp_path):
     trial = new_trial(tmp_path / "t", 2)
     list(answer_all(trial, diagnose=says_none))
     text = trial.apart.read_text()
@@ -538,7 +516,7 @@ def test_tampering_is_told(quick, tmp_path):
         list(answer_all(trial, diagnose=says_none))
 
 
-def test_a_bank_that_was_cut_short_is_made_again(quick, tmp_path):
+def test_a_bank_that_was_cut_short_is_made_again(new_trial, tmp_path):
     whole, cut = new_trial(tmp_path / "a", 2), Trial(tmp_path / "b")
     cut.folder.mkdir()
     for name in ("trial.json", "truths.json"):
@@ -550,7 +528,7 @@ def test_a_bank_that_was_cut_short_is_made_again(quick, tmp_path):
 
 
 @pytest.mark.parametrize("at", ["before the note", "before the bank's rename", "after it"])
-def test_a_trial_that_was_killed_ends_as_one_that_was_not(quick, tmp_path, at):
+def test_a_trial_that_was_killed_ends_as_one_that_was_not(new_trial, tmp_path, at):
     whole, cut = new_trial(tmp_path / "a", 1), Trial(tmp_path / "b")
     list(answer_all(whole, diagnose=says_none))
     shutil.copytree(whole.folder, cut.folder)
@@ -572,7 +550,7 @@ def test_a_trial_that_was_killed_ends_as_one_that_was_not(quick, tmp_path, at):
     assert list(open_truths(cut)[0].items()) == list(open_truths(whole)[0].items())
 
 
-def test_answers_that_were_damaged_are_named_and_asked_for_again(quick, tmp_path):
+def test_answers_that_were_damaged_are_named_and_asked_for_again(new_trial, tmp_path):
     trial = new_trial(tmp_path / "t", 2)
     list(answer_all(trial, diagnose=says_none))
     first, second = trial.answers.read_text().splitlines(keepends=True)
@@ -586,7 +564,7 @@ def test_answers_that_were_damaged_are_named_and_asked_for_again(quick, tmp_path
     assert trial.answers.read_text().startswith(first)
 
 
-def test_a_diagnosis_is_given_the_case_and_nothing_else(quick, tmp_path):
+def test_a_diagnosis_is_given_the_case_and_nothing_else(new_trial, tmp_path):
     trial = new_trial(tmp_path / "t", 1)
     (found,) = answer_all(trial, diagnose=peeks)
     assert found.not_identifiable == ("experiment.toml", "steps.csv", "wave.csv")
@@ -622,14 +600,8 @@ def test_kinds_of_a_wide_bank():
     assert plan_bank(40, 3, bank="wide") == plan_bank(40, 3, bank="wide") != plan_bank(40, 4, bank="wide")
 
 
-def deadly(task):
-    if task == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return task
-
-
 def test_what_is_lost_has_its_substitute():
-    assert dict(run_processes(deadly, [0, 1, 2], workers=2, lost=lambda k: -k)) == {0: 0, 1: -1, 2: 2}
+    assert dict(run_processes(deadly_at_one, [0, 1, 2], workers=2, lost=lambda k: -k)) == {0: 0, 1: -1, 2: 2}
 
 
 # ---- the command

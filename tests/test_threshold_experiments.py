@@ -469,7 +469,7 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory, model: Any) -> tuple[Any
     text = HEAD.format(model='interface = "rigid"', parameters="").replace("lambda =", "# lambda =")
     text += TABLE + TABLE.replace("loads.csv", "held.csv") + "holdout = true\n"
     place = folder_of(tmp_path_factory.mktemp("diagnosed"), text, loads=loads, held=held)
-    rivals = ["interface-compliance", "load-transmission", "linker-dieterich", "age-saturation", "stiffness-error", "nagata"]
+    rivals = ["interface-compliance", "load-transmission", "linker-dieterich", "stiffness-error"]
     found = srf.diagnose(place, effects=[*rivals, "sensor-lag", "track-topography", "drive-ripple"])
     found.write(place / "found")
     return found, place / "found"
