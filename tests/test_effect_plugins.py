@@ -134,6 +134,8 @@ def test_faults_of_python_effects_are_told(returned, states, message):
         ("[parameters]", '[constants]\nn = { value = 7, unit = "N" }\n[parameters]', "'n' already has a meaning"),
         ("[parameters]", '[constants]\nk = { value = 7, unit = "X" }\n[parameters]', "unknown unit 'X'"),
         ('kind = "effect"', 'kind = "effect"\nname = "Age"', "name: found 'Age'"),
+        ("[parameters]", '[[checks]]\nquantity = "mu"\nat = { v = 1.0 }\nvalue = 1.0\n[parameters]', "expected 'rate'"),
+        ("[parameters]", "[[checks]]\nat = { vv = 1.0 }\nvalue = 1.0\n[parameters]", "checks.0..at.vv: unknown key"),
     ],
 )
 def test_breaches_of_the_text_form_are_told(tmp_path, old, new, message):
@@ -147,6 +149,17 @@ def test_breaches_of_the_text_form_are_told(tmp_path, old, new, message):
 
 def reasons(changed: Effect) -> dict[str, str]:
     return {o.check: o.text for o in check_law(changed) if o.verdict == "FAIL"}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shipped_effects_meet_worked_values_of_every_formula(name):
+    effect = SHIPPED.get("effect", name)
+    formulas = {*dict(effect.changes), *(s.name for s in effect.states)}
+    assert {c.quantity for c in effect.checks} == formulas
+    (found,) = (o for o in check_law(effect) if o.check == "worked values")
+    assert found.verdict == ("ok" if formulas else "skipped")
+    wrong = replace(effect, checks=tuple(replace(c, value=1.01 * c.value) for c in effect.checks))
+    assert not formulas or "expected" in reasons(wrong)["worked values"]
 
 
 def test_checks_that_fail_say_why(tmp_path):

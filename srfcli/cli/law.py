@@ -203,7 +203,7 @@ def _document(one: Law) -> dict[str, Any]:
     found = {
         "name": one.name, "kind": kind_of(one), "about": one.about, **own,
         "parameters": {p.name: {key: getattr(p, key) for key in PARAMETER_KEYS} for p in one.parameters},
-        "cites": list(one.cites), **({} if isinstance(one, Effect) else {"checks": checks}), "source": one.source,
+        "cites": list(one.cites), "checks": checks, "source": one.source,
     }  # fmt: skip
     return plain_value(found)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -27,12 +27,14 @@ VELOCITY_FACTOR = 3.0  # times the slowest and fastest drive of the recordings: 
 DRAWN = ContinuationSettings(tol=1e-4, max_mesh=256)  # as good as a line in a figure
 
 
-def stability(registry: Registry, baseline: Experiment, at: Mapping[str, float], augmented: Experiment) -> dict[str, Any]:
+def stability(
+    registry: Registry, baseline: Experiment, at: Mapping[str, float], augmented: Experiment, beside: Sequence[str] | None = None
+) -> dict[str, Any]:
     """Return V (um/s), the critical loads (N) of both models under constant load and under the strongest modulation, and a note.
 
-    `at` are the baseline's fitted parameters; the augmented experiment has its own. Loads are NaN where sliding is steady at any;
-    boundaries under modulation have velocities of their own, NaN between components. Effects that critical loads do not depend on
-    change diagrams by the parameters that they had bent.
+    `at` are the baseline's fitted parameters; the augmented experiment has its own. Of its effects those `beside` the laws are
+    told, or all. Loads are NaN where sliding is steady at any; boundaries under modulation have velocities of their own, NaN
+    between components. Effects that critical loads do not depend on change diagrams by the parameters that they had bent.
     """
     tables = [t.table for t in baseline.thresholds]
     driven = np.concatenate([*(np.abs(r.drive.velocities) for r in baseline.runs), *(t.V for t in tables)])
@@ -61,7 +63,7 @@ def stability(registry: Registry, baseline: Experiment, at: Mapping[str, float],
             drawn = f"under a load modulated by {strongest[1]:.3g} at {strongest[0]:g} Hz, the strongest here."
             notes.insert(1, f"Drawn through: {drawn}")
         notes.append("srf continue --eps and srf map follow the boundary at any other.")
-    effects = [registry.get("effect", n) for n in augmented.choice.effects]
+    effects = [registry.get("effect", n) for n in (augmented.choice.effects if beside is None else beside)]
     apart = [e.name for e in effects if isinstance(e, Effect) and without_part(e)]
     if joined := [e.name for e in effects if e.name not in apart]:
         notes.append(f"{', '.join(joined)}: beside the laws; these commands have that with --effect.")
@@ -70,14 +72,17 @@ def stability(registry: Registry, baseline: Experiment, at: Mapping[str, float],
     return found | {"note": " ".join(notes)}
 
 
-def critical_loads(registry: Registry, fitted: Fitted, V: Array) -> Array:
-    """Return the critical load (N) of a fitted model under constant load at each velocity (um/s), NaN for none.
+def as_fitted(fitted: Fitted) -> Experiment:
+    """Return the experiment of a fitted model with its values; what acts in one run alone is left out."""
+    experiment, values = fitted.fit.likelihood.problem.experiment, fitted.fit.values
+    parameters = [replace(q, value=values.get(q.name, q.value)) for q in experiment.parameters]
+    choice = experiment.choice.plus(e.name for e in fitted.hypothesis.effects if not e.run)
+    return replace(experiment, choice=choice, parameters=tuple(parameters))
 
-    What acts in one run alone is left out.
-    """
-    hypothesis, problem = fitted.hypothesis, fitted.fit.likelihood.problem
-    choice = problem.experiment.choice.plus(e.name for e in hypothesis.effects if not e.run)
-    return _loads(*_model(registry, replace(problem.experiment, choice=choice), fitted.fit.values), V)
+
+def critical_loads(registry: Registry, fitted: Fitted, V: Array) -> Array:
+    """Return the critical load (N) of a fitted model under constant load at each velocity (um/s), NaN for none."""
+    return _loads(*_model(registry, as_fitted(fitted), fitted.fit.values), V)
 
 
 def _model(registry: Registry, experiment: Experiment, values: Mapping[str, float]) -> tuple[GeneratedModel, Array]:

@@ -216,9 +216,8 @@ def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment
     for name, p in own_parameters(effect, model).items():
         low, high = to_base(p.lower, p.unit), to_base(p.upper, p.unit)
         value = float(np.clip(neutral.get(p.name, to_base(p.default, p.unit)), low, high))
-        runs, absent = (), 0.0
-        if effect.run and p.name in neutral:
-            runs, absent = (effect.run,), neutral[p.name] + ABSENT * (value - neutral[p.name])
+        runs = (effect.run,) if effect.run and p.name in neutral else ()
+        absent = neutral[p.name] + ABSENT * (value - neutral[p.name]) if runs else 0.0
         found.append(FitParameter(name, value, low, high, p.name in effect.fixed, p.unit, runs, absent))
     for name in effect.frees:
         if name == "K":

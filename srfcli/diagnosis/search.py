@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from srfcli.codegen.model import Array, GeneratedModel
+from srfcli.codegen.model import Array
 from srfcli.core.errors import SrfError, Status
 from srfcli.data.values import Experiment, Run
 from srfcli.diagnosis.goodness_of_fit import field_share, shortcomings, taken_up
@@ -164,7 +164,6 @@ class ModelSearch:
         self.queue: list[_Move] = []
         self.count = 0
         self._tried: dict[str, Array] = {}  # from where each other ageing law was tried last
-        self._asked_the_file = not experiment.runs  # whether effects were scored at the file's own start values
 
     # ------------------------------------------------------------------ models and their fits
 
@@ -344,12 +343,9 @@ class ModelSearch:
             if self.queue and self.experiment.thresholds and not best.passes:  # far off the first order promises too little
                 promised = promised or self.queue[0].direction is not None
             if not promised:
-                if not (best.passes or self._asked_the_file):
-                    self._expand_at_the_file()
-                elif best.scores is None and len(best.hypothesis.effects) < MOST_EFFECTS:
-                    self._expand(best)
-                else:
+                if best.scores is not None or len(best.hypothesis.effects) >= MOST_EFFECTS:
                     break
+                self._expand(best)
                 continue
             move = heapq.heappop(self.queue)
             name = move.hypothesis.name
@@ -446,47 +442,14 @@ class ModelSearch:
         for promised in ([(s.gain, s) for s in scores.singles], [(s.gain - self._rarer, s) for s in scores.alone]):
             self._promise(node, plain, promised, WORTH, noise=False)
 
-    def _expand_at_the_file(self) -> None:
-        """Push effects and pairs that promise most at the file's own start values, after a few steps from there.
-
-        A model that lacks something is fitted where it makes up for that, and there what it lacks may promise nothing.
-        """
-        self._asked_the_file, base = True, self.baseline
-        problem = self._problem(Hypothesis(), {})
-        likelihood = Likelihood(problem, processes=(), rtol=SEARCH_RTOL)
-        x = self._at_the_file(likelihood, Hypothesis(), likelihood.values(likelihood.start))
-        if not np.isfinite(likelihood.at(x, slopes=False).log_likelihood):
-            return
-        found = maximise(likelihood, x, held=problem.names, close=NEAR, widths=(), progress=self.progress)
-        if found.status is Status.INTEGRATION:
-            return
-        remainder, there = self.remainder(StateSpaceFit(likelihood, found)), dict(found.point.values)
-        self.progress("scores at the file's own start values")
-        scores = Scores(self.registry, problem.experiment, remainder, (), self._joining(base))
-        singles = sorted(self._gains(scores), key=lambda g: -g[0])[:SINGLES]
-        tries = [((s.effect,), (s.values,), {n: s.shifts[n] for n in problem.names if s.shifts.get(n)}) for _, s in singles]
-        tries += [(p.effects, p.values, {}) for p in scores.pairs(PAIRS)]
-        for effects, sizes, shifts in tries:
-            hypothesis = Hypothesis(effects)
-            known = self.fitted.get(hypothesis.name)
-            if self.spent or (known and known.passes):
-                continue
-            try:
-                start = self._started(_Move(0.0, 0, hypothesis, there, sizes, fresh=len(effects), shifts=shifts))
-            except SrfError:
-                continue
-            own = Likelihood(self._problem(hypothesis, start), processes=(), rtol=SEARCH_RTOL)
-            reached = maximise(own, own.coordinates(start), steps=STRIDES, close=1.0, widths=(), progress=self.progress)
-            values = {n: v for n, v in reached.point.values.items() if not n.startswith("gauge_")}  # that is estimated anew
-            expected = base.attainable + reached.promised - base.fit.log_likelihood + len(effects) * self._one_more
-            self.progress(f"{hypothesis.name}: promises {expected:.1f}")
-            self.count += 1
-            sizes = _sizes_of(hypothesis, own.problem.model, values)
-            heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, values, sizes))
-
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""
-        return _sizes_of(node.hypothesis, node.fit.likelihood.problem.model, values or node.fit.values)
+        model, values = node.fit.likelihood.problem.model, values or node.fit.values
+        return tuple(
+            {p.name: values[long] for long, p in own_parameters(e, model).items() if long in values}
+            | {n: values[n] for n in e.frees if n in values}
+            for e in node.hypothesis.effects
+        )
 
     def _push(
         self,
@@ -776,15 +739,6 @@ class ModelSearch:
     def best(self) -> Fitted:
         """Return the model with the best evidence."""
         return self.ranked()[0]
-
-
-def _sizes_of(hypothesis: Hypothesis, model: GeneratedModel, values: Mapping[str, float]) -> tuple[dict[str, float], ...]:
-    """Return the values of a model's effects by the effects' own names."""
-    return tuple(
-        {p.name: values[long] for long, p in own_parameters(e, model).items() if long in values}
-        | {n: values[n] for n in e.frees if n in values}
-        for e in hypothesis.effects
-    )
 
 
 def _colours(values: Mapping[str, float]) -> list[str] | None:

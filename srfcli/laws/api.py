@@ -134,6 +134,7 @@ def effect(
     constitutive: bool = True,
     wrong: str = "",
     remedy: str = "",
+    checks: Iterable[Check] = (),
 ) -> Callable[[Callable[..., Any]], Effect]:
     """Turn a function into an `Effect`: it returns a mapping from slots (mu, rate, kappa, W, force, V) to formulas.
 
@@ -154,7 +155,7 @@ def effect(
                 name=own, parameters=listed, cites=tuple(cites), **_told(function, about),
                 changes=changes, states=extra, neutral=tuple((n, float(v)) for n, v in sizes.items()),
                 scans=tuple((p.name, SCANNED_VALUES) for p in listed if p.name not in sizes), needs=needed, lacks=tuple(lacks),
-                observed=observed, constitutive=constitutive, wrong=wrong, remedy=remedy,
+                observed=observed, constitutive=constitutive, wrong=wrong, remedy=remedy, checks=tuple(checks),
             )
         )  # fmt: skip
 

@@ -21,7 +21,7 @@ PLACES = ("slip", "stage", "time", "theta", "envelope")  # unknowns and abbrevia
 RUN_NAMES = ("W0", "eps", "f", "K", "V", "modulated")
 KEYS = (
     "format", "kind", "name", "about", "cites", "parameters", "constants", *SLOTS, "states", "settings", "frees", "needs",
-    "lacks", "observed", "constitutive", "answers", "on_request", "wrong", "remedy",
+    "lacks", "observed", "constitutive", "answers", "on_request", "wrong", "remedy", "checks",
 )  # fmt: skip
 MOST_VALUES = 1000  # values of an inner parameter
 SCANNED_VALUES = 8  # values at which an inner parameter is tried where its author says nothing
@@ -119,6 +119,7 @@ class EffectReader(LawReader):
             check_names(parameters, constants)
         known = set(known_names((p.name for p in (*parameters, *constants)), self.state_names(), self.listed("needs")))
         neutral, scans = self.sizes()
+        formulas = [*(slot for slot in SLOTS if slot in self.table), *self.state_names()]
         effect = Effect(
             name=self.name(), parameters=parameters, about=self.text("about"), cites=self.cites(), source=str(self.path),
             changes=tuple((slot, self.slot(slot, known | {slot})) for slot in SLOTS if slot in self.table),
@@ -127,7 +128,7 @@ class EffectReader(LawReader):
             constitutive=self.flag("constitutive", True), answers=self.text("answers"), constants=constants,
             scaled=tuple(self.scaled(parameters)), on_request=self.flag("on_request", False),
             fixed=tuple(n for n, e in self.table.get("parameters", {}).items() if e.get("fixed")),
-            wrong=self.text("wrong"), remedy=self.text("remedy"),
+            wrong=self.text("wrong"), remedy=self.text("remedy"), checks=self.checks(formulas, sorted(known | {*SLOTS})),
         )  # fmt: skip
         with self.placed():
             return finished(effect)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from srfcli.core.errors import ExpressionError, SrfError, did_you_mean
 from srfcli.core.files import parse_toml, read_text
 from srfcli.core.settings import Parameter
-from srfcli.core.units import QUANTITY_UNITS, find_unit
+from srfcli.core.units import find_unit
 from srfcli.laws.values import AgeingLaw, AgeingModifier, Check, Effect, FrictionLaw, Interface, Law, Reader, State
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ class LawReader:
             check_parameters(common["parameters"], kind=kind, states=states)
             check_states(states, common["parameters"])
         names = known_symbols(kind, (p.name for p in common["parameters"]), states)
-        common["checks"] = self.checks(key, names)
+        common["checks"] = self.checks((key,), names)
         common[key] = self.formula(key, kind, names)
         law = LAW_CLASSES[kind](**common)
         with self.placed():
@@ -291,23 +291,28 @@ class LawReader:
             states.append(State(**entry))
         return tuple(states)
 
-    def checks(self, quantity: str, names: tuple[str, ...]) -> tuple[Check, ...]:
+    def checks(self, quantities: Sequence[str], names: Iterable[str]) -> tuple[Check, ...]:
+        """Return the worked values; a formula that is not named is the first of `quantities`."""
         entries = self.table.get("checks", [])
         if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
             self.fail("checks", f"found {_shown(entries)}, expected tables", "Write [[checks]] with two brackets.")
-        return tuple(self.check(f"checks[{i}]", entry, quantity, names) for i, entry in enumerate(entries))
+        if entries and not quantities:
+            self.fail("checks", "there is no formula to check", "Leave them out.")
+        return tuple(self.check(f"checks[{i}]", entry, quantities, names) for i, entry in enumerate(entries))
 
-    def check(self, where: str, entry: Mapping[str, Any], quantity: str, names: tuple[str, ...]) -> Check:
+    def check(self, where: str, entry: Mapping[str, Any], quantities: Sequence[str], names: Iterable[str]) -> Check:
+        """Return one worked value."""
         self.keys(where, entry, _CHECK_KEYS)
         for key in ("at", "value"):
             if key not in entry:
                 self.fail(f"{where}.{key}", "missing")
-        if entry.get("quantity", quantity) != quantity:
-            found = _shown(entry["quantity"])
-            self.fail(f"{where}.quantity", f"found {found}, expected {quantity!r}", did_you_mean(found, QUANTITY_UNITS))
+        quantity = entry.get("quantity", quantities[0])
+        if quantity not in quantities:
+            found, wanted = _shown(quantity), " or ".join(repr(q) for q in quantities)
+            self.fail(f"{where}.quantity", f"found {found}, expected {wanted}", did_you_mean(found, quantities))
         if not isinstance(entry["at"], dict):
             self.fail(f"{where}.at", f"found {_shown(entry['at'])}, expected {{ v = 1.0, ... }}")
-        self.keys(f"{where}.at", entry["at"], names)
+        self.keys(f"{where}.at", entry["at"], tuple(names))
         at = tuple((name, self.number(f"{where}.at.{name}", value)) for name, value in entry["at"].items())
         value = self.number(f"{where}.value", entry["value"])
         rtol = self.number(f"{where}.rtol", entry.get("rtol", Check.rtol))

@@ -15,7 +15,6 @@ import numpy as np
 
 from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
-from srfcli.data.experiment import read_experiment
 from srfcli.diagnosis.answer import RunView, answer, load_views, material, parameter_rows, ranked_rows, run_views
 from srfcli.diagnosis.design import DiscriminatingRun, discriminating_files
 from srfcli.results.provenance import Provenance, write_result
@@ -234,7 +233,7 @@ class DiagnosisResult(Result):
             Where the folder holds something else, or cannot be written.
         """
         from srfcli.diagnosis.augment import augment
-        from srfcli.diagnosis.diagram import stability
+        from srfcli.diagnosis.diagram import as_fitted, stability
 
         folder, diagnosis, last, found = Path(folder), self.diagnosis, self.diagnosis.final, self.answer
         with whole_folder(folder, lambda: check_answer(folder, force=force)) as fresh:  # an hour may have passed
@@ -257,10 +256,7 @@ class DiagnosisResult(Result):
             for name, source in augmented.copies.items():
                 shutil.copyfile(source, fresh / "augmented" / name)
             made_of = dict(self._material)
-            diagram = stability(
-                self.registry, diagnosis.experiment, diagnosis.shown.fit.values,
-                read_experiment(fresh / "augmented", registry=self.registry, format=self.reader),
-            )  # fmt: skip
+            diagram = stability(self.registry, diagnosis.experiment, diagnosis.shown.fit.values, as_fitted(last), augmented.left)
             if diagram:
                 marks = {(float(f"{V:.3g}"), float(f"{np.mean(r.load(r.t)[0]):.3g}"))
                          for r in diagnosis.experiment.runs for V, share in _velocities(r) if share > 0.1}  # fmt: skip

@@ -199,20 +199,9 @@ class _LawCheck:
 
     def worked_values(self) -> str:
         """Raise `SrfError` where a worked value is not met."""
-        if not self.law.checks:
-            raise Skipped("the law gives none; add [[checks]]")
-        if self.formula is None:
+        if self.law.checks and self.formula is None:
             raise SrfError("a rigid interface has no formula to check")
-        units = {p.name: p.unit for p in self.parameters}
-        for number, check in enumerate(self.law.checks):
-            values = self.values | {name: to_base(value, units.get(name, "1")) for name, value in check.at}
-            missing = sorted({s.name for s in self.formula.free_symbols} - set(values))
-            if missing:
-                raise SrfError(f"checks[{number}]: no value for '{missing[0]}'", "Add it to the table 'at'.")
-            found = float(evaluate(self.formula, values))
-            if not abs(found - check.value) <= check.rtol * abs(check.value):
-                raise SrfError(f"checks[{number}]: {check.quantity} = {found!r}, expected {check.value!r}")
-        return f"{len(self.law.checks)} met"
+        return worked_values(self.law, {FORMULA[kind_of(self.law)]: self.formula}, self.parameters, self.values)
 
 
 # What `srf law check` asks of an effect: units, a neutral value at which the model is its baseline, derivatives.
@@ -238,6 +227,7 @@ def check_effect(effect: Effect, registry: Registry) -> list[Outcome]:
         ("acts", check.acts),
         ("steady start", check.steady_start),
         ("derivatives", check.derivatives),
+        ("worked values", check.worked_values),
     ]
     return [Outcome("parses", "ok", f"effect {effect.name}: {summary(effect)}"), *run_checks(steps)]
 
@@ -282,6 +272,12 @@ class _EffectCheck:
             _expect(units[self.effect.observed], dimension("um"), f"observed '{self.effect.observed}'")
         return ", ".join([*(f"{slot} is in {SLOT_UNITS[slot]}" for slot, _ in formulas),
                           *(f"{s.name} in {describe(units[s.name])}" for s in self.effect.states)])  # fmt: skip
+
+    def worked_values(self) -> str:
+        formulas = {**dict(self.effect.changes), **{s.name: s.rate for s in self.effect.states}}
+        if not formulas:
+            raise Skipped("there is no formula")
+        return worked_values(self.effect, formulas, self.effect.parameters, reference_values(self.effect.parameters))
 
     # ---- with a baseline
 
@@ -495,6 +491,23 @@ class Outcome:
 
 class Skipped(Exception):
     """A check that does not apply; the text says why."""
+
+
+def worked_values(law: Law, formulas: Mapping[str, Any], parameters: Sequence[Parameter], values: Values) -> str:
+    """Return how many worked values a law's formulas meet; raise `SrfError` where one is not met."""
+    if not law.checks:
+        raise Skipped("the law gives none; add [[checks]]")
+    units = {p.name: p.unit for p in parameters}
+    for number, check in enumerate(law.checks):
+        formula = formulas[check.quantity]
+        given = {**values, **{name: to_base(value, units.get(name, "1")) for name, value in check.at}}
+        missing = sorted({s.name for s in formula.free_symbols} - set(given))
+        if missing:
+            raise SrfError(f"checks[{number}]: no value for '{missing[0]}'", "Add it to the table 'at'.")
+        found = float(evaluate(formula, given))
+        if not abs(found - check.value) <= check.rtol * abs(check.value):
+            raise SrfError(f"checks[{number}]: {check.quantity} = {found!r}, expected {check.value!r}")
+    return f"{len(law.checks)} met"
 
 
 def run_checks(steps: Sequence[tuple[str, Callable[[], str]]]) -> list[Outcome]:
