@@ -135,6 +135,11 @@ def test_faults_of_python_effects_are_told(returned, states, message):
         ("[parameters]", '[constants]\nk = { value = 7, unit = "X" }\n[parameters]', "unknown unit 'X'"),
         ('kind = "effect"', 'kind = "effect"\nname = "Age"', "name: found 'Age'"),
         ("[parameters]", '[[checks]]\nquantity = "mu"\nat = { v = 1.0 }\nvalue = 1.0\n[parameters]', "expected 'rate'"),
+        (
+            "[parameters]",
+            "[constants]\nk = { value = 7 }\n[[checks]]\nat = { k = 1.0 }\nvalue = 1.0\n[parameters]",
+            "at.k: unknown key",
+        ),
         ("[parameters]", "[[checks]]\nat = { vv = 1.0 }\nvalue = 1.0\n[parameters]", "checks.0..at.vv: unknown key"),
     ],
 )
@@ -160,6 +165,14 @@ def test_shipped_effects_meet_worked_values_of_every_formula(name):
     assert found.verdict == ("ok" if formulas else "skipped")
     wrong = replace(effect, checks=tuple(replace(c, value=1.01 * c.value) for c in effect.checks))
     assert not formulas or "expected" in reasons(wrong)["worked values"]
+
+
+def test_a_worked_value_of_no_formula_is_told():
+    effect = SHIPPED.get("effect", "stiffness-exponent")
+    strange = replace(effect, checks=(replace(effect.checks[0], quantity="kapa"),))
+    assert "no formula for 'kapa'" in reasons(strange)["worked values"]
+    idle = replace(SHIPPED.get("effect", "inertia"), checks=effect.checks)
+    assert "no formula for 'kappa'" in reasons(idle)["worked values"]
 
 
 def test_checks_that_fail_say_why(tmp_path):

@@ -163,7 +163,7 @@ def test_the_command_says_it(age):
 def test_the_form_is_offered_as_an_effect(age):
     """The file reads, keeps every check, and a model with it says what the fitted one says."""
     effect = read_law(age / "closed-form.toml")
-    assert {o.verdict for o in check_law(effect)} == {"ok"}
+    assert {o.check: o.verdict for o in check_law(effect) if o.verdict != "ok"} == {"worked values": "skipped"}  # it has none
     assert dict(effect.neutral) == {"age_power": 1.0} and effect.sizes == ("age_power",)
     (term,) = json.loads((age / "answer.json").read_text())["missing"]["terms"]
     assert effect.parameters[0].default == pytest.approx(term["parameters"]["age_power"]["value"])

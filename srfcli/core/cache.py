@@ -29,7 +29,7 @@ from pathlib import Path
 from types import CodeType
 
 from srfcli.core.errors import SrfError
-from srfcli.core.files import read_plain, write_atomic
+from srfcli.core.files import read_plain
 
 PREFIX = "# seal "
 SECRET = 32  # bytes
@@ -83,8 +83,8 @@ def cached_source(key: str, build: Callable[[], str]) -> str:
     if found is not None:
         return found
     source = build()
-    with contextlib.suppress(OSError, SrfError):
-        write_atomic(path, f"{PREFIX}{seal(path.name, source.encode())}\n{source}")
+    with contextlib.suppress(OSError):
+        _write(path, source)
     return source
 
 
@@ -108,6 +108,19 @@ def _read(path: Path) -> str | None:
     if not first.startswith(PREFIX) or not is_sealed(path.name, body.encode(), first.removeprefix(PREFIX)):
         return None
     return body
+
+
+def _write(path: Path, source: str) -> None:
+    """Store a text in one step, without a lock: a reader sees the whole entry or none, and of two writers the later one wins."""
+    data = source.encode()
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem[:12]}-", suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(f"{PREFIX}{seal(path.name, data)}\n".encode() + data)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
 
 
 def user_base(variable: str, below: str) -> Path:

@@ -265,7 +265,7 @@ def _part(target: Path, *, folder: bool = False) -> Iterator[Path]:
         if folder:
             part.mkdir(0o700)
         else:
-            part.touch(0o600 if target.exists() else 0o666, exist_ok=False)
+            part.touch(0o600 if target.exists() else 0o666, exist_ok=False)  # a new file is readable as the umask says
         lock = _locked(part)
         if lock is not None:  # else another process took it for that of a dead one before it was locked
             break

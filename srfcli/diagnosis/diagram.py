@@ -63,7 +63,8 @@ def stability(
             drawn = f"under a load modulated by {strongest[1]:.3g} at {strongest[0]:g} Hz, the strongest here."
             notes.insert(1, f"Drawn through: {drawn}")
         notes.append("srf continue --eps and srf map follow the boundary at any other.")
-    effects = [registry.get("effect", n) for n in (augmented.choice.effects if beside is None else beside)]
+    effects = [registry.get("effect", n) for n in augmented.choice.effects]
+    effects = [e for e in effects if beside is None or e.name in beside]
     apart = [e.name for e in effects if isinstance(e, Effect) and without_part(e)]
     if joined := [e.name for e in effects if e.name not in apart]:
         notes.append(f"{', '.join(joined)}: beside the laws; these commands have that with --effect.")
@@ -73,16 +74,17 @@ def stability(
 
 
 def as_fitted(fitted: Fitted) -> Experiment:
-    """Return the experiment of a fitted model with its values; what acts in one run alone is left out."""
+    """Return the experiment of a fitted model with its values; what acts in one run alone has those of the other runs."""
     experiment, values = fitted.fit.likelihood.problem.experiment, fitted.fit.values
-    parameters = [replace(q, value=values.get(q.name, q.value)) for q in experiment.parameters]
-    choice = experiment.choice.plus(e.name for e in fitted.hypothesis.effects if not e.run)
+    parameters = [replace(q, value=q.elsewhere if q.runs else values.get(q.name, q.value)) for q in experiment.parameters]
+    choice = experiment.choice.plus(e.name for e in fitted.hypothesis.effects)
     return replace(experiment, choice=choice, parameters=tuple(parameters))
 
 
 def critical_loads(registry: Registry, fitted: Fitted, V: Array) -> Array:
     """Return the critical load (N) of a fitted model under constant load at each velocity (um/s), NaN for none."""
-    return _loads(*_model(registry, as_fitted(fitted), fitted.fit.values), V)
+    experiment = as_fitted(fitted)
+    return _loads(*_model(registry, experiment, {q.name: q.value for q in experiment.parameters}), V)
 
 
 def _model(registry: Registry, experiment: Experiment, values: Mapping[str, float]) -> tuple[GeneratedModel, Array]:

@@ -21,7 +21,7 @@ from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
 from srfcli.symbolic.system import without_part
 
-ABSENT = 1e-3  # of the least size of an effect: what it does in a run where it does not act is then far below any noise
+ABSENT = 1e-3  # of the least size of an effect: what it does in a run where it does not act is far below any noise
 UNMODULATED = {symbol(name): 0 for name in ("modulated", "eps", "envelope")}
 
 
@@ -210,7 +210,8 @@ def typical_sizes(effect: Effect) -> dict[str, float]:
 def fit_parameters(effect: Effect, model: GeneratedModel, experiment: Experiment) -> list[FitParameter]:
     """Return start values and bounds of an effect's parameters in um, s, N: sizes at their neutral values, or just inside.
 
-    An effect of one run alone is neutral in the others, or by ABSENT of the way: a time constant of zero divides by it.
+    An effect of one run alone is neutral in the others. Where neutral lies outside the bounds, as a time constant of zero, which
+    formulas divide by, its value there is off neutral by ABSENT of the distance to the bound.
     """
     neutral, found = neutral_values(effect), []
     for name, p in own_parameters(effect, model).items():

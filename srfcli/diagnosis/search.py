@@ -293,11 +293,16 @@ class ModelSearch:
         if not self.spent:
             self._try_rivals()
             self._search()
-        self.cut_short = self.spent and bool(self.queue)
         self._where_effects_act()
         self._refit_baseline()
         self._eliminate()
-        self._search()  # where a simpler model is the best now, it was not asked yet what it lacks
+        simplest = self.best()
+        self._search()  # a simpler model that is the best now was not asked yet what it lacks
+        if self.best().name != simplest.name:
+            self._where_effects_act()
+            self._eliminate()
+        best = self.best()
+        self.cut_short = self.spent and (not best.passes or self._promising(best) or self._expandable(best))
         if self.experiment.runs is not self.whole.runs:
             self._fit_all()
         return self.best()
@@ -335,15 +340,24 @@ class ModelSearch:
         """Return whether the budget is used up."""
         return time.process_time() - self.begun > self.budget
 
+    def _promising(self, best: Fitted) -> bool:
+        """Return whether a model that waits is expected to come close to the best."""
+        if not self.queue:
+            return False
+        if self.experiment.thresholds and not best.passes and self.queue[0].direction is not None:
+            return True  # far off the first order promises too little
+        return -self.queue[0].expected >= best.evidence - CLOSE
+
+    def _expandable(self, node: Fitted) -> bool:
+        """Return whether a fitted model was not asked yet what it lacks, and could have that."""
+        return node.scores is None and len(node.hypothesis.effects) < MOST_EFFECTS
+
     def _search(self) -> None:
         """Fit what comes close to the best model, or would mend it; expand the best once nothing does."""
         while not self.spent:
             best = self.best()
-            promised = bool(self.queue) and -self.queue[0].expected >= best.evidence - CLOSE
-            if self.queue and self.experiment.thresholds and not best.passes:  # far off the first order promises too little
-                promised = promised or self.queue[0].direction is not None
-            if not promised:
-                if best.scores is not None or len(best.hypothesis.effects) >= MOST_EFFECTS:
+            if not self._promising(best):
+                if not self._expandable(best):
                     break
                 self._expand(best)
                 continue
@@ -440,7 +454,7 @@ class ModelSearch:
         self.progress(f"{node.name}: scores without field and colour")
         scores = Scores(self.registry, problem.experiment, plain.remainder, node.hypothesis.effects, self._joining(node))
         for promised in ([(s.gain, s) for s in scores.singles], [(s.gain - self._rarer, s) for s in scores.alone]):
-            self._promise(node, plain, promised, WORTH, noise=False)
+            self._promise(node, plain, promised, WORTH, noise=False)  # as many in one run alone as in all
 
     def _sizes(self, node: Fitted, values: Mapping[str, float] | None = None) -> tuple[dict[str, float], ...]:
         """Return the values of a model's effects, those fitted if left out, by the effects' own names."""

@@ -120,6 +120,7 @@ class EffectReader(LawReader):
         known = set(known_names((p.name for p in (*parameters, *constants)), self.state_names(), self.listed("needs")))
         neutral, scans = self.sizes()
         formulas = [*(slot for slot in SLOTS if slot in self.table), *self.state_names()]
+        given = sorted((known | {*SLOTS}) - {c.name for c in constants})
         effect = Effect(
             name=self.name(), parameters=parameters, about=self.text("about"), cites=self.cites(), source=str(self.path),
             changes=tuple((slot, self.slot(slot, known | {slot})) for slot in SLOTS if slot in self.table),
@@ -128,7 +129,7 @@ class EffectReader(LawReader):
             constitutive=self.flag("constitutive", True), answers=self.text("answers"), constants=constants,
             scaled=tuple(self.scaled(parameters)), on_request=self.flag("on_request", False),
             fixed=tuple(n for n, e in self.table.get("parameters", {}).items() if e.get("fixed")),
-            wrong=self.text("wrong"), remedy=self.text("remedy"), checks=self.checks(formulas, sorted(known | {*SLOTS})),
+            wrong=self.text("wrong"), remedy=self.text("remedy"), checks=self.checks(formulas, given),
         )  # fmt: skip
         with self.placed():
             return finished(effect)

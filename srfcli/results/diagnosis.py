@@ -6,7 +6,7 @@ import contextlib
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -256,7 +256,10 @@ class DiagnosisResult(Result):
             for name, source in augmented.copies.items():
                 shutil.copyfile(source, fresh / "augmented" / name)
             made_of = dict(self._material)
-            diagram = stability(self.registry, diagnosis.experiment, diagnosis.shown.fit.values, as_fitted(last), augmented.left)
+            diagram = stability(
+                self.registry, diagnosis.experiment, diagnosis.shown.fit.values,
+                replace(as_fitted(last), runs=diagnosis.experiment.runs), augmented.left,
+            )  # fmt: skip
             if diagram:
                 marks = {(float(f"{V:.3g}"), float(f"{np.mean(r.load(r.t)[0]):.3g}"))
                          for r in diagnosis.experiment.runs for V, share in _velocities(r) if share > 0.1}  # fmt: skip

@@ -89,7 +89,8 @@ class Matter:
     @property
     def same(self) -> bool:
         """True where nothing was added: one model, drawn once."""
-        return all(t.same for t in self.traces) and all(t["chi2"][0] == t["chi2"][1] for t in self.rows("thresholds"))
+        loads = [t["chi2"] for t in self.rows("thresholds")]
+        return all(t.same for t in self.traces) and all(a == b or not (finite(a) or finite(b)) for a, b in loads)
 
     def sides(self, baseline: Any = "baseline", augmented: Any = "augmented model", *more: Any) -> list[Any]:
         """Return what a table has of both models, or of the baseline alone where they are the same."""

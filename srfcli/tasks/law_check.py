@@ -16,7 +16,7 @@ from scipy.special import lambertw
 
 from srfcli.codegen.model import COMPLEX_STEP, Array, GeneratedModel, load_source
 from srfcli.codegen.numpy_source import generate_motion
-from srfcli.core.errors import SrfError
+from srfcli.core.errors import SrfError, did_you_mean
 from srfcli.core.settings import Parameter
 from srfcli.core.units import QUANTITY_UNITS, SYMBOL_UNITS, Dimension, describe, dimension, dimension_of, to_base
 from srfcli.laws.effect_file import summary
@@ -275,7 +275,7 @@ class _EffectCheck:
 
     def worked_values(self) -> str:
         formulas = {**dict(self.effect.changes), **{s.name: s.rate for s in self.effect.states}}
-        if not formulas:
+        if not (formulas or self.effect.checks):
             raise Skipped("there is no formula")
         return worked_values(self.effect, formulas, self.effect.parameters, reference_values(self.effect.parameters))
 
@@ -499,6 +499,8 @@ def worked_values(law: Law, formulas: Mapping[str, Any], parameters: Sequence[Pa
         raise Skipped("the law gives none; add [[checks]]")
     units = {p.name: p.unit for p in parameters}
     for number, check in enumerate(law.checks):
+        if check.quantity not in formulas:
+            raise SrfError(f"checks[{number}]: no formula for '{check.quantity}'", did_you_mean(check.quantity, formulas))
         formula = formulas[check.quantity]
         given = {**values, **{name: to_base(value, units.get(name, "1")) for name, value in check.at}}
         missing = sorted({s.name for s in formula.free_symbols} - set(given))

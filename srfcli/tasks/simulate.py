@@ -415,9 +415,9 @@ def runs_again(
     remarks = (f"not written, as {choice.law} has no such parameter: {', '.join(dropped)}",) if dropped else ()
     described = _described(model, experiment, values)
     work = Work(model, jobs, described, gauges, made, remarks, inputs, notes, {"title": experiment.title})
-    return (
-        work if field is None else on_field(work, open_model(registry, **asdict(choice), tables=FIELD_TABLE), field, start=start)
-    )
+    if field is None:
+        return work
+    return on_field(work, open_model(registry, **asdict(choice), tables=FIELD_TABLE), field, start=start)
 
 
 def _values(model: GeneratedModel, parameters: Mapping[str, str]) -> dict[str, float]:
@@ -484,7 +484,7 @@ def _experiment_again(
             listed[k] = replace(p, value=value, lower=min(p.lower, value), upper=max(p.upper, value), unit=unit)
     known = {*(p.name for p in listed), *OF_THE_APPARATUS}
     added = [p for p in model.parameters if p.name in values and p.name not in known]
-    listed += [FitParameter(p.name, value := values[p.name], *bounds(p, value), fixed=True, unit=p.unit) for p in added]
+    listed += [FitParameter(p.name, values[p.name], *bounds(p, values[p.name]), fixed=True, unit=p.unit) for p in added]
     return replace(
         experiment, path=folder, title=f"{experiment.title} (simulated)".strip(), choice=choice,
         mass=(values.get("M", experiment.mass) if choice.inertia else None),
