@@ -113,7 +113,7 @@ def main() -> None:
     truths = unseal(asked.trial / "bank", asked.trial / "truths.json")
     answers = read_answers(asked.trial / "answers.jsonl")
     cases = asked.cases or [case for case, a in sorted(answers.items()) if wrong(a, truths[case])]
-    report = Report(f"at_the_truth_{asked.trial.name}", __doc__ or "")
+    report = Report(f"at_the_truth_{truths[cases[0]]['seed'][0]}", __doc__ or "")
     rows: list[tuple[str, ...]] = []
     counted: Counter[str] = Counter()
     for case in cases:

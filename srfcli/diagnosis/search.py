@@ -54,7 +54,7 @@ CLOSE = 6.0  # log evidence within which two models may both be it: a Bayes fact
 MOST_EFFECTS = 2  # effects of a model
 ALIKE_EFFECTS = 0.9  # likeness of two effects at first order from which what one gains in a refit is expected of the other
 SINGLES, PAIRS = 5, 3  # promises of each model that are followed
-UNDERSTATED = 3.0  # times the gain at first order that an effect may bring beside a model that is far off or has taken it up
+UNDERSTATED = 2.0  # times the gain at first order that an effect may bring beside a model that is far off or has taken it up
 SHARED = 2.0  # in log evidence, what a field that all runs share costs: it is one of two kinds, and has an amplitude of its own
 NEAR = 0.5  # standard errors from its maximum to which a model is fitted: 0.1 in log likelihood
 SEARCH_RTOL = 1e-3  # tolerance of the integration: 0.02 in log likelihood
@@ -68,6 +68,7 @@ RESIZED_BY = 2.5  # by what factor a size that is built in is changed, at most, 
 AGAIN = 9  # of them, about the best, whose other parameters are fitted too where the model fails a test: 26 % apart
 STRIDES = 12  # steps of another ageing law from the file's own start values, or on from where it promises to be likelier
 FIELDS = (1.0, 3.0, 10.0, 30.0)  # of the field of the model beside, under which the file's own start values are followed
+HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
 FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
 
@@ -405,8 +406,9 @@ class ModelSearch:
         self.excluded += scores.excluded
         node = replace(node, scores=scores)
         self.fitted[node.name] = node
-        hidden = not node.passes or not node.fit.smooth or node.fit.likelihood.processes  # what is random may have taken it up
-        least = WORTH / UNDERSTATED if hidden else WORTH
+        least = WORTH if node.passes else WORTH / UNDERSTATED
+        if node.passes and (not node.fit.smooth or node.fit.likelihood.processes):  # what is random may have taken it up
+            least = -self._one_more if node.hypothesis.reported else HINT
         self._promise(node, node, self._gains(scores), least)
         for effect in (e for e in joining if e.settings or e.observed):
             self._try_built_in(node, effect)
