@@ -76,6 +76,24 @@ def test_a_diagnosis_names_the_run_in_which_alone_an_effect_acts(only, plans, tm
     assert [q.name in augmented.elsewhere(run) for run in augmented.runs] == [True, False, True]
 
 
+@needs_compiler
+@pytest.mark.parametrize("name", [NAME, "sensor-lag"])
+def test_in_the_other_runs_an_effect_of_one_run_changes_nothing(name, tmp_path):
+    """Innovations of the others are the baseline's: a time constant that cannot be zero is too small there to be seen."""
+    experiment = read_experiment(written(tmp_path, ()), registry=SHIPPED).fitted()
+    search = ModelSearch(SHIPPED, experiment, effects=[name])
+    innovations = []
+    for effects in ((), (replace(search.candidates[0], run="up"),)):
+        problem = Hypothesis(effects).problem(SHIPPED, experiment)
+        likelihood = Likelihood(problem)
+        values = likelihood.values(likelihood.start)
+        added = {n: p.default for p in search.candidates[0].parameters if (n := p.name) in problem.names}
+        found = likelihood.at(likelihood.coordinates({**values, **added}), slopes=False)
+        innovations.append({f.run.name: f.white for f in found.runs})
+    apart = {run: float(np.abs(white - innovations[1][run]).max()) for run, white in innovations[0].items()}
+    assert apart["up"] > 0.1 and apart["down"] < 0.01
+
+
 STATED = """
 effects = ["tangential-crosstalk"]
 [parameters]
