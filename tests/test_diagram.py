@@ -79,6 +79,18 @@ def test_a_fitted_stiffness_is_the_diagram_s(experiment):
     assert found["W0_hopf_baseline"][slow] == pytest.approx(1.3 * stated, rel=0.01)
 
 
+def test_what_acts_in_one_run_alone_is_no_part_of_either_system(experiment):
+    """The experiment's own effect of one run, and one that was found: both curves are those without them."""
+    calm = replace(experiment, runs=tuple(r for r in experiment.runs if r.modulation is None))
+    values = {q.name: q.value for q in calm.parameters}
+    plain = stability(SHIPPED, calm, values, calm)["W0_hopf_baseline"]
+    drag = FitParameter("c", 1e-3, -1.0, 1.0, False, "1", ("calm",), 0.0)
+    dragged = replace(calm, choice=replace(calm.choice, effects=("viscous-drag",)), parameters=(*calm.parameters, drag))
+    found = stability(SHIPPED, dragged, values | {"c": 1e-3}, dragged)
+    assert found["W0_hopf_baseline"] == pytest.approx(plain, rel=1e-9)
+    assert found["W0_hopf_augmented"] == pytest.approx(plain, rel=1e-9)
+
+
 def test_without_a_modulated_run_it_is_under_constant_load(experiment):
     calm = replace(experiment, runs=tuple(r for r in experiment.runs if r.modulation is None))
     alone = stability(SHIPPED, calm, {q.name: q.value for q in calm.parameters}, calm)

@@ -42,15 +42,14 @@ def stability(
     if not driven.size:
         return {}
     V = np.geomspace(driven.min() / VELOCITY_FACTOR, driven.max() * VELOCITY_FACTOR, DRAWN_VELOCITIES)
-    before, after = ({q.name: q.value for q in e.parameters} for e in (baseline, augmented))
     modulations = [r.modulation[:2] for r in baseline.runs if r.modulation]
     modulations += [(t.frequency, eps) for t in baseline.thresholds if (eps := float(t.table.eps.max())) > 0]
     strongest = max(modulations, key=lambda m: m[1], default=None)
     notes = ["Dotted: under constant load."] if strongest else ["Under constant load."]
     found: dict[str, Any] = {"V": V}
     try:
-        for side, experiment, values in (("baseline", baseline, before | dict(at)), ("augmented", augmented, after)):
-            model, base = _model(registry, experiment, values)
+        for side, experiment, fitted in (("baseline", baseline, at), ("augmented", augmented, {})):
+            model, base = _model(registry, experiment, fitted)
             found[f"W0_hopf_{side}"] = _loads(model, base, V)
             if strongest:
                 found |= _boundary(model, base, V, *strongest, side, notes)
@@ -74,21 +73,25 @@ def stability(
 
 
 def as_fitted(fitted: Fitted) -> Experiment:
-    """Return the experiment of a fitted model with its values; what acts in one run alone has those of the other runs."""
+    """Return the experiment of a fitted model with its values."""
     experiment, values = fitted.fit.likelihood.problem.experiment, fitted.fit.values
-    parameters = [replace(q, value=q.elsewhere if q.runs else values.get(q.name, q.value)) for q in experiment.parameters]
+    parameters = [replace(q, value=values.get(q.name, q.value)) for q in experiment.parameters]
     choice = experiment.choice.plus(e.name for e in fitted.hypothesis.effects)
     return replace(experiment, choice=choice, parameters=tuple(parameters))
 
 
 def critical_loads(registry: Registry, fitted: Fitted, V: Array) -> Array:
     """Return the critical load (N) of a fitted model under constant load at each velocity (um/s), NaN for none."""
-    experiment = as_fitted(fitted)
-    return _loads(*_model(registry, experiment, {q.name: q.value for q in experiment.parameters}), V)
+    return _loads(*_model(registry, as_fitted(fitted)), V)
 
 
-def _model(registry: Registry, experiment: Experiment, values: Mapping[str, float]) -> tuple[GeneratedModel, Array]:
-    """Return the model of sliding at one velocity for ever, and its parameters."""
+def _model(registry: Registry, experiment: Experiment, at: Mapping[str, float] | None = None) -> tuple[GeneratedModel, Array]:
+    """Return the model of sliding at one velocity for ever, and its parameters: an experiment's values, or those in `at`.
+
+    What acts in some runs alone is as in the others: it is no part of the system.
+    """
+    values = {q.name: q.value for q in experiment.parameters} | dict(at or {})
+    values |= {q.name: q.elsewhere for q in experiment.parameters if q.runs}
     model = open_model(registry, **asdict(experiment.choice), stability=True)
     own = {n: v for n, v in values.items() if n in model.names and n not in ("V", "W0", "K")}
     share, stated = 1.0, experiment.stiffness
