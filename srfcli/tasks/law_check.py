@@ -368,7 +368,8 @@ class _EffectCheck:
 
         plain = read(self.plain, _vector(self.plain))
         if not (off := _difference(read(self.model, self.p_neutral), plain)) < RTOL:
-            raise SrfError(f"at the neutral values the reading differs by {off:.2g} of its size", "The formula must be `gauge` alone there.")
+            what = f"at the neutral values the reading differs by {off:.2g} of its size"
+            raise SrfError(what, "The formula must be `gauge` alone there.")
         moved = _difference(read(self.model, _vector(self.model)), plain)
         if moved < 1e-12:
             raise SrfError("at the default values the gauge shows what it did", "Give the size a default off its neutral value.")
