@@ -62,7 +62,7 @@ def solved(run: Run, slider: Slider, functions: tuple[Callable[..., Any], Callab
         times = np.unique([a, *run.t[wanted], b])
         found = solve_ivp(
             lambda t, x: rates(x, V + acceleration * (t - since), W_at(t)[0], *constant),  # noqa: B023
-            (a, b), state, "LSODA", times, rtol=rtol, atol=rtol, max_step=run.load.longest_step,
+            (a, b), state, "LSODA", times, rtol=rtol, atol=rtol, max_step=run.load.longest_step(a, b),
             jac=lambda t, x: jacobian(x, V + acceleration * (t - since), W_at(t)[0], *constant),  # noqa: B023
         )  # fmt: skip
         if found.status:

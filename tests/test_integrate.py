@@ -117,6 +117,18 @@ def test_a_sampled_load_is_the_load_it_was_sampled_from(model):
     assert a.x == pytest.approx(b.x, rel=1e-5, abs=1e-5)
 
 
+def test_a_load_that_was_sampled_fast_in_a_part_holds_the_steps_short_there_alone(model):
+    """A slow oscillation of the load, read at 20 Hz for 100 s and at 2 kHz for 20 s: motion as under the load itself."""
+    whole = Modulation(6.0, 0.05, 0.5)
+    slow, fast = np.arange(-100, 2000) * 0.05, 100.0 + np.arange(40100) * 5e-4
+    sampled = SampledLoad(np.concatenate([slow, fast]), whole(np.concatenate([slow, fast]))[0])
+    assert sampled.longest_step(0.0, 90.0) > 50 * sampled.longest_step(101.0, 119.0)
+    t = np.linspace(0.0, 119.0, 201)
+    p, drive, start = model.vector(), Drive.constant(8.0), model.steady(model.vector({"V": 8.0, "W0": 6.0}))
+    a, b = (simulate(model, p, drive=drive, load=load, t=t, start=start, rtol=1e-10) for load in (whole, sampled))
+    assert a.x == pytest.approx(b.x, rel=1e-5, abs=1e-5)
+
+
 def test_a_load_read_at_uneven_times_is_the_load_it_was_sampled_from():
     """Nine samples a period, each up to 0.4 of an interval off its place: no short interval is bridged, and nothing is noise."""
     rng, whole = np.random.default_rng(4), Modulation(6.0, 0.19, 110.0)

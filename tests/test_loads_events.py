@@ -70,7 +70,7 @@ def test_a_modulation_rides_on_the_load_of_the_moment() -> None:
     load = ModulatedLoad(STEPS, Modulation(1.0, 0.2, 50.0))
     t = np.linspace(-1.0, 5.0, 777)
     assert load(t)[0] == pytest.approx(STEPS(t)[0] * (1 + 0.2 * np.cos(2 * np.pi * 50.0 * t)), rel=1e-13)
-    assert load.rest(3.0) == STEPS.rest(3.0) and load.longest_step == 0.25 / 50
+    assert load.rest(3.0) == STEPS.rest(3.0) and load.longest_step(0.0, 1.0) == 0.25 / 50
     whole = ModulatedLoad(ConstantLoad(4.0), Modulation(1.0, 0.2, 50.0, onset=1.0))
     assert whole(t)[0] == pytest.approx(Modulation(4.0, 0.2, 50.0, onset=1.0)(t)[0], rel=1e-14)
 

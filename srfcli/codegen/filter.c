@@ -426,11 +426,11 @@ static void fresh_gauge(Course *course, Belief *b, const dual *gauge) {
    changes, a noise begins that owes nothing to the one before. p holds dual numbers (NP, 1 + LANES), x0 (NX, 1 + LANES) and
    P0 (NX, NX, 1 + LANES) too, as do gauge, factor, offset and R (nt). Returns how many readings were reached; stats: steps,
    rejected. */
-int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
+int srf_filter(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, const double *P0, int ng, const int *order, const int *owner, const double *gauge, const int *rate, const int *signal, const int *shows, const double *weighs, int weighed, int slopes, double rtol, const double *atol, long max_steps, int nt, const double *t, const double *observed, const unsigned char *used, const double *factor, const double *offset, const double *R, int keep, double *nu, double *S, double *nu_d, double *S_d, double *mean, double *covariance, double *transition, double *gradient, double *stats, const volatile int *stop) {
     double values[NP];
     dual q[NP], colour[3 * GAUGE_PROCESSES * SIGNALS], y[NX], one, g[NX];
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, values};
-    Course course = {values, q, slopes, keep, ng, NX, order, rtol, longest, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
+    Course course = {values, q, slopes, keep, ng, NX, order, rtol, 0.0, 0.0, atol, {0.0}, 0.0, 1.0, 0.0, 1, {{0.0}, 0.0, {0}}, 0, 0, max_steps, stop};
     Belief b;
     int na, segment_ = -1, filled = 0, begins[NA] = {0}; /* 1 + the signal of the process whose first state this is */
     double now = t[0], last = t[0];
@@ -456,6 +456,7 @@ int srf_filter(int n_segments, const double *edges, const double *drive, const i
                 force.V = drive[3 * segment_];
                 force.acceleration = drive[3 * segment_ + 1];
                 force.since = drive[3 * segment_ + 2];
+                course.longest = longest[segment_];
                 course.before = 0.0;
                 course.h = 0.0;
                 course.first = 1;

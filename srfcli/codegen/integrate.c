@@ -423,7 +423,7 @@ static NOINLINE int segment(Imposed *force, History *q, double a, double b, doub
    X (nt, NX), S (nt, NX, ns); column k < own of S belongs to parameter which[k], or to an initial condition where which[k] < 0;
    the numbers of table i, all of them, own the columns from column[i] on, if that is not negative.
    The output at t[0], the start, is the caller's. Another thread may set *stop: the motion then ends with the step in hand. */
-int srf_integrate(int n_segments, const double *edges, const double *drive, const int *range, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, int ns, int own, const int *column, const int *which, const double *scale, const double *S0, double rtol, const double *atol, double longest, long max_steps, int nt, const double *t, double *X, double *S, double *stats, const volatile int *stop) {
+int srf_integrate(int n_segments, const double *edges, const double *drive, const int *range, const double *longest, int n_knots, int degree, const double *knots, const double *coefficients, const double *p, const double *x0, int ns, int own, const int *column, const int *which, const double *scale, const double *S0, double rtol, const double *atol, long max_steps, int nt, const double *t, double *X, double *S, double *stats, const volatile int *stop) {
     Imposed force = {n_knots, degree, knots, coefficients, 0, 0, 0, 0.0, 0.0, 0.0, p};
     History q;
     size_t size = (size_t)NX * ns;
@@ -461,7 +461,7 @@ int srf_integrate(int n_segments, const double *edges, const double *drive, cons
         force.V = drive[3 * k];
         force.acceleration = drive[3 * k + 1];
         force.since = drive[3 * k + 2];
-        int done = segment(&force, &q, edges[k], edges[k + 1], rtol, atol, longest, max_steps, next, nt, t, X, S, stats, stop);
+        int done = segment(&force, &q, edges[k], edges[k + 1], rtol, atol, longest[k], max_steps, next, nt, t, X, S, stats, stop);
         if (done < 0) {
             stats[3] = q.node[q.nodes - 1].t;
             free(block);

@@ -7,7 +7,6 @@ the exact derivative of each of its steps. The smoother runs backward over what 
 from __future__ import annotations
 
 import ctypes
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -158,7 +157,7 @@ def kalman_filter(
             rates.ctypes.data_as(_INTS), number.ctypes.data_as(_INTS), shows.ctypes.data_as(_INTS), doubles(signals.weighs),
             weighed,
             int(k > 0), ctypes.c_double(size), doubles(allowed),
-            ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(most), n,
+            ctypes.c_long(most), n,
             doubles(t), doubles(observed), ctypes.c_void_p(use.ctypes.data), doubles(factor.packed(first)),
             doubles(offset.packed(first)), doubles(R.packed(first)), int(keeping), doubles(nu), doubles(S), doubles(own_nu),
             doubles(own_S), *(doubles(a) for a in arrays), doubles(stats), ctypes.byref(stop),

@@ -36,10 +36,13 @@ DEGREE = 7
 
 
 class Load(abc.ABC):
-    """The imposed normal load and its rate, smooth between `breaks`; no step is longer than `longest_step` seconds."""
+    """The imposed normal load and its rate, smooth between `breaks`."""
 
     breaks: tuple[float, ...] = ()
-    longest_step: float = math.inf
+
+    def longest_step(self, start: float, end: float) -> float:
+        """Return the longest step (s) that jumps over nothing between two breaks."""
+        return math.inf
 
     @abc.abstractmethod
     def piece(self, t: float) -> LoadPiece:
@@ -128,8 +131,7 @@ class Modulation(Load):
     def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
         return (self.onset, self.full) if math.isfinite(self.onset) else ()
 
-    @property
-    def longest_step(self) -> float:  # type: ignore[override]
+    def longest_step(self, start: float, end: float) -> float:
         return 0.25 / self.f if self.eps else math.inf  # a longer one could jump over whole periods of a quiet start
 
     def piece(self, t: float) -> LoadPiece:
@@ -257,7 +259,6 @@ class SampledLoad(Load):
         self.times, self.W, self.noise = t, values, float(noise)
         self.knots, self.coefficients, self.breaks = _build(t, values, self.noise)
         self._check_contact()
-        self.longest_step = float(4 * np.median(np.diff(self.knots)))
         self._knots, self._rows = self.knots.tolist(), self.coefficients.tolist()
 
     def _check_contact(self) -> None:
@@ -267,6 +268,10 @@ class SampledLoad(Load):
         if middles.min() <= 0:
             at = self.knots[int(middles.argmin())]
             raise SrfError(f"the load between its samples falls to {middles.min():g} N near t = {at:g} s", "sample it finer")
+
+    def longest_step(self, start: float, end: float) -> float:
+        inside = self.knots[bisect_right(self._knots, start) - 1 : int(np.searchsorted(self.knots, end, side="left")) + 1]
+        return float(4 * np.median(np.diff(inside))) if inside.size > 1 else math.inf
 
     def check(self, start: float, end: float) -> None:
         if start < self._knots[0] or end > self._knots[-1]:
@@ -608,9 +613,8 @@ class ModulatedLoad(Load):
     def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
         return tuple(sorted({*self.base.breaks, *self.shape.breaks}))
 
-    @property
-    def longest_step(self) -> float:  # type: ignore[override]
-        return min(self.base.longest_step, self.shape.longest_step)
+    def longest_step(self, start: float, end: float) -> float:
+        return min(self.base.longest_step(start, end), self.shape.longest_step(start, end))
 
     def check(self, start: float, end: float) -> None:
         self.base.check(start, end)

@@ -90,7 +90,7 @@ def integrate(
         len(by), integers(columns), integers(np.array(by or [-1], dtype=np.intc)), doubles(sensitivity_scale(p, by)), doubles(S0),
         ctypes.c_double(rtol_of_estimate(rtol)),
         doubles(np.asarray(atol) * rtol_of_estimate(rtol) / rtol),
-        ctypes.c_double(load.longest_step if math.isfinite(load.longest_step) else 1e300), ctypes.c_long(MAX_STEPS),
+        ctypes.c_long(MAX_STEPS),
         t.size, doubles(t), doubles(x), doubles(S), doubles(stats), ctypes.byref(stop),
     )  # fmt: skip
     filled = interruptible(lambda: library.srf_integrate(*arguments), stop)
@@ -114,8 +114,9 @@ def imposed_arguments(t: Array, drive: Drive, load: Load) -> tuple[Any, ...]:
     high = np.clip(np.searchsorted(knots, edges[1:] - 1e-12 * np.abs(edges).max(), side="left"), low + 1, len(knots) - 1)
     ranges = np.column_stack([low, high])
     middle = np.array([drive.piece(0.5 * (a + b)) for a, b in segments], dtype=float)
+    longest = np.minimum([load.longest_step(a, b) for a, b in segments], 1e300)
     return (
-        len(segments), doubles(edges), doubles(middle), integers(ranges),
+        len(segments), doubles(edges), doubles(middle), integers(ranges), doubles(longest),
         len(knots), coefficients.shape[1] - 1, doubles(knots), doubles(coefficients),
     )  # fmt: skip
 
@@ -191,7 +192,7 @@ def integrate_lsoda(
         f, df = system.on_piece(drive, load, 0.5 * (a + b))
         wanted = np.nonzero((t > a) & (t <= b))[0]
         times = np.unique([a, *t[wanted], b])
-        found, good, count = _march(f, df if not k else None, state, times, relative, tolerance, load.longest_step)
+        found, good, count = _march(f, df if not k else None, state, times, relative, tolerance, load.longest_step(a, b))
         steps += count
         places = np.searchsorted(times, t[wanted])
         y[wanted[places < good]] = found[places[places < good]]
