@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -171,11 +172,31 @@ def test_steps_up_and_down_and_strokes_are_groups(ladder, tmp_path):
 
 @pytest.mark.parametrize(
     ("line", "what"),
-    [('by = "sement"', "segment"), ('vary = "mu0"', 'vary = ["mu0"]'), ('vary = ["E"]', "is to vary, and is not free")],
+    [
+        ('by = "sement"', "segment"),
+        ('trend = "slop"', "slip"),
+        ('vary = "mu0"', 'vary = ["mu0"]'),
+        ('vary = ["E"]', "is to vary, and is not free"),
+    ],
 )
 def test_what_varies_is_checked_where_it_is_written(line, what, ladder, tmp_path):
     done = CliRunner().invoke(cli, ["fit", str(with_model(ladder, tmp_path / "bad", line))])
     assert done.exit_code == 2 and what in done.stderr
+
+
+def test_an_experiment_says_itself_what_a_fit_of_many_steps_needs(ladder, tmp_path, monkeypatch):
+    """`srf new` writes what varies, by what, and the trend; with the # taken away the fit is that of the options."""
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(cli, ["new", str(ladder / "simulated.csv"), "--stiffness", "30 MPa/mm"])
+    text = Path("experiment.toml").read_text(encoding="utf-8")
+    assert done.exit_code == 0 and '# vary = ["mu0"]' in text and '# by = "segment"' in text and '# trend = "slip"' in text
+    options = ("--vary", "mu0", "--by", "segment", "--trend", "slip")
+    told = [CliRunner().invoke(cli, ["fit", ".", "--track", "smooth", "--csv", *options]).stdout]
+    for line in ("vary = ", "by = ", "trend = "):
+        text = text.replace(f"# {line}", line)
+    Path("experiment.toml").write_text(text, encoding="utf-8")
+    told.append(CliRunner().invoke(cli, ["fit", ".", "--track", "smooth", "--csv"]).stdout)
+    assert told[0] == told[1] and "simulated-6.trend" in told[0] and "mu0[simulated-6]" in told[0]
 
 
 def test_segments_that_do_not_rise_are_refused(ladder, tmp_path):

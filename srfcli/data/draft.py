@@ -29,6 +29,7 @@ from srfcli.core.units import (
 from srfcli.data.columns import open_source, read_columns
 from srfcli.data.description import FORMAT, ROLES, check_unit, read_description
 from srfcli.data.experiment import read_choice, read_experiment, read_parameters
+from srfcli.data.groups import levels
 from srfcli.data.imposed import StartsAtRest, Stroke, find_modulation, strokes
 from srfcli.data.values import Run
 from srfcli.laws.registry import Registry
@@ -87,7 +88,12 @@ FORCE_OF_STRESS = {stress: force for force, stress in STRESSES.items()}
 OBSERVED = ("elongation", "force", "shear_stress", "friction")
 NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
 HOLD_SPEED = 0.05  # of the slowest sliding, below which is a hold
-SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps
+SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps; with more it has many steps
+STEP_BY_STEP = (  # what a run with many steps may need
+    '# vary = ["mu0"]   # take the # away for a friction level of each step\'s own; "noise": a gauge noise of its own, too',
+    '# by = "segment"   # with it: the run is cut halfway between its steps',
+    '# trend = "slip"   # friction drifts slowly',
+)
 STROKES = 40  # of a file that are written
 LETTERS = "A is a, B is b, D0 is Dc (or L), mu is tau/sigma, W is sigma, K is k; a stress in MPa counts as the force on 1 mm^2"
 ROCK_START = {  # start values and bounds of A, B and D0 that hold most velocity steps on rock and gouge
@@ -347,7 +353,8 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     if still := [name for name in sketch.free if name not in sketch.strokes]:
         remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(still)}")
     sketch = replace(
-        sketch, kind=kind, why=why, modulations=modulations if kind == "oscillation" else {},
+        sketch, kind=kind, why=why, several=any(len(levels(run)) > SEVERAL for run in runs),
+        modulations=modulations if kind == "oscillation" else {},
         durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
     )  # fmt: skip
     text = sketch.text(_parameters(sketch, runs, registry))
@@ -407,6 +414,7 @@ class _Sketch:
     modulations: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     durations: Mapping[str, float] = field(default_factory=dict)
     strokes: Mapping[str, Stroke] = field(default_factory=dict)  # by name, where a file holds several
+    several: bool = False  # whether a run has many steps of the velocity
     negative: bool = False  # whether a load in compression is negative in the files
 
     @property
@@ -429,6 +437,7 @@ class _Sketch:
             f"ageing = {toml_value(self.ageing)}" + ("" if wish.ageing else '   # ageing law; "ruina" is the slip law'),
             f"interface = {toml_value(wish.interface)}",
             f"inertia = {toml_value(bool(wish.mass))}",
+            *(STEP_BY_STEP if self.several else ()),
         ]
         if parameters:
             lines += ["", "[parameters]   # start values and bounds of what is fitted; a wide bound costs little", *parameters]

@@ -18,7 +18,7 @@ from srfcli.data.clock import Mask, Place, Sampling, find_sampling, kept_samples
 from srfcli.data.columns import MOST_BYTES, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, Description, Node, RunDescription, ThresholdsDescription, read_description
 from srfcli.data.gauge import GaugeNoise, find_noise
-from srfcli.data.groups import BY, grouped
+from srfcli.data.groups import BY, TRENDS, grouped
 from srfcli.data.imposed import ACCIDENTS, LOADS, FoundModulation, check_start, drive_of, find_modulation, load_of
 from srfcli.data.noise import observable_jumps, quantisation, saturation, spikes, white_level
 from srfcli.data.scales import own_bounds
@@ -69,7 +69,7 @@ def read_experiment(
     apparatus, model = described.apparatus, described.model
     found = Experiment(
         described.path, described.title, choice, apparatus.mass, apparatus.text, parameters, runs, notices, apparatus.stated,
-        thresholds=tables,
+        trend=model.read("trend", lambda trend: trend.choice(TRENDS), None), thresholds=tables,
     )  # fmt: skip
     vary = model.read("vary", lambda listed: listed.items("parameters", 'Write vary = ["mu0"].'), [])
     found = grouped(found, [entry.text() for entry in vary], model.read("by", lambda by: by.choice(BY), "run"))
@@ -106,7 +106,7 @@ _IMPOSED = {
 
 def read_choice(node: Node, apparatus: Apparatus, registry: Registry) -> tuple[ModelChoice, tuple[Parameter, ...]]:
     """Return the chosen model and all parameters that its laws and the apparatus have, in declared units."""
-    node.keys(("law", "ageing", "interface", "inertia", "effects", "vary", "by"))
+    node.keys(("law", "ageing", "interface", "inertia", "effects", "vary", "by", "trend"))
     law = node.require("law", 'Name a friction law: law = "srf-vsat"; `srf laws` lists them.')
     ageing = node.require("ageing", 'Name an ageing law: ageing = "dieterich"; `srf laws` lists them.')
     interface, inertia = node.get("interface"), node.get("inertia")

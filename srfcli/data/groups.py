@@ -13,6 +13,7 @@ from srfcli.core.errors import SrfError
 from srfcli.data.values import Experiment, Run
 
 BY = ("run", "load", "segment", "direction")
+TRENDS = ("slip", "time")  # along which an observable drifts
 GAUGE_NOISE = "noise"  # what may vary besides parameters: the gauge noise of a group of runs
 CUT = ("segment", "direction")  # for which runs are cut
 VELOCITY_STEP = 1.5  # factor of a step of the velocity: what is fitted through noisy displacements wavers by less

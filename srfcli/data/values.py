@@ -178,7 +178,8 @@ class CriticalLoads:
 class Experiment:
     """Runs and critical loads under one apparatus and one model; `mass` in N s^2/um, None for a quasi-static slider.
 
-    Parameters in `vary` have a value for each run, load, segment or direction, as `by` says.
+    Parameters in `vary` have a value for each run, load, segment or direction, as `by` says. Observables drift with slip or
+    time where there is a `trend`.
     """
 
     path: Path
@@ -192,6 +193,7 @@ class Experiment:
     stiffness_unit: str = ""
     vary: tuple[str, ...] = ()
     by: str = "run"
+    trend: str | None = None
     thresholds: tuple[CriticalLoads, ...] = ()
 
     @property

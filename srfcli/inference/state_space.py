@@ -1270,13 +1270,14 @@ def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFi
     prior = np.array([logs[0], *np.repeat(np.gradient(logs), len(SHORT)) / len(SHORT)])  # below the first it is as none
     evidence, moves, covariances = [_laplace(maximum.point, inner)[0]], [np.zeros(inner.size)], []
     covariances.append(maximum.covariance[np.ix_(inner, inner)])
+    too_wide: set[float] = set()  # lengths at which an amplitude was too unlikely to count: a larger one is more so
     for share, short in product(FAINT_FIELDS, SHORT):
         x = _under_field(rough, bare, share * FAINT_FIELD, short)
-        likely = rough.at(x, slopes=False).log_likelihood > fitted.log_likelihood - DOWN
-        point = rough.at(x, slopes=likely)
-        if not likely:
-            point = replace(point, log_likelihood=-np.inf)
-        height, move, covariance = _laplace(point, np.array(at))
+        if short in too_wide or rough.at(x, slopes=False).log_likelihood < fitted.log_likelihood - DOWN:
+            too_wide.add(short)
+            height, move, covariance = -np.inf, np.zeros(inner.size), np.zeros((inner.size, inner.size))
+        else:
+            height, move, covariance = _laplace(rough.at(x), np.array(at))
         evidence.append(height)
         moves.append(move)
         covariances.append(covariance)
@@ -1598,17 +1599,22 @@ def _small_field(rough: Likelihood, bare: Point) -> Point | None:
     def tried(share: float, short: float) -> tuple[float, float, float]:
         return rough.at(_under_field(rough, x, share * FAINT_FIELD, short), slopes=False).log_likelihood, share, short
 
-    likeliest = max(tried(share, SHORT[middle]) for share in FAINT_FIELDS)
+    likeliest = (-np.inf, FAINT_FIELDS[0], SHORT[middle])
+    for wide in FAINT_FIELDS:  # beyond the likeliest amplitude, larger ones are less and less likely
+        found = tried(wide, SHORT[middle])
+        if found < likeliest:
+            break
+        likeliest = found
     height, share, short = max(likeliest, *(tried(likeliest[1], s) for s in (*SHORT[:middle], *SHORT[middle + 1 :])))
     if not np.isfinite(height):
         return None
     x, least = _under_field(rough, x, share * FAINT_FIELD, short), bare.log_likelihood + NEEDED
     for _ in range(FIELD_STEPS // 2):
-        found = maximise(rough, x, steps=2, widths=())
-        if found.promised < least or found.away < CONVERGED or np.array_equal(found.point.x, x):
+        reached = maximise(rough, x, steps=2, widths=())
+        if reached.promised < least or reached.away < CONVERGED or np.array_equal(reached.point.x, x):
             break
-        x = found.point.x
-    return found.point if found.point.log_likelihood > least else None
+        x = reached.point.x
+    return reached.point if reached.point.log_likelihood > least else None
 
 
 def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:

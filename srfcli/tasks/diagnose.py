@@ -46,7 +46,7 @@ def diagnose(
     effects : sequence of str
         Effects, or ageing laws, to look for; all that are registered if left out.
     trend : {'slip', 'time'}, optional
-        Let each run's observable drift.
+        Let each run's observable drift; as the experiment says if left out.
     vary : sequence of str
         Free parameters, or "noise" of the gauge, with a value of their own in each group of runs; as the experiment says if
         left out.
@@ -104,6 +104,7 @@ def diagnose(
         return grouped(found, vary, by)
 
     fitted = read(holdout=False).fitted()
+    trend = trend or fitted.trend
     if not fitted.runs and (trend or vary):
         raise SrfError(f"`{'trend' if trend else 'vary'}` is for recordings, and there are none", "Leave it out.")
     if compiler() is None and fitted.runs:

@@ -169,7 +169,7 @@ def fit(
     free : sequence of str, optional
         Parameters to fit; those that the experiment leaves free if left out.
     trend : {'slip', 'time'}, optional
-        Let each run's observable drift.
+        Let each run's observable drift; as the experiment says if left out.
     vary : sequence of str
         Free parameters, or "noise" of the gauge, with a value of their own in each group of runs, B in a run up is B[up]; as
         the experiment says if left out.
@@ -244,7 +244,7 @@ def fit(
     if sample:
         experiment.check_recorded("of which a posterior is drawn")
     found = fit_recordings(
-        registry, experiment, free=free, trend=trend, vary=vary, by=by, prior=prior, track=track,
+        registry, experiment, free=free, trend=trend or experiment.trend, vary=vary, by=by, prior=prior, track=track,
         ask_shared=not (profile or sample), starts=starts, seed=seed, progress=lambda text: progress("fit", text, None),
     )  # fmt: skip
     status = found.status
