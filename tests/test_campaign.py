@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,21 @@ def test_a_row_for_each_experiment_and_a_reason_for_those_without_a_fit() -> Non
     assert one["segments"] == one["steady"] == 1 and not rows["one"]["flags"]
     assert float(rows["drifts"]["final_slope"]) == pytest.approx(0.04, rel=0.2)
     assert "friction still changes with slip at the end of 1 of 1 segments" in rows["drifts"]["flags"]
+
+
+def test_of_what_varies_a_row_has_the_mean_and_says_so() -> None:
+    """Two runs whose B and mu0 may differ: neither is left empty, and A - B is not that of a start value."""
+    experiment("one", seed=1)
+    text = Path("one/experiment.toml").read_text(encoding="utf-8").replace("inertia = false", 'inertia = false\nvary = ["B"]')
+    run = text[text.index("[[runs]]") :]
+    shutil.copy("one/a.csv", "one/b.csv")
+    Path("one/experiment.toml").write_text(text + run.replace('"a"', '"b"').replace("a.csv", "b.csv"), encoding="utf-8")
+    srf("fit", "one", "--table", "out.csv", "--track", "smooth")
+    row = rows_of(Path("out.csv"))["one"]
+    A, B = float(row["A"]), float(row["B"])
+    assert abs(B - TRUE["B"]) < 4 * float(row["B_stderr"]) < 0.4 * TRUE["B"]
+    assert float(row["A_minus_B"]) == pytest.approx(A - B) and row["A_minus_B_stderr"] == ""
+    assert "B is the mean of 2 groups" in row["flags"]
 
 
 def _is(text: str) -> bool:

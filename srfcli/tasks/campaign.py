@@ -132,6 +132,9 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     own = [name for name in result.names if name in listed]
     parameters = {name: (table[name][1], _number(table[name][2]), table[name][5]) for name in own}
     values = {**{q.name: q.value for q in experiment.parameters}, **result.values}
+    varied = found.found.scatter  # of what varies the mean counts
+    values |= {name: s.mean if s else float(np.mean([values[n] for n in problem.groups[name]])) for name, s in varied.items()}
+    parameters |= {row[0]: (row[1], _number(row[2]), row[4]) for row in (found.varied.rows if found.varied else ())}
     place = {name: k for k, name in enumerate(result.names)}
     covariance = np.asarray(result.covariance)
 
@@ -154,11 +157,12 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
         variances = [covariance[place[n], place[n]] if n in place else 0.0 for n in ("A", "B")]
         both = 2 * float(covariance[place["A"], place["B"]]) if {"A", "B"} <= place.keys() else 0.0
         row["A_minus_B"] = values["A"] - values["B"]
-        row["A_minus_B_stderr"] = _number(float(np.sqrt(max(sum(variances) - both, 0.0)))) if place else None
+        told = place and not {"A", "B"} & varied.keys()
+        row["A_minus_B_stderr"] = _number(float(np.sqrt(max(sum(variances) - both, 0.0)))) if told else None
     unit, factor = experiment.shown("1/um" if experiment.per_load else "N/um")
     own_stiffness = runs[0].stiffness / (runs[0].first_load if experiment.per_load else 1.0)
     stated = float(values.get("K", own_stiffness))
-    row |= {"k": stated * factor, "k_unit": unit, "k_stderr": table["K"][2] if "K" in table else None}
+    row |= {"k": stated * factor, "k_unit": unit, "k_stderr": parameters["K"][1] if "K" in parameters else None}
     length = float(values.get("D0", 10.0))
     allowed = DRIFT * max(abs(values.get("A", 0.0)), abs(values.get("B", 0.0))) / length
     found_slopes = [s for run in runs for s in _slopes(run, length)]
@@ -177,6 +181,9 @@ def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
     if not found.worst.ok:
         yield "the maximum was not reached"
     yield from (f"{line[0]} {line[-1]}" for line in found.table.rows if line[-1])
+    for name, scatter in found.found.scatter.items():
+        apart = f", which scatter by {scatter.scatter / abs(scatter.mean):.0%} beyond their errors" if scatter else ""
+        yield f"{name} is the mean of {len(found.found.problem.groups[name])} groups{apart}"
     if row["steady"] < row["segments"]:
         yield f"friction still changes with slip at the end of {row['segments'] - row['steady']} of {row['segments']} segments"
     if not row["segments"]:
