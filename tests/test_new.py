@@ -110,6 +110,14 @@ def test_a_laboratory_s_table_becomes_an_experiment(form: str, step: dict[str, n
     assert mu0 == pytest.approx(0.605, abs=0.01)
 
 
+def test_a_unit_that_no_heading_says_is_told(step: dict[str, np.ndarray]) -> None:
+    """The n of sigma_n is no newton: a stress, in MPa, and that this is assumed."""
+    table(["time", "lp_disp [um]", "tau", "sigma_n"], [step["t"], step["x"], step["mu"] * step["sigma"], step["sigma"]])
+    done = srf("new", "run1.csv", "--stiffness", "0.06 MPa/um")
+    assert "'sigma_n' is the normal stress, in MPa, which no heading says" in done.stderr
+    assert "'lp_disp [um]' is the load point displacement, in um\n" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("headings", "options", "said", "hint"),
     [

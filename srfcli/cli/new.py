@@ -75,7 +75,8 @@ def command(files: tuple[Path, ...], out: str | None, force: bool, plugins: tupl
     made = draft(files, place.parent, wish, registry=registry)
     session = Session.current()
     for column in made.columns:
-        session.say(f"{column.heading!r} is the {column.role.replace('_', ' ')}, in {column.unit}")
+        assumed = ", which no heading says" if column.assumed and column.unit != "1" else ""
+        session.say(f"{column.heading!r} is the {column.role.replace('_', ' ')}, in {column.unit}{assumed}")
     for remark in made.remarks:
         session.say(f"Note: {remark}")
     if out == "-":

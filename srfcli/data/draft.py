@@ -139,12 +139,16 @@ class Wish:
 
 @dataclass(frozen=True)
 class Named:
-    """A column of a file that was taken for a role: its heading, its unit, and whether experiment.toml has to say so."""
+    """A column of a file that was taken for a role: its heading, its unit, and whether experiment.toml has to say so.
+
+    A unit is `assumed` where nobody told it.
+    """
 
     role: str
     heading: str
     unit: str
     said: bool
+    assumed: bool
 
 
 @dataclass(frozen=True)
@@ -181,7 +185,8 @@ def name_columns(
         actual = _by_unit(role, unit)
         if actual is None or actual in found:
             continue
-        found[actual] = Named(actual, heading, unit or ROLES[actual], name != actual or split_heading(heading)[1] is None)
+        said = name != actual or split_heading(heading)[1] is None
+        found[actual] = Named(actual, heading, unit or ROLES[actual], said, unit is None)
         taken.add(heading)
     _by_words(headings, found)
     seen = [role for role in (OBSERVED if not per_load else OBSERVED[::-1]) if role in found]
@@ -218,7 +223,7 @@ def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
         if len(named) == 1:
             heading = named[0]
             actual = FORCE_OF_STRESS.get(role, role) if kinds[heading] in ("N", "N*um") else role
-            found[actual] = Named(actual, heading, units_of[heading] or ROLES[actual], True)
+            found[actual] = Named(actual, heading, units_of[heading] or ROLES[actual], True, units_of[heading] is None)
             free.remove(heading)
 
 
@@ -245,18 +250,19 @@ def _wished(role: str, text: str, headings: Sequence[str], path: Path, geometry:
     heading = next((h for h in headings if name in (h, split_heading(h)[0])), None)
     if heading is None:
         raise SrfError(f"{path} has no column '{name}'", did_you_mean(name, headings))
-    found = unit or _spelled(heading)[1] or ROLES[role]
+    told = unit or _spelled(heading)[1]
+    found = told or ROLES[role]
     if role == "friction" and _kind_of_unit(found) in ("N", "N*um", "MPa"):
         role = "shear_stress" if _kind_of_unit(found) == "MPa" else "force"
     check_unit(found, role, where=f"--column {role}", geometry=geometry)
-    return Named(role, heading, found, True)
+    return Named(role, heading, found, True, told is None)
 
 
 def _spelled(heading: str) -> tuple[str, str | None]:
     """Return a heading's name in small letters and its unit, from brackets or a suffix; None where it has none."""
     name, unit = split_heading(heading)
     plain = re.sub(r"[^a-z0-9/]+", "_", name.strip().lower()).strip("_")
-    if unit is not None:
+    if unit is not None or any(plain in names for names in NAMED.values()):  # the n of sigma_n is no newton
         return plain.replace("/", "_"), unit
     for suffix in sorted(UNIT_SUFFIXES, key=len, reverse=True):
         if plain.endswith("_" + suffix):
