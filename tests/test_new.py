@@ -15,6 +15,7 @@ import tomli
 from click.testing import CliRunner, Result
 
 from srfcli.cli.main import cli
+from srfcli.data.noise import ar1
 
 SHARED = Path(os.environ.get("SRF_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 B819 = SHARED / "data" / "basalt-b819-velocity-step" / "velstep4_BRAVA_expb819_basalt.txt"
@@ -311,7 +312,7 @@ def test_holds_and_oscillations_are_told_from_steps() -> None:
         (["still.csv", "--stiffness", "1 1/um"], "no column has", "--column load_point_displacement=HEADING"),
         (["dated.csv", "--stiffness", "1 1/um", "--drive", "1"], "'2024-01-01 00:00:01'", "the seconds since the start"),
         (["twice.csv", "--stiffness", "1 1/um", "--drive", "1", "--load", "5 N"], "2 columns are called", "rename one"),
-        (["lift.csv", "--stiffness", "1 1/um"], "the load is -1 N", "--window FROM,TO"),
+        (["lift.csv", "--stiffness", "1 1/um"], "the load is -1 MPa", "--window FROM,TO"),
     ],
 )
 def test_what_is_missing_or_wrong_is_said_in_a_line_and_nothing_is_written(arguments: list[str], said: str, hint: str) -> None:
@@ -336,6 +337,21 @@ def test_an_existing_file_is_kept() -> None:
     Path("experiment.toml").write_text("mine")
     srf("new", "run1.csv", "--stiffness", "1 1/um", code=2)
     assert Path("experiment.toml").read_text() == "mine"
+
+
+def test_a_recording_that_begins_at_rest_has_the_velocity_of_its_sliding_as_reference() -> None:
+    """The stage stands for 20 s, and goes on at 2 um/s: V0 is that, and `srf check` says that nothing can be simulated.
+
+    Friction is coloured, and has no number for 30 s: no gauge sits at the end of its range there.
+    """
+    t = np.arange(0.0, 120.0, 0.1)
+    x = 2.0 * np.clip(t - 20.0, 0.0, None) - 1e-7 * t
+    mu = 0.6 * (1 - np.exp(-np.clip(t - 20.0, 0.0, None) / 5.0)) + 1e-3 * ar1(t.size, 0.8, rng=np.random.default_rng(1))
+    table(["time [s]", "lp_disp [um]", "mu", "sigma_n [MPa]"], [t, x, np.where(t < 30, np.nan, mu), 20.0 + 0.01 * np.sin(t / 9)])
+    srf("new", "run1.csv", "--stiffness", "1e-3 1/um")
+    assert tomli.loads(Path("experiment.toml").read_text())["parameters"]["V0"]["value"] == pytest.approx(2.0, rel=0.02)
+    done = srf("check", ".")
+    assert "run1: the simulation ended at" in done.stdout and "saturation" not in done.stdout
 
 
 @pytest.mark.parametrize("command", ["fit", "check", "diagnose"])

@@ -539,6 +539,13 @@ def _levels(V: np.ndarray) -> int:
     return int(np.sum(counts > 0.02 * V.size))
 
 
+def _first_velocity(run: Run) -> float:
+    """Return the first velocity of sliding (um/s); 1 where there is none."""
+    V = np.abs(run.drive(run.t))
+    sliding = NO_SLIDING * float(V.max()) < V
+    return float(V[int(np.argmax(sliding))]) or 1.0
+
+
 def _modulations(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
     found = {}
     for run in runs:
@@ -557,7 +564,7 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
     base, modifiers = registry.ageing(sketch.ageing)
     surface = registry.get("interface", wish.interface)
     listed: list[Parameter] = [p for each in (law, base, *modifiers, surface) for p in each.parameters]
-    V = float(np.median([abs(run.drive.at(float(run.t[0]))) or 1.0 for run in runs]))
+    V = float(np.median([_first_velocity(run) for run in runs]))
     friction = [(run.observed * run.friction_factor(run.load(run.t)[0]))[run.used] for run in runs]
     mu = float(np.median(np.concatenate(friction)))
     lines = []

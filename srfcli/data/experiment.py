@@ -20,7 +20,7 @@ from srfcli.data.description import Apparatus, Description, Node, RunDescription
 from srfcli.data.gauge import GaugeNoise, find_noise
 from srfcli.data.groups import BY, TRENDS, grouped
 from srfcli.data.imposed import ACCIDENTS, LOADS, FoundModulation, check_start, drive_of, find_modulation, load_of
-from srfcli.data.noise import observable_jumps, quantisation, saturation, spikes, white_level
+from srfcli.data.noise import WIDEST_SPIKE, observable_jumps, quantisation, saturation, spikes, white_level
 from srfcli.data.scales import own_bounds
 from srfcli.data.thresholds import read_thresholds
 from srfcli.data.values import (
@@ -36,7 +36,7 @@ from srfcli.data.values import (
 )
 from srfcli.laws.registry import Registry
 from srfcli.laws.values import Effect
-from srfcli.motion.imposed import Load
+from srfcli.motion.imposed import Load, runs_of
 
 
 def read_experiment(
@@ -343,7 +343,8 @@ def clean_observable(
     t = place.t
     known, filled, notices = _numbers(place, x)
     quantum = quantisation(filled[known])
-    clipped = saturation(filled)
+    clipped = np.zeros(x.size, bool)
+    clipped[known] = saturation(filled[known])
     if clipped.any():
         edge = float(filled[np.flatnonzero(clipped)[0]])
         told = f"at the extreme value {edge:.6g} of '{place.heading}': saturated, not compared"
@@ -453,10 +454,14 @@ def check_run(run: Run) -> RunCheck:
     sampling, (W, W_dot) = run.sampling, run.load(run.t)
     modulation = find_modulation(run.t, W)
     x = np.interp(run.t, run.t[run.used], run.observed[run.used])
-    cut = 1 + np.union1d(np.flatnonzero(np.diff(sampling.at)), sampling.gaps)
-    pieces, noises = np.split(x, cut), []
+    absent = ~run.used
+    for a, b in runs_of(~run.used):
+        absent[a : b + 1] = b - a >= WIDEST_SPIKE  # a few are bridged; a longer bridge would be taken for calm
+    cut = 1 + np.union1d(np.flatnonzero(np.diff(sampling.at) | np.diff(absent)), sampling.gaps)
+    pieces, noises = [*zip(np.split(x, cut), sampling.at[[0, *cut]], absent[[0, *cut]], strict=True)], []
     for k, dt in enumerate(sampling.spacings):
-        parts = [piece for piece, begin in zip(pieces, (0, *cut), strict=True) if sampling.at[begin] == k]
+        own = [(piece, missing) for piece, at, missing in pieces if at == k]
+        parts = [piece for piece, missing in own if not missing] or [piece for piece, _ in own]
         noises.append(find_noise(parts, dt, quantum=run.quantum, cycles=modulation.frequency * dt if modulation else None))
     noise = noises[int(np.argmax(np.bincount(sampling.at)))]
     load = LoadHistory(float(W.mean()), float(W.min()), float(W.max()), float(np.abs(W_dot / W).max()), modulation)

@@ -132,7 +132,7 @@ def whiten(noises: Sequence[GaugeNoise], rate: NDArray[np.intc], begins: Mask, t
     if not any(noise.colours for noise in noises):
         return np.asarray(columns / np.sqrt(floor)[:, None])
     out, known = np.empty_like(columns), {}
-    steps = np.diff(t, prepend=t[0])
+    steps = np.diff(t, prepend=t[:1])
     key, P, V, x = None, np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, columns.shape[1]))
     h, gain, S, settled = np.zeros(0), np.zeros(0), 0.0, False
     for k in range(t.size):

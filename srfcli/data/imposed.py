@@ -585,19 +585,20 @@ def load_of(run: RunDescription, columns: Columns) -> tuple[Load, list[Notice]]:
         f, eps, onset = run.modulation
         return Modulation(W0, eps, f, onset), []
     place, values = columns.place(role), columns.arrays[role]
-    load, notices = load_from_column(place, values)
+    unit = "MPa" if role == "normal_stress" else "N"
+    load, notices = load_from_column(place, values, unit)
     first = load.rest(float(place.t[0]))
     if run.load is not None and abs(run.load - first) > DIFFERS * first:
         run.node.child("load").fail(
-            f"the load is {run.load:g} N, but {place.column} begins with {first:g} N", "Take one of the two away."
+            f"the load is {run.load:g} {unit}, but {place.column} begins with {first:g} {unit}", "Take one of the two away."
         )
     if run.modulation is not None:
         notices += modulation_notices(place, run.modulation, values)
     return load, notices
 
 
-def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
-    """Return the load in a column W (n,) in N, and what was done to it.
+def load_from_column(place: Place, W: Array, unit: str = "N") -> tuple[Load, list[Notice]]:
+    """Return the load in a column W (n,) in N or MPa, as `unit` says, and what was done to it.
 
     Empty cells and spikes are bridged. A load that varies no more than its noise is constant; noise that would show in dW/dt is
     smoothed away. Raises SrfError for a load that is missing, not positive or saturated.
@@ -612,7 +613,7 @@ def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
         first, last = np.flatnonzero(clipped)[[0, -1]]
         raise SrfError(
             f"{place.span(first, last)}, column '{place.heading}': {int(clipped.sum())} samples sit at the extreme "
-            f"value {filled[first]:.6g} N: the gauge is saturated, the load unknown",
+            f"value {filled[first]:.6g} {unit}: the gauge is saturated, the load unknown",
             "Take a window without this part.",
         )
     least = 2e-3 * float(np.median(np.abs(filled)))
@@ -625,29 +626,29 @@ def load_from_column(place: Place, W: Array) -> tuple[Load, list[Notice]]:
     if filled.min() < NO_CONTACT:
         at = int(filled.argmin())
         raise SrfError(
-            f"{place.span(at, at)}, column '{place.heading}': the load is {filled[at]:.6g} N",
+            f"{place.span(at, at)}, column '{place.heading}': the load is {filled[at]:.6g} {unit}",
             "The slider must stay in contact: zero the gauge ([columns] offset), or take a window without this part.",
             kind="no contact",
         )
-    load, told = _smooth(place, filled)
+    load, told = _smooth(place, filled, unit)
     return load, [*notices, *told]
 
 
-def _smooth(place: Place, W: Array) -> tuple[Load, list[Notice]]:
+def _smooth(place: Place, W: Array, unit: str) -> tuple[Load, list[Notice]]:
     if np.ptp(W) == 0 or W.size < 4:
         return ConstantLoad(float(W[0])), []
     noise = white_level(W, place.t)
     mean = float(W.mean())
     if noise and is_constant(W, noise):
-        what = f"constant to its noise of {noise / mean:.2g} of {mean:.6g} N: taken as constant"
+        what = f"constant to its noise of {noise / mean:.2g} of {mean:.6g} {unit}: taken as constant"
         return ConstantLoad(mean), [Notice("load-constant", place.column, what)]
     if noise <= NEGLIGIBLE * float(np.ptp(W)):
         return SampledLoad(place.t, W), []
     load = SampledLoad(place.t, W, noise=noise)
     steps = np.diff(load.knots)
     what = (
-        f"noise of {noise:.3g} N ({noise / mean:.2g} of the load), which dW/dt would amplify: smoothed by a spline with knots "
-        f"{steps.min():.3g} to {steps.max():.3g} s apart"
+        f"noise of {noise:.3g} {unit} ({noise / mean:.2g} of the load), which dW/dt would amplify: smoothed by a spline with "
+        f"knots {steps.min():.3g} to {steps.max():.3g} s apart"
     )
     return load, [Notice("load-smoothed", place.column, what)]
 
@@ -790,5 +791,5 @@ def read_load(path: Path, *, registry: Registry, format: str | None = None) -> t
     rows = np.arange(1, t.size + 1)
     keep, notices = kept_samples(Place(path, time.heading, rows, t))
     place = Place(path, loads.heading, rows[keep], t[keep])
-    load, told = load_from_column(place, W[keep])
+    load, told = load_from_column(place, W[keep], "MPa" if loads.role == "normal_stress" else "N")
     return load, place.t, (*notices, *told)
