@@ -47,6 +47,17 @@ def npz_bytes(numbers: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
+def struct_bytes(numbers: np.ndarray, *, packed: bool) -> bytes:
+    """Return a MATLAB file with a struct in a struct: data.x, data.ram.x, ..."""
+    from scipy.io import savemat
+
+    stream = io.BytesIO()
+    first, *others = zip(NAMES, numbers, strict=True)
+    data = {first[0]: first[1], "ram": dict(others), "name": "run 5", "rows": 3.0}
+    savemat(stream, {"notes": "x", "data": data}, do_compression=packed)
+    return stream.getvalue()
+
+
 def mat_bytes(numbers: np.ndarray) -> bytes:
     from scipy.io import savemat
 
@@ -277,6 +288,21 @@ def test_what_is_no_column_of_an_archive_is_left_out(tmp_path: Path) -> None:
         columns(open_source(tmp_path / "o.npz", registry=REGISTRY))
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_fields_of_matlab_structs_are_columns(packed: bool, tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    numbers = table()
+    (tmp_path / "s.mat").write_bytes(struct_bytes(numbers, packed=packed))
+    source = open_source(tmp_path / "s.mat", registry=REGISTRY)
+    assert source.headings == NAMES and np.array_equal(columns(source), numbers)
+    t = np.arange(30.0)
+    several = {"a": {"t": t, "u": 2 * t}, "b": {"t": 3 * t}, "c": [{"t": t}, {"t": t}]}
+    savemat(tmp_path / "two.mat", several, do_compression=packed)
+    source = open_source(tmp_path / "two.mat", registry=REGISTRY)
+    assert source.headings == ("a.t", "u", "b.t") and np.array_equal(columns(source), [t, 2 * t, 3 * t])
+
+
 def test_matlab_matrices_and_strangers(tmp_path: Path) -> None:
     from scipy.io import savemat
 
@@ -410,6 +436,7 @@ def mutated(draw: st.DrawFn, whole: bytes) -> bytes:
 
 
 WHOLE = {kind: make(table()) for kind, make in WRITERS.items()}
+STRUCTS = [struct_bytes(table(), packed=packed) for packed in (False, True)]
 
 
 @pytest.mark.parametrize("kind", WRITERS)
@@ -417,6 +444,13 @@ WHOLE = {kind: make(table()) for kind, make in WRITERS.items()}
 @given(draw=st.data())
 def test_a_damaged_file(kind: str, draw: st.DataObject) -> None:
     survive(draw.draw(mutated(WHOLE[kind])), format=kind)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@FUZZ
+@given(draw=st.data())
+def test_a_damaged_struct(packed: bool, draw: st.DataObject) -> None:
+    survive(draw.draw(mutated(STRUCTS[packed])), format="matlab")
 
 
 def read(folder: Path) -> None:

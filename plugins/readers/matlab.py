@@ -1,4 +1,4 @@
-"""MATLAB files of version 5: one vector for each column."""
+"""MATLAB files of version 5: one vector for each column, in variables of their own or in the fields of structs."""
 
 import os
 import struct
@@ -18,7 +18,9 @@ HEAD = 4096  # bytes in which the header of a variable must lie
 TEXT, MATRIX, COMPRESSED = 128, 14, 15
 STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 NUMERIC = range(6, 16)  # classes: double, single, and integers
+STRUCT, DEEPEST = 2, 4  # the class of a struct, and how many may stand in each other
 COMPLEX = 0x0800
+MOST_BYTES = 2**29  # of a struct, which is unpacked as a whole
 WHOLE = "Was the file copied to its end?"
 
 
@@ -41,7 +43,7 @@ class _Variable:
     sniff=lambda head: head.startswith(b"MATLAB ") and not head.startswith(b"MATLAB 7.3") and head[126:128] in (b"IM", b"MI"),
 )
 def matlab(path: Path) -> Source:
-    """MATLAB 5 file, a vector for each column, or a matrix `data` as data_1, data_2, ...; units in [columns]"""
+    """MATLAB 5 file: each vector or field of a struct a column, a matrix `data` as data_1, data_2, ...; units in [columns]"""
     with path.open("rb") as stream:
         head = stream.read(TEXT)
         if head.startswith(b"MATLAB 7.3"):
@@ -53,12 +55,14 @@ def matlab(path: Path) -> Source:
             raise SrfError(f"{path}: not a whole MATLAB 5 file: {error}", WHOLE) from None
     places: dict[str, tuple[_Variable, int]] = {}
     lengths: dict[str, int] = {}
+    fields = [v.name.rpartition(".")[2] for v in variables]
+    short = {v.name: f if fields.count(f) == 1 else v.name for v, f in zip(variables, fields, strict=True)}
     for variable in variables:
         rows, columns = (max(variable.shape), 1) if 1 in variable.shape else variable.shape
         if columns > MOST:
             raise SrfError(f"{path}: variable '{variable.name}' has {columns} columns", f"At most {MOST} are read.")
         for k in range(columns):
-            heading = variable.name if columns == 1 else f"{variable.name}_{k + 1}"
+            heading = short[variable.name] if columns == 1 else f"{short[variable.name]}_{k + 1}"
             places[heading], lengths[heading] = (variable, k), rows
     if not places:
         raise SrfError(f"{path}: holds no vector of numbers", "Save one variable for each column, as time, force.")
@@ -83,7 +87,7 @@ def matlab(path: Path) -> Source:
 
 
 def _variables(stream: BinaryIO, order: str) -> Iterator[_Variable]:
-    """Yield the matrices of numbers in a file; its other variables are passed over."""
+    """Yield the matrices of numbers in a file and in its structs; other variables are passed over."""
     end, at, count = os.fstat(stream.fileno()).st_size, TEXT, 0
     while at + 8 <= end:
         stream.seek(at)
@@ -99,12 +103,41 @@ def _variables(stream: BinaryIO, order: str) -> Iterator[_Variable]:
             if struct.unpack_from(f"{order}I", data)[0] != MATRIX:
                 raise ValueError(f"no matrix in the element at byte {at}")
             data = data[8:]
-        found = _header(data, order) if size else None
-        if found is not None:
-            name, shape, begin, is_complex = found
-            packed = kind == COMPRESSED
+        packed = kind == COMPRESSED
+        found = [_header(data, order)] if size else []
+        if size and _class(data, order) == STRUCT:
+            stream.seek(at + 8)
+            data = stream.read(size)
+            data = zlib.decompressobj().decompress(data, MOST_BYTES)[8:] if packed else data
+            found = [*_fields(data, order, 0, DEEPEST)]
+        for name, shape, begin, is_complex in (f for f in found if f is not None):
             yield _Variable(name, shape, at + 8, size, packed, begin + (8 if packed else 0), is_complex)
         at += 8 + size
+
+
+def _fields(data: bytes, order: str, at: int, depth: int, prefix: str = "") -> Iterator[tuple[str, tuple[int, int], int, bool]]:
+    """Yield what `_header` returns of the numbers in a struct whose matrix begins at `at`, named STRUCT.FIELD."""
+    _, _, place = _part(data, at, order)
+    _, sizes, place = _part(data, place, order)
+    _, name, place = _part(data, place, order)
+    if sizes != struct.pack(f"{order}ii", 1, 1) or not depth:
+        return  # an array of structs is no table
+    _, width, place = _part(data, place, order)
+    _, names, place = _part(data, place, order)
+    (length,) = struct.unpack(f"{order}i", width)
+    if length < 1:
+        raise ValueError(f"field names of {length} bytes")
+    own = prefix or f"{name.decode('latin-1')}."
+    for k in range(0, len(names), length):
+        kind, content, after = _part(data, place, order)
+        if kind != MATRIX:
+            raise ValueError(f"a field of type {kind}")
+        field = own + names[k : k + length].split(b"\0")[0].decode("latin-1")
+        if content and _class(content, order) == STRUCT:
+            yield from _fields(data, order, place + 8, depth - 1, f"{field}.")
+        elif content and (found := _header(content, order)) is not None:
+            yield field, found[1], place + 8 + found[2], found[3]
+        place = after
 
 
 def _part(data: bytes, at: int, order: str) -> tuple[int, bytes, int]:
@@ -119,6 +152,10 @@ def _part(data: bytes, at: int, order: str) -> tuple[int, bytes, int]:
     if begin + size > len(data):
         raise ValueError("the header of a variable breaks off")
     return kind, data[begin : begin + size], after
+
+
+def _class(data: bytes, order: str) -> int:
+    return int(struct.unpack_from(f"{order}I", _part(data, 0, order)[1])[0]) & 0xFF
 
 
 def _header(data: bytes, order: str) -> tuple[str, tuple[int, int], int, bool] | None:
