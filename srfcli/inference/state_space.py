@@ -1599,22 +1599,17 @@ def _small_field(rough: Likelihood, bare: Point) -> Point | None:
     def tried(share: float, short: float) -> tuple[float, float, float]:
         return rough.at(_under_field(rough, x, share * FAINT_FIELD, short), slopes=False).log_likelihood, share, short
 
-    likeliest = (-np.inf, FAINT_FIELDS[0], SHORT[middle])
-    for wide in FAINT_FIELDS:  # beyond the likeliest amplitude, larger ones are less and less likely
-        found = tried(wide, SHORT[middle])
-        if found < likeliest:
-            break
-        likeliest = found
+    likeliest = max(tried(share, SHORT[middle]) for share in FAINT_FIELDS)
     height, share, short = max(likeliest, *(tried(likeliest[1], s) for s in (*SHORT[:middle], *SHORT[middle + 1 :])))
     if not np.isfinite(height):
         return None
     x, least = _under_field(rough, x, share * FAINT_FIELD, short), bare.log_likelihood + NEEDED
     for _ in range(FIELD_STEPS // 2):
-        reached = maximise(rough, x, steps=2, widths=())
-        if reached.promised < least or reached.away < CONVERGED or np.array_equal(reached.point.x, x):
+        found = maximise(rough, x, steps=2, widths=())
+        if found.promised < least or found.away < CONVERGED or np.array_equal(found.point.x, x):
             break
-        x = reached.point.x
-    return reached.point if reached.point.log_likelihood > least else None
+        x = found.point.x
+    return found.point if found.point.log_likelihood > least else None
 
 
 def _shrunk(rough: Likelihood, point: Point, at: int) -> Point:
