@@ -352,6 +352,16 @@ def test_a_recording_that_begins_at_rest_has_the_velocity_of_its_sliding_as_refe
     assert tomli.loads(Path("experiment.toml").read_text())["parameters"]["V0"]["value"] == pytest.approx(2.0, rel=0.02)
     done = srf("check", ".")
     assert "run1: the simulation ended at" in done.stdout and "saturation" not in done.stdout
+    assert json.loads(srf("check", ".", "--no-simulate", "--json").stdout)["rows"][0]["noise"] == pytest.approx(1e-3, rel=0.2)
+
+
+def test_the_noise_of_a_channel_that_is_slower_than_its_file() -> None:
+    """One cell in ten has a number: what is between is bridged, as pieces of one sample tell nothing."""
+    t, rng = np.arange(0.0, 300.0, 0.1), np.random.default_rng(1)
+    mu = np.where(np.arange(t.size) % 10, np.nan, 0.6 + rng.normal(0, 1e-3, t.size))
+    table(["time [s]", "lp_disp [um]", "mu", "sigma_n [MPa]"], [t, 2 * t, mu, 20.0 + 0.01 * np.sin(t / 9)])
+    srf("new", "run1.csv", "--stiffness", "1e-3 1/um")
+    assert json.loads(srf("check", ".", "--no-simulate", "--json").stdout)["rows"][0]["noise"] > 1e-4
 
 
 @pytest.mark.parametrize("command", ["fit", "check", "diagnose"])

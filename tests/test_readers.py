@@ -301,6 +301,32 @@ def test_fields_of_matlab_structs_are_columns(packed: bool, tmp_path: Path) -> N
     savemat(tmp_path / "two.mat", several, do_compression=packed)
     source = open_source(tmp_path / "two.mat", registry=REGISTRY)
     assert source.headings == ("a.t", "u", "b.t") and np.array_equal(columns(source), [t, 2 * t, 3 * t])
+    beside = {
+        "time": t,
+        "force": 2 * t,
+        "raw": {"v": np.arange(99.0)},
+        "data": np.stack([t, 3 * t], axis=1),
+        "z": {"data_1": 4 * t},
+    }
+    savemat(tmp_path / "beside.mat", beside, do_compression=packed)
+    source = open_source(tmp_path / "beside.mat", registry=REGISTRY)
+    assert source.headings == ("time", "force", "data_1", "data_2", "z.data_1") and np.array_equal(columns(source)[-1], 4 * t)
+
+
+def test_structs_that_claim_each_other_s_fields_are_refused(tmp_path: Path) -> None:
+    """Each of 200 structs ends after its fields' names: read beyond its own end, it would take those behind it for its fields."""
+
+    def part(kind: int, data: bytes) -> bytes:
+        return struct.pack("<II", kind, len(data)) + data + b"\0" * (-len(data) % 8)
+
+    def head(name: bytes, fields: int) -> bytes:
+        flags, shape = part(6, struct.pack("<II", 2, 0)), part(5, struct.pack("<ii", 1, 1))
+        return flags + shape + part(1, name) + part(5, struct.pack("<i", 1)) + part(1, b"a" * fields)
+
+    body = head(b"s", 200) + b"".join(part(14, head(b"", 199 - k)) for k in range(200))
+    (tmp_path / "s.mat").write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + part(14, body))
+    with pytest.raises(SrfError, match="not a whole MATLAB 5 file"):
+        open_source(tmp_path / "s.mat", registry=REGISTRY)
 
 
 def test_matlab_matrices_and_strangers(tmp_path: Path) -> None:

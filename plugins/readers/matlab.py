@@ -3,6 +3,7 @@
 import os
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,8 @@ STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"
 NUMERIC = range(6, 16)  # classes: double, single, and integers
 STRUCT, DEEPEST = 2, 4  # the class of a struct, and how many may stand in each other
 COMPLEX = 0x0800
-MOST_BYTES = 2**29  # of a struct, which is unpacked as a whole
+LARGEST_STRUCT = 2**27  # bytes of a struct, which is unpacked as a whole; a larger one is passed over
+Buffer = bytes | memoryview
 WHOLE = "Was the file copied to its end?"
 
 
@@ -56,17 +58,20 @@ def matlab(path: Path) -> Source:
     places: dict[str, tuple[_Variable, int]] = {}
     lengths: dict[str, int] = {}
     fields = [v.name.rpartition(".")[2] for v in variables]
-    short = {v.name: f if fields.count(f) == 1 else v.name for v, f in zip(variables, fields, strict=True)}
+    known = Counter(fields)
+    short = {v.name: f if known[f] == 1 else v.name for v, f in zip(variables, fields, strict=True)}
     for variable in variables:
         rows, columns = (max(variable.shape), 1) if 1 in variable.shape else variable.shape
         if columns > MOST:
             raise SrfError(f"{path}: variable '{variable.name}' has {columns} columns", f"At most {MOST} are read.")
         for k in range(columns):
-            heading = short[variable.name] if columns == 1 else f"{short[variable.name]}_{k + 1}"
+            heading, full = (n if columns == 1 else f"{n}_{k + 1}" for n in (short[variable.name], variable.name))
+            heading = full if heading in places else heading
             places[heading], lengths[heading] = (variable, k), rows
     if not places:
         raise SrfError(f"{path}: holds no vector of numbers", "Save one variable for each column, as time, force.")
-    rows = max(lengths.values())
+    outside = [n for h, n in lengths.items() if "." not in places[h][0].name]  # of structs, which may hold more than a recording
+    rows = max(outside) if outside.count(max(outside, default=0)) > 1 else max(lengths.values())
     headings = tuple(h for h in places if lengths[h] == rows)  # a lone number is a remark, not a column
 
     def blocks(wanted: tuple[int, ...]) -> Iterator[Sequence[np.ndarray]]:
@@ -88,7 +93,7 @@ def matlab(path: Path) -> Source:
 
 def _variables(stream: BinaryIO, order: str) -> Iterator[_Variable]:
     """Yield the matrices of numbers in a file and in its structs; other variables are passed over."""
-    end, at, count = os.fstat(stream.fileno()).st_size, TEXT, 0
+    end, at, count, left = os.fstat(stream.fileno()).st_size, TEXT, 0, [MOST]
     while at + 8 <= end:
         stream.seek(at)
         kind, size = struct.unpack(f"{order}II", stream.read(8))
@@ -107,40 +112,50 @@ def _variables(stream: BinaryIO, order: str) -> Iterator[_Variable]:
         found = [_header(data, order)] if size else []
         if size and _class(data, order) == STRUCT:
             stream.seek(at + 8)
-            data = stream.read(size)
-            data = zlib.decompressobj().decompress(data, MOST_BYTES)[8:] if packed else data
-            found = [*_fields(data, order, 0, DEEPEST)]
+            data = stream.read(size) if size <= LARGEST_STRUCT else b""
+            unpacked = zlib.decompressobj()
+            data = unpacked.decompress(data, LARGEST_STRUCT) if packed and data else data
+            whole = bool(data) and not (packed and unpacked.unconsumed_tail)
+            found = [*_fields(memoryview(data)[8 if packed else 0 :], order, left)] if whole else []
         for name, shape, begin, is_complex in (f for f in found if f is not None):
             yield _Variable(name, shape, at + 8, size, packed, begin + (8 if packed else 0), is_complex)
         at += 8 + size
 
 
-def _fields(data: bytes, order: str, at: int, depth: int, prefix: str = "") -> Iterator[tuple[str, tuple[int, int], int, bool]]:
-    """Yield what `_header` returns of the numbers in a struct whose matrix begins at `at`, named STRUCT.FIELD."""
-    _, _, place = _part(data, at, order)
+def _fields(
+    data: memoryview, order: str, left: list[int], at: int = 0, depth: int = DEEPEST, prefix: str = ""
+) -> Iterator[tuple[str, tuple[int, int], int, bool]]:
+    """Yield what `_header` returns of the numbers in a struct (`data` is its matrix), named STRUCT.FIELD; it begins at `at`.
+
+    At most as many fields as are `left` in the file.
+    """
+    _, _, place = _part(data, 0, order)
     _, sizes, place = _part(data, place, order)
     _, name, place = _part(data, place, order)
-    if sizes != struct.pack(f"{order}ii", 1, 1) or not depth:
+    if bytes(sizes) != struct.pack(f"{order}ii", 1, 1) or not depth:
         return  # an array of structs is no table
     _, width, place = _part(data, place, order)
     _, names, place = _part(data, place, order)
     (length,) = struct.unpack(f"{order}i", width)
-    if length < 1:
+    if length < 1 and len(names):
         raise ValueError(f"field names of {length} bytes")
-    own = prefix or f"{name.decode('latin-1')}."
-    for k in range(0, len(names), length):
+    own = prefix or f"{bytes(name).decode('latin-1')}."
+    for k in range(0, len(names), max(length, 1)):
+        left[0] -= 1
+        if left[0] < 0:
+            raise ValueError(f"more than {MOST} fields")
         kind, content, after = _part(data, place, order)
         if kind != MATRIX:
             raise ValueError(f"a field of type {kind}")
-        field = own + names[k : k + length].split(b"\0")[0].decode("latin-1")
-        if content and _class(content, order) == STRUCT:
-            yield from _fields(data, order, place + 8, depth - 1, f"{field}.")
-        elif content and (found := _header(content, order)) is not None:
-            yield field, found[1], place + 8 + found[2], found[3]
+        field = own + bytes(names[k : k + length]).split(b"\0")[0].decode("latin-1")
+        if len(content) and _class(content, order) == STRUCT:
+            yield from _fields(content, order, left, at + place + 8, depth - 1, f"{field}.")
+        elif len(content) and (found := _header(content, order)) is not None:
+            yield field, found[1], at + place + 8 + found[2], found[3]
         place = after
 
 
-def _part(data: bytes, at: int, order: str) -> tuple[int, bytes, int]:
+def _part(data: Buffer, at: int, order: str) -> tuple[int, Buffer, int]:
     """Return type and content of the part that begins at `at`, and where the next one does."""
     kind, size = struct.unpack_from(f"{order}II", data, at)
     if kind >> 16:  # a small part: its size and its content share the tag
@@ -154,11 +169,11 @@ def _part(data: bytes, at: int, order: str) -> tuple[int, bytes, int]:
     return kind, data[begin : begin + size], after
 
 
-def _class(data: bytes, order: str) -> int:
+def _class(data: Buffer, order: str) -> int:
     return int(struct.unpack_from(f"{order}I", _part(data, 0, order)[1])[0]) & 0xFF
 
 
-def _header(data: bytes, order: str) -> tuple[str, tuple[int, int], int, bool] | None:
+def _header(data: Buffer, order: str) -> tuple[str, tuple[int, int], int, bool] | None:
     """Return name, shape, where the numbers begin and whether they are complex; None for what is no matrix of numbers."""
     _, flags, at = _part(data, 0, order)
     flag = struct.unpack_from(f"{order}I", flags)[0]
@@ -171,7 +186,7 @@ def _header(data: bytes, order: str) -> tuple[str, tuple[int, int], int, bool] |
         raise ValueError(f"a matrix of shape {shape}")
     if len(shape) != 2 or 0 in shape:
         return None
-    return name.decode("latin-1"), (shape[0], shape[1]), at, bool(flag & COMPLEX)
+    return bytes(name).decode("latin-1"), (shape[0], shape[1]), at, bool(flag & COMPLEX)
 
 
 def _numbers(stream: BinaryIO, order: str, variable: _Variable) -> np.ndarray:

@@ -88,7 +88,7 @@ FORCE_OF_STRESS = {stress: force for force, stress in STRESSES.items()}
 OBSERVED = ("elongation", "force", "shear_stress", "friction")
 NO_SLIDING = 1e-3  # of the fastest velocity, below which nothing slides
 HOLD_SPEED = 0.05  # of the slowest sliding, below which is a hold
-SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps; with more it has many steps
+SEVERAL = 3  # velocities of sliding from which a run with holds is one of steps; with as many steps it has many
 STEP_BY_STEP = (  # what a run with many steps may need
     '# vary = ["mu0"]   # take the # away for a friction level of each step\'s own; "noise": a gauge noise of its own, too',
     '# by = "segment"   # with it: the run is cut halfway between its steps',
@@ -359,7 +359,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     if still := [name for name in sketch.free if name not in sketch.strokes]:
         remarks.append(f"the initial state is estimated, as the drive stands still at first in {', '.join(still)}")
     sketch = replace(
-        sketch, kind=kind, why=why, several=any(len(levels(run)) > SEVERAL for run in runs),
+        sketch, kind=kind, why=why, several=kind == "steps" and any(len(_slid(run)) > SEVERAL for run in runs),
         modulations=modulations if kind == "oscillation" else {},
         durations={run.name: float(math.ceil(run.t[-1] - min(run.t[0], 0.0))) for run in runs},
     )  # fmt: skip
@@ -539,11 +539,10 @@ def _levels(V: np.ndarray) -> int:
     return int(np.sum(counts > 0.02 * V.size))
 
 
-def _first_velocity(run: Run) -> float:
-    """Return the first velocity of sliding (um/s); 1 where there is none."""
-    V = np.abs(run.drive(run.t))
-    sliding = NO_SLIDING * float(V.max()) < V
-    return float(V[int(np.argmax(sliding))]) or 1.0
+def _slid(run: Run) -> list[float]:
+    """Return the velocities of sliding (um/s) that a run is held at, one after the other."""
+    found = [V for _, V in levels(run)]
+    return [V for V in found if NO_SLIDING * max(found) < V]
 
 
 def _modulations(runs: Sequence[Run]) -> dict[str, tuple[float, float, float]]:
@@ -564,7 +563,7 @@ def _parameters(sketch: _Sketch, runs: Sequence[Run], registry: Registry) -> lis
     base, modifiers = registry.ageing(sketch.ageing)
     surface = registry.get("interface", wish.interface)
     listed: list[Parameter] = [p for each in (law, base, *modifiers, surface) for p in each.parameters]
-    V = float(np.median([_first_velocity(run) for run in runs]))
+    V = float(np.median([next(iter(_slid(run)), 1.0) for run in runs]))
     friction = [(run.observed * run.friction_factor(run.load(run.t)[0]))[run.used] for run in runs]
     mu = float(np.median(np.concatenate(friction)))
     lines = []

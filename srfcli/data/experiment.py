@@ -17,7 +17,7 @@ from srfcli.core.units import NO_GEOMETRY, Geometry, is_stress, same_dimension, 
 from srfcli.data.clock import Mask, Place, Sampling, find_sampling, kept_samples, sampling_notices
 from srfcli.data.columns import MOST_BYTES, Columns, open_source, read_columns
 from srfcli.data.description import Apparatus, Description, Node, RunDescription, ThresholdsDescription, read_description
-from srfcli.data.gauge import GaugeNoise, find_noise
+from srfcli.data.gauge import FEWEST_SAMPLES, GaugeNoise, find_noise
 from srfcli.data.groups import BY, TRENDS, grouped
 from srfcli.data.imposed import ACCIDENTS, LOADS, FoundModulation, check_start, drive_of, find_modulation, load_of
 from srfcli.data.noise import WIDEST_SPIKE, observable_jumps, quantisation, saturation, spikes, white_level
@@ -277,13 +277,13 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
             'Give the run load = "20 MPa", or the stiffness as friction per micron, in 1/um.',
         )
     drive, told = drive_of(run, columns)
-    load, weighed = load_of(run, columns)
+    units = _units(run, columns, apparatus)
+    load, weighed = load_of(run, columns, "MPa" if any(units.values()) else "N")
     check_start(run, drive, float(t[0]))
     role, *beside = [c.role for c in columns.channels.values() if c.role in OBSERVABLES | OTHER_OBSERVABLES]
     at_start = load.rest(float(t[0]))
     stiffness = apparatus.stiffness * (at_start if apparatus.per_load else 1.0)
     rise = np.abs(drive(t)) * per_elongation(role, stiffness, at_start)
-    units = _units(run, columns, apparatus)
     if len(set(units.values())) > 1:
         named = ", ".join(f"{what} is a {'stress' if stress else 'force'}" for what, stress in units.items())
         notices.append(Notice("unit", run.file.name, f"{named}: a stress counts as the force on 1 mm^2"))
@@ -456,12 +456,13 @@ def check_run(run: Run) -> RunCheck:
     x = np.interp(run.t, run.t[run.used], run.observed[run.used])
     absent = ~run.used
     for a, b in runs_of(~run.used):
-        absent[a : b + 1] = b - a >= WIDEST_SPIKE  # a few are bridged; a longer bridge would be taken for calm
+        absent[a : b + 1] = b - a >= WIDEST_SPIKE  # a few are bridged; in a longer bridge nothing is noise
     cut = 1 + np.union1d(np.flatnonzero(np.diff(sampling.at) | np.diff(absent)), sampling.gaps)
     pieces, noises = [*zip(np.split(x, cut), sampling.at[[0, *cut]], absent[[0, *cut]], strict=True)], []
     for k, dt in enumerate(sampling.spacings):
-        own = [(piece, missing) for piece, at, missing in pieces if at == k]
-        parts = [piece for piece, missing in own if not missing] or [piece for piece, _ in own]
+        parts = [piece for piece, at, missing in pieces if at == k and not missing]
+        if max(map(len, parts), default=0) < FEWEST_SAMPLES:  # a channel that is slower than the file: bridged after all
+            parts = [x[a : b + 1] for a, b in runs_of(sampling.at == k)]
         noises.append(find_noise(parts, dt, quantum=run.quantum, cycles=modulation.frequency * dt if modulation else None))
     noise = noises[int(np.argmax(np.bincount(sampling.at)))]
     load = LoadHistory(float(W.mean()), float(W.min()), float(W.max()), float(np.abs(W_dot / W).max()), modulation)

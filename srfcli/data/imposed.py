@@ -13,6 +13,7 @@ from scipy.linalg import solveh_banded
 
 from srfcli.codegen.model import Array
 from srfcli.core.errors import Notice, SrfError
+from srfcli.core.units import is_stress
 from srfcli.data.clock import Place, kept_samples
 from srfcli.data.columns import MOST_BYTES, Columns, Finder, open_source
 from srfcli.data.description import RunDescription
@@ -575,8 +576,8 @@ NO_CONTACT = 1e-15  # N: no contact
 SMALLEST_MODULATION = 5e-4  # relative amplitude of a modulation, at least: a servo varies the load by less
 
 
-def load_of(run: RunDescription, columns: Columns) -> tuple[Load, list[Notice]]:
-    """Return the load in a run's column, else the one that it states, and what is to be told of it."""
+def load_of(run: RunDescription, columns: Columns, unit: str) -> tuple[Load, list[Notice]]:
+    """Return the load in a run's column, else the one that it states, and what is to be told of it in N or MPa."""
     role = columns.role(*LOADS)
     if role is None:
         W0 = 1.0 if run.load is None else run.load
@@ -585,7 +586,6 @@ def load_of(run: RunDescription, columns: Columns) -> tuple[Load, list[Notice]]:
         f, eps, onset = run.modulation
         return Modulation(W0, eps, f, onset), []
     place, values = columns.place(role), columns.arrays[role]
-    unit = "MPa" if role == "normal_stress" else "N"
     load, notices = load_from_column(place, values, unit)
     first = load.rest(float(place.t[0]))
     if run.load is not None and abs(run.load - first) > DIFFERS * first:
@@ -791,5 +791,5 @@ def read_load(path: Path, *, registry: Registry, format: str | None = None) -> t
     rows = np.arange(1, t.size + 1)
     keep, notices = kept_samples(Place(path, time.heading, rows, t))
     place = Place(path, loads.heading, rows[keep], t[keep])
-    load, told = load_from_column(place, W[keep], "MPa" if loads.role == "normal_stress" else "N")
+    load, told = load_from_column(place, W[keep], "MPa" if is_stress(loads.unit) else "N")
     return load, place.t, (*notices, *told)

@@ -92,6 +92,7 @@ def augment(
     model: dict[str, object] = {"law" if kind == "friction" else kind: f"{kind}.toml" for kind in LAW_KINDS}
     model |= {"inertia": inertia} | ({"effects": effects} if effects else {})
     model |= {"vary": experiment.vary, "by": experiment.by} if experiment.vary else {}
+    model |= {"trend": experiment.trend} if experiment.trend else {}
     lines = toml_lines({"format": "srf-experiment/1", "title": title.strip()})
     tables = [("[apparatus]", rig), ("[model]", model)]
     tables.append(("[parameters]", {q.name: parameter_table(q, base if q.name == "K" else "") for q in listed}))

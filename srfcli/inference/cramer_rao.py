@@ -152,7 +152,7 @@ def _question(experiment: Experiment, checks: Sequence[RunCheck], registry: Regi
         share = stiffness_share(experiment, checks[0].run)
         free, widths = (*free, "K"), {**widths, "K": STIFFER * checks[0].run.stiffness / share}
     free = tuple(n for n in free if n in model.names)
-    return _Question(model, experiment, values, asked, free, widths, "slip" if apparatus else None)
+    return _Question(model, experiment, values, asked, free, widths, (experiment.trend or "slip") if apparatus else None)
 
 
 def _default(registry: Registry, interface: str, name: str) -> float:

@@ -1270,14 +1270,13 @@ def _with_faint_fields(fitted: StateSpaceFit, rough: Likelihood) -> StateSpaceFi
     prior = np.array([logs[0], *np.repeat(np.gradient(logs), len(SHORT)) / len(SHORT)])  # below the first it is as none
     evidence, moves, covariances = [_laplace(maximum.point, inner)[0]], [np.zeros(inner.size)], []
     covariances.append(maximum.covariance[np.ix_(inner, inner)])
-    too_wide: set[float] = set()  # lengths at which an amplitude was too unlikely to count: a larger one is more so
     for share, short in product(FAINT_FIELDS, SHORT):
         x = _under_field(rough, bare, share * FAINT_FIELD, short)
-        if short in too_wide or rough.at(x, slopes=False).log_likelihood < fitted.log_likelihood - DOWN:
-            too_wide.add(short)
-            height, move, covariance = -np.inf, np.zeros(inner.size), np.zeros((inner.size, inner.size))
-        else:
-            height, move, covariance = _laplace(rough.at(x), np.array(at))
+        likely = rough.at(x, slopes=False).log_likelihood > fitted.log_likelihood - DOWN
+        point = rough.at(x, slopes=likely)
+        if not likely:
+            point = replace(point, log_likelihood=-np.inf)
+        height, move, covariance = _laplace(point, np.array(at))
         evidence.append(height)
         moves.append(move)
         covariances.append(covariance)

@@ -631,7 +631,7 @@ class CampaignResult(Result):
         with plots.one_panel(None, title=title, size=(max(6.0, 1.0 + 0.3 * len(known)), 4.2)) as (figure, axes):
             place = range(len(known))
             values, errors = ([row[key] for row in known] for key in ("A_minus_B", "A_minus_B_stderr"))
-            errors = [e if e is not None and math.isfinite(e) else 0.0 for e in errors]
+            errors = [e if e is not None and math.isfinite(e) else math.nan for e in errors]
             axes.errorbar(place, values, yerr=[1.96 * e for e in errors], fmt="o", capsize=3, color=plots.COLOURS[0])
             axes.axhline(0.0, color="#555555", linestyle=plots.DOTTED)
             axes.set(xticks=list(place), ylabel="A − B, and 95 % intervals", xlabel="experiment")

@@ -134,7 +134,9 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     values = {**{q.name: q.value for q in experiment.parameters}, **result.values}
     varied = found.found.scatter  # of what varies the mean counts
     values |= {name: s.mean if s else float(np.mean([values[n] for n in problem.groups[name]])) for name, s in varied.items()}
-    parameters |= {row[0]: (row[1], _number(row[2]), row[4]) for row in (found.varied.rows if found.varied else ())}
+    for name, mean, error, _, unit, _ in found.varied.rows if found.varied else ():  # without an error where one is at its bound
+        shown = from_base(values[name], unit) if mean is None else mean
+        parameters[name] = (shown, _number(error), unit)
     place = {name: k for k, name in enumerate(result.names)}
     covariance = np.asarray(result.covariance)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from srfcli.codegen.c_source import GET_COMPILER, compiler
@@ -98,15 +99,14 @@ def diagnose(
                 raise SrfError(f"unknown effect '{name}'", did_you_mean(name, sorted(known)))
 
     def read(*, holdout: bool) -> Experiment:
-        if isinstance(experiment, Experiment):
-            return grouped(experiment, vary, by)
-        found = read_experiment(Path(experiment), registry=registry, format=reader, holdout=holdout)
-        return grouped(found, vary, by)
+        found = experiment
+        if not isinstance(found, Experiment):
+            found = read_experiment(Path(found), registry=registry, format=reader, holdout=holdout)
+        return replace(grouped(found, vary, by), trend=trend or found.trend)
 
     fitted = read(holdout=False).fitted()
-    trend = trend or fitted.trend
-    if not fitted.runs and (trend or vary):
-        raise SrfError(f"`{'trend' if trend else 'vary'}` is for recordings, and there are none", "Leave it out.")
+    if not fitted.runs and (fitted.trend or vary):
+        raise SrfError(f"`{'trend' if fitted.trend else 'vary'}` is for recordings, and there are none", "Leave it out.")
     if compiler() is None and fitted.runs:
         raise SrfError("srf diagnose needs a C compiler: it fits dozens of models", GET_COMPILER)
     stopped = searching = False
@@ -114,7 +114,7 @@ def diagnose(
     def told(text: str) -> None:
         progress(text, search.share if searching else None)
 
-    search = ModelSearch(registry, fitted, told, effects or None, trend)
+    search = ModelSearch(registry, fitted, told, effects or None, fitted.trend)
     searching = True
     try:
         search.run()
