@@ -72,7 +72,7 @@ def test_a_row_for_each_experiment_and_a_reason_for_those_without_a_fit() -> Non
 
 
 def test_of_what_varies_a_row_has_the_mean_and_says_so() -> None:
-    """Two runs whose B and mu0 may differ: neither is left empty, and A - B is not that of a start value."""
+    """Two runs whose B may differ: it is not left empty, and A - B is not that of a start value."""
     experiment("one", seed=1)
     text = Path("one/experiment.toml").read_text(encoding="utf-8").replace("inertia = false", 'inertia = false\nvary = ["B"]')
     run = text[text.index("[[runs]]") :]

@@ -109,17 +109,23 @@ def _variables(stream: BinaryIO, order: str) -> Iterator[_Variable]:
                 raise ValueError(f"no matrix in the element at byte {at}")
             data = data[8:]
         packed = kind == COMPRESSED
-        found = [_header(data, order)] if size else []
         if size and _class(data, order) == STRUCT:
             stream.seek(at + 8)
-            data = stream.read(size) if size <= LARGEST_STRUCT else b""
-            unpacked = zlib.decompressobj()
-            data = unpacked.decompress(data, LARGEST_STRUCT) if packed and data else data
-            whole = bool(data) and not (packed and unpacked.unconsumed_tail)
-            found = [*_fields(memoryview(data)[8 if packed else 0 :], order, left)] if whole else []
-        for name, shape, begin, is_complex in (f for f in found if f is not None):
+            found = [*_fields(_struct(stream, size, packed), order, left)]
+        else:
+            found = [f for f in [_header(data, order) if size else None] if f is not None]
+        for name, shape, begin, is_complex in found:
             yield _Variable(name, shape, at + 8, size, packed, begin + (8 if packed else 0), is_complex)
         at += 8 + size
+
+
+def _struct(stream: BinaryIO, size: int, packed: bool) -> memoryview:
+    """Return the matrix of a struct, whose element has `size` bytes from here on; nothing of one that is too large."""
+    data, rest = stream.read(size) if size <= LARGEST_STRUCT else b"", b""
+    if packed:
+        unpacked = zlib.decompressobj()
+        data, rest = unpacked.decompress(data, LARGEST_STRUCT)[8:], unpacked.unconsumed_tail
+    return memoryview(b"" if rest else data)
 
 
 def _fields(
@@ -129,6 +135,8 @@ def _fields(
 
     At most as many fields as are `left` in the file.
     """
+    if not data:
+        return
     _, _, place = _part(data, 0, order)
     _, sizes, place = _part(data, place, order)
     _, name, place = _part(data, place, order)

@@ -454,7 +454,7 @@ def check_run(run: Run) -> RunCheck:
     sampling, (W, W_dot) = run.sampling, run.load(run.t)
     modulation = find_modulation(run.t, W)
     x = np.interp(run.t, run.t[run.used], run.observed[run.used])
-    absent = ~run.used
+    absent = np.zeros(run.t.size, bool)
     for a, b in runs_of(~run.used):
         absent[a : b + 1] = b - a >= WIDEST_SPIKE  # a few are bridged; in a longer bridge nothing is noise
     cut = 1 + np.union1d(np.flatnonzero(np.diff(sampling.at) | np.diff(absent)), sampling.gaps)

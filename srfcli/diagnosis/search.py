@@ -156,7 +156,7 @@ class ModelSearch:
         trend: str | None = None,
     ) -> None:
         self.registry, self.whole, self.progress = registry, experiment, progress
-        self.trend = trend  # of every fit
+        self.trend = trend or experiment.trend  # of every fit
         self.experiment = experiment = replace(experiment, runs=thinned(experiment.runs))
         self.candidates, self.excluded = applicable(registry, experiment, effects)
         self.laws = [e.name for e in registry.entries("ageing") if effects is None or e.name in effects]

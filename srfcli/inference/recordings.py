@@ -107,13 +107,13 @@ def fit_recordings(
         raise SrfError(
             f"to fit several observables, as run '{beside}' has, does not go with `track` shared", "Leave `observables` out."
         )
-    experiment = grouped(experiment, vary, by)
+    experiment = grouped(experiment, vary, by, trend)
     if experiment.vary and track == "shared":
         raise SrfError("`vary` does not go with `track` shared", "Leave it out.")
     stability = open_model(registry, **asdict(experiment.choice), stability=True) if experiment.thresholds else None
     if not experiment.runs:
-        if vary or trend or track:
-            named = "vary" if vary else "trend" if trend else "track"
+        if vary or experiment.trend or track:
+            named = "vary" if vary else "trend" if experiment.trend else "track"
             raise SrfError(f"`{named}` is for recordings, and {experiment.path} has none", "Leave it out.")
         assert stability is not None
         model = stability
@@ -121,7 +121,7 @@ def fit_recordings(
         model = open_model(registry, **asdict(experiment.choice), random_field=True)
     if stability is not None and track == "shared":
         raise SrfError("`track` shared does not go with critical loads", "Leave it out, or name rough.")
-    problem = fit_problem(model, experiment, free=free, trend=trend, stability=stability)
+    problem = fit_problem(model, experiment, free=free, trend=experiment.trend, stability=stability)
     if track == "shared" and len(problem.runs) < 2:
         raise SrfError(
             f"`track` shared is for several runs, and {experiment.path} has one to fit", "Name rough, or leave it out."

@@ -260,6 +260,7 @@ class SampledLoad(Load):
         self.knots, self.coefficients, self.breaks = _build(t, values, self.noise)
         self._check_contact()
         self._knots, self._rows = self.knots.tolist(), self.coefficients.tolist()
+        self._longest: dict[tuple[float, float], float] = {}
 
     def _check_contact(self) -> None:
         """Raise SrfError where the load between two positive samples is not positive."""
@@ -270,6 +271,11 @@ class SampledLoad(Load):
             raise SrfError(f"the load between its samples falls to {middles.min():g} N near t = {at:g} s", "sample it finer")
 
     def longest_step(self, start: float, end: float) -> float:
+        if (start, end) not in self._longest:  # asked for at each evaluation of a likelihood
+            self._longest[start, end] = self._four_knots(start, end)
+        return self._longest[start, end]
+
+    def _four_knots(self, start: float, end: float) -> float:
         inside = self.knots[bisect_right(self._knots, start) - 1 : int(np.searchsorted(self.knots, end, side="left")) + 1]
         return float(4 * np.median(np.diff(inside))) if inside.size > 1 else math.inf
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from srfcli.codegen.c_source import GET_COMPILER, compiler
@@ -102,7 +101,7 @@ def diagnose(
         found = experiment
         if not isinstance(found, Experiment):
             found = read_experiment(Path(found), registry=registry, format=reader, holdout=holdout)
-        return replace(grouped(found, vary, by), trend=trend or found.trend)
+        return grouped(found, vary, by, trend)
 
     fitted = read(holdout=False).fitted()
     if not fitted.runs and (fitted.trend or vary):
@@ -114,7 +113,7 @@ def diagnose(
     def told(text: str) -> None:
         progress(text, search.share if searching else None)
 
-    search = ModelSearch(registry, fitted, told, effects or None, fitted.trend)
+    search = ModelSearch(registry, fitted, told, effects or None)
     searching = True
     try:
         search.run()

@@ -244,7 +244,7 @@ def fit(
     if sample:
         experiment.check_recorded("of which a posterior is drawn")
     found = fit_recordings(
-        registry, experiment, free=free, trend=trend or experiment.trend, vary=vary, by=by, prior=prior, track=track,
+        registry, experiment, free=free, trend=trend, vary=vary, by=by, prior=prior, track=track,
         ask_shared=not (profile or sample), starts=starts, seed=seed, progress=lambda text: progress("fit", text, None),
     )  # fmt: skip
     status = found.status
