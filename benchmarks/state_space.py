@@ -78,6 +78,8 @@ def one(task: tuple[int, float, bool, str]) -> dict[str, object]:
 
     if without == "ridges":
         state_space.RIDGE_REACH = 0.0
+    if without == "scans":
+        state_space.PEAK = np.inf
     if without == "weights":
         state_space.WIDTHS = ()
     if without == "faint":
@@ -99,7 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--repeats", type=int, default=50)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--without", choices=("ridges", "weights", "faint"), default="")
+    parser.add_argument("--without", choices=("ridges", "scans", "weights", "faint"), default="")
     parser.add_argument("--only-print", action="store_true")
     asked = parser.parse_args()
     if not asked.only_print:

@@ -43,6 +43,7 @@ from srfcli.inference.state_space import (
     mass_at_bounds,
     maximise,
     processes_in,
+    scan_narrow,
     thinned,
     with_less_colour,
 )
@@ -172,6 +173,8 @@ class ModelSearch:
         """Return a model fitted from where its parent stands, and judged; the baseline from the file's own start values."""
         hypothesis = move.hypothesis if move else Hypothesis()
         options = {"processes": _colours(move.values) if move else None, "cautious": True, **self.options}
+        if move:
+            options["least"] = self.baseline.fit.log_likelihood - ASTRAY
 
         def fitted(values: dict[str, float] | None) -> StateSpaceFit:
             return self._state_space(self._problem(hypothesis, values or {}), start=values, beside=False, **options)
@@ -375,9 +378,7 @@ class ModelSearch:
                 continue
             self._revise(move, found)
             if found is self.best() and not found.passes and not move.again:
-                again = self._restart(found)
-                if again:
-                    heapq.heappush(self.queue, again)
+                self._restart(found)
 
     def _revise(self, move: _Move, found: Fitted) -> None:
         """Raise what is expected of effects that are like a fitted one at first order by what that gained beyond its promise."""
@@ -524,22 +525,35 @@ class ModelSearch:
             sizes = (*self._sizes(node), {own[0]: values[own[0]]})
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(values), sizes))
 
-    def _restart(self, node: Fitted) -> _Move | None:
-        """Return a model that fails a test, to be fitted anew where its fit may have ended in a false maximum.
+    def _restart(self, node: Fitted) -> None:
+        """Fit a model that fails a test anew where its fit may have ended in a false maximum.
 
-        From another size of what is built in where that is likelier, else from where it stands, under a wider field, if a part of
-        the recordings is off that neither the field nor coloured noise has taken up.
+        At once from where a scan of a parameter leads, or another size of what is built in, if that is likelier. Else it is
+        pushed, to be fitted from where it stands, under a wider field, if a part of the recordings is off that neither the field
+        nor coloured noise has taken up.
         """
-        best, found = node.fit.maximum, self._resized(node)
-        gain = found.log_likelihood - node.fit.log_likelihood if found else 0.0
-        if not gain > NEEDED:
-            if correlated(best.point) > DEVIATION or field_share(node.fit) > 1 or best.away > NOT_CONVERGED:
-                return None
-            found, gain = best.point, 0.0
-        assert found is not None
+        best, found = node.fit.maximum, self._scanned(node) or self._resized(node)
+        likelier = found is not None and found.log_likelihood > node.fit.log_likelihood + NEEDED
+        if not likelier and (correlated(best.point) > DEVIATION or field_share(node.fit) > 1 or best.away > NOT_CONVERGED):
+            return
         self.count += 1
-        values = dict(found.values)
-        return _Move(-(node.evidence + gain + WORTH), self.count, node.hypothesis, values, self._sizes(node, values), again=True)
+        values = dict(found.values if found and likelier else best.point.values)
+        sizes = self._sizes(node, values)
+        move = _Move(-(node.evidence + WORTH), self.count, node.hypothesis, values, sizes, again=True)
+        if likelier:
+            self._record(self.fit(move))
+        else:
+            heapq.heappush(self.queue, move)
+
+    def _scanned(self, node: Fitted) -> Point | None:
+        """Return the likeliest point that scans of parameters with narrow maxima lead to, None where it is no likelier."""
+        if not self.experiment.runs:
+            return None
+        problem, best = node.fit.likelihood.problem, node.fit.maximum.point
+        likelihood = Likelihood(problem, processes=node.fit.likelihood.processes, rtol=SEARCH_RTOL)
+        begun = likelihood.at(likelihood.coordinates(_followable(best.values, problem)))
+        found = scan_narrow(likelihood, begun, self.progress)
+        return found.point if found and found.point.log_likelihood > best.log_likelihood + NEEDED else None
 
     def _resized(self, node: Fitted) -> Point | None:
         """Return the likeliest point from other sizes of what is built in, the other parameters fitted under each.
@@ -555,9 +569,9 @@ class ModelSearch:
         trials, values = [], _followable(node.fit.values, likelihood.problem)
         for ratio in np.geomspace(1 / RESIZED_BY, RESIZED_BY, AGAIN):
             y = likelihood.coordinates({**values, name: values[name] * ratio})
-            trials.append(maximise(likelihood, y, held=[name], steps=12, close=1.0, widths=(), progress=self.progress))
+            trials.append(maximise(likelihood, y, held=[name], steps=STRIDES // 2, close=1.0, widths=(), progress=self.progress))
         likeliest = max(trials, key=lambda f: f.point.log_likelihood)
-        return maximise(likelihood, likeliest.point.x, steps=12, close=1.0, widths=(), progress=self.progress).point
+        return maximise(likelihood, likeliest.point.x, steps=STRIDES, close=1.0, widths=(), progress=self.progress).point
 
     def _refit_noise(self, base: Fitted) -> None:
         """Fit the best model with all the gauge noise that it wants, and the baseline and what else comes close with the same."""

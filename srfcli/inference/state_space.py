@@ -73,10 +73,14 @@ MOST_WORK = 5  # times the steps of integration of the point before, after which
 WIDTHS = (0.1, 0.03, 0.01)  # of each parameter, within which a reading's derivatives are to hold, one after the other
 WIDEST_ERRORS = 1000.0  # times that width, in standard errors: what readings tell sharply together may still be uncertain
 WEIGHT_ROUNDS = 12  # of weights and standard errors, each from the other
+FAR_PROBE = 50.0  # standard errors of a parameter at which innovations move by less than derivatives want, if it oscillates
+PEAK = 40.0  # in log likelihood: the height of a narrow maximum from which it is looked for
+SCAN_REACH = 0.36  # of a parameter, in its logarithm, to either side: start values are 30 % off
+PEAKS, PEAK_STEPS = 3, 3  # of a scan that are looked at closer, and the steps of scoring that the other parameters then have
 PROBE = 10.0  # standard errors along a ridge, at which the likelihood is asked for
-LOST_CURVATURE = 0.5  # share of what its curvature loses there, below which there are other maxima
-RIDGE_STRIDE, RIDGE_REACH = 0.05, 0.5  # of a parameter: strides along its ridge, and how far they go
-DOWN = 10.0  # in log likelihood, by how much less a stride may find than the best on its side, and be followed
+LOST_CURVATURE = 0.5  # share of what derivatives want at a probe, below which there are other maxima
+RIDGE_STRIDE, RIDGE_REACH = 0.05, 0.5  # of a parameter, where maxima beside one are looked for, and how far a probe may go
+DOWN = 10.0  # in log likelihood, by how much less likely than without a field a faint one may be and be averaged over
 NEIGHBOUR_STEPS = (16, 64)  # of two standard errors to either side, least and most, in which other maxima are looked for
 HOPS = 4  # from one maximum to a likelier one beside it
 FLAT = 1e-8  # of the scaled information: a direction that is flatter has a score of rounding alone
@@ -1076,6 +1080,7 @@ def fit_state_space(
     cautious: bool = False,
     thorough: bool = True,
     beside: bool = True,
+    least: float = -np.inf,
     close: float = CONVERGED,
     rtol: float = FILTER_RTOL,
     progress: Callable[[str], None] = lambda text: None,
@@ -1089,7 +1094,7 @@ def fit_state_space(
     of coloured noise the gauge has, words of PROCESSES; left out, Schwarz's criterion decides, early and, if the fit is to be
     `thorough`, again at the maximum; where it is `cautious`, more than one only if innovations are correlated all along, as those
     of a model that lacks something are not. `beside` says whether maxima next to that found are looked for
-    (`likeliest_beside`). The status is that of the last maximisation.
+    (`likeliest_beside`). What stays below `least` in log likelihood is not finished. The status is that of the last maximisation.
     """
     tried: list[Likelihood] = []
 
@@ -1109,7 +1114,7 @@ def fit_state_space(
         elif part is not None and part.maximum.status is not Status.INTEGRATION:
             found = _on_all(part, likelihood, **choice)
         else:
-            found = _fitted(likelihood, start or {}, thorough=thorough, beside=beside, **choice)
+            found = _fitted(likelihood, start or {}, thorough=thorough, beside=beside, least=least, **choice)
         found = _surveyed(found, close, progress) if problem.tables else found
         return replace(found, evaluations=sum(own.evaluations for own in tried) + (part.evaluations if part else 0))
     except KeyboardInterrupt as error:
@@ -1197,6 +1202,7 @@ def _fitted(
     cautious: bool,
     thorough: bool,
     beside: bool,
+    least: float,
     close: float,
     progress: Callable[[str], None],
 ) -> StateSpaceFit:
@@ -1220,14 +1226,18 @@ def _fitted(
     assert found is not None
     if fresh and found.away >= 1.0 and found.status is not Status.INTEGRATION:
         found = maximise(wide, found.point.x, steps=SCORING_STEPS // 2, close=1.0, progress=progress)
+    if fresh and found.status is not Status.INTEGRATION:
+        found = scan_narrow(wide, found.point, progress) or found
     best = StateSpaceFit(wide, found)
     if found.status is Status.INTEGRATION:
         return best
+    if found.point.log_likelihood < least:
+        found = maximise(wide, found.point.x, close=close, progress=progress) if np.isinf(found.away) else found
+        best = StateSpaceFit(wide, found)
+        if found.point.log_likelihood < least:
+            return best
     # under a field the filter stays with whatever is slow: what is correlated then is the gauge's noise
     best = first = _with_colour(best, likelihood, progress, cautious) if processes is None else best
-    walked = fresh and best.maximum.away < 1.0
-    if walked:
-        best = replace(best, maximum=_along_ridges(best.likelihood, best.maximum, 1.0, progress))
     best = _with_or_without(best, smooth, likelihood, close, progress)
     if thorough and processes is None:
         moved = best.smooth or best.log_likelihood > first.log_likelihood + NEEDED
@@ -1249,7 +1259,6 @@ def _fitted(
                 other = StateSpaceFit(instead, own)
             best = other if other.criterion > best.criterion else best
     if fresh:
-        best = best if walked else replace(best, maximum=_along_ridges(best.likelihood, best.maximum, close, progress))
         best = likeliest_beside(best, close, progress) if beside else best
     if fresh and smooth is None and best.smooth:
         best = _with_faint_fields(best, likelihood(False, best.likelihood.processes))
@@ -1351,31 +1360,70 @@ def _along(likelihood: Likelihood, maximum: Maximum, j: int, d: float) -> Point:
     return likelihood.at(x, slopes=False, like=maximum.point)
 
 
-def _along_ridges(likelihood: Likelihood, maximum: Maximum, close: float, progress: Callable[[str], None]) -> Maximum:
-    """Return the maximum at the likeliest place that strides along ridges find, the other parameters fitted at each."""
-    for j in _ridges(likelihood, maximum):
-        maximum = _walked(likelihood, maximum, j, close, progress)
-    return maximum
+def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], None]) -> Maximum | None:
+    """Return the likeliest maximum that scans of single parameters find, from a point near one; None where it is no likelier.
+
+    Readings of an oscillation that has gone round many times since it began have a narrow maximum at the parameter that makes
+    its frequency, and nothing leads there. Under a wide field it is where it is whatever the other parameters are, so that they
+    stay where they are while the readings of one run are asked.
+    """
+    x = begun.x.copy()
+    amplitude = likelihood.names.index("field_amplitude")
+    x[amplitude] = max(x[amplitude], _under_field(likelihood, x, WIDE[0], SHORT[0])[amplitude])
+    point, highest = likelihood.at(x), begun.log_likelihood + NEEDED
+    found: Maximum | None = None
+    for j in np.nonzero(np.diag(point.information)[: len(likelihood.problem.names)] > 0)[0].tolist():
+        narrow = _narrow(likelihood, point, j)
+        if narrow is None:
+            continue
+        run, half = narrow
+        reach, name = SCAN_REACH * _size(likelihood, point, j), likelihood.names[j]
+        low, high = max(point.x[j] - reach, likelihood.lower[j]), min(point.x[j] + reach, likelihood.upper[j])
+        points = np.tile(point.x, (int((high - low) / half) + 2, 1))
+        points[:, j] = np.linspace(low, high, len(points))
+        here = likelihood.filtered(run, point.values)
+        most = MOST_WORK * here.found.steps
+        told = np.array([likelihood.filtered(run, likelihood.values(y), most=most).log_likelihood for y in points])
+        summit = told >= np.maximum(np.append(told[1:], -np.inf), np.append(-np.inf, told[:-1]))
+        likely = np.nonzero(summit & (told > max(here.log_likelihood + NEEDED, told.max() - PEAK / 2)))[0]
+        tops = [maximise(likelihood, points[k], held=[name], steps=PEAK_STEPS, widths=()).point for k in likely[:PEAKS]]
+        if tops:
+            top = max(tops, key=lambda p: p.log_likelihood)
+            other = maximise(likelihood, top.x, steps=SCORING_STEPS // 2, close=1.0, widths=())
+            height = other.point.log_likelihood
+            progress(f"log likelihood {height:.1f} by a scan of {name}, {begun.log_likelihood:.1f} before")
+            if height > highest:
+                found, point, highest = other, top, height
+    return found
 
 
-def _walked(likelihood: Likelihood, maximum: Maximum, j: int, close: float, progress: Callable[[str], None]) -> Maximum:
-    stride = RIDGE_STRIDE * _size(likelihood, maximum.point, j)
-    column = maximum.covariance[:, j] / maximum.covariance[j, j]
-    best = maximum.point
+def _narrow(likelihood: Likelihood, point: Point, j: int) -> tuple[Run, float] | None:
+    """Return the part of a run that shows a maximum of parameter j which no derivative leads to, and half the width of that.
+
+    Innovations then move by less than derivatives want when the parameter goes far: two oscillations that are out of step differ
+    by no more than themselves. Half of how far they move, squared, is the height of the maximum; the part of the run is as long
+    as shows four times the least one.
+    """
+    reach = FAR_PROBE / np.sqrt(point.information[j, j])
+    probes: list[Point] = []
     for side in (1, -1):
-        x, top = maximum.point.x, maximum.point.log_likelihood
-        for _ in range(int(RIDGE_REACH / RIDGE_STRIDE)):
-            x = np.clip(x + side * stride * column, likelihood.lower, likelihood.upper)
-            there = maximise(likelihood, x, held=[likelihood.names[j]], steps=2, widths=()).point
-            if not there.log_likelihood > top - DOWN:
-                break
-            x, top = there.x, max(top, there.log_likelihood)
-            best = max(best, there, key=lambda p: p.log_likelihood)
-    if best is maximum.point:
-        return maximum
-    found = maximise(likelihood, best.x, close=close, widths=(), progress=progress)
-    progress(f"log likelihood {found.point.log_likelihood:.1f} along a ridge from {maximum.point.log_likelihood:.1f}")
-    return max(maximum, found, key=lambda m: m.point.log_likelihood)
+        y = point.x.copy()
+        y[j] += side * reach
+        if likelihood.lower[j] <= y[j] <= likelihood.upper[j]:
+            probes.append(likelihood.at(y, slopes=False, like=point))
+    if not probes or not all(np.isfinite(probe.log_likelihood) for probe in probes):
+        return None
+    most, found = 2 * PEAK, None
+    for at, (f, (places, a, _)) in enumerate(zip(point.runs, _slopes(likelihood, point), strict=False)):
+        moves = [(probe.runs[at].every.nu - f.every.nu)[f.used] ** 2 / f.every.S[f.used] for probe in probes]
+        moved = max(moves, key=lambda own: float(np.sum(own)))
+        told = a[:, places.index(j)] ** 2 if j in places else np.zeros_like(moved)
+        if most < np.sum(moved) < LOST_CURVATURE * np.sum(told) * reach**2:
+            most = float(np.sum(moved))
+            few = min(int(np.searchsorted(np.cumsum(moved), 8 * PEAK)) + 1, moved.size)
+            readings = int(f.used[few - 1]) // len(f.run.signals) + 1
+            found = f.run.part(slice(None, readings)), float(np.sqrt(np.sum(moved[:few]) / (2 * np.sum(told[:few]))))
+    return found
 
 
 def _beside(likelihood: Likelihood, maximum: Maximum, j: int) -> tuple[Point, Array]:
@@ -1577,9 +1625,12 @@ def _with_or_without(
     best = StateSpaceFit(rough, found)
     if smooth is False:
         return best
-    lost = found.point.log_likelihood - HOPELESS
-    if smooth or (tried is None and plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood > lost):
-        tried = bare(SCORING_STEPS)
+    if tried is None:
+        there = plain.at(plain.coordinates(found.point.values), slopes=False).log_likelihood
+        if smooth or there > found.point.log_likelihood - HOPELESS:
+            tried = bare(SCORING_STEPS)
+        elif found.point.x[at] < faint:  # an oscillation is integrated more closely, so that its narrow maximum is next to this
+            tried = bare(BARE_STEPS)
     if tried is None or not (smooth or tried.log_likelihood > best.log_likelihood - NEEDED):
         return best
     if tried.maximum.away < close:
