@@ -45,6 +45,7 @@ from srfcli.inference.state_space import (
     processes_in,
     scan_narrow,
     thinned,
+    wide_starts,
     with_less_colour,
 )
 from srfcli.laws.registry import Registry
@@ -68,7 +69,6 @@ BUILT = 16  # sizes of what is built in, a mass or an interface, that are tried
 RESIZED_BY = 2.5  # by what factor a size that is built in is changed, at most, where the model fails a test
 AGAIN = 9  # of them, about the best, whose other parameters are fitted too where the model fails a test: 26 % apart
 STRIDES = 12  # steps of another ageing law from the file's own start values, or on from where it promises to be likelier
-FIELDS = (1.0, 3.0, 10.0, 30.0)  # of the field of the model beside, under which the file's own start values are followed
 HINT = 4.0  # gain in log likelihood from which an effect is fitted where what is random may have taken it up: p = 0.005
 FOLLOWED = 0.3  # least amplitude of the field from which an extended model is fitted, over that from which a baseline is
 
@@ -658,13 +658,10 @@ class ModelSearch:
             heapq.heappush(self.queue, _Move(-expected, self.count, hypothesis, dict(found.point.values), ()))
 
     def _at_the_file(self, likelihood: Likelihood, hypothesis: Hypothesis, values: Mapping[str, float]) -> Array:
-        """Return the file's own start values under the gauge noise of `values` and the likeliest of a few fields."""
+        """Return the file's own start values under the gauge noise of `values` and the likeliest of a few wide fields."""
         own = likelihood.beside(self._problem(hypothesis, {}))
-        around = {name: value for name, value in values.items() if name not in own.problem.names}
-        narrow = _followable(around, own.problem)
-        fields = [{**around, **{n: narrow[n] for n in FIELD}, FIELD[0]: w * narrow[FIELD[0]]} for w in FIELDS]
-        starts = [own.coordinates(values) for values in fields]
-        return max(starts, key=lambda x: own.at(x, slopes=False).log_likelihood)
+        noise = {n: v for n, v in values.items() if n not in own.problem.names and n not in FIELD}
+        return next(iter(wide_starts(own, noise, self.progress)), own.coordinates(noise))
 
     def _where_effects_act(self) -> None:
         """Fit the best model with its effects in all runs where one acts in one, and in one where the others do not need it.

@@ -1220,7 +1220,7 @@ def _fitted(
                 break
         return found
 
-    found = from_any(_widest(wide, start, progress))
+    found = from_any(wide_starts(wide, start, progress))
     if found is None or (fresh and found.status is Status.INTEGRATION):
         found = from_any(_elsewhere(wide, wide.coordinates(start), progress))
     assert found is not None
@@ -1732,7 +1732,7 @@ def _under_field(rough: Likelihood, x: Array, wide: float, short: float) -> Arra
     return found
 
 
-def _widest(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> list[Array]:
+def wide_starts(rough: Likelihood, start: Mapping[str, float], progress: Callable[[str], None]) -> list[Array]:
     """Return x at `start` under a few wide fields, the likeliest first: there the filter stays with the recording."""
     x = rough.coordinates(start)
     if "field_amplitude" in start:
