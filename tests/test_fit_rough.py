@@ -197,6 +197,8 @@ def test_an_experiment_says_itself_what_a_fit_of_many_steps_needs(ladder, tmp_pa
     Path("experiment.toml").write_text(text, encoding="utf-8")
     told.append(CliRunner().invoke(cli, ["fit", ".", "--track", "smooth", "--csv"]).stdout)
     assert told[0] == told[1] and "simulated-6.trend" in told[0] and "mu0[simulated-6]" in told[0]
+    done = CliRunner().invoke(cli, ["fit", ".", "--track", "smooth", "--csv", "--trend", "none"])
+    assert done.exit_code == 0 and "simulated-6.trend" not in done.stdout and "mu0[simulated-6]" in done.stdout
 
 
 def test_segments_that_do_not_rise_are_refused(ladder, tmp_path):

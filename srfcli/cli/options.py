@@ -588,8 +588,8 @@ def vary_options(function: F) -> F:
     by = click.option("--by", type=click.Choice(ways), help="Groups of --vary; unless given, those of the experiment, else runs.")
     text = "Parameters, or noise, with a value of their own in each group that --by names, else in each run."
     vary = click.option("--vary", multiple=True, metavar="NAMES", help=text)
-    text = "Let each run's observable drift with slip or time; unless given, as the experiment says."
-    trend = click.option("--trend", type=click.Choice(["slip", "time"]), help=text)
+    text = "Let each run's observable drift with slip or time, or not; unless given, as the experiment says."
+    trend = click.option("--trend", type=click.Choice(["slip", "time", "none"]), help=text)
     return trend(vary(by(function)))
 
 

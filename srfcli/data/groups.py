@@ -24,11 +24,11 @@ FEWEST_OF_RUN = 8  # samples of a run
 def grouped(experiment: Experiment, vary: Sequence[str] = (), by: str | None = None, trend: str | None = None) -> Experiment:
     """Return the experiment with what varies, by what, and along what its observables drift; left out, as it says itself.
 
-    By segment or direction, its runs are cut between the steps of their velocities; a stroke of a reciprocating drive is not.
+    A trend of "none" takes that of the experiment back. By segment or direction, its runs are cut between the steps of their
+    velocities; a stroke of a reciprocating drive is not.
     """
-    chosen = replace(
-        experiment, vary=tuple(vary) or experiment.vary, by=by or experiment.by, trend=trend or experiment.trend
-    )  # fmt: skip
+    drift = None if trend == "none" else trend or experiment.trend
+    chosen = replace(experiment, vary=tuple(vary) or experiment.vary, by=by or experiment.by, trend=drift)
     strokes = chosen.by == "direction" and any(run.backward for run in experiment.runs)
     if chosen.by not in CUT or experiment.by in CUT or strokes:  # what is cut already stays as it is
         return chosen

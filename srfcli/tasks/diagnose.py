@@ -45,8 +45,8 @@ def diagnose(
         A folder with experiment.toml, or that file: its held-out recordings are opened only when the models are final.
     effects : sequence of str
         Effects, or ageing laws, to look for; all that are registered if left out.
-    trend : {'slip', 'time'}, optional
-        Let each run's observable drift; as the experiment says if left out.
+    trend : {'slip', 'time', 'none'}, optional
+        Let each run's observable drift, or not; as the experiment says if left out.
     vary : sequence of str
         Free parameters, or "noise" of the gauge, with a value of their own in each group of runs; as the experiment says if
         left out.

@@ -168,8 +168,8 @@ def fit(
         A folder with experiment.toml, or that file; or from `srfcli.read_experiment`, which also takes a reader and plugins.
     free : sequence of str, optional
         Parameters to fit; those that the experiment leaves free if left out.
-    trend : {'slip', 'time'}, optional
-        Let each run's observable drift; as the experiment says if left out.
+    trend : {'slip', 'time', 'none'}, optional
+        Let each run's observable drift, or not; as the experiment says if left out.
     vary : sequence of str
         Free parameters, or "noise" of the gauge, with a value of their own in each group of runs, B in a run up is B[up]; as
         the experiment says if left out.
