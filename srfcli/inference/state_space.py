@@ -161,10 +161,13 @@ class Filtered:
 
     @property
     def slopes(self) -> tuple[Array, Array]:
-        """Return the derivatives (m, k) of innovations over their standard deviations, and of the variances' logarithms."""
+        """Return the derivatives (m, k) of innovations over their standard deviations, and of the variances' logarithms.
+
+        Not finite where the motion could not be followed.
+        """
         used, f = self.used, self.every
         S = f.S[used][:, None]
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             return f.nu_d[used] / np.sqrt(S), f.S_d[used] / S
 
     @property

@@ -268,7 +268,7 @@ class SampledLoad(Load):
         middles = (self.coefficients * half[:, None] ** np.arange(DEGREE + 1)).sum(axis=1)
         if middles.min() <= 0:
             at = self.knots[int(middles.argmin())]
-            raise SrfError(f"the load between its samples falls to {middles.min():g} N near t = {at:g} s", "sample it finer")
+            raise SrfError(f"the load between its samples falls below zero near t = {at:g} s", "sample it finer")
 
     def longest_step(self, start: float, end: float) -> float:
         if (start, end) not in self._longest:  # asked for at each evaluation of a likelihood
