@@ -10,6 +10,7 @@ Best-first search: Pearl, Heuristics, 1984; Laplace's method: Kass and Raftery, 
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -540,10 +541,11 @@ class ModelSearch:
         values = dict(found.values if found and likelier else best.point.values)
         sizes = self._sizes(node, values)
         move = _Move(-(node.evidence + WORTH), self.count, node.hypothesis, values, sizes, again=True)
-        if likelier:
-            self._record(self.fit(move))
-        else:
+        if not likelier:
             heapq.heappush(self.queue, move)
+            return
+        with contextlib.suppress(SrfError):  # else it stays as it was
+            self._record(self.fit(move))
 
     def _scanned(self, node: Fitted) -> Point | None:
         """Return the likeliest point that scans of parameters with narrow maxima lead to, None where it is no likelier."""

@@ -1389,7 +1389,8 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
         told = np.array([likelihood.filtered(run, likelihood.values(y), most=most).log_likelihood for y in points])
         summit = told >= np.maximum(np.append(told[1:], -np.inf), np.append(-np.inf, told[:-1]))
         likely = np.nonzero(summit & (told > max(here.log_likelihood + NEEDED, told.max() - PEAK / 2)))[0]
-        tops = [maximise(likelihood, points[k], held=[name], steps=PEAK_STEPS, widths=()).point for k in likely[:PEAKS]]
+        likely = likely[np.argsort(-told[likely])][:PEAKS]
+        tops = [maximise(likelihood, points[k], held=[name], steps=PEAK_STEPS, widths=()).point for k in likely]
         if tops:
             top = max(tops, key=lambda p: p.log_likelihood)
             other = maximise(likelihood, top.x, steps=SCORING_STEPS // 2, close=1.0, widths=())
