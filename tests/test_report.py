@@ -319,7 +319,7 @@ def test_no_name_breaks_out_of_the_page(tmp_path: Path) -> None:
 def test_two_runs_whose_names_make_one_file_name_keep_both_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "figure_bytes", lambda figure, suffix: f"{figure}{suffix}".encode())
     monkeypatch.setattr(report_figures, "overview", lambda traces, narrow=False: None)
-    monkeypatch.setattr(report_figures, "scan_figure", lambda rows, narrow=False: None)
+    monkeypatch.setattr(report_figures, "scan_figure", lambda rows, load_unit, narrow=False: None)
     monkeypatch.setattr(report_figures, "run_figure", lambda one, narrow=False: one.name)
     material = made_material("none")
     empty = made_run("empty") | {"used": np.zeros(900, dtype=bool)}  # nothing to draw
@@ -442,13 +442,15 @@ def test_the_residual_scan_is_read_in_the_order_of_its_p_values() -> None:
     rows = [{"axis": axis, "run": "", "kind": "mean", "low": low, "high": high, "log_p": log_p, "p_value": p}
             for axis, low, high, log_p, p in (("v", 1.0, 2.0, -230.2585, 1e-90), ("v", 2.0, 3.0, -23.0, 1e-3),
                                               ("v", 3.0, 4.0, -1.0, 0.9), ("frequency", 119.5, 120.5, -50.0, 0.5))]  # fmt: skip
-    found = spots(rows)
+    found = spots(rows, "MPa")
     assert [round(s.height, 2) for s in found] == [100.0, 21.71, 9.99, 0.43]
     assert [s.place.replace("\u00a0", " ") for s in found[:2]] == ["1.00 to 2.00 µm/s", "120 Hz"]
     assert [s.sure for s in found] == [True, False, True, False]
     assert [s.axis for s in foremost(found, each=1)] == ["v", "frequency"]
-    (edge,) = spots([rows[0] | {"axis": "dlnW/dt", "low": -4.5e-15, "high": 35.8}])
+    (edge,) = spots([rows[0] | {"axis": "dlnW/dt", "low": -4.5e-15, "high": 35.8}], "MPa")
     assert edge.place.startswith("0 to 35.8")  # an end that rounding alone keeps from zero
+    (load,) = spots([rows[0] | {"axis": "W", "low": 58.0, "high": 72.0}], "MPa")
+    assert load.place.replace("\u00a0", " ") == "58.0 to 72.0 MPa"
 
 
 def test_command_lines_are_quoted_and_name_the_laws_that_there_are() -> None:

@@ -182,7 +182,8 @@ class DiagnosisResult(Result):
             for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
                 row[key] = row[key] and row[key] * factor
         stiffness, unit = experiment.shown_stiffness
-        made["stated"] = {"stiffness": f"{stiffness:.4g} {unit_text(unit)}"}
+        made["stated"] = {"stiffness": f"{stiffness:.4g} {unit_text(unit)}", "ageing": experiment.choice.ageing}
+        made["laws"] = sorted({ranked.hypothesis.ageing for ranked in self.diagnosis.ranked} - {""})
         effects = [effect for ranked in self.diagnosis.ranked for effect in ranked.hypothesis.effects]
         made["own"] = {effect.reported: [*(p.name for p in effect.parameters), *effect.frees] for effect in effects}
         return made

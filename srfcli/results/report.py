@@ -71,6 +71,11 @@ class Matter:
         return self.material.get(name) or ()
 
     @property
+    def load_unit(self) -> str:
+        """Return the unit of the runs' loads, N or MPa."""
+        return self.traces[0].load_unit if self.traces else "N"
+
+    @property
     def fitted(self) -> list[report_figures.Trace]:
         """Return the fitted runs, those with the largest part of the misfit first."""
         shares = {r["name"]: r.get("share") or 0.0 for r in self.located}
@@ -205,7 +210,7 @@ def _location_sentences(matter: Matter) -> list[str]:
 
 def _frequencies(matter: Matter, narrow: Sequence[float]) -> list[str]:
     """Return where in frequency the misfit is, the strongest place of the table and the figure first."""
-    seen = [s for s in report_figures.spots(matter.rows("residual_scan")) if s.axis == "frequency" and s.sure]
+    seen = [s for s in report_figures.spots(matter.rows("residual_scan"), matter.load_unit) if s.axis == "frequency" and s.sure]
     if not seen:
         return []
     low, high = seen[0].low, seen[0].high
@@ -242,7 +247,7 @@ def _run(matter: Matter, one: report_figures.Trace) -> Markup:
 
 def residual_scan(matter: Matter) -> Markup:
     """Return the residual scan: phases, frequencies and quantities of state that the misfit goes with."""
-    found = report_figures.spots(matter.rows("residual_scan"))
+    found = report_figures.spots(matter.rows("residual_scan"), matter.load_unit)
     if not found:
         return Markup("")
     rows = [
@@ -573,15 +578,15 @@ def _drawings(matter: Matter) -> Iterator[Drawing]:
         yield f"run {one.name}", partial(report_figures.run_figure, one)
     for loads in matter.rows("thresholds"):
         yield f"loads {loads['name']}", partial(report_figures.loads_figure, loads)
-    yield "residual-scan", partial(report_figures.scan_figure, matter.rows("residual_scan"))
+    yield "residual-scan", partial(report_figures.scan_figure, matter.rows("residual_scan"), matter.load_unit)
     if not matter.same:
         yield "parameters", partial(report_figures.parameters_figure, matter.rows("parameters"))
     force = matter.material.get("force") or {}
     runs = {str(k): v for k, v in force.items() if isinstance(v, Mapping) and "t" in v}
     for name, one_force in runs.items():
-        yield f"force {name}", partial(report_figures.force_figure, name, one_force)
+        yield f"force {name}", partial(report_figures.force_figure, name, one_force, matter.load_unit)
     if runs:
-        yield "force-by-state", partial(report_figures.force_by_state, runs)
+        yield "force-by-state", partial(report_figures.force_by_state, runs, matter.load_unit)
     if matter.material.get("diagram"):
         yield "diagram", partial(report_figures.diagram_figure, matter.material["diagram"])
 

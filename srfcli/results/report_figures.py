@@ -393,7 +393,7 @@ SIGNIFICANT = 0.01  # of the p-value adjusted for all that was looked at
 WIDE_AXIS = 100.0  # ratio from which an axis is logarithmic
 APART = ("run", "window")  # axes that the figures of the runs show
 
-# name: what it is in words, its unit
+# name: what it is in words, its unit; that of a load is the recordings'
 AXES: dict[str, tuple[str, str]] = {
     "run": ("run as a whole", "s"),
     "window": ("time window", "s"),
@@ -403,7 +403,7 @@ AXES: dict[str, tuple[str, str]] = {
     "frequency": ("frequency", "Hz"),
     "v": ("slip velocity v", "µm/s"),
     "phi": ("age φ", "s"),
-    "W": ("load W", "N"),
+    "W": ("load W", ""),
     "dlnW/dt": ("rate of the load d ln W/dt", "1/s"),
     "position": ("place on the track", "µm"),
     "slip": ("slip", "µm"),
@@ -425,6 +425,7 @@ class Spot:
     high: float
     height: float
     p_value: float | None
+    unit: str = ""
 
     @property
     def sure(self) -> bool:
@@ -434,19 +435,19 @@ class Spot:
     @property
     def place(self) -> str:
         """Return the place in words, with its unit."""
-        unit = AXES.get(self.axis, ("", ""))[1]
         if self.axis == "frequency" or self.low == self.high:
-            return with_unit(number(0.5 * (self.low + self.high)), unit)
+            return with_unit(number(0.5 * (self.low + self.high)), self.unit)
         least = ROUNDING * max(abs(self.low), abs(self.high))
         low, high = (0.0 if abs(end) < least else end for end in (self.low, self.high))
-        return with_unit(f"{number(low)} to {number(high)}", unit)
+        return with_unit(f"{number(low)} to {number(high)}", self.unit)
 
 
-def spots(rows: Sequence[Mapping[str, Any]]) -> list[Spot]:
-    """Return the rows of the residual scan, the least probable first."""
+def spots(rows: Sequence[Mapping[str, Any]], load_unit: str) -> list[Spot]:
+    """Return the rows of the residual scan, the least probable first; `load_unit` is N or MPa."""
     found = [
         Spot(str(r["axis"]), str(r["run"] or ""), str(r["kind"]), float(r["low"]), float(r["high"]),
-             -float(r["log_p"]) / math.log(10), r["p_value"])
+             -float(r["log_p"]) / math.log(10), r["p_value"],
+             load_unit if r["axis"] == "W" else AXES.get(str(r["axis"]), ("", ""))[1])
         for r in rows if all(finite(r[k]) for k in ("low", "high", "log_p"))
     ]  # fmt: skip
     return sorted(found, key=lambda s: -s.height)
@@ -466,10 +467,10 @@ def foremost(found: Sequence[Spot], *, each: int = 2, most: int = 12) -> list[Sp
     return kept
 
 
-def scan_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
+def scan_figure(rows: Sequence[Mapping[str, Any]], load_unit: str, *, narrow: bool = False) -> Figure | None:
     """Return a panel for each axis of the residual scan with several bins, but runs and times; None where there is none."""
     by_axis: dict[str, list[Spot]] = {}
-    for spot in spots(rows):
+    for spot in spots(rows, load_unit):
         if spot.axis not in APART and spot.kind != "shape":
             by_axis.setdefault(spot.axis, []).append(spot)
     shown = {k: v for k, v in by_axis.items() if len({(s.low, s.high) for s in v}) >= PANEL_BINS}
@@ -481,7 +482,7 @@ def scan_figure(rows: Sequence[Mapping[str, Any]], *, narrow: bool = False) -> F
         figure = bare_figure((NARROW_FIGURE if narrow else 3.5 * columns + 0.2, 2.3 * lines + 0.2))
         panels = figure.subplots(lines, columns, squeeze=False).ravel().tolist()
         for k, (axis, (name, found)) in enumerate(zip(panels, shown.items(), strict=False)):
-            about, unit = AXES.get(name, (name_text(name, narrow=narrow), ""))
+            about, unit = AXES.get(name, (name_text(name, narrow=narrow), ""))[0], found[0].unit
             axis.set_title(about + (f"  [{unit}]" if unit else ""), fontsize=9.5)
             _bins(axis, found)
             axis.set_ylabel("−log$_{10}$ p" if k % columns == 0 else "")
@@ -530,7 +531,7 @@ def _columns(bins: Sequence[Spot], log: bool) -> list[Spot]:
 # Figures of what was found: how far parameters had been bent, a missing force, a stability diagram.
 
 FORCE_BINS = 40  # in which a force is averaged along a quantity of state
-STATES = (("v", "slip velocity v  [µm/s]", True), ("phi", "age φ  [s]", True), ("W", "load W  [N]", False))
+STATES = (("v", "slip velocity v  [µm/s]", True), ("phi", "age φ  [s]", True), ("W", "load W  [{}]", False))
 WIDE_QUANTITY = 10.0  # ratio from which a quantity has a logarithmic axis
 
 
@@ -562,10 +563,10 @@ def parameters_figure(parameters: Sequence[Mapping[str, Any]], *, narrow: bool =
         return figure
 
 
-def force_figure(name: str, force: Mapping[str, Any], *, narrow: bool = False) -> Figure:
+def force_figure(name: str, force: Mapping[str, Any], load_unit: str, *, narrow: bool = False) -> Figure:
     """Return a run's missing friction (n,) over time with its band (2, n), above slip velocity and load."""
     t = np.asarray(force["t"], dtype=float)
-    imposed = (("v", "v\n[µm/s]"), ("W", "W\n[N]"))
+    imposed = (("v", "v\n[µm/s]"), ("W", f"W\n[{load_unit}]"))
     with house_style():
         figure, axes = new_figure(1 + len(imposed), size=(NARROW_FIGURE if narrow else 9.0, 2.6 + 1.0 * len(imposed)))
         low, high = np.asarray(force["band"], dtype=float)
@@ -590,7 +591,7 @@ def force_figure(name: str, force: Mapping[str, Any], *, narrow: bool = False) -
         return figure
 
 
-def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, narrow: bool = False) -> Figure | None:
+def force_by_state(forces: Mapping[str, Mapping[str, Any]], load_unit: str, *, narrow: bool = False) -> Figure | None:
     """Return the missing friction of all runs against slip velocity, age and load, averaged in pieces; None if none varies."""
     shown = [s for s in STATES if any(np.ptp(f[s[0]]) > 0 for f in forces.values())]
     if not shown:
@@ -607,7 +608,7 @@ def force_by_state(forces: Mapping[str, Mapping[str, Any]], *, narrow: bool = Fa
                 x, y = (np.asarray(force[k], dtype=float) for k in (key, "force"))
                 _by_state(axis, x, y, log, name_text(name, narrow=narrow), index)
             axis.axhline(0, color="#777777", linewidth=0.8)
-            axis.set_xlabel(label)
+            axis.set_xlabel(label.format(load_unit))
             if log:
                 axis.set_xscale("log")
                 decade_ticks(axis)

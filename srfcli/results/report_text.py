@@ -169,6 +169,8 @@ def gain_sentence(answer: Mapping[str, Any], material: Mapping[str, Any]) -> str
 def _wrong(effect: str, material: Mapping[str, Any]) -> str:
     if told := _filled("wrong", effect, material):
         return told
+    if effect in material.get("laws", ()):
+        return f"the ageing law is {effect}, not {material['stated']['ageing']}"
     sizes = joined([f"{p['name']} = {_size(p)}" for p in _rows(effect, material)])
     about = _about(effect, material)
     return f"the model lacks {effect}{f' ({about})' if about else ''}" + (f": {sizes}" if sizes else "")
