@@ -249,6 +249,13 @@ def test_a_wrong_stiffness_is_told_with_what_was_stated_and_what_to_set(tmp_path
     assert report_text.remedy(answer, material).startswith('Set stiffness = "0.006531\u00a01/µm" in [apparatus], and calibrate')
 
 
+def test_another_ageing_law_is_no_missing_effect() -> None:
+    answer = {"verdict": "identified", "effects": ["ruina", "inertia"]}
+    material = {"laws": ["ruina"], "stated": {"ageing": "dieterich"}}
+    text = report_text.verdict_sentence(answer, material)
+    assert text.startswith("The ageing law is ruina, not dieterich. The model lacks inertia")
+
+
 def test_every_shipped_effect_has_a_remedy() -> None:
     registry = bundled_registry()
     for entry in registry.entries("effect"):
