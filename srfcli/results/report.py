@@ -538,7 +538,7 @@ def write_report(folder: Path, answer: Mapping[str, Any], material: Mapping[str,
     """Write report.html and figures/*.svg, *.png into `folder`, each whole or not at all, and return their places.
 
     `answer` is the object of the format srf.diagnose/1. `material` is that of `srfcli.diagnosis.answer.material`:
-    title; about {effect: a phrase};
+    title; about {effect: a phrase}; stated {stiffness, ageing}; laws: other ageing laws that were fitted;
     runs: {name, holdout, label, load_unit, t, observed, used, baseline, augmented, V, W, windows} with arrays (n,), t in s, V in
     um/s, and of baseline and augmented model: white, rms, friction;
     thresholds: {name, holdout, table, baseline, augmented, chi2 (of both models)}, critical loads (n,) in N;
