@@ -534,14 +534,15 @@ class ModelSearch:
         nor coloured noise has taken up.
         """
         best, found = node.fit.maximum, self._scanned(node) or self._resized(node)
-        likelier = found is not None and found.log_likelihood > node.fit.log_likelihood + NEEDED
-        if not likelier and (correlated(best.point) > DEVIATION or field_share(node.fit) > 1 or best.away > NOT_CONVERGED):
+        if found is not None and not found.log_likelihood > node.fit.log_likelihood + NEEDED:
+            found = None
+        if found is None and (correlated(best.point) > DEVIATION or field_share(node.fit) > 1 or best.away > NOT_CONVERGED):
             return
         self.count += 1
-        values = dict(found.values if found and likelier else best.point.values)
+        values = dict((found or best.point).values)
         sizes = self._sizes(node, values)
         move = _Move(-(node.evidence + WORTH), self.count, node.hypothesis, values, sizes, again=True)
-        if not likelier:
+        if found is None:
             heapq.heappush(self.queue, move)
             return
         with contextlib.suppress(SrfError):  # else it stays as it was

@@ -1374,9 +1374,11 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
     amplitude = likelihood.names.index("field_amplitude")
     x[amplitude] = max(x[amplitude], _under_field(likelihood, x, WIDE[0], SHORT[0])[amplitude])
     point, highest = likelihood.at(x), begun.log_likelihood + NEEDED
-    found: Maximum | None = None
+    if not np.isfinite(point.log_likelihood):
+        return None
+    slopes, found = _slopes(likelihood, point), None
     for j in np.nonzero(np.diag(point.information)[: len(likelihood.problem.names)] > 0)[0].tolist():
-        narrow = _narrow(likelihood, point, j)
+        narrow = _narrow(likelihood, point, slopes, j)
         if narrow is None:
             continue
         run, half = narrow
@@ -1397,16 +1399,18 @@ def scan_narrow(likelihood: Likelihood, begun: Point, progress: Callable[[str], 
             height = other.point.log_likelihood
             progress(f"log likelihood {height:.1f} by a scan of {name}, {begun.log_likelihood:.1f} before")
             if height > highest:
-                found, point, highest = other, top, height
+                found, point, slopes, highest = other, top, _slopes(likelihood, top), height
     return found
 
 
-def _narrow(likelihood: Likelihood, point: Point, j: int) -> tuple[Run, float] | None:
-    """Return the part of a run that shows a maximum of parameter j which no derivative leads to, and half the width of that.
+def _narrow(
+    likelihood: Likelihood, point: Point, slopes: Sequence[tuple[list[int], Array, Array]], j: int
+) -> tuple[Run, float] | None:
+    """Return the part of a run that shows a maximum of parameter j which no derivative leads to, and half its width.
 
-    Innovations then move by less than derivatives want when the parameter goes far: two oscillations that are out of step differ
-    by no more than themselves. Half of how far they move, squared, is the height of the maximum; the part of the run is as long
-    as shows four times the least one.
+    `slopes` are those of the point (`_slopes`); the width is that at half of the height. Innovations move by less than
+    derivatives want when the parameter goes far: two oscillations that are out of step differ by no more than themselves. Half
+    of how far they move, squared, is the height of the maximum; the part of the run is as long as shows four times the least one.
     """
     reach = FAR_PROBE / np.sqrt(point.information[j, j])
     probes: list[Point] = []
@@ -1418,7 +1422,7 @@ def _narrow(likelihood: Likelihood, point: Point, j: int) -> tuple[Run, float] |
     if not probes or not all(np.isfinite(probe.log_likelihood) for probe in probes):
         return None
     most, found = 2 * PEAK, None
-    for at, (f, (places, a, _)) in enumerate(zip(point.runs, _slopes(likelihood, point), strict=False)):
+    for at, (f, (places, a, _)) in enumerate(zip(point.runs, slopes, strict=False)):
         moves = [(probe.runs[at].every.nu - f.every.nu)[f.used] ** 2 / f.every.S[f.used] for probe in probes]
         moved = max(moves, key=lambda own: float(np.sum(own)))
         told = a[:, places.index(j)] ** 2 if j in places else np.zeros_like(moved)
