@@ -14,6 +14,7 @@ import pytest
 import tomli
 from click.testing import CliRunner, Result
 
+import srfcli
 from srfcli.cli.main import cli
 from srfcli.diagnosis.search import Fitted, ModelSearch
 from srfcli.diagnosis.verdict import UNEXPLAINED
@@ -267,3 +268,21 @@ def test_names_of_prediction_files_do_not_clash() -> None:
     assert prediction_names(["a/b", "a-b", "A-B", "..", "run 1"]) == [
         "prediction-a-b.csv", "prediction-a-b-2.csv", "prediction-A-B-3.csv", "prediction-run.csv", "prediction-run 1.csv",
     ]  # fmt: skip
+
+
+def test_a_law_that_became_another_leaves_it_the_confidence(tmp_path: Path) -> None:
+    """`kato-tullis` far above its cut-off velocity is `ruina`; and a result says its verdict first wherever it is shown."""
+    rock = ("--law", "dieterich-ruina", "--interface", "rigid", "--no-inertia", "--K", "30 MPa/mm", "--W0", 10)
+    rock += ("--set", "mu0=0.6", "--set", "A=0.008", "--set", "B=0.011", "--set", "D0=10")
+    made = ("--drive", "30:3,15:30,30:3", "--rate", 10, "--noise", 0.002, "--seed", 1, "--free", "mu0,A,B,D0")
+    srf("simulate", *rock, "--ageing", "ruina", *made, "--observe", "force", "--out-dir", tmp_path / "made")
+    description = tmp_path / "made" / "experiment.toml"
+    description.write_text(description.read_text().replace('ageing = "ruina"', 'ageing = "dieterich"'))
+    found = srfcli.diagnose(tmp_path / "made", effects=["ruina", "kato-tullis"])
+    assert (found.verdict, found.effects) == ("identified", ("ruina",))
+    assert found.confidence["kato-tullis"] == 0.0 and found.confidence["ruina"] > 0.8
+    assert sum(found.confidence.values()) == pytest.approx(1.0)
+    assert [row[0] for row in found.table.rows] == ["ruina", "kato-tullis", "none"]
+    assert str(found).startswith("identified: ruina\n")
+    assert repr(found) == "<DiagnosisResult: identified: ruina; ok>"
+    assert found._repr_html_().startswith("<p>identified: ruina</p>")

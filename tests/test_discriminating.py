@@ -302,7 +302,7 @@ def test_friction_per_micron_follows_the_load(diagnosis: Diagnosis) -> None:
 def test_a_load_that_nothing_tells_is_left_alone(diagnosis: Diagnosis) -> None:
     """Friction alone is recorded, under a drive read from a column: the load stays the 1 N that stands for it."""
     e = diagnosis.experiment
-    ramp = Drive.ramps([(0.0, 5.0), (0.8, 20.0), (1.6, 5.0)])
+    ramp = Drive.sequence([(0.8, 5.0, 20.0), (0.8, 20.0, 5.0)])
     runs = [replace(r, load=ConstantLoad(1.0), observable="friction", modulation=None, drive=ramp) for r in e.runs]
     apparatus = capabilities_of(replace(e, runs=tuple(runs), stiffness_text="0.04 1/um"))
     assert apparatus.kinds == ("velocity steps", "slide-hold-slide") and 5 <= min(apparatus.V) < max(apparatus.V) <= 20

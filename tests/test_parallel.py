@@ -208,7 +208,7 @@ def test_maps_are_the_same_bytes_for_any_number_of_workers(model):
     maps = [compute_map(model, small_grid(model), SMALL, run=run) for run in runs]
     for other in maps[1:]:
         assert other.leading.tobytes() == maps[0].leading.tobytes()
-        assert other.extra_leading.tobytes() == maps[0].extra_leading.tobytes()
+        assert other.extra_at.tobytes() == maps[0].extra_at.tobytes()
         assert [s.p.tobytes() for s in other.seeds] == [s.p.tobytes() for s in maps[0].seeds]
 
 

@@ -124,7 +124,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     """Return the verdict on a finished search; `whole` is the experiment with its held-out runs, opened only now."""
     ranked = tuple(search.ranked())
     baseline, best = search.baseline, ranked[0]
-    close, joint = may_be_it(ranked, whole)
+    close, joint, became = may_be_it(ranked, whole)
     best = close[0] if close else best
     shown = on_the_track_of(best, baseline) if best.passes else baseline
     held, held_loads = held_out(baseline, best, whole, shown), held_out_loads(baseline, best, whole)
@@ -149,18 +149,18 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
     ]
     return Diagnosis(
         whole, verdict, best, baseline, baseline if verdict in BASELINE_VERDICTS else shown, ranked, close,
-        _confidence(ranked, joint, verdict), scores,
+        _confidence(ranked, joint, became, verdict), scores,
         (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores}, _equivalent(scores, close), held,
         tuple(reasons), ungated, held_loads,
     )  # fmt: skip
 
 
-def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted, ...], dict[str, float]]:
+def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted, ...], dict[str, float], dict[str, str]]:
     """Return the models that pass and may be it, best first, and the log evidence of each model on all runs together.
 
     That is its evidence on the runs fitted and its likelihood of the runs held out, for those that pass; the others are given
     the same likelihood as the best of these. Of two that come close one that holds the other gives way, and one that
-    became the other; of an effect in all runs or in one, that which is worse.
+    became the other; of an effect in all runs or in one, that which is worse. The third is which became which, by name.
     """
     least = ranked[0].evidence - (BEHIND if ranked[0].passes else CLOSE)
     passed = [f for f in ranked if f.passes and f.evidence > least]
@@ -180,7 +180,12 @@ def may_be_it(ranked: Sequence[Fitted], whole: Experiment) -> tuple[tuple[Fitted
     best: dict[frozenset[str], Fitted] = {}
     for f in close:
         best.setdefault(frozenset(f.hypothesis.reported), f)
-    return tuple(f for f in best.values() if not any(_is_that_law(f, other, joint) for other in close)), joint
+    became = {}
+    for f in close:
+        laws = [other for other in close if _is_that_law(f, other, joint)]
+        if laws:
+            became[f.name] = min(laws, key=_count_of_parameters).name
+    return tuple(f for f in best.values() if f.name not in became), joint, became
 
 
 def predictive(fitted: Fitted, whole: Experiment) -> float:
@@ -201,11 +206,15 @@ def shared_gain(fitted: Fitted, whole: Experiment) -> float:
     return total
 
 
+def _count_of_parameters(fitted: Fitted) -> int:
+    return len(fitted.fit.likelihood.problem.model.parameters)
+
+
 def _is_that_law(fitted: Fitted, other: Fitted, evidence: Mapping[str, float]) -> bool:
     """Return whether a model became what another ageing law is that has fewer parameters: the innovations are the same."""
     if not other.hypothesis.ageing or other.hypothesis.effects or other is fitted:
         return False
-    more, less = (len(f.fit.likelihood.problem.model.parameters) for f in (fitted, other))
+    more, less = (_count_of_parameters(f) for f in (fitted, other))
     if more <= less or evidence[fitted.name] - evidence[other.name] > (more - less) * np.log(2):  # each halves the prior
         return False
     whites = zip(fitted.fit.maximum.point.runs, other.fit.maximum.point.runs, strict=True)
@@ -327,12 +336,20 @@ def _equivalent(scores: Sequence[Score], close: Sequence[Fitted]) -> tuple[tuple
     return tuple(found)
 
 
-def _confidence(ranked: Sequence[Fitted], joint: Mapping[str, float], verdict: str) -> dict[str, float]:
-    """Return the stated confidence in each model, by evidence, in `unknown`, in what the search `missed` where none passes."""
+def _confidence(
+    ranked: Sequence[Fitted], joint: Mapping[str, float], became: Mapping[str, str], verdict: str
+) -> dict[str, float]:
+    """Return the stated confidence in each model, by evidence, in `unknown`, in what the search `missed` where none passes.
+
+    A model that became another law is that law.
+    """
     weights = {f.name: joint[f.name] - (0.0 if f.passes else LACKING) for f in ranked}
     top = max(weights.values())
     share = {name: float(np.exp(max((w - top) / TEMPER, -60.0))) for name, w in weights.items()}
     total, unknown = sum(share.values()), 1 - MISSED if verdict == "unknown" else UNEXPLAINED
+    for name, law in became.items():
+        share[law] += share[name]
+        share[name] = 0.0
     passed = any(f.passes for f in ranked)  # else none of them is it
     found = {name: (1 - unknown) * v / total if passed else 0.0 for name, v in share.items()}
     found |= {"unknown": unknown} | ({} if passed else {"missed": 1 - unknown})

@@ -29,7 +29,6 @@ from srfcli.inference.prediction import own_names, own_start, predict, run_param
 from srfcli.laws.registry import Registry
 
 MODIFIER = "linker-dieterich"
-EFFECT_PARAMETERS = ("alpha", "lambda", "n")
 SIZES = {"alpha": 0.2, "lambda": 0.1, "n": 0.1}  # that one would want to see: of rock's alpha, of lambda's own value, of n
 OTHER_MOTION = 3.0  # rms of simulation minus recording over the recording's own spread, from which it is another motion
 STIFFER = 1.5  # from half to twice the stated stiffness
@@ -75,7 +74,7 @@ class Forecast:
 class _Question:
     """The experiment's model with alpha and n in it, values in um, s, N, and where in it is what.
 
-    `asked` gives the model's parameter for a name of EFFECT_PARAMETERS, `free` those unknown besides, `widths` their ranges.
+    `asked` gives the model's parameter for a name of SIZES, `free` those unknown besides, `widths` their ranges.
     """
 
     model: GeneratedModel

@@ -704,16 +704,6 @@ class Drive:
         rates = tuple((last - first) / duration for duration, first, last in pieces)
         return cls(times, tuple(first for _, first, _ in pieces), rates)
 
-    @classmethod
-    def ramps(cls, points: Sequence[tuple[float, float]]) -> Drive:
-        """Return straight lines through (t, V), constant before the first point and after the last."""
-        t, V = (np.array(column, dtype=float) for column in zip(*points, strict=True))
-        if (np.diff(t) <= 0).any():
-            raise SrfError("the times of a drive must rise", "give a jump as two points a moment apart, or use steps")
-        slopes = [*(np.diff(V) / np.diff(t)).tolist(), 0.0]
-        before = float(np.nextafter(t[0], -np.inf))
-        return cls((before, *t.tolist()), (float(V[0]), *V.tolist()), (0.0, *slopes))
-
     @property
     def breaks(self) -> tuple[float, ...]:
         """Return the times at which V or its slope may jump."""

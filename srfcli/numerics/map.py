@@ -76,7 +76,7 @@ class Discontinuity:
 class StabilityMap:
     """A map: `leading` (nx, ny), the leading multiplier, NaN where no orbit was found; `mesh` (nx, ny) intervals.
 
-    `extra_at` (E, 2), in grid steps, and `extra_leading` (E,) are points added in cells where a boundary could hide; `suspect`
+    `extra_at` (E, 2), in grid steps, are points added in cells where a boundary could hide; `suspect`
     (S, 3) are cells (column, row, size in grid steps) in which one still could.
     """
 
@@ -85,7 +85,6 @@ class StabilityMap:
     leading: ComplexArray
     mesh: Array
     extra_at: Array
-    extra_leading: ComplexArray
     suspect: Array
     seeds: list[Seed]
     discontinuities: list[Discontinuity] = field(default_factory=list)
@@ -186,7 +185,6 @@ def join_tiles(
         leading,
         mesh,
         extra_at[first],
-        np.concatenate([t["extra_leading"] for _, t in tiles])[first],
         np.concatenate([t["suspect"] for _, t in tiles]),
         seeds,
         discontinuities,
@@ -581,8 +579,8 @@ def _halved(task: TileTask, model: GeneratedModel, points: _Points, cells: Cells
 def solve_tile(task: TileTask) -> dict[str, Array]:
     """Return a tile as plain arrays; it depends on nothing but `task`.
 
-    `leading` (columns, rows) is the leading multiplier, NaN where no orbit was found; `mesh` the intervals; `extra_p` and
-    `extra_leading` the points added; `suspect` (S, 3) cells in which a boundary may still hide (column, row, size in grid
+    `leading` (columns, rows) is the leading multiplier, NaN where no orbit was found; `mesh` the intervals; `extra_at`
+    the points added; `suspect` (S, 3) cells in which a boundary may still hide (column, row, size in grid
     steps). Every pair of neighbours of different sign is a seed: `seed_ends` (E, 2, 2) in grid steps, `seed_axis` (E,),
     `seed_g` (E, 2), and between them `seed_p` (n_parameters, E), `seed_rho`, `seed_x`, `seed_stages`. Every stable point beside
     one without an orbit, or with quite another, is a discontinuity: `discontinuity_ends` (K, 2, 2), it and that neighbour,
@@ -602,7 +600,6 @@ def solve_tile(task: TileTask) -> dict[str, Array]:
         "leading": leading[:count].reshape(task.shape),
         "mesh": np.array(samples.orbit.intervals),
         "extra_at": samples.at[count:] + corner,
-        "extra_leading": leading[count:],
         "suspect": suspect,
         **_seeds(task, model, samples, sides[crossed(sides[:, 0], sides[:, 1])]),
         **_discontinuities(task, samples, sides[apart(sides[:, 0], sides[:, 1])]),

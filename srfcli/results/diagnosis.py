@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -143,6 +144,16 @@ class DiagnosisResult(Result):
         ]
         notes = tuple(_notes(self.answer, recorded=bool(self.diagnosis.experiment.runs)))
         return Table("srf.diagnose.hypotheses/1", HYPOTHESES, rows, "hypotheses", notes, status=self.status.value)
+
+    def __str__(self) -> str:
+        return f"{self.sentence}\n\n{super().__str__()}"
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.sentence}; {self.status.value}>"
+
+    def _repr_html_(self) -> str:
+        """Return the verdict and the table for a notebook."""
+        return f"<p>{escape(self.sentence)}</p>{super()._repr_html_()}"
 
     @property
     def parameter_table(self) -> Table:
