@@ -98,7 +98,7 @@ def test_slide_hold_slide(model):
 
 
 def test_output_times_do_not_change_the_motion(model):
-    drive, load = Drive.ramps([(0.0, 5.0), (0.4, 20.0)]), Modulation(6.0, 0.1, 120.0, onset=0.15)
+    drive, load = Drive.sequence([(0.4, 5.0, 20.0), (1.0, 20.0, 20.0)]), Modulation(6.0, 0.1, 120.0, onset=0.15)
     fine = simulate(model, model.vector(), drive=drive, load=load, t=np.linspace(0.0, 1.0, 1001), rtol=1e-10)
     coarse = simulate(model, model.vector(), drive=drive, load=load, t=np.array([0.0, 0.3, 1.0]), rtol=1e-10)
     assert coarse.x == pytest.approx(fine.x[[0, 300, 1000]], rel=1e-6, abs=1e-6)
@@ -187,7 +187,6 @@ def test_misuse_raises(model, change, message):
         lambda: SampledLoad(np.arange(5.0), np.array([1.0, 1.0, -1.0, 1.0, 1.0])),
         lambda: SampledLoad(np.arange(3.0), np.ones(3)),
         lambda: Drive((0.0, 0.0), (1.0, 2.0), (0.0, 0.0)),
-        lambda: Drive.ramps([(0.0, 1.0), (0.0, 2.0)]),
         lambda: Drive.constant(float("nan")),
     ],
 )
