@@ -222,7 +222,7 @@ def test_show_gives_every_part_as_json():
 def test_the_example_of_the_docs_runs(tmp_path):
     text = DOCUMENT.read_text(encoding="utf-8")
     blocks = [part.partition("```")[0] for part in text.split("```python\n")[1:]]
-    (first,) = (block for block in blocks if "load_registry" in block)
+    (first,) = (block for block in blocks if "srf.simulate(" in block)
     (second,) = (block for block in blocks if "@effect(" in block)
     toml = text.partition("```toml\n")[2].partition("```")[0]
     written(tmp_path, toml, "age-exponent.toml")

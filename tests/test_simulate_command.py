@@ -131,6 +131,45 @@ def test_a_recorded_load_is_the_load(empty_folder: Path) -> None:
         assert "no column" in simulate("--load-file", name, code=2).stderr
 
 
+MODULATED = ("--V", "10", "--W0", "7", "--f", "30", "--for", "2", "--rate", "500")
+
+
+def test_an_effect_that_lets_half_of_a_modulation_through_is_half_of_it() -> None:
+    half = columns(*MODULATED, "--eps", "0.1", "--onset", "0.5")
+    felt = columns(*MODULATED, "--eps", "0.2", "--onset", "0.5", "--effect", "load-transmission", "--set", "rho=0.5")
+    assert felt["W"] - 7 == pytest.approx(2 * (half["W"] - 7), abs=1e-12)  # what is imposed
+    assert felt["u"] == pytest.approx(half["u"], abs=1e-7)
+
+
+def test_a_stage_whose_velocity_ripples_is_seen_at_its_pitch() -> None:
+    """Critical loads do not depend on it: V changes with the stage's position, here 4 times a second."""
+    asked = ("--effect", "drive-ripple", "--set", "amplitude=0.05", "--set", "pitch=2")
+    u = columns("--V", "8", "--W0", "4", "--for", "4", "--rate", "100", *asked)["u"][200:400]
+    spectrum = np.abs(np.fft.rfft(u - u.mean()))
+    assert np.fft.rfftfreq(200, 0.01)[spectrum.argmax()] == 4.0 and np.ptp(u) > 0.01
+
+
+def test_a_gauge_that_lags_reads_what_was_a_time_constant_before() -> None:
+    """A drive that speeds up slowly stretches the spring at a nearly constant rate."""
+    lag = ("--effect", "sensor-lag", "--set", "time_constant=0.05")
+    c = columns("--drive", "1:5, 4:5->5.5, 1:5.5", "--W0", "4", "--rate", "100", *lag)
+    assert c["measured"][50] == pytest.approx(c["u"][50], rel=1e-12)
+    assert c["measured"][300:500] == pytest.approx(c["u"][295:495], abs=2e-5) != c["u"][300:500]
+    assert "measured" not in columns("--V", "5", "--W0", "4", "--for", "1", "--rate", "10", "--effect", "viscous-drag")
+
+
+@pytest.mark.parametrize("effect, size", [("load-distortion", "amplitude=0.1"), ("sensor-lag", "time_constant=0.02")])
+def test_an_experiment_with_an_effect_is_repeated(effect: str, size: str) -> None:
+    """What effects ask of a load is found in a recording as a new record has it."""
+    simulate(*MODULATED, "--eps", "0.2", "--onset", "0.5", "--effect", effect, "--set", size, "--out-dir", "made")
+    assert read("made").choice.effects == (effect,)
+    told = simulate("made", "--csv").stderr
+    distance = float(told.partition("distance from the recording ")[2].split()[0])
+    simulate(*MODULATED, "--eps", "0.2", "--onset", "0.5", "--out-dir", "plain")
+    off = read("made").runs[0].observed - read("plain").runs[0].observed
+    assert distance < 0.02 * np.sqrt(np.mean(off**2))
+
+
 def test_runs_of_an_experiment_at_its_true_values(shared: Path) -> None:
     """With the parameters that made them, the example's recordings differ from the simulation by their noise alone."""
     truth = json.loads((shared / "cases" / "truth.json").read_text())["open-01"]["parameters"]
@@ -323,6 +362,8 @@ def test_ctrl_c_keeps_the_runs_that_are_done(shared: Path, monkeypatch: pytest.M
         (["--rate", "-5"], "a rate lies between", "--rate 1000"),
         (["--onset", "1"], "nothing is modulated", "--eps"),
         (["--eps", "0.1", "--onset", "-1"], "before the record", "begins with it"),
+        (["--effect", "inertia", "--no-inertia"], "only replaces", "inertia = true"),
+        (["--effect", "drive-riple"], "unknown effect", "Did you mean 'drive-ripple'?"),
         (["--start", "q=3"], "'q' is no state", "Known: phi, u, v, z"),
         (["--start", "v=0"], "not above 0", "--start v"),
         (["--start", "soon"], "neither steady, nor a velocity", "--start"),

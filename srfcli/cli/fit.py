@@ -19,10 +19,10 @@ from srfcli.cli.options import (
     Spread,
     SystemOptions,
     listed,
+    options_with_effects,
     output_options,
     parse_ends,
     reader_option,
-    stability_options,
     vary_options,
     worker_options,
 )
@@ -79,7 +79,7 @@ USUAL_STEPS = 30  # of a fit: five of six experiments of one to seven runs took 
 @click.option("--tol", type=float, help="Relative error of a critical load.")
 @click.option("--max-evaluations", type=click.IntRange(1), help="Most evaluations of that cost, for each minimiser.")
 @worker_options
-@stability_options
+@options_with_effects
 @output_options
 def command(
     sources: tuple[Path, ...], place: str | None, spread: Spread, system: SystemOptions, output: OutputOptions, **options: Any

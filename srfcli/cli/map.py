@@ -33,7 +33,7 @@ srf map --eps 0.4 --workers 8 --resume parts --out map.csv
 
 
 @click.command("map", cls=SrfCommand, epilog=MAP)
-@options.stability_options
+@options.options_with_effects
 @options.value_option("eps", "Relative modulation amplitude, where it is not an axis.")
 @options.value_option("V", "Driving velocity in um/s, where it is not an axis.")
 @options.value_option("W0", "Mean normal load in N, where it is not an axis.")
@@ -254,8 +254,7 @@ def compare(
 
 def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, Any]) -> dict[str, SlidingSystem]:
     """Return a system for every pair of a friction and an ageing law, by a name that tells them apart."""
-    from srfcli.codegen.model import open_model
-    from srfcli.codegen.slider import SlidingSystem
+    from srfcli.codegen.slider import SlidingSystem, opener
 
     toml = load_toml(find_toml())
     chosen = {k: choose(k, system[k], toml=toml) for k in ("interface", "loading", "inertia")}
@@ -268,11 +267,12 @@ def _sliders(laws: tuple[str, ...], ageings: tuple[str, ...], system: dict[str, 
     if len(pairs) < 2:
         raise SrfError("one law is nothing to compare", "Name more: --law srf-vsat --law log-log, or several --ageing.")
     registry = options.open_registry(system["plugins"], named)
-    models = [open_model(registry, law=law, ageing=ageing, **shared) for law, ageing in pairs]
+    openers = [opener(registry, law=law, ageing=ageing, **shared) for law, ageing in pairs]
+    models = [opened(False) for opened in openers]
     short = len(set(ageings)) == 1, len(set(laws)) == 1
     names = [law if short[0] else ageing if short[1] else f"{law}/{ageing}" for law, ageing in pairs]
-    resolved = _resolved(models, system, toml)
-    return {n: SlidingSystem(m, r) for n, m, r in zip(names, models, resolved, strict=True)}
+    parts = zip(names, _resolved(models, system, toml), openers, models, strict=True)
+    return {name: SlidingSystem(resolved, opened, model.title) for name, resolved, opened, model in parts}
 
 
 def _resolved(models: list[GeneratedModel], system: dict[str, Any], toml: TomlSettings) -> list[Resolved]:

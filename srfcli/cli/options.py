@@ -274,11 +274,15 @@ class SystemOptions:
     def model(self, *, tables: Sequence[tuple[str, str]] = ()) -> GeneratedModel:
         """Return the numerical model of that system, with tables if asked for; sympy runs only where the cache has none."""
         from srfcli.codegen.model import open_model
-        from srfcli.codegen.slider import check_part
 
-        registry = self.registry()
-        check_part(registry, self.effects)
-        return open_model(registry, **self._names(), tables=tables, effects=self.effects, stability=True)
+        if tables:
+            return open_model(self.registry(), **self._names(), tables=tables, effects=self.effects)
+        return self._opener()(False)
+
+    def _opener(self) -> Callable[[bool], GeneratedModel]:
+        from srfcli.codegen.slider import opener
+
+        return opener(self.registry(), self.effects, **self._names())
 
     def resolve(self, parameters: Sequence[Parameter], **given: str | float | None) -> Resolved:
         """Return every parameter's value and origin.
@@ -295,12 +299,16 @@ class SystemOptions:
             Session.current().say(f"Warning: {sentence}")
         return resolved
 
-    def slider(self, **given: str | float | None) -> SlidingSystem:
-        """Return the system with its parameters, the command's own flags `given` among them as in `resolve`."""
-        from srfcli.codegen.slider import SlidingSystem
+    def slider(self, moving: bool = False, /, **given: str | float | None) -> SlidingSystem:
+        """Return the system with its parameters, the command's own flags `given` among them as in `resolve`.
 
-        model = self.model()
-        return SlidingSystem(model, self.resolve(model.parameters, **given))
+        For motion in time it is `moving`: effects that critical loads do not depend on count.
+        """
+        from srfcli.codegen.slider import SlidingSystem, declared
+
+        opened = self._opener()
+        model = opened(moving)
+        return SlidingSystem(self.resolve(declared(model), **given), opened, model.title)
 
     def say_defaults(self, resolved: Resolved, names: Iterable[str]) -> None:
         """Say on stderr which of these parameters have the default of their law."""
@@ -402,8 +410,8 @@ def system_options(function: F) -> F:
     return _as_one(function, "system", _read_system, SYSTEM_OPTIONS)
 
 
-def stability_options(function: F) -> F:
-    """Add what `system_options` adds, and --effect: for commands on the stability of sliding."""
+def options_with_effects(function: F) -> F:
+    """Add what `system_options` adds, and --effect."""
     text = "Add this effect to the laws; `srf laws --kind effect` lists all; repeatable."
     effect = click.option("--effect", "effects", multiple=True, metavar="NAME", help=text, shell_complete=names_of("effect"))
     return _as_one(function, "system", _read_system, {**SYSTEM_OPTIONS, "effects": effect})

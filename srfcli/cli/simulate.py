@@ -12,7 +12,7 @@ import click
 
 from srfcli.cli.base import Session, SrfCommand
 from srfcli.cli.emit import Progress, emit, finish, warn_uncompiled
-from srfcli.cli.options import LAW_CHOICES, PATH, OutputOptions, SystemOptions, output_options, system_options, value_option
+from srfcli.cli.options import LAW_CHOICES, PATH, OutputOptions, SystemOptions, options_with_effects, output_options, value_option
 from srfcli.core.errors import SrfError
 from srfcli.core.units import convert, parse_quantity, split_quantity
 from srfcli.motion import STEP_RISE
@@ -102,7 +102,7 @@ EXCLUSIVE = (("V", "drive"), ("duration", "drive"), ("W0", "load"), ("W0", "load
     help="Start values written to DIR: the true ones, or off by up to so much.",
 )
 @click.option("--free", metavar="NAMES", help="Parameters that DIR leaves to a fit.  [default: the law's, not V0]")
-@system_options
+@options_with_effects
 @output_options
 def command(system: SystemOptions, experiment: Path | None, output: OutputOptions, **given: Any) -> None:
     """Time traces of a slider: through steady sliding, stick-slip, holds and re-sliding.
@@ -201,6 +201,8 @@ def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], fie
     if system.chosen["loading"].origin == "flag" and system.chosen["loading"].value != "vertical":
         raise SrfError("the runs of an experiment are loaded from above", "Leave out --loading inclined.")
     laws = {k: s.value for k, s in system.chosen.items() if s.origin == "flag" and k != "loading"}
+    if system.effects:
+        laws["effects"] = (*experiment.choice.effects, *system.effects)
     work = runs_again(
         experiment, registry, laws=laws,
         parameters=system.flags, names=given["runs"], field=field, spread=spread,
@@ -220,7 +222,7 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], field: Friction
     from srfcli.motion.imposed import ConstantLoad, Drive, LoadSteps
     from srfcli.tasks import simulate as task
 
-    slider = system.slider(**{name: given[name] for name in ("V", "W0", "eps")})
+    slider = system.slider(True, **{name: given[name] for name in ("V", "W0", "eps")})
     values, folder = slider.resolved.values, given["folder"]
     observables = task.check_observables([n.strip() for n in (given["observable"] or "elongation").split(",")])
     if field is not None and system.chosen["loading"].value != "vertical":
@@ -258,7 +260,7 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], field: Friction
     choice, made = _laws(system), None
     if folder is not None:
         made = task.new_experiment(slider, choice, folder, free=given["free"], spread=spread, seed=given["seed"])
-    files = [name for name in (choice.law, choice.ageing, choice.interface) if name.endswith(LAW_FILES)]
+    files = [name for name in (choice.law, choice.ageing, choice.interface, *choice.effects) if name.endswith(LAW_FILES)]
     program = {"V": given["drive"], "W0": given["load"] or given["load_file"]}
     system.say_defaults(slider.resolved, [name for name, text in program.items() if text is None])
     loaded = None if given["load"] is None else length
@@ -339,7 +341,7 @@ def _laws(system: SystemOptions) -> ModelChoice:
     for key in LAW_CHOICES:
         if names[key].endswith(LAW_FILES):
             names[key] = str(Path(names[key]).resolve())
-    return ModelChoice(**names)
+    return ModelChoice(**names, effects=system.effects)
 
 
 # Reading of options: pieces of drive and load, sampling rates, start values, the random friction field.

@@ -25,7 +25,7 @@ srf linear --loading inclined --ageing dieterich+linker-dieterich --over angle=-
 
 
 @click.command("linear", cls=SrfCommand, epilog=LINEAR)
-@options.stability_options
+@options.options_with_effects
 @options.over_option(help="Values to run over, V=1:100:60 unless given; repeat for a grid of two parameters.")
 @click.option(
     "--all-roots", is_flag=True, help="List every Hopf point, also where stability returns or other roots are unstable."
@@ -59,7 +59,7 @@ VELOCITY = Parameter("V", 10.0, "um/s", 1e-12, 1e9, "driving velocities")
 
 
 @click.command("critical", cls=SrfCommand, epilog=CRITICAL)
-@options.stability_options
+@options.options_with_effects
 @options.values_option(VELOCITY)
 @options.values_option(options.AMPLITUDE)
 @click.option("--window", metavar="LOW:HIGH", help="Loads to look between, in N; else all at which a crossing can be.")
@@ -114,7 +114,7 @@ srf response --V 10 --W0 6 --mean --eps 0.05,0.1,0.2 --over f=20:400:30
 
 
 @click.command("response", cls=SrfCommand, epilog=RESPONSE)
-@options.stability_options
+@options.options_with_effects
 @options.value_option("V", "Driving velocity in um/s.")
 @options.value_option("W0", "Mean normal load in N.")
 @options.values_option(options.AMPLITUDE, about="relative modulation amplitudes, for --mean")
@@ -170,7 +170,7 @@ srf floquet --V 8 --W0 9 --eps 0.09 --json --tol 1e-9
 
 
 @click.command("floquet", cls=SrfCommand, epilog=FLOQUET)
-@options.stability_options
+@options.options_with_effects
 @options.value_option("V", "Driving velocity, in um/s.")
 @options.value_option("W0", "Mean normal load, in N.")
 @options.value_option("eps", "Relative amplitude of the load modulation.")
@@ -218,7 +218,7 @@ srf continue --eps 0.09 --law log-log --ageing dieterich+linker-dieterich
 
 
 @click.command("continue", cls=SrfCommand, epilog=CONTINUE)
-@options.stability_options
+@options.options_with_effects
 @options.values_option(options.AMPLITUDE, about="relative modulation amplitudes, a boundary for each")
 @options.value_option("V", "Driving velocity in um/s, where it is not an axis.")
 @options.value_option("W0", "Mean normal load in N, where it is not an axis.")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from srfcli.codegen.model import GeneratedModel, open_model
 from srfcli.core.errors import SrfError
-from srfcli.core.settings import DEFAULTS, Resolved, resolve
+from srfcli.core.settings import DEFAULTS, Parameter, Resolved, resolve
 from srfcli.laws.registry import Registry, load_registry
+from srfcli.laws.values import Effect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,14 +26,28 @@ class SlidingSystem:
 
     Attributes
     ----------
-    model : GeneratedModel
-        Functions of arrays, in um, s, N.
     resolved : Resolved
         The value of every parameter, and where it comes from.
+    model : GeneratedModel
+        Functions of arrays, in um, s, N: those of steady sliding and of a modulation that lasts. Raises SrfError for an effect
+        that neither depends on.
+    motion : GeneratedModel
+        The same for motion in time, under any drive and load. Another one where there are effects.
     """
 
-    model: GeneratedModel = field(repr=False)
     resolved: Resolved = field(repr=False)
+    opened: Callable[[bool], GeneratedModel] = field(repr=False)  # by whether it is for motion in time
+    title: str
+
+    @property
+    def model(self) -> GeneratedModel:
+        """Return the model of steady sliding and its stability."""
+        return self.opened(False)
+
+    @property
+    def motion(self) -> GeneratedModel:
+        """Return the model of motion in time."""
+        return self.opened(True)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -47,7 +63,7 @@ class SlidingSystem:
         """Return the parameters (n_parameters,) in um, s, N, some at other values in their declared units."""
         from srfcli.core.units import to_base
 
-        units = {q.name: q.unit for q in self.model.parameters}
+        units = {q.name: q.unit for q in self.resolved.parameters}
         moved = {n: to_base(float(v), units[n]) for n, v in declared.items()}
         return self.model.vector({**self.resolved.values, **moved})
 
@@ -61,10 +77,10 @@ class SlidingSystem:
         """
         kept = {n: v for n, v in self.resolved.declared.items() if self.resolved.origins[n] != "law default"}
         flags = {**kept, **parameters}
-        return SlidingSystem(self.model, resolve(self.model.parameters, flags, env={}, where=self.model.title))
+        return SlidingSystem(resolve(self.resolved.parameters, flags, env={}, where=self.title), self.opened, self.title)
 
     def __repr__(self) -> str:
-        return f"<SlidingSystem: {self.model.title}>"
+        return f"<SlidingSystem: {self.title}>"
 
 
 def system(
@@ -92,7 +108,7 @@ def system(
     inertia : bool
         Whether the slider's mass counts.
     effects : sequence of str
-        Effects that the system has besides its laws, names or paths of files, which critical loads depend on.
+        Effects that the system has besides its laws, names or paths of files.
     plugins : sequence of path
         Folders in which laws are looked for, too.
     parameters, **more : number or str
@@ -123,26 +139,59 @@ def system(
     """
     words = [w.strip() for text in (law, ageing, interface, *effects) for w in text.split("+")]
     registry = load_registry([Path(p) for p in plugins], named=[Path(w) for w in words if w.endswith(".py")])
-    check_part(registry, effects)
-    model = open_model(
-        registry, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia, effects=effects,
-        stability=True,
-    )  # fmt: skip
+    opened = opener(registry, effects, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia)
+    model = opened(bool(why_not_steady(registry, effects)))
     given = {**(parameters or {}), **more}
-    return SlidingSystem(model, resolve(model.parameters, given, env={}, where=model.title))
+    return SlidingSystem(resolve(declared(model), given, env={}, where=model.title), opened, model.title)
 
 
-def check_part(registry: Registry, effects: Sequence[str]) -> None:
-    """Raise SrfError for an effect that critical loads do not depend on."""
+def opener(registry: Registry, effects: Sequence[str] = (), **names: Any) -> Callable[[bool], GeneratedModel]:
+    """Return what opens the model of a system, by whether it is for motion in time; `names` are those of `open_model`.
+
+    Raises SrfError for an effect that only changes what the system is; the model of stability for one that it does not have.
+    """
+    for name in effects:
+        effect = registry.get("effect", name)
+        if isinstance(effect, Effect) and (instead := replaced_by(effect)):
+            raise SrfError(f"'{effect.name}' only replaces what the system is", f"Choose {' and '.join(instead)}.")
+
+    @cache
+    def opened(moving: bool) -> GeneratedModel:
+        if not effects:
+            return open_model(registry, **names) if not moving else opened(False)
+        if not moving and (reason := why_not_steady(registry, effects)):
+            raise SrfError(reason, "Leave it out.")
+        return open_model(registry, **names, effects=effects, stability=not moving)
+
+    return opened
+
+
+def why_not_steady(registry: Registry, effects: Sequence[str]) -> str:
+    """Return why critical loads do not depend on one of these effects; nothing where they depend on all."""
     if not effects:
-        return
-    from srfcli.laws.values import Effect
+        return ""
     from srfcli.symbolic.system import without_part
 
     for name in effects:
         effect = registry.get("effect", name)
         if isinstance(effect, Effect) and (reason := without_part(effect)):
-            raise SrfError(f"critical loads do not depend on '{effect.name}': it {reason}", "Leave it out.")
+            return f"critical loads do not depend on '{effect.name}': it {reason}"
+    return ""
+
+
+def replaced_by(effect: Effect) -> list[str]:
+    """Return what is to be chosen in place of an effect that has no formula of its own, nothing for one that has."""
+    instead = [f"{key} = {str(value).lower()}" for key, value in effect.settings]
+    return instead + [{"K": "another stiffness", "M": "a mass"}.get(name, name) for name in effect.frees]
+
+
+def declared(model: GeneratedModel) -> tuple[Parameter, ...]:
+    """Return the parameters of a model that a person sets: what effects ask of a run is not among them."""
+    if "begin" not in model.names:
+        return model.parameters
+    from srfcli.symbolic.system import RUN_SYMBOLS
+
+    return tuple(p for p in model.parameters if p not in RUN_SYMBOLS)
 
 
 def load_law(name: str | Path, *, kind: str = "friction", plugins: Sequence[str | Path] = ()) -> Law:

@@ -192,30 +192,33 @@ def run_parameters(model: GeneratedModel, experiment: Experiment, run: Run, valu
 def of_run(run: Run) -> dict[str, float]:
     """Return what effects ask of a recording: where and when it begins, and the load's modulation as it is in the data."""
     weighed = float(run.observable != "elongation")
-    return {"start": run.start, "begin": float(run.t[0]), "weighed": weighed, **_modulation(run)}
+    return {"start": run.start, "begin": float(run.t[0]), "weighed": weighed, **modulation_of(run.load, run.t)}
 
 
-def _modulation(run: Run) -> dict[str, float]:
-    """Return frequency, amplitude and phase at clock 0 of the load's modulation, onset and time scale of its switch-on."""
-    known = _MODULATIONS.get(id(run.load))
-    if known is not None and known[0] is run.load:
+def modulation_of(load: Load, t: Array) -> dict[str, float]:
+    """Return frequency, amplitude and phase at clock 0 of a load's modulation, onset and time scale of its switch-on.
+
+    They are found in the load as it is at the times t.
+    """
+    known = _MODULATIONS.get(id(load))
+    if known is not None and known[0] is load:
         return known[1]
-    W = run.load(run.t)[0]
-    found = find_modulation(run.t, W)
+    W = load(t)[0]
+    found = find_modulation(t, W)
     answer = {"f": 1.0, "eps": 0.0, "psi": 0.0, "onset0": -1e6, "rise0": 0.02, "modulated": 0.0}
     if found is not None:
-        answer |= {"f": found.frequency, "modulated": 1.0} | _switched(run, W, found.frequency, found.amplitude, found.onset)
-    _MODULATIONS[id(run.load)] = (run.load, answer)
+        answer |= {"f": found.frequency, "modulated": 1.0} | _switched(t, W, found.frequency, found.amplitude, found.onset)
+    _MODULATIONS[id(load)] = (load, answer)
     while len(_MODULATIONS) > 64:
         _MODULATIONS.pop(next(iter(_MODULATIONS)))
     return answer
 
 
-def _switched(run: Run, W: Array, f: float, eps: float, onset: float) -> dict[str, float]:
+def _switched(t: Array, W: Array, f: float, eps: float, onset: float) -> dict[str, float]:
     """Return amplitude, phase, onset and time scale by least squares on the load, W0 (1 + eps (1 + tanh)/2 cos)."""
     from scipy.optimize import least_squares
 
-    t, begin = run.t, float(run.t[0])
+    begin = float(t[0])
     on = t > (onset if np.isfinite(onset) else begin) + 10 / f
     on = on if on.any() else t > t[t.size // 2]
     mean = float(W[on].mean())

@@ -95,14 +95,22 @@ def observe(model: GeneratedModel, job: Job, trace: Trace, observable: str) -> A
     if observable == "slip":
         return np.asarray(job.drive.displacement(trace.t) - (trace.u - trace.u[0]))
     K, u = np.asarray(job.p[model.index("K")]), trace.u
-    if (shown := model.namespace.get("reading" if observable == job.observable else "stiffness")) is not None:
-        W0 = dict.fromkeys(["W0"], job.load.rest(float(job.t[0])))
-        p = model.vector(dict(zip(model.names, job.p.tolist(), strict=True)) | W0)
-        found = np.asarray(shown(trace.x, trace.V, trace.W, np.zeros_like(trace.W), p))
-        u, K = (found, K) if observable == job.observable else (u, found)
+    shown = _along(model, job, trace, "reading" if observable == job.observable else "stiffness")
+    if shown is not None:
+        u, K = (shown, K) if observable == job.observable else (u, shown)
     if observable == "elongation":
         return u
     return K * u if observable == "force" else K * u / trace.W
+
+
+def _along(model: GeneratedModel, job: Job, trace: Trace, name: str) -> Array | None:
+    """Return a function of a model with effects along a trace, None where the model has none of that name."""
+    function = model.namespace.get(name)
+    if function is None:
+        return None
+    W0 = dict.fromkeys(["W0"], job.load.rest(float(job.t[0])))
+    p = model.vector(dict(zip(model.names, job.p.tolist(), strict=True)) | W0)
+    return np.asarray(function(trace.x, trace.V, trace.W, np.zeros_like(trace.W), p))
 
 
 @dataclass(frozen=True)
@@ -137,11 +145,12 @@ class Work:
     meta: Mapping[str, Any] = field(default_factory=dict)
 
 
-def measure(work: Work, job: Job, observed: Array, observable: str) -> Array | None:
+def measure(work: Work, job: Job, trace: Trace, observed: Array, observable: str) -> Array | None:
     """Return an observable through its gauge, None where it reads exactly; each run and each observable has its own noise."""
     gauge = work.gauges.get(observable, Gauge())
     if not (gauge.noise or gauge.quantum):
-        return None
+        shown = _along(work.model, job, trace, "reading") if observable == job.observable else None
+        return None if shown is None or np.allclose(shown, trace.u, rtol=1e-12, atol=0.0) else observed
     stream = job.name if observable == job.observable else f"{job.name} {observable}"
     return measured(observed, **asdict(gauge), stream=stream)
 

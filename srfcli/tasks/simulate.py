@@ -20,7 +20,7 @@ from srfcli.data.description import MOST_OBSERVABLES
 from srfcli.data.noise import FrictionField, check_gauge, generator
 from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
 from srfcli.data.writing import stiffness_text
-from srfcli.inference.prediction import of_run
+from srfcli.inference.prediction import modulation_of, of_run
 from srfcli.laws.law_file import RESERVED
 from srfcli.laws.registry import Registry
 from srfcli.motion import STEP_RISE
@@ -119,7 +119,7 @@ def simulate_work(
                 work.model, job.p, drive=job.drive, load=job.load, t=job.t, start=job.start, tables=job.tables, rtol=rtol
             )
             shown = {name: observe(work.model, job, trace, name) for name in (job.observable, *job.beside)}
-            read = {name: measure(work, job, values, name) for name, values in shown.items()}
+            read = {name: measure(work, job, trace, values, name) for name, values in shown.items()}
             others = tuple(values if (y := read[name]) is None else y for name, values in shown.items())[1:]
             records.append(Record(job, trace, shown[job.observable], read[job.observable], others))
             progress(job.name, True)
@@ -168,6 +168,7 @@ def read_gauges(
 
 # A new record: one slider under a drive and a load.
 
+STEEPEST = 1.875  # slope of a modulation's rise at its middle, over that of a straight line
 REFERENCE_PARAMETERS = ("V0",)  # the velocity that mu0 refers to: not identifiable beside mu0
 BOUND_FACTOR = 5.0  # ratio of the bounds of a fit to the value
 
@@ -187,18 +188,21 @@ def record_of(
 
     `rough` is the model with FIELD_TABLE and the random field that it slides on.
     """
-    model, values, p, begin = system.model, system.resolved.values, system.vector(), float(t[0])
-    model.check_changing_load(p)
+    model, values, begin = system.motion, system.resolved.values, float(t[0])
     replaced = [name for name, given in (("V", drive), ("W0", load)) if given is not None]
     drive, load = drive or Drive.constant(values["V"]), load or ConstantLoad(values["W0"])
     modulation = (values["f"], values["eps"], begin if onset is None else onset) if values["eps"] else None
     if modulation is not None:
         f, eps, since = modulation
-        if isinstance(load, ConstantLoad):
-            load = Modulation(load.W0, eps, f, since)
-        else:
-            load = ModulatedLoad(load, Modulation(1.0, eps, f, since))
+        shape = Modulation(1.0, eps, f, since)
+        load = replace(shape, W0=load.W0) if isinstance(load, ConstantLoad) else ModulatedLoad(load, shape)
     load.check(begin, float(t[-1]))
+    asked: dict[str, float] = {}
+    if "begin" in model.names:  # by effects
+        found = modulation_of(load, t) if modulation is None else _as_effects_ask(shape)
+        asked = {"begin": begin, "weighed": float(observables[0] != "elongation"), **found}
+    p = model.vector({**values, **asked})
+    model.check_changing_load(p)
     state = start_state(model, p, start, drive=drive, load=load.rest(begin), begin=begin)
     job = Job(
         "simulated", p, drive, load, t, state, observables[0], modulation and modulation[0], modulation,
@@ -206,6 +210,13 @@ def record_of(
     )  # fmt: skip
     work = Work(model, (job,), system.described(without=replaced))
     return work if rough is None else on_field(work, *rough, start=start)
+
+
+def _as_effects_ask(shape: Modulation) -> dict[str, float]:
+    """Return a modulation as effects ask for it: switched on as (1 + tanh((t - onset0)/rise0))/2, as steeply as it rises."""
+    rise = shape.full - shape.onset
+    known = {"f": shape.f, "eps": shape.eps, "psi": shape.phase, "modulated": 1.0}
+    return known | {"onset0": shape.onset + rise / 2, "rise0": rise / (2 * STEEPEST)}
 
 
 def start_state(
@@ -263,24 +274,24 @@ def new_experiment(
 
     `free` names the parameters that a fit is to find, the law's but V0 if left out; `spread` is as in `perturbed`.
     """
-    model, values = system.model, system.resolved.values
-    laws = [p.name for p in model.parameters if p.name not in RESERVED]
-    known = [*laws, *(name for name in ("K", "M") if name in model.names)]
+    declared, values = system.resolved.parameters, system.resolved.values
+    laws = [p.name for p in declared if p.name not in RESERVED]
+    known = [*laws, *(p.name for p in declared if p.name in ("K", "M"))]
     if free is None:
         chosen = [name for name in laws if name not in REFERENCE_PARAMETERS]
     else:
         chosen = [name.strip() for name in free.split(",") if name.strip()]
     for name in chosen:
         if name not in known:
-            raise SrfError(f"`free`: {name!r} is no parameter of {model.title}", did_you_mean(name, known))
+            raise SrfError(f"`free`: {name!r} is no parameter of {system.title}", did_you_mean(name, known))
     parameters = [
         FitParameter(p.name, values[p.name], *bounds(p, values[p.name]), fixed=p.name not in chosen, unit=p.unit)
-        for p in model.parameters
+        for p in declared
         if p.name not in RESERVED or p.name in chosen
     ]
     mass = values.get("M") if choice.inertia else None
     listed = perturbed(parameters, spread, seed)
-    return Experiment(folder, f"simulated with {model.title}", choice, mass, stiffness_text(values["K"]), listed, (), ())
+    return Experiment(folder, f"simulated with {system.title}", choice, mass, stiffness_text(values["K"]), listed, (), ())
 
 
 def bounds(parameter: Parameter, value: float) -> tuple[float, float]:
