@@ -19,7 +19,7 @@ from srfcli.core.errors import SrfError
 from srfcli.data.clock import Place
 from srfcli.data.experiment import NOTICE_KINDS, check_run, read_experiment
 from srfcli.data.gauge import GaugeNoise, find_noise, whiten
-from srfcli.data.imposed import find_modulation, load_from_column
+from srfcli.data.imposed import drive_from_displacement, find_modulation, load_from_column
 from srfcli.data.noise import measured, spikes
 from srfcli.data.values import Run
 from srfcli.laws.registry import load_registry
@@ -493,3 +493,24 @@ def test_steps_of_the_drive_from_displacements(tmp_path: Path) -> None:
     drive = c.read(tmp_path).drive
     assert list(drive.velocities) == pytest.approx([8.0, 12.0], rel=2e-3)
     assert drive.breaks[0] == pytest.approx(6.0, abs=0.02)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1], ids=["clean", "0.1 um"])
+@pytest.mark.parametrize(
+    "steps",
+    [
+        [(100, 1), (50, 3), (20, 10), (10, 30), (20, 10), (50, 3)],
+        [(60, 1), (6, 10), (60, 1), (6, 10), (60, 1)],
+        [(40, 1), (15, 3), (40, 1), (15, 3), (40, 1), (5, 10), (40, 1)],
+    ],
+    ids=["up and down", "short", "with a last one"],
+)
+def test_steps_that_are_many_or_short_beside_the_record(steps: list[tuple[float, float]], noise: float) -> None:
+    """In a record of few stretches corners are in many of them: they are no noise of the displacements."""
+    ends = np.cumsum([0.0, *(duration for duration, _ in steps)])
+    way = np.cumsum([0.0, *(duration * V for duration, V in steps)])
+    t = np.arange(0.0, ends[-1], 0.1)
+    displacements = np.interp(t, ends, way) + noise * np.random.default_rng(3).standard_normal(t.size)
+    drive, _ = drive_from_displacement(t, displacements, "stage")
+    assert drive.velocities == pytest.approx([V for _, V in steps], rel=2e-3)
+    assert drive.breaks == pytest.approx(ends[1:-1], abs=0.1)

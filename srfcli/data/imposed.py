@@ -264,6 +264,8 @@ FEWEST_OF_PIECE = 5  # samples of a piece
 CORNER_ROUNDS = 40  # of the search for the places of the corners
 STRETCH = 128  # samples over which noise has its colour
 BURST = STRETCH  # samples of a burst of noise, at most
+CORNER = 4.0  # factor by which a corner lowers the squares of a stretch's residual, and the colour of noise does not
+MOST_CORNERS = 4  # of a stretch
 AROUND = 15  # neighbouring stretches from which the noise of one is estimated
 NOISE_SAMPLES = 101  # samples that share a level of white noise
 CLEAR = 8.0  # standard deviations about the lines beside it that a level jump exceeds
@@ -333,8 +335,8 @@ def split(t: Array, x: Array, sigma: Array, penalty: float) -> list[int]:
 def coloured_noise(t: Array, x: Array) -> Array:
     """Return for each sample the standard deviation of white noise that misfits a line as much as the noise in x (n,) does.
 
-    The noise is the residual of parabolas over 128 samples, in the upper quartile of fifteen stretches: a gauge's bursts count,
-    while corners, which are in few stretches, do not.
+    The noise is the residual of parabolas over 128 samples, in the upper quartile of fifteen stretches: a gauge's bursts count.
+    Corners and level jumps do not: what lowers a stretch's residual by a factor of CORNER is no noise.
     """
     from scipy.ndimage import percentile_filter
 
@@ -344,10 +346,7 @@ def coloured_noise(t: Array, x: Array) -> Array:
     found = np.empty(starts.size)
     for k, at in enumerate(starts.tolist()):
         part = slice(at, at + length)
-        place = (t[part] - t[part].mean()) / max(float(np.ptp(t[part])), 1e-300)
-        basis = np.linalg.qr(np.vander(place, 3))[0]
-        rest = x[part] - x[part].mean()
-        z = (rest - basis @ (basis.T @ rest)) / sigma[part]
+        z = _without_corners(t[part], x[part]) / sigma[part]
         power = float(z @ z)
         rho = min(max(float(z[1:] @ z[:-1]) / power, 0.0), 0.98) if power > 0 else 0.0
         found[k] = power / max(length - 3, 1) * (1 + rho) / (1 - rho)
@@ -357,6 +356,29 @@ def coloured_noise(t: Array, x: Array) -> Array:
         near = np.full(found.size, np.median(found))
     stretch = np.minimum(np.arange(x.size) // length, near.size - 1)
     return np.asarray(sigma * np.sqrt(np.maximum(near[stretch], 1.0)))
+
+
+def _without_corners(t: Array, x: Array) -> Array:
+    """Return the residual (n,) of a parabola through x over t, less the corners and level jumps that explain most of it."""
+    place = (t - t.mean()) / max(float(np.ptp(t)), 1e-300)
+    edges = 0.5 * (place[1:] + place[:-1])[1 : 1 - FEWEST_OF_PIECE // 2]
+    after = place[:, None] > edges
+    columns = np.concatenate([np.where(after, place[:, None] - edges, 0.0), after.astype(float)], axis=1)
+    basis, rest = np.linalg.qr(np.vander(place, 3))[0], x - x.mean()
+    rest = rest - basis @ (basis.T @ rest)
+    columns -= basis @ (basis.T @ columns)
+    for _ in range(MOST_CORNERS):
+        sizes = np.maximum(np.sum(columns**2, axis=0), 1e-300)
+        gains = (columns.T @ rest) ** 2 / sizes
+        best = int(np.argmax(gains))
+        direction = columns[:, best] / np.sqrt(sizes[best])
+        power = float(rest @ rest)
+        less = rest - direction * float(direction @ rest)
+        if not float(less @ less) < power / CORNER:
+            break
+        rest = less
+        columns -= np.outer(direction, direction @ columns)
+    return rest
 
 
 def corners(t: Array, x: Array, *, correct: bool = True) -> Line:
