@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import srfcli as srf
 from srfcli.core.errors import Status
 from srfcli.motion.imposed import ConstantLoad, Drive
 from srfcli.motion.simulate import simulate
@@ -63,3 +64,23 @@ def test_the_crossing_rate_is_the_slope_of_the_growth_rate(model):
         p = model.vector({"V": 20.0, "W0": point.W0 * (1 + sign * 1e-5)})
         rates.append(np.linalg.eigvals(rest_state(model, p)[1]).real.max())
     assert (rates[1] - rates[0]) / (2e-5 * point.W0) == pytest.approx(point.crossing_rate, rel=1e-4)
+
+
+@pytest.mark.parametrize("interface", ["elastic", "rigid"])
+@pytest.mark.parametrize("inertia", [True, False])
+def test_a_pore_pressure_adds_to_the_critical_load(interface, inertia):
+    """Friction is that of the load less the pressure: W0 = pressure is a pole of the rates, and no Hopf point."""
+    rig = {"interface": interface, "inertia": inertia, "V": 10.0}
+    drained = srf.linear(srf.system(**rig), over={"V": [10.0]})
+    wet = srf.linear(srf.system(**rig, effects=["pore-pressure"], pressure=0.8), over={"V": [10.0]})
+    (one,), (other,) = drained.table.rows, wet.table.rows
+    place = [c.name for c in drained.table.columns].index("W0")
+    assert other[place] == pytest.approx(one[place] + 0.8, rel=1e-6)
+
+
+def test_a_distorted_load_without_a_mass_is_the_limit_of_a_small_one():
+    distorted = {"effects": ["load-distortion"], "amplitude": 0.2, "V": 10.0}
+    loads = [srf.critical(srf.system(**distorted, inertia=False), V=10, eps=0.1)]
+    loads.append(srf.critical(srf.system(**distorted, M=1e-3), V=10, eps=0.1))
+    massless, light = (found.table.rows[0][[c.name for c in found.table.columns].index("W0")] for found in loads)
+    assert massless == pytest.approx(light, rel=2e-5) != 8.0

@@ -141,6 +141,23 @@ def test_an_effect_that_lets_half_of_a_modulation_through_is_half_of_it() -> Non
     assert felt["u"] == pytest.approx(half["u"], abs=1e-7)
 
 
+def test_an_effect_asks_the_load_and_not_the_samples(empty_folder: Path) -> None:
+    """A measured modulation of 30 Hz is found in what was measured, also where the record has 5 samples a second."""
+    t = np.arange(2101) / 1000
+    W = 5 * (1 + 0.1 * np.cos(60 * np.pi * t) * np.clip(t / 0.2, 0, 1))
+    rows = (f"{a!r},{b!r}" for a, b in zip(t.tolist(), W.tolist(), strict=True))
+    Path("L.csv").write_text("\n".join(["time [s],normal_load [N]", *rows]))
+    felt = ("--load-file", "L.csv", "--effect", "load-transmission", "--set", "rho=0.5", "--V", "10", "--for", "2")
+    fine, coarse = (columns(*felt, "--rate", rate)["u"][-1] for rate in ("1000", "5"))
+    assert coarse == pytest.approx(fine, abs=1e-6) != columns("--load-file", "L.csv", "--V", "10", "--for", "2")["u"][-1]
+
+
+def test_friction_force_is_that_of_the_load_on_the_asperities() -> None:
+    wet = ("--effect", "pore-pressure", "--set", "pressure=1")
+    c = columns("--interface", "rigid", "--V", "10", "--W0", "5", "--for", "1", "--rate", "10", *wet)
+    assert c["tau"] == pytest.approx(0.21 * c["u"], rel=1e-9) == 0.8 * c["W"] * c["mu"]
+
+
 def test_a_stage_whose_velocity_ripples_is_seen_at_its_pitch() -> None:
     """Critical loads do not depend on it: V changes with the stage's position, here 4 times a second."""
     asked = ("--effect", "drive-ripple", "--set", "amplitude=0.05", "--set", "pitch=2")
@@ -362,6 +379,7 @@ def test_ctrl_c_keeps_the_runs_that_are_done(shared: Path, monkeypatch: pytest.M
         (["--rate", "-5"], "a rate lies between", "--rate 1000"),
         (["--onset", "1"], "nothing is modulated", "--eps"),
         (["--eps", "0.1", "--onset", "-1"], "before the record", "begins with it"),
+        (["--loading", "inclined", "--drive", "1:5, 1:9"], "changes its velocity", "leave out --loading"),
         (["--effect", "inertia", "--no-inertia"], "only replaces", "inertia = true"),
         (["--effect", "drive-riple"], "unknown effect", "Did you mean 'drive-ripple'?"),
         (["--start", "q=3"], "'q' is no state", "Known: phi, u, v, z"),

@@ -251,7 +251,7 @@ def _new_record(system: SystemOptions, given: Mapping[str, Any], field: Friction
         t=task.sample_times(durations, rates, begin),
         drive=Drive.sequence(pieces, start=begin),
         load=load,
-        onset=_onset(given["onset"], begin, modulated=f is not None),
+        onset=None if given["onset"] is None else parse_quantity(given["onset"], "s", name="--onset"),
         start=given["start"],
         observables=observables,
         rough=None if field is None else (system.model(tables=task.FIELD_TABLE), field),
@@ -293,21 +293,6 @@ def _drive_pieces(given: Mapping[str, Any], V: float, length: float | None) -> t
         if not 0 < length <= LONGEST:
             raise SrfError(f"--for {length:g} s is not a length of time", "Write --for 4.")
     return ((float(f"{TRAVEL / V:.3g}") if length is None else length, V, V),)
-
-
-def _onset(text: str | None, begin: float, *, modulated: bool) -> float | None:
-    """Return when the modulation begins to rise, None for the first sample."""
-    if text is None:
-        return None
-    if not modulated:
-        raise SrfError("--onset is given and nothing is modulated", "Give the amplitude, too: --eps 0.09.")
-    since = parse_quantity(text, "s", name="--onset")
-    if since < begin:
-        raise SrfError(
-            f"--onset {since:g} s lies before the record, which begins at {begin:g} s",
-            "Sliding is steady before the first sample: the modulation begins with it or later.",
-        )
-    return since
 
 
 def _sampling_notes(rates: Sequence[float], f: float | None, loaded: float | None, driven: float) -> tuple[str, ...]:

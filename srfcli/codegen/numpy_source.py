@@ -308,6 +308,8 @@ def rates_functions(writer: Writer, eq: Equations) -> Staged:
     _write_rates_by_parameters(writer, rates, inputs)
     writer.scalar("friction", "Friction coefficient.", eq.mu, tail=inputs)
     writer.scalar("elongation", "Spring elongation u.", eq.spring, tail=inputs)
+    if eq.load != symbol("W"):
+        writer.scalar("load", "Normal load on the asperities.", eq.load, tail=inputs)
     return rates
 
 

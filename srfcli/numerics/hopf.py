@@ -105,14 +105,17 @@ def _candidates(model: GeneratedModel, p: Array) -> list[float]:
         real = roots[np.abs(roots.imag) <= 1e-6 * np.abs(roots)].real  # a double root splits by sqrt(rounding)
         return [float(r) for r in real if r > 0]
     loads = SCANNED_LOADS * p[model.index("K")]
-    with np.errstate(all="ignore"):
-        values = _hurwitz(model.characteristic(_with_load(model, p, loads)))
-    found = []
+
+    def last_but_one(W0: Array | float) -> Array:
+        with np.errstate(all="ignore"):  # rates may have a pole
+            return _hurwitz(model.characteristic(_with_load(model, p, W0)))
+
+    values, found = last_but_one(loads), []
     for i in np.nonzero(np.isfinite(values[:-1]) & np.isfinite(values[1:]) & (values[:-1] * values[1:] <= 0))[0]:
         a, b = loads[i], loads[i + 1]
         for _ in range(60):
             middle = np.sqrt(a * b)
-            value = _hurwitz(model.characteristic(_with_load(model, p, middle)))
+            value = last_but_one(middle)
             a, b = (middle, b) if value * values[i] > 0 else (a, middle)
         found.append(float(np.sqrt(a * b)))
     return found
@@ -130,7 +133,11 @@ def _hurwitz(a: Array) -> Array:
 
 def _polish(model: GeneratedModel, p: Array, W0: float) -> HopfPoint | None:
     """Return the Hopf point next to the load `W0` by Newton's method on P(i Omega; W0) = 0, or None where the roots are real."""
-    roots = np.roots(np.asarray(model.characteristic(_with_load(model, p, W0)))[::-1])
+    with np.errstate(all="ignore"):
+        coefficients = np.asarray(model.characteristic(_with_load(model, p, W0)))
+    if not np.isfinite(coefficients).all():  # a pole
+        return None
+    roots = np.roots(coefficients[::-1])
     pairs = roots[roots.imag > 1e-9 * np.abs(roots)]
     if not pairs.size:
         return None

@@ -199,12 +199,12 @@ class SimulationResult(Result):
             Column("v", "um/s", "slip velocity"),
             *(Column(name[3:], "s", "age of the contacts") for name in ages),
             Column("mu", "1", "friction coefficient"),
-            Column("tau", "N", "friction force W mu"),
+            Column("tau", "N", "friction force: mu times the load on the asperities"),
             *([Column("recorded", unit, "what the run's file holds")] if named else []),
             *([Column("measured", unit, "the simulated observable through the gauge")] if gauge else []),
             *beside,
         )
-        blocks = [_block(r, ages, [c.name for c in beside], named=named, gauge=gauge) for r in self.records]
+        blocks = [_block(r, self.work.model, ages, [c.name for c in beside], named=named, gauge=gauge) for r in self.records]
         notes = (*self.work.notes, *(note for r in self.records for note in summary(r, named=named)))
         meta = {"samples": {r.job.name: r.done for r in self.records}, **self.work.meta}
         return Table("srf.simulate/1", columns, Rows(blocks), model.title, notes, self.work.parameters, meta, self.worst.value)
@@ -267,12 +267,15 @@ class Rows(Sequence[tuple[Any, ...]]):
         raise IndexError(index)
 
 
-def _block(r: Record, ages: list[str], beside: list[str], *, named: bool, gauge: bool) -> tuple[tuple[Any, ...], Sequence[Array]]:
+def _block(
+    r: Record, model: GeneratedModel, ages: list[str], beside: list[str], *, named: bool, gauge: bool
+) -> tuple[tuple[Any, ...], Sequence[Array]]:
     """Return the cells that lead each row of a record, and the columns that follow."""
     n, trace = r.done, r.trace
     with np.errstate(over="ignore"):
         states = [np.exp(trace.state(name)) for name in ages]
-    columns = [trace.t, trace.V, trace.W, trace.u, trace.v, *states, trace.mu, trace.W * trace.mu]
+    load = _along(model, r.job, trace, "load")
+    columns = [trace.t, trace.V, trace.W, trace.u, trace.v, *states, trace.mu, (trace.W if load is None else load) * trace.mu]
     if named:
         assert r.job.run is not None
         columns.append(np.where(r.job.run.used, r.job.run.observed, np.nan))

@@ -318,7 +318,7 @@ class _Builder:
         reading, shown = self.parts.gauge, self.parts.plain
         if not system.inertia:
             spring, reading, shown = (e.subs(meaning) for e in (spring, reading, shown))
-        self.check_known([reading, shown], {*map(str, unknowns), "W"})
+        self.check_known([reading, shown], {*map(str, unknowns), "W", *clock})
         return Equations(
             names=tuple(names),
             unknowns=tuple(unknowns),

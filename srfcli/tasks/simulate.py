@@ -25,7 +25,7 @@ from srfcli.laws.law_file import RESERVED
 from srfcli.laws.registry import Registry
 from srfcli.motion import STEP_RISE
 from srfcli.motion import simulate as integrate
-from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, ModulatedLoad, Modulation
+from srfcli.motion.imposed import ConstantLoad, Drive, Load, LoadSteps, ModulatedLoad, Modulation, SampledLoad
 from srfcli.results.simulation import Gauge, Job, Record, SimulationResult, Work, measure, observe
 
 if TYPE_CHECKING:
@@ -191,16 +191,22 @@ def record_of(
     model, values, begin = system.motion, system.resolved.values, float(t[0])
     replaced = [name for name, given in (("V", drive), ("W0", load)) if given is not None]
     drive, load = drive or Drive.constant(values["V"]), load or ConstantLoad(values["W0"])
-    modulation = (values["f"], values["eps"], begin if onset is None else onset) if values["eps"] else None
+    if "angle" in values and any(drive.at(s) != drive.at(begin) for s in (*drive.breaks, float(t[-1]))):
+        raise SrfError(
+            "under an inclined spring W0 is the load in steady sliding at V, and the drive changes its velocity",
+            "Drive at one velocity, or leave out `loading`.",
+        )
+    modulation = (values["f"], values["eps"], _onset(onset, begin)) if values["eps"] else None
     if modulation is not None:
         f, eps, since = modulation
         shape = Modulation(1.0, eps, f, since)
         load = replace(shape, W0=load.W0) if isinstance(load, ConstantLoad) else ModulatedLoad(load, shape)
+    elif onset is not None:
+        raise SrfError("`onset` is given and nothing is modulated", "Give the amplitude, too: `eps` 0.09.")
     load.check(begin, float(t[-1]))
     asked: dict[str, float] = {}
     if "begin" in model.names:  # by effects
-        found = modulation_of(load, t) if modulation is None else _as_effects_ask(shape)
-        asked = {"begin": begin, "weighed": float(observables[0] != "elongation"), **found}
+        asked = {"begin": begin, "weighed": float(observables[0] != "elongation"), **_as_effects_ask(load, t)}
     p = model.vector({**values, **asked})
     model.check_changing_load(p)
     state = start_state(model, p, start, drive=drive, load=load.rest(begin), begin=begin)
@@ -212,10 +218,30 @@ def record_of(
     return work if rough is None else on_field(work, *rough, start=start)
 
 
-def _as_effects_ask(shape: Modulation) -> dict[str, float]:
-    """Return a modulation as effects ask for it: switched on as (1 + tanh((t - onset0)/rise0))/2, as steeply as it rises."""
-    rise = shape.full - shape.onset
+def _onset(onset: float | None, begin: float) -> float:
+    """Return when the modulation begins to rise, at `begin` (s) if left out."""
+    if onset is None:
+        return begin
+    if not onset >= begin:
+        raise SrfError(
+            f"`onset` {onset:g} s lies before the record, which begins at {begin:g} s",
+            "Sliding is steady before the first sample: the modulation begins with it or later.",
+        )
+    return onset
+
+
+def _as_effects_ask(load: Load, t: Array) -> dict[str, float]:
+    """Return a load's modulation as effects ask for it: switched on as (1 + tanh((t - onset0)/rise0))/2, as steeply as it rises.
+
+    That of a load of one's own is found at the times t, that of a measured one at its own.
+    """
+    shape = load if isinstance(load, Modulation) else load.shape if isinstance(load, ModulatedLoad) else None
+    if shape is None or not shape.eps:
+        return modulation_of(load, load.times if isinstance(load, SampledLoad) else t)
     known = {"f": shape.f, "eps": shape.eps, "psi": shape.phase, "modulated": 1.0}
+    if not math.isfinite(shape.onset):
+        return known
+    rise = shape.full - shape.onset
     return known | {"onset0": shape.onset + rise / 2, "rise0": rise / (2 * STEEPEST)}
 
 
