@@ -193,6 +193,66 @@ def test_values_are_checked_as_on_the_command_line(slider: srf.SlidingSystem) ->
         assert said in f"{error.value.message} {error.value.hint}"
 
 
+TIMES = [0.0, 0.5, 1.0]
+WRONG = {
+    "no mapping": (lambda s: srf.linear(s, over=["V"]), "no mapping from a parameter"),
+    "a number as window": (lambda s: srf.critical(s, window=5), "not two rising loads"),
+    "a falling window": (lambda s: srf.critical(s, window=(20, 4)), "not two rising loads"),
+    "few samples": (lambda s: srf.critical(s, samples=2), "crossings would be missed"),
+    "text for a number": (lambda s: srf.critical(s, eps="much"), "is not a number"),
+    "harmonics": (lambda s: srf.floquet(s, harmonics=-1), "is below 0"),
+    "systems without names": (lambda s: srf.compare([s, s]), "have no names"),
+    "a name as axis": (lambda s: srf.map(s, x="V", y=("W0", 1, 20, 3)), "is no axis"),
+    "nothing as value": (lambda s: srf.system(K=None), "is no number"),
+    "several values": (lambda s: s.at(K=np.array([1, 2])), "is no number"),
+    "times": (lambda s: srf.simulate(s, t="soon"), "no rising list of times"),
+    "a number as drive": (lambda s: srf.simulate(s, t=TIMES, drive=8), "no list of pairs"),
+    "no drive": (lambda s: srf.simulate(s, t=TIMES, drive=[]), "no list of pairs"),
+    "triples as load": (lambda s: srf.simulate(s, t=TIMES, load=[(1, 5, 6)]), "no list of pairs"),
+    "an onset of nothing": (lambda s: srf.simulate(s, t=TIMES, onset=0.5), "nothing is modulated"),
+    "an onset before": (lambda s: srf.simulate(s.at(eps=0.1), t=TIMES, onset=-5.0), "before the record"),
+    "an effect of the drive": (lambda s: srf.critical(srf.system(effects=["drive-ripple"])), "critical loads do not depend on"),
+    "a track": (lambda s: srf.fit("here", track="bumpy"), "`track`: 'bumpy'"),
+    "a trend": (lambda s: srf.fit("here", trend="up"), "`trend`: 'up'"),
+    "a name twice": (lambda s: srf.fit("here", free="A,A"), "named twice"),
+    "no start": (lambda s: srf.fit("here", starts=0), "one start or more"),
+    "what varies by what": (lambda s: srf.diagnose("here", by="weekday"), "`by`: 'weekday'"),
+}
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG.values(), ids=WRONG)
+def test_a_wrong_argument_is_said_in_a_line(call, message: str, slider: srf.SlidingSystem) -> None:
+    with pytest.raises(srf.SrfError) as found:
+        call(slider)
+    assert message in str(found.value) and "\n" not in str(found.value)
+
+
+def test_values_may_be_text_with_a_unit(slider: srf.SlidingSystem) -> None:
+    plain = srf.critical(slider, V=8, eps=0.1, window=(4, 20)).table.rows
+    assert srf.critical(slider, V="8 um/s", eps="10 %", window=("4 N", "20 N")).table.rows == plain
+    start = srf.simulate(slider, t=TIMES, start=10).records[0].trace
+    assert start.v[0] == pytest.approx(10.0)
+
+
+def test_a_registered_folder_is_looked_in(tmp_path: Path) -> None:
+    """What `srf.read_experiment` took from a folder of plugins, `check` and `fit` take from it, too."""
+    shipped = (Path(srf.__file__).parents[1] / "plugins" / "friction" / "dieterich-ruina.toml").read_text(encoding="utf-8")
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "own.toml").write_text(shipped.replace("dieterich-ruina", "own-law"), encoding="utf-8")
+    lines = ["time [s],load_point_velocity [um/s],friction", *(f"{0.1 * k:.1f},3,{0.6 + 1e-4 * (k % 3):.4f}" for k in range(60))]
+    (tmp_path / "run.csv").write_text("\n".join(lines))
+    (tmp_path / "experiment.toml").write_text(
+        'format = "srf-experiment/1"\napparatus = { stiffness = "3e-3 1/um" }\n'
+        'model = { law = "own-law", ageing = "ruina", interface = "rigid", inertia = false }\n'
+        "parameters = { mu0 = { value = 0.6, lower = 0.5, upper = 0.7 } }\n"
+        'runs = [{ name = "run", file = "run.csv", load = "10 MPa" }]\n'
+    )
+    experiment = srf.read_experiment(tmp_path, plugins=[tmp_path / "own"])
+    assert srf.fit(experiment, plugins=[tmp_path / "own"], track="smooth").values["mu0"] == pytest.approx(0.6, abs=0.02)
+    with pytest.raises(srf.SrfError, match="own-law"):
+        srf.fit(experiment)
+
+
 def test_settings_of_the_folder_do_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "srf.toml").write_text("[parameters]\nK = 0.5\n")
     monkeypatch.chdir(tmp_path)

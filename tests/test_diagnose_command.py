@@ -283,6 +283,6 @@ def test_a_law_that_became_another_leaves_it_the_confidence(tmp_path: Path) -> N
     assert found.confidence["kato-tullis"] == 0.0 and found.confidence["ruina"] > 0.8
     assert sum(found.confidence.values()) == pytest.approx(1.0)
     assert [row[0] for row in found.table.rows] == ["ruina", "kato-tullis", "none"]
-    assert str(found).startswith("identified: ruina\n")
-    assert repr(found) == "<DiagnosisResult: identified: ruina; ok>"
-    assert found._repr_html_().startswith("<p>identified: ruina</p>")
+    assert str(found).startswith("identified: the ageing law is ruina, not dieterich\n")
+    assert repr(found) == "<DiagnosisResult: identified: the ageing law is ruina, not dieterich; ok>"
+    assert found._repr_html_().startswith("<p>identified: the ageing law is ruina, not dieterich</p>")

@@ -280,7 +280,7 @@ def _usage_text(error: click.ClickException, group: click.Group, arguments: Sequ
         return message[:1].lower() + message[1:], f"{path} --help"
     name = error.option_name
     options = [o for p in command.params for o in (*p.opts, *p.secondary_opts) if o.startswith("--")]
-    close = difflib.get_close_matches(name, options, n=1, cutoff=0.75)
+    close = ["--free"] if name == "--fix" and "--free" in options else difflib.get_close_matches(name, options, n=1, cutoff=0.75)
     hints = [f"Did you mean '{close[0]}'?"] if close else []
     if "--set" in options and name.startswith("--") and name[2:].isidentifier():
         hints.append(f"A law's parameter is set with --set {name[2:]}=VALUE.")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -75,6 +75,21 @@ class ExpressionError(SrfError):
         text = self.text.replace("\n", " ").replace("\t", " ")
         text = _UNSEEN.sub("?", text)  # one sign for one, as the caret counts
         return f"  {text}\n  {' ' * self.column}^"
+
+
+def check_choice(name: str, value: str | None, choices: Sequence[str]) -> None:
+    """Raise SrfError for a value of the parameter `name` that is none of `choices`; None is left to whoever has a default."""
+    if value is not None and value not in choices:
+        raise SrfError(f"`{name}`: {value!r} is not one of its values", did_you_mean(str(value), choices))
+
+
+def as_names(value: str | Sequence[str], what: str) -> list[str]:
+    """Return names that are given as a list, or as text with commas; raises SrfError for a name that is given twice."""
+    names = [part.strip() for part in value.split(",")] if isinstance(value, str) else [str(name) for name in value]
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            raise SrfError(f"`{what}`: {name!r} is named twice", "Once is enough.")
+    return names
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -223,6 +223,8 @@ def check_value(parameter: Parameter, value: str | float, *, origin: str = "flag
         number = parse_quantity(value, parameter.unit, name=name) if isinstance(value, str) else float(value)
     except OverflowError:  # an integer of more than 308 digits
         number = math.inf
+    except (TypeError, ValueError):
+        raise SrfError(f"{name} = {value!r} is no number", f"Like {parameter.default:g}, or text with a unit.") from None
     source = None if origin == "flag" else f"It was set by {origin}."
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     if not math.isfinite(number):

@@ -45,8 +45,8 @@ NAMED = {  # role -> what headings call it, in small letters without their unit;
         "displacement", "shear_displacement", "x_lp", "slip", "stage", "stage_position",
     ),
     "normal_stress": (
-        "normal_stress", "effective_normal_stress", "norm_stress", "sigma_n", "sigman", "sig_n", "sigma", "sn", "ns",
-        "nor_stress",
+        "normal_stress", "effective_normal_stress", "eff_normal_stress", "norm_stress", "sigma_n", "sigman", "sig_n", "sign",
+        "sigma", "sn", "ns", "nor_stress",
     ),
     "normal_load": ("normal_load", "normal_force", "fn", "f_n", "norm_force", "load", "n", "w"),
     "elongation": ("elongation", "spring_elongation", "deflection", "spring_deflection", "u"),
@@ -204,7 +204,8 @@ def _by_words(headings: Sequence[str], found: dict[str, Named]) -> None:
     """
     taken = {named.heading for named in found.values()}
     units_of = {h: _spelled(h)[1] for h in headings if h not in taken}
-    words = {h: set(re.findall(r"[a-z]+", _spelled(h)[0])) for h in units_of}
+    apart = {h: re.sub(r"(?<=[a-z])(?=[A-Z][a-z])", " ", h) for h in units_of}  # NormalStress
+    words = {h: set(re.findall(r"[a-z]+", _spelled(text)[0])) for h, text in apart.items()}
     units_of = {h: "1" if unit is None and "strain" in words[h] else unit for h, unit in units_of.items()}
     kinds = {h: _kind_of_unit(unit) for h, unit in units_of.items()}
     free = [h for h in kinds if not words[h] & ASIDE]
@@ -303,9 +304,10 @@ def missing(columns: Sequence[Named], wish: Wish, path: Path, headings: Sequence
         lacks.append(("--column shear_stress=HEADING", f"{path}: which column is {what}? It has {listed}"))
     if wish.drive is None and not roles & {"load_point_velocity", "load_point_displacement"}:
         option = "--drive VELOCITY, or --column load_point_displacement=HEADING"
-        lacks.append((option, f"{path}: no column has the load point's velocity or displacement"))
+        lacks.append((option, f"{path}: which column is the load point's velocity or displacement? It has {listed}"))
     if wish.load is None and not roles & {"normal_load", "normal_stress", "friction"}:
-        lacks.append(("--load '5 N', or --column normal_stress=HEADING", f"{path}: no column has the normal load or stress"))
+        option = "--load '5 N', or --column normal_stress=HEADING"
+        lacks.append((option, f"{path}: which column is the normal load or stress? It has {listed}"))
     return lacks
 
 
@@ -328,6 +330,11 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     """
     unit = split_quantity(wish.stiffness, name="--stiffness", example="5e-3 1/um")[1]
     per_load = bool(unit) and find_unit(unit).powers == (-1, 0, 0, 0)
+    if unit and find_unit(unit).powers not in [find_unit(known).powers for known in ("N/um", "MPa/um", "1/um")]:
+        raise SrfError(
+            f"--stiffness '{wish.stiffness}' is no stiffness: a force, a stress or a friction over a length is one",
+            "As '0.21 N/um', '30 MPa/mm' or '1e-3 1/um'.",
+        )
     named: tuple[Named, ...] = ()
     names: list[str] = []
     remarks: list[str] = []
@@ -350,6 +357,8 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     for name in wish.holdout:
         if name not in sketch.names:
             raise SrfError(f"--holdout {name}: no such run", did_you_mean(name, sketch.names))
+    if set(wish.holdout) >= set(sketch.names):
+        raise SrfError("--holdout: every run is held out", "Leave one to be fitted.")
     sketch, runs = _read(sketch, registry)
     if sketch.negative:
         remarks.append("compression is negative in the file: the load counts with the other sign")

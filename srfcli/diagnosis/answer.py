@@ -212,11 +212,12 @@ def scan_row(row: Row) -> dict[str, Any]:
 
 def ranked_rows(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Return what was fitted, best evidence first; of models that are equal to the digit shown, the final one."""
+    became = {name: f"it has become {law}" for name, law in diagnosis.became.items()}
     ranked = sorted(diagnosis.ranked, key=lambda f: (-round(f.evidence, 1), f is not diagnosis.final))
     return [
         {"name": f.name, "evidence": f.evidence, "rms_over_noise": f.fit.maximum.point.rms,
          "field": 0.0 if f.fit.smooth else f.fit.values["field_amplitude"], "confidence": diagnosis.confidence.get(f.name, 0.0),
-         "against": f.against[0] if f.against else ""}
+         "against": f.against[0] if f.against else became.get(f.name, "")}
         for f in ranked
     ]  # fmt: skip
 

@@ -79,7 +79,7 @@ class Diagnosis:
 
     `shown` is the baseline with the final model's field and gauge noise, its own parameters fitted again.
     `detectable` is the size, in um, s, N, from which each effect could have been seen; `ungated` the verdict, had held-out runs
-    no say.
+    no say; `became` which ageing law another one became, by their names.
     """
 
     experiment: Experiment
@@ -98,6 +98,7 @@ class Diagnosis:
     reasons: tuple[str, ...]
     ungated: str
     held_loads: tuple[HeldLoads, ...] = field(default=(), repr=False)
+    became: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -151,7 +152,7 @@ def conclude(search: ModelSearch, whole: Experiment) -> Diagnosis:
         whole, verdict, best, baseline, baseline if verdict in BASELINE_VERDICTS else shown, ranked, close,
         _confidence(ranked, joint, became, verdict), scores,
         (*search.excluded, *absorbed), {s.effect.reported: s.detectable for s in scores}, _equivalent(scores, close), held,
-        tuple(reasons), ungated, held_loads,
+        tuple(reasons), ungated, held_loads, became,
     )  # fmt: skip
 
 

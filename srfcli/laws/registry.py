@@ -94,6 +94,8 @@ class Registry:
         others = [e.kind for e in self._entries if e.name == name]
         known = did_you_mean(name, (e.name for e in self.entries(kind)))
         hint = f"'{name}' is of kind {others[0]}. Known: {known.rpartition('Known: ')[2]}" if others else known
+        if kind == "ageing" and any(word in name for word in ("slip", "ageing", "aging")):
+            hint = f"The slip law is ruina, the ageing law dieterich. {hint}"
         raise SrfError(f"unknown {what} '{name}'", hint, kind="unknown name")
 
     def get(self, kind: str, name: str) -> Law:

@@ -18,6 +18,7 @@ from srfcli.core.errors import SrfError, Status
 from srfcli.core.files import check_folder_place, parse_json, read_plain, unused_name, whole_folder, write_atomic
 from srfcli.diagnosis.answer import RunView, answer, load_views, material, parameter_rows, ranked_rows, run_views
 from srfcli.diagnosis.design import DiscriminatingRun, discriminating_files
+from srfcli.diagnosis.verdict import parameters_of
 from srfcli.results.provenance import Provenance, write_result
 from srfcli.results.report_figures import loads_figure, run_figure, trace
 from srfcli.results.report_text import unit_text
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from srfcli.data.values import Run
     from srfcli.diagnosis.residual_scan import Location
+    from srfcli.diagnosis.search import Fitted
     from srfcli.diagnosis.verdict import Diagnosis
     from srfcli.laws.registry import Registry
 
@@ -113,8 +115,11 @@ class DiagnosisResult(Result):
     @property
     def sentence(self) -> str:
         """Return the verdict in a sentence."""
-        alone = self.diagnosis.acts_in
+        alone, stated = self.diagnosis.acts_in, self.diagnosis.experiment.choice.ageing
+        laws = {f.hypothesis.ageing for f in self.diagnosis.close} - {""}
         named = [f"{name} in {alone[name]} alone" if name in alone else name for name in self.effects]
+        if self.verdict == "identified":
+            named = [f"the ageing law is {name}, not {stated}" if name in laws else name for name in named]
         return SENTENCES[self.verdict].format(" and ".join(named))
 
     @property
@@ -159,8 +164,34 @@ class DiagnosisResult(Result):
     def parameter_table(self) -> Table:
         """Return each parameter under baseline and final model."""
         keys = ("name", "baseline", "baseline_stderr", "augmented", "augmented_stderr", "unit", "shift_sigma")
-        rows = [tuple(r[k] for k in keys) for r in parameter_rows(self.diagnosis)]
-        return Table("srf.diagnose.parameters/1", PARAMETERS, rows, "parameters")
+        rows = [tuple(r[k] for k in keys) for r in self._parameters]
+        notes = []
+        if _differ(self.answer):
+            notes.append("the baseline is fitted with the final model's field and gauge noise, to show what it lacks")
+        if self.verdict == "ambiguous":
+            notes += [f"{f.name}: {', '.join(self._added(f))}" for f in self.diagnosis.close]
+        return Table("srf.diagnose.parameters/1", PARAMETERS, rows, "parameters", tuple(notes))
+
+    @property
+    def _parameters(self) -> list[dict[str, Any]]:
+        """Return the rows of `parameter_rows` in the units of the recordings."""
+        rows = parameter_rows(self.diagnosis)
+        for row in rows:
+            row["unit"], factor = self.diagnosis.experiment.shown(str(row["unit"]))
+            for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
+                row[key] = row[key] and row[key] * factor
+        return rows
+
+    def _added(self, fitted: Fitted) -> list[str]:
+        """Return the parameters that a model has and the baseline has not, as text."""
+        listed = {q.name for q in self.diagnosis.baseline.fit.likelihood.problem.experiment.parameters}
+        told = []
+        for name, found in parameters_of(fitted).items():
+            if name not in listed and name != "ratio" and "." not in name:
+                unit, factor = self.diagnosis.experiment.shown(str(found["unit"]))
+                shown = "" if unit == "1" else f" {unit}"
+                told.append(f"{name} = {found['value'] * factor:.5g} +- {found['stderr'] * factor:.2g}{shown}")
+        return told or ["no parameter more"]
 
     @property
     def run_table(self) -> Table:
@@ -188,10 +219,7 @@ class DiagnosisResult(Result):
             run = runs[shown["name"]]
             unit = f"  [{unit_text(run.unit)}]" if run.unit != "1" else ""
             shown |= {"label": f"{run.quantity}{unit}", "load_unit": run.load_unit}
-        for row in made["parameters"]:
-            row["unit"], factor = experiment.shown(str(row["unit"]))
-            for key in ("baseline", "baseline_stderr", "augmented", "augmented_stderr"):
-                row[key] = row[key] and row[key] * factor
+        made["parameters"] = self._parameters
         stiffness, unit = experiment.shown_stiffness
         made["stated"] = {"stiffness": f"{stiffness:.4g} {unit_text(unit)}", "ageing": experiment.choice.ageing}
         made["laws"] = sorted({ranked.hypothesis.ageing for ranked in self.diagnosis.ranked} - {""})
@@ -306,10 +334,10 @@ def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:
         rest = "" if held is None else f", {held:.4g} in those held out"
         field = side["field"]
         track = "needs no random friction" if field is None else f"needs random friction of {field['amplitude']:.2g}"
-        like = " with the final model's" if name == "baseline" and found["baseline"] != found["augmented"] else ""
+        like = "with the final model's field and gauge noise, " if name == "baseline" and _differ(found) else ""
         told = f"rms over noise {side['fit']['rms_over_noise']:.4g} in"
         if recorded:
-            notes.append(f"{name}: {track};{like} {told} the runs fitted{rest}")
+            notes.append(f"{name}: {track}; {like}{told} the runs fitted{rest}")
         else:
             notes.append(f"{name}: {told} the critical loads fitted{rest}")
     notes += [f"{a} and {b} cannot be told apart by these recordings" for a, b in found["equivalent"]]
@@ -319,6 +347,10 @@ def _notes(found: dict[str, Any], *, recorded: bool) -> list[str]:
     for effect, size in found.get("detectable", {}).items():
         notes.append(f"{effect} could have been seen from a size of {size:.3g} on")
     return notes
+
+
+def _differ(found: dict[str, Any]) -> bool:
+    return bool(found["baseline"] != found["augmented"])
 
 
 def _missing(missing: dict[str, Any]) -> list[str]:
@@ -343,10 +375,11 @@ def _places(location: Location) -> list[str]:
     if location.forcing_phase is not None:
         notes.append("the misfit goes with the forcing: {:.2f} to {:.2f} rad after its maximum".format(*location.forcing_phase))
     if location.frequencies:
-        notes.append(f"it has lines at {', '.join(f'{f:.4g}' for f in location.frequencies)} Hz")
+        lines = ", ".join(f"{f:.4g}" for f in location.frequencies)
+        notes.append(f"the baseline's residuals have lines in their spectrum at {lines} Hz")
     if location.coordinate is not None:
         name, share = location.coordinate
-        notes.append(f"a function of {name} explains {100 * share:.0f} % of it")
+        notes.append(f"a function of {name} alone explains {100 * share:.0f} % of the residuals' power")
     return notes
 
 

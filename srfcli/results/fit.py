@@ -246,6 +246,39 @@ class FitResult(Result):
         title = self.experiment.title
         return Table("srf.fit/2", PARAMETERS, rows, title, tuple(self._notes()), {}, meta, status=self.worst.value)
 
+    @cached_property
+    def against(self) -> list[str]:
+        """Return what speaks against the model, in sentences: random friction that no track has, tests that the fit fails."""
+        from srfcli.diagnosis.goodness_of_fit import PLAUSIBLE, shortcomings
+
+        found, told = self.found, []
+        if found.friction_field is not None:
+            share = found.friction_field.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
+            if share > PLAUSIBLE:
+                told.append(f"that field is {100 * share:.1g} % of the friction, more than a track has")
+        if found.state_space is not None and found.status is not Status.INTERRUPTED:
+            failed = [text for text in shortcomings(found.state_space) if not text.startswith("the field's amplitude")]
+            told += [f"the fit fails a test: {text}" for text in failed[:TESTS_TOLD]]
+        return told
+
+    @cached_property
+    def difference(self) -> tuple[float, float | None] | None:
+        """Return A - B and its standard error with the covariance of the two, None without both; of what varies, of the means."""
+        found, names = self.found, ("A", "B")
+        known = {q.name: q.value for q in self.experiment.parameters} | found.fit.values
+        known |= {
+            n: s.mean if s else float(np.mean([known[m] for m in found.problem.groups[n]])) for n, s in found.scatter.items()
+        }
+        if not {*names} <= known.keys():
+            return None
+        free = [found.fit.names.index(n) for n in names if n in found.fit.names]
+        error = None
+        if free and not {*names} & found.scatter.keys():
+            signs = np.array([1.0, -1.0] if len(free) == 2 else [1.0])
+            variance = float(signs @ np.asarray(found.fit.covariance)[np.ix_(free, free)] @ signs)
+            error = float(np.sqrt(max(variance, 0.0))) if np.isfinite(variance) else None
+        return known["A"] - known["B"], error
+
     def _notes(self) -> list[str]:
         """Return what is to be known beside the numbers, in sentences."""
         found, fit = self.found, self.found.fit
@@ -253,6 +286,10 @@ class FitResult(Result):
         notes = [f"rms over noise {fit.rms_over_noise():.3f} in the {of} fitted"]
         if any(f.holdout for f in fit.runs) or any(t.loads.holdout for t in fit.tables):
             notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
+        if self.difference is not None and self.difference[1]:
+            difference, error = self.difference
+            sense = "rises" if difference > 0 else "falls"
+            notes.append(f"A - B = {difference:.6g} +- {error:.2g}: in steady sliding friction {sense} with velocity")
         done = [i.name for i in self.intervals]
         whose = "profile likelihood" + (f" of {', '.join(done)}, else 1.96 standard errors" if len(done) < len(fit.names) else "")
         notes.append("intervals: " + (whose if self.intervals else "1.96 standard errors; --profile refits") + ", 95 %")
@@ -270,20 +307,16 @@ class FitResult(Result):
         notes += [] if self.posterior is None else _posterior_notes(self.posterior)
         notes += load_notes(found.fit) if found.fit.tables else []
         if found.friction_field is not None:
-            from srfcli.diagnosis.goodness_of_fit import PLAUSIBLE
-
             notes.append(str(found.friction_field))
-            share = found.friction_field.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
-            if share > PLAUSIBLE:
-                notes.append(
-                    f"that field is {100 * share:.1g} % of the friction, more than a track has: it may stand in for physics that "
-                    "the model lacks. Try another ageing law or friction law, or `srf diagnose`."
-                )
+        notes += self.against
+        if self.against:
+            notes.append(
+                "the model does not explain the recordings: the values may be wrong by more than their errors. "
+                "Try another ageing law or friction law, or `srf diagnose`."
+            )
         if found.state_space is not None and found.status is not Status.INTERRUPTED:
-            from srfcli.diagnosis.goodness_of_fit import coarse_readings, shortcomings, uneven_noise
+            from srfcli.diagnosis.goodness_of_fit import coarse_readings, uneven_noise
 
-            failed = [text for text in shortcomings(found.state_space) if not text.startswith("the field's amplitude")]
-            notes += [f"the fit fails a test: {text}" for text in failed[:TESTS_TOLD]]
             notes += [*uneven_noise(found.state_space), *coarse_readings(found.state_space)]
         if self.worst is Status.INTERRUPTED and found.status is Status.INTERRUPTED and self.asked > 1:
             notes.append(f"interrupted: {len(found.starts)} of {self.asked} starts were done")

@@ -299,7 +299,7 @@ def summary(r: Record, *, named: bool) -> list[str]:
         sentences.append(f"{lead}stopped at t = {trace.reached:.6g} s of {trace.t[-1]:g} s: {trace.status.advice}")
     if r.job.run is not None and (good := r.job.run.used[:n] & np.isfinite(r.job.run.observed[:n])).any():
         rms = float(np.sqrt(np.mean((r.observed[:n] - r.job.run.observed[:n])[good] ** 2)))
-        unit = OBSERVABLES[r.job.observable]
+        unit = r.job.run.unit
         sentences.append(f"{lead}root mean square distance from the recording {rms:.4g}{'' if unit == '1' else f' {unit}'}")
     return sentences
 

@@ -155,12 +155,8 @@ def _row(path: str, found: FitResult) -> dict[str, Any]:
     }  # fmt: skip
     V = np.concatenate([np.abs(run.drive(run.t)) for run in runs])
     row |= {"V_min": float(V.min()), "V_max": float(V.max())}
-    if {"A", "B"} <= values.keys():
-        variances = [covariance[place[n], place[n]] if n in place else 0.0 for n in ("A", "B")]
-        both = 2 * float(covariance[place["A"], place["B"]]) if {"A", "B"} <= place.keys() else 0.0
-        row["A_minus_B"] = values["A"] - values["B"]
-        told = place and not {"A", "B"} & varied.keys()
-        row["A_minus_B_stderr"] = _number(float(np.sqrt(max(sum(variances) - both, 0.0)))) if told else None
+    if found.difference is not None:
+        row["A_minus_B"], row["A_minus_B_stderr"] = found.difference
     unit, factor = experiment.shown("1/um" if experiment.per_load else "N/um")
     own_stiffness = runs[0].stiffness / (runs[0].first_load if experiment.per_load else 1.0)
     stated = float(values.get("K", own_stiffness))
@@ -183,6 +179,7 @@ def _flags(row: Mapping[str, Any], found: FitResult) -> Iterator[str]:
     if not found.worst.ok:
         yield "the maximum was not reached"
     yield from (f"{line[0]} {line[-1]}" for line in found.table.rows if line[-1])
+    yield from found.against
     for name, scatter in found.found.scatter.items():
         apart = f", which scatter by {scatter.scatter / abs(scatter.mean):.0%} beyond their errors" if scatter else ""
         yield f"{name} is the mean of {len(found.found.problem.groups[name])} groups{apart}"

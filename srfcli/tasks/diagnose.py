@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from srfcli.codegen.c_source import GET_COMPILER, compiler
-from srfcli.core.errors import SrfError, did_you_mean
+from srfcli.core.errors import SrfError, as_names, check_choice, did_you_mean
 from srfcli.data.experiment import read_experiment
-from srfcli.data.groups import grouped
+from srfcli.data.groups import BY, grouped
 from srfcli.data.values import Experiment
 from srfcli.diagnosis.design import discriminating_run
 from srfcli.diagnosis.discrepancy import explain_unknown
@@ -25,12 +25,13 @@ from srfcli.results.diagnosis import DiagnosisResult
 def diagnose(
     experiment: Experiment | Path | str,
     *,
-    effects: Sequence[str] = (),
+    effects: str | Sequence[str] = (),
     trend: str | None = None,
-    vary: Sequence[str] = (),
+    vary: str | Sequence[str] = (),
     by: str | None = None,
     reader: str | None = None,
     seed: int = 0,
+    plugins: Sequence[str | Path] = (),
     registry: Registry | None = None,
     progress: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> DiagnosisResult:
@@ -43,11 +44,11 @@ def diagnose(
     ----------
     experiment : path or Experiment
         A folder with experiment.toml, or that file: its held-out recordings are opened only when the models are final.
-    effects : sequence of str
+    effects : str or sequence of str
         Effects, or ageing laws, to look for; all that are registered if left out.
     trend : {'slip', 'time', 'none'}, optional
         Let each run's observable drift, or not; as the experiment says if left out.
-    vary : sequence of str
+    vary : str or sequence of str
         Free parameters, or "noise" of the gauge, with a value of their own in each group of runs; as the experiment says if
         left out.
     by : {'run', 'load', 'segment', 'direction'}, optional
@@ -56,6 +57,8 @@ def diagnose(
         How every data file is read.
     seed : int
         Of the noise that is simulated for p-values, and of runs that are tried.
+    plugins : sequence of path
+        Folders in which laws are looked for, too.
     registry : Registry, optional
         Laws and effects, where they are at hand already.
     progress : callable
@@ -89,7 +92,10 @@ def diagnose(
     srfcli.core.errors.SrfError: unknown effect 'linker-dietrich'
     """
     begun = time.perf_counter()
-    registry = registry or load_registry()
+    check_choice("trend", trend, ("slip", "time", "none"))
+    check_choice("by", by, BY)
+    effects, vary = as_names(effects, "effects"), as_names(vary, "vary")
+    registry = registry or load_registry([Path(p) for p in plugins])
     if effects:
         known = {e.name for e in (*registry.entries("effect"), *registry.entries("ageing"))}
         known |= {law.reported for e in registry.entries("effect") if isinstance(law := registry.load(e), Effect)}

@@ -112,7 +112,10 @@ def _axis(model: GeneratedModel, given: tuple[str, float, float, int] | MapAxis,
     """Return the axis that a name, its ends and a number of points mean."""
     if isinstance(given, MapAxis):
         return given
-    name, lo, hi, count = given
+    try:
+        name, lo, hi, count = given
+    except (TypeError, ValueError):
+        raise SrfError(f"{given!r} is no axis", 'Name, low end, high end, number of points: ("V", 1, 100, 60).') from None
     log = name in logs if logs is not None else hi >= 10 * lo > 0
     if not lo < hi or count < 2:
         raise SrfError(f"{given} is no axis", 'Name, low end, high end, number of points: ("V", 1, 100, 60).')
@@ -211,6 +214,8 @@ def compare(
     >>> found[["law", "stabilised"]].round(2).values.tolist()
     [['dieterich', 0.5], ['ruina', 0.67]]
     """
+    if not isinstance(systems, Mapping):
+        raise SrfError("the systems to compare have no names", "Give them in a mapping: {'ageing': one, 'slip': other}.")
     names, models = tuple(systems), [s.model for s in systems.values()]
     if len(names) < 2:
         raise SrfError("one law is nothing to compare", "Name more, such as srf-vsat and log-log, or several ageing laws.")

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from srfcli.core.errors import SrfError, Status
+from srfcli.core.errors import SrfError, Status, as_names, check_choice
 from srfcli.data import experiment as description
+from srfcli.data.groups import BY
 from srfcli.data.values import Experiment
 from srfcli.inference import posterior as posteriors
 from srfcli.inference.cramer_rao import forecast
@@ -80,6 +81,7 @@ def check(
     *,
     runs: Sequence[str] = (),
     simulate: bool = True,
+    plugins: Sequence[str | Path] = (),
     registry: Registry | None = None,
     progress: Callable[[str], None] = lambda run: None,
 ) -> CheckResult:
@@ -88,11 +90,13 @@ def check(
     Parameters
     ----------
     experiment : path or Experiment
-        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`, which also takes a reader and plugins.
+        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`, which also takes a reader.
     runs : sequence of str
         Names of runs; all if left out.
     simulate : bool
         Whether each run is simulated, to say what its load can tell.
+    plugins : sequence of path
+        Folders in which laws are looked for, too.
     registry : Registry, optional
         Laws, where they are at hand already.
     progress : callable
@@ -132,7 +136,7 @@ def check(
     >>> found.runs[0].run.t.size, round(found.runs[0].noise.total, 4)
     (200, 0.0002)
     """
-    registry = registry or load_registry()
+    registry = registry or load_registry([Path(p) for p in plugins])
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment, registry=registry)
     experiment.check_recorded("to check")
@@ -144,9 +148,9 @@ def check(
 def fit(
     experiment: Experiment | Path | str,
     *,
-    free: Sequence[str] | None = None,
+    free: str | Sequence[str] | None = None,
     trend: str | None = None,
-    vary: Sequence[str] = (),
+    vary: str | Sequence[str] = (),
     by: str | None = None,
     prior: bool = True,
     track: str | None = None,
@@ -154,6 +158,7 @@ def fit(
     profile: bool = False,
     sample: int | None = None,
     seed: int = 0,
+    plugins: Sequence[str | Path] = (),
     registry: Registry | None = None,
     progress: Callable[[str, str, float | None], None] = lambda stage, text, share: None,
 ) -> FitResult:
@@ -165,12 +170,12 @@ def fit(
     Parameters
     ----------
     experiment : path or Experiment
-        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`, which also takes a reader and plugins.
-    free : sequence of str, optional
+        A folder with experiment.toml, or that file; or from `srfcli.read_experiment`, which also takes a reader.
+    free : str or sequence of str, optional
         Parameters to fit; those that the experiment leaves free if left out.
     trend : {'slip', 'time', 'none'}, optional
         Let each run's observable drift, or not; as the experiment says if left out.
-    vary : sequence of str
+    vary : str or sequence of str
         Free parameters, or "noise" of the gauge, with a value of their own in each group of runs, B in a run up is B[up]; as
         the experiment says if left out.
     by : {'run', 'load', 'segment', 'direction'}, optional
@@ -187,6 +192,8 @@ def fit(
         How many points of the posterior are drawn, with emcee.
     seed : int
         Of further starts and of the sampler.
+    plugins : sequence of path
+        Folders in which laws are looked for, too.
     registry : Registry, optional
         Laws, where they are at hand already.
     progress : callable
@@ -236,9 +243,15 @@ def fit(
     >>> found.status.ok, round(found.values["D0"]), found.stderr["D0"] < 0.2
     (True, 10, True)
     """
+    check_choice("track", track, ("smooth", "rough", "shared"))
+    check_choice("trend", trend, ("slip", "time", "none"))
+    check_choice("by", by, BY)
+    free, vary = None if free is None else as_names(free, "free"), as_names(vary, "vary")
+    if starts < 1 or (sample is not None and sample < 2):
+        raise SrfError("a fit has one start or more, and a sample two points or more", "As `starts` 4, `sample` 1000.")
     if track == "shared" and (profile or sample):
         raise SrfError("`track` shared does not go with `profile` or `sample`", "Leave it out, or name rough.")
-    registry = registry or load_registry()
+    registry = registry or load_registry([Path(p) for p in plugins])
     if not isinstance(experiment, Experiment):
         experiment = read_experiment(experiment, registry=registry)
     if sample:

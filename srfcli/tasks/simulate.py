@@ -15,7 +15,7 @@ from srfcli.codegen.model import Array, GeneratedModel, open_model
 from srfcli.codegen.splines import appended
 from srfcli.core.errors import SrfError, Status, did_you_mean, worst
 from srfcli.core.settings import Parameter, check_value, require_parameter
-from srfcli.core.units import from_base, parse_quantity, tidy, to_base
+from srfcli.core.units import find_unit, from_base, parse_quantity, split_quantity, tidy, to_base
 from srfcli.data.description import MOST_OBSERVABLES
 from srfcli.data.noise import FrictionField, check_gauge, generator
 from srfcli.data.values import OBSERVABLES, OTHER_OBSERVABLES, Experiment, FitParameter, ModelChoice, Run
@@ -61,8 +61,8 @@ def simulate(
         Normal load in N for each duration (s), steps rounded over 0.02 s; the system's W0 if left out.
     onset : float, optional
         When the modulation begins to rise, in s; at the first sample if left out.
-    start : array (n_states,) or str
-        State at the first sample, as the model orders it; 'steady' for steady sliding at the first velocity, '10' for steady
+    start : array (n_states,), number or str
+        State at the first sample, as the model orders it; 'steady' for steady sliding at the first velocity, 10 for steady
         sliding at 10 um/s, or values such as 'v=1e-3, phi=100 s' in place of those of steady sliding.
     observable : {'elongation', 'force', 'friction'} or sequence of str
         What the apparatus records, in um, N or 1; of several, others or 'slip' (um) and 'contact_area' (1) after the first.
@@ -91,7 +91,10 @@ def simulate(
     >>> float(run.records[0].trace.mu[-1].round(3))
     0.431
     """
-    times = np.asarray(t, float)
+    try:
+        times = np.asarray(t, float)
+    except (TypeError, ValueError):
+        times = np.zeros(0)
     if times.ndim != 1 or times.size < 2 or not (np.diff(times) > 0).all():
         raise SrfError("t is no rising list of times", "Like numpy.linspace(0, 4, 4001), in s.")
     observables = check_observables([observable] if isinstance(observable, str) else list(observable))
@@ -100,11 +103,23 @@ def simulate(
     if drive is None:
         drive = Drive.constant(system.resolved.values["V"])
     elif not isinstance(drive, Drive):
-        drive = Drive.steps(drive)
+        drive = Drive.steps(_pairs(drive, "drive", "times in s and velocities in um/s: [(0, 10), (2, 20)]"))
     if load is not None and not isinstance(load, Load):
-        load = LoadSteps.sequence([(length, W, W) for length, W in load], start=float(times[0]), rise=STEP_RISE)
+        pieces = _pairs(load, "load", "durations in s and loads in N: [(2, 5), (2, 7)]")
+        load = LoadSteps.sequence([(length, W, W) for length, W in pieces], start=float(times[0]), rise=STEP_RISE)
     work = record_of(system, t=times, drive=drive, load=load, onset=onset, start=start, observables=observables)
     return simulate_work(work, rtol=rtol)
+
+
+def _pairs(given: Any, name: str, like: str) -> list[tuple[float, float]]:
+    """Return pairs of numbers; raises SrfError for anything else."""
+    try:
+        pairs = [(float(first), float(second)) for first, second in given]
+    except (TypeError, ValueError):
+        pairs = []
+    if not pairs:
+        raise SrfError(f"`{name}` {given!r} is no list of pairs", f"Give {like}.")
+    return pairs
 
 
 def simulate_work(
@@ -264,6 +279,8 @@ def start_state(
                 "or begin `drive` with a piece that moves.",
             )
         return None
+    if isinstance(start, int | float) and not isinstance(start, bool):
+        start = repr(start)
     if not isinstance(start, str):
         return np.asarray(start, float)
     if "=" not in start:
@@ -434,7 +451,7 @@ def runs_again(
     experiment.check_recorded("to simulate")
     choice = replace(experiment.choice, **laws)
     model = open_model(registry, **asdict(choice), stability=False)
-    values = _values(model, parameters)
+    values = _values(model, parameters, stress=experiment.stress)
     runs = experiment.named(names)
     observables = list(dict.fromkeys(tuple(s.observable for s in run.signals) for run in runs))
     if len(observables) > 1 and (noise or quantum):
@@ -457,9 +474,12 @@ def runs_again(
     return on_field(work, open_model(registry, **asdict(choice), tables=FIELD_TABLE), field, start=start)
 
 
-def _values(model: GeneratedModel, parameters: Mapping[str, str]) -> dict[str, float]:
-    """Return the parameters that are set, in um, s, N."""
+def _values(model: GeneratedModel, parameters: Mapping[str, str], *, stress: bool) -> dict[str, float]:
+    """Return the parameters that are set, in um, s, N; where stresses were recorded, a stiffness is one over a length."""
     values = {}
+    unit = split_quantity(parameters["K"], name="K")[1] if stress and "K" in parameters else ""
+    if unit and find_unit(unit).powers == find_unit("N/um").powers:
+        raise SrfError(f"`K` {parameters['K']} is a force over a length, and the recordings are stresses", "Give it in MPa/mm.")
     for name, text in parameters.items():
         if name in IMPOSED:
             raise SrfError(f"{name} is what the runs impose", "An experiment says itself how it is driven and loaded.")

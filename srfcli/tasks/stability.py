@@ -37,19 +37,34 @@ Said = Callable[[str], None]
 
 def swept(model: GeneratedModel, over: Mapping[str, Sequence[float] | float]) -> dict[str, tuple[float, ...]]:
     """Return parameter -> values in declared units; raises SrfError for an unknown name or a value out of bounds."""
+    if not isinstance(over, Mapping):
+        raise SrfError(f"over = {over!r} is no mapping from a parameter to its values", "Like {'V': [1, 10, 100]}.")
     return {name: checked(model, name, values) for name, values in over.items()}
 
 
 def checked(model: GeneratedModel, name: str, values: Any) -> tuple[float, ...]:
-    """Return the values of one parameter, a number or several, in its declared unit; raises SrfError as `swept` does."""
+    """Return the values of one parameter, a number or several, in its declared unit; raises SrfError as `swept` does.
+
+    Each is a number or text with a unit.
+    """
     parameter = require_parameter(name, model.parameters, where=model.title)
-    listed = np.atleast_1d(np.asarray(values, float))
-    if listed.ndim != 1 or not listed.size:
+    listed = [values] if isinstance(values, str) or np.ndim(values) == 0 else list(values)
+    if not listed:
         raise SrfError(f"{name}: expected a number or a list of numbers", f'Like {{"{name}": [1, 2, 5]}}.')
-    return tuple(check_value(parameter, float(v)) for v in listed)
+    return tuple(check_value(parameter, v) for v in listed)
+
+
+def _ends(model: GeneratedModel, window: Any) -> tuple[float, float]:
+    """Return the ends of a window of loads in N."""
+    ends = checked(model, "W0", window)
+    if len(ends) != 2 or not 0 < ends[0] < ends[1]:
+        raise SrfError(f"`window` {window!r} is not two rising loads above 0", "Like (4, 500).")
+    return ends[0], ends[1]
 
 
 # `linear`: stability of steady sliding under constant load.
+
+FEWEST_SAMPLES = 8  # of a line on which crossings are looked for
 
 LOADS_TRIED = np.geomspace(1e-3, 1e5, 9)  # um, times K: where there is no Hopf point, stability is that of these
 VELOCITIES_TRIED = tuple(np.geomspace(1.0, 100.0, 60).tolist())  # um/s
@@ -194,9 +209,9 @@ def response(
     from srfcli.numerics.response import linear_response, mean_friction
 
     over = {"f": FREQUENCIES} if over is None else over
-    if len(over) != 1:
-        raise SrfError(f"over has {len(over)} parameters", "One parameter is swept: over={'f': [1, 10, 100]}.")
-    model, ((name, values),) = system.model, swept(system.model, over).items()
+    if len(grid := swept(system.model, over)) != 1:
+        raise SrfError(f"over has {len(grid)} parameters", "One parameter is swept: over={'f': [1, 10, 100]}.")
+    model, ((name, values),) = system.model, grid.items()
     if name == "eps":
         raise SrfError("eps is not swept", "Give amplitudes by `eps`; the linear response has none.")
     model.check_changing_load(system.vector())
@@ -251,6 +266,8 @@ def floquet(system: SlidingSystem, *, tol: float = 1e-6, max_mesh: int = 1024, h
     >>> state.stable, round(state.state.mean_friction, 6)
     (True, 0.418811)
     """
+    if harmonics < 0:
+        raise SrfError(f"`harmonics` {harmonics} is below 0", "Like 5.")
     p = system.model.vector(system.resolved.values)
     system.model.check_changing_load(p)
     from srfcli.numerics.floquet import solve_floquet  # costs a tenth of the start of `linear`, like the imports below
@@ -321,11 +338,13 @@ def critical(
 
     if not 1e-12 < tol < 0.1 or not 1e-8 < resolution < 1:
         raise SrfError(f"`tol` {tol:g} or `resolution` {resolution:g} is out of range", "Take 1e-8 and 1e-3.")
+    if samples < FEWEST_SAMPLES:
+        raise SrfError(f"`samples` {samples}: between so few loads crossings would be missed", f"Take {FEWEST_SAMPLES} or more.")
     model, own = system.model, system.resolved.values
     model.check_changing_load(system.vector())
     velocities = (own["V"],) if V is None else checked(model, "V", V)
     amplitudes = (own["eps"],) if eps is None else checked(model, "eps", eps)
-    lo, hi = (None, None) if window is None else checked(model, "W0", window)
+    lo, hi = (None, None) if window is None else _ends(model, window)
     found: list[tuple[str, CriticalLine]] = []
     status = Status.OK
     try:
