@@ -119,6 +119,10 @@ def drive_fitted(c: Columns) -> None:
     c.heading, c.toml = HEADING.replace("velocity [um/s]", "displacement [um]"), NO_DRIVE
 
 
+def friction(c: Columns) -> None:
+    c.u *= 100
+
+
 def unit(c: Columns) -> None:
     c.heading = HEADING.replace("spring", "spring [nm]")
 
@@ -151,6 +155,7 @@ FLAWS: dict[str, tuple[Callable[[Columns], None], str]] = {
     "drive-differs": (drive_differs, "600 of 1200 velocities differ from the declared drive by more than 5 %, the first 8"),
     "drive-segmented": (drive_segmented, "2 constant or straight pieces describe them"),
     "drive-fitted": (drive_fitted, "a continuous line of 2 straight pieces"),
+    "friction": (friction, "are the units of what is observed, of load and stiffness right?"),
     "unit": (unit, "the heading says 'nm', [columns] says 'um', which counts"),
     "observable": (observable, "elongation is what is compared; the file also has force, left aside"),
     "load": (load, "normal_load is what counts; the file also has normal_stress, left aside"),

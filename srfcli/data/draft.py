@@ -362,6 +362,7 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     sketch, runs = _read(sketch, registry)
     if sketch.negative:
         remarks.append("compression is negative in the file: the load counts with the other sign")
+    remarks += [f"{run.name}: {notice.what}" for run in runs for notice in run.notices if notice.kind == "friction"]
     modulations = _modulations(runs)
     kind, why = (wish.kind, "as it was said") if wish.kind else _kind(runs, modulations)
     remarks.append(f"kind of experiment: {kind}, {why}")

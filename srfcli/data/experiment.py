@@ -295,12 +295,17 @@ def read_run(run: RunDescription, described: Description, *, registry: Registry,
         known, filled, odd = _numbers(columns.place(name), columns.arrays[name])
         others.append(Signal(name, filled, known, quantisation(filled[known])))
         flaws += odd
-    return Run(
+    read = Run(
         name=run.name, file=run.file, holdout=run.holdout, start=run.start, initial=run.initial, t=t, observed=observed,
         observable=role, used=used, drive=drive, load=load, stiffness=stiffness, modulation=run.modulation, quantum=quantum,
         notices=(*notices, *told, *weighed, *flaws), stress=any(units.values()), proposed=proposed, others=tuple(others),
         backward=run.backward, segments=run.segments,
     )  # fmt: skip
+    friction = float(np.median((observed * read.friction_factor(load(t)[0]))[used])) if used.any() else 1.0
+    if LEAST_FRICTION < abs(friction) < LARGEST_FRICTION:
+        return read
+    what = f"the friction coefficient is {friction:.3g}: are the units of what is observed, of load and stiffness right?"
+    return replace(read, notices=(*read.notices, Notice("friction", columns.place(role).column, what)))
 
 
 def _numbers(place: Place, x: Array) -> tuple[Mask, Array, list[Notice]]:
@@ -386,6 +391,7 @@ def clean_observable(
 
 # The check of a recording: sampling, flaws, noise, and the history of drive and load, as found in the data.
 
+LEAST_FRICTION, LARGEST_FRICTION = 0.01, 3.0  # that surfaces which slide in contact have
 NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "gap": "samples are missing",
     "sampling-change": "the sampling rate changes",
@@ -402,6 +408,7 @@ NOTICE_KINDS = {  # of notices, as --fail-on takes them
     "drive-differs": "the column of velocities is not the declared drive",
     "drive-segmented": "a drive found in noisy velocities",
     "drive-fitted": "a drive found in displacements",
+    "friction": "a friction coefficient that no surfaces have",
     "unit": "a heading and [columns] differ in unit",
     "observable": "more than one observable in the file",
     "load": "more than one load in the file",

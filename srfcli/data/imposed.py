@@ -190,6 +190,9 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         f"a continuous line of {slopes.size} {pieces}, {told} um/s, fitted through the displacements, "
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
+    noise = float(np.median(local_noise(X[known])))
+    if line.misfit > UNEXPLAINED * noise:
+        what += f", {line.misfit / noise:.0f} times their noise: look at the column, or state the run's drive"
     back = int(np.argmin(way))
     if -way[back] > line.misfit:
         told = f"{-way[back]:.3g} um at t = {line.knots[back]:.7g} s"
@@ -272,6 +275,7 @@ CLEAR = 8.0  # standard deviations about the lines beside it that a level jump e
 SAMPLES_BESIDE = 200  # samples on each side by which a jump is told from a corner
 EVEN = 1e-5  # of the largest noise, at least: smaller ones would be lost in the rounding of the running sums
 LEAST_NOISE = 1e-100  # um or um/s: a noise whose square is still a number
+UNEXPLAINED = 30.0  # times its noise that a displacement differs from the line, from where that is told
 WOBBLE = 0.02  # relative change of slope below which there is no corner
 
 
