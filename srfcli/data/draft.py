@@ -25,6 +25,7 @@ from srfcli.core.units import (
     parse_quantity,
     split_heading,
     split_quantity,
+    unit_factor,
 )
 from srfcli.data.columns import open_source, read_columns
 from srfcli.data.description import FORMAT, ROLES, check_unit, read_description
@@ -330,11 +331,11 @@ def draft(files: Sequence[Path], folder: Path, wish: Wish, *, registry: Registry
     """
     unit = split_quantity(wish.stiffness, name="--stiffness", example="5e-3 1/um")[1]
     per_load = bool(unit) and find_unit(unit).powers == (-1, 0, 0, 0)
-    if unit and find_unit(unit).powers not in [find_unit(known).powers for known in ("N/um", "MPa/um", "1/um")]:
-        raise SrfError(
-            f"--stiffness '{wish.stiffness}' is no stiffness: a force, a stress or a friction over a length is one",
-            "As '0.21 N/um', '30 MPa/mm' or '1e-3 1/um'.",
-        )
+    try:
+        unit_factor(unit or "N/um", "1/um" if per_load else "N/um", wish.geometry())
+    except SrfError as error:
+        hint = error.hint if error.kind == "unit" else "As '0.21 N/um', '1.5 MPa/mm' or '1e-3 1/um'."
+        raise SrfError(f"--stiffness '{wish.stiffness}': {error.message}", hint) from error
     named: tuple[Named, ...] = ()
     names: list[str] = []
     remarks: list[str] = []
