@@ -239,7 +239,7 @@ def test_effects_without_a_part_in_critical_loads_are_refused(empty_folder: Path
     assert result.exit_code == 2
     assert reason in result.output
     with pytest.raises(SrfError, match=reason):
-        srf.system(effects=[effect])
+        srf.linear(srf.system(effects=[effect]))
 
 
 # experiments that hold tables
