@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from srfcli.codegen.model import Array
-from srfcli.data.values import OBSERVABLES, Experiment, Run, per_elongation
+from srfcli.data.values import OBSERVABLES, Experiment, Run, per_elongation, shown_unit
 from srfcli.data.writing import DESCRIPTION, experiment_files, run_csv
 from srfcli.diagnosis.augment import augment
 from srfcli.diagnosis.search import Fitted
@@ -73,6 +73,7 @@ class DiscriminatingRun:
     noise: float
     predicted: Mapping[str, Array] = field(repr=False)
     tried: int = 0
+    load_unit: str = "N"
 
     @property
     def discriminates(self) -> bool:
@@ -296,8 +297,9 @@ class Design:
         return DiscriminatingRun(
             names, trial.proposal, run, worth[true_name, wrong_name],
             {a: min(g for (true, _), g in worth.items() if true == a) for a in names}, seconds, repeats, (first, second),
-            float(run.t[at]), float(left[at]), abs(float(left[at])) / factor, OBSERVABLES[run.observable],
-            wrongs[wrong_name], trial.y,
+            float(run.t[at]), float(left[at]), abs(float(left[at])) / factor,
+            shown_unit(OBSERVABLES[run.observable], stress=self.experiment.stress),
+            wrongs[wrong_name], trial.y, load_unit=shown_unit("N", stress=self.experiment.stress),
         )  # fmt: skip
 
     def refitted(self, run: Run, wrong: Side, y: Array) -> Loss | None:
@@ -395,8 +397,8 @@ class Proposal:
             W += self.eps * self.W0 * envelope * np.cos(2 * np.pi * self.f * t)
         return W
 
-    def changes(self) -> list[tuple[float, str]]:
-        """Return when (s) something is changed, and what, in order of time."""
+    def changes(self, unit: str = "N") -> list[tuple[float, str]]:
+        """Return when (s) something is changed, and what, in order of time; loads have this unit."""
         found, t = [], 0.0
         for (d, V), (_, after) in zip(self.drive, self.drive[1:], strict=False):
             t += d
@@ -404,18 +406,18 @@ class Proposal:
             found.append((t, verb if V else f"the stage moves again, at {after:g} um/s"))
         W = self.W0
         for at, jump in self.steps:
-            found.append((at, f"the load changes from {W:.4g} to {W + jump:.4g} N"))
+            found.append((at, f"the load changes from {W:.4g} to {W + jump:.4g} {unit}"))
             W += jump
         if self.eps:
             found.append((self.onset, "the modulation is switched on"))
         return sorted(found)
 
-    def text(self) -> str:
-        """Return what is to be done, in words: drive; load."""
+    def text(self, unit: str = "N") -> str:
+        """Return what is to be done, in words: drive; load, in this unit."""
         drive = ", then ".join(f"{d:g} s at {V:g} um/s" if V else f"{d:g} s at rest" for d, V in self.drive)
-        load = f"{self.W0:g} N"
+        load = f"{self.W0:g} {unit}"
         for at, jump in self.steps:
-            load += f", {'up' if jump > 0 else 'down'} by {abs(jump):g} N at {at:g} s"
+            load += f", {'up' if jump > 0 else 'down'} by {abs(jump):g} {unit} at {at:g} s"
         if self.eps:
             load += f", from {self.onset:g} s on modulated by {100 * self.eps:g} % at {self.f:g} Hz"
         return f"{drive}; load {load}"
@@ -631,7 +633,8 @@ def sentences(found: DiscriminatingRun) -> list[str]:
             f"gains {found.gain:.2g} in log likelihood, and {TOLD_APART:g} are wanted. For this apparatus they are one class."
         ]
     return [
-        f"What would discriminate between {names} is {run.kind}: {run.text()}; sampled at {1 / run.interval:.4g} Hz.",
+        f"What would discriminate between {names} is {run.kind}: {run.text(found.load_unit)}; "
+        f"sampled at {1 / run.interval:.4g} Hz.",
         f"Whichever of them is true, the others then lose at least {found.gain:.3g} in log likelihood, refitted to all runs. "
         + _long(found),
         _look(found),
@@ -649,7 +652,7 @@ def _long(found: DiscriminatingRun) -> str:
 def _look(found: DiscriminatingRun) -> str:
     """Return where to look, and for how much."""
     first, second = map(_name, found.pair)
-    before = [(t, what) for t, what in found.proposal.changes() if t <= found.at]
+    before = [(t, what) for t, what in found.proposal.changes(found.load_unit) if t <= found.at]
     since = f", {found.at - before[-1][0]:.2g} s after {before[-1][1]}" if before else ""
     size = f"{abs(found.peak):.2g}{'' if found.unit == '1' else f' {found.unit}'}"
     um = "" if found.unit == "um" else f" ({found.peak_um:.2g} um of the spring's elongation)"
@@ -687,7 +690,7 @@ def run_text(found: DiscriminatingRun, experiment: Experiment) -> str:
     """Return the run as experiment.toml describes one; its file has times and load, and what a hypothesis predicts."""
     run = replace(found.run, holdout=False)
     description = experiment_files(replace(experiment, runs=(run,)))[DESCRIPTION]
-    load = found.proposal.text().partition("; load ")[2]
+    load = found.proposal.text(found.load_unit).partition("; load ")[2]
     return f"[[runs]]\n# load {load}, as the file has it\n{description.rpartition(RUNS)[2]}"
 
 
