@@ -500,7 +500,7 @@ def test_steps_of_the_drive_from_displacements(tmp_path: Path) -> None:
     assert drive.breaks[0] == pytest.approx(6.0, abs=0.02)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.1], ids=["clean", "0.1 um"])
+@pytest.mark.parametrize(("noise", "count"), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1)], ids=["clean", "noise", "encoder"])
 @pytest.mark.parametrize(
     "steps",
     [
@@ -510,12 +510,21 @@ def test_steps_of_the_drive_from_displacements(tmp_path: Path) -> None:
     ],
     ids=["up and down", "short", "with a last one"],
 )
-def test_steps_that_are_many_or_short_beside_the_record(steps: list[tuple[float, float]], noise: float) -> None:
+def test_steps_that_are_many_or_short_beside_the_record(steps: list[tuple[float, float]], noise: float, count: float) -> None:
     """In a record of few stretches corners are in many of them: they are no noise of the displacements."""
     ends = np.cumsum([0.0, *(duration for duration, _ in steps)])
     way = np.cumsum([0.0, *(duration * V for duration, V in steps)])
     t = np.arange(0.0, ends[-1], 0.1)
     displacements = np.interp(t, ends, way) + noise * np.random.default_rng(3).standard_normal(t.size)
+    displacements = np.round(displacements / count) * count if count else displacements
     drive, _ = drive_from_displacement(t, displacements, "stage")
     assert drive.velocities == pytest.approx([V for _, V in steps], rel=2e-3)
     assert drive.breaks == pytest.approx(ends[1:-1], abs=0.1)
+
+
+def test_counts_of_an_encoder_are_no_steps_of_the_drive() -> None:
+    """A hundred samples to a count: each jump is the encoder's, and the misfit its rounding."""
+    t = np.arange(0.0, 600.0, 0.1)
+    drive, told = drive_from_displacement(t, np.round(np.interp(t, [0, 300, 600], [0, 30, 120])), "stage")
+    assert drive.velocities == pytest.approx([0.1, 0.3], rel=1e-3)
+    assert "times their noise" not in told[-1].what

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+import srfcli
 from srfcli.cli.main import cli
 from srfcli.data.experiment import read_experiment
 from srfcli.data.values import Experiment
@@ -150,6 +151,15 @@ def test_an_effect_asks_the_load_and_not_the_samples(empty_folder: Path) -> None
     felt = ("--load-file", "L.csv", "--effect", "load-transmission", "--set", "rho=0.5", "--V", "10", "--for", "2")
     fine, coarse = (columns(*felt, "--rate", rate)["u"][-1] for rate in ("1000", "5"))
     assert coarse == pytest.approx(fine, abs=1e-6) != columns("--load-file", "L.csv", "--V", "10", "--for", "2")["u"][-1]
+
+
+def test_an_experiment_names_an_effect_s_file_by_its_whole_path(empty_folder: Path) -> None:
+    shipped = Path(srfcli.__file__).parents[1] / "plugins" / "effect" / "viscous-drag.toml"
+    Path("drag.toml").write_text(shipped.read_text(encoding="utf-8").replace("viscous-drag", "drag"), encoding="utf-8")
+    simulate("--V", "8", "--W0", "5", "--for", "1", "--rate", "20", "--effect", "drag.toml", "--out-dir", "made")
+    assert read("made").choice.effects == (str(Path("drag.toml").resolve()),)
+    assert "distance from the recording" in simulate("made", "--csv").stderr
+    assert "named twice" in simulate("made", "--effect", str(Path("drag.toml").resolve()), code=2).stderr
 
 
 def test_friction_force_is_that_of_the_load_on_the_asperities() -> None:
@@ -380,6 +390,7 @@ def test_ctrl_c_keeps_the_runs_that_are_done(shared: Path, monkeypatch: pytest.M
         (["--onset", "1"], "nothing is modulated", "--eps"),
         (["--eps", "0.1", "--onset", "-1"], "before the record", "begins with it"),
         (["--loading", "inclined", "--drive", "1:5, 1:9"], "changes its velocity", "leave out --loading"),
+        (["--effect", "viscous-drag", "--effect", "viscous-drag"], "named twice", "Once is enough"),
         (["--effect", "inertia", "--no-inertia"], "only replaces", "inertia = true"),
         (["--effect", "drive-riple"], "unknown effect", "Did you mean 'drive-ripple'?"),
         (["--start", "q=3"], "'q' is no state", "Known: phi, u, v, z"),

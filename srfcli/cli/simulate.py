@@ -193,6 +193,7 @@ def _write(found: SimulationResult, folder: Path, seed: int, output: OutputOptio
 
 def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], field: FrictionField | None, spread: float) -> Work:
     """Return the runs of the experiment at `path`; srf.toml and the environment do not choose its laws, flags do."""
+    from srfcli.codegen.slider import check_effects
     from srfcli.data.experiment import read_experiment
     from srfcli.tasks.simulate import runs_again
 
@@ -202,7 +203,8 @@ def _runs_again(system: SystemOptions, path: Path, given: Mapping[str, Any], fie
         raise SrfError("the runs of an experiment are loaded from above", "Leave out --loading inclined.")
     laws = {k: s.value for k, s in system.chosen.items() if s.origin == "flag" and k != "loading"}
     if system.effects:
-        laws["effects"] = (*experiment.choice.effects, *system.effects)
+        laws["effects"] = (*experiment.choice.effects, *_placed(system.effects))
+        check_effects(registry, laws["effects"])
     work = runs_again(
         experiment, registry, laws=laws,
         parameters=system.flags, names=given["runs"], field=field, spread=spread,
@@ -323,10 +325,13 @@ def _laws(system: SystemOptions) -> ModelChoice:
     from srfcli.data.values import ModelChoice
 
     names = {key: setting.value for key, setting in system.chosen.items() if key != "loading"}
-    for key in LAW_CHOICES:
-        if names[key].endswith(LAW_FILES):
-            names[key] = str(Path(names[key]).resolve())
-    return ModelChoice(**names, effects=system.effects)
+    names |= dict(zip(LAW_CHOICES, _placed([names[key] for key in LAW_CHOICES]), strict=True))
+    return ModelChoice(**names, effects=_placed(system.effects))
+
+
+def _placed(names: Sequence[str]) -> tuple[str, ...]:
+    """Return names of laws, a file's as its whole path."""
+    return tuple(str(Path(name).resolve()) if name.endswith(LAW_FILES) else name for name in names)
 
 
 # Reading of options: pieces of drive and load, sampling rates, start values, the random friction field.

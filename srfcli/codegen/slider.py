@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from srfcli.codegen.model import GeneratedModel, open_model
-from srfcli.core.errors import SrfError
+from srfcli.core.errors import SrfError, as_names
 from srfcli.core.settings import DEFAULTS, Parameter, Resolved, resolve
 from srfcli.laws.registry import Registry, load_registry
 from srfcli.laws.values import Effect
@@ -60,7 +60,7 @@ class SlidingSystem:
         return {k: v for k, v in self.resolved.described().items() if k not in left}
 
     def vector(self, **declared: float) -> NDArray[Any]:
-        """Return the parameters (n_parameters,) in um, s, N, some at other values in their declared units."""
+        """Return the parameters (n_parameters,) of `model` in um, s, N, some at other values in their declared units."""
         from srfcli.core.units import to_base
 
         units = {q.name: q.unit for q in self.resolved.parameters}
@@ -90,7 +90,7 @@ def system(
     interface: str = str(DEFAULTS["interface"].value),
     loading: str = str(DEFAULTS["loading"].value),
     inertia: bool = True,
-    effects: Sequence[str] = (),
+    effects: str | Sequence[str] = (),
     plugins: Sequence[str | Path] = (),
     parameters: Mapping[str, float | str] | None = None,
     **more: float | str,
@@ -107,7 +107,7 @@ def system(
         How the normal load is applied.
     inertia : bool
         Whether the slider's mass counts.
-    effects : sequence of str
+    effects : str or sequence of str
         Effects that the system has besides its laws, names or paths of files.
     plugins : sequence of path
         Folders in which laws are looked for, too.
@@ -137,6 +137,7 @@ def system(
     >>> pmma.parameters["K"], pmma.at(K=0.3).parameters["K"]
     (0.21, 0.3)
     """
+    effects = as_names(effects, "effects")
     words = [w.strip() for text in (law, ageing, interface, *effects) for w in text.split("+")]
     registry = load_registry([Path(p) for p in plugins], named=[Path(w) for w in words if w.endswith(".py")])
     opened = opener(registry, effects, law=law, ageing=ageing, interface=interface, loading=loading, inertia=inertia)
@@ -150,10 +151,7 @@ def opener(registry: Registry, effects: Sequence[str] = (), **names: Any) -> Cal
 
     Raises SrfError for an effect that only changes what the system is; the model of stability for one that it does not have.
     """
-    for name in effects:
-        effect = registry.get("effect", name)
-        if isinstance(effect, Effect) and (instead := replaced_by(effect)):
-            raise SrfError(f"'{effect.name}' only replaces what the system is", f"Choose {' and '.join(instead)}.")
+    check_effects(registry, effects)
 
     @cache
     def opened(moving: bool) -> GeneratedModel:
@@ -179,10 +177,15 @@ def why_not_steady(registry: Registry, effects: Sequence[str]) -> str:
     return ""
 
 
-def replaced_by(effect: Effect) -> list[str]:
-    """Return what is to be chosen in place of an effect that has no formula of its own, nothing for one that has."""
-    instead = [f"{key} = {str(value).lower()}" for key, value in effect.settings]
-    return instead + [{"K": "another stiffness", "M": "a mass"}.get(name, name) for name in effect.frees]
+def check_effects(registry: Registry, effects: Sequence[str]) -> None:
+    """Raise SrfError for an effect that is named twice, or has no formula of its own and only changes what the system is."""
+    for name in as_names(effects, "effects"):
+        effect = registry.get("effect", name)
+        assert isinstance(effect, Effect)
+        instead = [f"{key} = {str(value).lower()}" for key, value in effect.settings]
+        instead += [{"K": "another stiffness", "M": "a mass"}.get(freed, freed) for freed in effect.frees]
+        if instead:
+            raise SrfError(f"'{effect.name}' only replaces what the system is", f"Choose {' and '.join(instead)}.")
 
 
 def declared(model: GeneratedModel) -> tuple[Parameter, ...]:

@@ -190,7 +190,7 @@ def drive_from_displacement(t: Array, X: Array, where: str, *, correct: bool = F
         f"a continuous line of {slopes.size} {pieces}, {told} um/s, fitted through the displacements, "
         f"from which they differ by {line.misfit:.3g} um (rms)"
     )
-    noise = float(np.median(local_noise(X[known])))
+    noise = max(float(np.median(local_noise(X[known]))), quantisation(X[known]) / np.sqrt(12.0))
     if line.misfit > UNEXPLAINED * noise:
         what += f", {line.misfit / noise:.0f} times their noise: look at the column, or state the run's drive"
     back = int(np.argmin(way))
@@ -344,13 +344,13 @@ def coloured_noise(t: Array, x: Array) -> Array:
     """
     from scipy.ndimage import percentile_filter
 
-    sigma = local_noise(x)
+    sigma, step = local_noise(x), quantisation(x)
     length = min(STRETCH, x.size)
     starts = np.arange(0, x.size - length + 1, length)
     found = np.empty(starts.size)
     for k, at in enumerate(starts.tolist()):
         part = slice(at, at + length)
-        z = _without_corners(t[part], x[part]) / sigma[part]
+        z = _without_corners(t[part], x[part], step) / sigma[part]
         power = float(z @ z)
         rho = min(max(float(z[1:] @ z[:-1]) / power, 0.0), 0.98) if power > 0 else 0.0
         found[k] = power / max(length - 3, 1) * (1 + rho) / (1 - rho)
@@ -362,8 +362,11 @@ def coloured_noise(t: Array, x: Array) -> Array:
     return np.asarray(sigma * np.sqrt(np.maximum(near[stretch], 1.0)))
 
 
-def _without_corners(t: Array, x: Array) -> Array:
-    """Return the residual (n,) of a parabola through x over t, less the corners and level jumps that explain most of it."""
+def _without_corners(t: Array, x: Array, step: float) -> Array:
+    """Return the residual (n,) of a parabola through x over t, less the corners and level jumps that explain most of it.
+
+    A jump by the `step` of an encoder is none.
+    """
     place = (t - t.mean()) / max(float(np.ptp(t)), 1e-300)
     edges = 0.5 * (place[1:] + place[:-1])[1 : 1 - FEWEST_OF_PIECE // 2]
     after = place[:, None] > edges
@@ -378,7 +381,8 @@ def _without_corners(t: Array, x: Array) -> Array:
         direction = columns[:, best] / np.sqrt(sizes[best])
         power = float(rest @ rest)
         less = rest - direction * float(direction @ rest)
-        if not float(less @ less) < power / CORNER:
+        one_count = best >= edges.size and abs(float(direction @ rest)) / np.sqrt(sizes[best]) < 1.5 * step
+        if one_count or not float(less @ less) < power / CORNER:
             break
         rest = less
         columns -= np.outer(direction, direction @ columns)

@@ -349,6 +349,8 @@ def _confidence(
     share = {name: float(np.exp(max((w - top) / TEMPER, -60.0))) for name, w in weights.items()}
     total, unknown = sum(share.values()), 1 - MISSED if verdict == "unknown" else UNEXPLAINED
     for name, law in became.items():
+        while law in became:  # each has fewer parameters than the one before
+            law = became[law]
         share[law] += share[name]
         share[name] = 0.0
     passed = any(f.passes for f in ranked)  # else none of them is it

@@ -192,7 +192,19 @@ def run_parameters(model: GeneratedModel, experiment: Experiment, run: Run, valu
 def of_run(run: Run) -> dict[str, float]:
     """Return what effects ask of a recording: where and when it begins, and the load's modulation as it is in the data."""
     weighed = float(run.observable != "elongation")
-    return {"start": run.start, "begin": float(run.t[0]), "weighed": weighed, **modulation_of(run.load, run.t)}
+    return {"start": run.start, "begin": float(run.t[0]), "weighed": weighed, **_modulation(run)}
+
+
+def _modulation(run: Run) -> dict[str, float]:
+    """Return the modulation of a run's load, that of the whole run where this is a part of one."""
+    known = _MODULATIONS.get(id(run.load))
+    if known is not None and known[0] is run.load:
+        return known[1]
+    answer = modulation_of(run.load, run.t)
+    _MODULATIONS[id(run.load)] = (run.load, answer)
+    while len(_MODULATIONS) > 64:
+        _MODULATIONS.pop(next(iter(_MODULATIONS)))
+    return answer
 
 
 def modulation_of(load: Load, t: Array) -> dict[str, float]:
@@ -200,18 +212,12 @@ def modulation_of(load: Load, t: Array) -> dict[str, float]:
 
     They are found in the load as it is at the times t.
     """
-    known = _MODULATIONS.get(id(load))
-    if known is not None and known[0] is load:
-        return known[1]
     W = load(t)[0]
     found = find_modulation(t, W)
     answer = {"f": 1.0, "eps": 0.0, "psi": 0.0, "onset0": -1e6, "rise0": 0.02, "modulated": 0.0}
-    if found is not None:
-        answer |= {"f": found.frequency, "modulated": 1.0} | _switched(t, W, found.frequency, found.amplitude, found.onset)
-    _MODULATIONS[id(load)] = (load, answer)
-    while len(_MODULATIONS) > 64:
-        _MODULATIONS.pop(next(iter(_MODULATIONS)))
-    return answer
+    if found is None:
+        return answer
+    return answer | {"f": found.frequency, "modulated": 1.0} | _switched(t, W, found.frequency, found.amplitude, found.onset)
 
 
 def _switched(t: Array, W: Array, f: float, eps: float, onset: float) -> dict[str, float]:

@@ -255,29 +255,31 @@ class FitResult(Result):
         if found.friction_field is not None:
             share = found.friction_field.amplitude / max(min(map(typical_friction, found.problem.runs)), 1e-6)
             if share > PLAUSIBLE:
-                told.append(f"that field is {100 * share:.1g} % of the friction, more than a track has")
-        if found.state_space is not None and found.status is not Status.INTERRUPTED:
+                told.append(f"the friction field is {100 * share:.1g} % of the friction, more than a track has")
+        if found.state_space is not None and found.status.ok:
             failed = [text for text in shortcomings(found.state_space) if not text.startswith("the field's amplitude")]
             told += [f"the fit fails a test: {text}" for text in failed[:TESTS_TOLD]]
         return told
 
     @cached_property
     def difference(self) -> tuple[float, float | None] | None:
-        """Return A - B and its standard error with the covariance of the two, None without both; of what varies, of the means."""
-        found, names = self.found, ("A", "B")
+        """Return A - B and its standard error with the covariance of the two, None without both; of what varies, of the means.
+
+        The error is None where one varies or stands at a bound.
+        """
+        found, names, groups = self.found, ("A", "B"), self.found.problem.groups
         known = {q.name: q.value for q in self.experiment.parameters} | found.fit.values
-        known |= {
-            n: s.mean if s else float(np.mean([known[m] for m in found.problem.groups[n]])) for n, s in found.scatter.items()
-        }
+        for name, each in groups.items():
+            scatter = found.scatter.get(name)
+            known[name] = scatter.mean if scatter else float(np.mean([known[n] for n in each]))
         if not {*names} <= known.keys():
             return None
         free = [found.fit.names.index(n) for n in names if n in found.fit.names]
-        error = None
-        if free and not {*names} & found.scatter.keys():
-            signs = np.array([1.0, -1.0] if len(free) == 2 else [1.0])
-            variance = float(signs @ np.asarray(found.fit.covariance)[np.ix_(free, free)] @ signs)
-            error = float(np.sqrt(max(variance, 0.0))) if np.isfinite(variance) else None
-        return known["A"] - known["B"], error
+        own = np.asarray(found.fit.covariance)[np.ix_(free, free)]
+        if not free or {*names} & groups.keys() or not (np.diag(own) > 0).all():
+            return known["A"] - known["B"], None
+        signs = np.array([1.0 if found.fit.names[k] == "A" else -1.0 for k in free])
+        return known["A"] - known["B"], float(np.sqrt(max(float(signs @ own @ signs), 0.0)))
 
     def _notes(self) -> list[str]:
         """Return what is to be known beside the numbers, in sentences."""
@@ -288,8 +290,7 @@ class FitResult(Result):
             notes[0] += f", {fit.rms_over_noise(holdout=True):.3f} in those held out"
         if self.difference is not None and self.difference[1]:
             difference, error = self.difference
-            sense = "rises" if difference > 0 else "falls"
-            notes.append(f"A - B = {difference:.6g} +- {error:.2g}: in steady sliding friction {sense} with velocity")
+            notes.append(f"A - B = {difference:.6g} +- {error:.2g}, the covariance of the two allowed for")
         done = [i.name for i in self.intervals]
         whose = "profile likelihood" + (f" of {', '.join(done)}, else 1.96 standard errors" if len(done) < len(fit.names) else "")
         notes.append("intervals: " + (whose if self.intervals else "1.96 standard errors; --profile refits") + ", 95 %")

@@ -150,7 +150,7 @@ def measure(work: Work, job: Job, trace: Trace, observed: Array, observable: str
     gauge = work.gauges.get(observable, Gauge())
     if not (gauge.noise or gauge.quantum):
         shown = _along(work.model, job, trace, "reading") if observable == job.observable else None
-        return None if shown is None or np.allclose(shown, trace.u, rtol=1e-12, atol=0.0) else observed
+        return None if shown is None or np.allclose(shown, trace.u, rtol=1e-12, atol=0.0, equal_nan=True) else observed
     stream = job.name if observable == job.observable else f"{job.name} {observable}"
     return measured(observed, **asdict(gauge), stream=stream)
 

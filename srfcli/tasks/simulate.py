@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import accumulate, pairwise
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from srfcli.codegen.model import Array, GeneratedModel, open_model
+from srfcli.codegen.slider import declared
 from srfcli.codegen.splines import appended
 from srfcli.core.errors import SrfError, Status, did_you_mean, worst
 from srfcli.core.settings import Parameter, check_value, require_parameter
@@ -184,6 +186,7 @@ def read_gauges(
 # A new record: one slider under a drive and a load.
 
 STEEPEST = 1.875  # slope of a modulation's rise at its middle, over that of a straight line
+FINE = 20_000  # times at which a load is looked at for a modulation
 REFERENCE_PARAMETERS = ("V0",)  # the velocity that mu0 refers to: not identifiable beside mu0
 BOUND_FACTOR = 5.0  # ratio of the bounds of a fit to the value
 
@@ -206,7 +209,7 @@ def record_of(
     model, values, begin = system.motion, system.resolved.values, float(t[0])
     replaced = [name for name, given in (("V", drive), ("W0", load)) if given is not None]
     drive, load = drive or Drive.constant(values["V"]), load or ConstantLoad(values["W0"])
-    if "angle" in values and any(drive.at(s) != drive.at(begin) for s in (*drive.breaks, float(t[-1]))):
+    if "angle" in values and any(drive.at(s) != drive.at(begin) for s in (*(b for b in drive.breaks if b < t[-1]), float(t[-1]))):
         raise SrfError(
             "under an inclined spring W0 is the load in steady sliding at V, and the drive changes its velocity",
             "Drive at one velocity, or leave out `loading`.",
@@ -248,11 +251,12 @@ def _onset(onset: float | None, begin: float) -> float:
 def _as_effects_ask(load: Load, t: Array) -> dict[str, float]:
     """Return a load's modulation as effects ask for it: switched on as (1 + tanh((t - onset0)/rise0))/2, as steeply as it rises.
 
-    That of a load of one's own is found at the times t, that of a measured one at its own.
+    That of a measured load is found at its own times, that of another one between the first and last of t.
     """
     shape = load if isinstance(load, Modulation) else load.shape if isinstance(load, ModulatedLoad) else None
     if shape is None or not shape.eps:
-        return modulation_of(load, load.times if isinstance(load, SampledLoad) else t)
+        fine = np.linspace(t[0], t[-1], max(t.size, FINE))
+        return modulation_of(load, load.times if isinstance(load, SampledLoad) else fine)
     known = {"f": shape.f, "eps": shape.eps, "psi": shape.phase, "modulated": 1.0}
     if not math.isfinite(shape.onset):
         return known
@@ -279,8 +283,8 @@ def start_state(
                 "or begin `drive` with a piece that moves.",
             )
         return None
-    if isinstance(start, int | float) and not isinstance(start, bool):
-        start = repr(start)
+    if isinstance(start, numbers.Real):
+        start = repr(float(start))
     if not isinstance(start, str):
         return np.asarray(start, float)
     if "=" not in start:
@@ -317,9 +321,9 @@ def new_experiment(
 
     `free` names the parameters that a fit is to find, the law's but V0 if left out; `spread` is as in `perturbed`.
     """
-    declared, values = system.resolved.parameters, system.resolved.values
-    laws = [p.name for p in declared if p.name not in RESERVED]
-    known = [*laws, *(p.name for p in declared if p.name in ("K", "M"))]
+    parts, values = system.resolved.parameters, system.resolved.values
+    laws = [p.name for p in parts if p.name not in RESERVED]
+    known = [*laws, *(p.name for p in parts if p.name in ("K", "M"))]
     if free is None:
         chosen = [name for name in laws if name not in REFERENCE_PARAMETERS]
     else:
@@ -329,7 +333,7 @@ def new_experiment(
             raise SrfError(f"`free`: {name!r} is no parameter of {system.title}", did_you_mean(name, known))
     parameters = [
         FitParameter(p.name, values[p.name], *bounds(p, values[p.name]), fixed=p.name not in chosen, unit=p.unit)
-        for p in declared
+        for p in parts
         if p.name not in RESERVED or p.name in chosen
     ]
     mass = values.get("M") if choice.inertia else None
@@ -483,7 +487,7 @@ def _values(model: GeneratedModel, parameters: Mapping[str, str], *, stress: boo
     for name, text in parameters.items():
         if name in IMPOSED:
             raise SrfError(f"{name} is what the runs impose", "An experiment says itself how it is driven and loaded.")
-        parameter = require_parameter(name, model.parameters, where=model.title)
+        parameter = require_parameter(name, declared(model), where=model.title)
         values[name] = to_base(check_value(parameter, text), parameter.unit)
     return values
 
@@ -512,7 +516,7 @@ def _job(model: GeneratedModel, experiment: Experiment, run: Run, values: Mappin
 def _described(model: GeneratedModel, experiment: Experiment, values: Mapping[str, float]) -> dict[str, dict[str, Any]]:
     """Return name -> {value, unit, origin} of what does not change from run to run."""
     listed, described = _listed(experiment), {}
-    for p in model.parameters:
+    for p in declared(model):
         if p.name in IMPOSED:
             continue
         origin = "flag" if p.name in values else "experiment" if p.name in listed else "law default"
