@@ -204,6 +204,7 @@ def test_a_run_may_begin_without_any_friction(rock_model, first):
     assert mu == first and lower < mu - 0.09 and upper > mu + 0.09
 
 
+@pytest.mark.slow
 def test_stick_slip_from_afar(make_model):
     """A start at which sliding is steady, whatever the recording does."""
     model = make_model(random_field=True)

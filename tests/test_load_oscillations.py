@@ -43,10 +43,10 @@ def written(example: ModuleType, folder: Path, **truth: float) -> Path:
     ("truth", "name", "parameter", "value"),
     [
         pytest.param({"alpha": 0.1}, "linker-dieterich", "alpha", 0.1, marks=pytest.mark.slow),
-        ({"alpha": 0.3}, "linker-dieterich", "alpha", 0.3),
+        pytest.param({"alpha": 0.3}, "linker-dieterich", "alpha", 0.3, marks=pytest.mark.slow),
         pytest.param({"alpha": 0.5}, "linker-dieterich", "alpha", 0.5, marks=pytest.mark.slow),
         ({"nagata": 1.0}, "nagata", "c", 1.0),
-        ({"rho": 0.8}, "load-transmission", "rho", 0.8),
+        pytest.param({"rho": 0.8}, "load-transmission", "rho", 0.8, marks=pytest.mark.slow),
     ],
     ids=["alpha 0.1", "alpha 0.3", "alpha 0.5", "nagata", "transmission"],
 )

@@ -125,6 +125,7 @@ def test_a_load_cell_and_a_displacement_gauge_tell_the_stiffness() -> None:
 
 
 @compiled
+@pytest.mark.slow
 @pytest.mark.usefixtures("empty_folder")
 def test_a_diagnosis_takes_all_observables() -> None:
     folder = made(Path("made"), "force,slip", "0.002,0.1", "--ageing", "ruina")

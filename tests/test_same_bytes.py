@@ -40,6 +40,7 @@ if __name__ == "__main__":  # workers import this file
 """
 
 
+@pytest.mark.slow
 def test_any_number_of_threads_and_workers() -> None:
     Path("all.py").write_text(ALL)
     running = []

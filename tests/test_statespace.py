@@ -417,6 +417,7 @@ def test_a_fit_follows_a_ridge_that_bends(make_model):
     assert maximise(likelihood, likelihood.coordinates({**true, **off}), close=0.5).away < 0.5
 
 
+@pytest.mark.slow
 def test_a_compliance_is_found_by_how_the_contact_rings(make_model):
     """In stick-slip it rings at 430 Hz, read every 4 ms: one lambda in 0.5 % explains that, and nothing leads there."""
     true = {"mu0": 0.459, "A": 0.0131, "B": 0.028, "D0": 0.403, "lambda": 0.523}
